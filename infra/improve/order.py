@@ -53,6 +53,11 @@ class ImproveOrder:
     """Device to train on; by default cuda if there is one, else cpu."""
 
     def __post_init__(self) -> None:
+        if "://" in self.out:
+            raise TrilightError(
+                f"out is {self.out!r}; expected a folder of this machine, since rounds read their "
+                "own files again."
+            )
         self.strata()
         self.training(1, ("data",), None).settings()
 

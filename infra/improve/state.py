@@ -141,5 +141,11 @@ def _read(path: Path) -> Any:
 
 
 def _write(path: Path, record: Mapping[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrilightError(
+            f"improve: {path.parent} cannot be made ({error.strerror}); expected a folder that may "
+            "be written. Choose another --out."
+        ) from error
     write_atomically(path, (json.dumps(record, indent=2, sort_keys=True) + "\n").encode())
