@@ -22,8 +22,9 @@ COMMANDS = {
     "assets": "Turn objects into clean meshes within a budget or an error; writes quality.html.",
     "generate": "Turn objects into a verified, resumable dataset; run it again to resume after any "
     "stop.",
-    "submit": "Do elsewhere what generate does: by a flow on the workers of a Prefect server, and "
-    "watch it, or as an array of tasks on Slurm, Kubernetes, SkyPilot, AWS or Google Batch.",
+    "submit": "Do elsewhere what generate or improve does: by a flow on the workers of a Prefect "
+    "server, and watch it, or as an array of tasks on Slurm, Kubernetes, SkyPilot, AWS or Google "
+    "Batch.",
     "revisit": "Render the scenes of a finished dataset again, with new cameras, lights, materials "
     "or another resolution; pictures that stay the same are copied.",
     "plan": "Measure a few scenes and predict time, bytes and cost of all, each with an interval.",
@@ -57,7 +58,7 @@ COMMANDS = {
 """The commands with their help. A command is the function of its name in the file of its name; a
 group of commands is the `app` in that file."""
 
-GROUPS = ("shards",)
+GROUPS = ("shards", "submit")
 """Commands with subcommands."""
 
 app = App(

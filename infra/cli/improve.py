@@ -2,11 +2,19 @@
 
 from functools import partial
 
-from infra.cli.console import console, first_words, look_at, print_json, print_table
+from infra.cli.console import (
+    console,
+    first_words,
+    look_at,
+    next_step,
+    print_json,
+    print_rows,
+    print_table,
+)
 from infra.cli.options import Shown, command
 from infra.improve.local import train_here
 from infra.improve.order import ImproveOrder
-from infra.improve.report import picture_of, rows_of
+from infra.improve.report import picture_of, rows_of, summary_of
 from infra.improve.rounds import LoopWorkers
 from infra.improve.rounds import improve as run_rounds
 from infra.improve.state import Rounds
@@ -42,4 +50,7 @@ def improve(order: ImproveOrder, shown: Shown) -> None:
     print_table(
         f"Round {len(found)}", [{k: v for k, v in row.items() if k != "round"} for row in last]
     )
+    print_rows("Closed loop", summary_of(found))
     look_at(f"Read {order.root / 'improve.md'}, look at {picture_of(rounds)}")
+    run = str(order.root / "run")
+    next_step(["inspect", run], ["evaluate", run, "--data", str(rounds.dataset(1))])

@@ -10,9 +10,8 @@ from infra.train_order import TrainOrder
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from scene_templates.strata import Stratum
-from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
-from storage.settings.described import checked, settings_record
+from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 
 Axis = Literal["walls", "objects", "lights", "roughness"]
@@ -54,6 +53,11 @@ class ImproveOrder:
     """Device to train on; by default cuda if there is one, else cpu."""
 
     def __post_init__(self) -> None:
+        if "://" in self.out:
+            raise TrilightError(
+                f"out is {self.out!r}; expected a folder of this machine, since rounds read their "
+                "own files again."
+            )
         self.strata()
         self.training(1, ("data",), None).settings()
 
@@ -61,12 +65,6 @@ class ImproveOrder:
     def root(self) -> Path:
         """The folder of everything."""
         return Path(self.out)
-
-    @property
-    def digest(self) -> str:
-        """sha256 of what decides the result; not where it is made, nor on which device."""
-        record = settings_record(self)
-        return sha256_hex(canonical_json({k: v for k, v in record.items() if k not in _PLACES}))
 
     def settings(self) -> BuildSettings:
         """Return the build with its changes, without strata."""
@@ -112,5 +110,5 @@ class ImproveOrder:
         )
 
 
-_PLACES = ("out", "device")
-"""Fields that decide nothing."""
+PLACES = ("out", "device")
+"""Fields that decide nothing of the result."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from infra.improve.state import Lessons, Rounds
@@ -26,6 +27,21 @@ def rows_of(rounds: Rounds, found: Sequence[Lessons]) -> list[dict[str, str]]:
             cells = dict(zip(("log L1", "fell by", "core-s a scene"), taught, strict=True))
             rows.append({"round": str(number), "stratum": name, "share": f"{weight:.1%}", **cells})
     return rows
+
+
+def summary_of(found: Sequence[Lessons]) -> list[tuple[str, str]]:
+    """Return what the rounds took and what they taught, as names and values."""
+    first, last = (fmean(one.losses.values()) for one in (found[0], found[-1]))
+    return [
+        ("rounds", str(len(found))),
+        ("training scenes", ", ".join(str(one.scenes) for one in found)),
+        ("core-seconds of making", f"{sum(one.making_core_s for one in found):.0f}"),
+        ("core-seconds of training", f"{sum(one.training_core_s for one in found):.0f}"),
+        (
+            "log L1 of held-out scenes",
+            f"{first:.4f} after round 1, {last:.4f} at the end",
+        ),
+    ]
 
 
 def write_report(rounds: Rounds, found: Sequence[Lessons]) -> None:

@@ -30,6 +30,9 @@ from storage.dataset.training_data import TrainingData
 if TYPE_CHECKING:
     from infra.improve.judging import Judged
 
+STEPS = ("make", "train", "judge")
+"""What a round does, in order."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class LoopWorkers:
@@ -42,7 +45,7 @@ class LoopWorkers:
     told: Callable[[int, Drawn, Lessons], None] = lambda number, drawn, lessons: None
     """Is told of each round that is done, also of those that were before."""
     begins: Callable[[int, str], None] = lambda number, what: None
-    """Is told of the round and what of it begins."""
+    """Is told of the round and which of STEPS begins."""
 
 
 def improve(order: ImproveOrder, workers: LoopWorkers) -> list[Lessons]:

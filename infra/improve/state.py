@@ -12,11 +12,11 @@ Every file appears at once (storage.atomic), so that a kill at any moment costs 
 import dataclasses
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from infra.improve.order import ImproveOrder
+from infra.improve.order import PLACES, ImproveOrder
 from infra.improve.weights import Lesson
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
@@ -49,7 +49,7 @@ class Lessons:
     """Core-seconds of the training process; of the last one, where it was killed and went on."""
     strata: Mapping[str, Lesson]
     """By stratum; those without a held-out scene are left out."""
-    losses: Mapping[str, float] = field(default_factory=dict)
+    losses: Mapping[str, float]
     """Mean log L1 of each held-out scene after the round, by key."""
 
 
@@ -66,20 +66,21 @@ class Rounds:
             TrilightError: another order was begun in the folder.
         """
         path, record = self.order.root / "order.json", settings_record(self.order)
-        if path.is_file():
-            there = _read(path)
-            if there["digest"] != self.order.digest:
-                wrong = [
-                    f"{name} is {value!r}, but was begun with {there['order'].get(name)!r}"
-                    for name, value in json.loads(json.dumps(record)).items()
-                    if name not in ("out", "device") and there["order"].get(name) != value
-                ]
-                raise TrilightError(
-                    f"{self.order.out}: holds another loop: {'; '.join(wrong)}. Go on as it was "
-                    "begun, or choose another --out."
-                )
+        if not path.is_file():
+            _write(path, {"order": record})
             return
-        _write(path, {"digest": self.order.digest, "order": record})
+        there = _read(path).get("order", {})
+        # as JSON reads them: a form makes 10.0 of what a command line calls 10
+        wrong = [
+            f"{name} is {value!r}, but was begun with {there.get(name)!r}"
+            for name, value in json.loads(json.dumps(record)).items()
+            if name not in PLACES and there.get(name) != value
+        ]
+        if wrong:
+            raise TrilightError(
+                f"{self.order.out}: holds another loop: {'; '.join(wrong)}. Go on as it was "
+                "begun, or choose another --out."
+            )
 
     def dataset(self, number: int) -> Path:
         """Return the folder of a round's dataset."""
@@ -140,5 +141,11 @@ def _read(path: Path) -> Any:
 
 
 def _write(path: Path, record: Mapping[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrilightError(
+            f"improve: {path.parent} cannot be made ({error.strerror}); expected a folder that may "
+            "be written. Choose another --out."
+        ) from error
     write_atomically(path, (json.dumps(record, indent=2, sort_keys=True) + "\n").encode())

@@ -5,18 +5,24 @@ It stands in `infra`, where making and learning may both be seen. Making a round
 is done adds a table of weights and losses, and a picture of all rounds so far.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, cast
+from uuid import UUID
 
 from prefect import flow
-from prefect.artifacts import create_image_artifact, create_table_artifact
+from prefect.artifacts import (
+    create_image_artifact,
+    create_progress_artifact,
+    create_table_artifact,
+    update_progress_artifact,
+)
 from prefect.logging import get_run_logger
 
 from infra.improve.local import core_s_of
 from infra.improve.order import ImproveOrder
-from infra.improve.report import picture_of, rows_of
-from infra.improve.rounds import LoopWorkers, improve
+from infra.improve.report import picture_of, rows_of, summary_of
+from infra.improve.rounds import STEPS, LoopWorkers, improve
 from infra.improve.state import Drawn, Lessons, Rounds
 from infra.serving.train_model import RunChanges, RunName, train_in_process
 from infra.train_order import TrainOrder
@@ -28,6 +34,7 @@ from pipeline.flows.forms import (
     parameters_of,
 )
 from pipeline.flows.prefect_runner import PrefectRunner
+from pipeline.flows.submission import WHOLE
 from pipeline.flows.watching import make_watched, small_picture
 from storage.remote.safe_url import safe_text
 
@@ -67,13 +74,10 @@ def improve_loop(**parameters: Any) -> None:
 
     A run that was cancelled or killed goes on where it stopped: start it again with the same form.
     """
-    order, log = improve_order(parameters), get_run_logger()
+    order = improve_order(parameters)
 
     def train(training: TrainOrder) -> float:
         return core_s_of(partial(train_in_process, training))
-
-    def begins(number: int, what: str) -> None:
-        log.info("round %d of %d: %s", number, order.rounds, what)
 
     shown = _Shown(order)
     improve(
@@ -82,9 +86,10 @@ def improve_loop(**parameters: Any) -> None:
             make=lambda dataset: make_watched(dataset, PrefectRunner()),
             train=train,
             told=shown.round_done,
-            begins=begins,
+            begins=shown.begins,
         ),
     )
+    shown.finished()
 
 
 class _Shown:
@@ -93,17 +98,47 @@ class _Shown:
     def __init__(self, order: ImproveOrder) -> None:
         self._rounds = Rounds(order)
         self._found: list[Lessons] = []
+        self._log = get_run_logger()
+        self._progress: UUID | None = None
+
+    def begins(self, number: int, what: str) -> None:
+        """Tell what is done from now on: a third of a round."""
+        doing = f"round {number} of {self._rounds.order.rounds}: {what}"
+        self._log.info("%s", doing)
+        self._shown(partial(self._tell, number - 1 + STEPS.index(what) / len(STEPS), doing))
 
     def round_done(self, number: int, drawn: Drawn, lessons: Lessons) -> None:
+        """Show a round that is done, also one that was before."""
         self._found.append(lessons)
+        self._shown(partial(self._show_round, number))
+
+    def finished(self) -> None:
+        """Sum the loop up; a dataset's summary, which each round has, is older."""
+        rows = [{"what": what, "value": value} for what, value in summary_of(self._found)]
+        self._shown(partial(self._tell, len(self._found), "all rounds are done"))
+        where = self._rounds.order.out
+        self._shown(partial(create_table_artifact, rows, key="summary", description=where))
+
+    def _tell(self, rounds: float, doing: str) -> None:
+        percent = 100.0 * rounds / self._rounds.order.rounds
+        if self._progress is None:
+            # Prefect's functions return coroutines only where an event loop runs
+            self._progress = cast(
+                UUID, create_progress_artifact(percent, key=WHOLE, description=doing)
+            )
+        else:
+            update_progress_artifact(self._progress, percent, description=doing)
+
+    def _show_round(self, number: int) -> None:
+        rows = [row for row in rows_of(self._rounds, self._found) if row["round"] == str(number)]
+        what = f"round {number}: what was drawn, and what it taught"
+        create_table_artifact(rows, key="strata", description=what)
+        picture = small_picture(picture_of(self._rounds))
+        create_image_artifact(picture, key="rounds", description=self._rounds.order.out)
+
+    def _shown(self, show: Callable[[], object]) -> None:
         try:
-            rows = [
-                row for row in rows_of(self._rounds, self._found) if row["round"] == str(number)
-            ]
-            what = f"round {number}: what was drawn, and what it taught"
-            create_table_artifact(rows, key="strata", description=what)
-            picture = small_picture(picture_of(self._rounds))
-            create_image_artifact(picture, key="rounds", description=self._rounds.order.out)
+            show()
         except Exception as error:  # a server away for a moment must not cost hours of work
             why = safe_text(str(error).partition("\n")[0])
-            get_run_logger().warning("what this page shows is not complete (%s)", why)
+            self._log.warning("what this page shows is not complete (%s)", why)

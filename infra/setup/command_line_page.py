@@ -64,13 +64,12 @@ def every_command() -> list[Command]:
 
 
 def _commands(found: App, name: str) -> Iterator[Command]:
-    if found.default_command is None:
-        for inner in found:
-            if not inner.startswith("-"):
-                yield from _commands(found[inner], f"{name} {inner}")
-        return
-    options = tuple(map(_option, found.assemble_argument_collection()))
-    yield Command(name=name, help=found.help, options=options)
+    if found.default_command is not None:
+        options = tuple(map(_option, found.assemble_argument_collection()))
+        yield Command(name=name, help=found.help, options=options)
+    for inner in found:
+        if not inner.startswith("-"):
+            yield from _commands(found[inner], f"{name} {inner}")
 
 
 def _option(argument: Any) -> Option:

@@ -53,7 +53,8 @@ pre { background: var(--box) } label:has(.zoom) { cursor: zoom-in }
 @media (max-width: 78rem) {
   table:not(.narrow) { display: block; overflow-x: auto }
   table:not(.narrow) td { overflow-wrap: normal } }
-table.narrow { width: auto } table.narrow td, table.narrow th { padding-right: 1.6rem }
+table.narrow { width: auto } table.narrow td:first-child { overflow-wrap: break-word }
+table.narrow td, table.narrow th { padding-right: 1.6rem }
 @media (max-width: 30rem) { table.narrow td, table.narrow th { padding-right: .8rem } }
 """
 """What all pages look like."""

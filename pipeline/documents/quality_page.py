@@ -16,8 +16,9 @@ from storage.records.asset import AssetRow
 from storage.records.objects import Failure
 
 _STYLE = """
-.pair { display: inline-block; width: min(530px, 100%); margin: 0 1.2rem 1.2rem 0;
+.pair { display: inline-block; width: min(530px, 100%); margin-bottom: 1.2rem;
   vertical-align: top } .pair p { margin: .2rem 0 }
+@media (min-width: 40rem) { .pair { margin-right: 1.2rem } }
 .pair img { width: 256px; max-width: 49%; background: #fff; border: 1px solid var(--rule);
   box-sizing: border-box }
 """

@@ -24,13 +24,15 @@ from prefect.client.schemas.objects import FlowRun, WorkerStatus
 from prefect.exceptions import PrefectException
 from prefect.settings import get_current_settings
 
-from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.remote.safe_url import safe_text
 from storage.settings.described import described
 
 POLL_S = 1.0
 """Between two looks at a run."""
+WHOLE = "whole"
+"""Key of the progress of a run that makes several datasets, each of which has a progress as well;
+its description says what the run is at."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +60,9 @@ class SeenRun:
     message: str
     """What Prefect says of that state."""
     percent: float
-    """Of the shards that are there."""
+    """Of the shards that are there, or of the whole where that is several datasets."""
+    doing: str
+    """What a run of several datasets is at; empty for others."""
     tables: Mapping[str, Sequence[tuple[str, str]]]
     """Rows of `progress` and, at the end, of `summary`."""
     is_final: bool
@@ -98,15 +102,18 @@ def server() -> Iterator[SyncPrefectClient]:
         ) from trouble
 
 
-def parameters(order: DatasetOrder) -> dict[str, Any]:
-    """Return what an order asks beside its defaults, as the flow's form takes it."""
-    given: dict[str, Any] = {"build": order.build}
-    for field in described(DatasetOrder):
+def parameters(order: Any) -> dict[str, Any]:
+    """Return the build of an order and what it asks beside its defaults, as its flow's form has it.
+
+    Args:
+        order: of a class of settings whose fields are the flow's parameters.
+    """
+    kind: type = type(order)
+    given: dict[str, Any] = {}
+    for field in described(kind):
         value = getattr(order, field.name)
-        if field.name not in ("build", "changes") and value != field.default:
-            given[field.name] = value
-    if order.changes:
-        given["changes"] = _nested(order.changes)
+        if field.name == "build" or value not in (field.default, {}):
+            given[field.name] = _nested(value) if isinstance(value, Mapping) else value
     plain: dict[str, Any] = json.loads(json.dumps(given))
     return plain
 
@@ -174,16 +181,19 @@ def _look(client: SyncPrefectClient, run: FlowRun) -> SeenRun:
         artifact_filter=ArtifactFilter(flow_run_id=ArtifactFilterFlowRunId(any_=[run.id]))
     )
     in_order = sorted(shown, key=lambda artifact: str(artifact.updated))
-    percent, tables = 0.0, {}
-    for artifact in in_order:
-        if artifact.type == "progress":
-            percent = float(str(artifact.data))
-        elif artifact.type == "table" and artifact.key:
-            tables[artifact.key] = _rows(artifact.data)
+    bars = {artifact.key: artifact for artifact in in_order if artifact.type == "progress"}
+    whole = bars.get(WHOLE)
+    bar = whole or next(reversed(bars.values()), None)
+    tables = {
+        artifact.key: rows
+        for artifact in in_order
+        if artifact.type == "table" and artifact.key and (rows := _rows(artifact.data))
+    }
     return SeenRun(
         state=state.name or state.type.value if state else "Pending",
         message=safe_text(state.message or "") if state else "",
-        percent=percent,
+        percent=float(str(bar.data)) if bar else 0.0,
+        doing=(whole.description or "") if whole else "",
         tables=tables,
         is_final=is_final,
         is_completed=state is not None and state.is_completed(),
@@ -191,8 +201,9 @@ def _look(client: SyncPrefectClient, run: FlowRun) -> SeenRun:
 
 
 def _rows(data: Any) -> list[tuple[str, str]]:
+    """Return the rows of a table of names and values; none of one with other columns."""
     rows = json.loads(data) if isinstance(data, str) else data or []
-    return [(str(row["what"]), str(row["value"])) for row in rows]
+    return [(str(row["what"]), str(row["value"])) for row in rows if {"what", "value"} <= set(row)]
 
 
 def _nested(changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -164,7 +164,11 @@ class Watched:
             *((f"rejected: {reason} ({stage})", str(count)) for stage, reason, count in rejected),
             ("cost of this run", cost),
         ]
-        create_table_artifact([{"what": name, "value": value} for name, value in everything], key)
+        create_table_artifact(
+            [{"what": name, "value": value} for name, value in everything],
+            key,
+            description=self._order.place,
+        )
 
 
 def usd_per_core_hour() -> float:

@@ -53,9 +53,11 @@ class TrainingData:
     def split(self, name: str) -> ShardSet:
         """Return the shards of a split; raises TrilightError where it holds no scene."""
         if name not in self.splits:
+            there = ", ".join(self.splits) or "no split"
             raise TrilightError(
-                f"{self.shown}: the {name} split holds no scene; expected at least one. Generate "
-                f"the dataset with more scenes; in a list, name shards {name}-....tar too."
+                f"{self.shown}: the {name} split holds no scene; expected at least one. There is "
+                f"{there}: choose it, or generate the dataset with more scenes; in a list, name "
+                f"shards {name}-....tar too."
             )
         return self.splits[name]
 

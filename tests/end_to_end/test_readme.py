@@ -26,6 +26,7 @@ TUTORIALS = [
         "publish",
         "a-cluster",
         "mix-datasets",
+        "close-the-loop",
         "blender-and-back",
     )
 ]
@@ -58,7 +59,8 @@ def _trilight_words(line: str) -> list[str]:
 
 
 def _command(words: list[str]) -> tuple[str, ...]:
-    return tuple(words[: 2 if words[0] == "shards" else 1])
+    is_within = words[0] == "shards" or words[:2] == ["submit", "improve"]
+    return tuple(words[: 2 if is_within else 1])
 
 
 COMMANDS = sorted({_command(words) for line in USED if (words := _trilight_words(line))})
@@ -165,6 +167,7 @@ def test_the_tutorials_run(tmp_path: Path) -> None:
         "runs/mine/validation_sheet.png",
         "data/both.png",
         "boards/mine/leaderboard.png",
+        "data/improved/improve.png",
     )
     for made in made_by_pages:
         assert (tmp_path / made).stat().st_size > 10_000

@@ -39,14 +39,24 @@ def test_wrong_orders_are_refused_before_anything_is_made(tmp_path: Path) -> Non
         ({"floor": 1.5}, "floor"),
         ({"run_changes": {"widht": 3}}, "widht"),
         ({"changes": {"scenes.lights.count": [2, 2]}}, "axis lights"),
+        ({"out": "s3://bucket/loop"}, "a folder of this machine"),
     ):
         with pytest.raises(TrilightError, match=message):
             loop_order(tmp_path, **given)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(TrilightError, match="file cannot be made.*Choose another --out"):
+        Rounds(loop_order(tmp_path / "file")).begin()
     rounds = Rounds(loop_order(tmp_path))
     rounds.begin()
     Rounds(loop_order(tmp_path, device="cpu")).begin()  # elsewhere it is the same loop
     with pytest.raises(TrilightError, match="steps is 4, but was begun with 6"):
         Rounds(loop_order(tmp_path, steps=4)).begin()
+
+
+def test_numbers_of_forms_are_those_of_the_command_line(tmp_path: Path) -> None:
+    """A form makes 20.0 of what a command line calls 20: it is the same loop."""
+    Rounds(loop_order(tmp_path, changes={"renders.noise_floor_db": 20})).begin()
+    Rounds(loop_order(tmp_path, changes={"renders.noise_floor_db": 20.0})).begin()
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,7 @@ def tables(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, str]]]:
     """Key and rows of each table that is shown; there is no server."""
     shown: list[tuple[str, dict[str, str]]] = []
 
-    def table(rows: list[dict[str, str]], key: str) -> None:
+    def table(rows: list[dict[str, str]], key: str, description: str) -> None:
         shown.append((key, {row["what"]: row["value"] for row in rows}))
 
     monkeypatch.setattr(watching, "create_table_artifact", table)

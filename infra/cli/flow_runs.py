@@ -1,0 +1,111 @@
+"""A flow run from the command line: asked for, watched, and reported when it has ended."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from infra.cli.console import console, note, print_json, print_rows, progress_bars
+from storage.errors import TrilightError
+from storage.settings.described import checked
+
+if TYPE_CHECKING:
+    from pipeline.flows.submission import SeenRun, Submitted
+
+
+@checked()
+class FlowRuns:
+    """Runs on a Prefect server."""
+
+    deployment: str | None = None
+    """Name of the flow's deployment; by default local, which make serve makes, or the only one
+    there is."""
+    no_watch: bool = False
+    """Return as soon as the server has the run, instead of watching it to its end."""
+
+
+def run_flow(
+    flow: str, given: Mapping[str, Any], runs: FlowRuns, *, where: str, as_json: bool
+) -> bool:
+    """Run a flow by a worker of the server, and print how far it is and its summary.
+
+    Args:
+        flow: its name.
+        given: its parameters.
+        runs: how it is run.
+        where: what is made, for the summary.
+        as_json: print the outcome as JSON, and nothing else.
+
+    Returns:
+        Whether it has ended, since it was watched.
+
+    Raises:
+        TrilightError: there is no such server or deployment, or the run did not end well.
+    """
+    from pipeline.flows import submission as prefect  # reads its settings now
+
+    with prefect.server() as client:
+        run = prefect.submit(client, flow, runs.deployment, given)
+        if not as_json:
+            _say_where(run, prefect.workers_online(client, run.pool))
+        if runs.no_watch:
+            if as_json:
+                print_json({"flow_run": str(run.id), "deployment": run.deployment})
+            return False
+        last = _watched(prefect.looks(client, run.id), silent=as_json)
+    _report(run, last, where, as_json=as_json)
+    return True
+
+
+def _say_where(run: "Submitted", workers: int) -> None:
+    console.print(f"Run {run.name} of {run.deployment}: {run.page}", soft_wrap=True)
+    console.print(
+        f"Ctrl-C here leaves it running; prefect flow-run cancel {run.id} ends it", soft_wrap=True
+    )
+    if not workers:
+        start = f"prefect worker start --pool {run.pool}"
+        note(f"no worker of the pool {run.pool} is online, and the run waits for one: {start}")
+
+
+def _watched(looks: "Iterable[SeenRun]", *, silent: bool) -> "SeenRun":
+    """Draw what is seen of a run, and return the last look."""
+    last = None
+    with progress_bars() as bars:
+        bar = bars.add_task("percent", total=100, note="", visible=not silent)
+        for look in looks:
+            if not silent:
+                _say_changes(look, last, bars.console.print)
+            scenes = dict(look.tables.get("progress", ())).get("scenes in shards")
+            note = f"scenes {scenes}" if scenes and not look.doing else ""
+            bars.update(bar, completed=round(look.percent), note=note)
+            last = look
+    assert last is not None  # a run has at least one look
+    return last
+
+
+def _say_changes(look: "SeenRun", before: "SeenRun | None", say: Callable[[str], None]) -> None:
+    """Say a state, and a part of the work, once each."""
+    if before is None or before.state != look.state:
+        say(look.state)
+    if look.doing and (before is None or before.doing != look.doing):
+        say(look.doing)
+
+
+def _report(run: "Submitted", last: "SeenRun", where: str, *, as_json: bool) -> None:
+    rows: Sequence[tuple[str, str]] = last.tables.get("summary", ())
+    if as_json:
+        print_json(
+            {
+                "flow_run": str(run.id),
+                "deployment": run.deployment,
+                "state": last.state,
+                "message": last.message,
+                "summary": dict(rows),
+            }
+        )
+    elif last.is_completed:
+        print_rows(f"{run.deployment} finished", [*rows, ("where", where)])
+    if not last.is_completed:
+        reason = last.message.rstrip(".") or "no reason given"
+        raise TrilightError(
+            f"{run.deployment}: the run ended as {last.state}: {reason}. Its log is "
+            f"at {run.page}; the same command goes on with what is missing."
+        )

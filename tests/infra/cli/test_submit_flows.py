@@ -1,0 +1,75 @@
+"""`trilight submit` of a flow: what is said while it runs, and at its end; the server is a toy."""
+
+import contextlib
+import json
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+import pytest
+
+from pipeline.flows import submission
+from pipeline.flows.submission import SeenRun, Submitted
+from tests.command_line import trilight
+
+RUN = Submitted(
+    id=UUID(int=1), name="a-run", deployment="improve/local", pool="local", page="http://page"
+)
+
+
+def seen(state: str, doing: str = "", **more: Any) -> SeenRun:
+    plain: dict[str, Any] = {"message": "", "percent": 50.0, "tables": {}}
+    ended = state in ("Completed", "Crashed")
+    told = {**plain, "is_final": ended, "is_completed": state == "Completed", **more}
+    return SeenRun(state=state, doing=doing, **told)
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What the server is asked for; its run is seen in `looks`, without any by default."""
+    found: list[Any] = []
+
+    def submit(client: object, flow: str, deployment: str | None, given: object) -> Submitted:
+        found.append((flow, deployment, given))
+        return RUN
+
+    monkeypatch.setattr(submission, "server", contextlib.nullcontext)
+    monkeypatch.setattr(submission, "submit", submit)
+    monkeypatch.setattr(submission, "workers_online", lambda client, pool: 1)
+    return found
+
+
+def test_a_loop_is_watched_round_by_round(
+    asked: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    training = "round 1 of 2: train"
+    looks = [seen("Pending"), seen("Running", training), seen("Running", training)]
+    looks.append(seen("Completed", "all rounds are done", tables={"summary": [("rounds", "2")]}))
+    monkeypatch.setattr(submission, "looks", lambda client, run: iter(looks))
+    words = ["submit", "improve", "smoke", "--rounds", "2", "--out", str(tmp_path)]
+    told = trilight(words).stdout
+    given = {"build": "smoke", "rounds": 2, "out": str(tmp_path)}
+    assert asked == [("improve", None, given)]
+    for line in ("Run a-run of improve/local: http://page", "Pending", training, "rounds  2"):
+        assert told.count(line) == 1, told
+    assert f"Next: trilight inspect {tmp_path / 'run'}" in told
+    assert json.loads(trilight([*words, "--json"]).stdout)["summary"] == {"rounds": "2"}
+
+
+def test_a_run_that_crashed_is_a_mistake_with_its_reason(
+    asked: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = seen("Crashed", message="it was killed.")
+    monkeypatch.setattr(submission, "looks", lambda client, run: iter([ended]))
+    failed = trilight(["submit", "improve", "smoke"])
+    assert "ended as Crashed: it was killed. Its log is at http://page" in failed.stderr
+
+
+def test_who_does_not_watch_gets_the_run(asked: list[Any]) -> None:
+    words = ["submit", "improve", "smoke", "--no-watch", "--deployment", "cluster", "--json"]
+    assert json.loads(trilight(words).stdout)["flow_run"] == str(RUN.id)
+    assert asked[0][:2] == ("improve", "cluster")
+
+
+def test_a_flow_that_is_none_is_told_those_there_are() -> None:
+    assert "build-dataset, improve, or of slurm" in trilight(["submit", "x", "smoke"]).mistake
