@@ -21,7 +21,7 @@ from infra.bench.sides.maker_costs import (
 )
 from infra.bench.sides.maker_processes import Stint, StintTimes, begun_here, stints_together
 from infra.bench.sides.makers_simulation import (
-    DOCUMENTS,
+    FINISHING,
     IDLE,
     LOST,
     MAKING,
@@ -54,8 +54,8 @@ _START_S = 20.0
 take the rest."""
 _REQUESTS_A_S, _LATENCY_S = 3_500.0, 0.03
 """What object stores promise for writes below one prefix, and take for one."""
-_SHARE_NOTED = 0.1
-"""Of the shards that are listed: pipeline.making.publication takes up notes then."""
+_AT_ONCE = 32
+"""Notes that whoever finishes fetches at a time (storage.dataset.shard_notes)."""
 
 PROCESSES: Mapping[str, tuple[int, ...]] = {"quick": (1, 4, 16), "careful": (1, 4, 16, 64)}
 _SHARDS_EACH, _SCENES = 4, 8
@@ -67,7 +67,7 @@ _SHARES = {
     "starting": STARTING,
     "lost": LOST,
     "idle": IDLE,
-    "documents": DOCUMENTS,
+    "finishing": FINISHING,
 }
 
 
@@ -99,23 +99,24 @@ def protocol_of(workshop: Workshop, place: str) -> Protocol:
     if place == "folder":
         return Protocol(
             start_s=_START_S,
-            share_noted=_SHARE_NOTED,
             begin=steps["begin"],
             note=steps["note"],
-            publish=steps["publish"],
+            end=steps["end"],
+            finish=steps["finish"],
         )
     own = {  # the folder is one machine's own, and so are its turns
         name: dataclasses.replace(step, in_turn_s=NOTHING) for name, step in steps.items()
     }
     return Protocol(
         start_s=_START_S,
-        share_noted=_SHARE_NOTED,
         keeps_scenes=False,
         requests_a_s=_REQUESTS_A_S,
         latency_s=_LATENCY_S,
         begin=own["begin"],
         note=own["note"],
-        publish=own["publish"],
+        end=own["end"],
+        finish=own["finish"],
+        at_once=_AT_ONCE,
     )
 
 
@@ -212,7 +213,7 @@ def _count(point: Point) -> tuple[str, float]:
 
 _LOST_TO: Sequence[tuple[str, str]] = (
     ("waiting for a turn %", "waiting"),
-    ("begin, note, publish %", "own_steps"),
+    ("begin, note, end %", "own_steps"),
     ("starting %", "starting"),
     ("made twice %", "lost"),
     ("idle %", "idle"),

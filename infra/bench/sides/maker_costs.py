@@ -1,4 +1,4 @@
-"""What a maker's steps cost on a dataset of a size: to begin, to note a shard, to publish.
+"""What a maker's steps cost on a dataset of a size: to begin, to note a shard, to end, to finish.
 
 Core-seconds, those of them in a turn that one maker has at a time, and requests to a bucket.
 """
@@ -30,7 +30,11 @@ from storage.installation import IMPORT_ROOT
 from storage.remote.bucket import Bucket
 from storage.remote.url import RemoteUrl, parse_url
 
-STEPS = ("begin", "note", "publish")
+STEPS = ("begin", "end", "note", "finish")
+"""The maker has the last shards of an array. Its end is one where others are still at work; the one
+who makes the last shard of all finishes the dataset."""
+TASK_SHARDS = 40
+"""Shards of a task of the array."""
 StepFigures = Mapping[str, Sequence[float]]
 """Of each step: core-seconds, those in a turn, requests."""
 
@@ -86,7 +90,10 @@ def main(words: list[str]) -> None:
     with joined(folder):
         publication = begin_dataset(folder, build, found_here, 1, accept_environment=False)
         publication.refresh()
-        publication.missing_shards()
+        last = publication.num_shards
+        publication.missing_shards(range(max(0, last - TASK_SHARDS), last))
+        marks.append(_mark(log))
+        publication.finish()  # the last shard is missing: the longest look of all
         marks.append(_mark(log))
         entry = outlined(publication.num_shards - 1, build, template)
         path = folder.shard(entry.name)
@@ -128,7 +135,7 @@ def fitted_steps(found: Sequence[tuple[int, int, StepFigures]]) -> dict[str, Mak
     """Return the steps of a maker as they grow, fitted to those of some datasets.
 
     Args:
-        found: shards planned and listed, and what the steps took; three at least.
+        found: shards planned and made, and what the steps took; three at least.
     """
     return {
         step: MakerStep(
@@ -141,12 +148,12 @@ def fitted_steps(found: Sequence[tuple[int, int, StepFigures]]) -> dict[str, Mak
 
 
 def _growing(found: Sequence[tuple[int, int, float]]) -> Growing:
-    """Fit a fixed part and parts for shards planned and listed, none negative, relative errors."""
+    """Fit a fixed part and parts for shards planned and made, none negative, relative errors."""
     from scipy.optimize import nnls
 
     values = np.array([value for _, _, value in found])
     weights = 1 / np.maximum(values, max(values.max() * 1e-3, 1e-9))
-    columns = np.array([(1.0, planned, listed) for planned, listed, _ in found])
+    columns = np.array([(1.0, planned, made) for planned, made, _ in found])
     scale = columns.max(axis=0)
-    (fixed, planned, listed), _ = nnls(columns / scale * weights[:, None], values * weights)
-    return Growing(fixed=fixed / scale[0], planned=planned / scale[1], listed=listed / scale[2])
+    (fixed, planned, made), _ = nnls(columns / scale * weights[:, None], values * weights)
+    return Growing(fixed=fixed / scale[0], planned=planned / scale[1], made=made / scale[2])

@@ -1,9 +1,9 @@
 """A thousand machines that make one dataset, simulated: how long they take, and over what.
 
 Each machine takes tasks of an array, one after the other: it starts, begins, makes shard by shard,
-notes each, and publishes at the end. Machines vanish and are replaced; what theirs had made of a
-task stays, and the rest is queued again. Scenes differ in cost as rendered ones do, and some
-machines are slow.
+notes each, and looks at the end whether all are there; the last one finishes the dataset. Machines
+vanish and are replaced; what theirs had made of a task stays, and the rest is queued again. Scenes
+differ in cost as rendered ones do, and some machines are slow.
 """
 
 import math
@@ -28,12 +28,12 @@ class Growing:
     """Of any dataset."""
     planned: float = 0.0
     """For each shard that it will have."""
-    listed: float = 0.0
-    """For each shard that its manifest lists."""
+    made: float = 0.0
+    """For each shard that is there."""
 
-    def of(self, planned: int, listed: float) -> float:
+    def of(self, planned: int, made: float) -> float:
         """Return the number for so many shards."""
-        return self.fixed + self.planned * planned + self.listed * listed
+        return self.fixed + self.planned * planned + self.made * made
 
 
 NOTHING = Growing()
@@ -61,18 +61,18 @@ class Protocol:
     """Once for a task, at its beginning."""
     note: MakerStep
     """For each shard."""
-    publish: MakerStep
+    end: MakerStep
     """Once for a task, at its end."""
-    share_noted: float = math.inf
-    """Publishes earlier where its notes are this share of what is listed."""
+    finish: MakerStep
+    """What the last maker does when every shard is there, alone."""
     keeps_scenes: bool = True
     """Whether the scenes of an unfinished shard outlive the machine, as in a shared folder."""
     requests_a_s: float = math.inf
     """How many requests the server takes a second, from all together."""
     latency_s: float = 0.0
     """Of one request, which waits for the one before."""
-    documents_s: float = 0.0
-    """What the last maker does when every shard is there."""
+    at_once: int = 1
+    """Requests that the last maker has on the way at a time, where it fetches notes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,9 +135,9 @@ class Fate:
         return {name: seconds / total for name, seconds in self.spent_s.items()}
 
 
-MAKING, STARTING, WAITING, OWN_STEPS, LOST, IDLE, DOCUMENTS = (
-    "making scenes", "starting", "waiting for a turn", "begin, note and publish", "made twice",
-    "idle", "documents",
+MAKING, STARTING, WAITING, OWN_STEPS, LOST, IDLE, FINISHING = (
+    "making scenes", "starting", "waiting for a turn", "begin, note and end", "made twice",
+    "idle", "finishing",
 )  # fmt: skip
 
 
@@ -159,7 +159,7 @@ class _Making:
         self._turn, self._server = Turn(self._clock), Turn(self._clock)
         self._cores = Turn(self._clock, fleet.cores_together) if fleet.cores_together else None
         self._spent: defaultdict[str, float] = defaultdict(float)
-        self._done = self._listed = self._vanished = 0
+        self._done = self._vanished = 0
         each = _shard_seconds(fleet, self._rng)
         size = fleet.task_shards
         self._tasks = deque(_Task(deque(each[at : at + size])) for at in range(0, len(each), size))
@@ -170,11 +170,20 @@ class _Making:
         for _ in range(fleet.machines):
             self._machine(after_s=0.0)
         self._clock.run()
-        seconds = self._last_s + self._protocol.documents_s
+        finishing_s = self._finishing_s()
+        seconds = self._last_s + finishing_s
         spent = dict(self._spent)
-        spent[DOCUMENTS] = self._protocol.documents_s
+        spent[FINISHING] = finishing_s
         spent[IDLE] = max(0.0, fleet.machines * seconds - sum(spent.values()))
         return Fate(seconds=seconds, spent_s=spent, vanished=self._vanished)
+
+    def _finishing_s(self) -> float:
+        protocol, planned = self._protocol, self._fleet.num_shards
+        requests = protocol.finish.requests.of(planned, planned)
+        answered_s = requests * max(
+            protocol.latency_s / protocol.at_once, 1 / protocol.requests_a_s
+        )
+        return protocol.finish.work_s.of(planned, planned) + answered_s
 
     def _machine(self, *, after_s: float) -> None:
         fleet = self._fleet
@@ -201,15 +210,10 @@ class _Making:
         protocol = self._protocol
         yield from self._spend(STARTING, protocol.start_s)
         yield from self._step(protocol.begin)
-        noted, known = 0, self._listed
         while task.shards:
             yield from self._make(task, slow)
-            noted += 1
             yield from self._step(protocol.note)
-            if noted >= protocol.share_noted * known:
-                yield from self._publish()
-                noted, known = 0, self._listed
-        yield from self._publish()
+        yield from self._step(protocol.end)
 
     def _make(self, task: _Task, slow: float) -> Steps:
         began, takes_s = self._clock.now, task.shards[0] * slow
@@ -226,21 +230,16 @@ class _Making:
         task.shards.popleft()
         self._done += 1
 
-    def _publish(self) -> Steps:
-        yield from self._step(self._protocol.publish, publishes=True)
-
-    def _step(self, step: MakerStep, *, publishes: bool = False) -> Steps:
+    def _step(self, step: MakerStep) -> Steps:
         protocol, planned = self._protocol, self._fleet.num_shards
 
         def now(grows: Growing) -> float:
-            return grows.of(planned, self._listed)
+            return grows.of(planned, self._done)
 
         alone_s = max(0.0, now(step.work_s) - now(step.in_turn_s))
         requests = now(step.requests)
         if step.in_turn_s != NOTHING:
             yield from self._in(self._turn, lambda: now(step.in_turn_s), kept_s=_LEASE_S)
-        if publishes:
-            self._listed = self._done
         if self._cores is None:
             yield from self._spend(OWN_STEPS, alone_s)
         else:

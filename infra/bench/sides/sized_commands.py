@@ -87,18 +87,31 @@ def _words(*words: str) -> None:
 
 
 def _start(root: Path) -> None:
-    """Begin as a maker does, up to its first task."""
+    """Begin as a task of an array does, up to its first piece."""
+    from infra.bench.sides.maker_costs import TASK_SHARDS
     from pipeline.making.tasks import TaskSizes, cut_tasks
 
     with _joined(root) as publication:
         publication.refresh()
-        missing = publication.missing_shards()
+        last = publication.num_shards
+        missing = publication.missing_shards(range(max(0, last - TASK_SHARDS), last))
         splits = _build().splits
         next(cut_tasks(missing, splits, TaskSizes()), None)
 
 
 def _end(root: Path) -> None:
-    """Publish the one shard that was missing, and look whether anything else is."""
+    """Note a shard and look whether any is missing, while another maker still has the last."""
+    from infra.bench.subjects.simulated_set import SCENES_OF_OUTLINE, ShardTemplate, outlined
+
+    with _joined(root) as publication:
+        template = ShardTemplate("train", SCENES_OF_OUTLINE, first=0)
+        last = publication.num_shards - 1
+        publication.add_shard(outlined(last - 1, _build(), template))
+        assert publication.finish() is None
+
+
+def _finish(root: Path) -> None:
+    """Note the shard that was missing, and list all."""
     from infra.bench.subjects.simulated_set import SCENES_OF_OUTLINE, ShardTemplate, outlined
 
     with _joined(root) as publication:
@@ -108,7 +121,7 @@ def _end(root: Path) -> None:
         path.touch()
         os.truncate(path, entry.num_bytes)
         publication.add_shard(entry)
-        publication.finish()
+        assert publication.finish() is not None
 
 
 @contextlib.contextmanager
@@ -219,6 +232,7 @@ COMMANDS: Mapping[str, Sized] = {
     "plan": Sized(of="outline", run=_plan),
     "open for training": Sized(of="outline", run=_open),
     "generate, end": Sized(of="outline", run=_end),
+    "generate, last end": Sized(of="outline", run=_finish),
     "resume training": Sized(of="whole", run=_resume),
     "verify --fast": Sized(of="whole", run=_verify),
     "inspect": Sized(of="whole", run=_inspect),

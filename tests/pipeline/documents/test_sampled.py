@@ -22,7 +22,9 @@ from tests.scenes_by_hand import tiny_scene
 def dataset(tmp_path: Path) -> Dataset:
     """Return 11 shards of one scene each, one of them for testing."""
     shards = {f"train-{row:06d}.tar": [sample(row, tiny_scene())] for row in range(10)}
-    return write_dataset(tmp_path / "set", {**shards, "test-000010.tar": [sample(10, tiny_scene())]})
+    return write_dataset(
+        tmp_path / "set", {**shards, "test-000010.tar": [sample(10, tiny_scene())]}
+    )
 
 
 def test_shards_are_spread_over_each_split(dataset: Dataset) -> None:

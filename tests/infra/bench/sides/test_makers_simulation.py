@@ -20,7 +20,9 @@ FLEET = Fleet(
     life_s=math.inf, shards_per_task=1,
 )  # fmt: skip
 """40 shards of one second each, which is ten seconds."""
-FREE = Protocol(start_s=0.0, begin=MakerStep(), note=MakerStep(), publish=MakerStep())
+FREE = Protocol(
+    start_s=0.0, begin=MakerStep(), note=MakerStep(), end=MakerStep(), finish=MakerStep()
+)
 
 
 def _step(seconds: float, **changes: float) -> MakerStep:
@@ -33,9 +35,9 @@ def _step(seconds: float, **changes: float) -> MakerStep:
         (FREE, 10.0),
         (dataclasses.replace(FREE, start_s=1.0), 20.0),
         (dataclasses.replace(FREE, note=_step(0.5)), 15.0),
-        (dataclasses.replace(FREE, publish=_step(1.0, fixed=1.0)), 41.0),  # one after the other
-        (dataclasses.replace(FREE, publish=_step(0.0, planned=1 / 40)), 41.0),
-        (dataclasses.replace(FREE, documents_s=7.0), 17.0),
+        (dataclasses.replace(FREE, end=_step(1.0, fixed=1.0)), 41.0),  # one after the other
+        (dataclasses.replace(FREE, end=_step(0.0, planned=1 / 40)), 41.0),
+        (dataclasses.replace(FREE, finish=_step(7.0)), 17.0),
     ],
 )
 def test_what_is_known(protocol: Protocol, seconds: float) -> None:
@@ -45,8 +47,8 @@ def test_what_is_known(protocol: Protocol, seconds: float) -> None:
     assert sum(fate.spent_s.values()) == pytest.approx(4 * seconds)
 
 
-def test_a_turn_that_grows_with_what_is_listed_stops_to_scale() -> None:
-    protocol = dataclasses.replace(FREE, publish=_step(0.0, listed=0.05))
+def test_a_turn_that_grows_with_what_is_made_stops_to_scale() -> None:
+    protocol = dataclasses.replace(FREE, end=_step(0.0, made=0.05))
     fates = [simulated(dataclasses.replace(FLEET, machines=n), protocol) for n in (4, 40)]
     assert fates[1].seconds > 0.7 * fates[0].seconds
     assert fates[1].shares()[WAITING] > 0.4

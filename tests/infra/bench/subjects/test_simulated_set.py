@@ -31,5 +31,5 @@ def test_an_outline_lacks_its_last_shard_until_a_maker_goes_on(tmp_path: Path) -
     assert (status.scenes_done, status.scenes_planned) == (64, 72)
     assert status.core_hours == 64 * 12.5 * 2 / 3600
     assert len(open_training_data([str(tmp_path)]).split("train").names) == 6
-    measure_steps([str(tmp_path), ""])  # begins, notes the last shard and publishes
+    measure_steps([str(tmp_path), ""])  # begins, notes the last shard and finishes
     assert missing_shards(str(tmp_path)) == [0]  # all is there; its documents are not
