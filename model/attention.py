@@ -43,5 +43,5 @@ def _packed(q_BHQD: Tensor, k_BHND: Tensor, v_BHND: Tensor, keys: Sequences) -> 
     if q.shape[:2] != k.shape[:2]:
         starts_B1 = torch.arange(len(q) + 1, dtype=torch.int32, device=q.device) * q.shape[1]
         asks = Sequences(starts_B1, q.shape[1])
-    found = attend_packed(*(x.flatten(0, 1) for x in (q, k, v)), asks, keys)
+    found = attend_packed(q.flatten(0, 1), k.flatten(0, 1), v.flatten(0, 1), asks, keys)
     return found.unflatten(0, q.shape[:2]).transpose(1, 2)
