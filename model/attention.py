@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import scaled_dot_product_attention
 
-from model.packing import Packing, attend_packed, packed
+from model.packing import Sequences, attend_packed
 
-Keys = Tensor | Packing | None
-"""Which keys exist: bool [B, N], False for padding; where they are packed; None: all do."""
+Keys = Tensor | Sequences | None
+"""Which keys exist: bool [B, N], False for padding; where they lie one after the other; None: all
+do."""
 
 
 def attend(q_BHQD: Tensor, k_BHND: Tensor, v_BHND: Tensor, keys: Keys) -> Tensor:
@@ -27,22 +28,20 @@ def attend(q_BHQD: Tensor, k_BHND: Tensor, v_BHND: Tensor, keys: Keys) -> Tensor
     Args:
         q_BHQD, k_BHND, v_BHND: one floating dtype.
         keys: which exist. A mask reaches the kernel as [B, 1, 1, N]: spelled out for every query
-            and head it would double the time. Each row needs at least one key. Of a packing, the B
-            sequences are either padded here, or B is 1 and they follow each other.
+            and head it would double the time. Each row needs at least one key. Of sequences, keys
+            are rows of them one after the other; queries are those too, or B equal sequences.
     """
-    if isinstance(keys, Packing):
+    if isinstance(keys, Sequences):
         return _packed(q_BHQD, k_BHND, v_BHND, keys)
     mask = None if keys is None else keys[:, None, None, :]
     return scaled_dot_product_attention(q_BHQD, k_BHND, v_BHND, attn_mask=mask)
 
 
-def _packed(q_BHQD: Tensor, k_BHND: Tensor, v_BHND: Tensor, keys: Packing) -> Tensor:
+def _packed(q_BHQD: Tensor, k_BHND: Tensor, v_BHND: Tensor, keys: Sequences) -> Tensor:
     q, k, v = (x.transpose(1, 2) for x in (q_BHQD, k_BHND, v_BHND))
-    if k.shape[0] * k.shape[1] == len(keys.index_P):  # packed already, and so are the queries
-        asks, longest, k, v = keys.starts_S1, keys.longest, k.flatten(0, 1), v.flatten(0, 1)
-    else:
-        longest = q.shape[1]
-        asks = torch.arange(len(q) + 1, dtype=torch.int32, device=q.device) * longest
-        k, v = packed(k, keys), packed(v, keys)
-    found = attend_packed(q.flatten(0, 1), k, v, asks, longest, keys)
+    asks = keys
+    if q.shape[:2] != k.shape[:2]:
+        starts_B1 = torch.arange(len(q) + 1, dtype=torch.int32, device=q.device) * q.shape[1]
+        asks = Sequences(starts_B1, q.shape[1])
+    found = attend_packed(q.flatten(0, 1), k.flatten(0, 1), v.flatten(0, 1), asks, keys)
     return found.unflatten(0, q.shape[:2]).transpose(1, 2)

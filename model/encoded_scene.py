@@ -34,22 +34,16 @@ class TokenPlaces:
     """Tokens of each scene, where they are the first of each and `is_key_BN` says so too. The host
     knows them without waiting for the device."""
 
-    def packing(self, x: Tensor, head_width: int, views: int = 1) -> Packing | None:
-        """Return where tokens of the views of scenes are when packed; None where masks are meant.
+    def packing(self, x: Tensor, head_width: int) -> Packing | None:
+        """Return where the tokens of scenes are when packed; None where masks are meant.
 
         Args:
             x: what attention is computed with.
             head_width: of that attention.
-            views: of each scene; its tokens come once for each.
         """
         if self.lengths is None or not takes_packed(x, head_width):
             return None
-        lengths = [length for length in self.lengths for _ in range(views)]
-        return pack_lengths(lengths, self.positions_BN33.shape[1], x.device)
-
-    def keys(self, x: Tensor, head_width: int, views: int = 1) -> Keys:
-        """Return which tokens are keys, packed where `packing` is not None."""
-        return self.packing(x, head_width, views) or self.is_key_BN
+        return pack_lengths(self.lengths, self.positions_BN33.shape[1], x.device)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,10 +59,17 @@ class EncodedScene:
     keys_values: tuple[KeysValues, ...]
     """Keys and values for each layer of the view stage; for that of hits, keys are rotated into the
     world."""
+    packing: Packing | None = None
+    """Where their tokens are: scene after scene in one row [1, H, P, D]; None where scenes are
+    padded."""
     traced: "tuple[TracedScene, ...]" = ()
     """Of the view stage of hits: each scene, ready for rays; none where its views come traced."""
     surfaces: "tuple[LitScene, ...]" = ()
     """Of demodulated bundles: each scene, whose albedo rays ask; none where it is known."""
+
+    def keys(self, views: int = 1) -> Keys:
+        """Return which keys exist; packed ones for each view, all scenes of a view together."""
+        return self.places.is_key_BN if self.packing is None else self.packing.of_views(views)
 
     def only(self, index: int) -> "EncodedScene":
         """Return one scene of the batch, without the padding that its company brought."""
@@ -86,8 +87,17 @@ class EncodedScene:
                 num_registers=num_registers,
             ),
             keys_values=tuple(
-                (k[[index]][:, :, exists], v[[index]][:, :, exists]) for k, v in self.keys_values
+                (self._of(index, k, exists), self._of(index, v, exists))
+                for k, v in self.keys_values
             ),
             traced=self.traced[index : index + 1],
             surfaces=self.surfaces[index : index + 1],
         )
+
+    def _of(self, index: int, x: Tensor, exists: Tensor | slice) -> Tensor:
+        """Return keys or values [1, H, N, D] of one scene."""
+        lengths = self.places.lengths
+        if self.packing is None or lengths is None:
+            return x[[index]][:, :, exists]
+        first = sum(lengths[:index])
+        return x[:, :, first : first + lengths[index]]

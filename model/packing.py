@@ -23,11 +23,20 @@ MOST_HEAD_WIDTH = 256
 """Widest head that flash attention takes; widths are multiples of 8."""
 
 
-class Packing(NamedTuple):
-    """Where the tokens of S padded sequences [S, N] are when P of them that exist are packed.
+class Sequences(NamedTuple):
+    """Where S sequences start that follow each other.
 
     A named tuple, since compiled code takes its parts as inputs.
     """
+
+    starts_S1: Tensor
+    """int32 [S + 1] where sequences start, and where the last one ends."""
+    longest: int
+    """At least the length of each."""
+
+
+class Packing(NamedTuple):
+    """Where the tokens of S padded sequences [S, N] are when P of them that exist are packed."""
 
     index_P: Tensor
     """int64 place of each token among the S N padded ones."""
@@ -35,10 +44,15 @@ class Packing(NamedTuple):
     """int64 [S N] place of each padded one among the packed; 0 where it does not exist."""
     exists_M: Tensor
     """bool [S N]."""
-    starts_S1: Tensor
-    """int32 [S + 1] where sequences start, and where the last one ends."""
-    longest: int
-    """At least the length of each."""
+    sequences: Sequences
+    """Where they lie then."""
+
+    def of_views(self, views: int) -> Sequences:
+        """Return where the sequences lie when all of them come again for each of several views."""
+        (starts_S1, longest), total = self.sequences, len(self.index_P)
+        first_V1 = total * torch.arange(views, dtype=torch.int32, device=starts_S1.device)[:, None]
+        ends_VS = first_V1 + starts_S1[1:]
+        return Sequences(torch.nn.functional.pad(ends_VS.flatten(), (1, 0)), longest)
 
 
 def pack_lengths(lengths: Sequence[int], longest: int, device: torch.device) -> Packing:
@@ -57,8 +71,9 @@ def pack_lengths(lengths: Sequence[int], longest: int, device: torch.device) -> 
         index_P=row_P * longest + place_P,
         back_M=back_SN.flatten(),
         exists_M=exists_SN.flatten(),
-        starts_S1=starts_S1.int(),
-        longest=-(-max(lengths) // LONGEST_STEP) * LONGEST_STEP,
+        sequences=Sequences(
+            starts_S1=starts_S1.int(), longest=-(-max(lengths) // LONGEST_STEP) * LONGEST_STEP
+        ),
     )
 
 
@@ -107,32 +122,26 @@ def packed(x_SNK: Tensor, packing: Packing) -> Tensor:
     return found
 
 
-def unpacked(x_PK: Tensor, packing: Packing) -> Tensor:
-    """Return them where they were, and 0 in the padding: [P, ...] -> [S, N, ...]."""
-    found: Tensor = _Unpack.apply(x_PK, *packing[:3])
-    return found.unflatten(0, (len(packing.starts_S1) - 1, -1))
-
-
 def attend_packed(
-    q_QHD: Tensor, k_PHD: Tensor, v_PHD: Tensor, asks_S1: Tensor, longest: int, keys: Packing
+    q_QHD: Tensor, k_PHD: Tensor, v_PHD: Tensor, asks: Sequences, keys: Sequences
 ) -> Tensor:
     """Return softmax(q k^T / sqrt(D)) v, [Q, H, D], of each sequence to its own keys.
 
     Args:
-        q_QHD: packed queries, half precision on a card.
-        k_PHD, v_PHD: keys and values, packed as `keys` says.
-        asks_S1: int32 where the queries of each sequence start.
-        longest: at least the number of queries of each.
-        keys: of the same sequences.
+        q_QHD: queries, half precision on a card.
+        k_PHD, v_PHD: keys and values.
+        asks: where the queries lie.
+        keys: where the keys of the same sequences lie.
     """
     if q_QHD.device.type == "cuda":
         from torch.nn.attention.varlen import varlen_attn
 
-        starts = asks_S1, keys.starts_S1
-        found: Any = varlen_attn(q_QHD, k_PHD, v_PHD, *starts, longest, keys.longest)
+        starts = asks.starts_S1, keys.starts_S1
+        found: Any = varlen_attn(q_QHD, k_PHD, v_PHD, *starts, asks.longest, keys.longest)
         return found  # one tensor, where nothing else is asked for
     parts = []
-    for (first, end), (low, high) in zip(_spans(asks_S1), _spans(keys.starts_S1), strict=True):
+    spans = zip(_spans(asks.starts_S1), _spans(keys.starts_S1), strict=True)
+    for (first, end), (low, high) in spans:
         q, k, v = (x.transpose(0, 1) for x in (q_QHD[first:end], k_PHD[low:high], v_PHD[low:high]))
         parts.append(scaled_dot_product_attention(q[None], k[None], v[None])[0].transpose(0, 1))
     return torch.cat(parts)

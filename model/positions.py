@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from model.encoded_scene import TokenPlaces
+from model.packing import Packing, packed
 
 Rotation = tuple[Tensor, Tensor]
 """cos and sin [..., N, D / 2]."""
@@ -55,12 +56,13 @@ def rotate(x_HND: Tensor, cos_NA: Tensor, sin_NA: Tensor) -> Tensor:
     """Turn each pair (channel i, channel i + D / 2) of x [..., H, N, D] by its angle.
 
     cos and sin are [..., N, D / 2]; all heads turn alike. A half-precision x is turned in the
-    table's precision and rounded once, at the end.
+    table's precision and rounded once, at the end. In memory the heads of a token stay together, as
+    the layers before have them and those after attention read them: nothing is copied on the way.
     """
-    cos_1NA, sin_1NA = cos_NA.unsqueeze(-3), sin_NA.unsqueeze(-3)
-    a, b = x_HND.chunk(2, dim=-1)
-    turned = torch.cat([a * cos_1NA - b * sin_1NA, b * cos_1NA + a * sin_1NA], dim=-1)
-    return turned.to(x_HND.dtype)
+    cos_N1A, sin_N1A = cos_NA.unsqueeze(-2), sin_NA.unsqueeze(-2)
+    a, b = x_HND.transpose(-2, -3).chunk(2, dim=-1)
+    turned = torch.cat([a * cos_N1A - b * sin_N1A, b * cos_N1A + a * sin_N1A], dim=-1)
+    return turned.to(x_HND.dtype).transpose(-2, -3)
 
 
 def encode_normals(normals_N33: Tensor, octaves: int) -> Tensor:
@@ -137,6 +139,19 @@ def token_places(
         num_registers=num_registers,
         lengths=None if num_triangles is None else tuple(num_registers + n for n in num_triangles),
     )
+
+
+def packed_rotation(rotation_BNA: Rotation, packing: Packing) -> Rotation:
+    """Return the rotation [1, P, A] of tokens that are packed."""
+    cos_BNA, sin_BNA = rotation_BNA
+    return packed(cos_BNA, packing)[None], packed(sin_BNA, packing)[None]
+
+
+def packed_camera_rotation(rotation_BVNA: Rotation, packing: Packing) -> Rotation:
+    """Return the rotation [1, V, P, A] of tokens that are packed, in the space of each camera."""
+    cos_BVNA, sin_BVNA = rotation_BVNA
+    found = packed_rotation((cos_BVNA.transpose(1, 2), sin_BVNA.transpose(1, 2)), packing)
+    return found[0].transpose(1, 2), found[1].transpose(1, 2)
 
 
 def world_rotation(rotary: TriangleRotary, places: TokenPlaces) -> Rotation:

@@ -118,17 +118,23 @@ class RenderFormer(nn.Module):
         if skies is not None:
             places = without_absent(places, skies, registers)
         keys_values: tuple[KeysValues, ...] = ()
+        packing = None
         if self.encoder is not None:
+            packing = self.encoder.packing(places)
             batch = batch_with_cells(batch, self.config.texture_cells)
             if sides_BT12 is not None and unit_B3 is not None:
                 sides_BT12 = sides_BT12 / unit_B3.repeat(1, 4)[:, None]
                 batch = in_units(batch, unit_B3)
             with tf32(self.tf32):
                 sky_BSW = None if skies is None else self.encoder.sky(skies, unit_B3)
-                context_BNW = self.encoder(batch, places, sides_BT12, sky_BSW)
-                keys_values = self.decoder.keys_values(context_BNW, places)
+                context_BNW = self.encoder(batch, places, sides_BT12, sky_BSW, packing)
+                keys_values = self.decoder.keys_values(context_BNW, places, packing)
         return EncodedScene(
-            places=places, keys_values=keys_values, traced=traced, surfaces=surfaces
+            places=places,
+            keys_values=keys_values,
+            packing=packing,
+            traced=traced,
+            surfaces=surfaces,
         )
 
     def decode(

@@ -12,12 +12,12 @@ from model.attention import Keys
 from model.config import ModelConfig
 from model.encoded_scene import TokenPlaces
 from model.layers import TOKEN_NORM_EPS, EncoderLayer, Norm, dtype_of, run_layer
-from model.packing import packed, unpacked
+from model.packing import Packing, packed
 from model.positions import (
-    Rotation,
     TriangleRotary,
     encode_normals,
     encoded_normal_width,
+    packed_rotation,
     world_rotation,
 )
 from model.precision import as_given
@@ -97,16 +97,22 @@ class TriangleEncoder(nn.Module):
             for _ in range(config.encoder_layers)
         )
 
+    def packing(self, places: TokenPlaces) -> Packing | None:
+        """Return where the tokens are to be packed before the layers; None where they are not."""
+        return places.packing(next(self.layers.parameters()), self.rotary.head_width)
+
     def forward(
         self,
         batch: SceneBatch,
         places: TokenPlaces,
         light_BTL: Tensor | None = None,
         sky_BSW: Tensor | None = None,
+        packing: Packing | None = None,
     ) -> Tensor:
         """Return the context [B, N, W] with N = registers + cells of the sky + triangles.
 
         `light_BTL` is as in TriangleTokens, `sky_BSW` of SkyTokens; None where no scene has a sky.
+        With a packing the context is one row of all tokens that exist, [1, P, W].
         """
         materials = batch.material_of(self.columns)
         cells = None if self.tokens.cells_WC is None else batch.cells
@@ -121,14 +127,10 @@ class TriangleEncoder(nn.Module):
             parts[1] = tokens_BTW + 0 * sum(weight.sum() for weight in self.sky.parameters())
         x_BNW = torch.cat(parts, dim=1).to(dtype_of(self.layers))
         rotation = world_rotation(self.rotary, places)
-        packing = places.packing(x_BNW, self.rotary.head_width)
-        if packing is None:
-            return self._layers(x_BNW, rotation, places.is_key_BN)
-        cos_PA, sin_PA = (packed(table_BNA, packing) for table_BNA in rotation)
-        x_PW = self._layers(packed(x_BNW, packing)[None], (cos_PA, sin_PA), packing)[0]
-        return unpacked(x_PW, packing)
-
-    def _layers(self, x_BNW: Tensor, rotation: Rotation, keys: Keys) -> Tensor:
+        keys: Keys = places.is_key_BN
+        if packing is not None:
+            x_BNW, keys = packed(x_BNW, packing)[None], packing.sequences
+            rotation = packed_rotation(rotation, packing)
         due_BNW = None
         for layer in self.layers:
             x_BNW, due_BNW = run_layer(

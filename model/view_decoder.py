@@ -15,7 +15,13 @@ from model.empty_bundles import blacken_absent, bundles_that_see, fill_absent
 from model.encoded_scene import EncodedScene, KeysValues, TokenPlaces
 from model.image_head import build_head, stack_taps
 from model.layers import TOKEN_NORM_EPS, DecoderLayer, Norm, dtype_of, run_layer
-from model.positions import Rotation, TriangleRotary, camera_rotation
+from model.packing import Packing
+from model.positions import (
+    Rotation,
+    TriangleRotary,
+    camera_rotation,
+    packed_camera_rotation,
+)
 from model.precision import as_given
 from model.projected import PictureRotary
 from model.rays import bundle_rays, ray_directions
@@ -49,7 +55,9 @@ class ViewDecoder(nn.Module):
         )
         self.head = build_head(config)
 
-    def keys_values(self, context_BNW: Tensor, places: TokenPlaces) -> tuple[KeysValues, ...]:
+    def keys_values(
+        self, context_BNW: Tensor, places: TokenPlaces, packing: Packing | None = None
+    ) -> tuple[KeysValues, ...]:
         """Return what each layer asks of a context: once per scene, for any number of views.
 
         Keys are not rotated yet, wherever their tokens stand: that takes a camera.
@@ -62,13 +70,17 @@ class ViewDecoder(nn.Module):
 
         Of a network that predicts light, what `model.demodulated.composed` reads, [B, V, R, R, 6].
         """
-        x_BVQW = self.bundle_tokens(cameras.fov_deg_BV, resolution)
+        # the packed keys of a view lie together, and so do its bundles: views come before scenes
+        is_turned = scene.packing is not None
+        fov_deg_BV = cameras.fov_deg_BV.T if is_turned else cameras.fov_deg_BV
+        x_BVQW = self.bundle_tokens(fov_deg_BV, resolution)
         rotations = self._rotations(scene, cameras, resolution)
         cuts = self._cuts(resolution // self.patch_px, x_BVQW.device)
         taps = self._taps(x_BVQW, scene, rotations, cuts)
         weights = rounded_parts_of(self.head, self.head.rounded_parts(), x_BVQW.device)
         picture_MCRR = rounded_call(self.head, weights, taps)
-        return picture_MCRR.movedim(1, -1).unflatten(0, cameras.fov_deg_BV.shape)
+        picture_BVRRC = picture_MCRR.movedim(1, -1).unflatten(0, fov_deg_BV.shape)
+        return picture_BVRRC.transpose(0, 1) if is_turned else picture_BVRRC
 
     def where_seen(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
         """Return what `forward` returns for one scene, from the bundles that see it alone.
@@ -93,20 +105,23 @@ class ViewDecoder(nn.Module):
         return torch.stack(pictures).movedim(1, -1)[None]
 
     def _rotations(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Rotations:
-        """Return the rotations of keys [B, V, N, A] and of bundles [Q, A]."""
+        """Return the rotations of keys [B, V, N, A], or packed [1, V, P, A]; and of bundles."""
         keys_BVNA = camera_rotation(self.rotary, scene.places, cameras.c2w_BV44)
-        if self.projected is None:
-            return keys_BVNA, None
-        per_side = resolution // self.patch_px
-        bundles_QA = self.projected.of_bundles(per_side, keys_BVNA)
-        return self.projected.of_tokens(keys_BVNA, scene.places, cameras, per_side), bundles_QA
+        bundles_QA = None
+        if self.projected is not None:
+            per_side = resolution // self.patch_px
+            bundles_QA = self.projected.of_bundles(per_side, keys_BVNA)
+            keys_BVNA = self.projected.of_tokens(keys_BVNA, scene.places, cameras, per_side)
+        if scene.packing is not None:
+            keys_BVNA = packed_camera_rotation(keys_BVNA, scene.packing)
+        return keys_BVNA, bundles_QA
 
     def _taps(
         self, x_BVQW: Tensor, scene: EncodedScene, rotations: Rotations, cuts: Cuts
     ) -> list[Tensor]:
         """Return what the head reads, [B V, Q, W] each."""
         x_BVQW = x_BVQW.to(dtype_of(self.layers))
-        keys = scene.places.keys(x_BVQW, self.rotary.head_width, views=x_BVQW.shape[1])
+        keys = scene.keys(views=rotations[0][0].shape[1])
         outputs = {}
         for index, (layer, keys_values) in enumerate(
             zip(self.layers, scene.keys_values, strict=True)

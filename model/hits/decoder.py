@@ -36,7 +36,8 @@ from model.layers import (
     run_layer,
     split_heads,
 )
-from model.positions import Rotation, TriangleRotary, rotate, world_rotation
+from model.packing import Packing
+from model.positions import Rotation, TriangleRotary, packed_rotation, rotate, world_rotation
 from model.precision import as_given
 
 _SURFACE = 3 + 3 + 3 + 1 + 3 + 3 + 1 + 1 + 1 + 4
@@ -177,9 +178,13 @@ class HitDecoder(nn.Module):
         self.norm = Norm(config.width, eps=LAYER_NORM_EPS)
         self.head = PixelHead(config)
 
-    def keys_values(self, context_BNW: Tensor, places: TokenPlaces) -> tuple[KeysValues, ...]:
+    def keys_values(
+        self, context_BNW: Tensor, places: TokenPlaces, packing: Packing | None = None
+    ) -> tuple[KeysValues, ...]:
         """Return what each layer asks of a context, keys rotated in the world: once a scene."""
         rotation_BND = world_rotation(self.rotary, places)
+        if packing is not None:
+            rotation_BND = packed_rotation(rotation_BND, packing)
         found = []
         for layer in cast(Iterable[Any], self.layers):
             k_BHND, v_BHND = layer.cross.keys_values(context_BNW)
@@ -231,7 +236,7 @@ class HitDecoder(nn.Module):
         x_BVAW = self.anchors(silu(self.told(anchor_BVAF))).to(dtype_of(self.layers))
         rotation = self.rotary(position_BVA3[..., None, :].expand(-1, -1, -1, 3, 3))
         reads_BV11 = traced.given_VI[..., INPUTS.index("tokens"), None, None]
-        keys = scene.places.keys(x_BVAW, self.config.head_width)
+        keys = scene.keys()
         known = scene.keys_values or [None] * len(self.layers)
         for layer, keys_values in zip(self.layers, known, strict=True):
             x_BVAW = run_layer(

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from model import encoded_scene
-from model.packing import pack_lengths, packed, unpacked
+from model.packing import pack_lengths, packed
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneBatch, batch_scenes
 from tests.model.kit import FAMILIES, RESOLUTION, awake, random_scene, tiny_config
@@ -44,18 +44,35 @@ def _forbid_masks(q: Tensor, k: Tensor, v: Tensor, attn_mask: Tensor | None) -> 
     return torch.nn.functional.scaled_dot_product_attention(q, k, v)
 
 
-def test_packing_keeps_what_exists_and_unpacking_puts_it_back() -> None:
+def test_packing_keeps_what_exists_and_gradients_go_back_there() -> None:
     packing = pack_lengths(LENGTHS, 9, torch.device("cpu"))
     x = torch.arange(27.0).reshape(3, 9, 1).requires_grad_()
     exists = torch.arange(9) < torch.tensor(LENGTHS)[:, None]
     there = packed(x, packing)
     assert torch.equal(there.detach(), x.detach()[exists])
-    assert packing.starts_S1.tolist() == [0, 5, 14, 15] and packing.longest >= 9
-    back = unpacked(there, packing)
-    assert torch.equal(back.detach()[..., 0], x.detach()[..., 0] * exists)
-    (back * x.detach()).sum().backward()
+    starts_S1, longest = packing.sequences
+    assert starts_S1.tolist() == [0, 5, 14, 15] and longest >= 9
+    assert packing.of_views(2).starts_S1.tolist() == [0, 5, 14, 15, 20, 29, 30]
+    (there * there.detach()).sum().backward()
     assert x.grad is not None
-    assert torch.equal(x.grad[..., 0], x.detach()[..., 0] * exists), "and gradients go that way"
+    assert torch.equal(x.grad[..., 0], x.detach()[..., 0] * exists)
+
+
+def test_one_scene_of_a_packed_batch_is_that_scene_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, batch = awake(tiny_config()), _batch()
+    with torch.no_grad():
+        padded = model.encode(batch)
+        monkeypatch.setattr(encoded_scene, "takes_packed", lambda *_: True)
+        row = model.encode(batch)
+        assert row.packing is not None and padded.packing is None
+        for index, length in enumerate(LENGTHS):
+            for found, wanted in zip(
+                row.only(index).keys_values, padded.only(index).keys_values, strict=True
+            ):
+                assert found[0].shape[2] == length + model.config.num_registers
+                for ours, theirs in zip(found, wanted, strict=True):
+                    # float64 sums through some layers, as above
+                    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-11)
 
 
 def test_where_a_mask_says_more_than_lengths_there_is_a_mask() -> None:
