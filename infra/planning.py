@@ -32,9 +32,8 @@ _DRAWS = 2000
 _BYTES_PER_TASK_RUN = 19_400
 """Bytes in Prefect's database: states, events and indices (`trilight bench orchestration`; figures
 in docs/tradeoffs.md, How far the records keep up)."""
-_BYTES_PER_MEMBER = 65
-"""Bytes in the manifest: name, offset and size of one member (measured, in the same place)."""
-_LARGE_MANIFEST_MB = 512
+_BYTES_PER_SHARD = 180
+"""Bytes of a row of the manifest: 172 of train-000123.tar, 178 of one in a part of the folder."""
 _LONG_TASK_MINUTES = 10
 
 
@@ -147,7 +146,6 @@ def predict(
     core_hours = _total(measured.core_s[1:] or measured.core_s, num_scenes / 3600)
     scene_s = core_hours.value * 3600 / num_scenes / cores_owned()
     num_tasks = min(MOST_TASKS, max(1, math.ceil(num_scenes * scene_s / TASK_S)))
-    members = num_scenes * (measured.num_views + 2)
     found = Prediction(
         num_scenes=num_scenes,
         num_shards=num_shards,
@@ -160,18 +158,13 @@ def predict(
         num_tasks=num_tasks,
         task_minutes=num_scenes * scene_s / num_tasks / 60,
         database_mb=num_tasks * _BYTES_PER_TASK_RUN / 1e6,
-        manifest_mb=members * _BYTES_PER_MEMBER / 1e6,
+        manifest_mb=num_shards * _BYTES_PER_SHARD / 1e6,
         notes=(),
     )
     return dataclasses.replace(found, notes=tuple(_notes(found)))
 
 
 def _notes(found: Prediction) -> Iterator[str]:
-    if found.manifest_mb > _LARGE_MANIFEST_MB:
-        yield (
-            f"manifest.json will have {found.manifest_mb:.0f} MB, of at most 1024 that are read "
-            "from a server: make several datasets with different seeds, and give all to training"
-        )
     if found.task_minutes > _LONG_TASK_MINUTES:
         parts = math.ceil(found.task_minutes / _LONG_TASK_MINUTES)
         yield (

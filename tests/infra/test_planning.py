@@ -55,10 +55,10 @@ def test_two_million_scenes_come_with_warnings() -> None:
     measured = _measured((400.0, 400.0))
     found = predict(measured, order, cores=4096, usd_per_core_hour=0.04)
     assert found.num_tasks == MOST_TASKS
-    assert any("manifest.json" in note for note in found.notes)
+    assert found.manifest_mb < 2  # it lists 7,813 shards, however many views they hold
     assert any("flow runs" in note for note in found.notes)
     fewer = predict(measured, dataclasses.replace(order, scenes=500), cores=1, usd_per_core_hour=1)
-    assert not any("manifest.json" in note for note in fewer.notes)
+    assert fewer.notes == ()
 
 
 class _Clock:
