@@ -1,12 +1,11 @@
 """One object: from a file to an `Asset`. It runs in a child process: native code may end it."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalise
 from pipeline.assets.cleaning.guards import check_clean, check_raw
 from pipeline.assets.cleaning.orient import orient_outward
@@ -23,18 +22,6 @@ from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class AssetAttempt:
-    """What one method made of an object."""
-
-    method: str
-    """The one that was used: another than asked for where that one is not safe for the mesh."""
-    asset: Asset
-    """With the levels that passed the gate, possibly none."""
-    missed: Mapping[int, tuple[str, str]]
-    """Reason and message by budget, for the levels that did not."""
 
 
 def prepare_asset(path: Path, settings: AssetSettings, method: str) -> AssetAttempt:

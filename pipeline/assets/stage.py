@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.reading.source_file import needs_child, read_source
 from pipeline.assets.recipe import methods_of
 from pipeline.assets.settings import AssetSettings
@@ -17,9 +17,6 @@ from storage.digests import sha256_hex
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level, decode_asset
 from storage.records.objects import Failure, ObjectRecord
-
-if TYPE_CHECKING:
-    from pipeline.assets.prepare import AssetAttempt
 
 BorrowChild = Callable[[], AbstractContextManager[IsolatedChild]]
 
@@ -227,7 +224,7 @@ def _rising(levels: list[Level]) -> tuple[Level, ...]:
     return tuple(reversed(kept))
 
 
-def attempt_in_child(source: Path, settings: AssetSettings, method: str) -> "AssetAttempt":
+def attempt_in_child(source: Path, settings: AssetSettings, method: str) -> AssetAttempt:
     """Run the recipe; only here are the mesh libraries imported, and only children come here."""
     from pipeline.assets.prepare import prepare_asset
 

@@ -8,25 +8,31 @@ the child: the kernel itself watches the pipe between the two, no thread of Pyth
 
 import contextlib
 import multiprocessing
+import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from pipeline.isolation.answers import declared_form, decode_answer
 from pipeline.isolation.confinement import Reach, code_of, confine, confinement_wanted
 from pipeline.isolation.deaths import ChildFailed, Result, with_retries
+from pipeline.isolation.frames import TooLong, patient, receive, send
 from pipeline.isolation.inside import serve
-from pipeline.isolation.waiting import wait_for_answer
-from storage.errors import EnvironmentFailure, Rejected, TrilightError
+from pipeline.isolation.waiting import Patience
+from storage.errors import EnvironmentFailure
 from storage.extensions import load_same, loaded_files
 
 _START_UP_S = 180.0
 _LAUNCHES = 3
+_MOST_BYTES = 16 << 30
+"""Of one answer: more than any child on a processor may hold."""
 _CRASHES = (signal.SIGABRT, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV, signal.SIGTRAP)
 """Signals by which native code ends itself. All others come from outside, SIGBUS too:
 a file that cannot be read or a disk that is full behind a memory map."""
@@ -108,7 +114,7 @@ class IsolatedChild:
             if self._calls_left == 0:
                 self._start()
             self._calls_left -= 1
-            return self._exchange((function, args), self._limits.wall_s)
+            return self._exchange(function, args, self._limits.wall_s)
         except ChildFailed:
             self._stop()
             raise
@@ -145,10 +151,10 @@ class IsolatedChild:
             files = loaded_files()
             if self._reach is not None and confinement_wanted():  # while it has one thread
                 own = {Path(path).parent for path, _ in files} | code_of(self._setup[0])
-                self._exchange((confine, (self._reach, self._code | own)), _START_UP_S)
+                self._exchange(confine, (self._reach, self._code | own), _START_UP_S)
             if files:  # first: what follows may be made of what they define
-                self._exchange((load_same, (files,)), _START_UP_S)
-            self._exchange(self._setup, _START_UP_S)
+                self._exchange(load_same, (files,), _START_UP_S)
+            self._exchange(_set_up, self._setup, _START_UP_S)
         except ChildFailed as failure:
             if self._closed:
                 raise ChildClosed from failure
@@ -157,21 +163,21 @@ class IsolatedChild:
             raise
         self._calls_left = self._limits.calls_per_child
 
-    def _exchange(self, request: tuple[Callable[..., Any], tuple[Any, ...]], wall_s: float) -> Any:
+    def _exchange(
+        self, function: Callable[..., Result], args: tuple[Any, ...], wall_s: float
+    ) -> Result:
         assert self._connection is not None
+        declared_form(function)  # before anything is done, whether the answer could be read
+        file, wait = self._connection.fileno(), patient(Patience(self._process.pid, wall_s))
         try:
-            self._connection.send(request)
-            wait_for_answer(self._connection, self._process.pid, wall_s)
-            kind, *payload = self._connection.recv()
+            send(file, [ForkingPickler.dumps((function, args))], wait)
+            answer = receive(file, wait, _MOST_BYTES)
+        except TooLong as error:
+            raise ChildFailed("nonsense", f"its answer would have {error}") from error
         except (EOFError, OSError) as error:
             raise self._death() from error
-        if kind == "result":
-            return payload[0]
-        if kind == "rejected":
-            raise Rejected(*payload)
-        if kind == "mistake":
-            raise TrilightError(*payload)
-        raise ChildFailed(kind, *payload)
+        result: Result = decode_answer(answer, function)
+        return result
 
     def _death(self) -> ChildFailed:
         self._process.join(10)
@@ -185,6 +191,11 @@ class IsolatedChild:
             return ChildFailed(f"crashed_signal_{-code}", f"native code ended by {name}")
         hint = "; the system may be out of memory" if -code == signal.SIGKILL else ""
         return ChildFailed("killed", f"ended by {name}{hint}")
+
+
+def _set_up(setup: Callable[..., object], args: tuple[Any, ...]) -> None:
+    """Prepare a new child; what that returns stays there."""
+    setup(*args)
 
 
 def _cannot_be_set_up(failure: ChildFailed) -> EnvironmentFailure:
@@ -215,6 +226,7 @@ def _launched(limits: ChildLimits) -> tuple[Any, Connection]:
                     f"a child process cannot be started ({error}); see `trilight doctor`."
                 ) from error
         else:
+            os.set_blocking(ours.fileno(), False)
             return process, ours
         finally:
             theirs.close()

@@ -48,6 +48,8 @@ ENDS: Mapping[str, End] = {
     # or thread. Neither breaks a law of the item.
     "crashed": End(tries=3, is_verdict=False),
     "exception": End(tries=3, is_verdict=False),
+    # The child says what it was not asked for: it has lost its mind, or a file has taken it over.
+    "nonsense": End(tries=2, is_verdict=False),
 }
 """Ends by reason; the keys carry no signal number."""
 

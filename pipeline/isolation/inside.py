@@ -11,9 +11,12 @@ import sys
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
-from storage.errors import Rejected, TrilightError
+from pipeline.isolation.answers import encode_error, encode_result
+from pipeline.isolation.frames import receive, send, wait_forever
+from storage.errors import EnvironmentFailure, Rejected, TrilightError
 
 _PR_SET_PDEATHSIG = 1
 _F_SETSIG = 10  # Linux; Python's fcntl module does not name it
@@ -57,13 +60,15 @@ def serve(connection: Connection, memory_bytes: int, cpu_s: int | None) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+    file = connection.fileno()
     while True:
         try:
-            function, args = connection.recv()
+            # our owner's own words, which are trusted; of ours it trusts none
+            function, args = ForkingPickler.loads(receive(file, wait_forever, sys.maxsize))
         except EOFError:
             os._exit(0)  # the parent has died: skip the destructors of native libraries
         _allow_cpu(cpu_s)
-        connection.send(_answer(function, args))
+        send(file, _answer(function, args), wait_forever)
 
 
 def _allow_cpu(seconds: int | None) -> None:
@@ -75,17 +80,19 @@ def _allow_cpu(seconds: int | None) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (soft, resource.getrlimit(resource.RLIMIT_CPU)[1]))
 
 
-def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, ...]:
+def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> list[bytes | memoryview]:
     try:
-        return ("result", function(*args))
+        return encode_result(function(*args), function)
     except Rejected as rejection:
-        return ("rejected", rejection.reason, rejection.message)
+        return encode_error("rejected", rejection.reason, rejection.message)
+    except EnvironmentFailure as failure:
+        return encode_error("EnvironmentFailure", str(failure))
     except TrilightError as mistake:
-        return ("mistake", str(mistake))
+        return encode_error("TrilightError", str(mistake))
     except MemoryError:
-        return ("out_of_memory", "an allocation went over the limit of the child")
+        return encode_error("out_of_memory", "an allocation went over the limit of the child")
     except Exception:
-        return ("exception", _last_error())
+        return encode_error("exception", _last_error())
 
 
 def _last_error() -> str:

@@ -6,7 +6,8 @@ nothing of a child's time, however long they last.
 """
 
 import logging
-from multiprocessing.connection import Connection
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.isolation.deaths import ChildFailed
@@ -22,36 +23,51 @@ LOOKS_BEFORE_KILL = 60
 """Polls that may find a child stopped before it is given up: time to continue it by hand."""
 
 
-def wait_for_answer(connection: Connection, process_id: int, wall_s: float) -> None:
-    """Return as soon as the connection has something to receive: an answer, or its end.
+class Patience:
+    """The time of one call, of which each wait takes its part."""
 
-    Args:
-        connection: to the child.
-        process_id: of the child.
-        wall_s: most seconds to wait.
+    def __init__(self, process_id: int, wall_s: float) -> None:
+        """Begin a call.
 
-    Raises:
-        ChildFailed: `timeout_wall`, or `stopped` where the child was stopped and not continued.
-    """
-    waited_s, stopped = 0.0, 0
-    while waited_s < wall_s:
-        pause_s = min(LOOK_S, wall_s - waited_s)
-        if connection.poll(pause_s):
-            return
-        waited_s += pause_s
-        stopped = stopped + 1 if _is_stopped(process_id) else 0
-        if stopped == LOOKS_BEFORE_WORDS:
+        Args:
+            process_id: of the child.
+            wall_s: most seconds to wait, in all.
+        """
+        self._process_id, self._wall_s = process_id, wall_s
+        self._waited_s, self._stopped = 0.0, 0
+
+    def until(self, happens: Callable[[float], bool]) -> None:
+        """Return as soon as something happens.
+
+        Args:
+            happens: waits at most so many seconds, and returns whether it has happened.
+
+        Raises:
+            ChildFailed: `timeout_wall`, or `stopped` where the child was stopped and not continued.
+        """
+        while self._waited_s < self._wall_s:
+            pause_s = min(LOOK_S, self._wall_s - self._waited_s)
+            began_s = time.monotonic()
+            if happens(pause_s):  # in pieces, however small, the time runs on
+                self._waited_s += min(pause_s, time.monotonic() - began_s)
+                return
+            self._waited_s += pause_s
+            self._look()
+        raise ChildFailed("timeout_wall", f"no answer within {self._wall_s:.0f} s")
+
+    def _look(self) -> None:
+        self._stopped = self._stopped + 1 if _is_stopped(self._process_id) else 0
+        if self._stopped == LOOKS_BEFORE_WORDS:
             log.warning(
                 "child process %d has been stopped from outside. Continue it with `kill -CONT %d`; "
                 "otherwise it is ended in %.0f s and its work is done again.",
-                process_id,
-                process_id,
-                (LOOKS_BEFORE_KILL - stopped) * LOOK_S,
+                self._process_id,
+                self._process_id,
+                (LOOKS_BEFORE_KILL - self._stopped) * LOOK_S,
             )
-        if stopped == LOOKS_BEFORE_KILL:
+        if self._stopped == LOOKS_BEFORE_KILL:
             waited = f"{LOOKS_BEFORE_KILL * LOOK_S:.0f} s"
             raise ChildFailed("stopped", f"stopped from outside (SIGSTOP) for {waited}")
-    raise ChildFailed("timeout_wall", f"no answer within {wall_s:.0f} s")
 
 
 def _is_stopped(process_id: int) -> bool:

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.assets.prepare import AssetAttempt, prepare_asset
+from pipeline.assets.attempt import AssetAttempt
+from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings
 from pipeline.isolation import ChildLimits, IsolatedChild, preload
 from storage.errors import Rejected, TrilightError

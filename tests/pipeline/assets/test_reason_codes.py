@@ -6,7 +6,7 @@ from tests.conftest import ROOT
 
 _RAISED = re.compile(r'Rejected\(\s*"([a-z_]+)"')
 _FAILED = re.compile(r'ChildFailed\(\s*f?"([a-z_]+?)(?:_\{|")')
-_ANSWERED = re.compile(r'return \("([a-z_]+)", (?!rejection|function|str)')
+_ANSWERED = re.compile(r'encode_error\("((?!rejected)[a-z_]+)"')
 _CHOSEN = re.compile(r'reason = "([a-z_]+)" if [^\n]+ else "([a-z_]+)"')
 
 

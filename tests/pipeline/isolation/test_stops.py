@@ -76,7 +76,7 @@ def test_a_child_that_is_continued_in_time_answers_itself(
 CALLED = """
 import os, time
 
-def wait_for(path):
+def wait_for(path) -> int:
     while not os.path.exists(path):
         time.sleep(0.02)
     return os.getpid()

@@ -7,14 +7,11 @@ import ctypes
 import os
 import signal
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import attempt_in_child
 from pipeline.making.attempt_scene import SceneAttempt, attempt_scene
-
-if TYPE_CHECKING:
-    from pipeline.assets.prepare import AssetAttempt
 
 OBJECT = "poison.obj"
 """Its mesh ends whoever reads it."""
@@ -26,14 +23,14 @@ LOST_SCENE = 2
 """All of its attempts do."""
 
 
-def prepare_or_crash(source: Path, settings: AssetSettings, method: str) -> "AssetAttempt":
+def prepare_or_crash(source: Path, settings: AssetSettings, method: str) -> AssetAttempt:
     """Read address 0 as a broken mesh library does, or prepare the object."""
     if source.name == OBJECT:
         ctypes.string_at(0)
     return attempt_in_child(source, settings, method)
 
 
-def prepare_or_die(source: Path, settings: AssetSettings, method: str) -> "AssetAttempt":
+def prepare_or_die(source: Path, settings: AssetSettings, method: str) -> AssetAttempt:
     """Be killed as often as the file DEATHS above the source says, or prepare the object.
 
     The file counts down.
