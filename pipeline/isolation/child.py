@@ -25,7 +25,7 @@ from pipeline.isolation.confinement import Reach, code_of, confine, confinement_
 from pipeline.isolation.deaths import ChildFailed, Result, with_retries
 from pipeline.isolation.frames import TooLong, patient, receive, send
 from pipeline.isolation.inside import serve
-from pipeline.isolation.waiting import Patience
+from pipeline.isolation.waiting import CallTime
 from storage.errors import EnvironmentFailure
 from storage.extensions import load_same, loaded_files
 
@@ -168,7 +168,7 @@ class IsolatedChild:
     ) -> Result:
         assert self._connection is not None
         declared_form(function)  # before anything is done, whether the answer could be read
-        file, wait = self._connection.fileno(), patient(Patience(self._process.pid, wall_s))
+        file, wait = self._connection.fileno(), patient(CallTime(self._process.pid, wall_s))
         try:
             send(file, [ForkingPickler.dumps((function, args))], wait)
             answer = receive(file, wait, _MOST_BYTES)

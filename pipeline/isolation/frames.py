@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from pipeline.isolation.waiting import Patience
+from pipeline.isolation.waiting import CallTime
 
 _LENGTH = 8
 
@@ -26,8 +26,8 @@ def wait_forever(file: int, event: int) -> None:
     """Return at once: reading and writing a file that blocks waits by itself."""
 
 
-def patient(patience: Patience) -> Wait:
-    """Return how an owner waits, whose files do not block; raises as `Patience.until`."""
+def patient(patience: CallTime) -> Wait:
+    """Return how an owner waits, whose files do not block; raises as `CallTime.until`."""
 
     def wait(file: int, event: int) -> None:
         poll = select.poll()

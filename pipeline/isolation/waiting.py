@@ -23,7 +23,7 @@ LOOKS_BEFORE_KILL = 60
 """Polls that may find a child stopped before it is given up: time to continue it by hand."""
 
 
-class Patience:
+class CallTime:
     """The time of one call, of which each wait takes its part."""
 
     def __init__(self, process_id: int, wall_s: float) -> None:
