@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pipeline.exchange.convert import convert_scene
 from pipeline.exchange.open_scene import SceneSource
@@ -81,7 +82,7 @@ def test_inspecting(source: SceneSource, tmp_path: Path, monkeypatch: pytest.Mon
     assert (tmp_path / "sheet.png").exists()
 
 
-def _grey(source: SceneSource, variant: Variant) -> "np.ndarray":
+def _grey(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:
     return np.full((2, 4, 3), 128, np.uint8)
 
 
@@ -94,7 +95,7 @@ def test_rendering() -> None:
         if kills[0] == 1:
             kills[0] += kill_children()
 
-    def picture() -> "np.ndarray":
+    def picture() -> NDArray[np.float32]:
         return tracer.render(scene.c2w[0], float(scene.fov_deg[0]), "a view").radiance_rgb
 
     tracer = PathTracer(settings, seed=0, variant=choose_variant(), threads=1, sampled=sampled)
