@@ -64,10 +64,12 @@ def remove_leftovers(folder: Path, *, older_than_s: float = 0.0) -> None:
         older_than_s: files that were written to more recently stay; for locks that may not reach
             every machine that writes there.
     """
-    for leftover in folder.rglob(f"*{TEMPORARY_SUFFIX}"):
-        with contextlib.suppress(OSError):  # its writer has just finished, or it is not ours
-            if time.time() - leftover.stat().st_mtime >= older_than_s:
-                leftover.unlink()
+    for place, _, names in os.walk(folder):  # a third of the time of rglob, of a million files
+        for name in filter(lambda name: name.endswith(TEMPORARY_SUFFIX), names):
+            leftover = Path(place, name)
+            with contextlib.suppress(OSError):  # its writer has just finished, or it is not ours
+                if time.time() - leftover.stat().st_mtime >= older_than_s:
+                    leftover.unlink()
 
 
 def write_error(path: Path, error: OSError) -> TrilightError:

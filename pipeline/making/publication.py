@@ -171,7 +171,10 @@ class Publication:
 
     def _are_all_there(self) -> bool:
         """Return whether every shard is there; looks part by part, up to the first that is not."""
-        return not any(map(self._missing, in_parts(range(self.num_shards))))
+        parts = list(in_parts(range(self.num_shards)))
+        if any(len(self._shards_there(part)) < len(part) for part in parts):  # names cost more
+            return False
+        return not any(map(self._missing, parts))
 
     def finish(self) -> Manifest | None:
         """List all shards in the manifest, and their rejections, if all are there; return it.

@@ -233,6 +233,8 @@ COMMANDS: Mapping[str, Sized] = {
     "open for training": Sized(of="outline", run=_open),
     "generate, end": Sized(of="outline", run=_end),
     "generate, last end": Sized(of="outline", run=_finish),
+    "open for training, finished": Sized(of="outline", run=_open),
+    "status, finished": Sized(of="outline", run=lambda root: _words("status", str(root))),
     "resume training": Sized(of="whole", run=_resume),
     "verify --fast": Sized(of="whole", run=_verify),
     "inspect": Sized(of="whole", run=_inspect),
