@@ -13,6 +13,7 @@ import contextlib
 import fcntl
 import os
 import re
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -193,7 +194,8 @@ class DatasetFolder:
     def joined(self, when_alone: Callable[[], None] = lambda: None) -> Iterator[None]:
         """Join the workers that make the dataset.
 
-        A worker that is alone at first removes what killed writers left more than an hour ago.
+        A worker that is alone at first removes what killed writers left more than an hour ago,
+        unless another one has looked within that hour: to look costs the whole set.
 
         Args:
             when_alone: called by a worker that is alone at first, before another one can join.
@@ -204,12 +206,20 @@ class DatasetFolder:
         descriptor = open_lock(self._lock)
         try:
             if flock_now(descriptor):
-                remove_leftovers(self.root, older_than_s=_LEFT_S)
+                self._clean()
                 when_alone()
             fcntl.flock(descriptor, fcntl.LOCK_SH)
             yield
         finally:
             os.close(descriptor)
+
+    def _clean(self) -> None:
+        looked = self.staging / "cleaned"
+        with contextlib.suppress(FileNotFoundError):
+            if time.time() - looked.stat().st_mtime < _LEFT_S:
+                return
+        remove_leftovers(self.root, older_than_s=_LEFT_S)
+        looked.touch()
 
     def turn(self, what: str) -> "contextlib.AbstractContextManager[bool]":
         """Hold the lock of a step that one worker does at a time, such as `manifest`."""

@@ -89,6 +89,9 @@ def test_leftovers_are_cleared_only_where_nobody_works(tmp_path: Path) -> None:
         with folder.joined():
             assert leftover.exists()
     with folder.joined():
+        assert leftover.exists(), "somebody has looked within the hour"
+    os.utime(folder.staging / "cleaned", (hours_ago, hours_ago))
+    with folder.joined():
         assert not leftover.exists()
         assert young.exists()  # of another machine, perhaps, that our locks do not reach
 
