@@ -124,7 +124,7 @@ def _begin(
     return True
 
 
-def _advance() -> Sampling | None:
+def _advance() -> Sampling | GrowingPicture | None:
     """Return the next step; None after the last."""
     if _state.ended:
         return None

@@ -26,6 +26,8 @@ def with_unlisted(dataset: Dataset) -> Dataset:
         TrilightError: a note is none.
     """
     notes = {note.shard.name: note for note in _notes(dataset)}
+    if not notes:
+        return dataset
     shards = {shard.name: shard for shard in dataset.manifest.shards}
     shards |= {name: note.shard for name, note in notes.items()}
     every = tuple(sorted(shards.values(), key=number_of_shard))
