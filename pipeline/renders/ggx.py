@@ -55,7 +55,9 @@ class AlbedoLookup:
         cosine = dr.maximum(cos_in, 0)
         u = dr.sqrt(cosine / _stretch(cosine, alpha)) * (X_STEPS - 1)
         v = dr.sqrt(alpha) * (ROUGHNESS_STEPS - 1)
-        column, row = mi.UInt32(u), mi.UInt32(v)
+        # bounded: what is no number becomes another integer on each kind of processor
+        column = dr.minimum(mi.UInt32(u), X_STEPS - 1)
+        row = dr.minimum(mi.UInt32(v), ROUGHNESS_STEPS - 1)
         u, v = u - mi.Float(column), v - mi.Float(row)
         near = dr.gather(mi.Vector4f, self._rows, row * X_STEPS + column, active)
         return dr.lerp(dr.lerp(near.x, near.y, u), dr.lerp(near.z, near.w, u), v)

@@ -112,7 +112,11 @@ def bin_of(direction: Any) -> tuple[Any, Any]:
     folded_x = dr.mulsign(1 - dr.abs(y), x)
     folded_y = dr.mulsign(1 - dr.abs(x), y)
     x, y = dr.select(below, folded_x, x), dr.select(below, folded_y, y)
-    column, line = (mi.UInt32(dr.clip((v + 1) * (SIDE / 2), 0, SIDE - 1)) for v in (x, y))
+    # A direction of no length is no number, and what that is as an integer is the processor's own:
+    # bounded behind the conversion too, it reads within the table, and its light is nothing anyway.
+    column, line = (
+        dr.minimum(mi.UInt32(dr.clip((v + 1) * (SIDE / 2), 0, SIDE - 1)), SIDE - 1) for v in (x, y)
+    )
     return line * SIDE + column, length
 
 

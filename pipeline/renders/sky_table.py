@@ -103,6 +103,7 @@ class SkyTable:
         columns = [left + step for step in (0, 1)]
         columns = [mi.UInt32(dr.select(c < 0, c + width, c)) for c in columns]
         columns = [dr.select(c >= self._width, c - self._width, c) for c in columns]
+        columns = [dr.minimum(c, self._width - 1) for c in columns]  # of what is no direction
         upper, lower = (
             [
                 dr.gather(mi.Vector4f, self._texels, row * self._width + column, active)

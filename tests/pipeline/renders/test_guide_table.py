@@ -92,6 +92,18 @@ def test_directions_are_drawn_by_the_density() -> None:
         assert abs(by_drawn.mean() - by_twin.mean()) < 5 * error
 
 
+@pytest.mark.parametrize("length", [0.0, np.nan, np.inf])
+def test_what_is_no_direction_still_has_a_bin(length: float) -> None:
+    """As an integer it is another one on each kind of processor: one read beyond the table, and
+    crashed or not by where that ended in memory."""
+    import mitsuba as mi
+
+    from pipeline.renders.guide_table import bin_of
+
+    for direction in ((length, 0, 0), (0, length, 0), (0, 0, -length), (length, length, length)):
+        assert int(np.array(bin_of(mi.Vector3f(*direction))[0])[0]) < 1024
+
+
 def test_a_cell_that_learnt_nothing_is_not_guided() -> None:
     import mitsuba as mi
 
