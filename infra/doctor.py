@@ -57,6 +57,14 @@ def examine(looking_at: Callable[[str], None] = lambda name: None) -> Iterator[F
             yield check()
         except TrilightError as error:  # of what it asked, which says the next step itself
             yield Finding(name=name, state="missing", found=str(error), consequence="", mend="")
+        except (metadata.PackageNotFoundError, ModuleNotFoundError) as error:
+            yield Finding(
+                name=name,
+                state="missing",
+                found=f"no package {error.name}",
+                consequence="what needs it fails",
+                mend="make setup",
+            )
 
 
 def _machine() -> Finding:

@@ -24,8 +24,8 @@ class Measured:
 
     names: tuple[str, ...] = ()
     """Names of experiments or of families of them; by default all are listed and none is run. The
-    name card measures the graphics card here into one file to send back, and card FILE ... shows
-    such files."""
+    name card measures the graphics card here into one file to send back, card RUN ... only the
+    steps of these runs, and card FILE ... shows such files."""
     share: str | None = None
     """Measure only a share of the rows, K/N for the K-th of N, into a file of its own beside the
     results; without one, a later call takes all such files over and measures what they lack. For

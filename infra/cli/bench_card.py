@@ -22,11 +22,13 @@ RECEIVED, PAGE, BLOCK = "docs/bench/cards", "docs/how-to/measure-a-card.md", "ca
 
 
 def bench_card(
-    files: tuple[str, ...], out: Path | None, asked: "Asked", *, write_docs: bool
+    names: tuple[str, ...], out: Path | None, asked: "Asked", *, write_docs: bool
 ) -> None:
-    """Measure, or show files; `out` is the file, or a folder for it."""
-    if files:
-        _show_files([Path(name) for name in files], write_docs=write_docs)
+    """Measure all runs or those named, or show files; `out` is the file, or a folder for it."""
+    from train.runs import RUNS
+
+    if names and not all(name in RUNS for name in names):
+        _show_files([Path(name) for name in names], write_docs=write_docs)
         return
     first_words("Measuring the card: 15 to 30 minutes; nothing else should run")
     from infra.torch_library import require_torch
@@ -44,6 +46,8 @@ def bench_card(
             device,
             chosen_effort(device),
             data=asked.data,
+            runs=names,
+            keep=lambda record: write_report(record, Path(path)),
             doing=lambda name: status.update(f"measuring: {name}"),
         )
     write_report(record, Path(path))

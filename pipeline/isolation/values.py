@@ -22,6 +22,8 @@ from typing import Any, Literal, get_args, get_origin
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.array_hints import array_scalar
+
 DTYPES: Mapping[str, np.dtype[Any]] = {
     name: np.dtype(name)
     for name in ("bool", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
@@ -92,8 +94,8 @@ def form_of(hint: Any) -> Form:
         return Form(lambda value: value in args, _as_it_is, functools.partial(_one_of, args))
     if origin in (typing.Union, types.UnionType):
         return _union(args)
-    if origin is np.ndarray:
-        return _array(args[1])
+    if (scalar := array_scalar(hint)) is not None:
+        return _array(scalar)
     if origin is tuple:
         return _row(tuple, args[0]) if args[-1] is Ellipsis else _fixed(args)
     if origin in (list, Sequence):
@@ -208,10 +210,9 @@ def _union(options: tuple[Any, ...]) -> Form:
     return Form(takes, pack, unpack)
 
 
-def _array(declared: Any) -> Form:
+def _array(scalar: Any) -> Form:
     """Return the form of arrays of one dtype, or of the dtypes of an abstract one."""
-    (kind,) = get_args(declared)
-    wanted = kind if isinstance(kind, type) and issubclass(kind, np.generic) else np.generic
+    wanted = scalar if isinstance(scalar, type) and issubclass(scalar, np.generic) else np.generic
 
     def takes(value: Any) -> bool:
         return (

@@ -16,6 +16,8 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.array_hints import array_scalar
+
 
 @dataclass(frozen=True)
 class Within:
@@ -225,6 +227,4 @@ def _kind_and_shape(hint: Any) -> tuple[type, Shape]:
     if get_origin(hint) is tuple:
         first, second = get_args(hint)
         return first, "many" if second is ... else "pair"
-    (_, dtype) = get_args(hint)
-    (scalar,) = get_args(dtype)
-    return (float if issubclass(scalar, np.floating) else int), "array"
+    return (float if issubclass(array_scalar(hint), np.floating) else int), "array"

@@ -13,8 +13,8 @@ _PLAIN = re.compile(r"[^\w .,()+:-]")
 MOST_ROWS, MOST_CHARACTERS = 100, 60
 NONE = "n/a"
 
-RUN_NAMES = ("run", "scenes a pass", "ms a step", "at least", "H100 by count, ms", "TFLOP/s",
-             "views/s", "GiB", "kernels", "the same by count", "dearest parts")  # fmt: skip
+RUN_NAMES = ("run", "scenes a pass", "ms a step", "not compiled", "at least", "H100 by count, ms",
+             "TFLOP/s", "views/s", "GiB", "kernels", "the same by count", "dearest parts")  # fmt: skip
 """Headings of `run_rows`. `at least` is what the products alone take at the measured peak; `by
 count` is what `trilight bench roofline` predicts of a compiled step on an H100."""
 
@@ -67,12 +67,12 @@ def run_rows(record: Mapping[str, Any]) -> Iterator[list[str]]:
             yield [name, _failed(row), *[""] * (len(RUN_NAMES) - 2)]
             continue
         scenes, asked = _number(row.get("scenes")), _number(row.get("asked_scenes"))
-        steps = [value for value in row.get("step_ms") or () if isinstance(value, int | float)]
         profile = _map(row, "profile")
         yield [
             name,
             scenes if scenes == asked else f"{scenes} of {asked}: memory",
-            _number(statistics.median(steps)) if steps else NONE,
+            _median(row),
+            _median(_map(row, "not_compiled")),
             _number(row.get("least_ms")),
             _number(_map(row, "h100").get("ms")),
             _number(row.get("teraflop_per_s"), 3),
@@ -82,6 +82,11 @@ def run_rows(record: Mapping[str, Any]) -> Iterator[list[str]]:
             _number(_map(row, "h100").get("kernels")),
             _dearest(_map(profile, "by_part_ms")),
         ]
+
+
+def _median(row: Mapping[str, Any]) -> str:
+    steps = [value for value in row.get("step_ms") or () if isinstance(value, int | float)]
+    return _number(statistics.median(steps)) if steps else NONE
 
 
 def _dearest(parts: Mapping[str, Any]) -> str:

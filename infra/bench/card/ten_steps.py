@@ -1,5 +1,6 @@
 """Steps of a named run on the card, at its own size or with fewer scenes where memory lacks."""
 
+import dataclasses
 import gc
 import statistics
 import time
@@ -13,7 +14,6 @@ from infra.bench.card.probe import wait_for
 from infra.bench.card.step_profile import marked_parts, profiled
 from model.costs import training_flops
 from model.renderformer import count_parameters
-from storage.errors import TrilightError
 from train.loop.crew import Crew
 from train.loop.state import new_state
 from train.loop.step import Stepper
@@ -38,11 +38,14 @@ def steps_of_run(run: str, effort: CardEffort, device: torch.device) -> dict[str
     scenes, why = asked, ""
     while scenes:
         try:
-            return record | _measured(settings, scenes, effort, device)
+            found = _measured(settings, scenes, effort, device)
+            if device.type == "cuda" and settings.compile == "auto":
+                found["not_compiled"] = _not_compiled(settings, scenes, effort, device)
+            return record | found
         except torch.OutOfMemoryError:
             why = "too little memory, even for one scene a pass"
             scenes //= 2
-        except (RuntimeError, TrilightError) as error:
+        except Exception as error:  # of torch's compiler too, which has classes of its own
             return record | {"failed": f"{type(error).__name__}: {str(error)[:500]}"}
         finally:
             _give_back(device)
@@ -53,6 +56,19 @@ def _give_back(device: torch.device) -> None:
     gc.collect()
     if device.type == "cuda":
         torch.cuda.empty_cache()
+
+
+def _not_compiled(
+    settings: TrainSettings, scenes: int, effort: CardEffort, device: torch.device
+) -> dict[str, Any] | None:
+    """Return times, kernels and memory without torch.compile; None where memory lacks."""
+    _give_back(device)
+    try:
+        found = _measured(dataclasses.replace(settings, compile="no"), scenes, effort, device)
+    except torch.OutOfMemoryError:
+        return None
+    kept = {name: found[name] for name in ("first_step_s", "step_ms", "peak_gib")}
+    return kept | {"kernels": found["profile"]["kernels"]}
 
 
 def _measured(
