@@ -14,7 +14,8 @@ MOST_ROWS, MOST_CHARACTERS = 100, 60
 NONE = "n/a"
 
 RUN_NAMES = ("run", "scenes a pass", "ms a step", "not compiled", "at least", "H100 by count, ms",
-             "TFLOP/s", "views/s", "GiB", "kernels", "the same by count", "dearest parts")  # fmt: skip
+             "TFLOP/s", "views/s", "GiB", "kernels", "the same by count",
+             "dearest parts")  # fmt: skip
 """Headings of `run_rows`. `at least` is what the products alone take at the measured peak; `by
 count` is what `trilight bench roofline` predicts of a compiled step on an H100."""
 
