@@ -90,6 +90,24 @@ def as_given(device: torch.device) -> AbstractContextManager[None]:
 
 
 @contextmanager
+def quick_products(device: torch.device, *, wanted: bool) -> Iterator[None]:
+    """Have a card multiply float32 matrices with 10 bits of mantissa, eight times as fast.
+
+    While a network trains in few bits: on the way back, whose other products have 7 bits, and in
+    the pixels of `hits`. On an H200 float32 there was a sixth of the step of `hits-256`.
+    """
+    if device.type != "cuda" or not wanted:
+        yield
+        return
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+@contextmanager
 def tf32(allowed: bool) -> Iterator[None]:
     """Allow or forbid TF32 in CUDA's float32 products and convolutions; no effect on a CPU.
 

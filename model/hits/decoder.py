@@ -38,7 +38,7 @@ from model.layers import (
 )
 from model.packing import Packing
 from model.positions import Rotation, TriangleRotary, packed_rotation, rotate, world_rotation
-from model.precision import as_given
+from model.precision import as_given, quick_products
 
 _SURFACE = 3 + 3 + 3 + 1 + 3 + 3 + 1 + 1 + 1 + 4
 """Numbers that say what surface a pixel sees, and what its mirrored ray (`_surface`)."""
@@ -207,7 +207,9 @@ class HitDecoder(nn.Module):
             )
             place = at(traced.pixels_VRRC)
         x_BVAW = self._asked(scene, traced, anchor, place[..., Channel.POSITION])
-        with as_given(traced.pixels_VRRC.device):
+        device = traced.pixels_VRRC.device
+        trains = torch.is_grad_enabled() and torch.is_autocast_enabled("cuda")
+        with as_given(device), quick_products(device, wanted=trains):
             return self._pictures(traced, told, mirrored, x_BVAW.to(told.dtype), place, unit_B1113)
 
     def _told(self, traced: Traced, unit_B1113: Tensor) -> tuple[Tensor, Tensor]:

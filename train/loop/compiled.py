@@ -41,12 +41,42 @@ def compile_parts(
             "package triton. Install it, or --set compile=no."
         )
     torch._dynamo.config.recompile_limit = max(MOST_GRAPHS, torch._dynamo.config.recompile_limit)
+    if device.type == "cuda":
+        _without_tiling_analysis()
     for _, module, method in compiled_parts(model, objective):
         if method == "forward":
             module.compile(dynamic=True)
         else:
             setattr(module, method, torch.compile(getattr(module, method), dynamic=True))
     return True
+
+
+def undo_compiling(model: RenderFormer, objective: Objective) -> None:
+    """Have the parts run as they were before `compile_parts`, kernel by kernel."""
+    for _, module, method in compiled_parts(model, objective):
+        if method == "forward":
+            module._compiled_call_impl = None
+        elif method in vars(module):
+            delattr(module, method)
+
+
+def is_of_the_compiler(error: Exception) -> bool:
+    """Return whether an error says that torch could not compile, not that a step went wrong."""
+    from torch._dynamo.exc import TorchDynamoException
+    from torch._inductor.exc import InductorError
+
+    return isinstance(error, TorchDynamoException | InductorError)
+
+
+def _without_tiling_analysis() -> None:
+    """Switch off an analysis that does not know variable lengths, which ours are.
+
+    On an H200, torch 2.11 ended there with an assertion in the way back of `smoke` and `pretrain`
+    (pytorch/pytorch issues 181563 and 197077); the second is open in later versions too.
+    """
+    import torch._inductor.config as inductor
+
+    inductor.triton.coalesce_tiling_analysis = False
 
 
 def compiled_parts(

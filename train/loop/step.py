@@ -13,8 +13,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from model.precision import quick_products
+from storage.errors import TrilightError
 from train.data.buckets import TrainingBatch
-from train.loop.compiled import compile_parts
+from train.loop.compiled import compile_parts, is_of_the_compiler, undo_compiling
 from train.loop.crew import Crew
 from train.loop.decision import decided, decides_late
 from train.loop.state import TrainState
@@ -71,7 +73,8 @@ class Stepper:
         )
         self.activity = Activity()
         self.layers = LayerNorms(state.model)
-        compile_parts(state.model, objective, settings.compile, crew.device)
+        self.is_compiled = compile_parts(state.model, objective, settings.compile, crew.device)
+        self.remarks: list[str] = []  # for the notes of the run
         self._net: nn.Module = state.model
         if crew.world_size > 1:
             # Every weight is used. Told so, torch would regroup the gradients after the first step,
@@ -100,7 +103,34 @@ class Stepper:
             batches: of this process; every process must hold equally many views.
             learning_rate: of AdamW's step.
             asked_to_stop: whether this process was; all are told with the step's figures.
+
+        Raises:
+            TrilightError: torch cannot compile the network, and was told to, or there are several
+                processes; one that was not told to goes on without.
         """
+        try:
+            return self._taken(batches, learning_rate, asked_to_stop=asked_to_stop)
+        except Exception as error:
+            if not (self.is_compiled and is_of_the_compiler(error)):
+                raise
+            self._leave_compiler(error)
+        return self._taken(batches, learning_rate, asked_to_stop=asked_to_stop)
+
+    def _leave_compiler(self, error: Exception) -> None:
+        """Go on kernel by kernel: the weights have not moved yet."""
+        reason = f"torch {torch.__version__} cannot compile the network ({type(error).__name__})"
+        if self._settings.compile == "yes" or self._crew.world_size > 1:
+            raise TrilightError(
+                f"training: {reason}; expected a version that can. Say --set compile=no, with "
+                "--resume where there is a checkpoint, or install another torch."
+            ) from error
+        undo_compiling(self._state.model, self._objective)
+        self.is_compiled = False
+        self.remarks.append(f"{reason}: it runs kernel by kernel, which takes longer")
+
+    def _taken(
+        self, batches: Sequence[TrainingBatch], learning_rate: float, *, asked_to_stop: bool
+    ) -> Unread:
         state, activity = self._state, self.activity
         state.updater.zero_grad()
         num_views = sum(batch.noise_BV.numel() for batch in batches)
@@ -156,7 +186,8 @@ class Stepper:
         self.activity.begin("backward")
         if last and self._crew.world_size > 1:
             prediction.register_hook(self._note_exchange)
-        (losses.total_BV.sum() / num_views).backward()
+        with quick_products(self._crew.device, wanted=self._settings.precision == "bfloat16"):
+            (losses.total_BV.sum() / num_views).backward()
         self.activity.begin("other")
         shown_BV = prediction.detach().clamp(min=0).mean(dim=(2, 3, 4))
         wanted_BV = batch.target_BVRR3.mean(dim=(2, 3, 4))

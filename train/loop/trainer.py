@@ -217,6 +217,8 @@ class Trainer:
             batches, rate = self.copies.send(drawn.batches), learning_rate(step, settings)
             unread = self.stepper.take(batches, rate, asked_to_stop=asked_to_stop())
         self._note_unusable()
+        while self.stepper.remarks:
+            self._note(self.stepper.remarks.pop(0))
         self.window.spend(
             views=settings.scenes_per_step * settings.views_per_scene,
             waited_s=waited_s,

@@ -78,7 +78,7 @@ def _measured(
     lpips = drawn_lpips(settings, THIN) if effort.shrunk else drawn_lpips(settings)
     objective = Objective(settings.loss, lpips).to(device)
     stepper = Stepper(state, settings, objective, Crew(device=device))
-    batch = drawn_batch(settings, scenes)
+    batch = drawn_batch(settings, scenes).to(device)  # a run sends the next while one is computed
 
     def step() -> None:
         report = stepper.step([batch], settings.learning_rate)

@@ -1,5 +1,6 @@
 """Compiled layers compute what layers compute, from one graph for all of them and all lengths."""
 
+import dataclasses
 from collections.abc import Iterator
 
 import pytest
@@ -11,10 +12,17 @@ from model.renderformer import RenderFormer
 from model.scene_tensors import batch_scenes
 from storage.errors import TrilightError
 from tests.model.kit import RESOLUTION, awake, random_scene, tiny_config
+from tests.train.kit import tiny_run
+from tests.train.toy import toy_sample
+from train.data.buckets import TrainingBatch, make_batch
+from train.data.scenes import training_scene
 from train.loop import compiled
-from train.loop.compiled import compile_parts, compiled_parts
+from train.loop.compiled import compile_parts, compiled_parts, undo_compiling
+from train.loop.crew import Crew
+from train.loop.state import new_state
+from train.loop.step import Stepper
 from train.loss.objective import Objective
-from train.settings import LossSettings
+from train.settings import Compile, LossSettings
 
 CPU = torch.device("cpu")
 QUICK = ((3, 5), (4, 9, 2))
@@ -108,3 +116,58 @@ def test_what_is_compiled_where(monkeypatch: pytest.MonkeyPatch) -> None:
         compile_parts(model, objective, "yes", card)
     monkeypatch.setattr(compiled, "_has_triton", lambda: True)
     assert compile_parts(model, objective, "auto", card)
+
+
+def _batch() -> TrainingBatch:
+    resolution = tiny_run().resolution
+    return make_batch(
+        [training_scene(toy_sample(index, resolution=resolution), resolution) for index in (0, 1)]
+    )
+
+
+def _fails_to_compile(graph: object, inputs: object) -> object:
+    raise AssertionError("no kernel for this")
+
+
+def _uncompilable(monkeypatch: pytest.MonkeyPatch, compile: Compile) -> Stepper:
+    """Return a stepper on the processor whose compiler, as on some card, fails."""
+    real = torch.compile
+    monkeypatch.setattr(compiled, "_worth_it", lambda _: True)
+    monkeypatch.setattr(
+        torch.nn.Module,
+        "compile",
+        lambda module, **_: setattr(
+            module,
+            "_compiled_call_impl",
+            real(module._call_impl, backend=_fails_to_compile, dynamic=True),
+        ),
+    )
+    run = dataclasses.replace(tiny_run(), compile=compile)
+    return Stepper(new_state(run), run, Objective(run.loss, None), Crew(device=CPU))
+
+
+def test_what_cannot_be_compiled_is_trained_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On an H200 torch 2.11 failed to compile `smoke`, and the run ended before its first step."""
+    batch = _batch()
+    plain = Stepper(new_state(tiny_run()), tiny_run(), _objective(), Crew(device=CPU))
+    wanted = plain.step([batch], 1e-3)
+    stepper = _uncompilable(monkeypatch, compile="auto")
+    assert stepper.step([batch], 1e-3) == wanted
+    (remark,) = stepper.remarks
+    assert "cannot compile" in remark and not stepper.is_compiled
+    assert stepper.step([batch], 1e-3) == plain.step([batch], 1e-3)
+    assert len(stepper.remarks) == 1
+
+
+def test_who_insists_on_compiling_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    stepper = _uncompilable(monkeypatch, compile="yes")
+    with pytest.raises(TrilightError, match="cannot compile the network.*--set compile=no"):
+        stepper.step([_batch()], 1e-3)
+
+
+def test_compiling_is_undone() -> None:
+    model, objective = awake(tiny_config()), _objective()
+    compile_parts(model, objective, "yes", CPU)
+    undo_compiling(model, objective)
+    for _, module, method in compiled_parts(model, objective):
+        assert module._compiled_call_impl is None and method not in vars(module)
