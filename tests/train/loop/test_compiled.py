@@ -104,6 +104,26 @@ def test_inductor_computes_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     _check(monkeypatch, "inductor", "linear", QUICK, 12)
 
 
+def test_a_part_is_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in the eyes of torch 2.11, which cuts where it is asked whether a device has autocast.
+
+    On an H200 it compiled each norm of each layer alone then, and was not done within minutes.
+    """
+
+    def cut(_: str) -> bool:
+        raise AssertionError("torch 2.11 cannot trace this question")
+
+    monkeypatch.setattr(torch.amp, "is_autocast_available", cut)
+    model = awake(tiny_config("linear"), dtype=torch.float32)
+    for _, module, method in compiled_parts(model, _objective()):
+        assert method in ("forward", "keys_values")
+        whole = torch.compile(
+            getattr(module, method), backend="eager", dynamic=True, fullgraph=True
+        )
+        setattr(module, method, whole)
+    _results(model, (3, 5))
+
+
 def test_what_is_compiled_where(monkeypatch: pytest.MonkeyPatch) -> None:
     model, objective, card = awake(tiny_config()), _objective(), torch.device("cuda")
     layers = len(model.encoder.layers) + len(model.decoder.layers)
