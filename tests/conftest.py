@@ -37,3 +37,23 @@ def card(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProcessPoolExecut
 
     with card_process(tmp_path_factory.mktemp("card")) as process:
         yield process
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Have each worker begin with tests that may last long: one that came last kept two waiting."""
+    workers = getattr(config, "workerinput", {}).get("workercount", 1)
+    long = sorted(filter(_patience_s, items), key=_patience_s, reverse=True)
+    rest = [item for item in items if not _patience_s(item)]  # in order: they share fixtures
+    dealt: list[pytest.Item] = []
+    for worker in range(workers):
+        own = long[worker::workers]
+        room = (len(items) * (worker + 1)) // workers - len(dealt) - len(own)
+        dealt += [*own, *rest[:room]]
+        rest = rest[room:]
+    items[:] = [*dealt, *rest]
+
+
+def _patience_s(item: pytest.Item) -> float:
+    """Return the timeout that a test itself states, s: who lasts long does. Files share servers."""
+    stated = (each.args[0] for each in item.own_markers if each.name == "timeout")
+    return max(map(float, stated), default=0.0)
