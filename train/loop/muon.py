@@ -78,16 +78,26 @@ class StackedMuon(torch.optim.Muon):
         """Take what `muon` takes."""
         super().__init__(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
         self._products = products
-        self._thirds = {id(weight) for weight in thirds}
+        cut = {id(weight) for weight in thirds}
+        self._thirds = [
+            [id(weight) in cut for weight in group["params"]] for group in self.param_groups
+        ]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy needs; torch's optimisers keep their own fields alone."""
+        own = {"_products": self._products, "_thirds": self._thirds, "decision": self.decision}
+        return super().__getstate__() | own
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """Move every matrix along the gradient it holds; one without a gradient stays."""
-        for group in self.param_groups:
-            moved = [weight for weight in group["params"] if weight.grad is not None]
+        for group, thirds in zip(self.param_groups, self._thirds, strict=True):
+            given = zip(group["params"], thirds, strict=True)
+            held = [(weight, 3 if cut else 1) for weight, cut in given if weight.grad is not None]
+            moved = [weight for weight, _ in held]
             by_shape = defaultdict[torch.Size, list[tuple[Tensor, Tensor]]](list)
-            for weight, wanted in zip(moved, self._wanted(moved, group["momentum"]), strict=True):
-                parts = 3 if id(weight) in self._thirds else 1
+            wanted_steps = self._wanted(moved, group["momentum"])
+            for (weight, parts), wanted in zip(held, wanted_steps, strict=True):
                 for pair in zip(weight.chunk(parts), wanted.chunk(parts), strict=True):
                     by_shape[pair[0].shape].append(pair)
             for pairs in by_shape.values():

@@ -1,5 +1,6 @@
 """Muon in float32 is Muon: the iteration by singular values, torch's own, and nothing new."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -187,3 +188,18 @@ def test_processes_that_share_the_work_move_alike(
             found = shared_out(list(several), work, torch.float32)
         assert torch.equal(found, work(list(several))), "the last to be asked was told everything"
         told.clear()
+
+
+def test_a_copy_moves_the_copied_weights_alike() -> None:
+    """Torch's optimisers forget fields of their subclasses when they are copied."""
+    weights = [torch.nn.Parameter(torch.randn(6, 4)), torch.nn.Parameter(torch.randn(4, 4))]
+    first = muon(weights, 0.1, "float32", thirds=weights[:1])
+    second = copy.deepcopy(first)
+    copies = second.param_groups[0]["params"]
+    for ours, theirs in zip(weights, copies, strict=True):
+        ours.grad = torch.randn_like(ours)
+        theirs.grad = ours.grad.clone()
+    first.step()
+    second.step()
+    for ours, theirs in zip(weights, copies, strict=True):
+        assert torch.equal(ours, theirs)
