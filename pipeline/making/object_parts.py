@@ -25,6 +25,7 @@ from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.claims import claimed
 from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
 from storage.records.asset import least_triangles_in
 from storage.records.objects import Failure, ObjectRecord
 
@@ -112,6 +113,14 @@ class ObjectPart:
                 return self._proof(rows)
             except FileNotFoundError:
                 continue
+            except PermissionError as error:
+                if path == self._kept:  # somebody else's cache: what it knows is found out again
+                    continue
+                raise TrilightError(
+                    f"{path}: {error.strerror}; expected a file that every maker of the dataset "
+                    "may read. Make them members of one group that may read its folder, or run as "
+                    "one user."
+                ) from error
             except (KeyError, TypeError, ValueError):
                 path.unlink(missing_ok=True)  # damaged: it is made again
         return None

@@ -13,6 +13,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset
 from pipeline.making import object_parts
 from pipeline.making.object_parts import Proof, cut_objects, prepare_in_parts
+from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
 from tests.pipeline.making.frozen_kit import prepared
 
@@ -189,3 +190,24 @@ def test_a_damaged_proof_is_none(mesher: Mesher, tmp_path: Path, damage: bytes) 
         path.write_bytes(damage)
     assert _prepare(records, tmp_path / "two") == expected
     assert max(mesher.made.values()) == 2
+
+
+def test_of_a_file_of_another_user(
+    mesher: Mesher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a cache it is as if it were not there; beside the dataset it is said what to do."""
+    records = _records(tmp_path / "objects", 3)
+    expected = _prepare(records, tmp_path / "one")
+    read = Path.read_bytes
+    unreadable = tmp_path / "cache"
+
+    def refused(path: Path) -> bytes:
+        if path.is_relative_to(unreadable) and path.exists():
+            raise PermissionError(13, "Permission denied", str(path))
+        return read(path)
+
+    monkeypatch.setattr(Path, "read_bytes", refused)
+    assert _prepare(records, tmp_path / "two") == expected
+    unreadable = tmp_path / "two"
+    with pytest.raises(TrilightError, match="Permission denied; expected a file that every maker"):
+        _prepare(records, tmp_path / "two")
