@@ -1,17 +1,18 @@
 """A dataset's order with the settings of another dataset or of a file in it."""
 
 import dataclasses
-from typing import Any
+from typing import Any, TypeVar
 
 from infra.cli.changes import Shared, all_changes, dataset_record
 from pipeline.builds.named import named_build
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.renders.settings import asked_floors
 
+Order = TypeVar("Order", bound=DatasetOrder)
 _LICENCES = "allowed_licences"
 
 
-def with_shared(order: DatasetOrder, shared: Shared) -> DatasetOrder:
+def with_shared(order: Order, shared: Shared) -> Order:
     """Return an order whose changes are all that differs from its build.
 
     Raises:

@@ -9,9 +9,11 @@ from infra.cli.console import first_words, next_step
 from infra.cli.dataset_changes import with_shared
 from infra.cli.flow_runs import FlowRuns, run_flow
 from infra.cli.options import Shown, command
-from infra.cli.submit_array import ARRAYS, ArrayAsked, submit_to_array
+from infra.cli.submit_array import ArrayAsked, submit_to_array
 from infra.improve.order import ImproveOrder
 from pipeline.executors.arrays.machines import ArrayMachines
+from pipeline.executors.arrays.order import DatasetByArray
+from pipeline.executors.arrays.submission import ARRAYS
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -19,6 +21,8 @@ from storage.settings.described import checked
 app = App(name="submit", usage="trilight submit FLOW BUILD [OPTIONS]")
 IMPROVE = "improve"
 """A flow with options of its own, those of `trilight improve`."""
+BY_ARRAY = "make-by-array"
+"""A flow that asks a scheduler, and shows what its tasks make."""
 FLOWS = ("generate-scenes", "prepare-assets", "build-dataset")
 """Flows that take the options of `trilight generate`."""
 
@@ -28,13 +32,13 @@ class Submission:
     """Who is to make it."""
 
     flow: str
-    """Flow to run: generate-scenes, prepare-assets (objects alone) or build-dataset, or improve,
-    which has options of its own; or without any server, as an array of tasks for what is missing:
-    slurm, kubernetes, sky, aws-batch or google-batch."""
+    """Flow to run: generate-scenes, prepare-assets (objects alone) or build-dataset, or improve and
+    make-by-array, which have options of their own; or without any server, as an array of tasks for
+    what is missing: slurm, kubernetes, sky, aws-batch or google-batch."""
 
     def __post_init__(self) -> None:
         if self.flow not in (*FLOWS, *ARRAYS):
-            served = ", ".join((*FLOWS, IMPROVE))
+            served = ", ".join((*FLOWS, BY_ARRAY, IMPROVE))
             raise TrilightError(
                 f"flow {self.flow!r} is unknown; expected one of {served}, or of "
                 f"{', '.join(ARRAYS)}."
@@ -66,6 +70,21 @@ def submit(
 
     given = parameters(with_shared(order, shared))
     ended = run_flow(submission.flow, given, runs, where=order.place, as_json=shown.json)
+    if ended and not shown.json and Path(order.place).is_dir():
+        next_step(["verify", order.place], ["inspect", order.place])
+
+
+@app.command(
+    name=BY_ARRAY,
+    help="Have a worker of a Prefect server submit what is missing as an array; watch it there.",
+)
+@command("build")
+def submit_by_array(order: DatasetByArray, shared: Shared, runs: FlowRuns, shown: Shown) -> None:
+    first_words(f"Submitting {BY_ARRAY} with the build {order.build}", silent=shown.json)
+    from pipeline.flows.submission import parameters
+
+    given = parameters(with_shared(order, shared))
+    ended = run_flow(BY_ARRAY, given, runs, where=order.place, as_json=shown.json)
     if ended and not shown.json and Path(order.place).is_dir():
         next_step(["verify", order.place], ["inspect", order.place])
 

@@ -10,16 +10,13 @@ from pipeline.executors.arrays.form import submit_form
 from pipeline.executors.arrays.forms import FORMS
 from pipeline.executors.arrays.job import ArrayJob, array_job
 from pipeline.executors.arrays.machines import ArrayMachines
-from pipeline.executors.slurm_array import sbatch_environment, sbatch_words, submit_array
+from pipeline.executors.arrays.submission import SLURM, submitted
+from pipeline.executors.slurm_array import sbatch_environment, sbatch_words
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
 from storage.settings.described import checked
 from storage.settings.ranges import Within
-
-SLURM = "slurm"
-ARRAYS = (SLURM, *FORMS)
-"""Stand in the place of a flow."""
 
 
 @checked()
@@ -64,7 +61,7 @@ def _refuse_of_others(on: str, asked: ArrayAsked, machines: ArrayMachines) -> No
 
 
 def _submit_slurm(job: ArrayJob, asked: ArrayAsked, *, as_json: bool) -> None:
-    number = None if asked.dry_run else submit_array(job, asked.sbatch)
+    number = None if asked.dry_run else submitted(job, SLURM, ArrayMachines(), asked.sbatch)
     if as_json:
         array = number_ranges(job.tasks)
         print_json({"job": number, "array": array, "shards_per_task": job.per_task})

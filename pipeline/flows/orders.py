@@ -1,7 +1,7 @@
 """Converts the parameters of a flow run (from Prefect's forms) to orders."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pipeline.flows.forms import (
     BuildChanges,
@@ -15,6 +15,8 @@ from storage.dataset.shard_places import MAX_SHARDS
 from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import Within
+
+Order = TypeVar("Order", bound=DatasetOrder)
 
 DATASET_FORMS: Mapping[str, Any] = {
     "build": BuildName,
@@ -49,12 +51,20 @@ def dataset_order(parameters: Mapping[str, Any]) -> DatasetOrder:
     Raises:
         TrilightError: a value that no schema can refuse; the message names it.
     """
-    return DatasetOrder(**_values(parameters, DatasetOrder))
+    return order_of(parameters, DatasetOrder)
 
 
 def dataset_in_runs(parameters: Mapping[str, Any]) -> DatasetInRuns:
     """Return the order in several runs that a flow's parameters state; raises as above."""
-    return DatasetInRuns(**_values(parameters, DatasetInRuns))
+    return order_of(parameters, DatasetInRuns)
+
+
+def order_of(parameters: Mapping[str, Any], kind: type[Order]) -> Order:
+    """Return the order of a kind that a flow's parameters state; raises as above."""
+    values = {name: parameters[name] for name in kind.__dataclass_fields__}
+    values["allow_licences"] = tuple(values["allow_licences"])
+    values["changes"] = changed_values(values["changes"])
+    return kind(**values)
 
 
 def run_name() -> str:
@@ -64,10 +74,3 @@ def run_name() -> str:
     given = {"build": DatasetOrder.build, **flow_run.parameters}
     parts = (given["build"], given.get("scenes"), given.get("out"))
     return "-".join(str(part) for part in parts if part is not None)
-
-
-def _values(parameters: Mapping[str, Any], kind: type[DatasetOrder]) -> dict[str, Any]:
-    values = {name: parameters[name] for name in kind.__dataclass_fields__}
-    values["allow_licences"] = tuple(values["allow_licences"])
-    values["changes"] = changed_values(values["changes"])
-    return values

@@ -59,7 +59,8 @@ def _trilight_words(line: str) -> list[str]:
 
 
 def _command(words: list[str]) -> tuple[str, ...]:
-    is_within = words[0] == "shards" or words[:2] == ["submit", "improve"]
+    own = (["submit", "improve"], ["submit", "make-by-array"])
+    is_within = words[0] == "shards" or words[:2] in own
     return tuple(words[: 2 if is_within else 1])
 
 

@@ -72,4 +72,7 @@ def test_who_does_not_watch_gets_the_run(asked: list[Any]) -> None:
 
 
 def test_a_flow_that_is_none_is_told_those_there_are() -> None:
-    assert "build-dataset, improve, or of slurm" in trilight(["submit", "x", "smoke"]).mistake
+    assert (
+        "build-dataset, make-by-array, improve, or of slurm"
+        in trilight(["submit", "x", "smoke"]).mistake
+    )

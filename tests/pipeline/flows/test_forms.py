@@ -9,6 +9,7 @@ from prefect.exceptions import ParameterTypeError
 from infra.serving.improve_loop import improve_loop
 from infra.serving.train_model import train_model
 from pipeline.builds.settings import BuildSettings
+from pipeline.flows.array_flow import make_by_array
 from pipeline.flows.dataset_flows import build_dataset, generate_scenes, prepare_assets
 from pipeline.flows.forms import BuildChanges, changed_values
 from pipeline.flows.orders import dataset_order
@@ -21,6 +22,7 @@ FLOWS = {
     "prepare-assets": prepare_assets,
     "generate-scenes": generate_scenes,
     "build-dataset": build_dataset,
+    "make-by-array": make_by_array,
     "train-model": train_model,
     "improve": improve_loop,
 }
