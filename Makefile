@@ -14,8 +14,10 @@ setup: $(VENV)/.dataset-ready  ## what making data needs
 
 setup-all: $(VENV)/.all-ready  ## that, torch, and the tools of the tests
 
-dataset: setup  ## 24 scenes of built-in objects, verified
-	trilight generate smoke --objects builtin: --out data/smoke --scenes 24
+SCENES := 24
+
+dataset: setup  ## scenes of built-in objects, verified: 24, or SCENES=N
+	trilight generate smoke --objects builtin: --out data/smoke --scenes $(SCENES)
 	trilight verify data/smoke
 
 test: setup-all  ## the tests that take minutes, on two cores; a third of that is waiting, hence four workers

@@ -27,7 +27,7 @@ from tests.end_to_end.conftest import (
 )
 
 ARGUMENTS = (
-    "generate", "smoke", "--objects", "builtin:", "--scenes", "24",
+    "generate", "smoke", "--objects", "builtin:24", "--scenes", "24",
     "--resolution", "32", "--noise-floor", "20", "--seed", "0",
 )  # fmt: skip
 KILLS = 6

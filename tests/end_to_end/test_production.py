@@ -34,7 +34,7 @@ MANY, FEW = 40, 12
 then starts a process, comes before the first has made them all; and three shards."""
 SMALL: dict[str, Any] = {"scenes": MANY, "resolution": 64, "noise_floor_db": 20}
 """Tiny scenes, as wide as the smoke run's pictures."""
-OPTIONS = ("--objects", "builtin:", "--resolution", "64", "--noise-floor", "20")
+OPTIONS = ("--objects", "builtin:24", "--resolution", "64", "--noise-floor", "20")
 CANARY = "CANARY-51b2"
 RUN_S = 900
 """A run takes a minute; on busy machines many times that."""

@@ -84,7 +84,9 @@ def test_a_black_sky_is_none() -> None:
     np.testing.assert_array_equal(pictures[2], pictures[0])
 
 
-@pytest.mark.parametrize("tracer", TRACERS)
+@pytest.mark.parametrize(
+    "tracer", [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow)]
+)
 def test_a_seen_sky_stands_behind_everything(tracer: Any) -> None:
     hidden, seen = (open_scene(smooth(64, is_seen=flag)) for flag in (False, True))
     camera = camera_of(hidden, 64)
