@@ -42,7 +42,8 @@ RUN_S = 600
 
 def _parameters(out: Path) -> list[str]:
     parameters = {
-        "objects": "builtin:24", "scenes": SCENES, "resolution": 32, "noise_floor_db": 20, "out": out,
+        "objects": "builtin:24", "scenes": SCENES, "resolution": 32, "noise_floor_db": 20,
+        "out": out,
     }  # fmt: skip
     return [word for key, value in parameters.items() for word in ("-p", f"{key}={value}")]
 
