@@ -7,6 +7,7 @@ be killed: another run shows the same. Image, machines and accounts are the work
 """
 
 import time
+from collections.abc import Callable
 from typing import Any, cast
 from uuid import UUID
 
@@ -141,7 +142,7 @@ class ShownArray:
     def _picture(self, sheet: str) -> None:
         create_image_artifact(sheet, key="contact-sheet", description=self._place)
 
-    def _shown(self, show: Any) -> None:
+    def _shown(self, show: Callable[[], None]) -> None:
         try:
             show()
         except Exception as error:  # a server away for a moment must not end what is watched
