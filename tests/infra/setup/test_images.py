@@ -189,7 +189,7 @@ def test_the_worker_keeps_to_its_namespace_and_jobs_name_the_secret(
 
 def test_deployments_name_flows_that_are_there() -> None:
     found = yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]
-    assert len(found) == 16  # five flows in three ways, and one whose worker is where a scheduler is
+    assert len(found) == 16  # five flows in three ways, and one beside a scheduler
     assert {row["name"] for row in found} == {"local", "docker", "kubernetes"}
     for row in found:
         path, function = row["entrypoint"].split(":")
