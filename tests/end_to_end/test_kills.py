@@ -116,7 +116,7 @@ def test_kills_of_children_end_in_the_same_digest(tmp_path: Path) -> None:
         return sum(len(log.read_text().splitlines()) for log in (out / "logs").glob("*.jsonl"))
 
     run, killed = _start(out, 2, environment), Counter[str]()
-    moments = [("meshes", at) for at in (6, 18, 30, 42)] + [("scenes", at) for at in (1, 5, 9, 13)]
+    moments = [("meshes", at) for at in (3, 8, 13, 18)] + [("scenes", at) for at in (1, 5, 9, 13)]
     for what, at in moments:
         while (num_meshes(cache) if what == "meshes" else num_scenes()) < at:
             if run.poll() is not None:  # three kills of one set-up end a run; it goes on
