@@ -32,7 +32,9 @@ from tests.end_to_end.production_kit import (
 MANY, FEW = 40, 12
 """Scenes, four to a shard: so many that a second worker, which looks for work every ten seconds and
 then starts a process, comes before the first has made them all; and three shards."""
-SMALL: dict[str, Any] = {"scenes": MANY, "resolution": 64, "noise_floor_db": 20}
+SMALL: dict[str, Any] = {
+    "objects": "builtin:24", "scenes": MANY, "resolution": 64, "noise_floor_db": 20,
+}  # fmt: skip
 """Tiny scenes, as wide as the smoke run's pictures."""
 OPTIONS = ("--objects", "builtin:24", "--resolution", "64", "--noise-floor", "20")
 CANARY = "CANARY-51b2"
@@ -127,7 +129,7 @@ def _refuses_secrets(tmp_path: Path, environment: dict[str, str], database: Post
     """Neither the database, its log nor ours ever sees what was refused, and the rest names it."""
     with pytest.raises(AssertionError, match="Validation failed for field 'objects'"):
         secret = f"https://me:{CANARY}@host/folder"
-        call(documented_run(**SMALL, out=tmp_path / "no", objects=secret), environment, RUN_S)
+        call(documented_run(**{**SMALL, "objects": secret}, out=tmp_path / "no"), environment, RUN_S)
     rows = database.dump()
     assert str(tmp_path / "one") in rows  # parameters are in what is looked through, and so are
     assert "packed, 4 scenes" in rows  # the lines of logs
