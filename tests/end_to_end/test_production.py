@@ -129,7 +129,9 @@ def _refuses_secrets(tmp_path: Path, environment: dict[str, str], database: Post
     """Neither the database, its log nor ours ever sees what was refused, and the rest names it."""
     with pytest.raises(AssertionError, match="Validation failed for field 'objects'"):
         secret = f"https://me:{CANARY}@host/folder"
-        call(documented_run(**{**SMALL, "objects": secret}, out=tmp_path / "no"), environment, RUN_S)
+        call(
+            documented_run(**{**SMALL, "objects": secret}, out=tmp_path / "no"), environment, RUN_S
+        )
     rows = database.dump()
     assert str(tmp_path / "one") in rows  # parameters are in what is looked through, and so are
     assert "packed, 4 scenes" in rows  # the lines of logs
