@@ -5,7 +5,7 @@ It stands in `infra`, where making and learning may both be seen. Making a round
 is done adds a table of weights and losses, and a picture of all rounds so far.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, cast
 from uuid import UUID
@@ -35,8 +35,7 @@ from pipeline.flows.forms import (
 )
 from pipeline.flows.prefect_runner import PrefectRunner
 from pipeline.flows.submission import WHOLE
-from pipeline.flows.watching import make_watched, small_picture
-from storage.remote.safe_url import safe_text
+from pipeline.flows.watching import Forgiving, make_watched, small_picture
 
 IMPROVE_FORMS: Mapping[str, Any] = {
     "build": BuildName,
@@ -99,6 +98,7 @@ class _Shown:
         self._rounds = Rounds(order)
         self._found: list[Lessons] = []
         self._log = get_run_logger()
+        self._shown = Forgiving(self._log)
         self._progress: UUID | None = None
 
     def begins(self, number: int, what: str) -> None:
@@ -135,10 +135,3 @@ class _Shown:
         create_table_artifact(rows, key="strata", description=what)
         picture = small_picture(picture_of(self._rounds))
         create_image_artifact(picture, key="rounds", description=self._rounds.order.out)
-
-    def _shown(self, show: Callable[[], object]) -> None:
-        try:
-            show()
-        except Exception as error:  # a server away for a moment must not cost hours of work
-            why = safe_text(str(error).partition("\n")[0])
-            self._log.warning("what this page shows is not complete (%s)", why)

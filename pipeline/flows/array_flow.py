@@ -7,7 +7,6 @@ be killed: another run shows the same. Image, machines and accounts are the work
 """
 
 import time
-from collections.abc import Callable
 from typing import Any, cast
 from uuid import UUID
 
@@ -25,7 +24,7 @@ from pipeline.executors.arrays.order import DatasetByArray
 from pipeline.executors.arrays.submission import machines_here, submitted
 from pipeline.flows.forms import parameters_of
 from pipeline.flows.orders import DATASET_FORMS, order_of, run_name
-from pipeline.flows.watching import small_picture
+from pipeline.flows.watching import Forgiving, small_picture
 from storage.dataset.layout import dataset_folder
 from storage.dataset.progress import DatasetStatus, missing_shards, read_status
 from storage.errors import TrilightError
@@ -94,7 +93,7 @@ class ShownArray:
 
     def __init__(self, place: str) -> None:
         self._place = place
-        self._warned = False
+        self._shown = Forgiving(get_run_logger())
         self._rows: list[tuple[str, str]] = []
         self._progress: UUID | None = None
         self._shown(self._begin)
@@ -141,14 +140,6 @@ class ShownArray:
 
     def _picture(self, sheet: str) -> None:
         create_image_artifact(sheet, key="contact-sheet", description=self._place)
-
-    def _shown(self, show: Callable[[], None]) -> None:
-        try:
-            show()
-        except Exception as error:  # a server away for a moment must not end what is watched
-            if not self._warned:
-                self._warned = True
-                get_run_logger().warning("what this page shows is not complete (%s)", error)
 
 
 def _failures(status: DatasetStatus) -> list[tuple[str, str]]:

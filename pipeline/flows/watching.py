@@ -54,6 +54,23 @@ def make_watched(order: DatasetOrder, runner: Runner) -> Outcome:
     return outcome
 
 
+class Forgiving:
+    """Shows what it is called with; what cannot be shown is told once, and never ends the run."""
+
+    def __init__(self, log: "logging.Logger | logging.LoggerAdapter[logging.Logger]") -> None:
+        self._log, self._warned = log, False
+
+    def __call__(self, show: Callable[[], object]) -> None:
+        """Show something on the page of a run."""
+        try:
+            show()
+        except Exception as error:  # a server away for a moment must not cost hours of work
+            if not self._warned:
+                self._warned = True
+                why = safe_text(str(error).partition("\n")[0])
+                self._log.warning("what this page shows is not complete (%s)", why)
+
+
 class Watched:
     """The artifacts of one flow run."""
 
@@ -70,9 +87,9 @@ class Watched:
         self._told = -_EVERY_S
         self._scenes = 0
         self._core_s = 0.0
-        self._warned = False
         self._progress: UUID | None = None
         self._log = get_run_logger()
+        self._shown = Forgiving(self._log)
         self._shown(self._begin)
 
     def task_done(self, run: Run, outcome: TaskOutcome) -> None:
@@ -103,15 +120,6 @@ class Watched:
     def scenes_per_s(self) -> float:
         """Return the rate of this run since its first scene was begun; 0 before one is made."""
         return self._scenes / (time.monotonic() - self._began) if self._began is not None else 0.0
-
-    def _shown(self, show: Callable[[], None]) -> None:
-        try:
-            show()
-        except Exception as error:  # a server away for a moment must not cost hours of pictures
-            if not self._warned:
-                self._warned = True
-                why = safe_text(str(error).partition("\n")[0])
-                self._log.warning("what this page shows is not complete (%s)", why)
 
     def _begin(self) -> None:
         # Prefect's functions return coroutines only where an event loop runs

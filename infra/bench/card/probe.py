@@ -3,13 +3,13 @@
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import torch
 
 from infra.bench.card.effort import CardEffort
+from model.precision import quick_products
 
 _ASKED = ("driver_version", "memory.total", "power.limit", "clocks.max.sm", "clocks.max.mem")
 """What nvidia-smi is asked for; neither a serial number nor an identifier is."""
@@ -65,22 +65,11 @@ def product_rates(device: torch.device, effort: CardEffort) -> dict[str, float]:
     width = effort.product_width
     rates = {"float32": _rate(device, torch.float32, width)}
     if device.type == "cuda":
-        with tensor_float32():
+        with quick_products(device, wanted=True):
             rates["tf32"] = _rate(device, torch.float32, width)
         rates["bfloat16"] = _rate(device, torch.bfloat16, width)
         rates["float16"] = _rate(device, torch.float16, width)
     return rates
-
-
-@contextmanager
-def tensor_float32() -> Iterator[None]:
-    """Allow TF32 in products for a while."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high")
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)
 
 
 def _rate(device: torch.device, dtype: torch.dtype, width: int) -> float:
