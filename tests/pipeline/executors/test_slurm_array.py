@@ -49,7 +49,7 @@ def test_ranges(numbers: tuple[int, ...], text: str) -> None:
     assert number_ranges(numbers) == text
 
 
-def test_an_array_fits_the_cluster_and_covers_every_shard() -> None:
+def test_an_array_fits_the_cluster_and_covers_every_shard(cluster: Path) -> None:
     order = DatasetOrder(build="pretrain-256", scenes=2_000_000)
     job = array_job(order, per_task=None, at_once=None)
     shards = -(-2_000_000 // 256)
@@ -59,7 +59,7 @@ def test_an_array_fits_the_cluster_and_covers_every_shard() -> None:
         array_job(order, per_task=1, at_once=None)
 
 
-def test_settings_that_divide_the_dataset_count() -> None:
+def test_settings_that_divide_the_dataset_count(cluster: Path) -> None:
     changes = {"splits.scenes_per_shard": 8}
     order = DatasetOrder(build="smoke", scenes=64, changes=changes, objects="my objects")
     job = array_job(order, per_task=2, at_once=3)
