@@ -21,7 +21,9 @@ def answering_card() -> Any:
         patch.setattr(torch.cuda, "max_memory_allocated", lambda *_: 3 << 30)
         # nothing is computed, so that no kernel could be seen
         patch.setattr(
-            ten_steps, "profiled", lambda step, device: {"of": str(device), "ran": step()}
+            ten_steps,
+            "profiled",
+            lambda step, device: {"of": str(device), "ran": step(), "kernels": 7},
         )
         yield
 

@@ -49,6 +49,7 @@ def test_on_a_card_with_too_little_memory_fewer_scenes_are_taken(tmp_path: Path)
     assert (enough["asked_scenes"], enough["scenes"]) == (2, 1)
     assert enough["lpips"] and enough["muon"] and enough["peak_gib"] == 3
     assert enough["profile"]["of"] == "cuda:0"
+    assert enough["not_compiled"]["kernels"] == 7, "kernel by kernel too: what compiling brings"
     assert little["failed"] == "too little memory, even for one scene a pass"
 
 
