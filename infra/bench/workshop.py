@@ -30,9 +30,9 @@ from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from pipeline.making.accept_objects import accept_objects
 from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.attempt_scene import SceneRecipe, set_up_child
+from pipeline.making.begin_publication import begin
 from pipeline.making.environment import environment
 from pipeline.making.prepare_isolated import preload_mesh_libraries
-from pipeline.making.publication import begin
 from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import DatasetFolder
 from storage.errors import Rejected, TrilightError

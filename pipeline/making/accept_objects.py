@@ -4,9 +4,9 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 
-from pipeline.making.accept_maps import accept_maps
+from pipeline.making.accept_maps import AcceptedMaps, accept_maps
 from pipeline.making.asked_objects import AskedObjects
-from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects
+from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects, require_same
 from pipeline.making.lock_parts import LockPart
 from pipeline.making.object_parts import Proof, prepare_in_parts, proved
 from pipeline.making.prepare_isolated import prepare_isolated
@@ -15,6 +15,7 @@ from storage.dataset.progress import announce_objects, count_object
 from storage.errors import TrilightError
 from storage.records.lock_rows import LockRows
 from storage.records.object_index import ObjectIndex
+from storage.remote.safe_url import safe_url
 
 
 def share_mesh_work(order: AskedObjects, part: LockPart) -> FoundObjects | None:
@@ -26,14 +27,14 @@ def share_mesh_work(order: AskedObjects, part: LockPart) -> FoundObjects | None:
     Raises:
         TrilightError: as `find_objects` and `prepare_in_parts`.
     """
-    folder = order.publication.folder
-    with folder.turn("objects"):  # one maker downloads, and the others find it done
-        order.publication.refresh()
-        if part.frozen(order.publication) is not None:
+    publication = order.publication
+    with publication.folder.turn("objects"):  # one maker downloads, and the others find it done
+        publication.refresh()
+        if part.frozen(publication) is not None:
             return None
-        found = order.found()
-        announce_objects(folder, len(found.records))
-    _proofs(found, order, part, enough=part.index.exists)
+        found = order.found(part)
+        announce_objects(publication.folder, len(found.records))
+    _proofs(found, order, part, enough=lambda: publication.has(part.index))
     return found
 
 
@@ -57,8 +58,8 @@ def accept_objects(
     if trusted := trusted_objects(order, part):
         return trusted
     frozen = part.frozen(order.publication)
-    shared, found = found is not None, found or order.found()
-    maps = accept_maps(order.own, settings, workers=order.workers)
+    shared, found = found is not None, found or order.found(part)
+    maps = _same_maps(accept_maps(order.own, settings, workers=order.workers), order, part)
     if frozen is None:
         prepared, rejected = _proofs(found, order, part, again=not shared)
     else:
@@ -71,11 +72,20 @@ def accept_objects(
             done=lambda: count_object(folder),
         )
         prepared = [*map(proved, assets)]
-        maps = replace(maps, rows=tuple(row for row in maps.rows if row[0].uid in frozen))
     accepted = freeze_objects(order, found, prepared, rejected, maps, part)
     if part.number is None:
         shutil.rmtree(folder.staged_parts, ignore_errors=True)
     return accepted
+
+
+def _same_maps(maps: AcceptedMaps, order: AskedObjects, part: LockPart) -> AcceptedMaps:
+    """Return those of the maps that the dataset was begun with, or all where that is now."""
+    frozen = part.frozen_maps(order.publication)
+    if frozen is None:
+        return maps
+    kept = tuple(row for row in maps.rows if row[0].uid in frozen)
+    require_same(safe_url(order.source), frozen, [entry for entry, _ in kept])
+    return replace(maps, rows=kept)
 
 
 def _proofs(
@@ -89,6 +99,7 @@ def _proofs(
         [record for record in found.records if part.holds(record.uid)],
         order.settings.mesh_settings,
         part.folder.staged_parts,
+        others=order.publication if part.folder.bucket else None,
         workers=order.workers,
         done=lambda count: count_object(part.folder, count),
         enough=enough,
@@ -107,6 +118,7 @@ def trusted_objects(order: AskedObjects, part: LockPart | None = None) -> Accept
         TrilightError: as `accept_maps`.
     """
     part = part or order.whole
+    part.take(order.publication)
     try:
         facts = ObjectIndex(part.index).facts
         lock = LockRows(part.lock)
@@ -118,7 +130,8 @@ def trusted_objects(order: AskedObjects, part: LockPart | None = None) -> Accept
     except TrilightError:
         return None
     found = accept_maps(order.own, order.settings, workers=order.workers)
-    maps = tuple(row for row in found.rows if lock.find(row[0].uid) == row[0])
+    kept = LockRows(part.maps) if facts.num_maps and part.maps.exists() else lock
+    maps = tuple(row for row in found.rows if kept.find(row[0].uid) == row[0])
     if len(maps) != facts.num_maps:  # the long way says which one has changed
         return None
     return AcceptedObjects(

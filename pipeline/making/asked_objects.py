@@ -1,13 +1,14 @@
 """What is asked for where the objects of a dataset are frozen."""
 
 from dataclasses import dataclass
+from functools import partial
 
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.accept_maps import NO_FOLDERS, MapFolders
 from pipeline.making.frozen_pool import FrozenPool
 from pipeline.making.lock_parts import LockPart
 from pipeline.making.publication import Publication
-from pipeline.objects.sources import FoundObjects, find_objects
+from pipeline.objects.sources import FoundObjects, list_objects
 from storage.dataset.progress import announce_downloads
 from storage.digests import canonical_json, sha256_hex
 
@@ -45,13 +46,13 @@ class AskedObjects:
             lock=part.lock, index=part.index, source=self.source, licence=self.licence
         )
 
-    def found(self) -> FoundObjects:
-        """List the source, and download what is not here; raises as `find_objects`."""
+    def found(self, part: LockPart) -> FoundObjects:
+        """List the source, and download what of a part is not here; raises as `find_objects`."""
         folder = self.publication.folder
-        return find_objects(
+        listed = list_objects(
             self.source,
             work_dir=folder.staged_objects,
             allowed_licences=self.settings.allowed_licences,
             licence=self.licence,
-            downloaded=lambda done, total: announce_downloads(folder, done, total),
         )
+        return listed.found(part.holds, partial(announce_downloads, folder))

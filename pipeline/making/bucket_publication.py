@@ -1,13 +1,16 @@
 """The manifest of a dataset that is made in a bucket, by makers on any number of machines."""
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from pipeline.builds.settings import BuildSettings
-from pipeline.making.publication import Publication, begin, require_free
+from pipeline.making.begin_publication import begin, require_free
+from pipeline.making.publication import Publication
 from pipeline.shards.mirror import Mirror
+from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder, parts_of, shard_names_in, shard_names_in_part
 from storage.dataset.manifest import Manifest, read_head, read_manifest
@@ -15,7 +18,12 @@ from storage.dataset.settings import SplitSettings
 from storage.dataset.shard_notes import ShardNote, note_shard, noted_names
 from storage.dataset.splits import shard_name
 from storage.errors import TrilightError
-from storage.records.objects import LockedObject, encode_objects_lock
+from storage.records.objects import (
+    Failure,
+    LockedObject,
+    encode_failures,
+    encode_objects_lock,
+)
 from storage.remote.bucket import Bucket
 from storage.remote.url import RemoteUrl, parse_url
 
@@ -39,14 +47,39 @@ class BucketPublication(Publication):
     def send_documents(self) -> None:
         self._mirror.send_documents()
 
-    def send_index(self) -> None:
-        self._mirror.send_index()
-
     def lock_objects(self, objects: list[LockedObject]) -> None:
         self.add_failures(())  # where nothing was rejected, there is a file that says so
         self._mirror.freeze(encode_objects_lock(objects))
         super().lock_objects(objects)
         self._mirror.send_manifest()
+
+    def take_lock(self) -> None:
+        if not self.manifest.objects_lock_sha256 and (theirs := self._mirror.take_lock()):
+            with self._turn():
+                self._write(objects_lock_sha256=theirs)
+
+    def take(self, files: Iterable[Path]) -> None:
+        self._mirror.take(files)
+
+    def send(self, path: Path) -> None:
+        self._mirror.send_file(path)
+
+    def has(self, path: Path) -> bool:
+        return path.exists() or self._mirror.has(path)
+
+    def freeze_lock_part(
+        self, path: Path, rows: Iterable[LockedObject], failures: Iterable[Failure] = ()
+    ) -> None:
+        lock = encode_objects_lock(rows)
+        self._mirror.freeze_part(path, lock, encode_failures(failures))
+        write_atomically(path, lock)
+
+    def join_lock_parts(self) -> None:
+        self.add_failures(self._mirror.take_parts_of_lock())
+        before = self.manifest.objects_lock_sha256
+        super().join_lock_parts()
+        if self.manifest.objects_lock_sha256 != before:
+            self._mirror.replace_lock()
 
     def _note(self, note: ShardNote) -> None:
         if self.folder.shard(note.shard.name).exists():  # else another machine has sent it
@@ -162,6 +195,6 @@ def forget_empty(folder: DatasetFolder) -> None:
     while alone in the folder; whoever was at it all the same finds out (`Publication.refresh`).
     """
     with contextlib.suppress(TrilightError):  # an unreadable one is told of by whoever needs it
-        frozen = read_head(folder.manifest).objects_lock_sha256
+        frozen = read_head(folder.manifest).objects_lock_sha256 or folder.lock_parts()
         if not (frozen or folder.shard_files()) and not any(folder.staged_samples.rglob("*.tar")):
             folder.manifest.unlink()

@@ -81,18 +81,19 @@ def freeze_objects(
     if frozen is not None:
         for failure in passing:
             require_tried(shown, failure)
-    publication.add_failures([*found.failures, *rejected, *maps.failures])
+    failures = [*found.failures, *rejected, *maps.failures]
+    publication.add_failures(failures)
     objects = [_locked(asset, settings) for asset in prepared]
-    locked = [*objects, *(entry for entry, _ in maps.rows)]
+    own = [entry for entry, _ in maps.rows]
     if frozen is None:
         _require_enough(objects, part, publication, shown)
         _warn_of(shown, passing)
         _tell_of_materials(shown, prepared)
-        part.freeze(publication, locked)
+        part.freeze(publication, objects, own, failures)
     else:
-        _require_same_objects(shown, frozen, locked)
-    part.write_rows(locked)
-    _index(publication, part, locked, prepared, order.digest, found.num_found)
+        require_same(shown, frozen, [*objects, *own])
+        part.restore(objects)
+    _index(order, part, [*objects, *own], prepared, found.num_found)
     return AcceptedObjects(
         num_objects=len(objects),
         num_found=found.num_found,
@@ -102,18 +103,18 @@ def freeze_objects(
 
 
 def _index(
-    publication: Publication,
+    order: AskedObjects,
     part: LockPart,
     locked: list[LockedObject],
     prepared: list[ProvedObject],
-    asked: str,
     num_found: int,
 ) -> None:
     """Write the index of the lock, by which later makers trust it."""
     assets = {asset.record.uid: asset for asset in prepared}
+    rows = [entry for entry in locked if part.number is None or entry.kind == OBJECT]
     objects, offset = [], 0
     with part.lock.open("rb") as lines:
-        for line, entry in zip(lines, sorted(locked, key=attrgetter("uid")), strict=True):
+        for line, entry in zip(lines, sorted(rows, key=attrgetter("uid")), strict=True):
             if entry.kind == OBJECT:
                 asset = assets[entry.uid]
                 objects.append(
@@ -130,12 +131,11 @@ def _index(
         objects,
         lock_sha256=sha256_of_file(part.lock),
         lock_bytes=offset,
-        asked=asked,
+        asked=order.digest,
         num_found=num_found,
         num_maps=len(locked) - len(objects),
     )
-    if part.number is None:
-        publication.send_index()
+    order.publication.send(part.index)
 
 
 def frozen_objects(publication: Publication) -> dict[str, LockedObject] | None:
@@ -220,9 +220,8 @@ def _tell_of_materials(source: str, prepared: list[ProvedObject]) -> None:
         )
 
 
-def _require_same_objects(
-    source: str, frozen: dict[str, LockedObject], now: list[LockedObject]
-) -> None:
+def require_same(source: str, frozen: dict[str, LockedObject], now: list[LockedObject]) -> None:
+    """Raise TrilightError where a frozen row is not among those of now."""
     by_uid = {entry.uid: entry for entry in now}
     for uid, entry in frozen.items():
         if by_uid.get(uid) != entry:

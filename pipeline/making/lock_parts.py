@@ -3,12 +3,14 @@
 Scene k is a function of the settings, the lock and k, and nothing may change what it draws from
 once it may have been made. With one part, that asks for all objects before the first scene. With
 several, an object's part follows from its uid and a shard's part from its number, whatever else
-there is. The lock grows by whole parts, and a part that has rows in it never changes. So the first
-scenes wait for the first part alone, and each of them is still a function of the finished lock: it
-draws from the rows of its part. Each prefix of such a dataset is a dataset that verifies.
+there is. Each part is a file of its own, written once, in a bucket by whichever machine is first;
+the lock is made of them. So the first scenes wait for the first part alone, and each of them is
+still a function of the finished lock: it draws from the rows of its part.
+
+Textures and skies of a user's own are few and serve all parts: they are a file of their own too.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,12 +18,11 @@ from pipeline.making.publication import Publication
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import part_of_object, part_of_shard
-from storage.digests import sha256_hex
-from storage.errors import TrilightError
-from storage.records.lock_rows import LockRows
+from storage.digests import sha256_of_file
 from storage.records.objects import (
+    OBJECT,
+    Failure,
     LockedObject,
-    encode_objects_lock,
     read_objects_lock,
     write_objects_lock,
 )
@@ -43,7 +44,7 @@ class LockPart:
         """File with the rows of this part alone, for those who draw from it."""
         if self.number is None:
             return self.folder.objects_lock
-        return self.folder.staged_locks / f"{self.number:04d}.lock.jsonl"
+        return self.folder.lock_part(f"{self.number:04d}")
 
     @property
     def index(self) -> Path:
@@ -51,6 +52,11 @@ class LockPart:
         if self.number is None:
             return self.folder.staged_index
         return self.folder.staged_locks / f"{self.number:04d}.index"
+
+    @property
+    def maps(self) -> Path:
+        """File with the rows of textures and skies."""
+        return self.folder.objects_lock if self.number is None else self.folder.lock_part("maps")
 
     def holds(self, uid: str) -> bool:
         """Return whether an object belongs to this part."""
@@ -60,66 +66,86 @@ class LockPart:
         """Return whether a shard draws from this part."""
         return self.number is None or part_of_shard(shard_index, self.splits) == self.number
 
+    def take(self, publication: Publication) -> None:
+        """Have the files of this part here, where it is frozen already."""
+        if self.number is None:
+            publication.take_lock()
+        else:
+            publication.take([self.lock, self.index, self.maps])
+
     def frozen(self, publication: Publication) -> dict[str, LockedObject] | None:
         """Return what is frozen of this part by uid, or None where nothing is yet."""
-        if not publication.manifest.objects_lock_sha256:
-            return None
-        rows = read_objects_lock(self.folder.objects_lock)
-        here = {entry.uid: entry for entry in rows if self.holds(entry.uid)}
+        self.take(publication)
         if self.number is None:
-            return here
-        others = encode_objects_lock(entry for entry in rows if entry.uid not in here)
-        if sha256_hex(others) == publication.manifest.objects_lock_sha256:
-            return None  # a kill came between the lock and the manifest, or nothing is there yet
-        return here or None
+            rows = _whole(publication)
+        elif self.lock.exists():
+            rows = read_objects_lock(self.lock)
+        else:  # of a dataset whose .staging was deleted
+            rows = [
+                row for row in _whole(publication) if row.kind == OBJECT and self.holds(row.uid)
+            ]
+        return {entry.uid: entry for entry in rows} or None
 
-    def freeze(self, publication: Publication, locked: Sequence[LockedObject]) -> None:
-        """Freeze the objects of this part, beside those of others."""
-        others: list[LockedObject] = []
-        if self.number is not None and publication.manifest.objects_lock_sha256:
-            rows = read_objects_lock(self.folder.objects_lock)
-            others = [entry for entry in rows if not self.holds(entry.uid)]
-        publication.lock_objects([*others, *locked])
+    def frozen_maps(self, publication: Publication) -> dict[str, LockedObject] | None:
+        """Return what is frozen of textures and skies by uid, or None where nothing is yet."""
+        self.take(publication)
+        if self.number is not None and self.maps.exists():
+            rows = read_objects_lock(self.maps)
+        else:
+            rows = [row for row in _whole(publication) if row.kind != OBJECT]
+        return {entry.uid: entry for entry in rows} or None
 
-    def write_rows(self, locked: Sequence[LockedObject]) -> None:
-        """Write the file of this part's own rows, where the lock itself is not that."""
-        if self.number is not None:
-            write_objects_lock(self.lock, locked)
+    def freeze(
+        self,
+        publication: Publication,
+        objects: Sequence[LockedObject],
+        maps: Sequence[LockedObject],
+        failures: Iterable[Failure],
+    ) -> None:
+        """Freeze the objects of this part, beside those of others, and the maps with the first.
+
+        Args:
+            publication: the dataset.
+            objects: rows of this part.
+            maps: rows of textures and skies.
+            failures: what was rejected on the way.
+        """
+        if self.number is None:
+            publication.lock_objects([*objects, *maps])
+            return
+        if maps:
+            publication.freeze_lock_part(self.maps, maps)
+        publication.freeze_lock_part(self.lock, objects, failures)
+
+    def restore(self, objects: Sequence[LockedObject]) -> None:
+        """Write the file of a frozen part again, where `.staging` was deleted."""
+        if self.number is not None and not self.lock.exists():
+            write_objects_lock(self.lock, objects)
 
     def is_public(self, publication: Publication, sha256: str) -> bool:
-        """Return whether the rows of this part, which have a digest, are in the dataset's lock."""
-        frozen = publication.manifest.objects_lock_sha256
-        if self.number is None or not frozen:
-            return frozen == sha256
-        first = LockRows(self.lock).at(0)
-        return LockRows(self.folder.objects_lock).find(first.uid) == first
+        """Return whether the rows of this part, which have a digest, are those of the dataset."""
+        if self.number is None:
+            return publication.manifest.objects_lock_sha256 == sha256
+        return sha256_of_file(self.lock) == sha256
 
     def num_frozen(self) -> int:
-        """Return how many rows the dataset's lock has by now."""
-        with self.folder.objects_lock.open("rb") as lines:
-            return sum(1 for _ in lines)
+        """Return how many rows are frozen by now, as far as is known here."""
+        whole = self.folder.objects_lock
+        files = [whole] if whole.exists() else self.folder.lock_parts()
+        return sum(file.read_bytes().count(b"\n") for file in files)
+
+
+def _whole(publication: Publication) -> list[LockedObject]:
+    if not publication.manifest.objects_lock_sha256:
+        return []
+    return read_objects_lock(publication.folder.objects_lock)
 
 
 def lock_parts(
-    folder: DatasetFolder, splits: SplitSettings, shards: Sequence[int], *, maps: bool = False
+    folder: DatasetFolder, splits: SplitSettings, shards: Sequence[int]
 ) -> list[LockPart]:
-    """Return the parts that some shards draw from, those of the first shards first.
-
-    Raises:
-        TrilightError: there are several, and the dataset is made in a bucket, or has textures or
-            skies of the user's own (`maps`).
-    """
+    """Return the parts that some shards draw from, those of the first shards first."""
     if splits.object_parts == 1:
         return [LockPart(folder=folder, splits=splits)]
-    if folder.bucket:
-        raise TrilightError(
-            f"{folder.shown}: splits.object_parts is {splits.object_parts}; expected 1 for a "
-            "dataset in a bucket, whose lock appears once. Leave the setting away."
-        )
-    if maps:
-        raise TrilightError(
-            f"splits.object_parts is {splits.object_parts}; expected 1 beside --textures or "
-            "--skies, which are frozen with all objects. Leave one of them away."
-        )
     numbers = dict.fromkeys(part_of_shard(index, splits) for index in shards)
     return [LockPart(folder=folder, splits=splits, number=number) for number in numbers or [0]]

@@ -9,11 +9,12 @@ the digest of a uid says so. An object more or less changes the part that it is 
 
 import json
 import time
+import uuid
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from pipeline.assets.recipe import RECIPE, code_sha256
 from pipeline.assets.settings import AssetSettings
@@ -87,6 +88,16 @@ def cut_objects(records: Sequence[ObjectRecord]) -> list[list[ObjectRecord]]:
     return [part for part in parts if part]
 
 
+class OtherMachines(Protocol):
+    """Those that make the dataset too and share no folder with this one."""
+
+    def take(self, files: Iterable[Path]) -> None:
+        """Have files of the folder here, as far as somebody has sent them."""
+
+    def send(self, path: Path) -> None:
+        """Send a file of the folder."""
+
+
 class ObjectPart:
     """Some objects, and the file that says what came of them."""
 
@@ -101,13 +112,14 @@ class ObjectPart:
         of_objects = [_facts(record, looks) for record in records]
         facts = [of_objects, asdict(settings), RECIPE, code_sha256()]
         name = sha256_hex(canonical_json(facts))[:32]
-        self._shared = shared / name[:2] / f"{name}.jsonl"
-        self._kept = cache_folder("object-parts") / name[:2] / self._shared.name
+        self.file = shared / name[:2] / f"{name}.jsonl"
+        """Beside the dataset, for its other makers."""
+        self._kept = cache_folder("object-parts") / name[:2] / self.file.name
         self._by_uid = {record.uid: record for record in records}
 
     def proof(self) -> Proof | None:
         """Return what came of the objects, in their order; None where that is not known yet."""
-        for path in (self._shared, self._kept):
+        for path in (self.file, self._kept):
             try:
                 rows = [json.loads(line) for line in path.read_bytes().splitlines()]
                 return self._proof(rows)
@@ -125,9 +137,13 @@ class ObjectPart:
                 path.unlink(missing_ok=True)  # damaged: it is made again
         return None
 
-    def make(self, work: MeshWork, done: Callable[[], None]) -> bool:
+    def make(
+        self, work: MeshWork, done: Callable[[], None], others: OtherMachines | None = None
+    ) -> bool:
         """Prepare the objects unless somebody else does or has done; return whether we have."""
-        with claimed(self._shared.with_suffix(".claim")) as ours:
+        with claimed(self.file.with_suffix(".claim")) as ours:
+            if ours and others:
+                others.take([self.file])
             if not ours or self.proof() is not None:
                 return False
             prepared, failures = work.prepare(self.records, done)
@@ -135,14 +151,16 @@ class ObjectPart:
             data = b"".join(canonical_json(row) + b"\n" for row in rows)
             if not _may_change(failures):
                 write_atomically(self._kept, data)
-            write_atomically(self._shared, data)
+            write_atomically(self.file, data)
+            if others and not _may_change(failures):
+                others.send(self.file)
         return True
 
     def forget_passing(self) -> None:
         """Forget what the environment has kept from an earlier run: it is tried again."""
         proof = self.proof()
         if proof is not None and _may_change(proof[1]):
-            self._shared.unlink(missing_ok=True)
+            self.file.unlink(missing_ok=True)
 
     def _proof(self, rows: Iterable[dict[str, Any]]) -> Proof:
         proved_objects, failures = list[ProvedObject](), list[Failure]()
@@ -166,6 +184,7 @@ def prepare_in_parts(
     done: Callable[[int], None],
     enough: Callable[[], bool] = lambda: False,
     again: bool = True,
+    others: OtherMachines | None = None,
 ) -> Proof:
     """Prepare objects together with all who do so at the same time; returns when all are done.
 
@@ -177,6 +196,8 @@ def prepare_in_parts(
         done: called with the number of objects that were prepared, or found so; from any thread.
         enough: whether to return with what is known, since nobody needs the rest any more.
         again: try again what the environment has kept from an earlier call.
+        others: machines that share the work and not the folder. Claims do not reach them, so each
+            begins at another part; where two meet, a part is made twice, with the same outcome.
 
     Returns:
         The accepted objects and the rejected ones, both in the order of `records`.
@@ -193,7 +214,9 @@ def prepare_in_parts(
     ours: set[int] = set()
 
     def make(number: int) -> bool:
-        return not enough() and parts[number].make(work, lambda: done(1))
+        return not enough() and parts[number].make(work, lambda: done(1), others)
+
+    turns = _turns(len(parts), others is not None)
 
     # children end first: after Ctrl-C no thread waits for the objects that it has in hand
     with ThreadPoolExecutor(_AT_ONCE) as threads, MeshWork(settings, workers) as work:
@@ -204,7 +227,7 @@ def prepare_in_parts(
                     proofs[number] = proof
                     if number not in ours:
                         done(len(part.records))
-            missing = [number for number in range(len(parts)) if number not in proofs]
+            missing = [number for number in turns if number not in proofs]
             if not missing or enough():
                 break
             tried = zip(missing, threads.map(make, missing), strict=True)
@@ -217,6 +240,12 @@ def prepare_in_parts(
                 pause_s = min(2 * pause_s, _PAUSES_S[1])
     ordered = [proof for _, proof in sorted(proofs.items())]
     return [one for some, _ in ordered for one in some], [f for _, some in ordered for f in some]
+
+
+def _turns(count: int, elsewhere: bool) -> list[int]:
+    """Return parts in the order in which this maker tries them: who makes one, never what."""
+    first = uuid.uuid4().int % count if elsewhere and count else 0
+    return [*range(first, count), *range(first)]
 
 
 def _may_change(failures: Iterable[Failure]) -> bool:

@@ -118,7 +118,7 @@ def _begun(order: DatasetOrder) -> Iterator[Run]:
                 )
         else:
             shards = _wanted_shards(order, settings, publication)
-            part = lock_parts(folder, settings.splits, shards, maps=bool(own.folders))[0]
+            part = lock_parts(folder, settings.splits, shards)[0]
             accepted = accept_part(order, settings, publication, own, part)
         write_asked(folder, generate_words(order))
         yield Run(
@@ -149,7 +149,7 @@ def _by_parts(run: Run) -> Iterator[Run]:
     yield run
     if run.part is None or run.part.number is None:
         return
-    everything, own = replace(run, part=None), MapFolders()
+    everything, own = replace(run, part=None), map_folders(run.order, run.settings)
     folder, splits = run.publication.folder, run.settings.splits
     for part in lock_parts(folder, splits, everything.missing_shards()):
         if part != run.part:

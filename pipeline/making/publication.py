@@ -4,13 +4,13 @@ import contextlib
 import dataclasses
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from pipeline.builds.settings import BuildSettings, differences
+from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.derived import derivation_of
 from storage.dataset.layout import (
     DatasetFolder,
     in_parts,
@@ -18,6 +18,7 @@ from storage.dataset.layout import (
     shard_names_in,
     shard_names_in_part,
 )
+from storage.dataset.lock_parts import joined_lock
 from storage.dataset.manifest import (
     Manifest,
     ShardEntry,
@@ -34,10 +35,9 @@ from storage.dataset.shard_notes import (
     noted_shard,
     rejections_of_shard,
 )
-from storage.dataset.splits import planned_scenes, scenes_of_shard, shard_name, shards_for
+from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.extensions import recorded, require_same_extensions
 from storage.records.objects import (
     Failure,
     LockedObject,
@@ -46,7 +46,6 @@ from storage.records.objects import (
     write_failures,
     write_objects_lock,
 )
-from storage.settings.described import from_record
 
 _LOOKS = 7
 """For a shard that a worker says it has packed; network file systems may show it a minute later."""
@@ -94,9 +93,6 @@ class Publication:
     def send_documents(self) -> None:
         """Bring the documents of the folder to where the dataset is: here they are."""
 
-    def send_index(self) -> None:
-        """Bring the index of the frozen objects to where the dataset is: here it is."""
-
     @property
     def num_shards(self) -> int:
         """How many shards the dataset will have."""
@@ -104,10 +100,49 @@ class Publication:
 
     def lock_objects(self, objects: list[LockedObject]) -> None:
         """Freeze the objects of the dataset."""
-        write_objects_lock(self.folder.objects_lock, objects)
-        digest = sha256_hex(encode_objects_lock(objects))
+        self._write_lock(encode_objects_lock(objects))
+
+    def take_lock(self) -> None:
+        """Have the lock and its index here, where another machine has frozen the objects."""
+
+    def take(self, files: Iterable[Path]) -> None:
+        """Have files below the folder's `.staging` here, as far as they are with the dataset."""
+
+    def send(self, path: Path) -> None:
+        """Bring a file of the folder to where the dataset is: here it is."""
+
+    def has(self, path: Path) -> bool:
+        """Return whether a file of the folder is where the dataset is."""
+        return path.exists()
+
+    def freeze_lock_part(
+        self, path: Path, rows: Iterable[LockedObject], failures: Iterable[Failure] = ()
+    ) -> None:
+        """Freeze a part of the lock, and what was rejected on the way to it, once.
+
+        Args:
+            path: its file (DatasetFolder.lock_part).
+            rows: what it holds.
+            failures: as rows of failures.jsonl.
+        """
+        self.add_failures(failures)
+        write_objects_lock(path, rows)
+        self.join_lock_parts()
+
+    def join_lock_parts(self) -> None:
+        """Make the lock of its parts that are here; where there are none, it is as it is."""
+        if parts := self.folder.lock_parts():
+            files = [path.read_bytes() for path in parts]
+            if digest := self.manifest.objects_lock_sha256:
+                files.append(self.folder.objects_lock.read_bytes())
+            lock = joined_lock(files)
+            if sha256_hex(lock) != digest:
+                self._write_lock(lock)
+
+    def _write_lock(self, lock: bytes) -> None:
+        write_atomically(self.folder.objects_lock, lock)
         with self._turn():
-            self._write(objects_lock_sha256=digest)
+            self._write(objects_lock_sha256=sha256_hex(lock))
 
     def add_shard(self, shard: ShardEntry) -> None:
         """Note a finished shard.
@@ -184,6 +219,7 @@ class Publication:
         """
         if not self._are_all_there():
             return None
+        self.join_lock_parts()
         with self._turn():  # somebody may have planned more
             if not self._are_all_there():
                 return None
@@ -261,122 +297,3 @@ class Publication:
         whole = read_manifest(self.folder.manifest)  # a finished set that grows has shards
         write_manifest(self.folder.manifest, dataclasses.replace(whole, **changes))
         self.manifest = dataclasses.replace(self.manifest, **changes)
-
-
-def begin(
-    folder: DatasetFolder,
-    settings: BuildSettings,
-    environment: Mapping[str, Any],
-    num_scenes: int,
-    *,
-    accept_environment: bool,
-) -> Publication:
-    """Begin a dataset, or go on with the one that is there.
-
-    The number of scenes is rounded up to whole shards, and never falls.
-
-    Raises:
-        TrilightError: the dataset was begun with other settings, or in another environment and
-            `accept_environment` is False; the message names what differs.
-    """
-    if num_scenes < 1:
-        raise TrilightError(f"scenes is {num_scenes}; expected at least 1.")
-    whole = planned_scenes(num_scenes, settings.splits)
-    with folder.turn("manifest"):
-        if folder.manifest.exists():
-            manifest = read_head(folder.manifest)
-            _require_same_dataset(folder, manifest, settings, environment, accept_environment)
-            whole = max(whole, manifest.num_scenes)
-        else:
-            require_free(folder, _names_in(folder))
-            manifest = Manifest(
-                build=settings.build,
-                settings=settings.as_json(),
-                environment=environment,
-                num_scenes=whole,
-                num_views=settings.scenes.num_views,
-                objects_lock_sha256="",
-                shards=(),
-                extensions=recorded("data"),
-            )
-            write_manifest(folder.manifest, manifest)
-        publication = Publication(folder, manifest, settings.splits)
-        if whole != manifest.num_scenes:
-            publication.extend(whole)
-    return publication
-
-
-def _require_same_dataset(
-    folder: DatasetFolder,
-    manifest: Manifest,
-    settings: BuildSettings,
-    environment: Mapping[str, Any],
-    accept_environment: bool,
-) -> None:
-    _require_generated(folder, manifest)
-    require_same_extensions(folder.shown, manifest.extensions, recorded("data"))
-    begun = from_record(BuildSettings, manifest.settings).as_json()  # fields may come later
-    _require_same(folder, "setting", begun, settings.as_json(), "choose another --out")
-    if not accept_environment:
-        _require_same(
-            folder,
-            "environment",
-            manifest.environment,
-            environment,
-            "choose another --out, or accept pictures that agree only within their noise "
-            "floors with --accept-environment",
-        )
-
-
-def require_free(folder: DatasetFolder, names: Iterable[str]) -> None:
-    """Refuse to begin a dataset where something else is.
-
-    Args:
-        folder: of the dataset.
-        names: of the shards and documents that are where it is to be.
-
-    Raises:
-        TrilightError: there are shards, or a document that the dataset's own would replace.
-    """
-    there = set(names)
-    if any(name.endswith(".tar") for name in there):
-        raise TrilightError(
-            f"{folder.shown}: there are shards but no manifest.json; expected an empty folder or a "
-            "dataset. Choose another --out."
-        )
-    for path in (folder.card, folder.licences):
-        if path.name in there:
-            raise TrilightError(
-                f"{folder.shown}: {path.name} is there, and the dataset's own would replace it; "
-                "expected an empty folder or a dataset. Choose another --out."
-            )
-
-
-def _names_in(folder: DatasetFolder) -> Iterator[str]:
-    yield from (path.relative_to(folder.root).as_posix() for path in folder.shard_files())
-    yield from (path.name for path in (folder.card, folder.licences) if path.exists())
-
-
-def _require_generated(folder: DatasetFolder, manifest: Manifest) -> None:
-    if derivation := derivation_of(manifest.settings):
-        raise TrilightError(
-            f"{folder.shown}: this dataset was made by `trilight shards {derivation.operation}` "
-            "and cannot grow; extend its sources and make it anew, or choose another --out."
-        )
-
-
-def _require_same(
-    folder: DatasetFolder,
-    what: str,
-    before: Mapping[str, Any],
-    now: Mapping[str, Any],
-    next_step: str,
-) -> None:
-    differing = list(differences(before, now))
-    if differing:
-        name, old, new = differing[0]
-        more = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
-        raise TrilightError(
-            f"{folder.shown}: this dataset was begun with another {what}: {name} was {old!r}, now "
-            f"{new!r}{more}; {next_step}."
-        )

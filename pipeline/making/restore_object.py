@@ -1,17 +1,15 @@
 """A frozen object whose prepared file is not here: it is prepared again, and must be the same."""
 
 import functools
-from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.making.freeze_objects import changed, require_tried
 from pipeline.making.prepare_isolated import asset_store, prepare_isolated
 from pipeline.making.run import ShardJob
-from pipeline.objects.sources import find_objects
+from pipeline.objects.sources import ListedObjects, list_objects
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex
 from storage.records.lock_rows import LockRows
-from storage.records.objects import ObjectRecord
 from storage.remote.safe_url import safe_url
 
 
@@ -35,7 +33,8 @@ def restore_object(job: ShardJob, uid: str, asset_name: str) -> None:
         return  # somebody was quicker
     place.unlink(missing_ok=True)
     work_dir, allowed = job.folder.staged_objects, tuple(settings.allowed_licences)
-    record = _records(frozen.source, frozen.licence, work_dir, allowed).get(uid)
+    listed = _listed(frozen.source, frozen.licence, work_dir, allowed)
+    record = next(iter(listed.found(lambda other: other == uid).records), None)
     if record is None or locked is None:
         raise changed(shown, uid, "is missing or no longer usable")
     prepared, rejected = prepare_isolated(
@@ -57,9 +56,8 @@ def _holds(path: Path, sha256: str) -> bool:
 
 
 @functools.lru_cache(maxsize=1)
-def _records(
+def _listed(
     source: str, licence: str | None, work_dir: Path, allowed: tuple[str, ...]
-) -> Mapping[str, ObjectRecord]:
-    """Return what a source holds by uid; it is listed once, however many objects are away."""
-    found = find_objects(source, work_dir=work_dir, allowed_licences=allowed, licence=licence)
-    return {record.uid: record for record in found.records}
+) -> ListedObjects:
+    """Return what a source holds; it is listed once, however many objects are away."""
+    return list_objects(source, work_dir=work_dir, allowed_licences=allowed, licence=licence)

@@ -21,6 +21,7 @@ from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry
 from storage.dataset.statistics import Statistics
+from storage.digests import sha256_of_file
 from storage.errors import TrilightError
 from storage.records.objects import Failure
 
@@ -55,13 +56,16 @@ class Run:
 
     def job(self, num_at_once: int) -> "ShardJob":
         """Return what the tasks of this run share, `num_at_once` of them in one process."""
-        manifest = self.publication.manifest
+        manifest, part = self.publication.manifest, self.part
+        frozen = manifest.objects_lock_sha256
+        if part is not None and part.number is not None:
+            frozen = sha256_of_file(part.lock)
         return ShardJob(
             folder=self.publication.folder,
             settings=self.settings,
             environment={} if self.order.accept_environment else manifest.environment,
             accepted=self.accepted,
-            lock_sha256=manifest.objects_lock_sha256,
+            lock_sha256=frozen,
             num_at_once=num_at_once,
             extensions=manifest.extensions,
         )
@@ -118,7 +122,7 @@ class ShardJob:
     accepted: AcceptedObjects
     """What scenes are made of; prepared files are in the user's cache, or are made there again."""
     lock_sha256: str
-    """Digest of the frozen objects."""
+    """Digest of the frozen objects, of those of its part where there are several."""
     num_at_once: int
     """Tasks at a time in one process; they share its cores."""
     extensions: Mapping[str, str]

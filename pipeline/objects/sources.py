@@ -129,30 +129,75 @@ class FoundObjects:
     failures: tuple[Failure, ...]
     """The other ones, of the stage `objects`, sorted by uid: licence_refused, download_failed,
     too_large_bytes, too_many_buffers, unsafe_name, unknown_uid, link_outside, name_clash."""
+    num_unwanted: int = 0
+    """Objects of the source that were not asked for."""
 
     @property
     def num_found(self) -> int:
         """How many objects the source has."""
-        return len(self.records) + len(self.failures)
+        return len(self.records) + len(self.failures) + self.num_unwanted
 
 
 def _silent(done: int, total: int) -> None:
     """Show no progress."""
 
 
-def find_objects(
+def _every(uid: str) -> bool:
+    return True
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ListedObjects:
+    """What a source holds; its files are brought to this machine where they are wanted."""
+
+    source: str
+    """As it was asked for."""
+    listing: Listing
+    """What it said."""
+    allowed: list[ObjectRecord]
+    """Objects whose licence is allowed."""
+    refused: list[Failure]
+    """The others, and what cannot be used whatever its licence."""
+
+    def found(
+        self,
+        wanted: Callable[[str], bool] = _every,
+        downloaded: Callable[[int, int], None] = _silent,
+    ) -> FoundObjects:
+        """Return the objects that may be used, after bringing them here.
+
+        What is downloaded stays in the user's cache (`storage.cache`; Objaverse in the place of its
+        own package), and is not downloaded again.
+
+        Args:
+            wanted: says of a uid whether it is asked for; the others are left where they are.
+            downloaded: called with how many downloads are done, failed ones included, and with how
+                many there are; from the calling thread.
+
+        Raises:
+            TrilightError: nothing of what is wanted could be downloaded.
+        """
+        records = [record for record in self.allowed if wanted(record.uid)]
+        failures = [failure for failure in self.refused if wanted(failure.item)]
+        num_wanted = len(records) + len(failures)
+        with _said_by(self.source) as value:
+            here, lost = self.listing.fetch(records, downloaded)
+            _require_some(printable(safe_url(value)), here, [*failures, *lost])
+        return FoundObjects(
+            records=tuple(sorted(here, key=attrgetter("uid"))),
+            failures=tuple(sorted([*failures, *lost], key=attrgetter("item"))),
+            num_unwanted=len(self.allowed) + len(self.refused) - num_wanted,
+        )
+
+
+def list_objects(
     source: str,
     *,
     work_dir: Path,
     allowed_licences: Sequence[str],
     licence: str | None = None,
-    downloaded: Callable[[int, int], None] = _silent,
-) -> FoundObjects:
-    """Return the objects of a source that may be used, after bringing them to this machine.
-
-    The licence of an object is judged before it is downloaded. What is downloaded stays in the
-    user's cache (`storage.cache`; Objaverse in the place of its own package), and is not
-    downloaded again.
+) -> ListedObjects:
+    """Return what a source holds; the licence of an object is judged before it is downloaded.
 
     Args:
         source: a folder; `http(s)://`, `s3://`, `gs://`, `hf://` or `file://` and a folder;
@@ -163,16 +208,34 @@ def find_objects(
         work_dir: where built-in objects are written; not touched for other sources.
         allowed_licences: SPDX identifiers, `LicenseRef-...`, or compound expressions as they stand.
         licence: of files that come without any statement, as the user states it.
-        downloaded: called with how many downloads are done, failed ones included, and with how
-            many there are; from the calling thread.
 
     Raises:
         TrilightError: the source is malformed, missing or empty; its catalogue has a mistake; a
             licence identifier is malformed, or is stated where the source states its own; a package
-            is missing; a server does not answer, or nothing could be downloaded.
+            is missing, or a server does not answer.
     """
     with _said_by(source) as value:
-        return _find(value, work_dir, allowed_licences, licence, downloaded)
+        listing = _listed(value, work_dir, licence, allowed_licences)
+    assert listing is not None
+    allowed, refused = refuse_licences(listing.records, allowed_licences)
+    return ListedObjects(
+        source=source, listing=listing, allowed=allowed, refused=[*listing.failures, *refused]
+    )
+
+
+def find_objects(
+    source: str,
+    *,
+    work_dir: Path,
+    allowed_licences: Sequence[str],
+    licence: str | None = None,
+    downloaded: Callable[[int, int], None] = _silent,
+) -> FoundObjects:
+    """Return all objects of a source that may be used; as `list_objects` and what it `found`."""
+    listed = list_objects(
+        source, work_dir=work_dir, allowed_licences=allowed_licences, licence=licence
+    )
+    return listed.found(downloaded=downloaded)
 
 
 def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
@@ -181,29 +244,10 @@ def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str
     Writes nothing except the cached listing of a server.
 
     Raises:
-        TrilightError: as `find_objects`, as far as listing the source tells.
+        TrilightError: as `list_objects`.
     """
     with _said_by(source) as value:
         _listed(value, Path(), licence, allowed_licences, only_look=True)
-
-
-def _find(
-    source: str,
-    work_dir: Path,
-    allowed_licences: Sequence[str],
-    licence: str | None,
-    downloaded: Callable[[int, int], None],
-) -> FoundObjects:
-    listing = _listed(source, work_dir, licence, allowed_licences)
-    assert listing is not None
-    allowed, refused = refuse_licences(listing.records, allowed_licences)
-    here, lost = listing.fetch(allowed, downloaded)
-    failures = [*listing.failures, *refused, *lost]
-    _require_some(printable(safe_url(source)), here, failures)
-    return FoundObjects(
-        records=tuple(sorted(here, key=attrgetter("uid"))),
-        failures=tuple(sorted(failures, key=attrgetter("item"))),
-    )
 
 
 @contextlib.contextmanager

@@ -16,13 +16,13 @@ twice, and the first writer of a shard wins. That is wasted work, never wrong.
 import dataclasses
 import io
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from storage.atomic import write_atomically
 from storage.claims import claimed
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles, read_beside
-from storage.dataset.layout import DatasetFolder, place_of_part
+from storage.dataset.layout import LOCK_PART, DatasetFolder, place_of_part
 from storage.dataset.manifest import (
     SHARD_NAME,
     Manifest,
@@ -44,13 +44,15 @@ from storage.dataset.shard_notes import (
 )
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
-from storage.records.objects import decode_failures, read_failures, write_failures
+from storage.records.objects import Failure, decode_failures, read_failures, write_failures
 from storage.remote.bucket import Bucket
 from storage.remote.cache import shard_cache
 from storage.remote.url import RemoteUrl, parse_url
 
 _PLANNED = ".staging/planned/"
 """Folder with one file for each requested number of scenes; the largest counts."""
+_REJECTED = ".failures"
+"""What the file of a part's rejections has after the name of the part's."""
 _HEAD_BYTES = 1 << 18
 """What is read of a manifest to know its head, which takes about 6 kB."""
 
@@ -137,6 +139,50 @@ class Mirror:
                 "expected the same --objects everywhere. Give that, or choose another --out."
             )
 
+    def take_lock(self) -> str:
+        """Bring the frozen objects here where somebody has frozen them; return their digest."""
+        head = self._head()
+        sha256 = head.objects_lock_sha256 if head else ""
+        self._take_lock(sha256)
+        return sha256
+
+    def has(self, path: Path) -> bool:
+        """Return whether a file of the folder is in the bucket."""
+        return self._bucket.read_start(self._name(path), 1) is not None
+
+    def take(self, files: Iterable[Path]) -> None:
+        """Bring files here that are in the bucket and not here."""
+        for path in files:
+            if not path.exists() and (data := self._files.read(self._name(path))) is not None:
+                write_atomically(path, data)
+
+    def freeze_part(self, path: Path, lock: bytes, failures: bytes) -> None:
+        """Put a part of the frozen objects into the bucket, after what was rejected for it.
+
+        Raises:
+            TrilightError: another machine has frozen another one.
+        """
+        name = self._name(path)
+        self._bucket.write(f"{name}{_REJECTED}", failures)
+        if not self._bucket.create(name, lock) and self._files.read(name) != lock:
+            raise TrilightError(
+                f"{self._folder.shown}: another worker has frozen {name} in the meantime, and not "
+                "with the same objects; expected the same --objects everywhere. Run the same "
+                "command again to go on with theirs, or choose another --out."
+            )
+
+    def take_parts_of_lock(self) -> list[Failure]:
+        """Bring every part of the frozen objects here; return what was rejected for them."""
+        folder = self._folder
+        names = self._bucket.names_in(self._name(folder.staged_locks))
+        rejected = [name for name in names if name.endswith(_REJECTED)]
+        self.take(folder.root / name for name in names if name.endswith(LOCK_PART))
+        return [row for name in rejected for row in decode_failures(self._files.read(name) or b"")]
+
+    def replace_lock(self) -> None:
+        """Put the lock of all parts into the bucket, which the manifest is to name."""
+        self._bucket.write(self._folder.objects_lock.name, self._folder.objects_lock)
+
     def planned(self) -> int:
         """Return how many scenes somebody has planned at most."""
         names = (name.removeprefix(_PLANNED) for name in self._bucket.names_in(_PLANNED))
@@ -216,9 +262,9 @@ class Mirror:
         with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
             return index_stream(stream, Path(name).name)
 
-    def send_index(self) -> None:
-        """Put the index of the frozen objects into the bucket: others trust the lock by it."""
-        self._bucket.write(self._name(self._folder.staged_index), self._folder.staged_index)
+    def send_file(self, path: Path) -> None:
+        """Put a file of the folder into the bucket, in place of one that is there."""
+        self._bucket.write(self._name(path), path)
 
     def send_manifest(self) -> None:
         """Put the folder's manifest and rejections into the bucket, in place of those there."""
@@ -281,12 +327,9 @@ def _identity(manifest: Manifest | None) -> object:
     """Return what scenes that are not in a shard yet depend on."""
     if manifest is None:
         return None
-    return (
-        manifest.settings,
-        manifest.environment,
-        manifest.objects_lock_sha256,
-        manifest.extensions,
-    )
+    in_parts = manifest.settings["splits"].get("object_parts", 1) > 1  # its lock grows
+    frozen = "" if in_parts else manifest.objects_lock_sha256
+    return (manifest.settings, manifest.environment, frozen, manifest.extensions)
 
 
 def _clear(folder: DatasetFolder) -> None:

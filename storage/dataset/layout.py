@@ -35,6 +35,8 @@ FILES_PER_FOLDER = 4096
 """Numbered files of one folder; with their sub-folders and what else lies there, below 5,000."""
 
 
+LOCK_PART = ".lock.jsonl"
+"""How files with a part of the lock end."""
 _PART = re.compile(r"part-(\d{4,6})")
 
 
@@ -129,7 +131,7 @@ class DatasetFolder:
     staged_index = _Below(".staging/objects.index")
     """The index of the frozen objects (storage.records.object_index)."""
     staged_locks = _Below(".staging/object_locks")
-    """Rows and index of each part of the lock, where it is frozen in parts."""
+    """Rows, index and rejections of each part of the lock, where it is frozen in parts."""
     staged_parts = _Below(".staging/object_parts")
     """What came of parts of the objects, until they are frozen."""
     staged_failures = _Below(".staging/failures")
@@ -174,6 +176,14 @@ class DatasetFolder:
     def shard_files(self) -> list[Path]:
         """Return every file that is called like a shard, listed in the manifest or not."""
         return sorted(self.root / name for name in shard_names_in(self.root))
+
+    def lock_part(self, name: str) -> Path:
+        """Return the file with the rows of a part of the lock."""
+        return self.staged_locks / f"{name}{LOCK_PART}"
+
+    def lock_parts(self) -> list[Path]:
+        """Return the files of all parts of the lock that are known here."""
+        return sorted(self.staged_locks.glob(f"*{LOCK_PART}"))
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:

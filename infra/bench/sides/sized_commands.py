@@ -146,8 +146,8 @@ def _build() -> "BuildSettings":
 def _plan(root: Path) -> None:
     """Predict a dataset of this size from scenes that are measured already, beginning it anew."""
     from infra.planning import MeasuredScenes, predict
+    from pipeline.making.begin_publication import begin
     from pipeline.making.dataset_order import DatasetOrder
-    from pipeline.making.publication import begin
     from storage.dataset.layout import DatasetFolder
     from storage.dataset.manifest import read_manifest
 

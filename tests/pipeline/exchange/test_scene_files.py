@@ -20,9 +20,9 @@ from pipeline.making.accept_scene_files import (
     build_once,
     settings_for_files,
 )
+from pipeline.making.begin_publication import begin
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.prepare_isolated import asset_child
-from pipeline.making.publication import begin
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.dataset.splits import scenes_of_shard, shard_name

@@ -10,10 +10,11 @@ from pipeline.assets.stage import PreparedAsset
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.asked_objects import AskedObjects
+from pipeline.making.begin_publication import begin
 from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects
 from pipeline.making.object_parts import proved
 from pipeline.making.prepare_isolated import asset_store
-from pipeline.making.publication import Publication, begin
+from pipeline.making.publication import Publication
 from pipeline.objects.sources import FoundObjects
 from storage.dataset.layout import DatasetFolder
 from storage.digests import sha256_hex

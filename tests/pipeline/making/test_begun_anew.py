@@ -7,10 +7,10 @@ import pytest
 
 from pipeline.builds.named import named_build
 from pipeline.executors.threads import ThreadRunner
+from pipeline.making.begin_publication import begin
 from pipeline.making.bucket_publication import joined
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset, prepare_dataset
-from pipeline.making.publication import begin
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError

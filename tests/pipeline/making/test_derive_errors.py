@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from pipeline.making.begin_publication import begin
 from pipeline.making.derive_dataset import derive_dataset
-from pipeline.making.publication import begin
 from pipeline.shards.derive import Derive
 from pipeline.shards.plans import Selection
 from storage.dataset.dataset import open_dataset

@@ -10,8 +10,8 @@ from prefect.exceptions import ParameterTypeError
 from infra.repair import repair
 from pipeline.builds.named import BUILDS, named_build, typed_build
 from pipeline.exchange.reader import file_child
+from pipeline.making.begin_publication import begin
 from pipeline.making.pipeline import make_task
-from pipeline.making.publication import begin
 from pipeline.making.run import ShardJob
 from pipeline.shards.derive import _extensions
 from scene_templates.families import FAMILIES

@@ -104,7 +104,7 @@ def test_a_second_start_looks_at_no_object(
     def look(source: str, **more: object) -> None:
         raise LookupError(source)
 
-    monkeypatch.setattr(asked_objects, "find_objects", look)
+    monkeypatch.setattr(asked_objects, "list_objects", look)
     assert accept_objects(asked(publication)) == accepted
     for source, licence in (("another", None), (SOURCE, "MIT")):
         with pytest.raises(LookupError):

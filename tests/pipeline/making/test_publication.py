@@ -9,7 +9,8 @@ import pytest
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.settings import BuildSettings, differences
 from pipeline.making import publication as publications
-from pipeline.making.publication import Publication, begin
+from pipeline.making.begin_publication import begin
+from pipeline.making.publication import Publication
 from pipeline.shards.pack import pack_shard
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder

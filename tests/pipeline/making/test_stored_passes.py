@@ -8,7 +8,8 @@ import pytest
 
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.settings import BuildSettings
-from pipeline.making.publication import Publication, begin
+from pipeline.making.begin_publication import begin
+from pipeline.making.publication import Publication
 from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.variant import activate, choose_variant

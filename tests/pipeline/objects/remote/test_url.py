@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.remote import source as remote_source
-from pipeline.objects.sources import FoundObjects, find_objects
+from pipeline.objects.sources import FoundObjects, find_objects, list_objects
 from storage.errors import TrilightError
 from storage.remote.url import PACKAGES, RemoteUrl, open_driver, parse_url
 
@@ -145,6 +145,19 @@ def test_a_bucket_is_listed_at_once(cache: Path, monkeypatch: pytest.MonkeyPatch
     assert found.records[1].source_url == "s3://bucket/set/x/d.obj"
     assert find() == found
     assert sorted(bucket.fetched) == ["bucket/set/a?b#c%20.obj", "bucket/set/x/d.obj"]
+
+
+def test_what_is_not_wanted_stays_on_the_server(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bucket = _Bucket({f"bucket/{name}.obj": name.encode() for name in "abc"})
+    monkeypatch.setattr("pipeline.objects.remote.folder.open_driver", lambda url: bucket)
+    listed = list_objects("s3://bucket", work_dir=cache, allowed_licences=DEFAULT_ALLOWED)
+    assert bucket.fetched == []
+    found = listed.found(lambda uid: uid == "b")
+    assert [record.uid for record in found.records] == ["b"]
+    assert bucket.fetched == ["bucket/b.obj"]
+    assert found.num_found == 3
 
 
 def test_a_transfer_that_grows_too_large_is_ended(
