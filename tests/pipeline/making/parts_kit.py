@@ -56,7 +56,8 @@ def parts_order(
     out: str, scenes: int, shards: str | None = None, textures: Path | None = None
 ) -> DatasetOrder:
     """Return an order whose first cycle of splits has six shards of four scenes."""
-    changes = {"scenes.num_views": 2, "splits.object_parts": PARTS, "splits.shards_per_cycle": 6}
+    changes: dict[str, float] = {"scenes.num_views": 2, "splits.object_parts": PARTS}
+    changes["splits.shards_per_cycle"] = 6
     if textures:
         changes |= {"scenes.textures.share": 0.5, "scenes.textures.own_share": 1.0}
     return tiny_order(
