@@ -2,7 +2,7 @@
 #   docker build --file infra/images/cpu.Dockerfile --tag trilight:latest .
 # pymeshlab is GPL-3: an image that is passed on must be offered under terms that the GPL allows.
 # WITHOUT_GPL=1 leaves it out.
-FROM python:3.11.13-slim-bookworm AS build
+FROM python:3.11.13-slim-bookworm@sha256:86adf8dbadc3d6e82ee5dd2c74bec2e1c2467cdad47886280501df722372d2e1 AS build
 ARG WITHOUT_GPL=""
 WORKDIR /opt/trilight
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
@@ -20,7 +20,7 @@ RUN python -m venv /opt/venv \
 COPY . .
 RUN /opt/venv/bin/python -m pip install --no-cache-dir --no-deps --no-build-isolation --editable .
 
-FROM python:3.11.13-slim-bookworm
+FROM python:3.11.13-slim-bookworm@sha256:86adf8dbadc3d6e82ee5dd2c74bec2e1c2467cdad47886280501df722372d2e1
 ARG WITHOUT_GPL=""
 LABEL org.opencontainers.image.title="trilight" \
       org.opencontainers.image.description="Makes the data for neural renderers" \

@@ -6,7 +6,7 @@
 #       trilight bench card --out /data/card.json
 #   docker cp card:/data/card.json .
 # The driver comes from the host (nvidia-container-toolkit); torch brings CUDA's libraries itself.
-FROM python:3.11.13-slim-bookworm AS build
+FROM python:3.11.13-slim-bookworm@sha256:86adf8dbadc3d6e82ee5dd2c74bec2e1c2467cdad47886280501df722372d2e1 AS build
 WORKDIR /opt/trilight
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 # meshoptimizer comes as source
@@ -21,7 +21,7 @@ RUN python -m venv /opt/venv \
 COPY . .
 RUN /opt/venv/bin/python -m pip install --no-cache-dir --no-deps --no-build-isolation --editable .
 
-FROM python:3.11.13-slim-bookworm
+FROM python:3.11.13-slim-bookworm@sha256:86adf8dbadc3d6e82ee5dd2c74bec2e1c2467cdad47886280501df722372d2e1
 LABEL org.opencontainers.image.title="trilight-cuda" \
       org.opencontainers.image.description="Makes the data for, trains and judges neural renderers" \
       org.opencontainers.image.licenses="MIT AND GPL-3.0-only"
