@@ -1,4 +1,4 @@
-"""One attempt at one scene, inside a render child: compose or read it, render its views."""
+"""One attempt at one scene, inside a render child: compose it, render its views."""
 
 import os
 from collections.abc import Sequence
@@ -7,7 +7,6 @@ from pathlib import Path
 
 from pipeline.assets.store import AssetStore
 from pipeline.builds.settings import BuildSettings
-from pipeline.exchange.scene_files import SceneFiles
 from pipeline.making.frozen_pool import AssetAway, FrozenPool
 from pipeline.making.own_maps import own_maps
 from pipeline.making.prepare_isolated import asset_store
@@ -23,6 +22,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.errors import Rejected
 from storage.records.objects import Failure, LockedObject
 from storage.records.sample import Sample, sample_key
+from storage.records.scene import Scene
 
 MAX_ATTEMPTS = 16
 """Attempts at a scene before it is given up."""
@@ -46,8 +46,6 @@ class SceneRecipe:
     """Where their prepared files are, as the maker sees it."""
     maps: tuple[tuple[LockedObject, Path], ...] = ()
     """A user's own textures and skies with their prepared files."""
-    files: SceneFiles | None = None
-    """Where scenes are read from files; otherwise they are composed of the objects."""
     revisited: RevisitedScenes | None = None
     """Where scenes are those of a finished dataset."""
     folder: DatasetFolder | None = None
@@ -87,15 +85,24 @@ def set_up_child(source: SceneRecipe) -> None:
     _state.pool, _state.own = {}, {}
 
 
-def attempt_scene(split: str, scene_index: int, attempt: int) -> SceneAttempt:
-    """Make one attempt at a scene; equal arguments give equal results in every child."""
+def attempt_scene(
+    split: str, scene_index: int, attempt: int, from_file: Scene | None = None
+) -> SceneAttempt:
+    """Make one attempt at a scene; equal arguments give equal results in every child.
+
+    Args:
+        split: of the scene.
+        scene_index: which.
+        attempt: from 0.
+        from_file: the scene, where it comes from a file: a confined child has read that.
+    """
     key = sample_key(scene_index)
     settings = _state.source.settings
     failures: list[Failure] = []
     told = ViewProgress(_state.source.folder, scene_index)
     stage = "scenes"
     try:
-        begun = _scene(split, scene_index, attempt)
+        begun = _scene(split, scene_index, attempt, from_file)
         stage = "renders"
         sample = render_sample(key, begun, settings, failures, told)
     except Rejected as rejection:
@@ -116,14 +123,12 @@ def attempt_scene(split: str, scene_index: int, attempt: int) -> SceneAttempt:
     return SceneAttempt(sample=sample, failures=failures)
 
 
-def _scene(split: str, scene_index: int, attempt: int) -> BegunScene:
+def _scene(split: str, scene_index: int, attempt: int, from_file: Scene | None) -> BegunScene:
     source, settings = _state.source, _state.source.settings
     if source.revisited is not None:
         return source.revisited.scene(scene_index, attempt, settings)
-    if source.files is not None:
-        num_views, seed = settings.scenes.num_views, settings.seed
-        scene = source.files.scene(scene_index, settings.assets, num_views=num_views, seed=seed)
-        return BegunScene(scene=scene, kept_cameras=num_views)
+    if from_file is not None:
+        return BegunScene(scene=from_file, kept_cameras=settings.scenes.num_views)
     scene = compose_scene(
         settings.scenes,
         assets_of(split),

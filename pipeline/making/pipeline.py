@@ -45,7 +45,12 @@ from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.lock_parts import LockPart, lock_parts
 from pipeline.making.machine import cores_owned
 from pipeline.making.publication import Publication
-from pipeline.making.render_children import close_children, cores_of_child, render_child
+from pipeline.making.render_children import (
+    close_children,
+    cores_of_child,
+    render_child,
+    scene_reader,
+)
 from pipeline.making.restore_object import restore_object
 from pipeline.making.run import (
     Outcome,
@@ -63,9 +68,10 @@ from storage.dataset.asked import write_asked
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.statistics import Statistics
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
+from storage.records.scene import Scene
 
 
 def make_dataset(
@@ -207,8 +213,8 @@ def make_task(job: ShardJob, pieces: tuple[Piece, ...]) -> TaskOutcome:
         TrilightError: the output cannot be written, or this machine would make other bytes.
     """
     started = time.monotonic()
-    with render_child(job) as child:
-        made = [make_piece(job, piece, child) for piece in pieces]
+    with render_child(job) as child, scene_reader(job) as read:
+        made = [make_piece(job, piece, child, read) for piece in pieces]
     seconds = time.monotonic() - started
     return TaskOutcome(
         shards=tuple(shard for _, shard in made if shard),
@@ -218,7 +224,12 @@ def make_task(job: ShardJob, pieces: tuple[Piece, ...]) -> TaskOutcome:
     )
 
 
-def make_piece(job: ShardJob, piece: Piece, child: IsolatedChild) -> tuple[int, ShardEntry | None]:
+def make_piece(
+    job: ShardJob,
+    piece: Piece,
+    child: IsolatedChild,
+    read: Callable[[int], Scene] | None = None,
+) -> tuple[int, ShardEntry | None]:
     """Make what is missing of a piece, and pack its shard if that is whole then.
 
     Scenes that somebody else is making are left to them; whoever stages the last one packs. A scene
@@ -229,15 +240,14 @@ def make_piece(job: ShardJob, piece: Piece, child: IsolatedChild) -> tuple[int, 
     """
     splits, profile = job.settings.splits, job.settings.storage.profile
     shard, scenes = UnfinishedShard(job.folder, splits, piece.shard_index), 0
-    from_files = job.accepted.files is not None
-    attempts = 1 if from_files else MAX_ATTEMPTS  # a file is always the same
+    attempts = 1 if read else MAX_ATTEMPTS  # a file is always the same
     for scene_index in range(piece.first, piece.last):
         with shard.claim(scene_index) as ours:
             if not ours:
                 continue
             began = time.monotonic()
             restore = partial(restore_object, job)
-            sample, failures = make_scene(shard.split, scene_index, attempts, child, restore)
+            sample, failures = make_scene(shard.split, scene_index, attempts, child, restore, read)
             shard.stage(
                 scene_index, sample, failures, profile, began=began, cores=cores_of_child(job)
             )
@@ -255,29 +265,30 @@ def make_scene(
     attempts: int,
     child: IsolatedChild,
     restore: Callable[[str, str], None],
+    read: Callable[[int], Scene] | None = None,
 ) -> tuple[Sample | None, list[Failure]]:
     """Turn meshes into a scene with pictures: the first attempt that is not rejected, if any is.
 
-    In the child, `attempt_scene` composes the scene (or reads its file) and renders its views. If a
-    child is killed, crashes or takes too long, the same attempt is tried again in a new one. An
-    object whose prepared file is away is brought back by `restore`, for the same attempt.
+    In the child, `attempt_scene` composes the scene and renders its views; a scene of a file is
+    read in another one, by `read`. If a child is killed, crashes or takes too long, the same
+    attempt is tried again in a new one. An object whose prepared file is away is brought back by
+    `restore`, for the same attempt.
     """
     failures: list[Failure] = []
     for attempt in range(attempts):
+        key = sample_key(scene_index)
         try:
-            tried = call_with_retries(child, attempt_scene, split, scene_index, attempt)
+            found = (read(scene_index),) if read else ()
+            tried = call_with_retries(child, attempt_scene, split, scene_index, attempt, *found)
             while tried.away:
                 restore(*tried.away)
                 tried = call_with_retries(child, attempt_scene, split, scene_index, attempt)
-        except ChildFailed as failure:
+        except (ChildFailed, Rejected) as error:
+            stage, reason, why = "renders", "environmental_skip", str(error)
+            if isinstance(error, Rejected):
+                stage, reason, why = "scenes", error.reason, error.message
             failures.append(
-                Failure(
-                    stage="renders",
-                    item=sample_key(scene_index),
-                    reason="environmental_skip",
-                    message=str(failure),
-                    attempt=attempt,
-                )
+                Failure(stage=stage, item=key, reason=reason, message=why, attempt=attempt)
             )
             continue
         failures += tried.failures

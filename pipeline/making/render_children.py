@@ -1,27 +1,35 @@
-"""The render children of this process: made at the first task of a job, warm for the next ones."""
+"""The children of this process that make scenes: made at the first task of a job, then warm.
+
+Those that render see scenes of our own making. Where scenes come from files, another child reads
+these, confined to their folder (pipeline.isolation.confinement).
+"""
 
 import contextlib
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from pipeline.assets.settings import AssetSettings
 from pipeline.builds.settings import differences
-from pipeline.isolation import ChildLimits, IsolatedChild
+from pipeline.exchange.scene_files import SceneFiles
+from pipeline.isolation import ChildLimits, IsolatedChild, call_with_retries, reach
 from pipeline.making.attempt_scene import SceneRecipe, set_up_child
 from pipeline.making.children import ChildPool
 from pipeline.making.environment import environment
 from pipeline.making.machine import cores_owned, visible_gpus
+from pipeline.making.prepare_isolated import asset_child
 from pipeline.making.run import ShardJob
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
+from storage.records.scene import Scene
 
 _RENDER_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=200)
 """A scene at 4096 samples and 512 pixels takes minutes; a render child holds below 1 GiB."""
 _CARD_LIMITS = ChildLimits(memory_bytes=1 << 46, wall_s=3600, calls_per_child=200)
 """CUDA reserves addresses for all memory of card and machine."""
 
-_pools: dict[tuple[str, str, str], ChildPool] = {}
+_pools: dict[tuple[str, ...], ChildPool] = {}
 _pools_lock = threading.Lock()
 
 
@@ -39,19 +47,54 @@ def close_idle_children() -> None:
         _close_idle()
 
 
-def _close_idle() -> None:
-    for key in [key for key, pool in _pools.items() if pool.num_users == 0]:
-        _pools.pop(key).close()
+def _close_idle(but: tuple[str, ...] = ()) -> None:
+    idle = [key for key, pool in _pools.items() if pool.num_users == 0]
+    for key in idle:
+        if not but or key[: len(but)] != but:
+            _pools.pop(key).close()
 
 
 @contextlib.contextmanager
 def render_child(job: ShardJob) -> Iterator[IsolatedChild]:
     """Lend a child for a job, made at its first task; idle ones of other jobs end then."""
-    key = (str(job.folder.root), job.settings.digest, job.lock_sha256)
+    with _lent((), job, _render_pool) as child:
+        yield child
+
+
+@contextlib.contextmanager
+def scene_reader(job: ShardJob) -> Iterator[Callable[[int], Scene] | None]:
+    """Lend what reads a scene from its file by its index; None where scenes are composed.
+
+    It raises as `SceneFiles.scene`, and ChildFailed.
+    """
+    files, settings = job.accepted.files, job.settings
+    if files is None:
+        yield None
+        return
+    with _lent(("files",), job, _reading_pool) as child:
+        yield lambda index: call_with_retries(
+            child, scene_of_file, files, index, settings.assets,
+            settings.scenes.num_views, settings.seed,
+        )  # fmt: skip
+
+
+def scene_of_file(
+    files: SceneFiles, scene_index: int, assets: AssetSettings, num_views: int, seed: int
+) -> Scene:
+    """Read a scene; only children come here. Raises as `SceneFiles.scene`."""
+    return files.scene(scene_index, assets, num_views=num_views, seed=seed)
+
+
+@contextlib.contextmanager
+def _lent(
+    kind: tuple[str, ...], job: ShardJob, make: Callable[[ShardJob], ChildPool]
+) -> Iterator[IsolatedChild]:
+    of_job = (str(job.folder.root), job.settings.digest, job.lock_sha256)
+    key = (*of_job, *kind)
     with _pools_lock:
         if key not in _pools:
-            _close_idle()
-            _pools[key] = _new_pool(job)
+            _close_idle(but=of_job)
+            _pools[key] = make(job)
         pool = _pools[key]
         pool.num_users += 1
     try:
@@ -62,7 +105,14 @@ def render_child(job: ShardJob) -> Iterator[IsolatedChild]:
             pool.num_users -= 1
 
 
-def _new_pool(job: ShardJob) -> ChildPool:
+def _reading_pool(job: ShardJob) -> ChildPool:
+    files = job.accepted.files
+    assert files is not None
+    folder = reach(files=[files.root])
+    return ChildPool(lambda _: asset_child(folder), job.num_at_once)
+
+
+def _render_pool(job: ShardJob) -> ChildPool:
     require_same_extensions("this worker: the dataset", job.extensions, recorded("data"))
     variant = choose_variant()
     if job.environment:
@@ -78,7 +128,6 @@ def _new_pool(job: ShardJob) -> ChildPool:
             gpu=cards[number % len(cards)] if cards else None,
             pool=job.accepted.pool,
             maps=job.accepted.maps,
-            files=job.accepted.files,
             revisited=job.accepted.revisited,
             folder=job.folder,
         )

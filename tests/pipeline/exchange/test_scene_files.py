@@ -6,8 +6,10 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from pipeline.builds.named import named_build
@@ -15,6 +17,7 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles, build_scene
 from pipeline.exchange.scene_folder import find_scene_files
 from pipeline.isolation import IsolatedChild, reach
+from pipeline.making import render_children
 from pipeline.making.accept_scene_files import (
     accept_scene_files,
     build_once,
@@ -247,6 +250,39 @@ def test_a_file_that_changes_during_a_run_stops_it(folder: Path) -> None:
         stream.write("# later\n")
     with pytest.raises(TrilightError, match="meshes/tri.obj: has changed while"):
         _scene(files, 1, settings)
+
+
+def test_a_run_reads_files_in_a_confined_child(folder: Path, tmp_path: Path) -> None:
+    """What it may read is the folder; what it returns is what is read here."""
+    settings = _settings(folder)
+    (folder / "c.json").write_text((folder / "a.json").read_text())
+    names = ("a.json", "c.json")
+    files = SceneFiles(
+        root=folder.resolve(),
+        names=names,
+        sha256=_digests(folder, "a.json") | _digests(folder, "c.json"),
+        unusable={"c.json": "it is not wanted"},
+        licence="MIT",
+    )
+    job = cast(Any, SimpleNamespace(
+        folder=DatasetFolder(tmp_path / "set"), settings=settings, lock_sha256="",
+        accepted=SimpleNamespace(files=files), num_at_once=1,
+    ))  # fmt: skip
+    try:
+        with render_children.scene_reader(job) as read:
+            assert read is not None
+            scene, expected = read(0), _scene(files, 0, settings)
+            assert scene.provenance == expected.provenance
+            np.testing.assert_array_equal(scene.vertex_positions, expected.vertex_positions)
+            with pytest.raises(Rejected, match="it is not wanted"):
+                read(1)
+            (child,) = next(iter(render_children._pools.values()))._children
+            assert child._reach is not None and child._reach.reads == {folder.resolve()}
+    finally:
+        render_children.close_children()
+    job.accepted.files = None
+    with render_children.scene_reader(job) as nothing:
+        assert nothing is None
 
 
 def test_the_licence_is_the_users_word(folder: Path, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ def test_only_children_that_nobody_uses_are_closed(monkeypatch: pytest.MonkeyPat
         folder=DatasetFolder(Path("a")), settings=SimpleNamespace(digest="d"), lock_sha256="l"
     ))  # fmt: skip
     monkeypatch.setattr(render_children, "_pools", {("b", "d", "l"): pool("other")})
-    monkeypatch.setattr(render_children, "_new_pool", lambda job: pool("ours"))
+    monkeypatch.setattr(render_children, "_render_pool", lambda job: pool("ours"))
     with render_children.render_child(job):
         assert closed == ["other"]
         render_children.close_idle_children()
