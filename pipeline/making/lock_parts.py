@@ -16,6 +16,7 @@ from pathlib import Path
 
 from pipeline.making.publication import Publication
 from storage.dataset.layout import DatasetFolder
+from storage.dataset.lock_parts import known_lock
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import part_of_object, part_of_shard
 from storage.digests import sha256_of_file
@@ -130,9 +131,7 @@ class LockPart:
 
     def num_frozen(self) -> int:
         """Return how many rows are frozen by now, as far as is known here."""
-        whole = self.folder.objects_lock
-        files = [whole] if whole.exists() else self.folder.lock_parts()
-        return sum(file.read_bytes().count(b"\n") for file in files)
+        return known_lock(self.folder).count(b"\n")
 
 
 def _whole(publication: Publication) -> list[LockedObject]:

@@ -18,7 +18,7 @@ from storage.dataset.layout import (
     shard_names_in,
     shard_names_in_part,
 )
-from storage.dataset.lock_parts import joined_lock
+from storage.dataset.lock_parts import known_lock
 from storage.dataset.manifest import (
     Manifest,
     ShardEntry,
@@ -131,12 +131,9 @@ class Publication:
 
     def join_lock_parts(self) -> None:
         """Make the lock of its parts that are here; where there are none, it is as it is."""
-        if parts := self.folder.lock_parts():
-            files = [path.read_bytes() for path in parts]
-            if digest := self.manifest.objects_lock_sha256:
-                files.append(self.folder.objects_lock.read_bytes())
-            lock = joined_lock(files)
-            if sha256_hex(lock) != digest:
+        if self.folder.lock_parts():
+            lock = known_lock(self.folder)
+            if sha256_hex(lock) != self.manifest.objects_lock_sha256:
                 self._write_lock(lock)
 
     def _write_lock(self, lock: bytes) -> None:

@@ -1,9 +1,19 @@
 """The lock of a dataset whose objects are frozen in parts: the rows of all parts, sorted by uid."""
 
+import contextlib
 import json
 from collections.abc import Iterable
 
+from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
+
+
+def known_lock(folder: DatasetFolder) -> bytes:
+    """Return the lock of a dataset's folder; of one that is not finished, of its parts so far."""
+    parts = [path.read_bytes() for path in folder.lock_parts()]
+    with contextlib.suppress(FileNotFoundError):
+        parts.append(folder.objects_lock.read_bytes())
+    return joined_lock(parts)
 
 
 def joined_lock(files: Iterable[bytes]) -> bytes:

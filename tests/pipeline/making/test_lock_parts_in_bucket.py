@@ -5,9 +5,11 @@ from typing import Any
 
 import pytest
 
+from infra.cli.generate_report import report
 from pipeline.making import object_parts
 from pipeline.making.pipeline import make_dataset
 from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import dataset_folder
 from storage.dataset.splits import part_of_object
 from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
@@ -53,11 +55,17 @@ def _in_one_folder(machines: Machines, folder: Path, made: list[object]) -> tupl
 
 
 def test_each_machine_prepares_what_its_shards_draw_from(
-    bucket: Any, machines: Machines, made: list[object], tmp_path: Path
+    bucket: Any,
+    machines: Machines,
+    made: list[object],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     digest, lock = _in_one_folder(machines, tmp_path / "plain", made)
     machines.use("a")
-    _make(OUT, "0:6")  # the first cycle
+    outcome = _make(OUT, "0:6")  # the first cycle
+    report(dataset_folder(OUT), outcome, 1.0, as_json=False)
+    assert f"MIT ({outcome.num_objects_used})" in capsys.readouterr().out
     of_a = _objects(made)
     assert {part_of_object(uid, SPLITS) for uid in of_a} == {0}
     growing = open_dataset(OUT)
