@@ -327,7 +327,7 @@ def _identity(manifest: Manifest | None) -> object:
     """Return what scenes that are not in a shard yet depend on."""
     if manifest is None:
         return None
-    in_parts = manifest.settings["splits"].get("object_parts", 1) > 1  # its lock grows
+    in_parts = manifest.settings.get("splits", {}).get("object_parts", 1) > 1  # its lock grows
     frozen = "" if in_parts else manifest.objects_lock_sha256
     return (manifest.settings, manifest.environment, frozen, manifest.extensions)
 

@@ -139,7 +139,8 @@ def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
         if command in NOT_RUN_HERE:
             continue
         command = command.replace("FOLDER", shlex.quote(str(shared / "objects")))
-        command = command.replace("--scenes 64", "--scenes 12").replace("/mine", "/readme")
+        command = command.replace("--scenes 64", "--scenes 12 --resolution 64")
+        command = command.replace("/mine", "/readme")
         command = command.replace("make dataset", "make dataset SCENES=6")
         _run(command.replace("--out runs/readme", "--out runs/readme --steps 60"), tmp_path)
     assert (tmp_path / "data" / "smoke" / "contact_sheet.png").stat().st_size > 10_000
