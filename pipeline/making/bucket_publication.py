@@ -1,6 +1,7 @@
 """The manifest of a dataset that is made in a bucket, by makers on any number of machines."""
 
 import contextlib
+import time
 from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,11 @@ from storage.records.objects import (
 )
 from storage.remote.bucket import Bucket
 from storage.remote.url import RemoteUrl, parse_url
+
+_PATIENCE_S = 10.0
+"""With whoever lists the shards, and as long again for each so many notes that are to be read."""
+_NOTES_MEANWHILE = 5_000
+_LONGEST_PAUSE_S = 8.0
 
 
 class BucketPublication(Publication):
@@ -108,12 +114,28 @@ class BucketPublication(Publication):
             self.learn_plan()
             if not self._are_all_there():
                 return None
+            self._let_others_list()
             with self._turn():
                 self._mirror.take_listed(self.manifest)
             if listed := super().finish():
                 self._mirror.send_manifest()
+                self._mirror.say_listed(self.manifest.num_scenes)
             news = self.learn_plan()
         return listed
+
+    def _let_others_list(self) -> None:
+        """Wait while another machine lists the shards: a list costs a request for each of them.
+
+        Machines with tasks of one size end together, and all of them find all shards there. One
+        that dies over its list is waited for in vain, and then another one makes it.
+        """
+        planned, waited_s, pause_s = self.manifest.num_scenes, 0.0, 0.5
+        if self._mirror.is_first_to_list(planned):
+            return
+        patience_s = _PATIENCE_S * (1 + self.num_shards / _NOTES_MEANWHILE)
+        while waited_s < patience_s and not self._mirror.is_listed(planned):
+            time.sleep(pause_s)
+            waited_s, pause_s = waited_s + pause_s, min(2 * pause_s, _LONGEST_PAUSE_S)
 
     def _unlisted(self, listed: Manifest) -> list[ShardNote]:
         known = {entry.name for entry in listed.shards} - set(noted_names(self.folder))

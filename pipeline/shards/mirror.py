@@ -53,6 +53,8 @@ _PLANNED = ".staging/planned/"
 """Folder with one file for each requested number of scenes; the largest counts."""
 _REJECTED = ".failures"
 """What the file of a part's rejections has after the name of the part's."""
+_LISTING, _LISTED = ".staging/listing/", ".staging/listed/"
+"""Folders with a file for each number of scenes whose shards somebody lists, or has listed."""
 _HEAD_BYTES = 1 << 18
 """What is read of a manifest to know its head, which takes about 6 kB."""
 
@@ -208,6 +210,18 @@ class Mirror:
         self._take_failures()
         listed = dataclasses.replace(head, shards=self._manifest().shards)
         write_manifest(self._folder.manifest, listed)
+
+    def is_first_to_list(self, num_scenes: int) -> bool:
+        """Return whether nobody else has begun to list the shards of so many scenes."""
+        return self._bucket.create(f"{_LISTING}{num_scenes:012d}", b"\n")
+
+    def say_listed(self, num_scenes: int) -> None:
+        """Say that the manifest lists the shards of so many scenes."""
+        self._bucket.write(f"{_LISTED}{num_scenes:012d}", b"\n")
+
+    def is_listed(self, num_scenes: int) -> bool:
+        """Return whether the manifest lists the shards of so many scenes, as somebody said."""
+        return self._bucket.read_start(f"{_LISTED}{num_scenes:012d}", 1) is not None
 
     def notes(self, names: Sequence[str]) -> list[ShardNote]:
         """Return the notes on finished shards: from here, or else from the bucket."""

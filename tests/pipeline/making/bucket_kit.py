@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from pipeline.builds.named import named_build
+from pipeline.making import bucket_publication
 from pipeline.making.bucket_publication import begin_dataset, joined
 from pipeline.making.publication import Publication
 from storage.dataset.layout import dataset_folder
@@ -25,6 +26,7 @@ def empty_bucket(port: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     for name, value in {**CREDENTIALS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(tries, "PAUSE_S", 0.0)
+    monkeypatch.setattr(bucket_publication, "_PATIENCE_S", 0.0)
     control(port, "reset")
     remote_url._driver_of.cache_clear()
     place = remote_url.parse_url("s3://shards", what="bucket")

@@ -6,11 +6,13 @@ from typing import Any
 
 import pytest
 
+from pipeline.making import bucket_publication
 from pipeline.making import publication as publications
 from pipeline.making.accept_objects import trusted_objects
 from pipeline.making.frozen_pool import AssetAway
 from pipeline.making.prepare_isolated import asset_store
 from pipeline.making.publication import Publication
+from pipeline.shards import mirror
 from pipeline.shards.pack import pack_shard
 from storage.dataset.dataset import open_dataset
 from storage.dataset.staging import stage_scene
@@ -113,6 +115,55 @@ def test_a_shard_that_another_machine_has_sent_is_listed(bucket: Any, machines: 
         listed = publication.finish()
         assert listed is not None and listed.shards[0] == entry
     assert len(_failures(bucket, "failures.jsonl")) == 8
+
+
+def test_of_those_who_end_together_one_reads_the_notes(
+    bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The others wait for its list; one that died over its list is waited for in vain."""
+    read: list[str] = []
+    fetched = mirror.fetched_notes
+    monkeypatch.setattr(
+        mirror, "fetched_notes", lambda how, names, at: fetched(how, _told(names, read), at)
+    )
+    monkeypatch.setattr(bucket_publication, "_PATIENCE_S", 10.0)
+    with machines.maker("a") as first, machines.maker("b") as second:
+        machines.use("a")
+        first.lock_objects([_locked()])
+        make_tiny_shard(first, 0)
+        make_tiny_shard(first, 1)
+        machines.use("b")
+        second.take_lock()
+        waits: list[float] = []
+        monkeypatch.setattr(bucket_publication.time, "sleep", waits.append)
+        assert first._mirror.is_first_to_list(8)  # type: ignore[attr-defined]
+
+        def in_vain(pause_s: float) -> None:
+            waits.append(pause_s)
+            if len(waits) == 3:
+                first._mirror.say_listed(8)  # type: ignore[attr-defined]
+
+        with monkeypatch.context() as patch:
+            patch.setattr(bucket_publication.time, "sleep", in_vain)
+            listed = second.finish()
+        assert listed is not None and len(waits) == 3
+        assert len(read) == 2  # the manifest did not list them all the same
+        read.clear()
+        with machines.maker("c") as third:
+            assert third.finish() == listed
+            assert read == [] and len(waits) == 3
+    with machines.maker("d", 16) as longer:
+        for number in (2, 3):
+            make_tiny_shard(longer, number)
+        assert longer._mirror.is_first_to_list(16)  # type: ignore[attr-defined]
+        waits.clear()
+        assert longer.finish() is not None
+        assert 10 <= sum(waits) < 20, "its maker died over it"
+
+
+def _told(names: Any, read: list[str]) -> list[str]:
+    read += (found := list(names))
+    return found
 
 
 def test_who_comes_later_trusts_the_index_of_the_first(bucket: Any, machines: Machines) -> None:
