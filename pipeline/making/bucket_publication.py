@@ -133,9 +133,11 @@ class BucketPublication(Publication):
         if self._mirror.is_first_to_list(planned):
             return
         patience_s = _PATIENCE_S * (1 + self.num_shards / _NOTES_MEANWHILE)
-        while waited_s < patience_s and not self._mirror.is_listed(planned):
+        listed = self._mirror.is_listed(planned)
+        while waited_s < patience_s and not listed:
             time.sleep(pause_s)
             waited_s, pause_s = waited_s + pause_s, min(2 * pause_s, _LONGEST_PAUSE_S)
+            self.left_to_others = listed = self._mirror.is_listed(planned)
 
     def _unlisted(self, listed: Manifest) -> list[ShardNote]:
         known = {entry.name for entry in listed.shards} - set(noted_names(self.folder))

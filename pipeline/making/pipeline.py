@@ -93,7 +93,7 @@ def make_dataset(
         finished = run.publication.finish()
         run.require_within_budget()
         statistics = None
-        if finished:
+        if finished and not run.publication.left_to_others:
             statistics = runner.finish(lambda: make_documents(run.publication))
     return run.outcome(finished, statistics)
 

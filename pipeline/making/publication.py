@@ -84,6 +84,8 @@ class Publication:
         """What is finished of what was asked for, as far as this maker has looked."""
         self.failures: list[Failure] = []
         """What was rejected on the way to the shards of this run, until the manifest lists them."""
+        self.left_to_others = False
+        """Whether another machine has just listed the shards, and writes the documents."""
         self._splits = splits
 
     def dataset(self) -> Dataset:

@@ -147,10 +147,12 @@ def test_of_those_who_end_together_one_reads_the_notes(
             patch.setattr(bucket_publication.time, "sleep", in_vain)
             listed = second.finish()
         assert listed is not None and len(waits) == 3
+        assert second.left_to_others, "documents too: each reads the whole dataset"
         assert len(read) == 2  # the manifest did not list them all the same
         read.clear()
         with machines.maker("c") as third:
             assert third.finish() == listed
+            assert not third.left_to_others
             assert read == [] and len(waits) == 3
     with machines.maker("d", 16) as longer:
         for number in (2, 3):
@@ -159,6 +161,7 @@ def test_of_those_who_end_together_one_reads_the_notes(
         waits.clear()
         assert longer.finish() is not None
         assert 10 <= sum(waits) < 20, "its maker died over it"
+        assert not longer.left_to_others
 
 
 def _told(names: Any, read: list[str]) -> list[str]:
