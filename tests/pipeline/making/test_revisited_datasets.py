@@ -34,7 +34,7 @@ TINY = {
 def generated(out: Path, num_views: int) -> Dataset:
     changes = {**TINY, "scenes.num_views": num_views}
     order = DatasetOrder(
-        build="smoke", objects="builtin:", out=str(out), scenes=3, resolution=16, changes=changes
+        build="smoke", objects="builtin:24", out=str(out), scenes=3, resolution=16, changes=changes
     )
     make_dataset(order, Undocumented())
     return open_dataset(str(out))
