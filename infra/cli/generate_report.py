@@ -46,6 +46,10 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json
         ("why rejected", _place(folder, folder.failures)),
     ]
     _print_notes(outcome.notes)
+    if statistics is None and outcome.digest:
+        print_rows("Dataset finished by another machine, which writes its documents", rows)
+        next_step(["verify", folder.shown])
+        return
     if statistics is None:
         there = f"{outcome.num_shards} of {outcome.num_shards_planned} shards are there"
         print_rows(f"Range finished; {there}", rows)
@@ -83,7 +87,7 @@ def _print_json(
     row: dict[str, object] = {
         "out": folder.shown,
         "dataset_digest": outcome.digest,
-        "finished": statistics is not None,
+        "finished": bool(outcome.digest),
         "shards": outcome.num_shards,
         "shards_planned": outcome.num_shards_planned,
         "objects_found": outcome.num_objects_found,

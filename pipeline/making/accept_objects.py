@@ -1,15 +1,14 @@
 """From a source to frozen objects; where they are frozen already, from the lock and its index."""
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import replace
 
 from pipeline.making.accept_maps import AcceptedMaps, accept_maps
 from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects, require_same
 from pipeline.making.lock_parts import LockPart
-from pipeline.making.object_parts import Proof, prepare_in_parts, proved
-from pipeline.making.prepare_isolated import prepare_isolated
+from pipeline.making.object_parts import Proof, cut_objects, prepare_in_parts
 from pipeline.objects.sources import FoundObjects
 from storage.dataset.progress import announce_objects, count_object
 from storage.errors import TrilightError
@@ -63,19 +62,22 @@ def accept_objects(
     if frozen is None:
         prepared, rejected = _proofs(found, order, part, again=not shared)
     else:
-        wanted = [record for record in found.records if record.uid in frozen]
-        announce_objects(folder, len(wanted))
-        assets, rejected = prepare_isolated(
-            wanted,
-            settings.mesh_settings,
-            workers=order.workers,
-            done=lambda: count_object(folder),
-        )
-        prepared = [*map(proved, assets)]
+        wanted = _beside(frozen, found)
+        announce_objects(folder, len(wanted.records))
+        proofs, failures = _proofs(wanted, order, part)
+        prepared = [one for one in proofs if one.record.uid in frozen]
+        rejected = [failure for failure in failures if failure.item in frozen]
     accepted = freeze_objects(order, found, prepared, rejected, maps, part)
     if part.number is None:
         shutil.rmtree(folder.staged_parts, ignore_errors=True)
     return accepted
+
+
+def _beside(frozen: Container[str], found: FoundObjects) -> FoundObjects:
+    """Return the objects that are frozen, and those that were prepared together with them."""
+    parts = cut_objects(found.records)
+    kept = [part for part in parts if any(record.uid in frozen for record in part)]
+    return replace(found, records=tuple(record for part in kept for record in part))
 
 
 def _same_maps(maps: AcceptedMaps, order: AskedObjects, part: LockPart) -> AcceptedMaps:

@@ -24,6 +24,7 @@ from storage.records.objects import (
     LockedObject,
     encode_failures,
     encode_objects_lock,
+    write_objects_lock,
 )
 from storage.remote.bucket import Bucket
 from storage.remote.url import RemoteUrl, parse_url
@@ -80,12 +81,9 @@ class BucketPublication(Publication):
         self._mirror.freeze_part(path, lock, encode_failures(failures))
         write_atomically(path, lock)
 
-    def join_lock_parts(self) -> None:
-        self.add_failures(self._mirror.take_parts_of_lock())
-        before = self.manifest.objects_lock_sha256
-        super().join_lock_parts()
-        if self.manifest.objects_lock_sha256 != before:
-            self._mirror.replace_lock()
+    def restore_lock_part(self, path: Path, rows: Iterable[LockedObject]) -> None:
+        if not path.exists():  # the lock is made of all parts, by whoever finishes
+            write_objects_lock(path, rows)
 
     def _note(self, note: ShardNote) -> None:
         if self.folder.shard(note.shard.name).exists():  # else another machine has sent it
@@ -115,9 +113,17 @@ class BucketPublication(Publication):
             if not self._are_all_there():
                 return None
             self._let_others_list()
-            with self._turn():
-                self._mirror.take_listed(self.manifest)
-            if listed := super().finish():
+            if self.left_to_others:
+                self._mirror.take_finished()
+            else:
+                if self.in_parts:
+                    self.add_failures(self._mirror.take_parts_of_lock())
+                with self._turn():
+                    self._mirror.take_listed(self.manifest)
+            listed = super().finish()
+            if listed and not self.left_to_others:
+                if self.in_parts:
+                    self._mirror.send_lock()
                 self._mirror.send_manifest()
                 self._mirror.say_listed(self.manifest.num_scenes)
             news = self.learn_plan()
@@ -130,6 +136,7 @@ class BucketPublication(Publication):
         that dies over its list is waited for in vain, and then another one makes it.
         """
         planned, waited_s, pause_s = self.manifest.num_scenes, 0.0, 0.5
+        self.left_to_others = False
         if self._mirror.is_first_to_list(planned):
             return
         patience_s = _PATIENCE_S * (1 + self.num_shards / _NOTES_MEANWHILE)
@@ -187,7 +194,8 @@ def begin_dataset(
     mirror = Mirror(folder)
     is_new = not mirror.is_begun()
     if is_new:
-        require_free(folder, mirror.names())
+        require_free(folder, names := mirror.names())
+        _require_no_parts(folder, names)
         url = parse_url(folder.bucket, what="out")
         assert isinstance(url, RemoteUrl)
         Bucket(url).require_create()
@@ -199,6 +207,16 @@ def begin_dataset(
     in_bucket = BucketPublication(folder, publication.manifest, settings.splits, mirror)
     in_bucket.learn_plan()
     return in_bucket
+
+
+def _require_no_parts(folder: DatasetFolder, names: set[str]) -> None:
+    place = folder.staged_locks.relative_to(folder.root).as_posix()
+    if left := sorted(name for name in names if name.startswith(place)):
+        raise TrilightError(
+            f"{folder.shown}: {left[0]} is there but no manifest.json: objects of another dataset "
+            "are frozen here; expected an empty folder or a dataset. Delete .staging, or choose "
+            "another --out."
+        )
 
 
 def joined(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:

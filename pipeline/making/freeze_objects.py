@@ -92,7 +92,7 @@ def freeze_objects(
         part.freeze(publication, objects, own, failures)
     else:
         require_same(shown, frozen, [*objects, *own])
-        part.restore(objects)
+        part.restore(publication, objects, own)
     _index(order, part, [*objects, *own], prepared, found.num_found)
     return AcceptedObjects(
         num_objects=len(objects),

@@ -25,7 +25,6 @@ from storage.records.objects import (
     Failure,
     LockedObject,
     read_objects_lock,
-    write_objects_lock,
 )
 
 
@@ -118,10 +117,17 @@ class LockPart:
             publication.freeze_lock_part(self.maps, maps)
         publication.freeze_lock_part(self.lock, objects, failures)
 
-    def restore(self, objects: Sequence[LockedObject]) -> None:
-        """Write the file of a frozen part again, where `.staging` was deleted."""
-        if self.number is not None and not self.lock.exists():
-            write_objects_lock(self.lock, objects)
+    def restore(
+        self,
+        publication: Publication,
+        objects: Sequence[LockedObject],
+        maps: Sequence[LockedObject],
+    ) -> None:
+        """Have the files of a frozen part here, after a kill or where `.staging` was deleted."""
+        if self.number is not None:
+            if maps:
+                publication.restore_lock_part(self.maps, maps)
+            publication.restore_lock_part(self.lock, objects)
 
     def is_public(self, publication: Publication, sha256: str) -> bool:
         """Return whether the rows of this part, which have a digest, are those of the dataset."""
@@ -147,4 +153,4 @@ def lock_parts(
     if splits.object_parts == 1:
         return [LockPart(folder=folder, splits=splits)]
     numbers = dict.fromkeys(part_of_shard(index, splits) for index in shards)
-    return [LockPart(folder=folder, splits=splits, number=number) for number in numbers or [0]]
+    return [LockPart(folder=folder, splits=splits, number=number) for number in numbers]

@@ -157,7 +157,7 @@ def _by_parts(run: Run) -> Iterator[Run]:
         return
     everything, own = replace(run, part=None), map_folders(run.order, run.settings)
     folder, splits = run.publication.folder, run.settings.splits
-    for part in lock_parts(folder, splits, everything.missing_shards()):
+    for part in lock_parts(folder, splits, everything.missing_shards()):  # none: all are there
         if part != run.part:
             accepted = accept_part(run.order, run.settings, run.publication, own, part)
             yield replace(run, accepted=accepted, part=part)

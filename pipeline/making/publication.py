@@ -102,7 +102,8 @@ class Publication:
 
     def lock_objects(self, objects: list[LockedObject]) -> None:
         """Freeze the objects of the dataset."""
-        self._write_lock(encode_objects_lock(objects))
+        with self._turn():
+            self._write_lock(encode_objects_lock(objects))
 
     def take_lock(self) -> None:
         """Have the lock and its index here, where another machine has frozen the objects."""
@@ -128,20 +129,31 @@ class Publication:
             failures: as rows of failures.jsonl.
         """
         self.add_failures(failures)
-        write_objects_lock(path, rows)
+        self.restore_lock_part(path, rows)
+
+    def restore_lock_part(self, path: Path, rows: Iterable[LockedObject]) -> None:
+        """Have the file of a frozen part here, and the lock of all parts that are."""
+        if not path.exists():
+            write_objects_lock(path, rows)
         self.join_lock_parts()
 
     def join_lock_parts(self) -> None:
-        """Make the lock of its parts that are here; where there are none, it is as it is."""
-        if self.folder.lock_parts():
-            lock = known_lock(self.folder)
-            if sha256_hex(lock) != self.manifest.objects_lock_sha256:
-                self._write_lock(lock)
+        """Make the lock of its parts that are here; one that is frozen as a whole stays."""
+        if self.in_parts and self.folder.lock_parts():
+            with self._turn():
+                lock = known_lock(self.folder)
+                if sha256_hex(lock) != self.manifest.objects_lock_sha256:
+                    self._write_lock(lock)
+
+    @property
+    def in_parts(self) -> bool:
+        """Whether the objects are frozen in parts."""
+        return self._splits.object_parts > 1
 
     def _write_lock(self, lock: bytes) -> None:
+        """Write the lock and what the manifest says of it; call in the turn of the manifest."""
         write_atomically(self.folder.objects_lock, lock)
-        with self._turn():
-            self._write(objects_lock_sha256=sha256_hex(lock))
+        self._write(objects_lock_sha256=sha256_hex(lock))
 
     def add_shard(self, shard: ShardEntry) -> None:
         """Note a finished shard.

@@ -72,10 +72,15 @@ def scene_reader(job: ShardJob) -> Iterator[Callable[[int], Scene] | None]:
         yield None
         return
     with _lent(("files",), job, _reading_pool) as child:
-        yield lambda index: call_with_retries(
-            child, scene_of_file, files, index, settings.assets,
-            settings.scenes.num_views, settings.seed,
-        )  # fmt: skip
+
+        def read(index: int) -> Scene:
+            num_views, seed = settings.scenes.num_views, settings.seed
+            asked = (files, index, settings.assets, num_views, seed)
+            scene = call_with_retries(child, scene_of_file, *asked)
+            scene.check()  # here: whoever has taken the child over may say what it likes
+            return scene
+
+        yield read
 
 
 def scene_of_file(

@@ -10,6 +10,7 @@ from pipeline.objects.sources import ListedObjects, list_objects
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex
 from storage.records.lock_rows import LockRows
+from storage.records.objects import ObjectRecord
 from storage.remote.safe_url import safe_url
 
 
@@ -33,8 +34,7 @@ def restore_object(job: ShardJob, uid: str, asset_name: str) -> None:
         return  # somebody was quicker
     place.unlink(missing_ok=True)
     work_dir, allowed = job.folder.staged_objects, tuple(settings.allowed_licences)
-    listed = _listed(frozen.source, frozen.licence, work_dir, allowed)
-    record = next(iter(listed.found(lambda other: other == uid).records), None)
+    record = found_again(frozen.source, frozen.licence, work_dir, allowed, uid)
     if record is None or locked is None:
         raise changed(shown, uid, "is missing or no longer usable")
     prepared, rejected = prepare_isolated(
@@ -53,6 +53,19 @@ def _holds(path: Path, sha256: str) -> bool:
         return sha256_hex(path.read_bytes()) == sha256
     except FileNotFoundError:
         return False
+
+
+def found_again(
+    source: str, licence: str | None, work_dir: Path, allowed: tuple[str, ...], uid: str
+) -> ObjectRecord | None:
+    """Return an object of a source, with its file here; None where it is not, or no longer."""
+    for _ in range(2):  # a list that was made before may be older than the file
+        listed = _listed(source, licence, work_dir, allowed)
+        for record in listed.found(lambda other: other == uid).records:
+            if Path(record.path).exists():
+                return record
+        _listed.cache_clear()
+    return None
 
 
 @functools.lru_cache(maxsize=1)

@@ -162,7 +162,8 @@ class Outcome:
     num_shards_planned: int
     """Shards of the finished dataset."""
     statistics: Statistics | None
-    """What the dataset holds; None where it is not finished."""
+    """What the dataset holds; None where it is not finished, or another machine, which has finished
+    it, writes its documents."""
     notes: tuple[str, ...] = ()
     """What a person should know: fields of scene files that are unknown, cameras that were not
     used, and whether a frozen set is the published one."""

@@ -51,8 +51,6 @@ from storage.remote.url import RemoteUrl, parse_url
 
 _PLANNED = ".staging/planned/"
 """Folder with one file for each requested number of scenes; the largest counts."""
-_REJECTED = ".failures"
-"""What the file of a part's rejections has after the name of the part's."""
 _LISTING, _LISTED = ".staging/listing/", ".staging/listed/"
 """Folders with a file for each number of scenes whose shards somebody lists, or has listed."""
 _HEAD_BYTES = 1 << 18
@@ -92,7 +90,8 @@ class Mirror:
             TrilightError: the bucket cannot be read.
         """
         folder, theirs = self._folder, self._head()
-        if theirs is None or _identity(self._own_head()) != _identity(theirs):
+        own = self._own_head()
+        if theirs is None or _identity(own) != _identity(theirs) or not self._parts_agree():
             _clear(folder)
         shutil.rmtree(folder.staged_sent, ignore_errors=True)  # `look_at` looks again
         if theirs is None:
@@ -101,6 +100,19 @@ class Mirror:
         if not theirs.objects_lock_sha256:
             self._take_failures()
         write_manifest(folder.manifest, theirs)
+
+    def _parts_agree(self) -> bool:
+        """Return whether the parts of the lock that are here are those of the bucket."""
+        parts = self._folder.lock_parts()
+        return all(self._files.read(self._name(path)) == path.read_bytes() for path in parts)
+
+    def take_finished(self) -> None:
+        """Bring the finished manifest of the bucket here, and the lock that it names."""
+        theirs = self._manifest()
+        with self._folder.turn("manifest"):
+            self._take_failures()
+            self._take_lock(theirs.objects_lock_sha256)
+            write_manifest(self._folder.manifest, theirs)
 
     def _take_lock(self, sha256: str) -> None:
         """Bring the frozen objects here, and their index, unless they are here."""
@@ -165,7 +177,7 @@ class Mirror:
             TrilightError: another machine has frozen another one.
         """
         name = self._name(path)
-        self._bucket.write(f"{name}{_REJECTED}", failures)
+        self._bucket.write(_rejected_for(name, lock), failures)
         if not self._bucket.create(name, lock) and self._files.read(name) != lock:
             raise TrilightError(
                 f"{self._folder.shown}: another worker has frozen {name} in the meantime, and not "
@@ -177,13 +189,16 @@ class Mirror:
         """Bring every part of the frozen objects here; return what was rejected for them."""
         folder = self._folder
         names = self._bucket.names_in(self._name(folder.staged_locks))
-        rejected = [name for name in names if name.endswith(_REJECTED)]
         self.take(folder.root / name for name in names if name.endswith(LOCK_PART))
-        return [row for name in rejected for row in decode_failures(self._files.read(name) or b"")]
+        rejected = (_rejected_for(self._name(one), one.read_bytes()) for one in folder.lock_parts())
+        files = [self._files.read(name) for name in rejected if name in names]
+        return [row for file in files for row in decode_failures(file or b"")]
 
-    def replace_lock(self) -> None:
-        """Put the lock of all parts into the bucket, which the manifest is to name."""
-        self._bucket.write(self._folder.objects_lock.name, self._folder.objects_lock)
+    def send_lock(self) -> None:
+        """Put the lock of all parts into the bucket, unless it is there; the manifest follows."""
+        path = self._folder.objects_lock
+        if self._files.read(path.name) != path.read_bytes():
+            self._bucket.write(path.name, path)
 
     def planned(self) -> int:
         """Return how many scenes somebody has planned at most."""
@@ -335,6 +350,11 @@ class Mirror:
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self._folder.root).as_posix()
+
+
+def _rejected_for(part: str, lock: bytes) -> str:
+    """Return the file of what was rejected for a part of these rows: others may have other ones."""
+    return f"{part}.{sha256_hex(lock)[:16]}.failures"
 
 
 def _identity(manifest: Manifest | None) -> object:

@@ -1,7 +1,8 @@
 """Paths of a dataset folder, and the locks by which several workers share it.
 
 The shards and the files beside them are the dataset. `.staging` holds unfinished work; it may be
-deleted at any time, and is then made again.
+deleted at any time, and is then made again, with one exception: of an unfinished dataset in a
+bucket whose objects are frozen in parts, `.staging/object_locks` says what is frozen.
 
 No folder holds more than 5,000 entries: of files that are numbered, the first 4,096 stand in their
 folder, and each following 4,096 in one of its `part-0001`, `part-0002`, ... The place of a file

@@ -252,7 +252,9 @@ def test_a_file_that_changes_during_a_run_stops_it(folder: Path) -> None:
         _scene(files, 1, settings)
 
 
-def test_a_run_reads_files_in_a_confined_child(folder: Path, tmp_path: Path) -> None:
+def test_a_run_reads_files_in_a_confined_child(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What it may read is the folder; what it returns is what is read here."""
     settings = _settings(folder)
     (folder / "c.json").write_text((folder / "a.json").read_text())
@@ -276,6 +278,11 @@ def test_a_run_reads_files_in_a_confined_child(folder: Path, tmp_path: Path) -> 
             np.testing.assert_array_equal(scene.vertex_positions, expected.vertex_positions)
             with pytest.raises(Rejected, match="it is not wanted"):
                 read(1)
+            wrong = dataclasses.replace(scene, faces=scene.faces + len(scene.vertex_positions))
+            with monkeypatch.context() as patch:  # as a child that has been taken over
+                patch.setattr(render_children, "call_with_retries", lambda *asked: wrong)
+                with pytest.raises(TrilightError):
+                    read(0)
             (child,) = next(iter(render_children._pools.values()))._children
             assert child._reach is not None and child._reach.reads == {folder.resolve()}
     finally:

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.making import accept_objects as accepting
 from pipeline.making import asked_objects, object_parts, pipeline
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.objects.listing import Listing
@@ -44,11 +43,6 @@ def parts_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[objec
         return prepare(records, done)
 
     monkeypatch.setattr(mesher, "prepare", noted)
-    monkeypatch.setattr(
-        accepting,
-        "prepare_isolated",
-        lambda records, settings, *, workers, done: prepare(records, done),
-    )
     return order
 
 

@@ -138,18 +138,21 @@ def test_of_those_who_end_together_one_reads_the_notes(
         monkeypatch.setattr(bucket_publication.time, "sleep", waits.append)
         assert first._mirror.is_first_to_list(8)  # type: ignore[attr-defined]
 
-        def in_vain(pause_s: float) -> None:
+        def meanwhile(pause_s: float) -> None:
             waits.append(pause_s)
             if len(waits) == 3:
-                first._mirror.say_listed(8)  # type: ignore[attr-defined]
+                machines.use("a")
+                with monkeypatch.context() as patch:
+                    patch.setattr(first, "_let_others_list", lambda: None)
+                    first.finish()
+                machines.use("b")
+                read.clear()
 
         with monkeypatch.context() as patch:
-            patch.setattr(bucket_publication.time, "sleep", in_vain)
+            patch.setattr(bucket_publication.time, "sleep", meanwhile)
             listed = second.finish()
-        assert listed is not None and len(waits) == 3
+        assert listed == first.manifest and len(waits) == 3 and read == []
         assert second.left_to_others, "documents too: each reads the whole dataset"
-        assert len(read) == 2  # the manifest did not list them all the same
-        read.clear()
         with machines.maker("c") as third:
             assert third.finish() == listed
             assert not third.left_to_others
@@ -162,6 +165,38 @@ def test_of_those_who_end_together_one_reads_the_notes(
         assert longer.finish() is not None
         assert 10 <= sum(waits) < 20, "its maker died over it"
         assert not longer.left_to_others
+
+
+def test_who_waited_and_then_lists_more_writes_the_documents(
+    bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While it waited for the list of 8 scenes, somebody planned 16 and made them."""
+    monkeypatch.setattr(bucket_publication, "_PATIENCE_S", 10.0)
+    with machines.maker("a") as first, machines.maker("b") as second:
+        machines.use("a")
+        first.lock_objects([_locked()])
+        make_tiny_shard(first, 0)
+        make_tiny_shard(first, 1)
+        assert first._mirror.is_first_to_list(8)  # type: ignore[attr-defined]
+        machines.use("b")
+        second.take_lock()
+
+        def meanwhile(pause_s: float) -> None:
+            machines.use("a")
+            with monkeypatch.context() as patch:
+                patch.setattr(first, "_let_others_list", lambda: None)
+                first.finish()
+            with machines.maker("c", 16) as third:
+                make_tiny_shard(third, 2)
+                make_tiny_shard(third, 3)
+            machines.use("b")
+
+        monkeypatch.setattr(bucket_publication.time, "sleep", meanwhile)
+        listed = second.finish()
+        assert listed is not None and len(listed.shards) == 4
+        assert not second.left_to_others
+    assert len(open_dataset(OUT).manifest.shards) == 4
+    assert verify_dataset(OUT).problems == []
 
 
 def _told(names: Any, read: list[str]) -> list[str]:
