@@ -27,6 +27,13 @@ _LOCAL_NETWORK_CHECKS = (
 )
 
 
+_ON_THE_WAY = "Inspected target navigated or closed"
+
+
+class OnTheWay(AssertionError):
+    """The page was left while it was asked."""
+
+
 class Browser:
     """One page of a browser."""
 
@@ -54,6 +61,8 @@ class Browser:
             if message.get("method") == "Fetch.requestPaused":
                 self._fulfil(message["params"])
             if message.get("id") == number:
+                if message.get("error", {}).get("message") == _ON_THE_WAY:
+                    raise OnTheWay(method)
                 assert "error" not in message, (method, message["error"])
                 return dict(message["result"])
         raise AssertionError(f"{method}: no answer")
@@ -89,9 +98,15 @@ class Browser:
     def until(self, condition: str) -> None:
         """Wait until an expression holds."""
         deadline = time.monotonic() + PATIENCE_S
-        while not self.run(f"Boolean({condition})"):
+        while not self._holds(condition):
             assert time.monotonic() < deadline, (condition, self.run("document.body.innerText"))
             time.sleep(0.2)
+
+    def _holds(self, condition: str) -> bool:
+        try:
+            return bool(self.run(f"Boolean({condition})"))
+        except OnTheWay:  # a click has led to another page, which is asked next
+            return False
 
     def write(self, text: str) -> None:
         """Type into what has the focus."""
