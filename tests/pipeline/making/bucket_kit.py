@@ -12,6 +12,7 @@ from pipeline.making import bucket_publication
 from pipeline.making.bucket_publication import begin_dataset, joined
 from pipeline.making.publication import Publication
 from storage.dataset.layout import dataset_folder
+from storage.remote import bucket as remote_bucket
 from storage.remote import tries
 from storage.remote import url as remote_url
 from tests.pipeline.making.test_publication import ENVIRONMENT, _build
@@ -35,6 +36,47 @@ def empty_bucket(port: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     driver.mkdir("shards")
     yield driver
     remote_url._driver_of.cache_clear()
+
+
+class Killed(BaseException):
+    """Ends a maker between two requests, as SIGKILL would: locks go with it, and nothing else."""
+
+
+@contextlib.contextmanager
+def killed_before(monkeypatch: pytest.MonkeyPatch, method: str, ending: str) -> Iterator[None]:
+    """Expect a maker to be killed before it writes a file of such a name.
+
+    Args:
+        monkeypatch: takes it back.
+        method: `write` or `create`, of the bucket.
+        ending: of the file's name.
+    """
+    real = getattr(remote_bucket.Bucket, method)
+
+    def killed(self: Any, name: str, content: Any) -> Any:
+        if name.endswith(ending):
+            raise Killed
+        return real(self, name, content)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(remote_bucket.Bucket, method, killed)
+        yield
+
+
+class Writes:
+    """The writes of all makers to buckets, of which a run has so many before it is killed."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.left = 0
+        put = remote_bucket.Bucket._put
+
+        def put_or_die(bucket: Any, *arguments: Any, **options: Any) -> None:
+            self.left -= 1
+            if self.left < 0:
+                raise Killed
+            put(bucket, *arguments, **options)
+
+        monkeypatch.setattr(remote_bucket.Bucket, "_put", put_or_die)
 
 
 class Machines:

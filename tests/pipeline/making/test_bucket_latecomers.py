@@ -1,6 +1,8 @@
 """Two makers in one bucket, one of them late: nothing that the first has said is lost."""
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +119,20 @@ def test_a_shard_that_another_machine_has_sent_is_listed(bucket: Any, machines: 
     assert len(_failures(bucket, "failures.jsonl")) == 8
 
 
+@contextlib.contextmanager
+def _ending_together(machines: Machines) -> Iterator[tuple[Publication, Publication]]:
+    """Two makers that find all shards there: the first says that it lists; the second is in use."""
+    with machines.maker("a") as first, machines.maker("b") as second:
+        machines.use("a")
+        first.lock_objects([_locked()])
+        make_tiny_shard(first, 0)
+        make_tiny_shard(first, 1)
+        assert first._mirror.is_first_to_list(8)  # type: ignore[attr-defined]
+        machines.use("b")
+        second.take_lock()
+        yield first, second
+
+
 def test_of_those_who_end_together_one_reads_the_notes(
     bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -127,16 +143,9 @@ def test_of_those_who_end_together_one_reads_the_notes(
         mirror, "fetched_notes", lambda how, names, at: fetched(how, _told(names, read), at)
     )
     monkeypatch.setattr(bucket_publication, "_PATIENCE_S", 10.0)
-    with machines.maker("a") as first, machines.maker("b") as second:
-        machines.use("a")
-        first.lock_objects([_locked()])
-        make_tiny_shard(first, 0)
-        make_tiny_shard(first, 1)
-        machines.use("b")
-        second.take_lock()
+    with _ending_together(machines) as (first, second):
         waits: list[float] = []
         monkeypatch.setattr(bucket_publication.time, "sleep", waits.append)
-        assert first._mirror.is_first_to_list(8)  # type: ignore[attr-defined]
 
         def meanwhile(pause_s: float) -> None:
             waits.append(pause_s)
@@ -172,14 +181,7 @@ def test_who_waited_and_then_lists_more_writes_the_documents(
 ) -> None:
     """While it waited for the list of 8 scenes, somebody planned 16 and made them."""
     monkeypatch.setattr(bucket_publication, "_PATIENCE_S", 10.0)
-    with machines.maker("a") as first, machines.maker("b") as second:
-        machines.use("a")
-        first.lock_objects([_locked()])
-        make_tiny_shard(first, 0)
-        make_tiny_shard(first, 1)
-        assert first._mirror.is_first_to_list(8)  # type: ignore[attr-defined]
-        machines.use("b")
-        second.take_lock()
+    with _ending_together(machines) as (first, second):
 
         def meanwhile(pause_s: float) -> None:
             machines.use("a")

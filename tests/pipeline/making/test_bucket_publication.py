@@ -17,8 +17,7 @@ from storage.dataset.staging import is_staged, stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.sample import sample_key
-from storage.remote import bucket as remote_bucket
-from tests.pipeline.making.bucket_kit import OUT, Machines
+from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, Writes
 from tests.pipeline.making.test_publication import _build, _dataset, _locked, make_tiny_shard
 from tests.s3_server import control
 from tests.scenes_by_hand import tiny_sample
@@ -27,10 +26,6 @@ pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
 pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
 
 FIRST, SECOND = "train-000000.tar", "train-000001.tar"
-
-
-class Killed(BaseException):
-    """Ends a maker between two requests, as SIGKILL would: locks go with it, and nothing else."""
 
 
 def make(publication: Publication, *shards: int) -> None:
@@ -86,18 +81,9 @@ def test_a_kill_before_any_request_loses_nothing(
 ) -> None:
     """The n-th write of each run never happens; two machines take turns until one gets through."""
     plain = _dataset(tmp_path / "plain")
-    put, left, runs = remote_bucket.Bucket._put, 0, 0
-
-    def put_or_die(self: Any, *arguments: Any, **options: Any) -> None:
-        nonlocal left
-        left -= 1
-        if left < 0:
-            raise Killed
-        put(self, *arguments, **options)
-
-    monkeypatch.setattr(remote_bucket.Bucket, "_put", put_or_die)
+    writes, runs = Writes(monkeypatch), 0
     while True:
-        left, runs = runs // 2, runs + 1
+        writes.left, runs = runs // 2, runs + 1
         try:
             with machines.maker("ab"[runs % 2]) as publication:
                 make(publication, 0, 1)

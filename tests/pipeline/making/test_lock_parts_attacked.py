@@ -17,17 +17,12 @@ from storage.dataset.splits import part_of_object
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import read_objects_lock
-from storage.remote import bucket as remote_bucket
-from tests.pipeline.making.bucket_kit import OUT, Machines
+from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, killed_before
 from tests.pipeline.making.parts_kit import parts_by_hand, parts_order, textures_in
 from tests.pipeline.making.test_lock_parts import SPLITS
 from tests.pipeline.making.tiny_scenes_kit import Undocumented
 
 LOCK = "shards/set/objects.lock.jsonl"
-
-
-class Killed(BaseException):
-    """Ends a maker between two steps, as SIGKILL would."""
 
 
 @pytest.fixture
@@ -69,18 +64,9 @@ def test_a_range_prepares_no_other_part(
 def test_a_lock_without_its_index_is_not_prepared_again(
     bucket: Any, machines: Machines, made: list[object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write = remote_bucket.Bucket.write
-
-    def killed(self: Any, name: str, content: Any) -> None:
-        if name.endswith("0000.index"):
-            raise Killed
-        write(self, name, content)
-
     machines.use("a")
-    with monkeypatch.context() as patch:
-        patch.setattr(remote_bucket.Bucket, "write", killed)
-        with pytest.raises(Killed):
-            _make(OUT, "0:6")
+    with killed_before(monkeypatch, "write", "0000.index"):
+        _make(OUT, "0:6")
     assert _objects(made)
     machines.use("b")
     _make(OUT, "0:6")

@@ -16,7 +16,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import TEXTURE
 from storage.remote import bucket as remote_bucket
-from tests.pipeline.making.bucket_kit import OUT, Machines
+from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, Writes, killed_before
 from tests.pipeline.making.parts_kit import parts_by_hand, parts_order, textures_in
 from tests.pipeline.making.test_lock_parts import SPLITS
 from tests.pipeline.making.tiny_scenes_kit import Undocumented
@@ -25,10 +25,6 @@ pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
 pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
 
 LOCK = "shards/set/objects.lock.jsonl"
-
-
-class Killed(BaseException):
-    """Ends a maker between two requests, as SIGKILL would."""
 
 
 @pytest.fixture
@@ -103,18 +99,9 @@ def test_machines_share_the_work_of_a_part(
     """What one has prepared before it died, the other one does not look at."""
     monkeypatch.setattr(object_parts, "_MEAN_OBJECTS", 4)
     monkeypatch.setattr(object_parts, "_AT_ONCE", 1)
-    create = remote_bucket.Bucket.create
-
-    def killed(self: Any, name: str, content: object) -> bool:
-        if name.endswith(".lock.jsonl"):
-            raise Killed
-        return create(self, name, content)  # type: ignore[arg-type]
-
     machines.use("a")
-    with monkeypatch.context() as patch:
-        patch.setattr(remote_bucket.Bucket, "create", killed)
-        with pytest.raises(Killed):
-            _make(OUT, "0:6")
+    with killed_before(monkeypatch, "create", ".lock.jsonl"):
+        _make(OUT, "0:6")
     assert _objects(made)
     machines.use("b")
     _make(OUT, "0:6")
@@ -130,18 +117,9 @@ def test_a_kill_before_any_request_loses_nothing(
 ) -> None:
     """The n-th write of each run never happens; two machines take turns until one gets through."""
     digest, lock = _in_one_folder(machines, tmp_path / "plain", made)
-    put, left, runs = remote_bucket.Bucket._put, 0, 0
-
-    def put_or_die(self: Any, *arguments: Any, **options: Any) -> None:
-        nonlocal left
-        left -= 1
-        if left < 0:
-            raise Killed
-        put(self, *arguments, **options)
-
-    monkeypatch.setattr(remote_bucket.Bucket, "_put", put_or_die)
+    writes, runs = Writes(monkeypatch), 0
     while True:
-        left, runs = runs // 2, runs + 1
+        writes.left, runs = runs // 2, runs + 1
         machines.use("ab"[runs % 2])
         try:
             outcome = _make(OUT)
@@ -151,7 +129,6 @@ def test_a_kill_before_any_request_loses_nothing(
     assert runs > 10
     assert outcome.digest == digest
     assert bucket.cat_file(LOCK) == lock
-    monkeypatch.setattr(remote_bucket.Bucket, "_put", put)
     assert verify_dataset(OUT).problems == []
 
 
