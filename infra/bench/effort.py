@@ -3,6 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.settings.described import checked
@@ -93,6 +94,8 @@ class Asked:
     data: str | None = None
     """Finished dataset (a folder or a URL) for the experiments economy and loader, and for those
     that train (repairs, learning-rates, optimisers); by default none."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where learning-rates and optimisers train."""
 
     @property
     def network(self) -> str:

@@ -68,7 +68,7 @@ def run(
     current = store.begin(_plan(experiment, effort, asked))
     taken = _take_shares(store, current)
     began = time.perf_counter()
-    with contextlib.closing(Workshop(effort, asked)) as workshop:
+    with contextlib.closing(Workshop(effort, asked, folder)) as workshop:
         _measure(experiment, current, store, workshop, turn_done)
         notes = [*workshop.notes, *taken]
     if not current.whole_turns():
@@ -92,21 +92,16 @@ def run_share(
     """Measure what is missing of one share of an experiment, and return the file of the share.
 
     Raises:
-        TrilightError: as `run`, or its points do not stand alone.
+        TrilightError: as `run`.
     """
-    if not experiment.by_point:
-        raise TrilightError(
-            f"bench {experiment.name}: its points are compared with each other in turns of one "
-            "machine; expected an experiment whose points stand alone, such as learning-rates. "
-            "Measure it without a share."
-        )
     if lack := lacking(experiment, asked):
         raise TrilightError(f"bench {experiment.name}: {lack}.")
     store = Store(share.path(store_of(folder, experiment.name, effort.name).path))
     plan = _plan(experiment, effort, asked)
     current = store.begin(plan)
-    wanted = rows_of(current.plan["turns"], current.plan["points"], share)
-    with contextlib.closing(Workshop(effort, asked)) as workshop:
+    turns, points = current.plan["turns"], current.plan["points"]
+    wanted = rows_of(turns, points, share, apart=experiment.by_point)
+    with contextlib.closing(Workshop(effort, asked, folder)) as workshop:
         _measure(experiment, current, store, workshop, turn_done, wanted)
     return store
 
@@ -185,7 +180,7 @@ def _measure(
             if point.name not in done and (named is None or point.name in named)
         ]
         try:
-            for point, figures in experiment.measure(workshop, wanted, turn):
+            for point, figures in experiment.measure(workshop, wanted, turn) if wanted else ():
                 store.add(current, turn, point, figures)
         except (Rejected, ChildFailed) as error:
             store.leave_out(current, turn, str(error))

@@ -1,8 +1,9 @@
 """One experiment in shares: measured by several calls, on several machines, and put together again.
 
-For experiments that take days and whose points stand alone. A share is every N-th row, a point in a
-turn; it has a file of its own beside the results, so that no two calls write into one, and goes on
-where it stopped. A call without a share takes all over that lie there, and measures the rest.
+For experiments that take days. A share is every N-th turn or, where points stand alone, every N-th
+row, a point in a turn; it has a file of its own beside the results, so that no two calls write into
+one, and goes on where it stopped. A call without a share takes all over that lie there, and
+measures the rest.
 """
 
 import json
@@ -53,8 +54,21 @@ def share_of(text: str) -> Share:
     return Share(number=int(found[1]), of=int(found[2]))
 
 
-def rows_of(turns: Sequence[str], points: Sequence[str], share: Share) -> dict[str, list[str]]:
-    """Return the points of a share by turn; its neighbours are in other shares."""
+def rows_of(
+    turns: Sequence[str], points: Sequence[str], share: Share, *, apart: bool
+) -> dict[str, list[str]]:
+    """Return the points of a share by turn; its neighbours are in other shares.
+
+    Args:
+        turns: all.
+        points: of each turn.
+        share: whose.
+        apart: whether the points of a turn may be measured apart from each other; else a share
+            holds whole turns.
+    """
+    if not apart:
+        held = {turn: share.holds(index) for index, turn in enumerate(turns)}
+        return {turn: list(points) if mine else [] for turn, mine in held.items()}
     rows = [(turn, point) for turn in turns for point in points]
     found: dict[str, list[str]] = {turn: [] for turn in turns}
     for index, (turn, point) in enumerate(rows):

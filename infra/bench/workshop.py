@@ -67,10 +67,10 @@ class Subject:
 class Workshop:
     """Makes and holds what experiments share, until `close`."""
 
-    def __init__(self, effort: Effort, asked: Asked) -> None:
+    def __init__(self, effort: Effort, asked: Asked, results: Path) -> None:
         # before any child: pymeshlab takes a second to import, and would be counted as work
         preload_mesh_libraries()
-        self.effort, self.asked = effort, asked
+        self.effort, self.asked, self.results = effort, asked, results
         self.notes: list[str] = []
         """Notes that belong to the result."""
         self._stack = contextlib.ExitStack()

@@ -29,8 +29,9 @@ class Measured:
     share: str | None = None
     """Measure only a share of the rows, K/N for the K-th of N, into a file of its own beside the
     results; without one, a later call takes all such files over and measures what they lack. For
-    experiments of days whose points stand alone, such as learning-rates: one share for each task of
-    a Slurm array. By default everything is measured."""
+    experiments of days, such as learning-rates: one share for each task of a Slurm array, or for
+    each of some processes on one card. Points that are compared in turns stay together. By default
+    everything is measured."""
     quick: bool = False
     """Measure for minutes instead of carefully."""
     out: Path | None = None

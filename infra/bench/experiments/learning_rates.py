@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from infra.bench.effort import Effort
 from infra.bench.experiment import Column, Experiment, Figures, Point, TurnFigures
@@ -15,7 +15,7 @@ from infra.bench.workshop import Workshop
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
-    from infra.bench.sides.rated_trainings import Optimiser
+    from infra.bench.sides.rated_trainings import Amount, Optimiser
     from infra.bench.sides.short_trainings import Course
 
 Turns = Mapping[str, Mapping[str, Figures]]
@@ -42,12 +42,18 @@ class Extent:
     """Of the networks whose rates are sought."""
     seeds: int
     """With which each rate is tried at each width."""
+    rules: tuple[str, ...]
+    """Names in RULES that rates are sought with; those of the first are compared."""
     compared_widths: tuple[int, ...]
     """Of the networks whose optimisers are compared, each at its best rate."""
     compared_seeds: int
     """With which they are."""
     held_out: int
     """Scenes of the validation split that are judged on."""
+    scenes_per_step: int
+    """Two views each."""
+    precision: Literal["float32", "bfloat16"]
+    """Of the networks' products."""
 
 
 EXTENTS = {
@@ -55,25 +61,32 @@ EXTENTS = {
         steps=200,
         widths=(64, 128, 256),
         seeds=1,
+        rules=(ONE_RATE, BY_WIDTH),
         compared_widths=(64,),
         compared_seeds=4,
         held_out=32,
+        scenes_per_step=2,
+        precision="float32",
     ),
     "careful": Extent(
         steps=2000,
-        widths=(64, 128, 256, 512),
+        widths=(64, 128, 256, 576),
         seeds=3,
-        compared_widths=(64, 128, 256, 512),
-        compared_seeds=5,
+        rules=(BY_WIDTH,),
+        compared_widths=(128, 576),
+        compared_seeds=4,
         held_out=64,
+        scenes_per_step=4,
+        precision="bfloat16",
     ),
 }
-"""By effort: 0.28 M, 1.05 M, 4.1 M and 16 M parameters."""
+"""By effort: 0.28 M, 1.05 M, 4.1 M and 20 M parameters; with care as `pretrain` multiplies."""
 
 WIDTHS = EXTENTS["careful"].widths
 
 _EXTENTS_SAID = (
-    f"{EXTENTS['careful'].steps} steps of two scenes (with --quick {EXTENTS['quick'].steps})"
+    f"{EXTENTS['careful'].steps} steps of {EXTENTS['careful'].scenes_per_step} scenes in bfloat16 "
+    f"(with --quick {EXTENTS['quick'].steps} of {EXTENTS['quick'].scenes_per_step} in float32)"
 )
 _AGAINST = "scenes of the validation split of `--data`, all their views at 32 pixels"
 
@@ -99,7 +112,7 @@ def best_rates(extent: Extent, folder: Path = RESULTS) -> dict[tuple["Optimiser"
     for effort in ("careful", "quick"):
         for run in reversed(store_of(folder, "learning-rates", effort).runs()):
             found = {
-                (optimiser, width): _best(run.turns, optimiser, width)
+                (optimiser, width): _best(run.turns, optimiser, width, extent.rules[0])
                 for optimiser in RATES
                 for width in extent.compared_widths
             }
@@ -112,13 +125,13 @@ def best_rates(extent: Extent, folder: Path = RESULTS) -> dict[tuple["Optimiser"
     )
 
 
-def _best(turns: Turns, optimiser: "Optimiser", width: int) -> float | None:
+def _best(turns: Turns, optimiser: "Optimiser", width: int, rule: str) -> float | None:
     """Return the rate of least mean error over the seeds; None where one was not tried."""
     tried = [points for turn, points in turns.items() if _width_and_seed(turn)[0] == width]
     errors = {
         rate: [points[name].get("log_l1", math.inf) for points in tried if name in points]
         for rate in RATES[optimiser]
-        for name in [rate_name(optimiser, ONE_RATE, rate)]
+        for name in [rate_name(optimiser, rule, rate)]
     }
     if not all(errors.values()):
         return None
@@ -143,16 +156,28 @@ def _course(workshop: Workshop) -> "Course":
     return course
 
 
+def _amount(workshop: Workshop) -> "Amount":
+    from infra.bench.sides.rated_trainings import Amount
+
+    extent = extent_of(workshop.effort)
+    return Amount(
+        steps=extent.steps,
+        scenes_per_step=extent.scenes_per_step,
+        precision=extent.precision,
+    )
+
+
 def _measure_rates(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     from infra.bench.sides.rated_trainings import BASE_WIDTH, Rated, rated
 
     width, seed = _width_and_seed(turn)
-    course, steps = _course(workshop), extent_of(workshop.effort).steps
+    course, amount = _course(workshop), _amount(workshop)
     for point in points:
         one = Rated(**point.settings)
         if width == BASE_WIDTH:  # rates that follow the width are the same there
             one = dataclasses.replace(one, by_width=False)
-        train = functools.partial(rated, course, one, width=width, seed=seed, steps=steps)
+        device = workshop.asked.device
+        train = functools.partial(rated, course, one, amount, width=width, seed=seed, device=device)
         figures = dict(workshop.kept((turn, one), train))
         if "log_l1" in figures:
             figures[f"w{width}"] = figures["log_l1"]
@@ -163,9 +188,9 @@ def _rate_points(effort: Effort) -> list[Point]:
     return [
         Point(
             name=rate_name(optimiser, rule, rate),
-            settings={"optimiser": optimiser, "learning_rate": rate, "by_width": by_width},
+            settings={"optimiser": optimiser, "learning_rate": rate, "by_width": RULES[rule]},
         )
-        for rule, by_width in RULES.items()
+        for rule in extent_of(effort).rules
         for optimiser, rates in RATES.items()
         for rate in rates
     ]
@@ -187,18 +212,19 @@ RIVAL = next(iter(COMPARED))
 
 
 def _measure_compared(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
-    from infra.bench.sides.rated_trainings import Rated, rated
+    from infra.bench.sides.rated_trainings import BASE_WIDTH, Rated, rated
 
     width, seed = _width_and_seed(turn)
-    steps = extent_of(workshop.effort).steps
-    course, best = _course(workshop), best_rates(extent_of(workshop.effort))
+    extent, course, amount = extent_of(workshop.effort), _course(workshop), _amount(workshop)
+    best = best_rates(extent, workshop.results)
     of_turn: dict[str, dict[str, float]] = {}
     for point in points:
         optimiser = point.settings["optimiser"]
         rate = best[optimiser, width]
         workshop.note(f"{optimiser} at width {width} with a rate of {rate:g}")
-        one = Rated(learning_rate=rate, **point.settings)
-        figures = rated(course, one, width=width, seed=seed, steps=steps)
+        by_width = RULES[extent.rules[0]] and width != BASE_WIDTH
+        one = Rated(learning_rate=rate, by_width=by_width, **point.settings)
+        figures = rated(course, one, amount, width=width, seed=seed, device=workshop.asked.device)
         of_turn[point.name] = figures
         if point.name.endswith("cosine") and "percent" in figures:
             figures["beside_wsd"] = figures["percent"] - of_turn[optimiser]["percent"]
@@ -207,7 +233,9 @@ def _measure_compared(workshop: Workshop, points: Sequence[Point], turn: str) ->
 
 def _compared_turns(effort: Effort) -> list[str]:
     extent = extent_of(effort)
-    seeds = range(extent.compared_seeds)
+    # with others than those that chose the rates, where these were several
+    first = extent.seeds if extent.seeds > 1 else 0
+    seeds = range(first, first + extent.compared_seeds)
     return [_turn(width, seed) for seed, width in itertools.product(seeds, extent.compared_widths)]
 
 

@@ -18,6 +18,7 @@ from infra.bench.effort import QUICK, Asked
 from infra.bench.experiments.engines import build_within
 from infra.bench.experiments.previews import PROBES
 from infra.bench.experiments.rungs import TRIANGLES, one_view_scene
+from infra.bench.run import RESULTS
 from infra.bench.workshop import Workshop
 from infra.rendering.way_table import (
     NETWORK_SCENE,
@@ -43,7 +44,7 @@ Timed = dict[tuple[int, int], Mapping[str, float]]
 def measured_costs(table: WayTable) -> PictureCosts:
     """Return what the parts take here, in well under a minute on an idle machine."""
     cores = os.cpu_count() or 1
-    with contextlib.closing(Workshop(QUICK, Asked())) as workshop:
+    with contextlib.closing(Workshop(QUICK, Asked(), RESULTS)) as workshop:
         build = build_within(TRIANGLES)
         child = workshop.render_child(build, BENCHMARK)
         scenes = [child.call(one_view_scene, build, int(turn.split()[-1])) for turn in PROBES]

@@ -12,8 +12,9 @@ import numpy as np
 from infra.bench.sides.short_trainings import Course, Trained, train_steps
 from model.base_widths import BaseWidths
 from model.config import ModelConfig, smoke
+from train.loop.crew import choose_device
 from train.runs import named_run
-from train.settings import Schedule, TrainSettings
+from train.settings import Precision, Schedule, TrainSettings
 
 Optimiser = Literal["AdamW", "Muon"]
 
@@ -55,9 +56,21 @@ def network_of(width: int) -> ModelConfig:
     )
 
 
-def run_of(rated: Rated, *, width: int, seed: int, steps: int) -> TrainSettings:
-    """Return the whole description of a training of `steps` steps where it takes all."""
-    num_steps = max(2, round(rated.steps_share * steps))
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Amount:
+    """How much each training does, alike in all."""
+
+    steps: int
+    """Of a training that takes all."""
+    scenes_per_step: int
+    """Two views each."""
+    precision: Precision
+    """Of the network's products."""
+
+
+def run_of(rated: Rated, amount: Amount, *, width: int, seed: int) -> TrainSettings:
+    """Return the whole description of a training."""
+    num_steps = max(2, round(rated.steps_share * amount.steps))
     return dataclasses.replace(
         named_run("smoke"),
         run="rated",
@@ -66,7 +79,9 @@ def run_of(rated: Rated, *, width: int, seed: int, steps: int) -> TrainSettings:
         seed=seed,
         num_steps=num_steps,
         warmup_steps=num_steps // 10,
-        scenes_per_step=2,
+        scenes_per_step=amount.scenes_per_step,
+        precision=amount.precision,
+        compile="no",  # it would take longer than it saves
         views_per_scene=2,
         learning_rate=rated.learning_rate,
         muon_rate=MUON_RATE if rated.optimiser == "Muon" else 0.0,
@@ -89,7 +104,9 @@ def figures_of(trained: Trained) -> dict[str, float]:
     return figures
 
 
-def rated(course: Course, one: Rated, *, width: int, seed: int, steps: int) -> dict[str, float]:
-    """Train once and judge."""
-    settings = run_of(one, width=width, seed=seed, steps=steps)
-    return figures_of(train_steps(course, settings))
+def rated(
+    course: Course, one: Rated, amount: Amount, *, width: int, seed: int, device: str
+) -> dict[str, float]:
+    """Train once on `cpu` or `cuda`, and judge."""
+    settings = run_of(one, amount, width=width, seed=seed)
+    return figures_of(train_steps(course, settings, choose_device(device)))

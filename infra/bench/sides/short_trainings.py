@@ -38,6 +38,8 @@ _PARTS = 1000
 
 _WARM_UP_PARTS = 50
 
+_PROCESSOR = torch.device("cpu")
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Course:
@@ -73,7 +75,8 @@ class Trained:
 
     steps: int
     core_s: float
-    """Of the whole process: reading, tracing, and both passes through the network."""
+    """Of the whole process: reading, tracing, and both passes through the network; with a card, of
+    its host alone."""
     view_core_s: float
     """Of a held-out view, its share of the scene's own stage included."""
     views: tuple[ViewScore, ...]
@@ -99,14 +102,16 @@ def train_for(course: Course, model: ModelConfig, *, seed: int, core_s: float) -
     return _judged(course, *_trained(course.train, settings, rate))
 
 
-def train_steps(course: Course, settings: TrainSettings) -> Trained:
-    """Train a network on one thread for as many steps as its run has, and judge it."""
+def train_steps(
+    course: Course, settings: TrainSettings, device: torch.device = _PROCESSOR
+) -> Trained:
+    """Train a network on one thread, or a card, for as many steps as its run has, and judge it."""
     torch.set_num_threads(1)
 
     def rate(step: int, spent: float) -> float | None:
         return learning_rate(step, settings) if step < settings.num_steps else None
 
-    return _judged(course, *_trained(course.train, settings, rate))
+    return _judged(course, *_trained(course.train, settings, rate, device))
 
 
 def _judged(course: Course, network: RenderFormer, steps: int, spent: float) -> Trained:
@@ -131,14 +136,19 @@ def _settings(model: ModelConfig, seed: int) -> TrainSettings:
 
 
 def _trained(
-    shards: ShardSet, settings: TrainSettings, rate: Callable[[int, float], float | None]
+    shards: ShardSet,
+    settings: TrainSettings,
+    rate: Callable[[int, float], float | None],
+    device: torch.device = _PROCESSOR,
 ) -> tuple[RenderFormer, int, float]:
     """Return network, steps and core-seconds; `rate` says None after the last step."""
-    crew = Crew(device=torch.device("cpu"))
-    state = new_state(settings, muon_precision=fitting_precision(crew))
+    crew = Crew(device=device)
+    state = new_state(settings, device, muon_precision=fitting_precision(crew))
     stepper = Stepper(state, settings, Objective(settings.loss, None), crew)
 
     def flops(triangles: int) -> int:
+        if device.type != "cpu":
+            return 1  # one pass a step: of so small ones a card feels the number of kernels alone
         views, resolution = settings.views_per_scene, settings.resolution
         workload = Workload(triangles=triangles, views=views, resolution=resolution)
         return training_flops(settings.model, workload)
@@ -155,7 +165,7 @@ def _trained(
     with closing(batches):
         while (now := rate(state.step, spent)) is not None:
             buckets = bucket_scenes(next(batches), flops, settings.scenes_per_pass)
-            stepper.step(buckets, now)
+            stepper.take(buckets, now)  # nobody reads what it did, so a card is not waited for
             state.step += 1
             spent = time.process_time() - began
     return state.model, state.step, spent

@@ -117,8 +117,6 @@ def test_where_points_stand_alone_only_what_a_turn_lacks_is_measured_again(tmp_p
 def test_shares_together_are_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every row once, by calls on several machines; a share goes on, and what is lost is found."""
     one = dataclasses.replace(experiment("a", "b", "c"), by_point=True)
-    with pytest.raises(TrilightError, match="expected an experiment whose points stand alone"):
-        run_share(experiment("a"), TINY, Asked(), share_of("1/2"), folder=tmp_path)
     for number in (1, 2, 3, 4):
         here = {**machine(), "processor": f"chip {number}"}
         monkeypatch.setattr(running, "machine", lambda here=here: here)
@@ -136,6 +134,15 @@ def test_shares_together_are_the_whole(tmp_path: Path, monkeypatch: pytest.Monke
     calls.clear()
     measured(tmp_path, one)
     assert len(calls) == 9, "rows of another revision are not taken"
+
+
+def test_turns_that_are_compared_within_are_shared_whole(tmp_path: Path) -> None:
+    one = experiment("a", "b", "c")
+    run_share(one, TINY, Asked(), share_of("2/2"), folder=tmp_path)
+    assert calls == [("b", point.name) for point in one.points(TINY)]
+    run_share(one, TINY, Asked(), share_of("1/2"), folder=tmp_path)
+    calls.clear()
+    assert measured(tmp_path, one).whole_turns() == ["a", "b", "c"] and not calls
 
 
 @pytest.mark.parametrize("text", ["0/4", "5/4", "4", "a/b", "1/0"])

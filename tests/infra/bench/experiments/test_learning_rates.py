@@ -1,5 +1,6 @@
 """The trainings that seek rates: what differs between them, and which rate is called the best."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -13,20 +14,20 @@ from infra.bench.experiments.learning_rates import (
     EXTENTS,
     ONE_RATE,
     RATES,
-    Extent,
     best_rates,
     extent_of,
     rate_name,
 )
-from infra.bench.sides.rated_trainings import Rated, course_of, network_of, rated, run_of
+from infra.bench.sides.rated_trainings import Amount, Rated, course_of, network_of, rated, run_of
 from infra.bench.store import Store
 from model.costs import Workload, costs
 from storage.errors import TrilightError
 from tests.train.toy import write_toy_dataset
 
-SEEN = Extent(
-    steps=4, widths=(64, 128), seeds=2, compared_widths=(64, 128), compared_seeds=1, held_out=2
+SEEN = dataclasses.replace(
+    EXTENTS["quick"], steps=4, widths=(64, 128), seeds=2, compared_widths=(64, 128), held_out=2
 )
+FEW = Amount(steps=200, scenes_per_step=2, precision="float32")
 
 
 def write_run(folder: Path, best: dict[tuple[str, int], float]) -> Store:
@@ -61,7 +62,7 @@ def test_without_rates_nothing_is_compared(tmp_path: Path) -> None:
 
 def test_trainings_differ_in_what_they_are_named_for() -> None:
     made = {
-        name: run_of(Rated(learning_rate=1e-3, **what), width=128, seed=3, steps=200)  # type: ignore[arg-type]
+        name: run_of(Rated(learning_rate=1e-3, **what), FEW, width=128, seed=3)  # type: ignore[arg-type]
         for name, what in COMPARED.items()
     }
     assert {run.muon_rate for name, run in made.items() if "Muon" in name} == {3.0}
@@ -71,9 +72,8 @@ def test_trainings_differ_in_what_they_are_named_for() -> None:
         assert (run.num_steps, run.warmup_steps) == ((100, 10) if half else (200, 20))
         assert run.schedule == ("cosine" if "cosine" in name else "wsd")
         assert (run.seed, run.model, run.base_widths.width) == (3, network_of(128), 0)
-    one = run_of(
-        Rated(optimiser="AdamW", learning_rate=1e-3, by_width=True), width=128, seed=0, steps=9
-    )
+    by_width = Rated(optimiser="AdamW", learning_rate=1e-3, by_width=True)
+    one = run_of(by_width, FEW, width=128, seed=0)
     assert one.base_widths.width == 64 and one.model.head_width == 64
 
 
@@ -85,7 +85,7 @@ def test_the_careful_form_is_what_was_asked_for() -> None:
     millions = [
         sum(costs(network_of(width), work).parameters.values()) / 1e6 for width in extent.widths
     ]
-    assert min(millions) < 1 < max(millions) < 20 and max(millions) > 15
+    assert min(millions) < 1 and max(millions) > 20
     assert extent_of(QUICK) == EXTENTS["quick"] and {one.by_point for one in EXPERIMENTS} == {
         True,
         False,
@@ -94,12 +94,12 @@ def test_the_careful_form_is_what_was_asked_for() -> None:
 
 def test_a_rate_that_is_too_high_is_told_from_one_that_is_not(tmp_path: Path) -> None:
     write_toy_dataset(tmp_path, train=6, validation=2, resolution=32)
-    course, steps = course_of(str(tmp_path), 2), 10
+    course, amount = course_of(str(tmp_path), 2), dataclasses.replace(FEW, steps=10)
 
     def error(rate: float) -> float:
         one = Rated(optimiser="AdamW", learning_rate=rate)
-        figures = rated(course, one, width=64, seed=0, steps=steps)
-        assert figures["core_s"] == pytest.approx(steps * figures["step_s"])
+        figures = rated(course, one, amount, width=64, seed=0, device="cpu")
+        assert figures["core_s"] == pytest.approx(10 * figures["step_s"])
         assert figures["percent"] == pytest.approx(100 * math.log(figures["log_l1"]))
         return figures["log_l1"]
 
