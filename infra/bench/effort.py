@@ -93,9 +93,9 @@ class Asked:
     take the first, and those that compare pair every other row with it."""
     data: str | None = None
     """Finished dataset (a folder or a URL) for the experiments economy and loader, and for those
-    that train (repairs, learning-rates, optimisers); by default none."""
+    that train (repairs, learning-rates, optimisers, schedules); by default none."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where learning-rates and optimisers train."""
+    """Where learning-rates, optimisers and schedules train."""
 
     @property
     def network(self) -> str:

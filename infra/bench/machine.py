@@ -3,6 +3,7 @@
 import os
 import platform
 import subprocess
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,8 @@ _LIBRARIES = (
 )
 
 
-def machine() -> dict[str, Any]:
-    """Return what a figure depends on, as JSON values."""
+def machine(device: str = "cpu") -> dict[str, Any]:
+    """Return what a figure depends on, as JSON values; with a card, `cuda`, its name too."""
     versions = {}
     for library in _LIBRARIES:
         try:
@@ -33,12 +34,24 @@ def machine() -> dict[str, Any]:
         except metadata.PackageNotFoundError:
             continue
     return {
+        **({"card": _card()} if device == "cuda" else {}),
         "processor": processor(),
         "cores": os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
         "versions": versions,
         "revision": revision(),
     }
+
+
+def named(machine: Mapping[str, Any]) -> str:
+    """Return what a machine is called beside its figures: a card before its host."""
+    return ", ".join(machine[part] for part in ("card", "processor") if part in machine)
+
+
+def _card() -> str:
+    import torch
+
+    return str(torch.cuda.get_device_name()) if torch.cuda.is_available() else "no card"
 
 
 def processor() -> str:

@@ -13,7 +13,7 @@ from infra.bench.choices import choices
 from infra.bench.curve import COST_NOISE
 from infra.bench.effort import CAREFUL, QUICK
 from infra.bench.experiment import Experiment
-from infra.bench.machine import ROOT
+from infra.bench.machine import ROOT, named
 from infra.bench.plot import plot
 from infra.bench.run import RESULTS, newest_run
 from infra.bench.store import Run
@@ -144,5 +144,5 @@ def _section(experiment: Experiment, folder: Path) -> Iterator[str]:
 def _measured_on(experiment: Experiment, run: Run) -> str:
     quick = " --quick" if _is_quick(run) else ""
     notes = "; ".join(run.notes)
-    on = f"{run.date}, {run.plan['machine']['processor']}, {run.plan['machine']['cores']}"
+    on = f"{run.date}, {named(run.plan['machine'])}, {run.plan['machine']['cores']}"
     return f"`trilight bench {experiment.name}{quick}` ({on} cores){f': {notes}' if notes else ''}"

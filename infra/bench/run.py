@@ -108,12 +108,12 @@ def run_share(
 
 def _take_shares(store: Store, current: Run) -> list[str]:
     """Take rows over that shares have measured; return what is to be said of them."""
-    processors = Counter[str]()
-    for turn, point, figures, processor in shared_rows(store.path, current.plan):
+    machines = Counter[str]()
+    for turn, point, figures, name in shared_rows(store.path, current.plan):
         if point not in current.turns.get(turn, {}):
             store.add(current, turn, point, figures)
-        processors[processor] += 1
-    return [f"{count} rows are of {name}" for name, count in sorted(processors.items())]
+        machines[name] += 1
+    return [f"{count} rows are of {name}" for name, count in sorted(machines.items())]
 
 
 def lacking(experiment: Experiment, asked: Asked) -> str:
@@ -145,7 +145,7 @@ def _plan(experiment: Experiment, effort: Effort, asked: Asked) -> dict[str, obj
         "experiment": experiment.name,
         "effort": dataclasses.asdict(effort),
         "asked": wanted,
-        "machine": machine(),
+        "machine": machine(asked.device),
         "points": [point.name for point in points_of(experiment, effort, asked)],
         "turns": [*(named.name for named in folder), *experiment.turns(effort)],
         **rival,

@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from infra.bench.experiment import Figures
+from infra.bench.machine import named
 from infra.bench.store import Run, Store
 from storage.errors import TrilightError
 
 _KEPT = ("versions", "revision")
 """Of a machine: what figures of other machines must agree with; errors do not depend on the rest,
-and core-seconds are what the note of a share says of its processor."""
+and core-seconds are what the note of a share says of its machine."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +79,7 @@ def rows_of(
 
 
 def shared_rows(results: Path, plan: Mapping[str, Any]) -> Iterator[tuple[str, str, Figures, str]]:
-    """Yield what the shares beside some results have measured: turn, point, figures, processor.
+    """Yield what the shares beside some results have measured: turn, point, figures, machine.
 
     Only of runs whose plan is this one, but for the machine's hardware.
     """
@@ -91,7 +92,7 @@ def shared_rows(results: Path, plan: Mapping[str, Any]) -> Iterator[tuple[str, s
 def _rows(run: Run) -> Iterator[tuple[str, str, Figures, str]]:
     for turn, points in run.turns.items():
         for point, figures in points.items():
-            yield turn, point, figures, run.plan["machine"]["processor"]
+            yield turn, point, figures, named(run.plan["machine"])
 
 
 def _comparable(plan: Mapping[str, Any]) -> dict[str, Any]:

@@ -32,7 +32,7 @@ def same_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     """The revision of a working tree may change while tests run."""
     calls.clear()
     here = machine()
-    monkeypatch.setattr(running, "machine", lambda: here)
+    monkeypatch.setattr(running, "machine", lambda device: here)
 
 
 def measured(folder: Path, one: Experiment, data: str | None = None) -> Run:
@@ -118,8 +118,8 @@ def test_shares_together_are_the_whole(tmp_path: Path, monkeypatch: pytest.Monke
     """Every row once, by calls on several machines; a share goes on, and what is lost is found."""
     one = dataclasses.replace(experiment("a", "b", "c"), by_point=True)
     for number in (1, 2, 3, 4):
-        here = {**machine(), "processor": f"chip {number}"}
-        monkeypatch.setattr(running, "machine", lambda here=here: here)
+        here = {**machine(), "card": "card", "processor": f"chip {number}"}
+        monkeypatch.setattr(running, "machine", lambda device, here=here: here)
         share = share_of(f"{number}/4")
         store = run_share(one, TINY, Asked(), share, folder=tmp_path)
         rows_now = store.path.read_bytes()
@@ -129,8 +129,8 @@ def test_shares_together_are_the_whole(tmp_path: Path, monkeypatch: pytest.Monke
     calls.clear()
     found = measured(tmp_path, one)
     assert len(calls) == 2 and found.whole_turns() == ["a", "b", "c"]
-    assert "3 rows are of chip 1" in found.notes
-    monkeypatch.setattr(running, "machine", lambda: {**here, "revision": "another"})
+    assert "3 rows are of card, chip 1" in found.notes
+    monkeypatch.setattr(running, "machine", lambda device: {**here, "revision": "another"})
     calls.clear()
     measured(tmp_path, one)
     assert len(calls) == 9, "rows of another revision are not taken"

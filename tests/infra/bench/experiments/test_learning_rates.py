@@ -9,11 +9,12 @@ import pytest
 
 from infra.bench.effort import CAREFUL, QUICK
 from infra.bench.experiments.learning_rates import (
-    COMPARED,
     EXPERIMENTS,
     EXTENTS,
     ONE_RATE,
+    OPTIMISERS,
     RATES,
+    SCHEDULES,
     best_rates,
     extent_of,
     rate_name,
@@ -63,7 +64,7 @@ def test_without_rates_nothing_is_compared(tmp_path: Path) -> None:
 def test_trainings_differ_in_what_they_are_named_for() -> None:
     made = {
         name: run_of(Rated(learning_rate=1e-3, **what), FEW, width=128, seed=3)  # type: ignore[arg-type]
-        for name, what in COMPARED.items()
+        for name, what in {**OPTIMISERS, **SCHEDULES}.items()
     }
     assert {run.muon_rate for name, run in made.items() if "Muon" in name} == {3.0}
     assert {run.muon_rate for name, run in made.items() if "AdamW" in name} == {0.0}
@@ -78,9 +79,13 @@ def test_trainings_differ_in_what_they_are_named_for() -> None:
 
 
 def test_the_careful_form_is_what_was_asked_for() -> None:
-    """1 M to 20 M parameters, 2000 steps at least, three seeds."""
+    """1 M to 20 M parameters, 2000 steps at least, and others judge than those that chose."""
     extent = extent_of(CAREFUL)
-    assert extent.steps >= 2000 and extent.seeds >= 3 <= extent.compared_seeds
+    assert extent.steps >= 2000 and extent.seeds >= 2 and extent.compared_seeds >= 4
+    chosen, judged = (
+        {turn.split("seed ")[1] for turn in one.turns(CAREFUL)} for one in EXPERIMENTS[:2]
+    )
+    assert chosen.isdisjoint(judged)
     work = Workload(triangles=300, views=2, resolution=32)
     millions = [
         sum(costs(network_of(width), work).parameters.values()) / 1e6 for width in extent.widths
