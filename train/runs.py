@@ -90,7 +90,7 @@ def hits_tokens() -> TrainSettings:
 
 
 def hits_256() -> TrainSettings:
-    """Return our first stage with traced hits at Base size: for a card, which nobody has run it on.
+    """Return our first stage with traced hits at Base size: for a card, which took some steps of it.
 
     Tracing a view of 256 pixels takes 0.1 to 0.35 core-seconds: the 256 views of a step keep 50
     cores busy for a second or two, so the loader decides the pace where there are fewer.
@@ -190,10 +190,11 @@ def pretrain() -> TrainSettings:
     Which of these choices helps was measured in small trainings (docs/log); at this size none
     has been. That half the steps suffice is shown by nothing: they are what we would pay.
 
-    The rate is the best of Muon at width 64 (0.28 M parameters, 200 steps of two scenes: `trilight
-    bench learning-rates`), and follows the width of any network from there (`base_widths`): that
-    its steps change layers by as much is tested (tests/laws/test_widths.py), and that it is the
-    best at Base, in steps of 128 scenes or over 250,000 of them, nobody has measured.
+    The rate is where Muon's error is least from 0.28 to 21 million parameters, and follows the
+    width from 64 on (`base_widths`): two seeds, 2,000 steps of four scenes at 32 pixels, on an H100
+    (`trilight bench learning-rates`; docs/log/2026-11-26-rates-on-a-card.md). Parabolas have their
+    least error between 6.2e-4 and 8.5e-4 at each width, with no trend. That it is the best at
+    Base, of 195 million, in steps of 128 scenes or over 250,000 of them, nobody has measured.
     """
     return dataclasses.replace(
         paper_pretrain(),
@@ -203,7 +204,7 @@ def pretrain() -> TrainSettings:
             rotation="uniform", mirror=True, channels=True, vertex_order=True, light_scale=2.0
         ),
         num_steps=250_000,
-        learning_rate=5e-4,
+        learning_rate=7e-4,
         base_widths=BaseWidths(width=64),
         schedule="wsd",
         muon_rate=3.0,
@@ -231,7 +232,7 @@ def finetune() -> TrainSettings:
         num_steps=50_000,
         scenes_per_step=64,
         scenes_per_pass=4,
-        learning_rate=1.7e-4,
+        learning_rate=2.3e-4,
         keep_every=10_000,
     )
 

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from model.image_head import DptHead, Fusion, build_head
+from model.image_head import DptHead, Enlarged, Fusion, build_head
 from tests.model.kit import awake, tiny_config
 
 
@@ -16,6 +16,21 @@ def test_heads_return_eight_pixels_per_bundle(head: str, per_side: int) -> None:
     built = build_head(config)
     taps = [torch.randn(2, per_side**2, config.width) for _ in built.taps]
     assert built(taps).shape == (2, 3, 8 * per_side, 8 * per_side)
+
+
+@pytest.mark.parametrize("small", [(1, 1), (1, 4), (3, 5), (16, 16)])
+def test_the_way_back_of_an_enlargement_is_that_of_torch(small: tuple[int, int]) -> None:
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(2, 3, *small, generator=generator, dtype=torch.float64).requires_grad_()
+    size = (2 * small[0] + 1, 2 * small[1])
+    twin = interpolate(x, size=size, mode="bilinear", align_corners=True)
+    gradient = torch.randn(twin.shape, generator=generator, dtype=torch.float64)
+    assert torch.equal(twin, Enlarged.apply(x, size))
+    (expected,) = torch.autograd.grad(twin, x, gradient)
+    (found,) = torch.autograd.grad(Enlarged.apply(x, size), x, gradient)
+    # float64 sums of tens of numbers around 1
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-13)
+    assert torch.autograd.gradcheck(lambda x: Enlarged.apply(x, size), x)
 
 
 @pytest.mark.parametrize("deepest", [False, True])

@@ -19,7 +19,7 @@ DEAREST, NAME_CHARACTERS = 20, 100
 """Kernels that are listed by name, and how much of a name is kept."""
 
 KINDS = (
-    ("attention", r"attention|flash|fmha|mem_eff"),
+    ("attention", r"attention|flash|fmha|mem_eff|sdpa"),
     ("optimiser", r"multi_tensor|foreach|fused_adam"),
     ("convolution", r"conv|wgrad|dgrad|winograd|cudnn"),
     ("product", r"gemm|cutlass|xmma|nvjet|cublas|matmul|aten::(addmm|mm|bmm|baddbmm)$"),

@@ -103,8 +103,8 @@ EXPERIMENTS = (
         turns=lambda effort: ["counted"],
         measure=_measure,
         by_point=True,
-        because="A prediction; what a card has shown of it is in "
-        "docs/log/2026-11-26-on-a-card.md. A kernel takes the longest of "
+        because="A prediction; what cards have shown of it is in "
+        "docs/log/2026-11-26-an-h100.md and -on-a-card.md. A kernel takes the longest of "
         "its launch (4 us), its bytes (80 % of 3.35 TB/s) and its products (65 % of 989 TFLOP/s in "
         "bfloat16, 50 % of 494 in TF32; flash attention 40 % forth and 30 % back, on packed "
         "sequences 32 and 24, with a mask 20 and 12). `compiled` is an estimate too: neighbours "

@@ -68,6 +68,8 @@ def test_a_run_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
         ("void pytorch_flash::flash_fwd_kernel<Flash_fwd_kernel_traits<128>>", "attention"),
         ("fmha_cutlassF_bf16_aligned_64x128_rf_sm80(PyTorchMemEffAttention)", "attention"),
         ("nvjet_hsh_128x256_64x4_2x1_v_bz_coopA_NTT", "product"),
+        ("cudnn_generated_fort_native_sdpa_sm90_flash_bprop_wgmma_f16_knob_26", "attention"),
+        ("cudnn_generated_fort_native_sdpa_sm90_knob_3", "attention"),
         ("ampere_bf16_s16816gemm_bf16_128x128_ldg8_f2f_stages_32x5_tn", "product"),
         ("sm80_xmma_fprop_implicit_gemm_indexed_tf32f32", "product"),
         ("void cudnn::ops::nchwToNhwcKernel<float>", "convolution"),
