@@ -90,7 +90,7 @@ def hits_tokens() -> TrainSettings:
 
 
 def hits_256() -> TrainSettings:
-    """Return our first stage with traced hits at Base size: for a card, which took some steps of it.
+    """Return our first stage with traced hits at Base size: for a card, which took steps of it.
 
     Tracing a view of 256 pixels takes 0.1 to 0.35 core-seconds: the 256 views of a step keep 50
     cores busy for a second or two, so the loader decides the pace where there are fewer.

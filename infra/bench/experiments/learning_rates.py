@@ -250,8 +250,9 @@ def _rate_turns(effort: Effort) -> list[str]:
 
 _AT_BEST = (
     "The networks and scenes of `learning-rates`, each optimiser with its best rate of that table "
-    "at each width. A turn is a width and a seed of weights, order and symmetries"
+    "at each width"
 )
+_TURNS = "A turn is a width and a seed of weights, order and symmetries."
 _L1 = "held-out log L1, thousandths"
 
 
@@ -279,9 +280,9 @@ EXPERIMENTS = (
             f"{point.settings['optimiser']}, {_rule(point)}",
             point.settings["learning_rate"],
         ),
-        because="A rate transfers where the same row is the best of its kind in every column. With "
-        "one seed, rows that are 2 % apart are equal. The rate of `pretrain` is the best one of "
-        "Muon at width 64.",
+        because="A rate transfers where the same row is the best of its kind in every column; rows "
+        "that are 2 % apart are equal. `pretrain` has 7e-4, about where parabolas through Muon's "
+        "rows have their least error (docs/log/2026-11-26-rates-on-a-card.md).",
         points=_rate_points,
         turns=_rate_turns,
         measure=_measure_rates,
@@ -291,7 +292,7 @@ EXPERIMENTS = (
     Experiment(
         name="optimisers",
         title="Optimisers, each at its best rate",
-        about=f"{_AT_BEST}, in all steps or in half.",
+        about=f"{_AT_BEST}, in all steps or in half. {_TURNS}",
         covers=("train.muon_rate", "train.num_steps"),
         cost=Column(name="core-seconds of a training", figure="core_s", over="mean"),
         error=Column(name=_L1, figure="log_l1", over="mean", then=thousandths),
@@ -311,7 +312,7 @@ EXPERIMENTS = (
     Experiment(
         name="schedules",
         title="Schedules, at the best rate of each optimiser",
-        about=f"{_AT_BEST}; cosine beside wsd in equal steps.",
+        about=f"{_AT_BEST}; cosine beside wsd in equal steps. {_TURNS}",
         covers=("train.schedule", "train.decay_share"),
         cost=Column(name="core-seconds of a training", figure="core_s", over="mean"),
         error=Column(name=_L1, figure="log_l1", over="mean", then=thousandths),
