@@ -4,9 +4,12 @@ import json
 import re
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from infra.setup.locks import LockedPackage, read_lock, write_lock
 from infra.setup.sbom import PLACE, bill_of_materials
@@ -38,6 +41,20 @@ def test_a_lock_is_read_as_it_was_written(tmp_path: Path) -> None:
     (tmp_path / "x.txt").write_text("a-b>=1\n")
     with pytest.raises(ValueError, match="NAME==VERSION"):
         read_lock(tmp_path / "x.txt")
+
+
+@pytest.mark.parametrize("python", ["3.11.2", "3.11.9", "3.12.3", "3.13.1"])
+def test_a_lock_has_what_its_packages_ask_for_on_every_python(python: str) -> None:
+    """It is written on one; Debian 12 has 3.11.2, and packages ask for more there."""
+    names = {canonicalize_name(row.name) for row in read_lock(ROOT / "requirements" / "all.txt")}
+    names.add(canonicalize_name("pip"))  # venv brings it
+    here = {"python_full_version": python, "python_version": python.rpartition(".")[0]}
+    for found in metadata.distributions():
+        if canonicalize_name(found.metadata["Name"]) in names:
+            for line in found.requires or ():
+                asked = Requirement(line)
+                if asked.marker is None or asked.marker.evaluate({**here, "extra": ""}):
+                    assert canonicalize_name(asked.name) in names, f"{found.name}: {line}"
 
 
 def test_pip_refuses_a_file_of_another_digest(tmp_path: Path) -> None:
