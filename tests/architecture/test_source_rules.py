@@ -43,6 +43,15 @@ def test_functions_are_short() -> None:
     assert not long
 
 
+def test_slow_tests_are_marked_where_make_seeks_them() -> None:
+    """`make test-slow` looks only through test files that hold the mark's own words."""
+    words = "mark" + ".slow"
+    assert words.replace(".", r"\.") in (ROOT / "Makefile").read_text()
+    marked = [path for path in _sources("tests") if words in path.read_text()]
+    assert len(marked) > 50
+    assert [path.name for path in marked if not path.name.startswith("test_")] == []
+
+
 def test_every_module_says_what_it_is() -> None:
     silent = [
         str(path.relative_to(ROOT))
