@@ -15,7 +15,7 @@ from tests.infra.bench.bench_kit import TINY
 
 @pytest.fixture(autouse=True)
 def few_objects(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the hundred objects of the benchmark, which take minutes to prepare, two scenes use few."""
+    """A hundred of the benchmark take minutes to prepare, and two scenes use few of them."""
     for family in (rungs, flicker):
         monkeypatch.setattr(family, "BENCHMARK", "builtin:12")
 
