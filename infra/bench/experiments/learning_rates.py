@@ -235,6 +235,13 @@ def _measure_compared(workshop: Workshop, points: Sequence[Point], turn: str) ->
         yield point.name, figures
 
 
+def _compared_points(compared: Mapping[str, Mapping[str, object]], effort: Effort) -> list[Point]:
+    return [
+        Point(name=name, settings=settings, default=name == "Muon")
+        for name, settings in compared.items()
+    ]
+
+
 def _compared_turns(effort: Effort) -> list[str]:
     extent = extent_of(effort)
     # with others than those that chose the rates, where these were several
@@ -253,12 +260,15 @@ _AT_BEST = (
     "at each width"
 )
 _TURNS = "A turn is a width and a seed of weights, order and symmetries."
-_L1 = "held-out log L1, thousandths"
 
 
 def thousandths(value: float) -> float:
     """Return a number in thousandths, for `Column.then`."""
     return 1000 * value
+
+
+_COST = Column(name="core-seconds of a training", figure="core_s", over="mean")
+_ERROR = Column(name="held-out log L1, thousandths", figure="log_l1", over="mean", then=thousandths)
 
 
 EXPERIMENTS = (
@@ -269,8 +279,8 @@ EXPERIMENTS = (
         "`one rate`: as in the paper; `by width`: rates and initial weights follow the width from "
         "64 on (`base_widths`). Muon's own rate is three times the stated one.",
         covers=("train.learning_rate", "train.muon_rate", "train.base_widths.width"),
-        cost=Column(name="core-seconds of a training", figure="core_s", over="mean"),
-        error=Column(name=_L1, figure="log_l1", over="mean", then=thousandths),
+        cost=_COST,
+        error=_ERROR,
         against=f"{_AGAINST}; the mean of the widths",
         columns=tuple(
             Column(name=f"width {width}", figure=f"w{width}", over="mean", then=thousandths)
@@ -294,17 +304,14 @@ EXPERIMENTS = (
         title="Optimisers, each at its best rate",
         about=f"{_AT_BEST}, in all steps or in half. {_TURNS}",
         covers=("train.muon_rate", "train.num_steps"),
-        cost=Column(name="core-seconds of a training", figure="core_s", over="mean"),
-        error=Column(name=_L1, figure="log_l1", over="mean", then=thousandths),
+        cost=_COST,
+        error=_ERROR,
         against=_AGAINST,
         rival=lambda asked: RIVAL,
         columns=(Column(name="more than AdamW, %", figure="percent", over="pair"),),
         because="Differences are of pairs of one width and seed, with bootstrapped 95 % intervals "
         "of their mean, which are too narrow for so few pairs: docs/log has those of Student's t.",
-        points=lambda effort: [
-            Point(name=name, settings=settings, default=name == "Muon")
-            for name, settings in OPTIMISERS.items()
-        ],
+        points=functools.partial(_compared_points, OPTIMISERS),
         turns=_compared_turns,
         measure=_measure_compared,
         needs=("torch", "data"),
@@ -314,8 +321,8 @@ EXPERIMENTS = (
         title="Schedules, at the best rate of each optimiser",
         about=f"{_AT_BEST}; cosine beside wsd in equal steps. {_TURNS}",
         covers=("train.schedule", "train.decay_share"),
-        cost=Column(name="core-seconds of a training", figure="core_s", over="mean"),
-        error=Column(name=_L1, figure="log_l1", over="mean", then=thousandths),
+        cost=_COST,
+        error=_ERROR,
         against=_AGAINST,
         columns=(
             Column(name="more than wsd, %", figure="beside_wsd", over="mean"),
@@ -324,10 +331,7 @@ EXPERIMENTS = (
         ),
         because="A schedule is tried at the peak rate that is best with wsd. Intervals are "
         "bootstrapped over the pairs, and too narrow for so few.",
-        points=lambda effort: [
-            Point(name=name, settings=settings, default=name == "Muon")
-            for name, settings in SCHEDULES.items()
-        ],
+        points=functools.partial(_compared_points, SCHEDULES),
         turns=_compared_turns,
         measure=_measure_compared,
         needs=("torch", "data"),
