@@ -28,19 +28,20 @@ def check(asset: Asset, settings: AssetSettings) -> None:
         assert level.record.quality.error_p99 <= settings.gate.max_error_p99
 
 
-@pytest.mark.parametrize("extent", [1e-8, 1.0, 1e8])
-def test_the_size_of_the_world_changes_nothing(tmp_path: Path, extent: float) -> None:
+def test_the_size_of_the_world_changes_nothing(tmp_path: Path) -> None:
     unit = moved(knot(), 1 / np.ptp(knot().positions, axis=0).max())
     settings = AssetSettings(budgets=(500,))
-    scaled = prepare(write_off(tmp_path / "a.off", moved(unit, extent)), settings)
     plain = prepare(write_off(tmp_path / "b.off", unit), settings)
-    assert geometry(scaled) == geometry(plain)
+    for extent in (1e-8, 1e8):
+        scaled = prepare(write_off(tmp_path / "a.off", moved(unit, extent)), settings)
+        assert geometry(scaled) == geometry(plain), extent
 
 
-@pytest.mark.parametrize("extent", [0.9e-9, 1.1e9])
-def test_beyond_them_it_ends(tmp_path: Path, extent: float) -> None:
+def test_beyond_them_it_ends(tmp_path: Path) -> None:
     unit = moved(knot(), 1 / np.ptp(knot().positions, axis=0).max())
-    assert reason_of(write_off(tmp_path / "a.off", moved(unit, extent))) == "extent_range"
+    for extent in (0.9e-9, 1.1e9):
+        path = write_off(tmp_path / "a.off", moved(unit, extent))
+        assert reason_of(path) == "extent_range", extent
 
 
 @pytest.mark.parametrize("method", ["pymeshlab_collapse", "meshoptimizer"])
@@ -102,11 +103,12 @@ def test_one_triangle_is_an_object(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "method", [pytest.param("pymeshlab_collapse", marks=pytest.mark.slow), "meshoptimizer"]
+    ("method", "rings"),
+    [pytest.param("pymeshlab_collapse", 251, marks=pytest.mark.slow), ("meshoptimizer", 51)],
 )
-def test_two_hundred_thousand_faces(tmp_path: Path, method: str) -> None:
-    ball = sphere(rings=251, columns=400)
-    assert len(ball.faces) == 200_000 + 800
+def test_as_many_faces_as_scans_have(tmp_path: Path, method: str, rings: int) -> None:
+    ball = sphere(rings=rings, columns=400)
+    assert len(ball.faces) == 800 * rings
     settings = AssetSettings(budgets=(1400,))
     asset = prepare(write_off(tmp_path / "a.off", ball), settings, method)
     check(asset, settings)

@@ -64,8 +64,9 @@ def test_a_guided_picture_has_the_light_of_an_unguided_one(scene: Scene) -> None
     assert_agree(render_blocks(scene, tracer=guided, block=8, passes=40, first_seed=700), plain)
 
 
-@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
-def test_a_guided_view_is_finite(scene: Scene) -> None:
+@pytest.mark.parametrize("name", ["hundred lamps", "roughness 0.01", "lamp that fills the view"])
+def test_a_guided_view_is_finite(name: str) -> None:
+    scene = SCENES[name]
     settings = RenderSettings(
         resolution=16, noise_floor_db=90.0, min_spp=8, max_spp=512, min_mean_radiance=0.0
     )

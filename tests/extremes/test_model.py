@@ -100,16 +100,16 @@ def share_below(values: Tensor, least: float) -> float:
     return (size < least).double().mean().item() if len(size) else 0.0
 
 
-@pytest.mark.parametrize("emission", EMISSIONS)
-def test_no_matrix_product_comes_near_the_end_of_float16(
-    emission: float, network: RenderFormer
-) -> None:
+def test_no_matrix_product_comes_near_the_end_of_float16(network: RenderFormer) -> None:
     """Of every linear layer and convolution, so of every type with fewer digits after it."""
-    with torch.no_grad():
-        found = outputs_of(network, lambda: network(lit(emission), 64))
-    peaks = {name: output.abs().max().item() for name, output in found.items()}
-    # norms keep every sum near its inputs' size; a hundredth of the range leaves room for training
-    assert max(peaks.values()) < HALF_MAX / 100, max(peaks, key=lambda name: peaks[name])
+    for emission in EMISSIONS:
+        with torch.no_grad():
+            found = outputs_of(network, lambda: network(lit(emission), 64))  # noqa: B023
+        peaks = {name: output.abs().max().item() for name, output in found.items()}
+        highest = max(peaks, key=lambda name: peaks[name])
+        # norms keep every sum near its inputs' size; a hundredth of the range leaves room for
+        # training
+        assert peaks[highest] < HALF_MAX / 100, (emission, highest)
 
 
 def backward_of(network: RenderFormer) -> dict[str, Tensor]:
@@ -183,15 +183,17 @@ def test_emission_is_read_from_darkness_to_a_million() -> None:
         assert read == pytest.approx(emission, rel=2e-6, abs=1e-7)
 
 
-@pytest.mark.parametrize("emission", EMISSIONS)
 @pytest.mark.parametrize("family", FAMILIES)
-def test_pictures_and_gradients_are_finite(family: str, emission: float) -> None:
+def test_pictures_and_gradients_are_finite(family: str) -> None:
     model = awake(tiny_config(family), torch.float32)
-    picture = model(lit(emission), 32)
-    (picture - 6.0).abs().mean().backward()
-    assert torch.isfinite(picture).all()
-    for name, weight in model.named_parameters():
-        assert weight.grad is not None and torch.isfinite(weight.grad).all(), name
+    for emission in EMISSIONS:
+        model.zero_grad()
+        picture = model(lit(emission), 32)
+        (picture - 6.0).abs().mean().backward()
+        assert torch.isfinite(picture).all(), emission
+        for name, weight in model.named_parameters():
+            assert weight.grad is not None, name
+            assert torch.isfinite(weight.grad).all(), (emission, name)
 
 
 def test_radiance_is_finite_wherever_training_data_is() -> None:
@@ -272,16 +274,16 @@ def test_norms_of_nothing_and_of_the_largest_are_finite(dtype: torch.dtype) -> N
     assert torch.all(norm(torch.zeros(2, 64, dtype=dtype)) == 0)
 
 
-@pytest.mark.parametrize("fov_deg", [0.1, 179.9])
 @pytest.mark.parametrize("family", FAMILIES)
-def test_one_triangle_and_the_widest_and_narrowest_cameras(family: str, fov_deg: float) -> None:
+def test_one_triangle_and_the_widest_and_narrowest_cameras(family: str) -> None:
     model = awake(tiny_config(family), torch.float32)
     scene = random_scene(1, num_views=1, dtype=torch.float32)
-    batch = batch_scenes([dataclasses.replace(scene, fov_deg_V=torch.tensor([fov_deg]))])
-    with torch.no_grad():
-        encoded = model.encode(batch)
-        assert torch.isfinite(model.decode(encoded, batch.cameras, 32)).all()
-        if family != "swin":
-            assert torch.isfinite(
-                model.decode(encoded, batch.cameras, 32, skip_empty_bundles=True)
-            ).all()
+    for fov_deg in (0.1, 179.9):
+        batch = batch_scenes([dataclasses.replace(scene, fov_deg_V=torch.tensor([fov_deg]))])
+        with torch.no_grad():
+            encoded = model.encode(batch)
+            assert torch.isfinite(model.decode(encoded, batch.cameras, 32)).all(), fov_deg
+            if family != "swin":
+                assert torch.isfinite(
+                    model.decode(encoded, batch.cameras, 32, skip_empty_bundles=True)
+                ).all(), fov_deg

@@ -15,6 +15,7 @@ from storage.errors import Rejected
 from storage.records.exr import decode_exr, encode_exr
 from storage.records.parts import sum_of_parts
 from storage.records.scene import Scene
+from tests.extremes.range_examples import naming
 from tests.pipeline.renders.scene_kit import (
     Part,
     flat,
@@ -93,16 +94,14 @@ SHAPES = {
 
 @pytest.mark.parametrize("surface", SURFACES.values(), ids=SURFACES.keys())
 def test_extreme_materials(surface: NDArray[np.float64]) -> None:
+    """Whole, and by part: a share is a quotient of what may be 0 or large.
+
+    What a lobe lacks is exactly black.
+    """
     ball = sphere([0, 0, 0.5], 0.5, surface)
     picture = _render(join([ball, _floor(surface), _lamp()])).radiance_rgb
     assert np.isfinite(picture).all()
     assert (picture >= 0).all()
-
-
-@pytest.mark.parametrize("surface", SURFACES.values(), ids=SURFACES.keys())
-def test_extreme_materials_by_part(surface: NDArray[np.float64]) -> None:
-    """A share is a quotient of what may be 0 or large; what a lobe lacks is exactly black."""
-    ball = sphere([0, 0, 0.5], 0.5, surface)
     scene = join([ball, _floor(surface), _mirror(), _lamp()])
     view = _render(scene, dataclasses.replace(SETTINGS, split=True, split_lobes=True))
     assert view.parts_rgb is not None
@@ -114,34 +113,36 @@ def test_extreme_materials_by_part(surface: NDArray[np.float64]) -> None:
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.01, 1.0])
-@pytest.mark.parametrize("specular", [[1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.5, 0.0]])
-@pytest.mark.parametrize("height", [1e-3, 1e-2])
-def test_extreme_materials_at_grazing_angles(
-    roughness: float, specular: list[float], height: float
-) -> None:
+def test_extreme_materials_at_grazing_angles(roughness: float) -> None:
     """The scale for multiple scattering is 0 / 0 along the surface, and largest at roughness 1."""
-    surface = material(specular=specular, roughness=roughness)
     low = light(np.array(LAMP) * [1, 1, 0] + [0, 0.9, 1e-3], 100.0)
-    scene = join([_floor(surface), low, _lamp()], eye=(0, -0.9, height), target=(0, 0.5, 0))
-    picture = _render(scene).radiance_rgb
-    assert np.isfinite(picture).all()
-    assert (picture >= 0).all()
-    assert (picture.max() > 0) == (max(specular) > 0)
+    for specular, height in (
+        ([1.0, 1.0, 1.0], 1e-3),
+        ([0.0, 0.0, 0.0], 1e-3),
+        ([1.0, 0.5, 0.0], 1e-3),
+        ([1.0, 1.0, 1.0], 1e-2),
+    ):
+        surface = material(specular=specular, roughness=roughness)
+        scene = join([_floor(surface), low, _lamp()], eye=(0, -0.9, height), target=(0, 0.5, 0))
+        picture = _render(scene).radiance_rgb
+        assert np.isfinite(picture).all(), (specular, height)
+        assert (picture >= 0).all(), (specular, height)
+        assert (picture.max() > 0) == (max(specular) > 0), (specular, height)
 
 
-@pytest.mark.parametrize("parts", SHAPES.values(), ids=SHAPES.keys())
-def test_extreme_shapes_and_lights(parts: list[Part]) -> None:
-    picture = _render(join(parts)).radiance_rgb
-    assert np.isfinite(picture).all()
-    assert (picture >= 0).all()
-    assert picture.max() > 0
+def test_extreme_shapes_and_lights() -> None:
+    for name, parts in SHAPES.items():
+        picture = _render(join(parts)).radiance_rgb
+        assert np.isfinite(picture).all(), name
+        assert (picture >= 0).all(), name
+        assert picture.max() > 0, name
 
 
-@pytest.mark.parametrize("fov_deg", [1.0, 10.0, 120.0, 170.0])
-def test_extreme_fields_of_view(fov_deg: float) -> None:
-    picture = _render(join([_floor(), _lamp()], fov_deg=fov_deg)).radiance_rgb
-    assert np.isfinite(picture).all()
-    assert picture.max() > 0
+def test_extreme_fields_of_view() -> None:
+    for fov_deg in (1.0, 10.0, 120.0, 170.0):
+        picture = _render(join([_floor(), _lamp()], fov_deg=fov_deg)).radiance_rgb
+        assert np.isfinite(picture).all(), fov_deg
+        assert picture.max() > 0, fov_deg
 
 
 @pytest.mark.parametrize("scale", [1e-3, 5e2])
@@ -157,7 +158,7 @@ def test_scale_changes_nothing(scale: float) -> None:
     assert np.median(abs(picture(scale) - picture(1.0))) < 1e-3 * picture(1.0).max()
 
 
-@pytest.mark.parametrize("radiance", [1e-3, 1.0, 1e4])
+@pytest.mark.parametrize("radiance", [1e-3, 1e4])
 def test_a_white_surface_in_a_furnace_conserves_energy(radiance: float) -> None:
     ball = sphere([0, 0, 0], 0.5, material(diffuse=1.0), rings=24)
     scene = join([ball, furnace(radiance)], eye=(0, -2, 0), fov_deg=10)
@@ -202,16 +203,16 @@ REASONS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("scene", "reason"), REASONS.values(), ids=REASONS.keys())
-def test_what_cannot_be_rendered_has_a_reason(scene: Scene, reason: str) -> None:
+def test_what_cannot_be_rendered_has_a_reason() -> None:
     """With the bound on darkness that builds have; and each is rejected again for the same."""
     settings = dataclasses.replace(SETTINGS, min_mean_radiance=0.01)
-    messages = []
-    for _ in range(2):
-        with pytest.raises(Rejected, match=reason) as caught:
-            SceneRenderer(scene, settings).render_view(scene.c2w[0], 40.0, seed=0)
-        messages.append(str(caught.value))
-    assert messages[0] == messages[1]
+    for name, (scene, reason) in REASONS.items():
+        messages = []
+        for _ in range(2):
+            with naming(name), pytest.raises(Rejected, match=reason) as caught:
+                SceneRenderer(scene, settings).render_view(scene.c2w[0], 40.0, seed=0)
+            messages.append(str(caught.value))
+        assert messages[0] == messages[1], name
 
 
 def test_an_emitter_without_area_leaves_a_scene_unlit() -> None:
@@ -228,22 +229,31 @@ def test_a_camera_in_a_lit_room_or_object_is_a_picture() -> None:
     assert picture.min() > 0
 
 
-@pytest.mark.parametrize("eye", [(0, 0, 0), (-1, -1, 0), (0, 0.1, 2)])
-def test_a_camera_on_a_face_a_vertex_or_an_emitter(eye: tuple[float, float, float]) -> None:
-    scene = join([_floor(), _lamp()], eye=eye, target=(0.5, 0.4, -0.2))
-    assert np.isfinite(_render(scene).radiance_rgb).all()
+def test_a_camera_on_a_face_a_vertex_or_an_emitter() -> None:
+    for eye in ((0, 0, 0), (-1, -1, 0), (0, 0.1, 2)):
+        scene = join([_floor(), _lamp()], eye=eye, target=(0.5, 0.4, -0.2))
+        assert np.isfinite(_render(scene).radiance_rgb).all(), eye
 
 
-@pytest.mark.parametrize(("resolution", "spp"), [(8, 1024), (40, 128), (512, 8)])
-def test_any_multiple_of_eight_is_a_resolution(resolution: int, spp: int) -> None:
-    """8 is the least, 40 no power of two, 512 that of published pictures; all show the same."""
-    scene = join([_floor(), light(np.array(LAMP) * [9, 9, 1], 5.0)], fov_deg=60)
+WIDE_VIEW = join([_floor(), light(np.array(LAMP) * [9, 9, 1], 5.0)], fov_deg=60)
+
+
+@pytest.fixture(scope="module")
+def truth() -> NDArray[np.float32]:
+    """Return the wide view in 8 x 8 pixels, nearly converged."""
+    exact = dataclasses.replace(SETTINGS, resolution=8, min_spp=4096, max_spp=4096, denoiser="off")
+    return SceneRenderer(WIDE_VIEW, exact).render_view(WIDE_VIEW.c2w[0], 60.0, seed=1).radiance_rgb
+
+
+@pytest.mark.parametrize(("resolution", "spp"), [(8, 1024), (40, 128), (136, 16)])
+def test_any_multiple_of_eight_is_a_resolution(
+    resolution: int, spp: int, truth: NDArray[np.float32]
+) -> None:
+    """8 is the least, 40 no power of two, 136 wider than 128; all show the same."""
     settings = dataclasses.replace(SETTINGS, resolution=resolution, min_spp=spp, max_spp=spp)
-    view = SceneRenderer(scene, settings).render_view(scene.c2w[0], 60.0, seed=0)
+    view = SceneRenderer(WIDE_VIEW, settings).render_view(WIDE_VIEW.c2w[0], 60.0, seed=0)
     assert view.radiance_rgb.shape == (resolution, resolution, 3)
     assert view.hits.shape == (resolution, resolution)
-    exact = dataclasses.replace(settings, resolution=8, min_spp=4096, max_spp=4096, denoiser="off")
-    truth = SceneRenderer(scene, exact).render_view(scene.c2w[0], 60.0, seed=1).radiance_rgb
     block = resolution // 8
     shown = view.radiance_rgb.reshape(8, block, 8, block, 3).mean(axis=(1, 3))
     lit = truth > 0.05 * truth.max()

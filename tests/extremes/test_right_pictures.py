@@ -77,27 +77,27 @@ SAME: dict[str, list[Part]] = {
 }
 
 
-@pytest.mark.parametrize("parts", SAME.values(), ids=SAME.keys())
-def test_what_adds_nothing_changes_nothing(parts: list[Part], plain: NDArray[np.float32]) -> None:
+def test_what_adds_nothing_changes_nothing(plain: NDArray[np.float32]) -> None:
     """No surface shadows itself or its twin, and what has no area is met by no ray."""
-    picture = _picture([*parts, light(LAMP, 100.0)])
-    # equal samples: what differs is float32 rounding of hits, and of heights of 1e-6
-    np.testing.assert_allclose(picture, plain, rtol=2e-5, atol=1e-7)
+    for name, parts in SAME.items():
+        picture = _picture([*parts, light(LAMP, 100.0)])
+        # equal samples: what differs is float32 rounding of hits, and of heights of 1e-6
+        np.testing.assert_allclose(picture, plain, rtol=2e-5, atol=1e-7, err_msg=name)
 
 
-@pytest.mark.parametrize("radiance", [1e-3, 1.0, 1e6])
 @pytest.mark.parametrize("denoiser", ["off", "high"])
-def test_light_scales_the_picture(denoiser: str, radiance: float) -> None:
+def test_light_scales_the_picture(denoiser: str) -> None:
     """The denoiser too: it finds its exposure anew."""
-    usual, scaled = (
+    usual, *others = (
         _view(join([FLOOR, light(LAMP, level)]), denoiser=denoiser).radiance_rgb / level
-        for level in (100.0, radiance)
+        for level in (100.0, 1e-3, 1.0, 1e6)
     )
-    # half of the float32 digits, behind a network whose exposure is a float32 logarithm
-    np.testing.assert_allclose(scaled, usual, rtol=1e-3, atol=1e-7 * usual.max())
+    for scaled in others:
+        # half of the float32 digits, behind a network whose exposure is a float32 logarithm
+        np.testing.assert_allclose(scaled, usual, rtol=1e-3, atol=1e-7 * usual.max())
 
 
-@pytest.mark.parametrize("size", [1e-1, 1e-3, 1e-5])
+@pytest.mark.parametrize("size", [1e-1, 1e-5])
 def test_an_emitter_far_below_a_pixel_gives_the_light_of_a_larger_one(
     size: float, plain: NDArray[np.float32]
 ) -> None:
@@ -114,7 +114,7 @@ def test_an_emitter_far_below_a_pixel_gives_the_light_of_a_larger_one(
     assert picture.mean() == pytest.approx(plain.mean() * area / wanted, rel=0.01)
 
 
-@pytest.mark.parametrize("height", [1e-2, 1e-4, 1e-6])
+@pytest.mark.parametrize("height", [1e-2, 1e-6])
 def test_a_camera_close_to_a_surface_sees_that_point(height: float) -> None:
     """As from a tenth of a metre; no ray begins behind what it should meet."""
 
@@ -127,9 +127,14 @@ def test_a_camera_close_to_a_surface_sees_that_point(height: float) -> None:
     assert near.radiance_rgb.mean() == pytest.approx(far.radiance_rgb.mean(), rel=0.02)
 
 
-@pytest.mark.parametrize("fov_deg", [1.0, 60.0, 170.0])
 @pytest.mark.parametrize(
-    ("eye", "target"), [((0, 0, 1), (0.3, 0.1, 0)), ((0.3, -0.4, 0.002), (1, 1, 0.0))]
+    ("fov_deg", "eye", "target"),
+    [
+        (1.0, (0, 0, 1), (0.3, 0.1, 0)),
+        (60.0, (0.3, -0.4, 0.002), (1, 1, 0.0)),
+        (170.0, (0, 0, 1), (0.3, 0.1, 0)),
+        (170.0, (0.3, -0.4, 0.002), (1, 1, 0.0)),
+    ],
 )
 def test_every_field_of_view_shows_what_its_rays_meet(
     fov_deg: float, eye: ArrayLike, target: ArrayLike
@@ -153,7 +158,7 @@ def test_fireflies_are_bounded_and_nothing_is_cut_off_for_it(lamp: NDArray[np.fl
     )
     power = 100.0 * (np.ptp(LAMP[:, 0]) / np.ptp(lamp[:, 0])) ** 2
     parts = [FLOOR, mirror, light(lamp, power)]
-    truth, cheap = (_picture(parts, spp=spp) for spp in (2048, 8))
+    truth, cheap = (_picture(parts, spp=spp) for spp in (1024, 8))
     # Measured at 8 samples: 12 % above and 3 % below the mean; brightest pixel 2 to 7 times that
     # of 1024. A sample that met the light by luck would be thousands of times as bright.
     assert cheap.mean() == pytest.approx(truth.mean(), rel=0.2)

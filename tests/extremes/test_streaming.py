@@ -60,14 +60,14 @@ def every(train: int) -> list[str]:
     [(1, 1, 1), (5, 1, 1), (5, 99, 2)],
     ids=["one sample of one view", "one sample a shard", "one shard"],
 )
-@pytest.mark.parametrize("window", [1, 1000])
 def test_small_splits_are_shown_whole_in_every_epoch(
-    tmp_path: Path, train: int, per_shard: int, views: int, window: int
+    tmp_path: Path, train: int, per_shard: int, views: int
 ) -> None:
     write_toy_dataset(
         tmp_path, train=train, validation=1, per_shard=per_shard, resolution=8, views=views
     )
-    assert keys(tmp_path, train, 3, window=window) == [every(train)] * 3
+    for window in (1, 1000):
+        assert keys(tmp_path, train, 3, window=window) == [every(train)] * 3, window
 
 
 def test_a_batch_may_be_larger_than_the_split(tmp_path: Path) -> None:

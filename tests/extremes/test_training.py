@@ -40,21 +40,19 @@ def batch(**changes: Tensor) -> TrainingBatch:
 
 
 @pytest.mark.parametrize("terms", TERMS)
-@pytest.mark.parametrize("target", [0.0, 1e-7, BRIGHTEST])
-@pytest.mark.parametrize("noise", [0.0, 1e-5, 10.0])
-def test_every_target_that_can_be_stored_gives_a_step(
-    terms: LossSettings, target: float, noise: float
-) -> None:
-    ends = batch()
-    ends = batch(
-        target_BVRR3=torch.full_like(ends.target_BVRR3, target),
-        noise_BV=torch.full_like(ends.noise_BV, noise),
-    )
-    run = tiny_run(loss=terms)
-    state = new_state(run)
-    report = stepper(state, run).step([ends], 1e-3)
-    assert report.applied and math.isfinite(report.loss) and math.isfinite(report.grad_norm)
-    assert all(torch.isfinite(weight).all() for weight in state.model.parameters())
+def test_every_target_that_can_be_stored_gives_a_step(terms: LossSettings) -> None:
+    usual, run = batch(), tiny_run(loss=terms)
+    for target, noise in ((0.0, 0.0), (0.0, 10.0), (1e-7, 1e-5), (BRIGHTEST, 0.0)):
+        ends = dataclasses.replace(
+            usual,
+            target_BVRR3=torch.full_like(usual.target_BVRR3, target),
+            noise_BV=torch.full_like(usual.noise_BV, noise),
+        )
+        state = new_state(run)
+        report = stepper(state, run).step([ends], 1e-3)
+        finite = math.isfinite(report.loss) and math.isfinite(report.grad_norm)
+        assert report.applied and finite, (target, noise)
+        assert all(torch.isfinite(weight).all() for weight in state.model.parameters())
 
 
 @given(
@@ -63,7 +61,7 @@ def test_every_target_that_can_be_stored_gives_a_step(
     noise=st.floats(0, 100, width=32),
     terms=st.sampled_from(TERMS),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_losses_and_their_gradients_are_finite_wherever_predictions_are(
     shown: float, wanted: float, noise: float, terms: LossSettings
 ) -> None:

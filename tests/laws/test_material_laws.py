@@ -41,8 +41,9 @@ def _furnace_plate(row: NDArray, cos_view: float) -> Scene:
     return join([quad(PLATE, row), furnace()], eye=eye, fov_deg=0.5)
 
 
-@pytest.mark.parametrize("roughness", [0.01, 0.1, 0.4, 0.7, 1.0])
-@pytest.mark.parametrize("cos_view", [0.95, 0.3])
+@pytest.mark.parametrize(
+    ("roughness", "cos_view"), [(0.01, 0.3), (0.1, 0.95), (0.4, 0.3), (1.0, 0.95), (1.0, 0.3)]
+)
 def test_a_plate_in_a_furnace_returns_the_directional_albedo(
     roughness: float, cos_view: float
 ) -> None:
@@ -54,20 +55,22 @@ def test_a_plate_in_a_furnace_returns_the_directional_albedo(
     assert_agree(estimate, exact(expected[None, None]), slack=2e-3)
 
 
-@pytest.mark.parametrize(
-    "row",
-    [
-        material(diffuse=[0.9, 0.5, 0.0]),
-        material(specular=[1.0, 0.6, 0.2], roughness=0.05),
-        material(),
-        material(diffuse=1e-4, specular=0.9, roughness=0.05),
-        material(diffuse=0.9, specular=1e-4, roughness=0.05),
-    ],
-    ids=["diffuse only", "mirror only", "black", "nearly mirror", "nearly diffuse"],
-)
-def test_the_ends_of_the_mixture_are_exact(row: NDArray) -> None:
-    estimate = render_blocks(_furnace_plate(row, 0.8), resolution=8, block=8, max_depth=2)
-    assert_agree(estimate, exact(_albedo(row, 0.8)[None, None]), slack=1e-3)
+ENDS = {
+    "diffuse only": material(diffuse=[0.9, 0.5, 0.0]),
+    "mirror only": material(specular=[1.0, 0.6, 0.2], roughness=0.05),
+    "black": material(),
+    "nearly mirror": material(diffuse=1e-4, specular=0.9, roughness=0.05),
+    "nearly diffuse": material(diffuse=0.9, specular=1e-4, roughness=0.05),
+}
+
+
+def test_the_ends_of_the_mixture_are_exact() -> None:
+    for name, row in ENDS.items():
+        estimate = render_blocks(
+            _furnace_plate(row, 0.8), resolution=8, block=8, max_depth=2, passes=12
+        )
+        expected = exact(_albedo(row, 0.8)[None, None])
+        assert_agree(estimate, expected, slack=1e-3, name=name)
 
 
 def test_a_surface_shades_the_same_from_behind() -> None:
@@ -83,7 +86,7 @@ def test_a_surface_shades_the_same_from_behind() -> None:
         kind="object",
     )
     front, back = (
-        render_blocks(join([floor, part, lamp], eye=(0, -2, 1)), first_seed=seed)
+        render_blocks(join([floor, part, lamp], eye=(0, -2, 1)), first_seed=seed, passes=8)
         for seed, part in enumerate([ball, turned])
     )
     assert_agree(front, back)

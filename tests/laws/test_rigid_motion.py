@@ -1,7 +1,6 @@
 """Moving a composed scene with its cameras changes its pictures by noise alone."""
 
 import numpy as np
-import pytest
 
 from pipeline.scenes.sight import Sight
 from scene_templates.families import DEFAULT_FAMILIES
@@ -19,13 +18,13 @@ def _scene(scene_index: int) -> Scene:
     return first_scene(SETTINGS, small_pool(), seed=11, scene_index=scene_index)
 
 
-@pytest.mark.parametrize("scene_index", range(2))
-def test_rendering_commutes_with_motion(scene_index: int) -> None:
-    scene = _scene(scene_index)
-    rotation = uniform_rotation(np.random.default_rng(scene_index))
+def test_rendering_commutes_with_motion() -> None:
+    scene = _scene(0)
+    rotation = uniform_rotation(np.random.default_rng(0))
     there = moved(scene, rotation, [0.3, -0.2, 0.1])
     # Frames around normals turn differently, so that the same seed means other samples.
-    assert_agree(render_blocks(there), render_blocks(scene, first_seed=99))
+    here = render_blocks(scene, first_seed=99, passes=8)
+    assert_agree(render_blocks(there, passes=8), here)
 
 
 def test_what_a_camera_sees_commutes_with_motion() -> None:

@@ -22,7 +22,7 @@ def _motion(seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return uniform_rotation(rng), rng.normal(0, 0.5, size=3)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_moved_scene_keeps_every_law(seed: int) -> None:
     there = moved(tiny_scene(), *_motion(seed))
     there.check()
@@ -30,7 +30,7 @@ def test_a_moved_scene_keeps_every_law(seed: int) -> None:
         assert np.array_equal(getattr(there, name), getattr(tiny_scene(), name))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_broken_scene_stays_broken(seed: int) -> None:
     scene = tiny_scene()
     for changes in (
@@ -44,7 +44,7 @@ def test_a_broken_scene_stays_broken(seed: int) -> None:
                 candidate.check()
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(2))
 def test_moving_and_storing_may_change_places(seed: int) -> None:
     sample, motion = tiny_sample(), _motion(seed)
 
@@ -58,7 +58,7 @@ def test_moving_and_storing_may_change_places(seed: int) -> None:
         assert np.array_equal(getattr(first, name), getattr(second, name)), name
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(2))
 def test_distances_and_what_cameras_see_stay(seed: int) -> None:
     scene, (rotation, shift) = tiny_scene(), _motion(seed)
     there = moved(scene, rotation, shift)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.load_tracer import load_tracer
@@ -21,6 +22,8 @@ class Estimate:
 
     mean: NDArray[np.float64]
     error: NDArray[np.float64]
+    freedom: float = np.inf
+    """Degrees of freedom of the errors: one less than the passes."""
 
 
 def camera_of(scene: Scene, resolution: int, view: int = 0) -> Camera:
@@ -44,20 +47,47 @@ def render_blocks(
 ) -> Estimate:
     """Return the means of `block` x `block` pixels, [R / block, R / block, 3]."""
     traced = tracer or load_tracer(scene, max_depth=max_depth, rr_depth=rr_depth)
-    camera = camera_of(scene, resolution)
-    count = resolution // block
-    pictures = [traced.radiance(camera, seed=first_seed + k, spp=64) for k in range(passes)]
-    cells = np.array(pictures, np.float64).reshape(passes, count, block, count, block, 3)
-    blocks = cells.mean(axis=(2, 4))
-    return Estimate(mean=blocks.mean(axis=0), error=blocks.std(axis=0, ddof=1) / np.sqrt(passes))
+    pictures = render_passes(
+        traced, scene, resolution=resolution, passes=passes, first_seed=first_seed
+    )
+    return blocks_of(pictures, block)
 
 
-def assert_agree(a: Estimate, b: Estimate, *, slack: float = 0.0) -> None:
-    """Compare two estimates by their standard errors; `slack` is a relative model error."""
+def render_passes(
+    tracer: Tracer, scene: Scene, *, resolution: int = 32, passes: int, first_seed: int = 0
+) -> NDArray[np.float64]:
+    """Return independent pictures of 64 samples, [passes, R, R, 3]."""
+    camera, seeds = camera_of(scene, resolution), range(first_seed, first_seed + passes)
+    return np.array([tracer.radiance(camera, seed=seed, spp=64) for seed in seeds], np.float64)
+
+
+def blocks_of(pictures: NDArray[np.float64], block: int) -> Estimate:
+    """Return the means of `block` x `block` pixels of independent pictures."""
+    passes, count = len(pictures), pictures.shape[1] // block
+    cells = pictures.reshape(passes, count, block, count, block, 3).mean(axis=(2, 4))
+    error = cells.std(axis=0, ddof=1) / np.sqrt(passes)
+    return Estimate(mean=cells.mean(axis=0), error=error, freedom=passes - 1)
+
+
+def assert_same_light(a: NDArray[np.float64], b: NDArray[np.float64], *, name: str = "") -> None:
+    """Compare independent pictures of 32 x 32 pixels in blocks, and as a whole."""
+    for block in (4, 32):
+        assert_agree(blocks_of(a, block), blocks_of(b, block), name=f"{name} by {block} pixels")
+
+
+def assert_agree(a: Estimate, b: Estimate, *, slack: float = 0.0, name: str = "") -> None:
+    """Compare two estimates by their standard errors; `slack` is a relative model error.
+
+    Errors of few passes are themselves uncertain: more of them are allowed, so that one value in a
+    hundred thousand is off. `name` is the case, where a test compares several.
+    """
+    few = sum(each.freedom for each in (a, b) if np.any(each.error))
+    sigmas = max(SIGMAS, float(stats.t.isf(5e-6, few))) if few else SIGMAS
     error = np.hypot(a.error, b.error)
-    allowed = SIGMAS * error + slack * np.abs(b.mean) + 1e-7
+    allowed = sigmas * error + slack * np.abs(b.mean) + 1e-7
     excess = np.abs(a.mean - b.mean) / allowed
-    assert excess.max() < 1, f"off by {excess.max():.2f} of what is allowed at {excess.argmax()}"
+    off = f"off by {excess.max():.2f} of what is allowed at {excess.argmax()}"
+    assert excess.max() < 1, f"{name}: {off}" if name else off
 
 
 def exact(mean: NDArray[np.float64]) -> Estimate:

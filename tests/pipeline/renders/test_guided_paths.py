@@ -12,7 +12,12 @@ from pipeline.renders.settings import RenderSettings
 from pipeline.renders.vector_tracer import VectorTracer
 from storage.records.scene import Scene
 from tests.pipeline.renders.guided_scenes import FLOOR, LAMP, WALL, lit_by_a_mirror, mirrors
-from tests.pipeline.renders.sampling import assert_agree, camera_of, render_blocks
+from tests.pipeline.renders.sampling import (
+    assert_same_light,
+    camera_of,
+    render_blocks,
+    render_passes,
+)
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -28,11 +33,10 @@ def _guided(tracer: VectorTracer) -> VectorTracer:
     return guided
 
 
-@pytest.mark.parametrize("share", [0.5, 0.95])
 @pytest.mark.parametrize(
-    "scene",
-    [mirrors(), lit_by_a_mirror(0.1), lit_by_a_mirror(0.3)],
-    ids=["mirrors", "small lamp", "large lamp"],
+    ("scene", "share"),
+    [(mirrors(), 0.95), (lit_by_a_mirror(0.1), 0.5)],
+    ids=["mirrors", "small lamp"],
 )
 def test_guided_pictures_show_the_same_light(
     scene: Scene, share: float, monkeypatch: pytest.MonkeyPatch
@@ -40,8 +44,9 @@ def test_guided_pictures_show_the_same_light(
     """However much is guided: the weights of all three strategies go by the mixture."""
     monkeypatch.setattr("pipeline.renders.guide_table._SHARE", share)
     tracer = _tracer(scene)
-    plain = render_blocks(scene, tracer=tracer, passes=32)
-    assert_agree(render_blocks(scene, tracer=_guided(tracer), passes=32, first_seed=700), plain)
+    plain = render_passes(tracer, scene, passes=12)
+    guided = render_passes(_guided(tracer), scene, passes=12, first_seed=700)
+    assert_same_light(guided, plain)
 
 
 def _means(tracer: VectorTracer, scene: Scene, seeds: range) -> tuple[float, float]:
@@ -75,7 +80,7 @@ def test_guided_camera_paths_have_less_noise_where_a_mirror_is_the_lamp() -> Non
     scene = lit_by_a_mirror(0.3)
     tracer = _tracer(scene)
     plain, guided = (
-        np.square(render_blocks(scene, tracer=each, block=1, passes=32).error).mean()
+        np.square(render_blocks(scene, tracer=each, block=1, passes=10).error).mean()
         for each in (tracer, _guided(tracer))
     )
     assert guided < 0.8 * plain
@@ -129,10 +134,10 @@ def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(vector_tracer, "_learnt", counted)
     scene = mirrors()
-    camera = camera_of(scene, 32)
+    camera = camera_of(scene, 16)
     for floor_db, max_spp, times in ((1.0, 512, 0), (90.0, 256, 0), (90.0, 512, 1)):
         settings = RenderSettings(
-            resolution=32, noise_floor_db=floor_db, min_spp=8, max_spp=max_spp,
+            resolution=16, noise_floor_db=floor_db, min_spp=8, max_spp=max_spp,
             min_mean_radiance=0.0,
             per_light=True,
         )  # fmt: skip
@@ -150,9 +155,9 @@ def test_lights_apart_share_a_table_and_add_up() -> None:
     tracer = _tracer(both)
     alone = [tracer.only_light(row).guided() for row in (2, 3)]
     assert alone[0]._scene.guide is alone[1]._scene.guide is _guided(tracer)._scene.guide
-    sums = [_means(each, both, range(40 * k, 40 * k + 40)) for k, each in enumerate(alone)]
-    plain, error = _means(tracer, both, range(1000, 1040))
+    sums = [_means(each, both, range(12 * k, 12 * k + 12)) for k, each in enumerate(alone)]
+    plain, error = _means(tracer, both, range(1000, 1012))
     # Four standard errors: once in 16,000 seeds, which are fixed.
     allowed = 4 * np.sqrt(sum(e**2 for _, e in sums) + error**2)
-    assert allowed < 0.02 * plain
+    assert allowed < 0.04 * plain
     assert abs(sum(mean for mean, _ in sums) - plain) < allowed

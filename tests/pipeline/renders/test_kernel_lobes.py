@@ -12,13 +12,20 @@ from tests.storage.records.test_multiscatter import stretched
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-@pytest.mark.parametrize("roughness", [0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.85, 1.0])
-def test_the_lobe_returns_all_light_from_a_hundred_directions(roughness: float) -> None:
+def test_the_lobe_returns_all_light_from_a_hundred_directions() -> None:
     """By its own samples: the mean of f cos / density, from the normal to a cosine of 1e-3."""
+    for roughness in (0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.85, 1.0):
+        off = _returned(roughness) - 1
+        # Measured: up to 0.37 %, of which the table has 0.25.
+        assert abs(off).max() < 0.005, roughness
+
+
+def _returned(roughness: float) -> NDArray:
+    """Return the share of light that comes back from each of a hundred directions."""
     import drjit as dr
     import mitsuba as mi
 
-    side, cosines = 128, np.geomspace(1e-3, 1, 100)
+    side, cosines = 96, np.geomspace(1e-3, 1, 100)
     count = side * side
     lanes = np.repeat(cosines, count)
     wi = mi.Vector3f(mi.Float(np.sqrt(1 - lanes**2)), 0, mi.Float(lanes))
@@ -29,9 +36,7 @@ def test_the_lobe_returns_all_light_from_a_hundred_directions(roughness: float) 
     wo = ggx.sample(lobes, wi, mi.Float(0), u)
     reflected, density = ggx.evaluate(lobes, wi, wo, mi.Vector3f(*UP))
     returned = dr.block_sum(dr.select(density > 0, reflected.x / density, 0), count) / count
-    off = np.array(returned) - 1
-    # Measured: up to 0.37 %, of which the table has 0.25.
-    assert abs(off).max() < 0.005
+    return np.array(returned)
 
 
 def test_no_mirror_reflects_to_below_the_triangle() -> None:

@@ -137,20 +137,21 @@ def _block_estimate(scene: Scene, *, per_light: bool) -> Estimate:
     parts = [tracer.only_light(row) for row in light_rows(scene)] if per_light else [tracer]
     camera = camera_of(scene, 32)
     means = []
-    for seed in range(16):
+    for seed in range(12):
         total = sum(part.radiance(camera, seed=seed, spp=64).astype(np.float64) for part in parts)
         means.append(np.asarray(total).reshape(4, 8, 4, 8, 3).mean(axis=(1, 3)))
     stack = np.array(means)
-    return Estimate(mean=stack.mean(axis=0), error=stack.std(axis=0, ddof=1) / 4)
+    return Estimate(mean=stack.mean(axis=0), error=stack.std(axis=0, ddof=1) / np.sqrt(12))
 
 
+@pytest.mark.slow
 def test_both_tracers_switch_the_same_light_on(llvm: None) -> None:
     from pipeline.renders.plugin_tracer import PluginTracer
     from pipeline.renders.vector_tracer import VectorTracer
 
     scene = lit_scene()
     camera = camera_of(scene, 16)
-    for row in (0, 2, 4):
+    for row in (0, 4):
         means = [
             np.mean(
                 [
@@ -184,7 +185,7 @@ def test_lights_apart_have_an_honest_floor_and_reach_a_target() -> None:
     settings = dataclasses.replace(SETTINGS, noise_floor_db=38.0, max_spp=2048)
     view = _render(lit_scene(), settings)
     assert view.noise_floor_db >= 38.0 and not view.at_cap
-    converged = dataclasses.replace(SETTINGS, min_spp=4096, max_spp=4096, per_light=False)
+    converged = dataclasses.replace(SETTINGS, min_spp=2048, max_spp=2048, per_light=False)
     truth = _render(lit_scene(), converged, seed=1)
     assert view.noise_floor_db < psnr_log_db(view.radiance_rgb, truth.radiance_rgb)
 

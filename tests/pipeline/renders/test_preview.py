@@ -1,6 +1,5 @@
 """Previews: any number of samples from one, unbiased before the denoiser, and no stated error."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,16 @@ from tests.scenes_by_hand import tiny_scene
 
 
 def made(scene: Scene, spp: int, seed: int = 0, **changes: Any) -> Preview:
+    return shown(loaded(scene, spp, **changes), scene, spp, seed)
+
+
+def loaded(scene: Scene, spp: int, **changes: Any) -> PreviewRenderer:
     settings = PreviewSettings(**{"resolution": 32, "spp": spp, "denoiser": "off", **changes})
-    steps = PreviewRenderer(scene, settings).view_steps(scene.c2w[0], float(scene.fov_deg[0]), seed)
+    return PreviewRenderer(scene, settings)
+
+
+def shown(renderer: PreviewRenderer, scene: Scene, spp: int, seed: int) -> Preview:
+    steps = renderer.view_steps(scene.c2w[0], float(scene.fov_deg[0]), seed)
     told = []
     while True:
         try:
@@ -33,34 +40,37 @@ def picture(scene: Scene, spp: int, seed: int = 0, **changes: Any) -> NDArray[np
     return made(scene, spp, seed, **changes).radiance_rgb
 
 
-@pytest.mark.parametrize("spp", [1, 3, 7, 20, 64, 85])
+@pytest.mark.parametrize("spp", [1, 7, 85])
 def test_any_number_of_samples_is_a_picture(spp: int) -> None:
     scene = tiny_scene()
     for denoiser in ("off", "fast", "high"):
         found = picture(scene, spp, denoiser=denoiser)
         assert found.shape == (32, 32, 3) and found.dtype == np.float32
         assert np.isfinite(found).all() and (found >= 0).all() and found.max() > 0
-        np.testing.assert_array_equal(found, picture(scene, spp, denoiser=denoiser))
+    np.testing.assert_array_equal(found, picture(scene, spp, denoiser="high"))
     assert not np.array_equal(picture(scene, spp), picture(scene, spp, seed=1))
 
 
-@pytest.mark.parametrize("spp", [1, 5])
-def test_few_samples_have_the_light_of_many(spp: int) -> None:
-    """The mean over seeds is that of 2048 samples, in blocks, within five standard errors."""
+def test_few_samples_have_the_light_of_many() -> None:
+    """The mean over seeds is that of 1024 samples, in blocks, within five standard errors."""
     scene = sampled_like_scene(np.random.default_rng(3), num_views=1)
-    blocks: Callable[[NDArray[np.float32]], NDArray[np.float64]] = lambda one: (  # noqa: E731
-        one.reshape(4, 8, 4, 8, 3).mean(axis=(1, 3, 4), dtype=np.float64)
-    )
-    few = np.array([blocks(picture(scene, spp, seed)) for seed in range(64)])
-    many = np.array([blocks(picture(scene, 128, 1000 + seed)) for seed in range(16)])
-    error = np.sqrt(few.var(axis=0, ddof=1) / len(few) + many.var(axis=0, ddof=1) / len(many))
-    off = np.abs(few.mean(axis=0) - many.mean(axis=0))
-    assert (off <= SIGMAS * error + 1e-6).all()  # black blocks have no spread
+
+    def blocks(spp: int, seeds: range) -> NDArray[np.float64]:
+        renderer = loaded(scene, spp, resolution=16)
+        pictures = [shown(renderer, scene, spp, seed).radiance_rgb for seed in seeds]
+        return np.array(pictures, np.float64).reshape(-1, 4, 4, 4, 4, 3).mean(axis=(2, 4, 5))
+
+    many = blocks(64, range(1000, 1016))
+    for spp in (1, 5):
+        few = blocks(spp, range(40))
+        error = np.sqrt(few.var(axis=0, ddof=1) / len(few) + many.var(axis=0, ddof=1) / len(many))
+        off = np.abs(few.mean(axis=0) - many.mean(axis=0))
+        assert (off <= SIGMAS * error + 1e-6).all(), spp  # black blocks have no spread
 
 
 def test_more_samples_and_a_denoiser_come_nearer() -> None:
     scene = sampled_like_scene(np.random.default_rng(3), num_views=1)
-    truth = picture(scene, 2048, 99)
+    truth = picture(scene, 512, 99)
 
     def error(spp: int, denoiser: str) -> float:
         found = picture(scene, spp, denoiser=denoiser)

@@ -59,7 +59,7 @@ def test_a_view_is_finite_lit_and_black_outside() -> None:
 
 def test_the_same_bits_for_any_number_of_threads_and_in_any_process() -> None:
     scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
-    settings = dataclasses.replace(CHEAP, resolution=64, min_spp=128, max_spp=128, aux_spp=64)
+    settings = dataclasses.replace(CHEAP, min_spp=128, max_spp=128, aux_spp=64)
     digests = []
     for threads in (1, 2):
         set_threads(threads)
@@ -159,7 +159,7 @@ def test_halves_of_many_samples_have_the_best_filter(monkeypatch: pytest.MonkeyP
 def test_a_linear_target_goes_on_where_the_log_one_is_reached() -> None:
     easy = dataclasses.replace(GROWING, noise_floor_db=10.0, max_spp=4096)
     first = _render(simple_scene(), easy)
-    wanted = first.noise_floor_linear_db + 2
+    wanted = first.noise_floor_linear_db + 1
     both = _render(simple_scene(), dataclasses.replace(easy, noise_floor_linear_db=wanted))
     assert both.spp > first.spp == 64
     assert both.noise_floor_linear_db >= wanted and not both.at_cap
@@ -206,29 +206,32 @@ def test_every_target_counts_at_the_cap(name: str, metric: str) -> None:
     assert view.at_cap and view.noise_floor_db > 10
 
 
-def test_the_measured_floor_is_below_the_true_agreement_here() -> None:
+@pytest.fixture(scope="module")
+def truth() -> NDArray[np.float32]:
+    """Return the simple scene of 64 x 64 pixels, nearly converged."""
+    converged = dataclasses.replace(CHEAP, resolution=64, min_spp=1024, max_spp=1024, aux_spp=64)
+    return _render(simple_scene(), converged, seed=1).radiance_rgb
+
+
+def test_the_measured_floor_is_below_the_true_agreement_here(truth: NDArray[np.float32]) -> None:
     """An honest floor: the picture is at least as close to a converged one as it claims.
 
     Sixteen times the samples are not the truth, but an ordinary scene's floor is understated by
     about 3 dB, far more than what is left in them.
     """
-    scene = simple_scene()
-    settings = dataclasses.replace(CHEAP, resolution=64, min_spp=128, max_spp=128, aux_spp=64)
-    view = _render(scene, settings)
-    better = _render(scene, dataclasses.replace(settings, min_spp=2048, max_spp=2048), seed=1)
-    true_db = psnr_log_db(view.radiance_rgb, better.radiance_rgb)
+    settings = dataclasses.replace(CHEAP, resolution=64, min_spp=64, max_spp=64, aux_spp=64)
+    view = _render(simple_scene(), settings)
+    true_db = psnr_log_db(view.radiance_rgb, truth)
     assert view.noise_floor_db < true_db
     assert view.noise_floor_db > true_db - 10
 
 
-def test_denoising_helps_and_can_be_left_out() -> None:
-    scene = simple_scene()
+def test_denoising_helps_and_can_be_left_out(truth: NDArray[np.float32]) -> None:
     settings = dataclasses.replace(CHEAP, resolution=64)
-    truth = _render(scene, dataclasses.replace(settings, min_spp=2048, max_spp=2048), seed=1)
     errors = [
         -psnr_log_db(
-            _render(scene, dataclasses.replace(settings, denoiser=quality)).radiance_rgb,
-            truth.radiance_rgb,
+            _render(simple_scene(), dataclasses.replace(settings, denoiser=quality)).radiance_rgb,
+            truth,
         )
         for quality in ("high", "fast", "off")
     ]
@@ -259,15 +262,3 @@ def test_a_scene_of_emitters_alone_is_rejected() -> None:
     scene = join([light([[0, 0, 1], [1, 0, 1], [0, 1, 1]], 1.0)])
     with pytest.raises(Rejected, match="no_surfaces"):
         SceneRenderer(scene, CHEAP)
-
-
-def test_memory_stays_flat_over_many_scenes() -> None:
-    settings = dataclasses.replace(CHEAP, resolution=16, min_spp=8, max_spp=8, aux_spp=4)
-    resident = []
-    for index in range(90):
-        scene = sampled_like_scene(np.random.default_rng(index % 10), num_views=1)
-        _render(scene, dataclasses.replace(settings, min_mean_radiance=0.0))
-        with open("/proc/self/statm") as stream:
-            resident.append(int(stream.read().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
-    # Allocators keep a few megabytes of what they had at their fullest.
-    assert resident[-1] < 1.03 * resident[30]

@@ -1,7 +1,6 @@
 """Passes: the largest that lead to round numbers, in two halves that share nothing."""
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
@@ -36,24 +35,19 @@ def _passes(first_spp: int, spp: int, max_spp: int) -> tuple[HalfSamples, list[t
     return samples, tracer.asked
 
 
-@pytest.mark.parametrize(
-    ("first_spp", "spp", "max_spp", "of_a_half"),
-    [
+def test_passes_are_the_largest_that_fit() -> None:
+    for first_spp, spp, max_spp, of_a_half in (
         (128, 128, 512, [64]),
         (32, 32, 4096, [16]),
         (32, 256, 4096, [16, 16, 16, 16, 64]),
         (32, 160, 160, [16, 16, 16, 16, 16]),
         (8, 32, 64, [4, 4, 4, 4]),
         (8, 64, 64, [4, 4, 4, 4, 16]),
-    ],
-)
-def test_passes_are_the_largest_that_fit(
-    first_spp: int, spp: int, max_spp: int, of_a_half: list[int]
-) -> None:
-    samples, asked = _passes(first_spp, spp, max_spp)
-    assert samples.spp == spp
-    assert [size for size, _ in asked[::2]] == of_a_half
-    assert [size for size, _ in asked[1::2]] == of_a_half
+    ):
+        samples, asked = _passes(first_spp, spp, max_spp)
+        assert samples.spp == spp
+        assert [size for size, _ in asked[::2]] == of_a_half
+        assert [size for size, _ in asked[1::2]] == of_a_half
 
 
 def test_the_mean_weighs_passes_by_their_samples() -> None:

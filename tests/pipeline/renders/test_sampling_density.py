@@ -17,12 +17,12 @@ SAMPLES = 300_000
 SIGNIFICANCE = 0.01
 """Chance that any of all cases is rejected although it is right; the seeds are fixed."""
 
-MIRRORS = [(r, c) for r in (0.03, 0.1, 0.3, 0.6, 1.0) for c in (0.02, 0.15, 0.5, 0.95)]
-MIRRORS += [(0.01, c) for c in (0.15, 0.5, 0.95)]
+MIRRORS = [(0.01, 0.5), (0.03, 0.02), (0.03, 0.95), (0.1, 0.15), (0.3, 0.5), (1.0, 0.02),
+           (1.0, 0.95)]  # fmt: skip
 """Roughness and cosine. Not 0.01 at 0.02: wi + wo is 0.04 long there, so that float32 rounds the
 half vector by 2 % of the lobe's width, and the histogram shows the rounding."""
 
-MIXTURES = [(r, c) for r in (0.5, 0.7, 1.0) for c in (0.15, 0.5, 0.95)]
+MIXTURES = [(0.5, 0.15), (0.7, 0.5), (1.0, 0.95)]
 CASES = len(MIRRORS) + len(MIXTURES)
 
 

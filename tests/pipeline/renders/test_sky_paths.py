@@ -7,12 +7,19 @@ import pytest
 
 from pipeline.renders import vector_tracer
 from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.tracer import Tracer
 from pipeline.renders.vector_tracer import VectorTracer
 from scene_templates.rotations import uniform_rotation
 from storage.records.environment import Environment
 from storage.records.scene import Scene
 from tests.pipeline.renders.kernel_bsdf import exact_twin
-from tests.pipeline.renders.sampling import assert_agree, camera_of, render_blocks
+from tests.pipeline.renders.sampling import (
+    assert_agree,
+    assert_same_light,
+    camera_of,
+    render_blocks,
+    render_passes,
+)
 from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
 from tests.sky_maps import constant, night, one_sun, smooth
 
@@ -44,8 +51,11 @@ def open_scene(sky: Environment | None, num_lights: int = 2) -> Scene:
     return join(parts, eye=(0.5, -1.7, 0.6), fov_deg=45, sky=sky)
 
 
-@pytest.mark.parametrize("num_lights", [0, 2])
-@pytest.mark.parametrize("name", SKIES)
+@pytest.mark.parametrize(
+    ("name", "num_lights"),
+    [("sun", 2), *(pytest.param(*case, marks=pytest.mark.slow)
+                   for case in (("smooth", 0), ("night", 2)))],
+)  # fmt: skip
 def test_both_integrators_agree_within_their_noise(
     name: str, num_lights: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -66,15 +76,18 @@ def test_both_integrators_agree_within_their_noise(
     assert len(score) > 90 and abs(score.mean()) < 0.5
 
 
-@pytest.mark.parametrize("share", [0.03, 0.97])
-def test_no_share_of_picks_changes_what_is_expected(
-    share: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_share_of_picks_changes_what_is_expected(monkeypatch: pytest.MonkeyPatch) -> None:
     """Camera paths, light paths and picks are weighed against each other by the share."""
     scene = open_scene(smooth())
-    usual = render_blocks(scene)
-    monkeypatch.setattr(vector_tracer, "sky_share", lambda *_: share)
-    assert_agree(render_blocks(scene, first_seed=500), usual)
+    usual = render_passes(_tracer(scene), scene, passes=8)
+    for share in (0.03, 0.97):
+        monkeypatch.setattr(vector_tracer, "sky_share", lambda *_, share=share: share)
+        other = render_passes(_tracer(scene), scene, first_seed=500, passes=8)
+        assert_same_light(other, usual, name=f"share {share}")
+
+
+def _tracer(scene: Scene) -> Tracer:
+    return load_tracer(scene, max_depth=10, rr_depth=5)
 
 
 def test_guided_paths_expect_the_same() -> None:
@@ -89,8 +102,8 @@ def test_guided_paths_expect_the_same() -> None:
     assert isinstance(tracer, VectorTracer)
     guided = tracer.guided()
     assert guided._scene.guide is not None and guided._scene.sky is not None
-    plain = render_blocks(scene, tracer=tracer)
-    assert_agree(render_blocks(scene, tracer=guided, first_seed=500), plain)
+    plain = render_passes(tracer, scene, passes=8)
+    assert_same_light(render_passes(guided, scene, first_seed=500, passes=8), plain)
 
 
 def test_parts_add_up_and_direct_light_is_that_of_one_bounce() -> None:

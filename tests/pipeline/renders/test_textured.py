@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ from numpy.typing import NDArray
 
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.plugin_tracer import PluginTracer
-from pipeline.renders.tracer import Tracer
 from storage.records.first_hits import first_hits
 from storage.records.lookup import texture_values
 from storage.records.retextured import with_textures
@@ -63,13 +63,13 @@ def _noise(seed: int, channels: int, low: float, high: float) -> Texture:
 
 
 LAMP = light(np.array([[-1, -1, 3], [2, -1, 3], [0, 1, 2.5]]), 5.0)
+TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow)]
 
 
-@pytest.mark.parametrize("plugins", [False, True])
-def test_corners_have_their_colours(plugins: bool) -> None:
+def test_corners_have_their_colours() -> None:
     """Seen from above with +x to the right and +y up; a turn or a mirrored u would swap them."""
     scene = _textured([_floor(material(diffuse=0.5)), LAMP], (CORNERS,), [0, -1, -1])
-    tracer: Tracer = (PluginTracer if plugins else load_tracer)(scene, max_depth=2, rr_depth=5)
+    tracer = load_tracer(scene, max_depth=2, rr_depth=5)
     albedo = tracer.features(camera_of(scene, 32), spp=1).albedo
     quarters = {(24, 8): RED, (24, 23): GREEN, (8, 8): BLUE, (8, 23): YELLOW}
     for (row, column), colour in quarters.items():
@@ -77,14 +77,14 @@ def test_corners_have_their_colours(plugins: bool) -> None:
         assert np.abs(albedo[row, column] - colour).max() < 0.08
 
 
-@pytest.mark.parametrize("plugins", [False, True])
-def test_guides_are_the_lookup_of_the_records(plugins: bool) -> None:
+@pytest.mark.parametrize("tracer", TRACERS)
+def test_guides_are_the_lookup_of_the_records(tracer: Any) -> None:
     """Coordinates from -1.75 to 1.25 wrap; a diffuse and a specular map of unlike sizes add up."""
     maps = _noise(1, 3, 0, 0.6), CORNERS_OF_LESS
     scene = _textured([_floor(material(roughness=0.4)), LAMP], maps, [0, 1, -1])
     scene = _moved(scene, 3.0, np.array([-1.75, -1.75]))
-    tracer: Tracer = (PluginTracer if plugins else load_tracer)(scene, max_depth=2, rr_depth=5)
-    albedo = tracer.features(camera_of(scene, 32), spp=1).albedo
+    made = tracer(scene, max_depth=2, rr_depth=5)
+    albedo = made.features(camera_of(scene, 32), spp=1).albedo
     rows = np.nan_to_num(first_hits(scene, resolution=32).material)
     wanted = rows[..., 0:3] + rows[..., 3:6]
     # Float32 places of hits: 1e-6 of a coordinate is 7e-6 texels, whose values differ by up to .6.
@@ -180,10 +180,10 @@ def test_in_a_furnace_a_textured_floor_shows_its_albedo(mirrors: bool) -> None:
     tracer = load_tracer(scene, max_depth=2, rr_depth=5)
     hits = first_hits(scene, resolution=16)
     met = hits.met
-    shown = tracer.radiance(camera_of(scene, 16), seed=1, spp=1024)
+    shown = tracer.radiance(camera_of(scene, 16), seed=1, spp=256)
     if mirrors:
         # The table of multiple scattering is exact to 0.25 % between its entries; the rest is noise
-        # of 1024 samples, each of which weighs close to 1.
+        # of 256 samples, each of which weighs close to 1.
         assert np.abs(shown[met].mean() - 1) < 0.004
         return
     middle = texture_values(map_, hits.uv[met])

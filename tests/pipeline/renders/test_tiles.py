@@ -20,6 +20,7 @@ from pipeline.renders.tiles import TILE_PX, TileChoice, passes_of_tiles
 from pipeline.renders.tracer import Chosen, HostSum, Tracer
 from tests.pipeline.renders.sampling import camera_of
 from tests.pipeline.renders.scene_kit import sampled_like_scene
+from tests.pipeline.renders.test_lights_apart import lit_scene
 from tests.pipeline.renders.test_renderer import digest
 
 PASS = 64
@@ -94,19 +95,19 @@ def test_a_scene_keeps_its_light_over_many_adaptive_views() -> None:
     """With the denoiser, which keeps the mean; the plain run has as many samples as all."""
     scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
     settings = RenderSettings(
-        resolution=32, noise_floor_db=80.0, min_spp=32, max_spp=256, min_mean_radiance=0.0
+        resolution=16, noise_floor_db=80.0, min_spp=32, max_spp=256, min_mean_radiance=0.0
     )
-    renderer, camera = SceneRenderer(scene, settings), camera_of(scene, 32)
+    renderer, camera = SceneRenderer(scene, settings), camera_of(scene, 16)
     adaptive = [
         renderer.render_view(camera.c2w, camera.fov_deg, seed).radiance_rgb.mean(dtype=np.float64)
-        for seed in range(16)
+        for seed in range(10)
     ]
     tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
     plain = [
-        tracer.radiance(camera, seed=10_000 + n, spp=64).mean(dtype=np.float64) for n in range(64)
+        tracer.radiance(camera, seed=10_000 + n, spp=64).mean(dtype=np.float64) for n in range(32)
     ]
     error = np.hypot(*(np.std(means, ddof=1) / np.sqrt(len(means)) for means in (adaptive, plain)))
-    assert error < 0.01 * np.mean(plain)
+    assert error < 0.02 * np.mean(plain)
     assert abs(np.mean(adaptive) - np.mean(plain)) < 4 * error  # 1 in 16,000
 
 
@@ -156,16 +157,16 @@ def test_the_choice_is_that_of_handing_out_passes_one_by_one(
     assert ((found == given_out) | (found == given_out + 1)).all()
 
 
-def _scene_tracer() -> tuple[Tracer, Camera]:
+def _scene_tracer(resolution: int = 32) -> tuple[Tracer, Camera]:
     scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
-    return load_tracer(scene, max_depth=6, rr_depth=2), camera_of(scene, 32)
+    return load_tracer(scene, max_depth=6, rr_depth=2), camera_of(scene, resolution)
 
 
 def test_a_pass_over_some_pixels_agrees_with_passes_over_all() -> None:
     """The slow twin traces the whole picture. Each pixel is off by less than 5.5 of its standard
     errors, and the mean square of the scores is 1: they go by 15 degrees of freedom each."""
-    tracer, camera = _scene_tracer()
-    chosen = np.random.default_rng(0).random((32, 32)) < 0.3
+    tracer, camera = _scene_tracer(16)
+    chosen = np.random.default_rng(0).random((16, 16)) < 0.6
     pairs = [
         (
             tracer.radiance(camera, seed=n, spp=64, chosen=chosen).mean(axis=-1),
@@ -204,11 +205,10 @@ def test_sums_over_chosen_pixels_are_those_of_the_passes() -> None:
     np.testing.assert_allclose(fast.read_squares(), slow.read_squares(), rtol=1e-12)
 
 
-@pytest.mark.parametrize("per_light", [False, True])
-def test_chosen_tiles_give_the_same_bits_on_any_number_of_threads(per_light: bool) -> None:
-    scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
+def test_chosen_tiles_give_the_same_bits_on_any_number_of_threads() -> None:
+    scene = lit_scene()
     settings = RenderSettings(
-        resolution=32, noise_floor_db=90.0, min_spp=32, max_spp=256, per_light=per_light
+        resolution=32, noise_floor_db=90.0, min_spp=32, max_spp=256, per_light=True
     )
     digests = []
     for threads in (1, 2):

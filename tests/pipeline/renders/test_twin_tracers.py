@@ -42,12 +42,9 @@ def _room(num_lights: int) -> Scene:
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("num_lights", [1, 5])
-def test_both_integrators_agree_within_their_noise(
-    num_lights: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_both_integrators_agree_within_their_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """Around one and the same BRDF, at every roughness, with white emitters."""
-    scene = _room(num_lights)
+    scene = _room(5)
     ours = render_blocks(scene)
     twin = exact_twin(scene, monkeypatch, max_depth=10, rr_depth=5)
     theirs = render_blocks(scene, first_seed=500, tracer=twin)
@@ -81,11 +78,11 @@ def test_the_fallback_agrees_within_noise_where_lobes_are_not_rough() -> None:
     assert (tracer.hits(camera) != plugins.hits(camera)).sum() <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize(("roughness", "bound"), [(0.6, 0.01), (0.8, 0.03), (1.0, 0.07)])
-def test_how_far_the_fallbacks_rough_metal_is_off(roughness: float, bound: float) -> None:
-    """Measured: 0.6, 1.9 and 4.5 % of the direct light, of which noise is 0.2 to 0.6 %."""
-    row = material(diffuse=0.05, specular=0.9, roughness=roughness)
+def test_how_far_the_fallbacks_rough_metal_is_off() -> None:
+    """Measured: 4.5 % of the direct light, of which noise is 0.2 to 0.6 %."""
+    row = material(diffuse=0.05, specular=0.9, roughness=1.0)
     floor = quad([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]], row)
     wall = quad([[-3, 1, 0], [3, 1, 0], [3, 1, 3], [-3, 1, 3]], row)
     lamp = light([[-0.5, -1, 2], [0.5, -1, 2], [0, -0.5, 2.2]], 10.0)
@@ -95,7 +92,7 @@ def test_how_far_the_fallbacks_rough_metal_is_off(roughness: float, bound: float
     plugins = PluginTracer(scene, max_depth=2, rr_depth=5)
     stock = render_blocks(scene, max_depth=2, first_seed=99, tracer=plugins)
     lit = stock.mean > 0.03 * stock.mean.max()
-    assert np.sqrt(np.mean(np.square(ours.mean[lit] / stock.mean[lit] - 1))) < bound
+    assert np.sqrt(np.mean(np.square(ours.mean[lit] / stock.mean[lit] - 1))) < 0.07
 
 
 def _scores(ours: Estimate, theirs: Estimate) -> NDArray[np.float64]:

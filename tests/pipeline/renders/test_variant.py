@@ -31,31 +31,27 @@ def test_candidates_are_files_each_named_once_newest_first() -> None:
     assert len({path.resolve() for path in found}) == len(found)
 
 
-def test_a_library_that_is_none_is_passed_over(
+@pytest.mark.usefixtures("llvm")
+def test_a_library_that_is_none_is_passed_over_and_success_is_remembered(
     own_cache: Path, monkeypatch: pytest.MonkeyPatch, variant: Variant
 ) -> None:
     """The one in the environment is tried first; what cannot be loaded is a no, not a crash."""
     bogus = own_cache / "libLLVM-99.so"
     bogus.write_bytes(b"not a library")
-    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(bogus))
-    assert llvm_libraries()[0] == bogus
-    assert choose_variant() == variant
-    remembered = (own_cache / "cache" / "llvm_probes.json").read_text()
-    assert len(json.loads(remembered)) == 1  # what failed may work once its cause is mended
-
-
-@pytest.mark.usefixtures("llvm")
-def test_success_is_remembered_and_believed(
-    own_cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chosen = choose_variant()
+    with monkeypatch.context() as patch:
+        patch.setenv("DRJIT_LIBLLVM_PATH", str(bogus))
+        assert llvm_libraries()[0] == bogus
+        assert choose_variant() == variant
     memory = own_cache / "cache" / "llvm_probes.json"
-    assert len(json.loads(memory.read_text())) == 1
-    monkeypatch.setattr(variant_module, "_probe", _must_not_be_asked)
-    assert choose_variant() == chosen
-    monkeypatch.undo()
+    remembered = json.loads(memory.read_text())
+    assert len(remembered) == 1  # what failed may work once its cause is mended
+    with monkeypatch.context() as patch:
+        patch.setattr(variant_module, "_probe", _must_not_be_asked)
+        assert choose_variant() == variant
     memory.write_text("damaged")
-    assert choose_variant() == chosen
+    monkeypatch.setattr(variant_module, "_probe", lambda variant: _Probed())
+    assert choose_variant() == variant
+    assert json.loads(memory.read_text()) == remembered
 
 
 def _must_not_be_asked(variant: Variant) -> _Probed:
