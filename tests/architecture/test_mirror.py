@@ -3,7 +3,7 @@
 from collections import defaultdict
 from pathlib import Path
 
-from tests.architecture.test_names import PACKAGES
+from infra.setup.wheel_tree import PACKAGES
 from tests.conftest import ROOT
 
 TESTS = ROOT / "tests"

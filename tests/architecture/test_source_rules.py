@@ -4,13 +4,38 @@ import ast
 import re
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
+from infra.setup import wheel_tree
 from tests.conftest import ROOT
 
-PACKAGES = ("trilight", "storage", "scene_templates", "pipeline", "model", "train", "infra")
+PACKAGES = ("trilight", *wheel_tree.PACKAGES)
 MAX_FILE_LINES, MAX_FUNCTION_LINES = 400, 40
+DOCSTRING = re.compile(r'(?:#[^\n]*\n|\s)*[rR]?"""\s*\S')
+"""How a module begins that says what it is."""
+IMPORTS = re.compile(rf"\b(?:from|import) (?:{'|'.join(wheel_tree.PACKAGES)})\b(?:\.| import)")
+MODULE = re.compile(rf"(?:{'|'.join(wheel_tree.PACKAGES)})(?:\.[a-z_0-9]+)+")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """What the rules look at in a module."""
+
+    long_functions: list[str]
+    public_classes: list[str]
+    imported: set[str]
+    """Top-level packages, wherever in the file they are imported."""
+    import_texts: list[str]
+    """Strings that import a package of ours."""
+    module_names: list[str]
+    """Strings that are the dotted name of a module of ours."""
+    asks_for_names: bool
+    """Whether it asks storage.installation for names of modules."""
 
 
 def _sources(*folders: str) -> Iterator[Path]:
@@ -26,21 +51,86 @@ def _body_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     return (function.end_lineno or 0) - body[0].lineno + 1 if body else 0
 
 
+def _facts(source: str) -> Facts:
+    tree = ast.parse(source)
+    long, imported, strings, prose = list[str](), set[str](), dict[int, str](), set[int]()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant):
+            if isinstance(node.value, str):
+                strings[id(node)] = node.value
+        elif isinstance(node, ast.Expr):
+            prose.add(id(node.value))
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            if _body_lines(node) > MAX_FUNCTION_LINES:
+                long.append(f"{node.lineno} {node.name}")
+        elif isinstance(node, ast.Import):
+            imported.update(alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            imported.add((node.module or "").partition(".")[0])
+    texts = [text for name, text in strings.items() if name not in prose]
+    classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    return Facts(
+        long_functions=long,
+        public_classes=[name for name in classes if not name.startswith("_")],
+        imported=imported,
+        import_texts=[text for text in texts if IMPORTS.search(text)],
+        module_names=[text for text in texts if _is_module(text)],
+        asks_for_names="module_name(" in source,
+    )
+
+
+def _is_module(text: str) -> bool:
+    """Return whether a string is a dotted name that could be imported, such as `a.b`."""
+    if not MODULE.fullmatch(text):
+        return False
+    place = ROOT / text.replace(".", "/")
+    return place.is_dir() or place.with_suffix(".py").is_file()
+
+
+@pytest.fixture(scope="module")
+def facts() -> dict[str, Facts]:
+    """Every module of the product, parsed once, by its path."""
+    found = {
+        path.relative_to(ROOT).as_posix(): _facts(path.read_text()) for path in _sources(*PACKAGES)
+    }
+    assert len(found) > 300, "the walk finds the modules"
+    return found
+
+
 def test_files_are_short() -> None:
     lengths = {path: len(path.read_text().splitlines()) for path in _sources(*PACKAGES, "tests")}
     long = {str(path.relative_to(ROOT)): n for path, n in lengths.items() if n > MAX_FILE_LINES}
     assert not long
 
 
-def test_functions_are_short() -> None:
-    long = [
-        f"{path.relative_to(ROOT)}:{node.lineno} {node.name}"
-        for path in _sources(*PACKAGES)
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        and _body_lines(node) > MAX_FUNCTION_LINES
-    ]
-    assert not long
+def test_functions_are_short(facts: dict[str, Facts]) -> None:
+    assert [f"{path}:{text}" for path, each in facts.items() for text in each.long_functions] == []
+
+
+def test_no_two_public_classes_have_one_name(facts: dict[str, Facts]) -> None:
+    """A search for a class finds one; of the bench, files may have classes of the same name."""
+    found = defaultdict[str, list[str]](list)
+    for path, each in facts.items():
+        if not path.startswith(("infra/bench/", "trilight/")):
+            for name in each.public_classes:
+                found[name].append(path)
+    assert len(found) > 200, "the walk finds the classes"
+    assert {name: paths for name, paths in found.items() if len(paths) > 1} == {}
+
+
+def test_no_string_names_a_module_of_ours(facts: dict[str, Facts]) -> None:
+    """A wheel rewrites no strings: code that needs such a name asks storage.installation."""
+    for path, each in facts.items():
+        if not path.startswith("trilight/"):
+            assert each.import_texts == [], path
+            assert each.asks_for_names or each.module_names == [], path
+
+
+def test_only_what_runs_in_blender_imports_it(facts: dict[str, Facts]) -> None:
+    sides = {f"infra/bench/sides/{name}_process.py" for name in ("blender", "usd")}
+    scripts = {*sides, "infra/blender/exact_materials.py"}
+    assert {path for path, each in facts.items() if "bpy" in each.imported} == scripts
+    assert not any(facts[script].imported & set(PACKAGES) for script in scripts)
 
 
 def test_slow_tests_are_marked_where_make_seeks_them() -> None:
@@ -56,7 +146,7 @@ def test_every_module_says_what_it_is() -> None:
     silent = [
         str(path.relative_to(ROOT))
         for path in _sources(*PACKAGES, "tests")
-        if path.name != "__init__.py" and not ast.get_docstring(ast.parse(path.read_text()))
+        if path.name != "__init__.py" and not DOCSTRING.match(path.read_text())
     ]
     assert not silent
 

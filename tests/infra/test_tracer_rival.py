@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from infra.tracer_rival import LADDER, Level, Price, TracerRival, chosen_level
 from storage.errors import TrilightError
 from storage.records.sample import Sample
+from tests.infra.cases import case
 from tests.train.kit import tiny_run
 from tests.train.toy import toy_sample
 from train.loop.state import new_state
@@ -54,24 +55,27 @@ class Counted(TracerRival):
         return np.zeros((16, 16, 3), np.float32)
 
 
-@pytest.mark.parametrize(
-    ("most", "scenes", "judged"), [(64, 10, 10 * 2), (10, 10, 10), (4, 10, 4), (1, 10, 1)]
-)
-def test_it_is_judged_on_no_more_views_than_asked_from_all_over_the_split(
-    most: int, scenes: int, judged: int
-) -> None:
-    rival = Counted(16, most_views=most, num_scenes=scenes)
-    asked = [
-        (number, rival.judged(dataclasses.replace(toy_sample(0), key=f"{number:09d}"), view))
-        for number in range(scenes)
-        for view in range(2)
-    ]
-    numbers = [number for number, picture in asked if picture is not None]
-    assert len(numbers) == judged <= most
-    assert max(numbers) >= scenes // 2 or most == 1
-    views = "all views" if most == 64 else "the first view"
-    assert rival.which.startswith(f"{views} of ")
-    assert ("each scene" in rival.which) == (most >= scenes)
+JUDGED = [(64, 10, 10 * 2), (10, 10, 10), (4, 10, 4), (1, 10, 1)]
+
+
+def test_it_is_judged_on_no_more_views_than_asked_from_all_over_the_split() -> None:
+    for most, scenes, judged in JUDGED:
+        with case(most):
+            rival = Counted(16, most_views=most, num_scenes=scenes)
+            asked = [
+                (
+                    number,
+                    rival.judged(dataclasses.replace(toy_sample(0), key=f"{number:09d}"), view),
+                )
+                for number in range(scenes)
+                for view in range(2)
+            ]
+            numbers = [number for number, picture in asked if picture is not None]
+            assert len(numbers) == judged <= most
+            assert max(numbers) >= scenes // 2 or most == 1
+            views = "all views" if most == 64 else "the first view"
+            assert rival.which.startswith(f"{views} of ")
+            assert ("each scene" in rival.which) == (most >= scenes)
 
 
 def test_without_a_path_tracer_it_says_so_and_the_network_is_timed_all_the_same(

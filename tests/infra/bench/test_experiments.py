@@ -1,7 +1,5 @@
 """Every experiment's declaration is whole, its points can be listed, and its results told."""
 
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -18,19 +16,21 @@ from infra.bench.run import RESULTS, lacking, newest_run
 from infra.bench.table import markdown
 from storage.errors import TrilightError
 from tests.infra.bench.bench_kit import TINY
+from tests.infra.cases import case
 
 EVERY = every_experiment()
 
 
-@pytest.mark.parametrize("one", EVERY, ids=lambda one: one.name)
-def test_a_declaration_is_whole(one: Experiment) -> None:
-    assert one.name == one.name.lower() and " " not in one.name
-    assert one.about.endswith(".") and one.title
-    columns = [column.name for column in columns_of(one)]
-    assert len(set(columns)) == len(columns) and set(one.also_cost) <= set(columns)
-    assert bool(one.against) == bool(one.error)
-    for effort in (QUICK, CAREFUL, TINY):
-        _can_be_listed(one, effort)
+def test_a_declaration_is_whole() -> None:
+    for one in EVERY:
+        with case(one.name):
+            assert one.name == one.name.lower() and " " not in one.name
+            assert one.about.endswith(".") and one.title
+            columns = [column.name for column in columns_of(one)]
+            assert len(set(columns)) == len(columns) and set(one.also_cost) <= set(columns)
+            assert bool(one.against) == bool(one.error)
+            for effort in (QUICK, CAREFUL, TINY):
+                _can_be_listed(one, effort)
 
 
 def _can_be_listed(one: Experiment, effort: Effort) -> None:
@@ -53,30 +53,19 @@ def test_names_are_of_one_thing() -> None:
         chosen(["sample"])
 
 
-def test_experiments_are_listed_where_torch_is_not_installed() -> None:
-    """What needs torch is then refused by name, and everything else can be measured."""
-    code = (
-        "import sys; sys.modules['torch'] = None\n"
-        "from infra.bench.catalogue import every_experiment\n"
-        "from infra.bench.effort import QUICK\n"
-        "assert all(one.points(QUICK) for one in every_experiment())"
-    )
-    ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stderr
-
-
 def test_what_is_missing_is_told() -> None:
     (economy,) = chosen(["economy"])
     assert "--data SET" in lacking(economy, Asked())
     assert lacking(economy, Asked(data="data/smoke")) == ""
 
 
-@pytest.mark.parametrize("one", EVERY, ids=lambda one: one.name)
-def test_the_results_that_are_kept_can_be_told(one: Experiment) -> None:
-    found = newest_run(RESULTS, one.name)
-    if found is not None:
-        assert len(list(markdown(one, found[0]))) == 2 + len(rows(one, found[0]))
-        assert any(row.on_front for row in rows(one, found[0])) or one.error is None
+def test_the_results_that_are_kept_can_be_told() -> None:
+    for one in EVERY:
+        with case(one.name):
+            found = newest_run(RESULTS, one.name)
+            if found is not None:
+                assert len(list(markdown(one, found[0]))) == 2 + len(rows(one, found[0]))
+                assert any(row.on_front for row in rows(one, found[0])) or one.error is None
 
 
 def test_what_is_advised_is_measured_and_on_the_front_or_says_why() -> None:

@@ -18,6 +18,7 @@ from infra.bench.curve import COST_NOISE, PricedLevel, at_error, on_front, rows,
 from infra.bench.effort import Asked
 from infra.bench.experiment import Column, Experiment, Point, points_of
 from infra.bench.machine import machine, revision
+from infra.bench.plot import plot
 from infra.bench.run import newest_run, run, run_share
 from infra.bench.shares import share_of
 from infra.bench.store import Run, Store
@@ -25,14 +26,22 @@ from infra.bench.table import markdown, printed, shown
 from storage.errors import TrilightError
 from storage.intervals import mean_interval
 from tests.infra.bench.bench_kit import FIGURES, TINY, calls, experiment
+from tests.infra.cases import case
 
 
 @pytest.fixture(autouse=True)
 def same_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The revision of a working tree may change while tests run."""
+    """The revision of a working tree may change while tests run; no figure is drawn."""
     calls.clear()
     here = machine()
     monkeypatch.setattr(running, "machine", lambda device: here)
+    monkeypatch.setattr(running, "plot", lambda *_: None)
+
+
+@pytest.fixture
+def figures(same_machine: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw the figure of a run, as a user sees it."""
+    monkeypatch.setattr(running, "plot", plot)
 
 
 def measured(folder: Path, one: Experiment, data: str | None = None) -> Run:
@@ -145,10 +154,11 @@ def test_turns_that_are_compared_within_are_shared_whole(tmp_path: Path) -> None
     assert measured(tmp_path, one).whole_turns() == ["a", "b", "c"] and not calls
 
 
-@pytest.mark.parametrize("text", ["0/4", "5/4", "4", "a/b", "1/0"])
-def test_a_share_that_is_none_is_refused(text: str) -> None:
-    with pytest.raises(TrilightError, match="expected K/N"):
-        share_of(text)
+def test_a_share_that_is_none_is_refused() -> None:
+    for text in ["0/4", "5/4", "4", "a/b", "1/0"]:
+        with case(text):
+            with pytest.raises(TrilightError, match="expected K/N"):
+                share_of(text)
 
 
 @settings(max_examples=30, deadline=None)  # each writes a dozen lines to the disk
@@ -188,6 +198,7 @@ def test_careful_results_are_believed_before_quick_ones(tmp_path: Path) -> None:
     assert found is not None and found[1].path.name == "made-up.jsonl"
 
 
+@pytest.mark.usefixtures("figures")
 def test_the_table_has_every_point_and_the_figure_is_a_picture(tmp_path: Path) -> None:
     one = experiment("a", "c")
     found = measured(tmp_path, one)
@@ -244,6 +255,7 @@ def test_pairs_are_of_the_turns_that_have_the_figure(tmp_path: Path) -> None:
     assert cheap.intervals["of some"] == mean_interval([2.0, 4.0], ["a", "c"])
 
 
+@pytest.mark.usefixtures("figures")
 def test_a_figure_of_kinds_shows_every_cost(tmp_path: Path) -> None:
     measured(tmp_path, paired("a", "c"))
     with Image.open(tmp_path / "made-up-quick.png") as picture:
@@ -251,6 +263,7 @@ def test_a_figure_of_kinds_shows_every_cost(tmp_path: Path) -> None:
         assert picture.width > 800 and (red[..., 0] - red[..., 2] > 100).sum() > 50
 
 
+@pytest.mark.usefixtures("figures")
 def test_a_figure_of_lines_has_a_panel_for_every_column_that_was_measured(tmp_path: Path) -> None:
     def shape(*figures: str) -> tuple[int, int]:
         one = dataclasses.replace(
@@ -332,12 +345,19 @@ def test_a_spread_holds_its_values(values: list[float]) -> None:
     assert found.low <= found.median <= found.high
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0, "0"), (1234.5, "1234"), (12.34, "12.3"), (1.234, "1.23"), (0.0123, "0.012")],
-)
-def test_numbers_are_told_with_three_digits(value: float, text: str) -> None:
-    assert shown(value) == text and not math.isnan(float(text))
+TOLD: list[tuple[float, str]] = [
+    (0, "0"),
+    (1234.5, "1234"),
+    (12.34, "12.3"),
+    (1.234, "1.23"),
+    (0.0123, "0.012"),
+]
+
+
+def test_numbers_are_told_with_three_digits() -> None:
+    for value, text in TOLD:
+        with case(text):
+            assert shown(value) == text and not math.isnan(float(text))
 
 
 def test_the_machine_is_told() -> None:

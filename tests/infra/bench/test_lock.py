@@ -8,6 +8,7 @@ import pytest
 
 from infra.bench.sides.lock_simulation import Part, samples_a_second
 from infra.bench.sides.lock_time import with_lock_time
+from tests.infra.cases import case
 
 
 def ready(kind: str) -> Callable[[], int]:
@@ -33,20 +34,19 @@ def test_what_lets_the_lock_go_is_told_from_what_holds_it() -> None:
     assert lets_go["lock_s"] < 0.5 * lets_go["core_s"]
 
 
-@pytest.mark.parametrize(
-    ("free_s", "locked_s", "main_s", "threads", "expected"),
-    [
-        (5e-3, 0.0, 0.0, 1, 200),
-        (5e-3, 0.0, 0.0, 8, 1600),
-        (3e-3, 2e-3, 0.0, 8, 500),
-        (3e-3, 2e-3, 3e-3, 8, 200),
-        (0.0, 1e-3, 9e-3, 4, 100),
-    ],
-)
-def test_cores_end_what_threads_do_until_the_lock_does(
-    free_s: float, locked_s: float, main_s: float, threads: int, expected: float
-) -> None:
-    decoding = Part(free_s=free_s, locked_s=locked_s, pieces=20)
-    consuming = Part(free_s=0.0, locked_s=main_s, pieces=50)
-    rate = samples_a_second(decoding, consuming, threads, ahead=32, seconds=3.0)
-    assert rate == pytest.approx(expected, rel=0.06)
+RATES = [
+    (5e-3, 0.0, 0.0, 1, 200),
+    (5e-3, 0.0, 0.0, 8, 1600),
+    (3e-3, 2e-3, 0.0, 8, 500),
+    (3e-3, 2e-3, 3e-3, 8, 200),
+    (0.0, 1e-3, 9e-3, 4, 100),
+]
+
+
+def test_cores_end_what_threads_do_until_the_lock_does() -> None:
+    for free_s, locked_s, main_s, threads, expected in RATES:
+        with case(expected):
+            decoding = Part(free_s=free_s, locked_s=locked_s, pieces=20)
+            consuming = Part(free_s=0.0, locked_s=main_s, pieces=50)
+            rate = samples_a_second(decoding, consuming, threads, ahead=32, seconds=3.0)
+            assert rate == pytest.approx(expected, rel=0.06)

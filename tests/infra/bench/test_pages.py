@@ -6,6 +6,7 @@ import pytest
 
 from infra.bench.pages import read_block, write_block
 from storage.errors import TrilightError
+from tests.infra.cases import case
 
 BEGIN, END = "<!-- kind:begin -->", "<!-- kind:end -->"
 
@@ -18,10 +19,11 @@ def test_what_a_person_wrote_around_it_stays(tmp_path: Path) -> None:
     assert read_block(page, "kind") == "of today\n"
 
 
-@pytest.mark.parametrize("text", ["", f"{BEGIN}\n", f"{END}\n{BEGIN}\n", f"{BEGIN}\n{END}\n" * 2])
-def test_a_page_without_both_marks_is_left_alone(tmp_path: Path, text: str) -> None:
-    page = tmp_path / "page.md"
-    page.write_text(text)
-    with pytest.raises(TrilightError, match="expected one line"):
-        write_block(page, "kind", "of today\n")
-    assert page.read_text() == text
+def test_a_page_without_both_marks_is_left_alone(tmp_path: Path) -> None:
+    for text in ["", f"{BEGIN}\n", f"{END}\n{BEGIN}\n", f"{BEGIN}\n{END}\n" * 2]:
+        with case(text):
+            page = tmp_path / "page.md"
+            page.write_text(text)
+            with pytest.raises(TrilightError, match="expected one line"):
+                write_block(page, "kind", "of today\n")
+            assert page.read_text() == text

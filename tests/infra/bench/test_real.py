@@ -8,7 +8,7 @@ import pytest
 from infra.bench.catalogue import chosen
 from infra.bench.curve import Row, rows
 from infra.bench.effort import Asked
-from infra.bench.experiments import flicker, rungs
+from infra.bench.experiments import rungs
 from infra.bench.run import run
 from tests.infra.bench.bench_kit import TINY
 
@@ -16,8 +16,7 @@ from tests.infra.bench.bench_kit import TINY
 @pytest.fixture(autouse=True)
 def few_objects(monkeypatch: pytest.MonkeyPatch) -> None:
     """A hundred of the benchmark take minutes to prepare, and two scenes use few of them."""
-    for family in (rungs, flicker):
-        monkeypatch.setattr(family, "BENCHMARK", "builtin:12")
+    monkeypatch.setattr(rungs, "BENCHMARK", "builtin:12")
 
 
 def measured(name: str, folder: Path) -> dict[str, Row]:
@@ -44,23 +43,6 @@ def test_bfloat16_is_not_float32(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pictures_come_nearer_with_samples_and_the_denoiser(tmp_path: Path) -> None:
-    db = {
-        name: row.values["psnr_log_db, dB"] for name, row in measured("samples", tmp_path).items()
-    }
-    # a quarter as many samples: twice the error of a raw picture, 6 dB; half is left for luck
-    assert db["128, off"] > db["32, off"] + 3
-    assert db["128, high"] > db["128, off"]
-
-
-@pytest.mark.slow
-def test_short_paths_lose_light(tmp_path: Path) -> None:
-    found = measured("depth", tmp_path)
-    lost = {name: row.values["light lost %"] for name, row in found.items()}
-    assert lost["2"] > lost["4"] > lost["16"] >= 0
-
-
-@pytest.mark.slow
 def test_our_renderer_beside_plain_mitsuba(tmp_path: Path) -> None:
     found = measured("frontier", tmp_path)
     db = {name: row.values["psnr_log_db, dB"] for name, row in found.items()}
@@ -79,10 +61,3 @@ def test_rungs_come_nearer_with_samples_and_with_what_is_traced(tmp_path: Path) 
     firsts = [row.values["a scene's first view, core-s"] for row in found.values()]
     assert sum(firsts) > sum(cost.values())
     assert not found["network builtin:"].intervals and len(found) == 10
-
-
-@pytest.mark.slow
-def test_films_of_more_samples_flicker_less(tmp_path: Path) -> None:
-    found = measured("flicker-64", tmp_path)
-    calm = {name: row.values["flicker, dB"] for name, row in found.items()}
-    assert 15 < calm["1 sample, fast"] < calm["16 samples, fast"] < 60

@@ -1,6 +1,7 @@
 """What every command has in common: help that says all, completion, a version, near names."""
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -10,10 +11,11 @@ import pytest
 
 from infra.cli.commands import COMMANDS
 from infra.cli.options import ALIASES
-from infra.setup.command_line_page import FILE, Command, command_line_page, every_command
+from infra.setup.command_line_page import Command, every_command
 from storage.settings.described import option_of
 from tests.command_line import trilight
 from tests.conftest import ROOT
+from tests.infra.cases import case
 
 ALL = {found.name: found for found in every_command()}
 TYPED = "pre"
@@ -30,23 +32,25 @@ def test_every_command_is_there_with_those_within() -> None:
     assert {"shards merge", "shards select", "shards reshard"} < set(ALL)
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_every_option_says_what_it_is_and_its_default(name: str) -> None:
-    for option in ALL[name].options:
-        assert option.help[0].isupper() or ": " in option.help
-        facts = option.help.rpartition(" [")[2]
-        said = "default" in option.help or "required" in facts
-        assert said or option.is_switch, f"{option.names}: {option.help}"
+def test_every_option_says_what_it_is_and_its_default() -> None:
+    for name in ALL:
+        with case(name):
+            for option in ALL[name].options:
+                assert option.help[0].isupper() or ": " in option.help
+                facts = option.help.rpartition(" [")[2]
+                said = "default" in option.help or "required" in facts
+                assert said or option.is_switch, f"{option.names}: {option.help}"
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_no_help_text_is_lost_at_80_columns(name: str) -> None:
+def test_no_help_text_is_lost_at_80_columns() -> None:
     """Rich would take `[builtin:]` for a style and drop it."""
-    shown = trilight([*name.split(), "--help"], env={"COLUMNS": "80"})
-    assert max(map(len, shown.stdout.splitlines())) <= 80
-    words = shown.stdout.split()
-    for option in ALL[name].options:
-        assert set(option.help.split()) <= set(words), option.names
+    for name in ALL:
+        with case(name):
+            shown = trilight([*name.split(), "--help"], env={"COLUMNS": "80"})
+            assert max(map(len, shown.stdout.splitlines())) <= 80
+            words = shown.stdout.split()
+            for option in ALL[name].options:
+                assert set(option.help.split()) <= set(words), option.names
 
 
 def test_every_name_is_that_of_its_field() -> None:
@@ -88,13 +92,17 @@ MISTAKES = {
 }
 
 
-@pytest.mark.parametrize("words", MISTAKES)
-def test_a_mistyped_command_line_is_one_line(words: str) -> None:
-    ended = trilight(words.split())
-    assert (ended.exit_code, ended.stdout) == (2, "")
-    assert ended.stderr.startswith("trilight: ") and ended.stderr.count("\n") == 1
-    assert MISTAKES[words] in ended.stderr
-    assert f"See trilight {words.split()[0] if ': ' in ended.stderr[10:] else ''}" in ended.stderr
+def test_a_mistyped_command_line_is_one_line() -> None:
+    for words in MISTAKES:
+        with case(words):
+            ended = trilight(words.split())
+            assert (ended.exit_code, ended.stdout) == (2, "")
+            assert ended.stderr.startswith("trilight: ") and ended.stderr.count("\n") == 1
+            assert MISTAKES[words] in ended.stderr
+            assert (
+                f"See trilight {words.split()[0] if ': ' in ended.stderr[10:] else ''}"
+                in ended.stderr
+            )
 
 
 REFUSED = {
@@ -107,19 +115,19 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("words", REFUSED)
-def test_a_value_that_the_settings_refuse_is_named_by_its_option(words: str) -> None:
-    ended = trilight(words.split())
-    assert ended.exit_code == 1
-    assert ended.stderr.startswith(f"trilight: {REFUSED[words]}")
+def test_a_value_that_the_settings_refuse_is_named_by_its_option() -> None:
+    for words in REFUSED:
+        with case(words):
+            ended = trilight(words.split())
+            assert ended.exit_code == 1
+            assert ended.stderr.startswith(f"trilight: {REFUSED[words]}")
 
 
 def test_the_real_command_names_no_module() -> None:
-    for words in (["verify"], ["verify", "-h"]):
-        found = _run([sys.executable, "-m", "trilight", *words], dict(os.environ))
-        assert "infra.cli" not in found.stdout + found.stderr
-        assert "trilight verify" in found.stdout + found.stderr
-    assert found.returncode == 0
+    found = _run([sys.executable, "-m", "trilight", "verify"], dict(os.environ))
+    assert found.returncode == 2
+    assert "infra.cli" not in found.stdout + found.stderr
+    assert "trilight verify" in found.stdout + found.stderr
 
 
 def _run(words: list[str], environment: dict[str, str]) -> "subprocess.CompletedProcess[str]":
@@ -128,20 +136,20 @@ def _run(words: list[str], environment: dict[str, str]) -> "subprocess.Completed
     )
 
 
-@pytest.mark.parametrize("shell", COMPLETED)
-def test_completion_installs_and_completes(shell: str, tmp_path: Path) -> None:
+def test_completion_installs_and_completes(tmp_path: Path) -> None:
     """In a home of its own; the shell itself asks for the names of builds."""
     home = {**os.environ, "HOME": str(tmp_path), "PATH": f"{_bin(tmp_path)}:{os.environ['PATH']}"}
-    script = tmp_path / "completion"
-    words = ["--install-completion", "--shell", shell, "--output", str(script)]
-    installed = _run([sys.executable, "-m", "trilight", *words], home)
-    assert installed.returncode == 0, installed.stderr
-    text = script.read_text()
-    assert "--albedo-over-one" in text and "refuse" in text
-    if not COMPLETED[shell] or shutil.which(shell) is None:
-        return
-    asked = [shell, "-c", COMPLETED[shell].replace("FILE", str(script))]
-    assert _run(asked, home).stdout.split() == ["pretrain-256"]
+    for shell, typed in COMPLETED.items():
+        script = tmp_path / f"completion of {shell}"
+        words = ["--install-completion", "--shell", shell, "--output", str(script)]
+        with case(shell):
+            installed = trilight(words, env={"HOME": str(tmp_path)})
+            assert installed.exit_code == 0, installed.stderr
+            text = script.read_text()
+            assert "--albedo-over-one" in text and "refuse" in text
+            if typed and shutil.which(shell) is not None:
+                asked = [shell, "-c", typed.replace("FILE", shlex.quote(str(script)))]
+                assert _run(asked, home).stdout.split() == ["pretrain-256"]
 
 
 def _bin(folder: Path) -> Path:
@@ -151,10 +159,6 @@ def _bin(folder: Path) -> Path:
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m trilight "$@"\n')
     program.chmod(0o755)
     return program.parent
-
-
-def test_the_page_of_the_command_line_is_current() -> None:
-    assert FILE.read_text() == command_line_page(), "run `make settings`"
 
 
 def test_an_option_that_two_classes_have_is_refused() -> None:

@@ -20,8 +20,12 @@ from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
 from tests.command_line import trilight
 from tests.crash import crash
+from tests.infra.cases import case
+from tests.infra.child_here import use_processes
 from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene
+
+pytestmark = pytest.mark.usefixtures("children_here")
 
 FORMS = ("usda", "usdc", "usdz", "json", "h5", "safetensors")
 PROFILE: Profile = "lossless"
@@ -98,37 +102,36 @@ def test_hdf5_takes_the_pictures_of_a_sample_along(tmp_path: Path, shard: Path) 
     assert read_renderformer_h5(tmp_path / "c.h5").radiance_rgb is None
 
 
-def test_a_strangers_stage_within_a_budget(tmp_path: Path) -> None:
+def test_a_strangers_stage_within_a_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A child that is confined can read the stage and write its scene, as for a user."""
     stage = write_stage(tmp_path, sphere=True)
+    fewer = convert(stage, tmp_path / "few.safetensors", "--budget", "600")
+    use_processes(monkeypatch)
     whole = convert(stage, tmp_path / "whole.safetensors")
     assert loaded(tmp_path / "whole.safetensors").environment is not None, "its DomeLight"
-    fewer = convert(stage, tmp_path / "few.safetensors", "--budget", "600")
     assert fewer["triangles"] <= 600 < whole["triangles"]
     assert any("reduced to" in note for note in fewer["notes"])
     loaded(tmp_path / "few.safetensors").check()
 
 
-@pytest.mark.parametrize(
-    ("source", "target", "message"),
-    [
-        ("absent.usda", "a.json", "no such file"),
-        ("a.txt", "a.json", "cannot be read as a scene"),
-        ("a.usda", "a.obj", "cannot be written as a scene"),
-        ("a.usda", "a.usd", "cannot be written as a scene"),
-        ("broken.usda", "a.json", "not readable as USD"),
-        ("broken.json", "a.usda", "not readable as JSON"),
-        ("empty.h5", "a.usda", "not a readable HDF5 file"),
-        ("https://x.y/a.usda", "a.json", "only files of this machine"),
-        ("circle.usda", "a.json", "in a circle"),
-        ("outside.usda", "a.json", "outside of its folder"),
-        ("meshless.json", "a.usda", "absent.obj"),
-        ("nan.json", "a.usda", "NaN is no JSON number"),
-        ("shapes.h5", "a.usda", "has shape"),
-    ],
+MISTAKES = (
+    ("absent.usda", "a.json", "no such file"),
+    ("a.txt", "a.json", "cannot be read as a scene"),
+    ("a.usda", "a.obj", "cannot be written as a scene"),
+    ("a.usda", "a.usd", "cannot be written as a scene"),
+    ("broken.usda", "a.json", "not readable as USD"),
+    ("broken.json", "a.usda", "not readable as JSON"),
+    ("empty.h5", "a.usda", "not a readable HDF5 file"),
+    ("https://x.y/a.usda", "a.json", "only files of this machine"),
+    ("circle.usda", "a.json", "in a circle"),
+    ("outside.usda", "a.json", "outside of its folder"),
+    ("meshless.json", "a.usda", "absent.obj"),
+    ("nan.json", "a.usda", "NaN is no JSON number"),
+    ("shapes.h5", "a.usda", "has shape"),
 )
-def test_mistakes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, target: str, message: str
-) -> None:
+
+
+def test_mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("a.txt", "empty.h5"):
         (tmp_path / name).touch()
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
@@ -145,14 +148,18 @@ def test_mistakes(
         del file["vn"]
         file["vn"] = np.zeros((2, 3, 3), np.float32)
     monkeypatch.chdir(tmp_path)
-    assert message in refused(source, target)
-    assert not (tmp_path / "a.json").exists()
+    before = set(tmp_path.iterdir())
+    for source, target, message in MISTAKES:
+        with case(source):
+            assert message in refused(source, target)
+        assert set(tmp_path.iterdir()) == before, source
 
 
 def test_a_crash_in_native_code_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = write_stage(tmp_path)
+    use_processes(monkeypatch)
     monkeypatch.setattr(convert_scene, "source_keys", crash)
     told = refused(stage, tmp_path / "a.json")
     assert told.startswith("stage.usda: could not be converted (crashed_signal_11")

@@ -27,6 +27,7 @@ def inspect(*arguments: str | Path) -> str:
     return result.output
 
 
+@pytest.mark.usefixtures("bare_reports")
 def test_the_report_stands_in_the_dataset(tmp_path: Path) -> None:
     five_scenes(tmp_path)
     printed = inspect(tmp_path)

@@ -11,6 +11,7 @@ from model.open import open_network
 from model.weights import encode_weights
 from storage.errors import TrilightError
 from tests.command_line import trilight
+from tests.infra.cases import case
 from tests.model.kit import awake, tiny_config
 from tests.model.published.test_convert import publishable
 
@@ -60,17 +61,18 @@ def test_errors_are_a_table_and_a_picture(tmp_path: Path) -> None:
         assert picture.width > picture.height > 300
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["huge"], r"neither a size nor a checkpoint here"),
-        (["large", "--resolution", "72"], "a multiple of 64"),
-        (["smoke", "--publish", "x"], "--publish needs a checkpoint"),
-    ],
-)
-def test_mistakes_are_named(arguments: list[str], message: str) -> None:
-    with pytest.raises(TrilightError, match=message):
-        printed(*arguments)
+MISTAKES = [
+    (["huge"], r"neither a size nor a checkpoint here"),
+    (["large", "--resolution", "72"], "a multiple of 64"),
+    (["smoke", "--publish", "x"], "--publish needs a checkpoint"),
+]
+
+
+def test_mistakes_are_named() -> None:
+    for arguments, message in MISTAKES:
+        with case(arguments):
+            with pytest.raises(TrilightError, match=message):
+                printed(*arguments)
 
 
 def test_a_linear_head_cannot_be_published(tmp_path: Path) -> None:

@@ -1,11 +1,11 @@
 """`trilight render`: a picture of every kind of source, and one clear line where there is none."""
 
 import io
+import itertools
 import json
+import operator
 import os
 import re
-import signal
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,13 @@ from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene, scene_digest
 from storage.settings.described import option_words
 from tests.command_line import trilight
+from tests.crash import crash
+from tests.infra.cases import case
+from tests.infra.child_here import use_processes
 from tests.infra.rendering.render_kit import SMALL, mistake, render
 from tests.scenes_by_hand import tiny_sample, tiny_scene
+
+pytestmark = pytest.mark.usefixtures("children_here")
 
 FLOOR = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3 4\n"
 WIDE = {"COLUMNS": "300"}
@@ -84,8 +89,9 @@ def _shard(path: Path, scene: Scene, profile: Profile = "lossless") -> Path:
 
 
 def test_one_scene_gives_one_picture_whatever_it_is_read_from(
-    described: Path, tmp_path: Path
+    described: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The last one in child processes, as for a user; the others here."""
     scene = load_source(scene_source(str(described))).scene
     (tmp_path / "two.safetensors").write_bytes(encode_scene(scene))
     shard = _shard(tmp_path / "train-000000.tar", scene)
@@ -97,10 +103,11 @@ def test_one_scene_gives_one_picture_whatever_it_is_read_from(
         f"{packed}::000000012",
     ]
     outs = [tmp_path / f"new/{row}.exr" for row in range(len(sources))]
-    found = [
-        render(source, "--view", "1", "--out", out)
-        for source, out in zip(sources, outs, strict=True)
-    ]
+    found = []
+    for source, out in zip(sources, outs, strict=True):
+        if source == sources[-1]:
+            use_processes(monkeypatch)
+        found.append(render(source, "--view", "1", "--out", out))
     pictures = [decode_exr(out.read_bytes()) for out in outs]
     assert pictures[0].shape == (16, 16, 3)
     assert pictures[0].mean() > 0.01
@@ -142,7 +149,13 @@ def test_the_picture_says_how_it_was_made(tmp_path: Path) -> None:
     assert header["trilight.spp"] == 8
     # an attribute is a float32
     assert header["trilight.noise_floor_db"] == pytest.approx(outcome["noise_floor_db"], rel=1e-6)
-    assert json.loads(header["trilight.settings"])["resolution"] == 16
+    settings = json.loads(header["trilight.settings"])
+    assert settings["resolution"] == 16
+    # no target that was not asked for: pictures made before there were others are kept
+    assert set(settings) == {
+        "resolution", "noise_floor_db", "min_spp", "max_spp", "reject_at_cap", "max_depth",
+        "rr_depth", "aux_spp", "denoiser", "min_mean_radiance", "per_light",
+    }  # fmt: skip
     assert "mitsuba_variant" in json.loads(header["trilight.environment"])
     assert str(tmp_path) not in str(header)
     first = out.read_bytes()
@@ -209,18 +222,6 @@ def test_the_words_of_what_was_asked_give_the_picture_again(tmp_path: Path) -> N
     assert pictures[0] == pictures[1]
 
 
-def test_a_picture_made_before_there_were_other_targets_is_kept(tmp_path: Path) -> None:
-    """Its request names no target that it was not asked for, so that its digest is the same."""
-    source = tmp_path / "tiny.safetensors"
-    source.write_bytes(encode_scene(tiny_scene()))
-    render(source, "--out", tmp_path / "x.exr")
-    header = OpenEXR.File(io.BytesIO((tmp_path / "x.exr").read_bytes()), header_only=True).header()
-    assert set(json.loads(header["trilight.settings"])) == {
-        "resolution", "noise_floor_db", "min_spp", "max_spp", "reject_at_cap", "max_depth",
-        "rr_depth", "aux_spp", "denoiser", "min_mean_radiance", "per_light",
-    }  # fmt: skip
-
-
 def test_parts_stand_as_layers_in_the_file_of_the_picture(tmp_path: Path) -> None:
     """With their floors in its header; a film's files with layers are kept like others."""
     source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
@@ -244,49 +245,29 @@ def test_parts_stand_as_layers_in_the_file_of_the_picture(tmp_path: Path) -> Non
     )
 
 
-def _nothing(folder: Path) -> None:
-    pass
+BAD_SOURCES = {
+    "absent.json": "no such file",
+    "https://me:secret@host/a.json": "https://host/a.json: only files of this",
+    "simplecache::https://host/a.tar::0": "only files of this machine",
+    "absent.tar::000000000": "no such file",
+    "absent.tar::../x": "no shard and key",
+    "absent.json::000000000": "no shard and key",
+    "set": "a folder; expected a scene",
+    "text.safetensors": "text.safetensors: safetensors: the header claims",
+    "pipe.safetensors": "pipe.safetensors: expected a regular file",
+}
 
 
-def _pipe(folder: Path) -> None:
-    os.mkfifo(folder / "a.safetensors")
-
-
-def _text(folder: Path) -> None:
-    (folder / "a.safetensors").write_text("no scene")
-
-
-def _folder(folder: Path) -> None:
-    (folder / "set").mkdir()
-
-
-@pytest.mark.parametrize(
-    ("prepare", "source", "message"),
-    [
-        (_nothing, "absent.json", "no such file"),
-        (_nothing, "https://me:secret@host/a.json", "https://host/a.json: only files of this"),
-        (_nothing, "simplecache::https://host/a.tar::0", "only files of this machine"),
-        (_nothing, "absent.tar::000000000", "no such file"),
-        (_nothing, "absent.tar::../x", "no shard and key"),
-        (_nothing, "absent.json::000000000", "no shard and key"),
-        (_folder, "set", "a folder; expected a scene"),
-        (_text, "a.safetensors", "a.safetensors: safetensors: the header claims"),
-        (_pipe, "a.safetensors", "a.safetensors: expected a regular file"),
-    ],
-)
-def test_a_bad_source_is_one_line(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    prepare: Callable[[Path], None],
-    source: str,
-    message: str,
-) -> None:
+def test_a_bad_source_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    prepare(tmp_path)
-    with pytest.raises(TrilightError, match=message) as caught:
-        load_source(scene_source(source))
-    assert "\n" not in str(caught.value)
-    assert "secret" not in str(caught.value)
+    Path("set").mkdir()
+    Path("text.safetensors").write_text("no scene")
+    os.mkfifo("pipe.safetensors")
+    for source, message in BAD_SOURCES.items():
+        with case(source), pytest.raises(TrilightError, match=message) as caught:
+            load_source(scene_source(source))
+        assert "\n" not in str(caught.value), source
+        assert "secret" not in str(caught.value), source
 
 
 def test_a_shard_needs_a_key_that_it_has(tmp_path: Path) -> None:
@@ -307,9 +288,8 @@ def test_a_scene_in_a_shard_obeys_the_laws(tmp_path: Path) -> None:
         load_source(scene_source(f"{shard}::000000012"))
 
 
-@pytest.mark.parametrize("engine", ["mitsuba", "neural"])
 def test_no_engine_takes_a_vertex_beyond_the_farthest_position(
-    engine: str, described: Path, tmp_path: Path
+    described: Path, tmp_path: Path
 ) -> None:
     """Triangles that reach so far vanish from traced pictures, and rotary angles lose digits."""
     far = json.loads(described.read_text())
@@ -318,7 +298,8 @@ def test_no_engine_takes_a_vertex_beyond_the_farthest_position(
     positions = tiny_scene().vertex_positions.copy()
     positions[0, 0] = 1e38
     shard = _shard(tmp_path / "train-000000.tar", tiny_scene(vertex_positions=positions))
-    for source in (described, f"{shard}::000000012"):
+    sources: tuple[str | Path, ...] = (described, f"{shard}::000000012")
+    for engine, source in itertools.product(("mitsuba", "neural"), sources):
         told = mistake(source, "--engine", engine, "--out", tmp_path / "x.exr", *SMALL)
         assert "vertex_positions[0, 0] is " in told and "expected from -1000 to 1000 m" in told
     assert not (tmp_path / "x.exr").exists()
@@ -373,15 +354,14 @@ def test_what_only_the_child_finds_out_is_one_line_too(tmp_path: Path) -> None:
     assert not out.exists()
 
 
-def _crash(*arguments: object) -> None:
-    os.kill(os.getpid(), signal.SIGSEGV)
-
-
 def test_a_crash_in_native_code_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """In a real child, which loads no renderer to be quick."""
     source = tmp_path / "tiny.safetensors"
     source.write_bytes(encode_scene(tiny_scene()))
-    monkeypatch.setattr(path_tracer, "_open_scene", _crash)
+    use_processes(monkeypatch)
+    monkeypatch.setattr(path_tracer, "set_up_renderer", operator.is_)
+    monkeypatch.setattr(path_tracer, "_open_scene", crash)
     told = mistake(source, "--out", tmp_path / "x.exr", *SMALL)
     assert told.startswith("tiny.safetensors: rendering failed (crashed_signal_11")

@@ -11,6 +11,8 @@ from storage.records.scene_file import encode_scene
 from tests.command_line import trilight
 from tests.scenes_by_hand import tiny_scene
 
+pytestmark = pytest.mark.usefixtures("children_here")
+
 WIDE = {"COLUMNS": "300"}
 
 
@@ -35,20 +37,20 @@ def test_a_preview_says_that_its_error_is_unknown(tmp_path: Path) -> None:
     assert "3, not denoised" in raw
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--spp", "4", "--noise-floor", "30"), "--spp is 4 beside --noise-floor; expected one"),
-        (("--spp", "4", "--split"), "--spp is 4 beside --split; expected one of them"),
-        (("--denoiser", "fast"), "--denoiser is fast; expected --spp beside it"),
-        (("--spp", "4", "--engine", "neural"), "--engine neural; expected --engine mitsuba: a"),
-        (("--spp", "4", "--engine", "both"), "--engine both; expected --engine mitsuba: a"),
-        (("--spp", "0"), "--spp is 0; expected a whole number from 1 to 4096 samples"),
-    ],
+REFUSED: tuple[tuple[tuple[str, ...], str], ...] = (
+    (("--spp", "4", "--noise-floor", "30"), "--spp is 4 beside --noise-floor; expected one"),
+    (("--spp", "4", "--split"), "--spp is 4 beside --split; expected one of them"),
+    (("--denoiser", "fast"), "--denoiser is fast; expected --spp beside it"),
+    (("--spp", "4", "--engine", "neural"), "--engine neural; expected --engine mitsuba: a"),
+    (("--spp", "4", "--engine", "both"), "--engine both; expected --engine mitsuba: a"),
+    (("--spp", "0"), "--spp is 0; expected a whole number from 1 to 4096 samples"),
 )
-def test_a_preview_measures_nothing(tmp_path: Path, words: tuple[str, ...], message: str) -> None:
+
+
+def test_a_preview_measures_nothing(tmp_path: Path) -> None:
     source = tmp_path / "tiny.safetensors"
     source.write_bytes(encode_scene(tiny_scene()))
-    asked = ["render", str(source), "--out", str(tmp_path / "x.exr"), *words]
-    assert message in unwrapped(trilight(asked, env=WIDE).output)
+    for words, message in REFUSED:
+        asked = ["render", str(source), "--out", str(tmp_path / "x.exr"), *words]
+        assert message in unwrapped(trilight(asked, env=WIDE).output), words
     assert not (tmp_path / "x.exr").exists()

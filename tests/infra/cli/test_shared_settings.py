@@ -16,6 +16,7 @@ from storage.errors import TrilightError
 from storage.settings.changes import changed
 from storage.settings.described import settings_record
 from tests.command_line import trilight
+from tests.infra.cases import case
 from tests.pipeline.making.test_publication import begin_tiny
 from train.runs import RUNS, named_run
 
@@ -28,19 +29,21 @@ def _file(folder: Path, text: str) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize("build", BUILDS)
-def test_a_build_like_another_is_that_other(build: str) -> None:
-    other = named_build(build)
-    changes = all_changes(named_build("smoke"), Shared(), other.as_json(), {})
-    assert changed(named_build("smoke"), changes).as_json() == other.as_json()
-    assert all_changes(other, Shared(), other.as_json(), {}) == {}
+def test_a_build_like_another_is_that_other() -> None:
+    for build in BUILDS:
+        with case(build):
+            other = named_build(build)
+            changes = all_changes(named_build("smoke"), Shared(), other.as_json(), {})
+            assert changed(named_build("smoke"), changes).as_json() == other.as_json()
+            assert all_changes(other, Shared(), other.as_json(), {}) == {}
 
 
-@pytest.mark.parametrize("run", RUNS)
-def test_a_run_like_another_is_that_other(run: str) -> None:
-    other = named_run(run)
-    changes = all_changes(named_run("smoke"), Shared(), settings_record(other), {})
-    assert changed(named_run("smoke"), changes) == other
+def test_a_run_like_another_is_that_other() -> None:
+    for run in RUNS:
+        with case(run):
+            other = named_run(run)
+            changes = all_changes(named_run("smoke"), Shared(), settings_record(other), {})
+            assert changed(named_run("smoke"), changes) == other
 
 
 def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
@@ -108,27 +111,27 @@ WRONG: dict[str, tuple[str, str]] = {
 }
 
 
-@pytest.mark.parametrize("text", WRONG)
-@pytest.mark.parametrize("command", ["generate", "plan"])
-def test_what_is_wrong_in_a_file_is_named_with_its_line(
-    command: str, text: str, tmp_path: Path
-) -> None:
-    file = _file(tmp_path, text)
-    told = trilight([command, "smoke", "--settings", file]).mistake
-    line, problem = WRONG[text]
-    assert told.startswith(f"{file}, {line}: ")
-    assert problem in told
+def test_what_is_wrong_in_a_file_is_named_with_its_line(tmp_path: Path) -> None:
+    for command in ["generate", "plan"]:
+        for text in WRONG:
+            with case((command, text)):
+                file = _file(tmp_path, text)
+                told = trilight([command, "smoke", "--settings", file]).mistake
+                line, problem = WRONG[text]
+                assert told.startswith(f"{file}, {line}: ")
+                assert problem in told
 
 
-@pytest.mark.parametrize(
-    ("words", "problem"),
-    [
-        (["--settings", "none.yaml"], "--settings none.yaml: not readable"),
-        (["--like", "nowhere"], "--like nowhere: nowhere/settings.json cannot be read"),
-    ],
-)
-def test_what_is_not_there_is_named(words: list[str], problem: str) -> None:
-    assert trilight(["train", "smoke", *words]).mistake.startswith(problem)
+ABSENT = [
+    (["--settings", "none.yaml"], "--settings none.yaml: not readable"),
+    (["--like", "nowhere"], "--like nowhere: nowhere/settings.json cannot be read"),
+]
+
+
+def test_what_is_not_there_is_named() -> None:
+    for words, problem in ABSENT:
+        with case(words):
+            assert trilight(["train", "smoke", *words]).mistake.startswith(problem)
 
 
 def test_a_run_is_followed_on_the_command_line(tmp_path: Path) -> None:

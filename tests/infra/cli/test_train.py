@@ -1,5 +1,6 @@
 """What a person who types `trilight train` reads, and what Ctrl-C does, in real processes."""
 
+import json
 import os
 import re
 import shlex
@@ -8,12 +9,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import pytest
 
 from infra.cli.console import progress_bars
 from infra.cli.train import _BarProgress, _QuietProgress
+from storage.errors import TrilightError
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.train.toy import write_toy_dataset
@@ -36,40 +38,41 @@ TINY = {
 
 def test_mistakes_and_the_first_words_come_before_torch(tmp_path: Path) -> None:
     """Torch takes seconds to import; here it cannot be."""
+    asked = {
+        "smok": ["smok"],
+        "widht": ["smoke", "--set", "widht=3"],
+        "finetune": ["finetune"],
+        "change": ["smoke", "--change", "seed=1"],
+        "resume": ["smoke", "--resume", "--change", "seed=1", "--set", "log_every=5"],
+        "steps": ["smoke", "--steps", "24"],
+    }
+    words = [["train", *each, "--data", str(tmp_path)] for each in asked.values()]
     code = (
-        "import sys; sys.modules['torch'] = None\n"
-        "from infra.cli.app import main\n"
-        "sys.argv = ['trilight', 'train', *sys.argv[1:]]\n"
-        "main()"
+        "import json, sys; sys.modules['torch'] = None\n"
+        "from tests.command_line import trilight\n"
+        "for words in json.loads(sys.argv[1]):\n"
+        "    ended = trilight(words)\n"
+        "    print(json.dumps([ended.exit_code, ended.stdout, ended.stderr]))\n"
     )
-
-    def said(*arguments: str) -> tuple[str, str]:
-        done = subprocess.run(
-            [sys.executable, "-c", code, *arguments, "--data", str(tmp_path)],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            check=False,
-            env=os.environ | {"COLUMNS": "200"},
-        )
-        assert done.returncode == 1
-        return done.stdout, done.stderr
-
-    assert "run 'smok': no such run; did you mean smoke?" in said("smok")[1]
-    assert "setting 'widht' does not exist" in said("smoke", "--set", "widht=3")[1]
-    assert "expected begin_with" in said("finetune")[1]
-    assert (
-        "it has not begun, so --change seed changes nothing"
-        in said("smoke", "--change", "seed=1")[1]
-    )
-    going_on = said("smoke", "--resume", "--change", "seed=1", "--set", "log_every=5")[0]
-    assert "Run smoke goes on. Loading torch and the checkpoint" in going_on
-    words, mistake = said("smoke", "--steps", "24")
-    assert "warmup_steps=3, log_every=1, validate_every=4, checkpoint_every=4" in words
-    assert "Run smoke: 24 steps of 4 scenes at 64 pixels. Loading torch" in words
-    assert "train needs PyTorch, which is not installed" in mistake
+    done = subprocess.run(
+        [sys.executable, "-c", code, json.dumps(words)],
+        cwd=ROOT, capture_output=True, text=True, check=True, env=os.environ | {"COLUMNS": "200"},
+    )  # fmt: skip
+    ended = dict(zip(asked, map(json.loads, done.stdout.splitlines()), strict=True))
+    assert {name: status for name, (status, *_) in ended.items()} == dict.fromkeys(asked, 1)
+    said = {name: mistake for name, (_, _, mistake) in ended.items()}
+    assert "run 'smok': no such run; did you mean smoke?" in said["smok"]
+    assert "setting 'widht' does not exist" in said["widht"]
+    assert "expected begin_with" in said["finetune"]
+    assert "it has not begun, so --change seed changes nothing" in said["change"]
+    assert "Run smoke goes on. Loading torch and the checkpoint" in ended["resume"][1]
+    first = ended["steps"][1]
+    assert "warmup_steps=3, log_every=1, validate_every=4, checkpoint_every=4" in first
+    assert "Run smoke: 24 steps of 4 scenes at 64 pixels. Loading torch" in first
+    assert "train needs PyTorch, which is not installed" in said["steps"]
 
 
+@pytest.mark.slow
 def test_a_run_that_is_stopped_says_what_goes_on_and_that_does(tmp_path: Path) -> None:
     """As printed, in a folder with a blank in its name; threads wait without burning a core."""
     data = write_toy_dataset(tmp_path / "the data", train=4, validation=0, resolution=16)
@@ -90,6 +93,36 @@ def test_a_run_that_is_stopped_says_what_goes_on_and_that_does(tmp_path: Path) -
     _, mistake = _stopped_after(again, out, saved + 1)
     assert found[2] in mistake, "once more the same, with one --resume"
     assert saved_steps(out / "checkpoints")[-1] > saved
+
+
+def test_a_run_that_is_stopped_says_what_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In this process; the slow test types what is said here, in real ones."""
+    data = write_toy_dataset(tmp_path / "the data", train=4, validation=0, resolution=16)
+    out = tmp_path / "my runs" / "first"
+    command = ["train", "smoke", "--data", str(data.folder.root), "--out", str(out)]
+    command += ["--device", "cpu", "--set", "checkpoint_every=50000", "--steps", "100000"]
+    command += [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
+    monkeypatch.setattr(sys, "argv", ["trilight", *command, "--resume"])
+    advance = _BarProgress.advance
+    steps: list[int] = []
+
+    def interrupt(progress: _BarProgress, **facts: Any) -> None:
+        """Press Ctrl-C after the first step."""
+        advance(progress, **facts)
+        steps.append(facts["step"])
+        if len(steps) == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(_BarProgress, "advance", interrupt)
+    ended = trilight(command, env={"COLUMNS": "200"})
+    assert isinstance(ended.exception, TrilightError)
+    assert ended.exception.exit_status == SAVED_STATUS
+    assert "Stopping after this step" in ended.stdout
+    (saved,) = saved_steps(out / "checkpoints")
+    again = shlex.join(["trilight", *command, "--resume"])
+    assert ended.mistake.endswith(f"stopped at step {saved}, nothing is lost. To go on: {again}")
 
 
 def _stopped_after(arguments: list[str], out: Path, step: int) -> tuple[str, str]:

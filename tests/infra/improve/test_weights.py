@@ -6,6 +6,7 @@ import pytest
 
 from infra.improve.weights import Lesson, next_weights
 from storage.errors import TrilightError
+from tests.infra.cases import case
 
 BASE = {"a": 1.0, "b": 1.0, "c": 2.0}
 LESSON = Lesson(loss_before=0.3, loss=0.2, core_s=2.0)
@@ -51,7 +52,8 @@ def test_a_stratum_without_a_lesson_is_taken_for_the_mean() -> None:
     assert weights["b"] / 0.25 == pytest.approx(mean)
 
 
-@pytest.mark.parametrize("wrong", [{"core_s": 0.0}, {"loss": float("nan")}, {"loss_before": 1e400}])
-def test_a_lesson_that_is_no_number_is_named(wrong: dict[str, float]) -> None:
-    with pytest.raises(TrilightError, match="stratum 'b' has the lesson"):
-        next_weights(BASE, _with("b", **wrong), 0.3)
+def test_a_lesson_that_is_no_number_is_named() -> None:
+    for wrong in [{"core_s": 0.0}, {"loss": float("nan")}, {"loss_before": 1e400}]:
+        with case(wrong):
+            with pytest.raises(TrilightError, match="stratum 'b' has the lesson"):
+                next_weights(BASE, _with("b", **wrong), 0.3)

@@ -10,6 +10,7 @@ from infra.leaderboard.picture_folder import FolderContestant, folder_contestant
 from pipeline.exchange.exports.scenes import picture_name
 from storage.errors import TrilightError
 from storage.records.exr import encode_channels
+from tests.infra.cases import case
 from tests.train.toy import toy_sample
 
 VIEWS = [("000000000", 0), ("000000000", 1), ("000000001", 0), ("000000001", 1)]
@@ -67,27 +68,26 @@ def test_missing_pictures_are_counted_and_the_first_is_named(folder: Path, tmp_p
     assert "no such folder; expected one" in refusal(tmp_path / "nowhere")
 
 
-@pytest.mark.parametrize(
-    ("rgb", "said"),
-    [
+def test_wrong_sizes_are_said(folder: Path) -> None:
+    for rgb, said in [
         (picture(0, 12), "000000001_view_0.exr: 12 x 12 pixels; expected 8 x 8 or 16 x 16"),
         (picture(0)[:8], "16 x 8 pixels; expected 8 x 8 or 16 x 16"),
         (picture(0, 8), "several widths .*view_0.exr has 16, 000000001_view_0.exr has 8"),
-    ],
-)
-def test_wrong_sizes_are_said(folder: Path, rgb: np.ndarray, said: str) -> None:
-    write(folder / picture_name(*VIEWS[2]), np.ascontiguousarray(rgb))
-    assert re.search(said, refusal(folder))
+    ]:
+        with case(said):
+            write(folder / picture_name(*VIEWS[2]), np.ascontiguousarray(rgb))
+            assert re.search(said, refusal(folder))
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
-def test_values_that_are_no_radiance_are_said_with_their_place(folder: Path, bad: float) -> None:
-    rgb = picture(0)
-    rgb[5, 6, 1] = rgb[7, 8, 0] = bad
-    write(folder / picture_name(*VIEWS[2]), rgb)
-    said = refusal(folder)
-    assert "000000001_view_0.exr: row 5, column 6" in said and "channel G" in said
-    assert "2 pixels are like it; expected finite radiance of at least 0" in said
+def test_values_that_are_no_radiance_are_said_with_their_place(folder: Path) -> None:
+    for bad in [np.nan, np.inf, -1.0]:
+        with case(bad):
+            rgb = picture(0)
+            rgb[5, 6, 1] = rgb[7, 8, 0] = bad
+            write(folder / picture_name(*VIEWS[2]), rgb)
+            said = refusal(folder)
+            assert "000000001_view_0.exr: row 5, column 6" in said and "channel G" in said
+            assert "2 pixels are like it; expected finite radiance of at least 0" in said
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import pytest
 
 from infra.leaderboard.rows import UNKNOWN_MACHINE, BoardRow, BoardRows, RowKey
 from storage.errors import TrilightError
+from tests.infra.cases import case
 
 KEY = RowKey(width=64, scene="000000001", view=0, name="somebody", digest="d")
 ROW = BoardRow(scores={"psnr_log_db": 30.0, "lpips": None}, first_s=0.5, further_s=0.25)
@@ -38,15 +39,16 @@ def test_a_line_that_a_kill_cut_short_is_judged_again(tmp_path: Path) -> None:
     assert path.read_bytes() == whole[: whole.index(b"\n") + 1]
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ('{"set": "another"}\n', r"are of the set another, and SOURCE is set a.*another --out"),
-        ("nothing\n", "not the rows of a leaderboard.*another --out, or delete the file"),
-        ('{"set": "set a"}\n{"width": 64}\n', "not the rows of a leaderboard"),
-    ],
-)
-def test_a_file_of_something_else_is_refused(tmp_path: Path, text: str, said: str) -> None:
-    (tmp_path / "rows.jsonl").write_text(text)
-    with pytest.raises(TrilightError, match=said):
-        BoardRows(tmp_path / "rows.jsonl", "set a")
+OTHERS = [
+    ('{"set": "another"}\n', r"are of the set another, and SOURCE is set a.*another --out"),
+    ("nothing\n", "not the rows of a leaderboard.*another --out, or delete the file"),
+    ('{"set": "set a"}\n{"width": 64}\n', "not the rows of a leaderboard"),
+]
+
+
+def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    for text, said in OTHERS:
+        with case(text):
+            (tmp_path / "rows.jsonl").write_text(text)
+            with pytest.raises(TrilightError, match=said):
+                BoardRows(tmp_path / "rows.jsonl", "set a")

@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -36,28 +36,44 @@ def dataset(tmp_path: Path) -> Dataset:
     return made
 
 
-def pushed(words: list[str], settings: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
-    """Run `trilight push` in a process of its own: the package reads where the hub is at import."""
-    command = [sys.executable, "-m", "infra.cli.app", "push", *words]
-    return subprocess.run(
+PUSHES = """
+import json, os, sys
+from tests.command_line import trilight
+
+for token, words in json.loads(sys.argv[1]):
+    os.environ["HF_TOKEN"] = token
+    ended = trilight(["push", *words])
+    print(json.dumps([ended.exit_code, ended.stdout, ended.stderr]))
+"""
+
+
+def pushed(
+    asked: Sequence[tuple[str, list[str]]], settings: Mapping[str, str]
+) -> list[tuple[int, str, str]]:
+    """Push with tokens in a process of its own: the package reads where the hub is at import.
+
+    Returns:
+        The exit status, stdout and stderr of each push.
+    """
+    command = [sys.executable, "-c", PUSHES, json.dumps(asked)]
+    done = subprocess.run(
         command, cwd=ROOT, env=settings, capture_output=True, text=True, timeout=300, check=False
     )
+    assert done.returncode == 0, done.stderr
+    return [tuple(json.loads(line)) for line in done.stdout.splitlines()]
 
 
 def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path: Path) -> None:
     there = tmp_path / "hub"
     there.mkdir()
     with hub_for_uploads(there, TOKEN) as (url, made):
-        mine, other = (settings_of(url, name, tmp_path / "home") for name in (TOKEN, "hf_other"))
         words = [str(dataset.folder.root), "ada/set", "--json"]
-        refused = pushed(words, other)
-        public = pushed([*words, "--private"], mine)
-        assert list(there.iterdir()) == []
-        result = pushed(words, mine)
-    assert refused.returncode == 1 and "set HF_TOKEN" in refused.stderr + refused.stdout
-    assert public.returncode == 1 and "already and public" in public.stderr + public.stdout
-    assert result.returncode == 0, result.stderr
-    said = json.loads(result.stdout)
+        asked = [("hf_other", words), (TOKEN, [*words, "--private"]), (TOKEN, words)]
+        refused, public, result = pushed(asked, settings_of(url, TOKEN, tmp_path / "home"))
+    assert refused[0] == 1 and "set HF_TOKEN" in refused[1] + refused[2]
+    assert public[0] == 1 and "already and public" in public[1] + public[2]
+    assert result[0] == 0, result[2]
+    said = json.loads(result[1])
     assert said["address"] == f"{url}/datasets/ada/set"
     assert made[-1]["type"] == "dataset" and made[-1]["name"] == "set"
     root = dataset.folder.root

@@ -71,6 +71,7 @@ def test_a_network_that_is_released_opens(tmp_path: Path) -> None:
     assert planned_upload(tmp_path, "ada/network").kind == "model"
 
 
+@pytest.mark.usefixtures("bare_reports")
 def test_sums_are_of_what_is_uploaded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     dataset = five_scenes(tmp_path / "dataset")
     _write_network(tmp_path / "network")

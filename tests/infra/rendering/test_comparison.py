@@ -7,6 +7,7 @@ import pytest
 
 from infra.rendering.comparison import Frame, flicker
 from pipeline.exchange.open_scene import SceneSource
+from tests.infra.cases import case
 
 
 def frame(name: str, key: str | None, error: float) -> Frame:
@@ -17,25 +18,24 @@ def frame(name: str, key: str | None, error: float) -> Frame:
     )
 
 
-@pytest.mark.parametrize(
-    ("before", "now", "goes_on"),
-    [
-        (("a.safetensors", None), ("a.safetensors", None), True),
-        (("stage.usda", "1"), ("stage.usda", "2"), True),
-        (("s.tar", "000000001"), ("s.tar", "000000001"), True),
-        (("s.tar", "000000001"), ("s.tar", "000000002"), False),
-        (("0.h5", None), ("1.h5", None), False),
-    ],
-)
-def test_only_frames_of_one_scene_or_stage_flicker(
-    before: tuple[str, str | None], now: tuple[str, str | None], goes_on: bool
-) -> None:
-    found = flicker(frame(*before, 0.1), frame(*now, 0.2))
-    assert (found is not None) == goes_on
-    if found is not None:
-        # a change of 0.1 everywhere is 20 dB; two floors of 20 dB are 3 dB worse together
-        assert found.db == pytest.approx(20, abs=1e-4)
-        assert found.noise_db == pytest.approx(20 - 10 * np.log10(2))
+FRAMES: list[tuple[tuple[str, str | None], tuple[str, str | None], bool]] = [
+    (("a.safetensors", None), ("a.safetensors", None), True),
+    (("stage.usda", "1"), ("stage.usda", "2"), True),
+    (("s.tar", "000000001"), ("s.tar", "000000001"), True),
+    (("s.tar", "000000001"), ("s.tar", "000000002"), False),
+    (("0.h5", None), ("1.h5", None), False),
+]
+
+
+def test_only_frames_of_one_scene_or_stage_flicker() -> None:
+    for before, now, goes_on in FRAMES:
+        with case((before, now, goes_on)):
+            found = flicker(frame(*before, 0.1), frame(*now, 0.2))
+            assert (found is not None) == goes_on
+            if found is not None:
+                # a change of 0.1 everywhere is 20 dB; two floors of 20 dB are 3 dB worse together
+                assert found.db == pytest.approx(20, abs=1e-4)
+                assert found.noise_db == pytest.approx(20 - 10 * np.log10(2))
 
 
 def test_the_first_frame_flickers_not_and_equal_errors_are_capped() -> None:

@@ -24,6 +24,8 @@ from tests.model.test_neural_renderer import many_lights
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 from train.evaluation.error_colours import error_picture
 
+pytestmark = pytest.mark.usefixtures("children_here")
+
 
 @pytest.fixture
 def network(tmp_path: Path) -> Path:

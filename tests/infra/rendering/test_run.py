@@ -24,6 +24,7 @@ from storage.errors import TrilightError
 from storage.records.exr import decode_exr
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
+from tests.infra.cases import case
 from tests.infra.rendering.test_cameras import HereReader
 from tests.scenes_by_hand import tiny_scene
 
@@ -181,29 +182,31 @@ def test_another_exposure_needs_no_other_picture(turn: Pairs, tmp_path: Path) ->
     assert 0 < darker.min() < 255
 
 
-@pytest.mark.parametrize(("width", "factor"), [(8, 32), (64, 4), (96, 3), (248, 2), (256, 1)])
-def test_small_pictures_are_enlarged_by_whole_numbers(width: int, factor: int) -> None:
-    pixels = np.random.default_rng(0).integers(0, 256, (width, width, 3)).astype(np.uint8)
-    found = enlarged(pixels)
-    assert enlargement(width) == factor
-    assert found.shape == (factor * width, factor * width, 3)
-    for row in range(factor):
-        for column in range(factor):
-            np.testing.assert_array_equal(found[row::factor, column::factor], pixels)
+def test_small_pictures_are_enlarged_by_whole_numbers() -> None:
+    for width, factor in [(8, 32), (64, 4), (96, 3), (248, 2), (256, 1)]:
+        with case(width):
+            pixels = np.random.default_rng(0).integers(0, 256, (width, width, 3)).astype(np.uint8)
+            found = enlarged(pixels)
+            assert enlargement(width) == factor
+            assert found.shape == (factor * width, factor * width, 3)
+            for row in range(factor):
+                for column in range(factor):
+                    np.testing.assert_array_equal(found[row::factor, column::factor], pixels)
 
 
-@pytest.mark.parametrize("exposure_ev", [0.0, -1.5])
-def test_the_captions_of_a_small_comparison_are_whole(exposure_ev: float) -> None:
-    dark, bright = (np.full((64, 64, 3), value, np.float32) for value in (0.1, 9.0))
-    sheet = comparison_sheet(dark, bright, Look(exposure_ev=exposure_ev)).astype(int)
-    assert sheet.shape == (24 + 256, 3 * 256 + 2 * 8, 3)
-    for column in range(3):
-        left = column * (256 + 8)
-        strip = sheet[:24, left : left + 256 + 8]
-        text = (strip.sum(axis=-1) < 3 * 128).any(axis=0)
-        # as tall letters as in the sheets of evaluate, and none under the next caption or cut off
-        assert (strip.sum(axis=-1) < 3 * 128).any(axis=1).sum() >= 10
-        assert text.any() and not text[256:].any() and not text[-20:].any()
+def test_the_captions_of_a_small_comparison_are_whole() -> None:
+    for exposure_ev in [0.0, -1.5]:
+        with case(exposure_ev):
+            dark, bright = (np.full((64, 64, 3), value, np.float32) for value in (0.1, 9.0))
+            sheet = comparison_sheet(dark, bright, Look(exposure_ev=exposure_ev)).astype(int)
+            assert sheet.shape == (24 + 256, 3 * 256 + 2 * 8, 3)
+            for column in range(3):
+                left = column * (256 + 8)
+                strip = sheet[:24, left : left + 256 + 8]
+                text = (strip.sum(axis=-1) < 3 * 128).any(axis=0)
+                # as tall as in the sheets of evaluate, and none under the next caption or cut off
+                assert (strip.sum(axis=-1) < 3 * 128).any(axis=1).sum() >= 10
+                assert text.any() and not text[256:].any() and not text[-20:].any()
 
 
 def test_the_film_like_curve_keeps_what_the_plain_one_clips() -> None:

@@ -16,6 +16,8 @@ from tests.infra.rendering.render_kit import SMALL, mistake, render, write_netwo
 from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
+pytestmark = pytest.mark.usefixtures("children_here")
+
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:

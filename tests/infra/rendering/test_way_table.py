@@ -18,6 +18,7 @@ from infra.rendering.way_table import (
 )
 from pipeline.renders.variant import Variant
 from storage.settings.described import settings_record
+from tests.infra.cases import case
 
 VARIANT = Variant(name="llvm_ad_rgb", libllvm="", note="")
 
@@ -62,30 +63,31 @@ def _record(**changes: Any) -> bytes:
     return json.dumps(settings_record(costs_of_here()) | changes).encode()
 
 
-@pytest.mark.parametrize(
-    ("data", "said"),
-    [
-        (b"", "Expecting value"),
-        (b"\xff\xfe", ""),
-        (b"[1, 2]", "expected"),
-        (_record()[:-40], ""),
-        (_record(rows=[]), "is missing; expected each part at each width"),
-        (_record(rows=[{"part": "scene"}]), "is missing"),
-        (_record().replace(b'"width": 64', b'"width": 63.5', 1), "expected a whole number"),
-        (_record().replace(b'"serial_s": 1', b'"serial_s": -1', 1), "expected a number from 0"),
-        (_record().replace(b'"serial_s": 1.0,', b'"serial_s": NaN,', 1), "expected"),
-        (_record(more=1), "does not exist"),
-    ],
-)
-def test_damaged_costs_are_not_used(data: bytes, said: str) -> None:
-    path = machine_costs_path()
-    path.parent.mkdir(parents=True)
-    path.write_bytes(data)
-    found = known_costs(VARIANT)
-    assert found.costs == shipped_table().costs
-    assert f"since {path} cannot be used" in found.source and said in found.source
-    assert f"`{MEASURE}` writes it anew" in found.source
-    assert "\n" not in found.source
+DAMAGED = [
+    (b"", "Expecting value"),
+    (b"\xff\xfe", ""),
+    (b"[1, 2]", "expected"),
+    (_record()[:-40], ""),
+    (_record(rows=[]), "is missing; expected each part at each width"),
+    (_record(rows=[{"part": "scene"}]), "is missing"),
+    (_record().replace(b'"width": 64', b'"width": 63.5', 1), "expected a whole number"),
+    (_record().replace(b'"serial_s": 1', b'"serial_s": -1', 1), "expected a number from 0"),
+    (_record().replace(b'"serial_s": 1.0,', b'"serial_s": NaN,', 1), "expected"),
+    (_record(more=1), "does not exist"),
+]
+
+
+def test_damaged_costs_are_not_used() -> None:
+    for data, said in DAMAGED:
+        with case(said):
+            path = machine_costs_path()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+            found = known_costs(VARIANT)
+            assert found.costs == shipped_table().costs
+            assert f"since {path} cannot be used" in found.source and said in found.source
+            assert f"`{MEASURE}` writes it anew" in found.source
+            assert "\n" not in found.source
 
 
 def test_a_folder_in_the_place_of_the_file_is_not_used() -> None:

@@ -3,26 +3,27 @@
 import pytest
 
 from infra.run_page.axes import Axis, axis_of, short_number
+from tests.infra.cases import case
+
+VALUES: list[tuple[list[float], bool]] = [
+    ([3.0], False),
+    ([0.0], False),
+    ([-2.0, 7.5], False),
+    ([1e-6, 1e-2], True),
+    ([0.03, 0.06], True),
+]
 
 
-@pytest.mark.parametrize(
-    ("values", "log"),
-    [
-        ([3.0], False),
-        ([0.0], False),
-        ([-2.0, 7.5], False),
-        ([1e-6, 1e-2], True),
-        ([0.03, 0.06], True),
-    ],
-)
-def test_an_axis_holds_its_values_in_order_and_has_ticks(values: list[float], log: bool) -> None:
-    axis = axis_of(values, log=log)
-    places = [axis.place(value) for value in values]
-    assert places == sorted(places) and 0 <= places[0] and places[-1] <= 1
-    ticks = axis.ticks()
-    assert 2 <= len(ticks) <= 10
-    room = 1e-9 * (axis.high - axis.low)  # rounding
-    assert all(axis.low - room <= tick <= axis.high + room for tick in ticks)
+def test_an_axis_holds_its_values_in_order_and_has_ticks() -> None:
+    for values, log in VALUES:
+        with case(values):
+            axis = axis_of(values, log=log)
+            places = [axis.place(value) for value in values]
+            assert places == sorted(places) and 0 <= places[0] and places[-1] <= 1
+            ticks = axis.ticks()
+            assert 2 <= len(ticks) <= 10
+            room = 1e-9 * (axis.high - axis.low)  # rounding
+            assert all(axis.low - room <= tick <= axis.high + room for tick in ticks)
 
 
 def test_equal_factors_are_equal_lengths_on_a_logarithmic_axis() -> None:

@@ -55,18 +55,22 @@ def test_prefect_reads_it_from_the_checkout_and_nothing_needs_to_be_exported(
     monkeypatch.setenv(PASSWORDS[0], 'me:a"quoted\\ pässword')
     grant(URL)
     (checkout / "pyproject.toml").write_text((ROOT / "pyproject.toml").read_text())
-    code = "from prefect.settings import get_current_settings as now; import json; a = now().api; "
-    code += "print(json.dumps([a.url, a.auth_string.get_secret_value()]))"
+    code = (
+        "import json, runpy, sys\n"
+        "from prefect.settings import get_current_settings as now\n"
+        "api = now().api\n"
+        "print(json.dumps([api.url, api.auth_string.get_secret_value()]), flush=True)\n"
+        "sys.argv = ['prefect', 'config', 'view']\n"
+        "runpy.run_module('prefect', run_name='__main__')\n"
+    )
     bare = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=checkout, env=bare, capture_output=True, check=True
-    )
-    assert json.loads(done.stdout) == [URL, 'me:a"quoted\\ pässword']
-    shown = subprocess.run(
-        [sys.executable, "-m", "prefect", "config", "view"],
+        [sys.executable, "-c", code],
         cwd=checkout, env=bare, capture_output=True, text=True, check=True,
     )  # fmt: skip
-    assert "quoted" not in shown.stdout + shown.stderr
+    read, _, shown = done.stdout.partition("\n")
+    assert json.loads(read) == [URL, 'me:a"quoted\\ pässword']
+    assert URL in shown and "quoted" not in shown + done.stderr
 
 
 def test_a_second_server_elsewhere_takes_no_command_away(

@@ -21,6 +21,7 @@ from infra.serving.local import running, start, stop
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from pipeline.flows.prefect_server import TOLD_BY_ITS_STARTER, wait_until_healthy
 from storage.errors import TrilightError
+from tests.infra.cases import case
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(120)"]
 
@@ -114,20 +115,19 @@ def healthy_server() -> Iterator[str]:
         stranger.shutdown()
 
 
-@pytest.mark.parametrize(
-    ("variable", "value"),
-    [
-        ("TRILIGHT_PORT", "x"), ("TRILIGHT_PORT", "0"), ("TRILIGHT_PORT", "65536"),
-        ("TRILIGHT_HOST", "::1"), ("TRILIGHT_WORKERS", "0"), ("TRILIGHT_WORKERS", "-1"),
-    ],
-)  # fmt: skip
-def test_wrong_variables_are_named(
-    monkeypatch: pytest.MonkeyPatch, variable: str, value: str
-) -> None:
+WRONG_VARIABLES = [
+    ("TRILIGHT_PORT", "x"), ("TRILIGHT_PORT", "0"), ("TRILIGHT_PORT", "65536"),
+    ("TRILIGHT_HOST", "::1"), ("TRILIGHT_WORKERS", "0"), ("TRILIGHT_WORKERS", "-1"),
+]  # fmt: skip
+
+
+def test_wrong_variables_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(local.shutil, "which", lambda name: name)
-    monkeypatch.setenv(variable, value)
-    with pytest.raises(SystemExit, match=rf"{variable} is '{value}'; expected"):
-        local.main(["start"])
+    for variable, value in WRONG_VARIABLES:
+        with case((variable, value)), monkeypatch.context() as patch:
+            patch.setenv(variable, value)
+            with pytest.raises(SystemExit, match=rf"{variable} is '{value}'; expected"):
+                local.main(["start"])
 
 
 def test_workers_share_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,9 +5,13 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from tests.conftest import ROOT
 
@@ -37,6 +41,31 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_the_navigation_takes_up_every_page_and_names_none_that_is_missing() -> None:
+    asked = list(_patterns(yaml.safe_load((ROOT / "docs" / ".nav.yml").read_text())["nav"]))
+    pages = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    for page in pages:
+        # the page of a folder stands in the place of an index
+        names = {page, page.replace("README.md", "index.md")}
+        assert any(fnmatch(name, pattern) for name in names for pattern in asked), page
+    for pattern in asked:
+        found = any(fnmatch(page.replace("README.md", "index.md"), pattern) for page in pages)
+        assert found, pattern
+
+
+def _patterns(nav: Any) -> Iterator[str]:
+    """Yield names and patterns of pages, whatever heading they are under."""
+    if isinstance(nav, str):
+        yield nav
+    elif isinstance(nav, dict):
+        for name, entry in nav.items():
+            yield from _patterns(entry) if name != "sort" else ()
+    else:
+        for entry in nav:
+            yield from _patterns(entry)
+
+
+@pytest.mark.slow
 def test_every_page_is_built_and_in_the_navigation(site: Path) -> None:
     shown = (site / "index.html").read_text()
     for page in (ROOT / "docs").rglob("*.md"):
@@ -46,6 +75,7 @@ def test_every_page_is_built_and_in_the_navigation(site: Path) -> None:
         assert f'href="{uri}"' in shown or uri == "index.html", uri
 
 
+@pytest.mark.slow
 def test_nothing_is_fetched_from_a_server(site: Path) -> None:
     pages = list(site.rglob("*.html"))
     assert len(pages) > 60
@@ -54,6 +84,7 @@ def test_nothing_is_fetched_from_a_server(site: Path) -> None:
     assert "var __index" in (site / "search" / "search_index.js").read_text()[:20]
 
 
+@pytest.mark.slow
 def test_files_beside_docs_are_pages_too(site: Path) -> None:
     page = (site / "tutorials" / "a-cluster.html").read_text()
     assert 'href="../source/infra/slurm/generate.sbatch.html"' in page

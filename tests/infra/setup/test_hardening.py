@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.infra.cases import case
 from tests.infra.setup.hardening_rules import (
     faults_of_manifests,
     faults_of_services,
@@ -78,11 +79,12 @@ def test_manifests_and_services_keep_the_rules(compose: Any) -> None:
     assert list(faults_of_services(compose)) == []
 
 
-@pytest.mark.parametrize("fault", BROKEN_MANIFESTS)
-def test_a_broken_manifest_is_found(fault: str) -> None:
-    rows = copy.deepcopy(documents())
-    BROKEN_MANIFESTS[fault](rows)
-    assert any(fault in said for said in faults_of_manifests(rows, job_template()))
+def test_a_broken_manifest_is_found() -> None:
+    for fault in BROKEN_MANIFESTS:
+        with case(fault):
+            rows = copy.deepcopy(documents())
+            BROKEN_MANIFESTS[fault](rows)
+            assert any(fault in said for said in faults_of_manifests(rows, job_template()))
 
 
 def test_a_broken_job_template_is_found() -> None:
@@ -91,11 +93,12 @@ def test_a_broken_job_template_is_found() -> None:
     assert said == ["job template: no seccomp profile"]
 
 
-@pytest.mark.parametrize("fault", BROKEN_SERVICES)
-def test_a_broken_service_is_found(compose: Any, fault: str) -> None:
-    broken = copy.deepcopy(compose)
-    BROKEN_SERVICES[fault](broken["services"])
-    assert any(said.startswith(fault) for said in faults_of_services(broken))
+def test_a_broken_service_is_found(compose: Any) -> None:
+    for fault in BROKEN_SERVICES:
+        with case(fault):
+            broken = copy.deepcopy(compose)
+            BROKEN_SERVICES[fault](broken["services"])
+            assert any(said.startswith(fault) for said in faults_of_services(broken))
 
 
 def test_images_of_others_have_a_digest(compose: Any) -> None:

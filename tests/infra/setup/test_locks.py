@@ -14,17 +14,19 @@ from packaging.utils import canonicalize_name
 from infra.setup.locks import LockedPackage, read_lock, write_lock
 from infra.setup.sbom import PLACE, bill_of_materials
 from tests.conftest import ROOT
+from tests.infra.cases import case
 
 LOCKS = sorted((ROOT / "requirements").glob("*.txt"))
 
 
-@pytest.mark.parametrize("path", LOCKS, ids=lambda path: path.stem)
-def test_every_package_of_a_lock_has_a_digest(path: Path) -> None:
-    rows = read_lock(path)
-    assert rows
-    assert [row.name for row in rows if not row.sha256] == []
-    assert len({row.name for row in rows}) == len(rows)
-    assert "://" not in path.read_text()
+def test_every_package_of_a_lock_has_a_digest() -> None:
+    for path in LOCKS:
+        with case(path.name):
+            rows = read_lock(path)
+            assert rows
+            assert [row.name for row in rows if not row.sha256] == []
+            assert len({row.name for row in rows}) == len(rows)
+            assert "://" not in path.read_text()
 
 
 def test_locks_that_share_a_package_share_its_version_and_its_digests() -> None:
@@ -43,17 +45,20 @@ def test_a_lock_is_read_as_it_was_written(tmp_path: Path) -> None:
         read_lock(tmp_path / "x.txt")
 
 
-@pytest.mark.parametrize("python", ["3.11.2", "3.11.9", "3.12.3", "3.13.1"])
-def test_a_lock_has_what_its_packages_ask_for_on_every_python(python: str) -> None:
+def test_a_lock_has_what_its_packages_ask_for_on_every_python() -> None:
     """It is written on one; Debian 12 has 3.11.2, and packages ask for more there."""
     names = {canonicalize_name(row.name) for row in read_lock(ROOT / "requirements" / "all.txt")}
     names.add(canonicalize_name("pip"))  # venv brings it
-    here = {"python_full_version": python, "python_version": python.rpartition(".")[0]}
+    pythons = ("3.11.2", "3.11.9", "3.12.3", "3.13.1")
+    places = [
+        {"python_full_version": python, "python_version": python.rpartition(".")[0], "extra": ""}
+        for python in pythons
+    ]
     for found in metadata.distributions():
         if canonicalize_name(found.metadata["Name"]) in names:
             for line in found.requires or ():
                 asked = Requirement(line)
-                if asked.marker is None or asked.marker.evaluate({**here, "extra": ""}):
+                if asked.marker is None or any(map(asked.marker.evaluate, places)):
                     assert canonicalize_name(asked.name) in names, f"{found.name}: {line}"
 
 

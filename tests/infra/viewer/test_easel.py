@@ -13,6 +13,7 @@ from infra.viewer.wanted import Wanted, wanted_of
 from pipeline.renders.results import Sampling
 from storage.errors import TrilightError
 from storage.records.scene import Scene
+from tests.infra.cases import case
 from tests.infra.viewer.served_kit import served
 from tests.scenes_by_hand import tiny_scene
 
@@ -130,20 +131,21 @@ def test_pictures_of_one_place_are_judged_by_the_target_and_else_by_the_traced_o
     easel.close()
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"engine": "none"}, {"resolution": 12}, {"resolution": 8192}, {"resolution": "16"},
-        {"resolution": True}, {"view": 2}, {"view": -1}, {"view": "0"}, {"fov": 0}, {"fov": None},
-        {"fov": float("inf")}, {"c2w": [0] * 16}, {"c2w": [1] * 3}, {"c2w": ["x"] * 16},
-        {"c2w": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, {"edits": [1]},
-        {"error_db": 99},
-    ],
-)  # fmt: skip
-def test_a_wish_that_means_nothing_is_refused(changes: dict[str, Any]) -> None:
-    with pytest.raises(TrilightError):
-        wanted_of({**request(), **changes}, {"traced": None}, 2)
-    assert wanted_of(request(), {"traced": None}, 2).resolution == 16
+MEANINGLESS: list[dict[str, Any]] = [
+    {"engine": "none"}, {"resolution": 12}, {"resolution": 8192}, {"resolution": "16"},
+    {"resolution": True}, {"view": 2}, {"view": -1}, {"view": "0"}, {"fov": 0}, {"fov": None},
+    {"fov": float("inf")}, {"c2w": [0] * 16}, {"c2w": [1] * 3}, {"c2w": ["x"] * 16},
+    {"c2w": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, {"edits": [1]},
+    {"error_db": 99},
+]  # fmt: skip
+
+
+def test_a_wish_that_means_nothing_is_refused() -> None:
+    for changes in MEANINGLESS:
+        with case(changes):
+            with pytest.raises(TrilightError):
+                wanted_of({**request(), **changes}, {"traced": None}, 2)
+            assert wanted_of(request(), {"traced": None}, 2).resolution == 16
 
 
 def test_the_page_of_a_scene_is_told_all_of_it() -> None:
@@ -172,17 +174,18 @@ def test_the_page_of_a_scene_is_told_all_of_it() -> None:
         assert asker.ask("api/shown/77")[0] == 422
 
 
-@pytest.mark.parametrize("form", [".glb", ".usda", ".safetensors", ".h5"])
-def test_a_scene_is_saved_with_its_changes_and_nothing_is_written_here(form: str) -> None:
-    room = SceneRoom(
-        name="tiny", scene=tiny_scene(), notes=(), painters={"traced": GreyPainter(0.4)},
-        target_px=None,
-    )  # fmt: skip
-    with served(room) as asker:
-        edits = {"lamps": {"1": {"gain": 2}}}
-        plain = asker.ask("api/export", {"form": form})
-        changed = asker.ask("api/export", {"form": form, "edits": edits})
-        assert plain[0] == changed[0] == 200
-        assert len(changed[1]) > 500 and changed[1] != plain[1]
-        for bad in ("../x.usda", ".exe", "", None, ".json"):
-            assert asker.ask("api/export", {"form": bad})[0] == 422
+def test_a_scene_is_saved_with_its_changes_and_nothing_is_written_here() -> None:
+    for form in [".glb", ".usda", ".safetensors", ".h5"]:
+        with case(form):
+            room = SceneRoom(
+                name="tiny", scene=tiny_scene(), notes=(), painters={"traced": GreyPainter(0.4)},
+                target_px=None,
+            )  # fmt: skip
+            with served(room) as asker:
+                edits = {"lamps": {"1": {"gain": 2}}}
+                plain = asker.ask("api/export", {"form": form})
+                changed = asker.ask("api/export", {"form": form, "edits": edits})
+                assert plain[0] == changed[0] == 200
+                assert len(changed[1]) > 500 and changed[1] != plain[1]
+                for bad in ("../x.usda", ".exe", "", None, ".json"):
+                    assert asker.ask("api/export", {"form": bad})[0] == 422

@@ -8,6 +8,7 @@ import pytest
 from infra.viewer.edits import edited
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
+from tests.infra.cases import case
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import textured_scene
 
@@ -41,26 +42,27 @@ def test_a_material_takes_the_place_of_its_texture() -> None:
     assert len(scene.textures) == 2, "the scene that was read stays as it is"
 
 
-@pytest.mark.parametrize(
-    ("edits", "says"),
-    [
-        ({"lamps": {"0": {}}}, "no lamp"),
-        ({"lamps": {"9": {}}}, "no lamp"),
-        ({"lamps": {"-1": {}}}, "no lamp"),
-        ({"lamps": {"1": {"move": [0, 0]}}}, "move"),
-        ({"lamps": {"1": {"move": [0, 0, 1e9]}}}, "move"),
-        ({"lamps": {"1": {"move": [0, 0, float("nan")]}}}, "move"),
-        ({"lamps": {"1": {"gain": 0}}}, "gain"),
-        ({"lamps": {"1": {"gain": "much"}}}, "gain"),
-        ({"lamps": {"1": 3}}, "lamps"),
-        ({"lamps": [1]}, "lamps"),
-        ({"materials": {"7": {}}}, "no material 7"),
-        ({"materials": {"x": {}}}, "materials"),
-        ({"materials": {"0": {"diffuse": [2, 0, 0]}}}, "diffuse"),
-        ({"materials": {"0": {"diffuse": [0.9, 0.9, 0.9]}}}, "diffuse \\+ specular"),
-        ({"materials": {"0": {"roughness": -1}}}, "roughness"),
-    ],
-)
-def test_what_means_nothing_is_refused(edits: dict[str, Any], says: str) -> None:
-    with pytest.raises(TrilightError, match=says):
-        edited(tiny_scene(), edits)
+MEANINGLESS: list[tuple[dict[str, Any], str]] = [
+    ({"lamps": {"0": {}}}, "no lamp"),
+    ({"lamps": {"9": {}}}, "no lamp"),
+    ({"lamps": {"-1": {}}}, "no lamp"),
+    ({"lamps": {"1": {"move": [0, 0]}}}, "move"),
+    ({"lamps": {"1": {"move": [0, 0, 1e9]}}}, "move"),
+    ({"lamps": {"1": {"move": [0, 0, float("nan")]}}}, "move"),
+    ({"lamps": {"1": {"gain": 0}}}, "gain"),
+    ({"lamps": {"1": {"gain": "much"}}}, "gain"),
+    ({"lamps": {"1": 3}}, "lamps"),
+    ({"lamps": [1]}, "lamps"),
+    ({"materials": {"7": {}}}, "no material 7"),
+    ({"materials": {"x": {}}}, "materials"),
+    ({"materials": {"0": {"diffuse": [2, 0, 0]}}}, "diffuse"),
+    ({"materials": {"0": {"diffuse": [0.9, 0.9, 0.9]}}}, "diffuse \\+ specular"),
+    ({"materials": {"0": {"roughness": -1}}}, "roughness"),
+]
+
+
+def test_what_means_nothing_is_refused() -> None:
+    for edits, says in MEANINGLESS:
+        with case(edits):
+            with pytest.raises(TrilightError, match=says):
+                edited(tiny_scene(), edits)

@@ -9,6 +9,7 @@ from infra.viewer.guard import MAX_BODY_BYTES, MAX_PATH, refusal
 from infra.viewer.server import Answer, PageServer, Question, Route, json_answer
 from infra.viewer.static_files import STATIC
 from storage.errors import TrilightError
+from tests.infra.cases import case
 from tests.infra.viewer.served_kit import Asker, served
 
 PORT, WORD = 4711, "secret"
@@ -39,42 +40,43 @@ def asker() -> Iterator[Asker]:
         yield found
 
 
-@pytest.mark.parametrize(
-    ("passes", "method", "path", "headers"),
-    [
-        (True, "GET", f"/{WORD}/", {}),
-        (True, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "none"}),
-        (True, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "document"}),
-        (True, "POST", f"/{WORD}/x", {"Origin": f"http://{HERE}", "Content-Length": "2"}),
-        (False, "GET", "/", {}),
-        (False, "GET", f"/{WORD}x/", {}),
-        (False, "GET", f"/{WORD[:-1]}/", {}),
-        (False, "GET", f"/x/../{WORD}/", {}),
-        (False, "GET", f"/{WORD}/", {"Host": "evil.example"}),
-        (False, "GET", f"/{WORD}/", {"Host": f"localhost:{PORT}"}),
-        (False, "GET", f"/{WORD}/", {"Host": f"evil.example:{PORT}"}),
-        (False, "GET", f"/{WORD}/", {"Origin": "http://evil.example"}),
-        (False, "GET", f"/{WORD}/", {"Origin": "null"}),
-        (False, "GET", f"/{WORD}/", {"origin": "http://evil.example"}),
-        (False, "GET", f"/{WORD}/", {"sec-fetch-site": "cross-site"}),
-        (False, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "image"}),
-        (False, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Dest": "script"}),
-        (False, "GET", f"/{WORD}/{'x' * MAX_PATH}", {}),
-        (False, "POST", f"/{WORD}/x", {"Content-Length": "2"}),
-        (False, "POST", f"/{WORD}/x", {"Origin": f"http://{HERE}"}),
-        (False, "POST", f"/{WORD}/x", {"Origin": f"http://{HERE}", "Content-Length": "-1"}),
-        (False, "POST", f"/{WORD}/x", {"Origin": f"http://{HERE}", "Content-Length": "9" * 30}),
-        (
-            False,
-            "POST",
-            f"/{WORD}/x",
-            {"Origin": "http://evil.example", "Content-Length": "2", "Sec-Fetch-Dest": "document"},
-        ),
-    ],
-)
-def test_who_may_ask(passes: bool, method: str, path: str, headers: dict[str, str]) -> None:
-    asked = {"Host": HERE, **headers}
-    assert (refusal(method, path, asked, port=PORT, word=WORD) is None) == passes
+QUESTIONS: list[tuple[bool, str, str, dict[str, str]]] = [
+    (True, "GET", f"/{WORD}/", {}),
+    (True, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "none"}),
+    (True, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "document"}),
+    (True, "POST", f"/{WORD}/x", {"Origin": f"http://{HERE}", "Content-Length": "2"}),
+    (False, "GET", "/", {}),
+    (False, "GET", f"/{WORD}x/", {}),
+    (False, "GET", f"/{WORD[:-1]}/", {}),
+    (False, "GET", f"/x/../{WORD}/", {}),
+    (False, "GET", f"/{WORD}/", {"Host": "evil.example"}),
+    (False, "GET", f"/{WORD}/", {"Host": f"localhost:{PORT}"}),
+    (False, "GET", f"/{WORD}/", {"Host": f"evil.example:{PORT}"}),
+    (False, "GET", f"/{WORD}/", {"Origin": "http://evil.example"}),
+    (False, "GET", f"/{WORD}/", {"Origin": "null"}),
+    (False, "GET", f"/{WORD}/", {"origin": "http://evil.example"}),
+    (False, "GET", f"/{WORD}/", {"sec-fetch-site": "cross-site"}),
+    (False, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "image"}),
+    (False, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Dest": "script"}),
+    (False, "GET", f"/{WORD}/{'x' * MAX_PATH}", {}),
+    (False, "POST", f"/{WORD}/x", {"Content-Length": "2"}),
+    (False, "POST", f"/{WORD}/x", {"Origin": f"http://{HERE}"}),
+    (False, "POST", f"/{WORD}/x", {"Origin": f"http://{HERE}", "Content-Length": "-1"}),
+    (False, "POST", f"/{WORD}/x", {"Origin": f"http://{HERE}", "Content-Length": "9" * 30}),
+    (
+        False,
+        "POST",
+        f"/{WORD}/x",
+        {"Origin": "http://evil.example", "Content-Length": "2", "Sec-Fetch-Dest": "document"},
+    ),
+]
+
+
+def test_who_may_ask() -> None:
+    for passes, method, path, headers in QUESTIONS:
+        with case((passes, method, path, headers)):
+            asked = {"Host": HERE, **headers}
+            assert (refusal(method, path, asked, port=PORT, word=WORD) is None) == passes
 
 
 def test_a_stranger_gets_one_sentence_and_no_header_that_lets_others_read(asker: Asker) -> None:
@@ -96,16 +98,17 @@ def test_every_answer_is_shut_in(asker: Asker) -> None:
         assert not [name for name in headers if name.lower().startswith("access-control")]
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "static/../guard.py", "static/%2e%2e/guard.py", "static//etc/passwd", "../etc/passwd",
-        "static/..%2f..%2fcli%2fview.py", "static/three", "static/", "%00", "api", "scene",
-    ],
-)  # fmt: skip
-def test_no_path_leads_out_of_the_list_of_files(asker: Asker, path: str) -> None:
-    status, answer, _ = asker.ask(path)
-    assert status == 404, answer
+NO_FILES = [
+    "static/../guard.py", "static/%2e%2e/guard.py", "static//etc/passwd", "../etc/passwd",
+    "static/..%2f..%2fcli%2fview.py", "static/three", "static/", "%00", "api", "scene",
+]  # fmt: skip
+
+
+def test_no_path_leads_out_of_the_list_of_files(asker: Asker) -> None:
+    for path in NO_FILES:
+        with case(path):
+            status, answer, _ = asker.ask(path)
+            assert status == 404, answer
 
 
 def test_routes_mistakes_and_bodies(asker: Asker) -> None:

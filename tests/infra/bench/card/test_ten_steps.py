@@ -14,6 +14,7 @@ from infra.bench.card.step_profile import REST, kind_of, summed
 from infra.bench.card.ten_steps import steps_of_run
 from model.costs import training_flops
 from tests.infra.bench.card import fake_cases
+from tests.infra.cases import case
 from tests.train.fake_card import card_process
 from train.runs import RUNS, named_run
 
@@ -62,26 +63,27 @@ def test_a_run_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["failed"] == "RuntimeError: CUDA error: an illegal memory access"
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("void pytorch_flash::flash_fwd_kernel<Flash_fwd_kernel_traits<128>>", "attention"),
-        ("fmha_cutlassF_bf16_aligned_64x128_rf_sm80(PyTorchMemEffAttention)", "attention"),
-        ("nvjet_hsh_128x256_64x4_2x1_v_bz_coopA_NTT", "product"),
-        ("cudnn_generated_fort_native_sdpa_sm90_flash_bprop_wgmma_f16_knob_26", "attention"),
-        ("cudnn_generated_fort_native_sdpa_sm90_knob_3", "attention"),
-        ("ampere_bf16_s16816gemm_bf16_128x128_ldg8_f2f_stages_32x5_tn", "product"),
-        ("sm80_xmma_fprop_implicit_gemm_indexed_tf32f32", "product"),
-        ("void cudnn::ops::nchwToNhwcKernel<float>", "convolution"),
-        ("void at::native::(anonymous namespace)::multi_tensor_apply_kernel", "optimiser"),
-        ("Memcpy HtoD (Pageable -> Device)", "copy or cast"),
-        ("void at::native::vectorized_elementwise_kernel<4, MulFunctor>", "elementwise"),
-        ("aten::mm", "product"),
-        ("aten::mul", "elementwise"),
-    ],
-)
-def test_kernels_are_of_a_kind_by_their_names(name: str, kind: str) -> None:
-    assert kind_of(name) == kind
+KINDS = [
+    ("void pytorch_flash::flash_fwd_kernel<Flash_fwd_kernel_traits<128>>", "attention"),
+    ("fmha_cutlassF_bf16_aligned_64x128_rf_sm80(PyTorchMemEffAttention)", "attention"),
+    ("nvjet_hsh_128x256_64x4_2x1_v_bz_coopA_NTT", "product"),
+    ("cudnn_generated_fort_native_sdpa_sm90_flash_bprop_wgmma_f16_knob_26", "attention"),
+    ("cudnn_generated_fort_native_sdpa_sm90_knob_3", "attention"),
+    ("ampere_bf16_s16816gemm_bf16_128x128_ldg8_f2f_stages_32x5_tn", "product"),
+    ("sm80_xmma_fprop_implicit_gemm_indexed_tf32f32", "product"),
+    ("void cudnn::ops::nchwToNhwcKernel<float>", "convolution"),
+    ("void at::native::(anonymous namespace)::multi_tensor_apply_kernel", "optimiser"),
+    ("Memcpy HtoD (Pageable -> Device)", "copy or cast"),
+    ("void at::native::vectorized_elementwise_kernel<4, MulFunctor>", "elementwise"),
+    ("aten::mm", "product"),
+    ("aten::mul", "elementwise"),
+]
+
+
+def test_kernels_are_of_a_kind_by_their_names() -> None:
+    for name, kind in KINDS:
+        with case(name):
+            assert kind_of(name) == kind
 
 
 def test_lpips_is_no_part_of_the_loss_in_the_sum() -> None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 from pathlib import Path
 
 import pytest
@@ -19,11 +18,10 @@ from infra.bench.experiments.learning_rates import (
     extent_of,
     rate_name,
 )
-from infra.bench.sides.rated_trainings import Amount, Rated, course_of, network_of, rated, run_of
+from infra.bench.sides.rated_trainings import Amount, Rated, network_of, run_of
 from infra.bench.store import Store
 from model.costs import Workload, costs
 from storage.errors import TrilightError
-from tests.train.toy import write_toy_dataset
 
 SEEN = dataclasses.replace(
     EXTENTS["quick"], steps=4, widths=(64, 128), seeds=2, compared_widths=(64, 128), held_out=2
@@ -95,17 +93,3 @@ def test_the_careful_form_is_what_was_asked_for() -> None:
         True,
         False,
     }
-
-
-def test_a_rate_that_is_too_high_is_told_from_one_that_is_not(tmp_path: Path) -> None:
-    write_toy_dataset(tmp_path, train=6, validation=2, resolution=32)
-    course, amount = course_of(str(tmp_path), 2), dataclasses.replace(FEW, steps=10)
-
-    def error(rate: float) -> float:
-        one = Rated(optimiser="AdamW", learning_rate=rate)
-        figures = rated(course, one, amount, width=64, seed=0, device="cpu")
-        assert figures["core_s"] == pytest.approx(10 * figures["step_s"])
-        assert figures["percent"] == pytest.approx(100 * math.log(figures["log_l1"]))
-        return figures["log_l1"]
-
-    assert error(1.0) > 2 * error(1e-3)

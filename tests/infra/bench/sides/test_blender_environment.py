@@ -1,13 +1,11 @@
 """What the comparison with Cycles does without Blender: finding it."""
 
-import ast
 from pathlib import Path
 
 import pytest
 
 from infra.bench.sides import blender_environment as environment
 from storage.errors import TrilightError
-from tests.conftest import ROOT
 
 
 def test_an_interrupted_installation_does_not_count(
@@ -44,27 +42,3 @@ def test_a_python_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, tmp_
 def test_what_a_failing_step_says_last_is_the_message() -> None:
     with pytest.raises(TrilightError, match=r"^Blender .*could not load it: no such wheel\.$"):
         environment._run("load it", ["sh", "-c", "echo first; echo no such wheel >&2; exit 3"])
-
-
-def test_only_what_runs_in_blender_imports_it() -> None:
-    importing = {
-        path.relative_to(ROOT).as_posix()
-        for package in ("infra", "pipeline", "storage", "scene_templates", "model", "train")
-        for path in (ROOT / package).rglob("*.py")
-        if "bpy" in _imports(path)
-    }
-    sides = {f"infra/bench/sides/{name}_process.py" for name in ("blender", "usd")}
-    scripts = {*sides, "infra/blender/exact_materials.py"}
-    assert importing == scripts
-    ours = {"infra", "pipeline", "storage", "scene_templates", "model", "train"}
-    assert not any(_imports(ROOT / script) & ours for script in scripts)
-
-
-def _imports(path: Path) -> set[str]:
-    names = []
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            names.append(node.module or "")
-    return {name.split(".")[0] for name in names}

@@ -5,6 +5,7 @@ import pytest
 
 from infra.bench.sides.machine_costs import PROBED_PX, Timed, costs_of
 from infra.rendering.way_table import shipped_table
+from tests.infra.cases import case
 
 CORES = 8
 
@@ -23,17 +24,20 @@ def timed_as_shipped(slower: float, serial: float) -> Timed:
     }
 
 
-@pytest.mark.parametrize(("slower", "serial"), [(1.0, 0.0), (2.5, 0.25), (0.1, 1.0)])
-def test_every_part_is_as_much_slower_and_as_serial(slower: float, serial: float) -> None:
-    table = shipped_table()
-    found = costs_of(table, timed_as_shipped(slower, serial), CORES, "here")
-    assert found.machine == "here"
-    for now, then in zip(found.rows, table.costs.rows, strict=True):
-        core_s = then.serial_s + then.parallel_s
-        assert (now.part, now.width) == (then.part, then.width)
-        # the table keeps four figures
-        assert now.serial_s == pytest.approx(slower * serial * core_s, rel=1e-3, abs=1e-9)
-        assert now.parallel_s == pytest.approx(slower * (1 - serial) * core_s, rel=1e-3, abs=1e-9)
+def test_every_part_is_as_much_slower_and_as_serial() -> None:
+    for slower, serial in [(1.0, 0.0), (2.5, 0.25), (0.1, 1.0)]:
+        with case(slower):
+            table = shipped_table()
+            found = costs_of(table, timed_as_shipped(slower, serial), CORES, "here")
+            assert found.machine == "here"
+            for now, then in zip(found.rows, table.costs.rows, strict=True):
+                core_s = then.serial_s + then.parallel_s
+                assert (now.part, now.width) == (then.part, then.width)
+                # the table keeps four figures
+                assert now.serial_s == pytest.approx(slower * serial * core_s, rel=1e-3, abs=1e-9)
+                assert now.parallel_s == pytest.approx(
+                    slower * (1 - serial) * core_s, rel=1e-3, abs=1e-9
+                )
 
 
 def test_what_threads_seem_to_slow_down_is_serial() -> None:

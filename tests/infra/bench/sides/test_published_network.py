@@ -13,28 +13,32 @@ from model.published.config import PublishedConfig
 from model.published.convert import from_published, to_published
 from model.renderformer import ELU_ALPHA
 from model.scene_tensors import SceneTensors
+from tests.infra.cases import case
 from tests.model.kit import awake, random_scene, render
 from tests.model.published.test_convert import publishable
 
 PATCH = 8
 
 
-@pytest.mark.parametrize("num_views", [1, 3])
-def test_the_transcription_is_our_network(num_views: int) -> None:
-    config = PublishedConfig(model=publishable("dpt"), texture_patch=PATCH)
-    weights = to_published(awake(config.model, torch.float32), PATCH)
-    generator = torch.Generator().manual_seed(1)
-    texture = weights["texture_encoder.weight"]
-    # an export holds one cell alone; a trained encoder fills them all
-    weights["texture_encoder.weight"] = 0.1 * torch.randn(texture.shape, generator=generator)
-    scene = random_scene(9, num_views, dtype=torch.float32)
-    ours = elu(render(from_published(weights, config), scene)[0], alpha=ELU_ALPHA)
-    inputs = published_inputs(scene, padded=14, texture_patch=PATCH)
-    with torch.no_grad():
-        theirs = published_forward(weights, config, inputs, ours.shape[1])
-    # float32 rounds sums of size 1 to 1e-7, over a dozen layers
-    torch.testing.assert_close(theirs, ours, rtol=0, atol=1e-5)
-    assert ours.std() > 0.05
+def test_the_transcription_is_our_network() -> None:
+    for num_views in [1, 3]:
+        with case(num_views):
+            config = PublishedConfig(model=publishable("dpt"), texture_patch=PATCH)
+            weights = to_published(awake(config.model, torch.float32), PATCH)
+            generator = torch.Generator().manual_seed(1)
+            texture = weights["texture_encoder.weight"]
+            # an export holds one cell alone; a trained encoder fills them all
+            weights["texture_encoder.weight"] = 0.1 * torch.randn(
+                texture.shape, generator=generator
+            )
+            scene = random_scene(9, num_views, dtype=torch.float32)
+            ours = elu(render(from_published(weights, config), scene)[0], alpha=ELU_ALPHA)
+            inputs = published_inputs(scene, padded=14, texture_patch=PATCH)
+            with torch.no_grad():
+                theirs = published_forward(weights, config, inputs, ours.shape[1])
+            # float32 rounds sums of size 1 to 1e-7, over a dozen layers
+            torch.testing.assert_close(theirs, ours, rtol=0, atol=1e-5)
+            assert ours.std() > 0.05
 
 
 def test_the_transcription_gives_the_published_outputs(shared: Path) -> None:

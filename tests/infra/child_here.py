@@ -1,0 +1,62 @@
+"""A stand-in for a child process that runs its calls here: imports and kernels are paid once."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from pipeline.exchange import reader
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Reach, Result
+from pipeline.making import path_tracer, progressive_tracer
+from storage.errors import Rejected, TrilightError
+
+
+class ChildHere:
+    """Has the calls of `pipeline.isolation.IsolatedChild`, and neither limits nor a process."""
+
+    def __init__(
+        self,
+        *,
+        limits: ChildLimits,
+        setup: Callable[..., None],
+        setup_args: tuple[Any, ...] = (),
+        confined_to: Reach | None = None,
+    ) -> None:
+        self._setup: tuple[Callable[..., None], tuple[Any, ...]] | None = (setup, setup_args)
+
+    def may(self, more: Reach) -> None:
+        """Allow more files: nothing is confined here."""
+
+    def call(self, function: Callable[..., Result], *args: Any) -> Result:
+        """Run a function; what it raises ends the call as it would in a child."""
+        try:
+            if self._setup is not None:
+                setup, setup_args = self._setup
+                setup(*setup_args)
+                self._setup = None
+            return function(*args)
+        except (Rejected, TrilightError):
+            raise
+        except Exception as error:
+            raise ChildFailed("exception", f"{type(error).__name__}: {error}") from error
+
+    def retire(self) -> None:
+        """End nothing."""
+
+    def close(self) -> None:
+        """End nothing."""
+
+
+_CALLERS = (reader, path_tracer, progressive_tracer)
+
+
+def use_children_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have scenes read, converted and path traced in this process."""
+    for module in _CALLERS:
+        monkeypatch.setattr(module, "IsolatedChild", ChildHere)
+
+
+def use_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have them read, converted and path traced in child processes again, as for a user."""
+    for module in _CALLERS:
+        monkeypatch.setattr(module, "IsolatedChild", IsolatedChild)
