@@ -1,8 +1,6 @@
 """What every test may ask for."""
 
 import os
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -28,15 +26,6 @@ def shared() -> Path:
     if not (folder / "objects").is_dir():
         pytest.skip(f"no real objects: set TRILIGHT_SHARED ({folder} has no objects/)")
     return folder
-
-
-@pytest.fixture(scope="session")
-def card(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProcessPoolExecutor]:
-    """A process with a card that is not there (infra.fake_card); one, for it takes seconds."""
-    from tests.train.fake_card import card_process
-
-    with card_process(tmp_path_factory.mktemp("card")) as process:
-        yield process
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -1,10 +1,10 @@
 """Law: the fast attention is the slow one, in value and gradient, for every shape and mask."""
 
-import pytest
 import torch
 from torch import Tensor
 
 from model.attention import attend
+from tests.for_each import for_each
 from tests.model.attention_reference import attend_reference
 
 SHAPES = [(1, 1, 1, 1, 2), (2, 2, 5, 7, 6), (3, 1, 17, 33, 8), (1, 4, 64, 130, 16)]
@@ -29,9 +29,9 @@ def make_mask(kind: str, scenes: int, keys: int) -> Tensor | None:
     return mask
 
 
-@pytest.mark.parametrize("kind", MASKS)
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize(
+@for_each("kind", MASKS)
+@for_each("shape", SHAPES)
+@for_each(
     ("dtype", "tolerance"),
     # Sums of up to 130 products: rounding of the dtype (1e-16, 6e-8) times their number.
     [(torch.float64, 1e-13), (torch.float32, 1e-5)],

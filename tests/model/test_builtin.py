@@ -11,12 +11,13 @@ from model.renderformer import count_parameters
 from model.weights import encode_weights, from_tensors, read_tensors, trained_range
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_scene
 
 NAMES = tuple(name for name in BUILTIN_NETWORKS if name != BUILTIN)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@for_each("name", NAMES)
 def test_the_card_is_of_these_weights(name: str) -> None:
     file = BUILTIN_NETWORKS[name]
     weights, card = file.read_bytes(), file.with_name("README.md").read_text()
@@ -37,7 +38,7 @@ def test_a_name_that_does_not_come_along_is_said() -> None:
         find_network("builtin:token")
 
 
-@pytest.mark.parametrize("name", NAMES)
+@for_each("name", NAMES)
 def test_it_renders_by_its_name_and_knows_its_range(name: str) -> None:
     renderer = NeuralRenderer.load(name, device="cpu")
     known = renderer.trained
@@ -49,7 +50,7 @@ def test_it_renders_by_its_name_and_knows_its_range(name: str) -> None:
     assert ["trained on 64" in note for note in notes] == [True] * (name == BUILTIN_TOKENS)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@for_each("name", NAMES)
 def test_its_file_is_written_again_byte_for_byte(name: str) -> None:
     """A field of the configuration that came later must not change what older networks are."""
     tensors, metadata = read_tensors(BUILTIN_NETWORKS[name])

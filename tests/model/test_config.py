@@ -7,6 +7,7 @@ from model.config import SIZES, ModelConfig, base
 from model.renderformer import RenderFormer, count_parameters
 from model.scene_tensors import SceneBatch
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.model.kit import tiny_config
 
 PUBLISHED_BASE = 205_170_000
@@ -19,7 +20,7 @@ MATERIAL_ENCODER = 10 * 768 + 768
 """...and ours, which reads ten."""
 
 
-@pytest.mark.parametrize("name", sorted(SIZES))
+@for_each("name", sorted(SIZES))
 def test_every_size_builds(name: str) -> None:
     with torch.device("meta"):
         assert count_parameters(RenderFormer(SIZES[name]())) > 0
@@ -46,7 +47,7 @@ def test_base_takes_a_batch_on_the_meta_device() -> None:
         assert RenderFormer(base())(batch, 256).shape == (2, 4, 256, 256, 3)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("changes", "message"),
     [
         ({"width": 50}, "heads of equal width"),
@@ -66,7 +67,7 @@ def test_a_contradictory_config_is_refused(changes: dict[str, object], message: 
         ModelConfig(**vars(tiny_config()) | changes)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("changes", "message"),
     [
         ({"dpt_taps": (0, 1, 2, 3)}, "dpt_taps .* expected layers below 2"),

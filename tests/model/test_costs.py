@@ -12,12 +12,13 @@ from model.costs import Workload, costs, flops
 from model.precision import set_precision
 from model.renderformer import RenderFormer, count_parameters
 from model.scene_tensors import batch_scenes
+from tests.for_each import for_each
 from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
 
 REPAIRED = tiny_config(patch_px=4, projected_freqs=1, demodulated=True, hit_rays=1)
 
 
-@pytest.mark.parametrize(
+@for_each(
     "config",
     [
         *map(tiny_config, FAMILIES),
@@ -26,7 +27,7 @@ REPAIRED = tiny_config(patch_px=4, projected_freqs=1, demodulated=True, hit_rays
         tiny_config("dpt", demodulated=True, hit_rays=1),
     ],
 )
-@pytest.mark.parametrize(("triangles", "views", "resolution"), [(5, 1, 16), (9, 3, 48)])
+@for_each(("triangles", "views", "resolution"), [(5, 1, 16), (9, 3, 48)])
 def test_flops_are_those_that_torch_counts(
     config: ModelConfig, triangles: int, views: int, resolution: int
 ) -> None:
@@ -48,9 +49,7 @@ def test_the_published_base_costs_what_was_counted_elsewhere() -> None:
     assert counted["head"] < 52.8e9, "its 1x1 comes before the upsampling here"
 
 
-@pytest.mark.parametrize(
-    ("name", "millions"), [("tiny", 5.2), ("small", 71), ("base", 195), ("large", 483)]
-)
+@for_each(("name", "millions"), [("tiny", 5.2), ("small", 71), ("base", 195), ("large", 483)])
 def test_sizes_have_the_parameters_that_they_claim(name: str, millions: float) -> None:
     workload = Workload(triangles=10, views=1, resolution=64)
     got = costs(SIZES[name](), workload)

@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-import pytest
 import torch
 
 from model.config import ModelConfig
@@ -14,6 +13,7 @@ from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from storage.records.first_hits import first_hits
 from storage.records.material import DIFFUSE, SPECULAR
 from storage.records.scene import Scene
+from tests.for_each import for_each
 from tests.model.hits.kit import corner
 from tests.model.kit import RESOLUTION, awake, random_scene, render, tiny_config
 
@@ -60,7 +60,7 @@ def test_rays_of_a_pixel_are_averaged() -> None:
     assert ((coarse - mean).abs() > 1e-5).any(dim=-1).double().mean() < 0.01
 
 
-@pytest.mark.parametrize("config", KINDS.values(), ids=KINDS.keys())
+@for_each("config", KINDS.values())
 def test_what_reflects_nothing_and_the_background_are_black(config: ModelConfig) -> None:
     model, scene = awake(config, torch.float32), corner()
     assert (picture(model, with_albedos(scene, 0, 0)) == 0).all()
@@ -89,7 +89,7 @@ def test_pictures_are_in_proportion_to_albedo_and_add_up() -> None:
     )
 
 
-@pytest.mark.parametrize("size", [-1e30, -50.0, 50.0, 1e30])
+@for_each("size", [-1e30, -50.0, 50.0, 1e30])
 def test_gradients_are_finite_whatever_a_head_says(size: float) -> None:
     light = torch.full((1, 1, 2, 2, 6), size, requires_grad=True)
     albedo = torch.zeros(1, 1, 2, 2, 6)
@@ -100,7 +100,7 @@ def test_gradients_are_finite_whatever_a_head_says(size: float) -> None:
     assert light.grad is not None and torch.isfinite(light.grad).all()
 
 
-@pytest.mark.parametrize("config", KINDS.values(), ids=KINDS.keys())
+@for_each("config", KINDS.values())
 def test_albedo_that_a_loader_brings_gives_the_picture_that_the_network_asks_for(
     config: ModelConfig,
 ) -> None:

@@ -10,6 +10,7 @@ from model.empty_bundles import bundles_that_see, fill_absent
 from model.positions import to_camera, token_places
 from model.scene_tensors import Cameras, SceneTensors, batch_scenes
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.model.kit import awake, random_scene, tiny_config
 
 RESOLUTION, PATCH = 64, 8
@@ -39,7 +40,7 @@ def bundles_of_points(scene: SceneTensors) -> Tensor:
     return hit
 
 
-@pytest.mark.parametrize("seed", range(6))
+@for_each("seed", range(6))
 def test_no_bundle_that_sees_geometry_is_skipped(seed: int) -> None:
     """Random cameras among the triangles: some of those are behind, some pierce the near plane."""
     scene = random_scene(3, num_views=4, seed=seed)
@@ -66,7 +67,7 @@ def test_a_small_triangle_keeps_its_bundle_and_the_neighbours() -> None:
     assert torch.equal(seen, expected)
 
 
-@pytest.mark.parametrize("depth_m", [0.01, 0.5, 500.0])
+@for_each("depth_m", [0.01, 0.5, 500.0])
 def test_what_is_kept_depends_on_direction_and_not_on_distance(depth_m: float) -> None:
     scene = one_small_triangle()
     moved = dataclasses.replace(scene, triangles_T33=scene.triangles_T33 * (depth_m / 4))
@@ -89,7 +90,7 @@ def test_a_triangle_behind_the_camera_keeps_nothing() -> None:
     assert not visible(behind).any()
 
 
-@pytest.mark.parametrize("family", ["linear", "dpt"])
+@for_each("family", ["linear", "dpt"])
 def test_skipping_nothing_changes_nothing(family: str) -> None:
     model = awake(tiny_config(family))
     wall = torch.tensor([[[-90.0, -90, -3], [90, -90, -3], [0, 90, -3]]], dtype=torch.float64)
@@ -102,7 +103,7 @@ def test_skipping_nothing_changes_nothing(family: str) -> None:
     torch.testing.assert_close(skipped, whole, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("family", ["linear", "dpt"])
+@for_each("family", ["linear", "dpt"])
 def test_what_is_skipped_is_black_and_the_rest_stays_near(family: str) -> None:
     model = awake(tiny_config(family))
     near, far = one_small_triangle(), random_scene(5, num_views=1)

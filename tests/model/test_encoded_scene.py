@@ -6,13 +6,13 @@ Tolerance 1e-11 as in test_renderformer: float64 sums through some twenty layers
 import dataclasses
 from typing import Any
 
-import pytest
 import torch
 from torch import Tensor
 
 from model.layers import CrossAttention, merge_heads, split_heads
 from model.positions import Rotation, camera_rotation, rotate, token_places, world_rotation
 from model.scene_tensors import Cameras, batch_scenes
+from tests.for_each import for_each
 from tests.model.attention_reference import attend_reference
 from tests.model.kit import FAMILIES, RESOLUTION, awake, random_scene, render, tiny_config
 
@@ -27,7 +27,7 @@ def view(cameras: Cameras, index: int) -> Cameras:
     return Cameras(c2w_BV44=cameras.c2w_BV44[:, [index]], fov_deg_BV=cameras.fov_deg_BV[:, [index]])
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@for_each("family", FAMILIES)
 def test_one_encoding_serves_every_camera_in_any_order(family: str) -> None:
     model = awake(tiny_config(family))
     scene = random_scene(7, num_views=3)
@@ -94,7 +94,7 @@ def test_what_is_kept_of_a_scene_depends_on_no_view() -> None:
             close(merge_heads(v), layer.cross.v(normed))
 
 
-@pytest.mark.parametrize("eps", [0.0, 1e-5])
+@for_each("eps", [0.0, 1e-5])
 def test_registers_stand_where_the_published_divisor_puts_them(eps: float) -> None:
     """In the world and again in the camera: sum / (T + eps) in each frame, by hand."""
     triangles = torch.randn(

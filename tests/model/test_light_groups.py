@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from model.light_groups import LightGroup, light_groups
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
+from tests.for_each import for_each
 from tests.pipeline.renders.scene_kit import Part, box, flat, join, light, material, quad
 
 FLOOR = quad(
@@ -39,7 +40,7 @@ def counts(groups: list[LightGroup]) -> list[int]:
     return [int(group.scene.triangle_emits.sum()) for group in groups]
 
 
-@pytest.mark.parametrize("count", [1, 8])
+@for_each("count", [1, 8])
 def test_a_scene_within_limits_is_rendered_as_it_is(count: int) -> None:
     scene = join([FLOOR, CUBE, *row_of_lamps(count)])
     (group,) = light_groups(scene, 8)

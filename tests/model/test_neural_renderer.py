@@ -22,6 +22,7 @@ from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
+from tests.for_each import for_each
 from tests.model.kit import awake, tiny_config
 from tests.pipeline.renders.scene_kit import flat, join, light, material, quad
 from tests.scenes_by_hand import tiny_scene
@@ -101,7 +102,7 @@ def _flat_picture(
     return torch.log10(1 + light_3).expand(resolution, resolution, 3)
 
 
-@pytest.mark.parametrize(("count", "most"), [(64, 8), (64, 1), (9, 8), (20, 3)])
+@for_each(("count", "most"), [(64, 8), (64, 1), (9, 8), (20, 3)])
 def test_groups_give_what_a_linear_network_gives_at_once(
     monkeypatch: pytest.MonkeyPatch, count: int, most: int
 ) -> None:
@@ -172,7 +173,7 @@ def test_what_it_was_trained_on_goes_round_through_metadata() -> None:
             trained_range({RANGE_KEY: text})
 
 
-@pytest.mark.parametrize("resolution", [0, -8, 4, 12])
+@for_each("resolution", [0, -8, 4, 12])
 def test_a_resolution_between_bundles_is_one_line(resolution: int) -> None:
     renderer = NeuralRenderer(network())
     expected = f"resolution is {resolution}; expected a positive multiple of 8"

@@ -12,6 +12,7 @@ from model.open import CONFIG_NAME, PUBLISHED, WEIGHTS_NAME, open_network, save_
 from model.renderformer import RenderFormer
 from model.weights import encode_weights
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.model.kit import awake, tiny_config
 from tests.model.published.test_convert import publishable
 
@@ -104,13 +105,13 @@ def test_without_the_hub_library_the_way_out_is_named(monkeypatch: pytest.Monkey
         open_network(PUBLISHED[0])
 
 
-@pytest.mark.parametrize("source", ["nowhere/at/all", "/nowhere", "weights.pt", "a/weights.bin"])
+@for_each("source", ["nowhere/at/all", "/nowhere", "weights.pt", "a/weights.bin"])
 def test_a_missing_file_is_not_asked_of_the_hub(source: str) -> None:
     with pytest.raises(TrilightError, match="no such file or folder"):
         open_network(source)
 
 
-@pytest.mark.parametrize("name", ["pytorch_model.bin", "weights.pt", "renamed.safetensors"])
+@for_each("name", ["pytorch_model.bin", "weights.pt", "renamed.safetensors"])
 def test_pickled_code_is_refused_unread(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     torch.save({"weight": torch.zeros(2)}, path)
@@ -130,14 +131,14 @@ def test_weights_without_their_config_are_refused(published: Path) -> None:
         open_network(str(published))
 
 
-@pytest.mark.parametrize("text", ["", "[1]", "{", "[" * 50_000])
+@for_each("text", ["", "[1]", "{", "[" * 50_000])
 def test_a_config_that_is_none_is_refused(published: Path, text: str) -> None:
     (published / CONFIG_NAME).write_text(text)
     with pytest.raises(TrilightError, match="config.json"):
         open_network(str(published))
 
 
-@pytest.mark.parametrize("size", [0, 7, 8, 1000])
+@for_each("size", [0, 7, 8, 1000])
 def test_a_truncated_file_is_refused(ours: Path, size: int) -> None:
     path = ours / WEIGHTS_NAME
     path.write_bytes(path.read_bytes()[:size])

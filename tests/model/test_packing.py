@@ -11,6 +11,7 @@ from model import encoded_scene
 from model.packing import pack_lengths, packed
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneBatch, batch_scenes
+from tests.for_each import for_each
 from tests.model.kit import FAMILIES, RESOLUTION, awake, random_scene, tiny_config
 
 LENGTHS = (5, 9, 1)
@@ -28,7 +29,7 @@ def _results(model: RenderFormer, batch: SceneBatch) -> dict[str, Tensor]:
     return {"picture": picture.detach(), **{k: v for k, v in weights.items() if v is not None}}
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@for_each("family", FAMILIES)
 def test_a_packed_batch_is_the_padded_one(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
     model, batch = awake(tiny_config(family)), _batch()
     padded = _results(model, batch)

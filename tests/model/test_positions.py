@@ -2,7 +2,6 @@
 
 import math
 
-import pytest
 import torch
 
 from model.positions import (
@@ -13,10 +12,11 @@ from model.positions import (
     rotate,
     to_camera,
 )
+from tests.for_each import for_each
 from tests.model.kit import random_scene
 
 
-@pytest.mark.parametrize("num_freqs", [1, 2, 3, 6])
+@for_each("num_freqs", [1, 2, 3, 6])
 def test_products_of_rotated_vectors_depend_on_the_difference_of_positions(num_freqs: int) -> None:
     rotary = TriangleRotary(num_freqs=num_freqs, max_freq=5.0, head_width=128).double()
     generator = torch.Generator().manual_seed(0)
@@ -40,7 +40,7 @@ def test_angles_are_coordinate_times_frequency_coordinate_major() -> None:
     torch.testing.assert_close(sin[0, 0], torch.tensor(expected).sin(), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("num_freqs", "max_freq", "expected"),
     [
         (1, 5.0, [1.0]),

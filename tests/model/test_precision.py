@@ -9,10 +9,11 @@ from model.layer_errors import layer_errors, probe_batch, random_network
 from model.precision import rounded_parts, set_precision, tf32
 from model.scene_tensors import converted
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.model.kit import FAMILIES, awake, random_scene, render, tiny_config
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@for_each("family", FAMILIES)
 def test_bfloat16_rounds_the_layers_and_keeps_what_makes_tokens(family: str) -> None:
     model = set_precision(awake(tiny_config(family), torch.float32), "bfloat16")
     rounded = {id(weight) for part in rounded_parts(model) for weight in part.parameters()}
@@ -26,7 +27,7 @@ def test_bfloat16_rounds_the_layers_and_keeps_what_makes_tokens(family: str) -> 
     assert model.encoder.rotary.freqs_F.dtype == torch.float32
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@for_each("family", FAMILIES)
 def test_pictures_are_float32_and_near(family: str) -> None:
     exact = awake(tiny_config(family), torch.float32)
     scene = random_scene(9, dtype=torch.float32)
@@ -51,7 +52,7 @@ def test_positions_are_never_rounded() -> None:
     assert (pictures[0] - pictures[1]).abs().max() < 0.1 * pictures[0].std()
 
 
-@pytest.mark.parametrize("name", ["tf32", "float16"])
+@for_each("name", ["tf32", "float16"])
 def test_what_a_cpu_has_no_path_for_is_refused(name: str) -> None:
     with pytest.raises(TrilightError, match=f"precision {name}: the network is on cpu"):
         set_precision(awake(tiny_config(), torch.float32), name)

@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor
 
@@ -13,6 +12,7 @@ from model.projected import BEYOND, landed
 from model.renderformer import RenderFormer
 from model.scene_tensors import Cameras, SceneTensors, batch_scenes
 from storage.conventions import camera_rays
+from tests.for_each import for_each
 from tests.model.kit import RESOLUTION, awake, random_pose, random_scene, render, tiny_config
 
 TIGHT = 1e-11
@@ -64,7 +64,7 @@ def test_a_triangle_lands_at_the_mean_of_its_corners_and_none_far_outside() -> N
     torch.testing.assert_close(landing(scene, 8)[0], expected.double())
 
 
-@pytest.mark.parametrize("side", [-1.0, 1.0])
+@for_each("side", [-1.0, 1.0])
 def test_what_passes_the_camera_leaves_by_its_own_side_without_a_jump(side: float) -> None:
     """Just before, at and far behind the camera's plane it lands at one place beyond the border."""
     depths = torch.tensor([1e-2, 1e-3, 0.0, -1e-3, -1.0, -1e6], dtype=torch.float64)
@@ -97,7 +97,7 @@ def test_wider_pictures_shift_nothing_in_units_of_the_picture() -> None:
     torch.testing.assert_close(fine[inside], 2 * coarse[inside], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("config", KINDS.values(), ids=KINDS.keys())
+@for_each("config", KINDS.values())
 def test_laws_of_the_network_hold_with_projected_positions(config: ModelConfig) -> None:
     model = awake(config)
     short, long = random_scene(5, seed=1), random_scene(19, seed=2)
@@ -157,7 +157,7 @@ def test_projected_positions_change_the_picture_and_no_other_weight() -> None:
     assert (render(plain, scene) - render(projected, scene)).abs().max() > 1e-3
 
 
-@pytest.mark.parametrize("config", KINDS.values(), ids=KINDS.keys())
+@for_each("config", KINDS.values())
 def test_gradients_are_finite_around_and_behind_the_camera(config: ModelConfig) -> None:
     scene = random_scene(12, num_views=1, dtype=torch.float32)
     eye = scene.c2w_V44[0, :3, 3]
@@ -201,7 +201,7 @@ def test_empty_bundles_are_skipped_with_their_own_places() -> None:
     assert 0 < black < 1 and torch.isfinite(some).all()
 
 
-@pytest.mark.parametrize(("window", "width"), [(0, 12), (2, 24)])
+@for_each(("window", "width"), [(0, 12), (2, 24)])
 def test_pictures_of_four_pixel_bundles_are_multiples_of_them(window: int, width: int) -> None:
     config = dataclasses.replace(PROJECTED, patch_px=4, window_bundles=window)
     assert config.picture_px == 4 * max(1, window)

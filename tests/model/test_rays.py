@@ -1,16 +1,16 @@
 """Laws of rays: they are those of storage.conventions, and bundling loses nothing."""
 
 import numpy as np
-import pytest
 import torch
 
 from model.rays import bundle_rays, ray_directions, unbundle
 from storage.conventions import camera_rays
 from storage.seeds import rng_for
+from tests.for_each import for_each
 
 
-@pytest.mark.parametrize("resolution", [8, 24, 256])
-@pytest.mark.parametrize("fov_deg", [1.0, 30.0, 45.0, 60.0, 170.0])
+@for_each("resolution", [8, 24, 256])
+@for_each("fov_deg", [1.0, 30.0, 45.0, 60.0, 170.0])
 def test_rays_agree_with_the_conventions(resolution: int, fov_deg: float) -> None:
     _, expected = camera_rays(np.eye(4), fov_deg, resolution)
     fov = torch.tensor(fov_deg, dtype=torch.float64)

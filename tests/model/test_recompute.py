@@ -1,13 +1,13 @@
 """Recomputing activations changes what is kept, and nothing else."""
 
-import pytest
 import torch
 
 from model.scene_tensors import batch_scenes
+from tests.for_each import for_each
 from tests.model.kit import FAMILIES, RESOLUTION, awake, random_scene, tiny_config
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@for_each("family", FAMILIES)
 def test_gradients_are_the_same_bit_by_bit(family: str) -> None:
     model = awake(tiny_config(family))
     batch = batch_scenes([random_scene(3, seed=1), random_scene(5, seed=2)])

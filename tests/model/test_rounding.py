@@ -6,11 +6,12 @@ from torch import Tensor
 
 from model import rounding
 from model.scene_tensors import batch_scenes
+from tests.for_each import for_each
 from tests.model.kit import RESOLUTION, awake, random_scene, tiny_config
 
 
-@pytest.mark.parametrize("recompute", [False, True])
-@pytest.mark.parametrize("family", ["linear", "dpt"])
+@for_each("recompute", [False, True])
+@for_each("family", ["linear", "dpt"])
 def test_rounding_together_changes_no_bit(
     family: str, recompute: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

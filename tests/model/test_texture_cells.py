@@ -17,9 +17,9 @@ from model.scene_tensors import with_cells as with_own_cells
 from model.texture_cells import CHANNELS, TextureCells, texture_cells
 from model.weights import decode_weights, encode_weights
 from storage.errors import TrilightError
-from storage.records.lookup import texture_values
 from storage.records.scene_maps import MAX_UV
 from storage.records.texture import CONSTANT, Texture
+from tests.for_each import for_each
 from tests.model.hits.kit import corner, textured
 from tests.model.kit import awake, render, tiny_config
 from train.data.augment import with_channels, with_vertices_turned
@@ -49,24 +49,8 @@ def _whole(cells: TextureCells) -> NDArray[np.float64]:
     return (cells.mean_KC[..., None, None].double() + cells.apart_KCPP.double()).numpy()
 
 
-def _twin(
-    texture: Texture, uv_32: NDArray, row: int, column: int, cells: int, fine: int = 48
-) -> NDArray:
-    """Return the mean over one cell's part of a triangle, by many lookups one after the other."""
-    total, count = np.zeros(texture.channels), 0
-    for i in range(fine):
-        for j in range(fine):
-            second, first = (row + (i + 0.5) / fine) / cells, (column + (j + 0.5) / fine) / cells
-            if first + second < 1:
-                uv = first * uv_32[0] + second * uv_32[1] + (1 - first - second) * uv_32[2]
-                value = texture_values(texture, uv)
-                total += np.square(value) if texture.channels == 1 else value
-                count += 1
-    return np.sqrt(total / count) if texture.channels == 1 else total / count
-
-
-@pytest.mark.parametrize("cells_a_side", [1, 4, 8, 32])
-@pytest.mark.parametrize("size", [0.002, 0.03, 0.5])
+@for_each("cells_a_side", [1, 4, 8, 32])
+@for_each("size", [0.002, 0.03, 0.5])
 def test_cells_of_a_ramp_are_its_analytic_means(cells_a_side: int, size: float) -> None:
     ramp = (np.arange(64) + 0.5) / 64
     texels = np.stack(np.broadcast_arrays(ramp, ramp[:, None], 0.25), axis=-1)
@@ -81,34 +65,6 @@ def test_cells_of_a_ramp_are_its_analytic_means(cells_a_side: int, size: float) 
             # Texels and coordinates are float32: 6e-8 of 0.75, a few times.
             assert np.abs(found[0, 0:2, row, column] - middle).max() < 3e-7
             assert np.abs(found[0, 2:7, row, column] - [0.25, 0.3, 0.3, 0.3, 0.3]).max() < 1e-7
-
-
-@pytest.mark.parametrize("place", [0, 2])
-def test_cells_are_means_over_their_part_of_the_triangle(place: int) -> None:
-    """Beside a slow twin that reads the full map at thousands of places."""
-    rng = np.random.default_rng(3)
-    channels = 1 if place == 2 else 3
-    texture = Texture(texels=rng.uniform(0.1, 1, (32, 16, channels)).astype(np.float32))
-    uv = np.array(
-        [
-            [[1.4, -0.1], [-0.3, 0.8], [0.1, 0.1]],
-            [[0.3, 0.2], [0.25, 0.27], [0.2, 0.2]],
-        ],
-        np.float32,
-    )
-    textures = _textures(texture, uv, place)
-    part = slice(6, 7) if place == 2 else slice(0, 3)
-    found = _whole(_found(textures, 4))[:, part]
-    for triangle in range(2):
-        for row in range(4):
-            for column in range(4 - row):
-                expected = _twin(texture, uv[triangle], row, column, 4)
-                # 10 to 16 lookups of a cell of up to 7 x 7 independent texels, whose own spread is
-                # 0.26. Roughness is squared before it is interpolated here, and after it there.
-                most = 0.06 if place == 2 else 0.04
-                assert np.abs(found[triangle, :, row, column] - expected).max() < most
-    apart = np.ptp(found[0, 0][np.add.outer(np.arange(4), np.arange(4)) < 4])
-    assert apart > 0.1
 
 
 def test_cells_beyond_the_longest_side_say_nothing() -> None:
@@ -129,7 +85,7 @@ def test_the_mean_of_a_triangle_is_that_of_its_cells_by_area() -> None:
     assert np.abs((apart * area).sum(axis=(1, 2)) / area.sum()).max() < 1e-7  # float32
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("texels", "uv"),
     [
         (np.ones((1, 1, 3), np.float32), [[0, 0], [1, 0], [0, 1]]),
@@ -141,16 +97,15 @@ def test_a_constant_texture_has_no_cells(texels: Cells, uv: list[list[float]]) -
     assert texture_cells(textures, np.ones((1, CHANNELS), np.float32), 4) is None
 
 
-@pytest.mark.parametrize(
+@for_each(
     "uv",
     [
         [[0.3, 0.3]] * 3,
         [[0.1, 0.1], [0.9, 0.9], [0.5, 0.5]],
         [[MAX_UV, -MAX_UV], [-MAX_UV, MAX_UV], [MAX_UV, MAX_UV]],
     ],
-    ids=["a point", "a line", "the farthest"],
 )
-@pytest.mark.parametrize("sides", [(2, 1), (3, 5), (64, 64)])
+@for_each("sides", [(2, 1), (3, 5), (64, 64)])
 def test_folded_and_far_coordinates_are_read(uv: list[list[float]], sides: tuple[int, int]) -> None:
     texels = np.random.default_rng(0).uniform(size=(*sides, 3)).astype(np.float32)
     cells = _found(_textures(Texture(texels=texels), [uv]), 8)
@@ -262,7 +217,7 @@ def test_cells_learn() -> None:
     assert gradient is not None and gradient.abs().max() > 0
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("changes", "message"),
     [
         ({"texture_cells": 65}, "texture_cells is 65; expected a whole number from 0 to 64"),

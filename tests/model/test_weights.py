@@ -10,10 +10,11 @@ from torch import Tensor
 from model.weights import CONFIG_KEY, TrainedRange, decode_weights, encode_config, encode_weights
 from storage.errors import TrilightError
 from storage.records.safe_read import safetensors_header
+from tests.for_each import for_each
 from tests.model.kit import awake, tiny_config
 
 
-@pytest.mark.parametrize("head", ["linear", "dpt"])
+@for_each("head", ["linear", "dpt"])
 def test_round_trip_is_exact_and_reproducible(head: str) -> None:
     model = awake(tiny_config(head), torch.float32)
     data = encode_weights(model)
@@ -37,7 +38,7 @@ def with_stranger(tensors: dict[str, Tensor]) -> None:
     tensors["stranger"] = torch.zeros(3)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("change", "message"),
     [
         (without_first, r"decoder.token_W is missing, expected \(48,\)"),
@@ -55,7 +56,7 @@ def test_wrong_tensors_are_listed(
         decode_weights(save(tensors, metadata={CONFIG_KEY: encode_config(config)}))
 
 
-@pytest.mark.parametrize(
+@for_each(
     "data",
     [
         b"",
@@ -64,7 +65,6 @@ def test_wrong_tensors_are_listed(
         save({"a": torch.zeros(1)}, metadata={CONFIG_KEY: "{}"}),
         save({"a": torch.zeros(1)}, metadata={CONFIG_KEY: "[1]"}),
     ],
-    ids=["empty", "zip", "no config", "empty config", "no object"],
 )
 def test_other_files_are_refused(data: bytes) -> None:
     with pytest.raises(TrilightError):

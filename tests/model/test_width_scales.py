@@ -11,6 +11,7 @@ from model.config import SIZES, ModelConfig, hits_smoke, smoke
 from model.renderformer import RenderFormer
 from model.width_scales import WidthScale, scale_start, width_scales
 from storage.errors import TrilightError
+from tests.for_each import for_each
 
 BASE = BaseWidths(width=128)
 
@@ -32,12 +33,12 @@ def wider(config: ModelConfig, times: int) -> ModelConfig:
     )
 
 
-@pytest.mark.parametrize("name", sorted(SIZES))
+@for_each("name", sorted(SIZES))
 def test_without_a_base_width_nothing_follows_the_width(name: str) -> None:
     assert set(width_scales(made(SIZES[name]()), BaseWidths()).values()) == {WidthScale()}
 
 
-@pytest.mark.parametrize("config", [smoke(), hits_smoke()], ids=["bundles", "hits"])
+@for_each("config", [smoke(), hits_smoke()])
 def test_at_the_base_width_all_is_as_it_is(config: ModelConfig) -> None:
     assert set(width_scales(made(config), BASE).values()) == {WidthScale()}
 
@@ -107,7 +108,7 @@ def test_weights_start_as_large_as_their_rule_says() -> None:
     assert spread("decoder.head.last.weight") == 0
 
 
-@pytest.mark.parametrize("name", ["tiny", "small", "large", "hits-base"])
+@for_each("name", ["tiny", "small", "large", "hits-base"])
 def test_every_size_has_a_network_at_the_base_width(name: str) -> None:
     config = SIZES[name]()
     at_base = BASE.of(config)

@@ -3,12 +3,12 @@
 In value and gradient.
 """
 
-import pytest
 import torch
 from torch import Tensor
 
 from model.layers import SelfAttention
 from model.windows import attend_in_windows, cut_windows
+from tests.for_each import for_each
 from tests.model.attention_reference import attend_reference
 
 CPU = torch.device("cpu")
@@ -40,8 +40,8 @@ def rolled_and_masked(q: Tensor, k: Tensor, v: Tensor, width: int, shifted: bool
     return result.roll((shift, shift), dims=(2, 3)).flatten(2, 3)
 
 
-@pytest.mark.parametrize("shifted", [False, True])
-@pytest.mark.parametrize(("side", "width"), [(8, 8), (16, 8), (24, 8), (4, 2), (2, 2)])
+@for_each("shifted", [False, True])
+@for_each(("side", "width"), [(8, 8), (16, 8), (24, 8), (4, 2), (2, 2)])
 def test_windows_are_those_of_the_roll(side: int, width: int, shifted: bool) -> None:
     generator = torch.Generator().manual_seed(side)
     shape = (2, 3, side**2, 4)
@@ -73,7 +73,7 @@ def test_a_shifted_cut_has_whole_windows_strips_and_corners() -> None:
     assert torch.equal(windows.order_Q[windows.back_Q], torch.arange(24**2))
 
 
-@pytest.mark.parametrize("shifted", [False, True])
+@for_each("shifted", [False, True])
 def test_a_bundle_reaches_its_own_window_only(shifted: bool) -> None:
     layer = SelfAttention(8, 2).double()
     windows = cut_windows(8, 4, shifted=shifted, device=CPU)

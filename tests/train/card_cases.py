@@ -1,32 +1,20 @@
 """What is done on the fake card (fake_card), in a process of its own; each function is one case."""
 
 import dataclasses
-import functools
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
-from torch.nn.modules.module import register_module_forward_pre_hook
 
-from model.config import SIZES
-from model.layers import Norm
 from model.neural_renderer import NeuralRenderer
 from model.open import save_published
 from model.renderformer import RenderFormer
 from storage.dataset.training_data import open_training_data
-from tests.command_line import trilight
 from tests.train.fake_card import CARD, fake_card
-from tests.train.toy import toy_sample, toy_scene
-from train.data.buckets import make_batch
-from train.data.scenes import training_scene
+from tests.train.toy import toy_scene
 from train.evaluation.evaluate import Contest, judged_views
-from train.loop.checkpoints import save_checkpoint
 from train.loop.crew import Crew
-from train.loop.state import new_state
-from train.loop.step import predicted
 from train.loss.lpips import load_lpips
 from train.run import train_run
 from train.runs import changed_run
@@ -100,51 +88,6 @@ def resume(data: str, lpips: str, out: Path) -> None:
     for name in ("first", "second"):
         record = json.loads((out / name / "settings.json").read_text())
         assert record["muon_precision"] == "bfloat16"
-
-
-def evaluate_command(data: str, lpips: str, out: Path) -> dict[str, set[str]]:
-    """Run `trilight evaluate`, and return on which devices network and LPIPS were asked."""
-    asked: dict[str, set[str]] = {"RenderFormer": set(), "Lpips": set()}
-
-    def note(module: nn.Module, inputs: tuple[Any, ...]) -> None:
-        if type(module).__name__ in asked:
-            asked[type(module).__name__].add(next(module.buffers()).device.type)
-
-    settings, network = one_step_of("smoke", "smoke"), out / "checkpoint.safetensors"
-    save_checkpoint(network, new_state(settings), settings, data_digest="", world_size=1)
-    arguments = ["evaluate", network, "--data", data, "--split", "validation", "--out", out]
-    with fake_card(), register_module_forward_pre_hook(note):
-        result = trilight([*map(str, arguments), "--lpips", lpips])
-        if result.exception is not None:
-            raise result.exception
-    return asked
-
-
-def types_on_the_card(size: str) -> dict[str, str]:
-    """Return `types_under_autocast` of a network on the card."""
-    with fake_card():
-        return types_under_autocast(RenderFormer(SIZES[size]()).to(CARD))
-
-
-def types_under_autocast(network: RenderFormer) -> dict[str, str]:
-    """Return the types of what modules return while training in bfloat16, by name.
-
-    A norm is `kept` where it returns the type that it was given.
-    """
-    found: dict[str, str] = {}
-
-    def note(name: str, module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-        kept = isinstance(module, Norm) and output.dtype == inputs[0].dtype
-        found[name] = "kept" if kept else str(output.dtype).removeprefix("torch.")
-
-    for name, module in network.named_modules():
-        if isinstance(module, Norm | nn.Linear | nn.Conv2d):
-            module.register_forward_hook(functools.partial(note, name))
-    device = network.decoder.token_W.device
-    batch = make_batch([training_scene(toy_sample(row, resolution=64), 64) for row in (0, 1)])
-    picture = predicted(network, batch.to(device), RESOLUTION, "bfloat16")
-    found["picture"] = str(picture.dtype).removeprefix("torch.")
-    return found
 
 
 def mixed_on_the_card(name: str) -> None:

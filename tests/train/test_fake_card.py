@@ -1,44 +1,32 @@
-"""Every named run takes its step on a graphics card, and every named size, without a card.
+"""A step of each kind of network on a graphics card that is not there (fake_card).
 
-On tensors without numbers (fake_card): forward, loss with LPIPS, backward, clipping, AdamW and
-Muon, running mean, validation, evaluation, checkpoint, export. No processor can show what these
-show: a module that stayed behind, a norm that answers in another type there.
+On tensors without numbers: forward, loss with LPIPS, backward, clipping, Muon, running mean,
+validation, evaluation, checkpoint, export. A module that stayed behind shows here alone.
 """
 
+import re
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
 import torch
 
-from model.config import SIZES
-from model.renderformer import RenderFormer
+from tests.for_each import for_each
 from tests.train import card_cases
+from tests.train.fake_card import card_process
 from tests.train.loss.test_lpips import small_weights
 from tests.train.toy import write_toy_dataset
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE
-from train.runs import RUNS
 
-PLAIN = ("smoke", "tiny", "small", "base", "large")
-CASES = {
-    "smoke": PLAIN, "pretrain": PLAIN, "builtin": ("smoke",), "finetune": ("base",),
-    "paper-pretrain": ("smoke", "base"), "paper-finetune": ("base",),
-    "paper-pretrain-large": ("large",), "paper-finetune-large": ("large",),
-    "hits": ("hits-smoke", "hits-base"), "hits-tokens": ("hits-smoke",), "hits-256": ("hits-base",),
-}  # fmt: skip
-"""Every run at its own size, and every size with AdamW (`smoke`) and with Muon (`pretrain`)."""
-
-QUICK = {
-    "smoke": "smoke", "builtin": "smoke", "paper-pretrain": "smoke", "pretrain": "tiny",
-    "hits": "hits-smoke",
-}  # fmt: skip
-"""Every kind of step. Second stages step as the first ones do, and `small` and `base` are a larger
-`tiny`; the windows of `large` take half a minute, and are with the slow tests."""
+pytestmark = pytest.mark.slow  # a process and a library of its own
 
 
-def test_every_run_and_every_size_is_among_the_cases() -> None:
-    assert set(CASES) == set(RUNS)
-    assert {size for sizes in CASES.values() for size in sizes} == set(SIZES)
+@pytest.fixture(scope="module")
+def card(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProcessPoolExecutor]:
+    """A process with a card that is not there."""
+    with card_process(tmp_path_factory.mktemp("card")) as process:
+        yield process
 
 
 @pytest.fixture(scope="module")
@@ -57,15 +45,8 @@ def lpips(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(folder)
 
 
-@pytest.mark.parametrize(
-    ("run", "size"),
-    [
-        pytest.param(run, size, marks=[] if QUICK.get(run) == size else pytest.mark.slow)
-        for run, sizes in CASES.items()
-        for size in sizes
-    ],
-)
-def test_every_run_of_every_size_works_on_a_card(
+@for_each(("run", "size"), [("pretrain", "smoke"), ("hits", "hits-smoke")])
+def test_each_view_stage_takes_its_step_on_a_card(
     run: str, size: str, card: ProcessPoolExecutor, data: str, lpips: str, tmp_path: Path
 ) -> None:
     card.submit(card_cases.train_and_judge, run, size, data, lpips, tmp_path).result()
@@ -77,41 +58,11 @@ def test_a_run_goes_on_and_a_second_one_begins_on_a_card(
     card.submit(card_cases.resume, data, lpips, tmp_path).result()
 
 
-@pytest.mark.slow  # a rival is traced as well
-def test_evaluate_has_everything_on_the_card(
-    card: ProcessPoolExecutor, data: str, lpips: str, tmp_path: Path
-) -> None:
-    asked = card.submit(card_cases.evaluate_command, data, lpips, tmp_path).result()
-    assert asked == {"RenderFormer": {"cuda"}, "Lpips": {"cuda"}}
-
-
-@pytest.mark.parametrize("size", ["smoke", "tiny"])
-@pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_bfloat16_rounds_neither_rays_nor_materials_nor_the_last_layers(
-    size: str, device: str, card: ProcessPoolExecutor
-) -> None:
-    """As model.precision says, with a linear head and with a DPT; norms keep the type they get."""
-    if device == "cuda":
-        types = card.submit(card_cases.types_on_the_card, size).result()
-    else:
-        types = card_cases.types_under_autocast(RenderFormer(SIZES[size]()))
-    exact = {"encoder.tokens.material", "encoder.tokens.normal", "decoder.rays"}
-    exact |= {"decoder.head.last"} | ({"decoder.head.widen"} if size == "tiny" else set())
-    assert {name: types[name] for name in exact} == dict.fromkeys(exact, "float32")
-    assert types["picture"] == "float32"
-    norms = {name: kind for name, kind in types.items() if name.endswith("norm")}
-    assert len(norms) > 10 and set(norms.values()) == {"kept"}
-    assert types["decoder.layers.0.ffn.down"] == "bfloat16", "and the layers are rounded"
-
-
-@pytest.mark.parametrize(
-    ("mistake", "message"),
-    [
-        ("processor", "Expected all tensors to be on the same device|two devices"),
-        ("numpy", "can't convert cuda:0"),
-        ("unique", "unique"),
-    ],
-)
-def test_the_card_forgives_nothing(mistake: str, message: str, card: ProcessPoolExecutor) -> None:
-    with pytest.raises(Exception, match=message):
-        card.submit(card_cases.mixed_on_the_card, mistake).result()
+def test_the_card_forgives_nothing(card: ProcessPoolExecutor) -> None:
+    for mistake, message in {
+        "processor": "Expected all tensors to be on the same device|two devices",
+        "numpy": "can't convert cuda:0",
+        "unique": "unique",
+    }.items():
+        error = card.submit(card_cases.mixed_on_the_card, mistake).exception()
+        assert error is not None and re.search(message, str(error)), mistake

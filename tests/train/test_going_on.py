@@ -8,6 +8,7 @@ import pytest
 
 from storage.errors import TrilightError
 from storage.settings.described import settings_record
+from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run
 from train.going_on import GoingOn, event_records, events_of, going_on
 from train.settings import AugmentationSettings, TrainSettings
@@ -64,7 +65,7 @@ def test_execution_is_free_and_noted() -> None:
     assert back.settings == tiny_run() and len(back.history) == 2 * len(EXECUTED)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("changes", "message"),
     [
         (
@@ -119,7 +120,7 @@ def test_a_decision_holds_from_its_step_and_is_not_typed_again() -> None:
     assert [event.step for event in last.history] == [8, 8, 10]
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("decisions", "message"),
     [
         (

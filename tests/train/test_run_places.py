@@ -1,5 +1,6 @@
 """A run from a server, or from a list, is the run from the folder."""
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,6 +23,9 @@ pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
 SHARDS_OF_THREE = ("train-000000.tar", "train-000001.tar")
 
 
+RUN = tiny_run(num_steps=8, validate_every=8)
+
+
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=7, validation=2, per_shard=3)
@@ -31,7 +35,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 def weights(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The weights of the run from the folder, uninterrupted."""
     out = tmp_path_factory.mktemp("whole")
-    return trained(tiny_run(), [str(dataset.folder.root)], out).folder.weights.read_bytes()
+    return trained(RUN, [str(dataset.folder.root)], out).folder.weights.read_bytes()
 
 
 @pytest.fixture
@@ -62,10 +66,10 @@ def test_a_run_begun_in_a_folder_goes_on_from_a_server(
     """In the middle of an epoch, over a bad line, with another number of threads."""
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
-        trained(tiny_run(), [str(dataset.folder.root)], out, progress=StopAt(7))
+        trained(RUN, [str(dataset.folder.root)], out, progress=StopAt(5))
     faults = [Fault(status=503), Fault(cut_after=5000), Fault(flip=True)]
     server.faults = {f"/train-{number:06d}.tar": list(faults) for number in range(3)}
-    result = trained(tiny_run(), [server.url], out, resume=True, workers=3)
+    result = trained(RUN, [server.url], out, resume=True, workers=3)
     assert result.folder.weights.read_bytes() == weights
     assert result.unusable == ()
 
@@ -75,7 +79,7 @@ def test_a_list_gives_the_same_weights_and_says_what_it_lacks(
 ) -> None:
     listener = StopAt(99)
     pattern = f"{server.url}/{{train-000000,train-000001,train-000002,validation-000000}}.tar"
-    result = trained(tiny_run(), [pattern], tmp_path / "out", progress=listener)
+    result = trained(RUN, [pattern], tmp_path / "out", progress=listener)
     # the header alone differs: without a manifest nobody knows how large the scenes may be
     ours, theirs = load(result.folder.weights.read_bytes()), load(weights)
     assert ours.keys() == theirs.keys() and all(torch.equal(ours[n], theirs[n]) for n in ours)
@@ -83,7 +87,7 @@ def test_a_list_gives_the_same_weights_and_says_what_it_lacks(
     assert lacks == NO_MANIFEST
     assert [note for note in others if "decode" not in note] == []  # how many threads do
     with pytest.raises(TrilightError, match=r"made with list:\w{12}\..* --change data=sha256:"):
-        trained(tiny_run(), [str(dataset.folder.root)], tmp_path / "out", resume=True)
+        trained(RUN, [str(dataset.folder.root)], tmp_path / "out", resume=True)
 
 
 def test_damaged_data_is_left_out_when_it_is_allowed(dataset: Dataset, tmp_path: Path) -> None:
@@ -94,8 +98,8 @@ def test_damaged_data_is_left_out_when_it_is_allowed(dataset: Dataset, tmp_path:
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
     with pytest.raises(TrilightError, match=r"train-000002\.tar.*sha256"):
-        trained(tiny_run(), [str(root)], tmp_path / "a")
-    result = trained(tiny_run(most_unusable=1), [str(root)], tmp_path / "b")
+        trained(RUN, [str(root)], tmp_path / "a")
+    result = trained(dataclasses.replace(RUN, most_unusable=1), [str(root)], tmp_path / "b")
     (message,) = result.unusable
     assert "train-000002.tar" in message
     assert message in result.folder.summary.read_text().replace("\\n", "\n")
@@ -115,10 +119,10 @@ def test_the_budget_of_damage_is_the_run_s_and_not_the_process_s(
         copied.folder.shard(name).write_bytes(data)
 
     first, second = SHARDS_OF_THREE
-    settings = tiny_run(most_unusable=3)
+    settings = dataclasses.replace(RUN, most_unusable=3)
     damage(first)
     with pytest.raises(KeyboardInterrupt):
-        trained(settings, [str(root)], out, progress=StopAt(7))
+        trained(settings, [str(root)], out, progress=StopAt(5))
     copied.folder.shard(first).write_bytes(whole[first])
     damage(second)
     with pytest.raises(TrilightError, match="6 samples are unusable; expected at most 3"):

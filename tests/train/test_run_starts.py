@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,7 @@ import torch
 from model.open import open_network
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import (
@@ -36,8 +39,8 @@ def run(settings: TrainSettings, dataset: Dataset, out: Path, start: Start) -> N
 def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) -> None:
     """With its configuration, whatever the run's own says, and resumes without naming it."""
     first = dataclasses.replace(TINY_MODEL, hidden_width=64)
-    run(tiny_run(model=first), dataset, tmp_path / "first", Start())
-    second = tiny_run(from_weights=True, learning_rate=1e-12, warmup_steps=0)
+    run(tiny_run(model=first, num_steps=4), dataset, tmp_path / "first", Start())
+    second = tiny_run(from_weights=True, learning_rate=1e-12, warmup_steps=0, num_steps=4)
     place = str(tmp_path / "first")
     run(second, dataset, tmp_path / "second", Start(begin_with=place))
     before, after = (open_network(tmp_path / name, network_of_run) for name in ("first", "second"))
@@ -46,9 +49,7 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
         # a learning rate of 1e-12 moves nothing that float32 shows but numbers near 0
         torch.testing.assert_close(weight, before.state_dict()[name], rtol=1e-6, atol=1e-10)
     run(second, dataset, tmp_path / "second", Start(resume=True))
-    with pytest.raises(
-        TrilightError, match="trained weights, and none are named; expected begin_with"
-    ):
+    with pytest.raises(TrilightError, match="weights, and none are named; expected begin_with"):
         run(second, dataset, tmp_path / "third", Start())
     with pytest.raises(TrilightError, match="or --set from_weights=true to begin with those"):
         run(tiny_run(), dataset, tmp_path / "third", Start(begin_with=place))
@@ -63,19 +64,27 @@ def test_a_run_without_the_weights_it_asks_for_does_not_begin(
     with pytest.raises(TrilightError, match="--set loss.perceptual=ms_ssim or none"):
         run(tiny_run(loss=LossSettings(perceptual="lpips")), dataset, tmp_path, Start())
     assert not list(tmp_path.iterdir())
-    other = tiny_run(loss=LossSettings(perceptual="ms_ssim"), num_steps=4)
+    other = tiny_run(loss=LossSettings(perceptual="ms_ssim"), num_steps=3)
     run(other, dataset, tmp_path, Start())
 
 
 def test_a_dead_start_is_said_early_and_once(dataset: Dataset, tmp_path: Path) -> None:
     """A learning rate of nearly nothing leaves the black start black."""
-    dead = tiny_run(num_steps=60, warmup_steps=2, learning_rate=1e-12, checkpoint_every=60)
+    small = tiny_run(
+        num_steps=54,
+        warmup_steps=2,
+        resolution=8,
+        scenes_per_step=1,
+        views_per_scene=1,
+        validate_every=54,
+        checkpoint_every=54,
+    )
+    dead = dataclasses.replace(small, learning_rate=1e-12)
     with pytest.raises(TrilightError, match=r"collapsed at the start: after 52 steps .*--resume"):
         run(dead, dataset, tmp_path / "dead", Start())
     assert saved_steps((tmp_path / "dead") / "checkpoints") == [52]
     run(dead, dataset, tmp_path / "dead", Start(resume=True))
-    alive = tiny_run(num_steps=60, warmup_steps=2, checkpoint_every=60)
-    run(alive, dataset, tmp_path / "alive", Start())
+    run(small, dataset, tmp_path / "alive", Start())
 
 
 def have_bfloat16(patch: pytest.MonkeyPatch, quick: bool) -> None:
@@ -83,31 +92,37 @@ def have_bfloat16(patch: pytest.MonkeyPatch, quick: bool) -> None:
     patch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: quick)
 
 
-@pytest.mark.parametrize(("muon_rate", "quick"), [(0.0, True), (3.0, True), (3.0, False)])
+class StopAfterEachStep(TrainProgress):
+    """A scheduler whose time is up after one step."""
+
+    def advance(self, **_: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+@for_each("quick", [True, False])
 def test_resumed_after_every_step_is_uninterrupted(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, muon_rate: float, quick: bool
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick: bool
 ) -> None:
-    """With a running mean, every symmetry that toy scenes have, and a perceptual term."""
+    """With Muon, a running mean, every symmetry that toy scenes have, and a perceptual term.
+
+    AdamW alone is in test_run.
+    """
     have_bfloat16(monkeypatch, quick)
     settings = tiny_run(
-        num_steps=6,
+        num_steps=4,
         ema_decay=0.9,
-        muon_rate=muon_rate,
+        muon_rate=3.0,
         loss=LossSettings(perceptual="ms_ssim", noise_half=0.01),
         log_every=1,
-        validate_every=6,
-        checkpoint_every=1,
-        checkpoints_kept=9,
+        validate_every=4,
     )
-    whole = trained(settings, [str(dataset.folder.root)], tmp_path / "whole")
-    weights = whole.folder.weights.read_bytes()
-    for step in range(1, 6):
-        out = tmp_path / str(step)
-        (out / "checkpoints").mkdir(parents=True)
-        name = f"step-{step:09d}.safetensors"
-        (out / "checkpoints" / name).write_bytes((whole.folder.checkpoints / name).read_bytes())
-        again = trained(settings, [str(dataset.folder.root)], out, resume=True)
-        assert again.folder.weights.read_bytes() == weights, step
+    data, out = [str(dataset.folder.root)], tmp_path / "stopped"
+    whole = trained(settings, data, tmp_path / "whole")
+    for step in (1, 2, 3):
+        with pytest.raises(TrilightError, match=f"stopped at step {step} "):
+            trained(settings, data, out, resume=step > 1, progress=StopAfterEachStep())
+    again = trained(settings, data, out, resume=True)
+    assert again.folder.weights.read_bytes() == whole.folder.weights.read_bytes()
 
 
 def test_lights_that_are_not_apart_cannot_be_mixed(dataset: Dataset, tmp_path: Path) -> None:
@@ -127,10 +142,9 @@ class Notes(TrainProgress):
 def test_a_run_goes_on_past_a_damaged_checkpoint_to_the_same_weights(
     dataset: Dataset, tmp_path: Path
 ) -> None:
-    settings, data = tiny_run(checkpoints_kept=3), [str(dataset.folder.root)]
+    settings, data = tiny_run(num_steps=8, checkpoints_kept=3), [str(dataset.folder.root)]
     whole = trained(settings, data, tmp_path)
-    weights, newest = whole.folder.weights.read_bytes(), whole.folder.checkpoints
-    path = newest / "step-000000012.safetensors"
+    weights, path = whole.folder.weights.read_bytes(), path_of_step(whole.folder.checkpoints, 8)
     damaged = bytearray(path.read_bytes())
     damaged[-4] ^= 4
     path.write_bytes(damaged)
@@ -154,10 +168,10 @@ def test_a_network_with_windows_is_trained(dataset: Dataset, tmp_path: Path) -> 
         dpt_channels=(4, 4, 4, 4),
         dpt_taps=(0, 1, 0, 1),
     )
-    settings = tiny_run(model=model, resolution=32, num_steps=40, learning_rate=5e-3)
+    settings = tiny_run(model=model, resolution=32, num_steps=20, learning_rate=5e-3)
     result = trained(settings, [str(dataset.folder.root)], tmp_path)
-    # 0.61 and 0.79 of it with two seeds
-    assert result.skipped_steps == 0 and result.loss_at_end < 0.9 * result.loss_at_start
+    # 0.80 and 0.88 of it with two seeds
+    assert result.skipped_steps == 0 and result.loss_at_end < 0.95 * result.loss_at_start
 
 
 def test_muon_goes_on_in_another_precision_on_another_processor(

@@ -10,11 +10,12 @@ from model.config import SIZES, large
 from storage.errors import TrilightError
 from storage.settings.changes import changed
 from storage.settings.described import settings_record
+from tests.for_each import for_each
 from tests.train.kit import tiny_run
 from train.runs import RUNS, changed_run, in_proportion, named_run
 
 
-@pytest.mark.parametrize("name", sorted(RUNS))
+@for_each("name", sorted(RUNS))
 def test_named_runs_carry_their_name_and_survive_json(name: str) -> None:
     settings = named_run(name)
     assert settings.run == name
@@ -30,7 +31,7 @@ def test_an_unknown_run_is_refused_with_the_known_ones() -> None:
         named_run("smoek")
 
 
-@pytest.mark.parametrize("name", sorted(RUNS))
+@for_each("name", sorted(RUNS))
 def test_fewer_steps_bring_their_warm_up_and_intervals_along(name: str) -> None:
     """So that any number of steps is a run that is logged, judged and saved as the whole one is."""
     run = named_run(name)
@@ -67,7 +68,7 @@ def test_what_is_stated_is_not_brought_along() -> None:
         changed_run("pretrain", {"log_every": "often"}, steps=24)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("changes", "message"),
     [
         ({"resolution": 20}, "resolution is 20; expected a multiple of 8"),

@@ -1,7 +1,9 @@
 """Every way on of docs/how-to/carry-on-a-run.md, tried: what stopped a run, and what goes on."""
 
+import dataclasses
 import json
 import math
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,11 +15,13 @@ from torch import Tensor
 from model.open import open_network
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.train.data.test_unusable import BAD_KEY, spoil_sample
 from tests.train.kit import tiny_run
 from tests.train.toy import write_toy_dataset
 from train import run as run_module
 from train.data.buckets import TrainingBatch
+from train.folder import RunFolder
 from train.loop import step as step_module
 from train.loop.checkpoints import network_of_run, path_of_step, read_checkpoint, saved_steps
 from train.loop.recorder import read_rows
@@ -61,7 +65,9 @@ def wsd(**changes: Any) -> TrainSettings:
     few = {
         "schedule": "wsd",
         "ema_decay": 0.9,
-        "num_steps": 10,
+        "num_steps": 5,
+        "warmup_steps": 1,
+        "log_every": 1,
         "validate_every": 1000,
         "checkpoint_every": 4,
         "validation_scenes": 1,
@@ -82,26 +88,41 @@ def apart(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
     return sum(float((one[name] - other[name]).square().sum()) for name in one) ** 0.5
 
 
-def test_an_extended_run_is_a_longer_one_to_the_bit(dataset: Dataset, tmp_path: Path) -> None:
+SHORT = wsd(checkpoints_kept=1, checkpoint_every=3)
+
+
+@pytest.fixture(scope="module")
+def short(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A finished run of five steps whose rate falls after the fourth; to be copied."""
+    return run(SHORT, dataset, tmp_path_factory.mktemp("short")).folder
+
+
+def copied(short: RunFolder, out: Path) -> Path:
+    shutil.copytree(short.root, out, dirs_exist_ok=True)
+    return out
+
+
+def test_an_extended_run_is_a_longer_one_to_the_bit(
+    dataset: Dataset, short: RunFolder, tmp_path: Path
+) -> None:
     """From where the short one's decay begins, which is kept for it; and the short one is whole."""
-    long = run(wsd(num_steps=20), dataset, tmp_path / "long")
-    short = run(wsd(checkpoints_kept=1, checkpoint_every=6), dataset, tmp_path / "short")
-    assert saved_steps(short.folder.checkpoints) == [8, 10]
-    begins = path_of_step(short.folder.checkpoints, 8)
-    whole = read_checkpoint(path_of_step(long.folder.checkpoints, 16)).arrays
+    long = run(wsd(num_steps=10), dataset, tmp_path / "long")
+    assert saved_steps(short.checkpoints) == [4, 5]
+    begins = path_of_step(short.checkpoints, 4)
+    whole = read_checkpoint(path_of_step(long.folder.checkpoints, 8)).arrays
     extended = run(
-        wsd(checkpoints_kept=1, checkpoint_every=6),
+        SHORT,
         dataset,
         tmp_path / "extended",
         branch=str(begins),
-        decisions={"num_steps": 20},
+        decisions={"num_steps": 10},
     )
-    ours = read_checkpoint(path_of_step(extended.folder.checkpoints, 16)).arrays
+    ours = read_checkpoint(path_of_step(extended.folder.checkpoints, 8)).arrays
     assert ours.keys() == whole.keys()
     assert all((ours[name] == whole[name]).all() for name in whole), "weights, mean and memories"
     # it decays where the longer one does, so the rest is the same too
     assert extended.folder.weights.read_bytes() == long.folder.weights.read_bytes()
-    assert short.folder.weights.read_bytes() != long.folder.weights.read_bytes()
+    assert short.weights.read_bytes() != long.folder.weights.read_bytes()
     logs = [read_rows(each.folder.metrics) for each in (extended, long)]
     losses = [[(row["step"], row.get("loss")) for row in rows if "loss" in row] for rows in logs]
     assert losses[0] == losses[1], "the branch has the log of the run that it left"
@@ -111,26 +132,28 @@ def test_an_extended_run_is_a_longer_one_to_the_bit(dataset: Dataset, tmp_path: 
     ]
     assert extended.history[1].after == {
         "run": "tiny",
-        "step": 8,
+        "step": 4,
         "sha256": read_checkpoint(begins).header["sha256"],
     }
 
 
-def test_a_finished_run_made_longer_in_its_own_folder(dataset: Dataset, tmp_path: Path) -> None:
+def test_a_finished_run_made_longer_in_its_own_folder(
+    dataset: Dataset, short: RunFolder, tmp_path: Path
+) -> None:
     """Its rate rises again, which is said; the decision is on disk, in the summary, and stays."""
-    run(wsd(), dataset, tmp_path)
-    with pytest.raises(TrilightError, match="num_steps is 14, but the checkpoint was made with 10"):
-        run(wsd(num_steps=14), dataset, tmp_path, resume=True)
+    copied(short, tmp_path)
+    with pytest.raises(TrilightError, match="num_steps is 7, but the checkpoint was made with 5"):
+        run(dataclasses.replace(SHORT, num_steps=7), dataset, tmp_path, resume=True)
     notes = Notes()
-    longer = run(wsd(), dataset, tmp_path, resume=True, decisions={"num_steps": 14}, progress=notes)
-    assert longer.num_steps == 14
-    assert any("the rate had been falling since step 8" in text for text in notes.texts)
-    recorded = {"step": 10, "kind": "meaning", "name": "num_steps", "before": 10, "after": 14}
+    longer = run(SHORT, dataset, tmp_path, resume=True, decisions={"num_steps": 7}, progress=notes)
+    assert longer.num_steps == 7
+    assert any("the rate had been falling since step 4" in text for text in notes.texts)
+    recorded = {"step": 5, "kind": "meaning", "name": "num_steps", "before": 5, "after": 7}
     record = json.loads(longer.folder.settings.read_text())
-    assert record["settings"]["num_steps"] == 14 and record["history"] == [recorded]
+    assert record["settings"]["num_steps"] == 7 and record["history"] == [recorded]
     assert json.loads(longer.folder.summary.read_text())["history"] == [recorded]
-    again = run(wsd(), dataset, tmp_path, resume=True)
-    assert again.num_steps == 14, "the command that began it goes on with what was decided"
+    again = run(SHORT, dataset, tmp_path, resume=True)
+    assert again.num_steps == 7, "the command that began it goes on with what was decided"
 
 
 class Killed(BaseException):
@@ -142,25 +165,25 @@ class KilledAtOnce(Notes):
         raise Killed
 
 
-def test_a_kill_forgets_no_decision(dataset: Dataset, tmp_path: Path) -> None:
-    run(wsd(), dataset, tmp_path)
-    path_of_step(tmp_path / "checkpoints", 10).unlink()
+def test_a_kill_forgets_no_decision(dataset: Dataset, short: RunFolder, tmp_path: Path) -> None:
+    copied(short, tmp_path)
+    path_of_step(tmp_path / "checkpoints", 5).unlink()
     with pytest.raises(Killed):
-        run(wsd(), dataset, tmp_path, resume=True, decisions={"seed": 5}, progress=KilledAtOnce())
-    again = run(wsd(), dataset, tmp_path, resume=True)
-    assert [(event.step, event.name, event.after) for event in again.history] == [(8, "seed", 5)]
+        run(SHORT, dataset, tmp_path, resume=True, decisions={"seed": 5}, progress=KilledAtOnce())
+    again = run(SHORT, dataset, tmp_path, resume=True)
+    assert [(event.step, event.name, event.after) for event in again.history] == [(4, "seed", 5)]
 
 
 def test_too_little_memory_goes_on_with_fewer_scenes_a_pass(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = wsd(scenes_per_step=4, checkpoints_kept=9)
+    settings = wsd(num_steps=6, scenes_per_step=4, checkpoint_every=2, checkpoints_kept=9)
     run(settings, dataset, tmp_path / "whole")
     original, steps = step_module.predicted, [0]
 
     def small_card(net: Any, batch: TrainingBatch, *rest: Any) -> Tensor:
         steps[0] += 1
-        if steps[0] > 10 and len(batch.target_BVRR3) > 1:
+        if steps[0] > 6 and len(batch.target_BVRR3) > 1:
             raise torch.OutOfMemoryError("CUDA out of memory")
         return original(net, batch, *rest)
 
@@ -168,7 +191,7 @@ def test_too_little_memory_goes_on_with_fewer_scenes_a_pass(
     with pytest.raises(TrilightError, match=r"too little memory in step \d+.*scenes_per_pass=2"):
         run(settings, dataset, tmp_path / "small")
     notes, step = Notes(), saved_steps(tmp_path / "small/checkpoints")[-1]
-    one = wsd(scenes_per_step=4, scenes_per_pass=1, checkpoints_kept=9)
+    one = dataclasses.replace(settings, scenes_per_pass=1)
     run(one, dataset, tmp_path / "small", resume=True, progress=notes)
     assert any("scenes_per_pass is 1 instead of 16" in text for text in notes.texts)
     found, wanted = weights(tmp_path / "small"), weights(tmp_path / "whole")
@@ -218,45 +241,45 @@ def failing(when: Callable[[TrainSettings, int], bool]) -> Callable[..., Unread]
     return taken
 
 
-@pytest.mark.parametrize("decisions", [{"learning_rate": 1e-3}, {"seed": 1}])
 def test_ten_skipped_steps_go_on_by_a_decision(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, decisions: dict[str, Any]
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the folder, or, where the weights themselves are lost, from an earlier checkpoint.
 
     Resumed as it is, it ends at the same step again: the row of skipped steps is remembered.
     """
-    settings = wsd(num_steps=24, keep_every=4)
+    settings = wsd(num_steps=16, keep_every=2, checkpoint_every=2)
 
     def diverges(now: TrainSettings, step: int) -> bool:
-        return step >= 8 and (now.learning_rate, now.seed) == (2e-3, 0)
+        return step >= 4 and (now.learning_rate, now.seed) == (2e-3, 0)
 
     monkeypatch.setattr(Stepper, "take", failing(diverges))
-    ways = r"10 steps in a row up to step 18.*--change learning_rate=0\.001.*seed=1.*--branch"
+    ways = r"10 steps in a row up to step 14.*--change learning_rate=0\.001.*seed=1.*--branch"
     for again in (False, True):
         with pytest.raises(TrilightError, match=ways):
             run(settings, dataset, tmp_path / "run", resume=again)
-    in_place = run(settings, dataset, tmp_path / "run", resume=True, decisions=decisions)
-    assert in_place.num_steps == 24
+    slower: dict[str, Any] = {"decisions": {"learning_rate": 1e-3}}
+    in_place = run(settings, dataset, tmp_path / "run", resume=True, **slower)
+    assert in_place.num_steps == 16
     rewound = run(
         settings,
         dataset,
         tmp_path / "branch",
-        branch=str(path_of_step(tmp_path / "run/checkpoints", 4)),
-        decisions=decisions,
+        branch=str(path_of_step(tmp_path / "run/checkpoints", 2)),
+        decisions={"seed": 1},
     )
     assert rewound.skipped_steps == 0
-    assert [event.step for event in rewound.history] == [4, 4]
+    assert [event.step for event in rewound.history] == [2, 2]
 
 
-def test_a_second_stage_says_where_its_weights_come_from(dataset: Dataset, tmp_path: Path) -> None:
-    run(wsd(), dataset, tmp_path / "first")
-    second = run(
-        wsd(from_weights=True), dataset, tmp_path / "second", begin_with=str(tmp_path / "first")
-    )
+def test_a_second_stage_says_where_its_weights_come_from(
+    dataset: Dataset, short: RunFolder, tmp_path: Path
+) -> None:
+    settings = wsd(from_weights=True, num_steps=2)
+    second = run(settings, dataset, tmp_path, begin_with=str(short.root))
     (event,) = second.history
     record = json.loads(second.folder.settings.read_text())
-    assert event.after == {"run": "tiny", "step": 10, "sha256": record["begun_with_sha256"]}
+    assert event.after == {"run": "tiny", "step": 5, "sha256": record["begun_with_sha256"]}
 
 
 def test_a_branch_takes_other_data_and_other_pictures(dataset: Dataset, tmp_path: Path) -> None:
@@ -264,7 +287,7 @@ def test_a_branch_takes_other_data_and_other_pictures(dataset: Dataset, tmp_path
     run(wsd(ema_decay=0.0), dataset, tmp_path / "first")
     other = write_toy_dataset(tmp_path / "data", train=5, validation=1, per_shard=3)
     digest = f"sha256:{other.digest[:12]}"
-    stage = {"data": digest, "resolution": 32, "num_steps": 12, "ema_decay": 0.5}
+    stage = {"data": digest, "resolution": 32, "num_steps": 6, "ema_decay": 0.5}
     branch = str(tmp_path / "first")
     with pytest.raises(TrilightError, match=f"--change data={digest}"):
         run(wsd(ema_decay=0.0), other, tmp_path / "second", branch=branch)
@@ -272,7 +295,7 @@ def test_a_branch_takes_other_data_and_other_pictures(dataset: Dataset, tmp_path
     out = tmp_path / "second"
     start: dict[str, Any] = {"branch": branch, "decisions": stage}
     result = run(wsd(ema_decay=0.0), other, out, **start)
-    assert result.num_steps == 12
+    assert result.num_steps == 6
     assert {event.name for event in result.history} == {*stage, "checkpoint"}
     assert open_network(out, network_of_run).config == wsd().model
     with pytest.raises(TrilightError, match="holds a run already; add --resume"):
@@ -283,7 +306,7 @@ def test_a_branch_takes_other_data_and_other_pictures(dataset: Dataset, tmp_path
 
 def test_what_is_decided_is_done(dataset: Dataset, tmp_path: Path) -> None:
     """By the stream, the loss, the update: none of them still reads what the command states."""
-    settings = wsd(num_steps=5, ema_decay=0.0)
+    settings = wsd(ema_decay=0.0)
     run(settings, dataset, tmp_path / "whole")
     branch = str(path_of_step(tmp_path / "whole/checkpoints", 4))
     for name, value in {
@@ -301,7 +324,7 @@ def test_what_is_decided_is_done(dataset: Dataset, tmp_path: Path) -> None:
     assert same(weights(tmp_path / "as it was"), weights(tmp_path / "whole"))
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("start", "message"),
     [
         ({"decisions": {"seed": 1}}, "has not begun, so --change seed changes nothing"),

@@ -9,6 +9,7 @@ import pytest
 
 from pipeline.objects.ply import encode_ply
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from tests.for_each import for_each
 from trilight import Material, SceneBuilder, TrilightError, read_scene
 
 TETRAHEDRON = (
@@ -98,7 +99,7 @@ def _described(place: dict[str, object]) -> dict[str, object]:
     }
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("mistake", "message"),
     [
         (lambda: Material(diffuse=(0.5, 0.5)), "diffuse is .*expected three finite numbers"),

@@ -10,6 +10,7 @@ import pytest
 import trilight
 from infra.setup.wheel_tree import PACKAGES
 from tests.conftest import ROOT
+from tests.for_each import for_each
 from trilight import extend
 
 
@@ -34,7 +35,7 @@ def test_extensions_have_one_place_to_import_from() -> None:
         extend.TEMPLATE  # noqa: B018
 
 
-@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.name)
+@for_each("example", sorted((ROOT / "examples").glob("*.py")))
 def test_examples_import_from_the_face_alone(example: Path) -> None:
     ours = {
         node.module
@@ -44,7 +45,7 @@ def test_examples_import_from_the_face_alone(example: Path) -> None:
     assert not ours
 
 
-@pytest.mark.parametrize("page", ["docs/reference/python.md", "README.md"])
+@for_each("page", ["docs/reference/python.md", "README.md"])
 def test_documents_name_what_is_there(page: str) -> None:
     text = (ROOT / page).read_text()
     named = set(re.findall(r"\btrilight\.([A-Za-z_]+)", "\n".join(_code(text))))

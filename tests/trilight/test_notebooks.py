@@ -16,6 +16,7 @@ import pytest
 
 import trilight
 from tests.conftest import ROOT
+from tests.for_each import for_each
 
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 
@@ -32,7 +33,7 @@ def _cells(notebook: Path) -> list[dict[str, Any]]:
     return cells
 
 
-@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+@for_each("notebook", NOTEBOOKS)
 def test_it_holds_code_and_no_outputs(notebook: Path) -> None:
     cells = [cell for cell in _cells(notebook) if cell["cell_type"] == "code"]
     assert len(cells) >= 5
@@ -44,7 +45,7 @@ def test_it_holds_code_and_no_outputs(notebook: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+@for_each("notebook", NOTEBOOKS)
 def test_it_runs(notebook: Path, tmp_path: Path) -> None:
     ran = subprocess.run(
         [sys.executable, "-c", RUN, str(notebook)],

@@ -21,6 +21,7 @@ from model.weights import decode_weights, encode_weights
 from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
+from tests.for_each import for_each
 from tests.model.hits.kit import corner, traced
 from tests.model.kit import awake, tiny_config
 
@@ -115,7 +116,7 @@ def test_before_any_training_what_was_traced_is_passed_on() -> None:
     assert not shown[inputs.pixels[..., 0] == 0].any(), "nothing is met: black"
 
 
-@pytest.mark.parametrize("tokens", [True, False])
+@for_each("tokens", [True, False])
 def test_the_picture_scales_with_the_lamps(tokens: bool) -> None:
     scene = corner()
     materials = scene.materials.copy()
@@ -172,7 +173,7 @@ def test_without_tokens_there_is_no_scene_stage() -> None:
     assert torch.isfinite(picture(model, tensors(corner()))).all()
 
 
-@pytest.mark.parametrize("tokens", [True, False])
+@for_each("tokens", [True, False])
 def test_every_weight_has_a_gradient_and_comes_back_from_its_file(tokens: bool) -> None:
     model = network(scene_tokens=tokens)
     model(batch_scenes([tensors(corner())]), PX).square().sum().backward()
@@ -224,7 +225,7 @@ def test_there_are_no_bundles_to_skip() -> None:
         renderer.view(renderer.prepare(scene), scene.c2w[0], 40.0, PX, skip_empty_bundles=True)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("changes", "message"),
     [
         ({"hit_rays": 0}, "hit_rays 0 with view_stage hits"),

@@ -13,6 +13,7 @@ from model.hits.light_filter import (
     _mean_around,
     _mixed,
 )
+from tests.for_each import for_each
 
 TOLD = 5
 
@@ -56,7 +57,7 @@ def test_no_light_is_made_and_none_is_negative() -> None:
     assert mixed.std() < 0.5 * shown.std(), "it does mix"
 
 
-@pytest.mark.parametrize("step", STEPS_PX)
+@for_each("step", STEPS_PX)
 def test_a_level_is_its_slow_twin(step: int) -> None:
     px = 11
     generator = torch.Generator().manual_seed(step)
@@ -82,7 +83,7 @@ def test_a_level_is_its_slow_twin(step: int) -> None:
         torch.testing.assert_close(_mixed(alike, near, both, step), expected)
 
 
-@pytest.mark.parametrize("px", [8, 40, 72])
+@for_each("px", [8, 40, 72])
 def test_pictures_are_the_same_in_parts_and_whole(px: int) -> None:
     given, model = drawn(px, seed=2), awake_filter(2)
     with torch.no_grad():
@@ -114,7 +115,7 @@ def test_its_slopes_are_those_of_differences() -> None:
     )
 
 
-@pytest.mark.parametrize("factor", [0.0, 1e-12, 1e6])
+@for_each("factor", [0.0, 1e-12, 1e6])
 def test_extremes_stay_finite(factor: float) -> None:
     """In single precision, as it runs; pixels without albedo beside those with it."""
     told, light, albedo = (each.float() for each in drawn(16, seed=4))

@@ -7,6 +7,7 @@ from model.hits.lit_scene import LitScene, Points
 from model.hits.reflectance import drawn, gloss_at, lobe
 from model.hits.vectors import dot, unit
 from storage.records.multiscatter import directional_albedo
+from tests.for_each import for_each
 
 COUNT = 20_000
 
@@ -29,8 +30,8 @@ def _toward(cosine: float, count: int = COUNT) -> np.ndarray:
     return np.tile(np.array([[sine], [0.0], [cosine]], np.float32), (1, count))
 
 
-@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.6, 1.0])
-@pytest.mark.parametrize("cosine", [0.95, 0.4, 0.1])
+@for_each("roughness", [0.1, 0.3, 0.6, 1.0])
+@for_each("cosine", [0.95, 0.4, 0.1])
 def test_a_white_lobe_returns_all_light(roughness: float, cosine: float) -> None:
     """Single scattering by drawn directions, and the scale for the rest: together 1."""
     scene = _plate(roughness)
@@ -46,7 +47,7 @@ def test_a_white_lobe_returns_all_light(roughness: float, cosine: float) -> None
     assert float(single) * gloss.colour[0, 0] == pytest.approx(1.0, abs=4e-3)
 
 
-@pytest.mark.parametrize("roughness", [0.15, 0.4, 0.9])
+@for_each("roughness", [0.15, 0.4, 0.9])
 def test_a_sample_weighs_its_value_over_its_density(roughness: float) -> None:
     scene = _plate(roughness)
     points = _points(scene, _toward(0.6, 500))
@@ -60,7 +61,7 @@ def test_a_sample_weighs_its_value_over_its_density(roughness: float) -> None:
     np.testing.assert_allclose(value[goes] / density[goes], weight[goes], rtol=0.02)
 
 
-@pytest.mark.parametrize("roughness", [0.3, 0.8])
+@for_each("roughness", [0.3, 0.8])
 def test_the_density_integrates_to_what_is_drawn_above(roughness: float) -> None:
     """Over the hemisphere, by even directions: all that is drawn and not lost below."""
     rng = np.random.default_rng(2)

@@ -1,7 +1,6 @@
 """Textures in what is traced for a network: exact at every hit, whatever its symmetries did."""
 
 import numpy as np
-import pytest
 import torch
 from numpy.typing import NDArray
 
@@ -13,6 +12,7 @@ from model.hits.view_inputs import Channel, ViewInputs, view_inputs
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from storage.records.first_hits import first_hits
 from storage.records.scene import Scene
+from tests.for_each import for_each
 from tests.model.hits.kit import corner, textured, traced
 from train.data.augment import mirrored, with_channels, with_vertices_turned
 from train.data.scenes import TrainingScene
@@ -73,7 +73,7 @@ def test_plain_triangles_of_a_textured_scene_and_plain_scenes_stay() -> None:
         assert np.mean(apart > 1e-5) < 0.05  # at rims, the other surface is textured
 
 
-@pytest.mark.parametrize("symmetry", ["turned", "mirrored", "channels"])
+@for_each("symmetry", ["turned", "mirrored", "channels"])
 def test_textures_go_through_the_symmetries_of_training(symmetry: str) -> None:
     scene = textured()
     tensors = scene_tensors(scene)

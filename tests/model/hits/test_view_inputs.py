@@ -11,6 +11,7 @@ from storage.conventions import pixel_places
 from storage.records.first_hits import first_hits
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
+from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, LAMP, corner, direct, traced
 from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
 from tests.rigid_motion import moved
@@ -97,9 +98,7 @@ def test_equal_arguments_equal_numbers_and_another_seed_another_noise() -> None:
     assert not np.array_equal(one.pixels, other.pixels)
 
 
-@pytest.mark.parametrize(
-    "resolution", [8, 24, 100, 256, pytest.param(1024, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("resolution", [8, 100, pytest.param(1024, marks=pytest.mark.slow)])
 def test_any_width_shows_the_same_scene(resolution: int) -> None:
     """Means of a picture and of one with 16 rays a pixel; 64 pixels see a highlight by chance."""
     tolerance = 0.03 if resolution > 8 else 0.2
@@ -151,7 +150,7 @@ EXTREMES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", EXTREMES)
+@for_each("name", EXTREMES)
 def test_extremes_are_finite_and_not_negative(name: str) -> None:
     scene = join(EXTREMES[name], eye=(1.0, -3.0, 1.4), target=(0, 0, 0.2), fov_deg=40.0)
     inputs = traced(scene, 16)

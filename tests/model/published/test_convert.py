@@ -23,6 +23,7 @@ from model.published.convert import (
 )
 from model.weights import read_tensors
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.model.kit import awake, tiny_config
 
 SWIN_LARGE: dict[str, Any] = {
@@ -52,8 +53,8 @@ def test_the_published_sizes_are_the_named_ones() -> None:
         assert got.texture_patch == patch
 
 
-@pytest.mark.parametrize("family", ["dpt", "swin"])
-@pytest.mark.parametrize("patch", [1, 8])
+@for_each("family", ["dpt", "swin"])
+@for_each("patch", [1, 8])
 def test_export_and_import_give_the_same_network(family: str, patch: int) -> None:
     config = PublishedConfig(model=publishable(family), texture_patch=patch)
     assert decode_published(json.loads(json.dumps(encode_published(config)))) == config
@@ -64,7 +65,7 @@ def test_export_and_import_give_the_same_network(family: str, patch: int) -> Non
         assert torch.equal(tensor, model.state_dict()[name]), name
 
 
-@pytest.mark.parametrize("name", ["base_tiny", "swin_tiny"])
+@for_each("name", ["base_tiny", "swin_tiny"])
 def test_export_gives_back_what_was_published(shared: Path, name: str) -> None:
     """All but the texture encoder bit by bit; that one as a function, by the test above."""
     path = shared / "renderformer_reference" / f"{name}.safetensors"
@@ -85,7 +86,7 @@ def test_export_gives_back_what_was_published(shared: Path, name: str) -> None:
             assert torch.equal(tensor, published[key]), key
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("fields", "message"),
     [
         ({"activation": "gelu"}, "activation 'gelu', expected 'swiglu'"),
@@ -102,7 +103,7 @@ def test_what_was_never_published_is_refused_by_name(fields: dict, message: str)
         decode_published(fields)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("changes", "message"),
     [
         ({"head": "linear", "dpt_features": 0, "dpt_channels": (), "dpt_taps": ()}, "head linear"),
@@ -143,7 +144,7 @@ def with_other_frequencies(tensors: dict[str, Tensor]) -> str:
     return "view_transformer.transformer.rope_emb.freqs is .* the configuration means"
 
 
-@pytest.mark.parametrize(
+@for_each(
     "change",
     [
         without_one,
@@ -183,7 +184,7 @@ def texture(material_TM: Tensor, patch: int) -> Tensor:
     return pictures.flatten(1)
 
 
-@pytest.mark.parametrize(("patch", "cells"), [(1, 1), (8, 43), (32, 559)])
+@for_each(("patch", "cells"), [(1, 1), (8, 43), (32, 559)])
 def test_a_folded_layer_is_the_unfolded_one(patch: int, cells: int) -> None:
     weight, bias = published_layer(patch)
     material = torch.rand(4, 10, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -195,7 +196,7 @@ def test_a_folded_layer_is_the_unfolded_one(patch: int, cells: int) -> None:
     torch.testing.assert_close(material @ ten.T + folded_bias, expected, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("patch", [1, 8, 32])
+@for_each("patch", [1, 8, 32])
 def test_folding_undoes_unfolding_bit_by_bit(patch: int) -> None:
     ten = torch.randn(WIDTH, 10, generator=torch.Generator().manual_seed(1))
     bias = torch.randn(WIDTH, generator=torch.Generator().manual_seed(2))

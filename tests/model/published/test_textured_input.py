@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor
 
@@ -11,6 +10,7 @@ from model.published.config import PublishedConfig
 from model.published.convert import TEXTURE, from_published, to_published
 from model.scene_tensors import batch_scenes, batch_with_cells, scene_tensors
 from model.texture_cells import TextureCells
+from tests.for_each import for_each
 from tests.model.hits.kit import corner, textured
 from tests.model.kit import awake, render
 from tests.model.published.test_convert import publishable
@@ -44,7 +44,7 @@ def _texture_of(material_10: Tensor, cells: TextureCells | None, row: int, patch
     return texture
 
 
-@pytest.mark.parametrize("patch", [1, 8, 32])
+@for_each("patch", [1, 8, 32])
 def test_tokens_are_what_the_published_layer_makes_of_cells(patch: int) -> None:
     tensors, config = _published(patch)
     network = from_published(tensors, config, cells=True).double()

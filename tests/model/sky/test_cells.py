@@ -1,7 +1,6 @@
 """Cells of a sky: equal parts of the sphere, means of the map, exact under symmetries."""
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from model.sky.cells import cell_of, sky_cells
@@ -10,6 +9,7 @@ from scene_templates.rotations import uniform_rotation
 from storage.records.environment import Environment
 from storage.records.lookup import environment_values
 from storage.records.sky_texels import row_solid_angles
+from tests.for_each import for_each
 from tests.sky_maps import as_sky, centres, constant, night, one_sun, smooth
 
 COUNTS = [48, 192]
@@ -20,7 +20,7 @@ def _on_sphere(count: int, seed: int = 0) -> NDArray[np.float64]:
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("count", COUNTS)
+@for_each("count", COUNTS)
 def test_cells_are_equal_parts_of_the_sphere_and_hang_together(count: int) -> None:
     places = _on_sphere(200_000)
     cells = cell_of(places, count)
@@ -34,7 +34,7 @@ def test_cells_are_equal_parts_of_the_sphere_and_hang_together(count: int) -> No
     assert farthest < {48: 32, 192: 16.5}[count]  # a disc of that area has a radius of 16.6 or 8.3
 
 
-@pytest.mark.parametrize("count", COUNTS)
+@for_each("count", COUNTS)
 def test_quarter_turns_and_mirrors_of_the_map_permute_the_cells(count: int) -> None:
     places = _on_sphere(5_000, seed=1)
     before = cell_of(places, count)
@@ -48,8 +48,8 @@ def test_quarter_turns_and_mirrors_of_the_map_permute_the_cells(count: int) -> N
         assert len(pairs) == len(np.unique(before))
 
 
-@pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.parametrize("height", [1, 3, 64, 300])
+@for_each("count", COUNTS)
+@for_each("height", [1, 3, 64, 300])
 def test_a_constant_sky_is_constant(count: int, height: int) -> None:
     cells = sky_cells(constant((0.5, 2.0, 1e5), height), count)
     assert cells.radiance_S3.shape == (count, 3)
@@ -81,7 +81,7 @@ def _light(sky: Environment) -> NDArray[np.float64]:
     return total
 
 
-@pytest.mark.parametrize("count", COUNTS)
+@for_each("count", COUNTS)
 def test_a_sun_keeps_its_light_and_its_place(count: int) -> None:
     sky = one_sun(1e6)
     cells = sky_cells(sky, count)
@@ -92,7 +92,7 @@ def test_a_sun_keeps_its_light_and_its_place(count: int) -> None:
     assert np.abs(total / _light(sky) - 1).max() < 0.01  # cells of these places are equal to 1 %
 
 
-@pytest.mark.parametrize("count", COUNTS)
+@for_each("count", COUNTS)
 def test_scene_and_sky_turned_together_have_the_same_cells_elsewhere(count: int) -> None:
     sky, rotation = night(), uniform_rotation(np.random.default_rng(3))
     before, after = sky_cells(sky, count), sky_cells(turned(sky, rotation), count)

@@ -11,6 +11,7 @@ from scene_templates.rotations import uniform_rotation
 from storage.records.environment import Environment
 from storage.records.lookup import environment_values
 from storage.records.sky_texels import row_solid_angles, texel_means
+from tests.for_each import for_each
 from tests.sky_maps import as_sky, constant, night, one_sun, six_poles, smooth
 
 TURN = uniform_rotation(np.random.default_rng(3)).astype(np.float32)
@@ -31,7 +32,7 @@ def _light(sky: Environment) -> NDArray[np.float64]:
     return np.array([(texel_means(channel) * angles).sum() for channel in channels])
 
 
-@pytest.mark.parametrize("name", SKIES)
+@for_each("name", SKIES)
 def test_light_over_density_is_the_light_of_the_map(name: str) -> None:
     sky = SKIES[name]()
     drawn = DrawnSky(sky)
@@ -46,7 +47,7 @@ def test_light_over_density_is_the_light_of_the_map(name: str) -> None:
     assert (np.abs(ratio.mean(axis=1) - _light(sky)) < 5 * error + 0.01 * _light(sky)).all()
 
 
-@pytest.mark.parametrize("name", ["smooth", "night"])
+@for_each("name", ["smooth", "night"])
 def test_directions_fall_into_texels_as_often_as_stated(name: str) -> None:
     sky = SKIES[name]()
     drawn = DrawnSky(sky)
@@ -76,7 +77,7 @@ def test_a_sun_is_found_by_most_draws() -> None:
     assert np.mean(drawn.radiance(direction).max(axis=0) > 100) > 0.7
 
 
-@pytest.mark.parametrize("height", [1, 16, 50, 64])
+@for_each("height", [1, 16, 50, 64])
 def test_a_blurred_sky_has_as_much_light(height: int) -> None:
     rng = np.random.default_rng(height)
     sky = as_sky(rng.uniform(size=(height, 2 * height, 3)) ** 8)

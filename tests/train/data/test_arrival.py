@@ -17,6 +17,7 @@ from torch import Tensor
 from storage.conventions import log10_radiance
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import open_training_data
+from tests.for_each import for_each
 from tests.train.fake_card import CARD, fake_card
 from tests.train.toy import write_toy_dataset
 from train.data.arrival import CopyStream, StepScenes, looks_up_itself, step_scenes
@@ -56,7 +57,7 @@ def steps(
         yield found
 
 
-@pytest.mark.parametrize("augmentation", [None, LIT], ids=["as stored", "stronger light"])
+@for_each("augmentation", [None, LIT])
 def test_targets_that_are_looked_up_on_arrival_are_the_same_bits(
     dataset: Dataset, augmentation: AugmentationSettings | None
 ) -> None:

@@ -20,6 +20,7 @@ from storage.conventions import radiance_from_log10
 from storage.records.lights import light_rows
 from storage.records.scene import Scene
 from storage.seeds import rng_for
+from tests.for_each import for_each
 from tests.pipeline.renders.sampling import Estimate, assert_agree, camera_of, render_blocks
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.train.data.test_augment import scene_behind
@@ -103,7 +104,7 @@ def transformed(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(SYMMETRIES))
+@for_each("name", sorted(SYMMETRIES))
 def test_the_path_traced_picture_is_the_transformed_one(
     name: str, scene: Scene, passes: NDArray[np.float32]
 ) -> None:

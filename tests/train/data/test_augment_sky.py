@@ -14,6 +14,7 @@ from model.scene_tensors import SceneTensors, scene_tensors
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
 from storage.records.stored_sample import StoredSample, stored_sample
+from tests.for_each import for_each
 from tests.model.hits.kit import corner
 from tests.model.hits.test_decoder import hits_config
 from tests.model.kit import tiny_config
@@ -41,7 +42,7 @@ def _direct(tensors: SceneTensors) -> NDArray:
     return total.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3))
 
 
-@pytest.mark.parametrize("symmetry", ["moved", "mirrored", "channels", "scaled"])
+@for_each("symmetry", ["moved", "mirrored", "channels", "scaled"])
 def test_a_sky_goes_through_the_symmetries_of_training(symmetry: str) -> None:
     tensors = scene_tensors(corner(sky=smooth(), radiance=0.0))
     training = TrainingScene(
@@ -75,7 +76,7 @@ def _below_a_sky() -> StoredSample:
     return stored_sample("0", encode_sample(dataclasses.replace(sample, scene=below)))
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("config", "is_known"),
     [
         (tiny_config(), False),
@@ -83,7 +84,6 @@ def _below_a_sky() -> StoredSample:
         (hits_config(), False),
         (hits_config(sky_rays=2), True),
     ],
-    ids=["bundles", "bundles with cells", "hits", "hits with rays"],
 )
 def test_training_takes_skies_that_its_network_knows(config: object, is_known: bool) -> None:
     settings = StreamSettings(

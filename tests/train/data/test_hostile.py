@@ -18,6 +18,7 @@ from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.records.exr import encode_exr
 from storage.records.sample import encode_sample
+from tests.for_each import for_each
 from tests.train.toy import toy_sample
 from train.data.order import RankShare
 from train.data.stream import StreamSettings, stream_batches
@@ -130,7 +131,7 @@ def keys(paths: list[str], unusable: Unusable, batches: int) -> list[str]:
         return [scene.key for batch in itertools.islice(stream, batches) for scene in batch]
 
 
-@pytest.mark.parametrize("case", CASES)
+@for_each("case", CASES)
 def test_a_bad_sample_costs_itself_and_is_named(tmp_path: Path, case: str) -> None:
     spoil, reason = CASES[case]
     paths = write_shards(tmp_path, spoil, bad_samples=1)

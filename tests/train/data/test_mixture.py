@@ -11,6 +11,7 @@ import torch
 from storage.dataset.mixed_data import open_mixture
 from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.train.data.test_stream import by_key, identity, same_batches
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
@@ -75,7 +76,7 @@ def take(
         return list(itertools.islice(batches, count))
 
 
-@pytest.mark.parametrize("weights", [(1.0,), (3.0, 1.0), (0.1, 0.2, 0.7), (1e-3, 5.0), (7.0, 3e5)])
+@for_each("weights", [(1.0,), (3.0, 1.0), (0.1, 0.2, 0.7), (1e-3, 5.0), (7.0, 3e5)])
 def test_every_stretch_has_its_shares_and_may_be_entered_anywhere(
     weights: tuple[float, ...],
 ) -> None:
@@ -117,7 +118,7 @@ def test_each_dataset_keeps_the_order_that_it_has_alone(
     assert any(not torch.equal(again[0], other) for other in again[1:]), "it draws views anew"
 
 
-@pytest.mark.parametrize("first", range(1, WHOLE, 2))
+@for_each("first", range(1, WHOLE, 2))
 def test_it_goes_on_anywhere_with_any_ranks_and_threads(
     data: TrainingData, whole: list[list[TrainingScene]], first: int
 ) -> None:
@@ -193,13 +194,12 @@ def test_a_run_of_two_datasets_resumes_to_the_bit_and_takes_up_a_third(
     roots: list[str], tmp_path: Path
 ) -> None:
     settings = tiny_run(data_weights=(1.0, 2.0), num_steps=8, validation_scenes=2)
-    uninterrupted = trained(settings, roots, tmp_path / "whole")
     out = tmp_path / "resumed"
-    trained(settings, roots, out)
+    uninterrupted = trained(settings, roots, out).folder.weights.read_bytes()
     path_of_step(out / "checkpoints", 8).unlink()
     (out / "model.safetensors").unlink()
     resumed = trained(settings, roots, out, resume=True, workers=3)
-    assert resumed.folder.weights.read_bytes() == uninterrupted.folder.weights.read_bytes()
+    assert resumed.folder.weights.read_bytes() == uninterrupted
     header = read_checkpoint(path_of_step(out / "checkpoints", 8)).header
     assert header["data_digest"].startswith("mix:") and len(header[RECORD]["digests"]) == 2
     (tmp_path / "third").mkdir()

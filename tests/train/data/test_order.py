@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from train.data.order import (
     OrderSettings,
     Place,
@@ -107,7 +108,7 @@ def test_each_rank_reads_few_shards_of_a_window() -> None:
     assert max(samples[0]) < 6 and min(samples[1]) > 1
 
 
-@pytest.mark.parametrize(("rank", "world_size"), [(1, 1), (-1, 2), (0, 0)])
+@for_each(("rank", "world_size"), [(1, 1), (-1, 2), (0, 0)])
 def test_ranks_that_do_not_exist_are_refused(rank: int, world_size: int) -> None:
     with pytest.raises(TrilightError, match="expected a rank from 0"):
         RankShare(rank=rank, world_size=world_size)

@@ -13,6 +13,7 @@ from storage.records.profiles import PROFILES, Profile
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.stored_sample import stored_sample
 from storage.seeds import rng_for
+from tests.for_each import for_each
 from tests.train.toy import toy_sample
 from train.data.augment import augmented, with_views
 from train.data.buckets import MOST_WASTE, bucket_scenes
@@ -41,13 +42,13 @@ def test_halving_twice_is_quartering_and_light_is_kept() -> None:
     assert block_mean(pictures, 16) is pictures
 
 
-@pytest.mark.parametrize("resolution", [0, 5, 32])
+@for_each("resolution", [0, 5, 32])
 def test_a_resolution_that_does_not_divide_is_refused(resolution: int) -> None:
     with pytest.raises(TrilightError, match=f"resolution {resolution}: expected a divisor of 16"):
         block_mean(np.zeros((1, 16, 16, 3), np.float32), resolution)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -1e-3])
+@for_each("bad", [np.nan, np.inf, -np.inf, -1e-3])
 def test_a_bad_target_is_refused_by_name(bad: float) -> None:
     sample = toy_sample(4, resolution=16)
     radiance = sample.radiance_rgb.copy()
@@ -70,7 +71,7 @@ def cost(num_triangles: int) -> float:
     return 300.0 + num_triangles
 
 
-@pytest.mark.parametrize("most", [2, 16])
+@for_each("most", [2, 16])
 def test_buckets_hold_each_scene_once_and_waste_little(most: int) -> None:
     scenes = [training_scene(toy_sample(index), 8) for index in range(12)]
     batches = bucket_scenes(scenes, cost, most)
@@ -105,8 +106,8 @@ def test_what_a_run_does_not_take_is_refused() -> None:
         training_scene(sample, 16, lights_apart=True)
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("lights_apart", [False, True], ids=["together", "apart"])
+@for_each("profile", PROFILES)
+@for_each("lights_apart", [False, True])
 def test_drawn_views_are_those_of_the_whole_sample_to_the_bit(
     profile: Profile, lights_apart: bool
 ) -> None:

@@ -15,6 +15,7 @@ from model.scene_tensors import tensors_of
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.model.kit import tiny_config
 from tests.train.toy import write_toy_dataset
 from train.data.order import RankShare
@@ -106,15 +107,15 @@ def whole(data: TrainingData) -> list[list[TrainingScene]]:
     return take(data, 0, WHOLE)
 
 
-@pytest.mark.parametrize("first", range(WHOLE))
+@for_each("first", range(WHOLE))
 def test_resuming_after_every_batch_is_uninterrupted(
     data: TrainingData, whole: list[list[TrainingScene]], first: int
 ) -> None:
     assert same_batches(whole[first:], take(data, first, WHOLE - first))
 
 
-@pytest.mark.parametrize("world_size", [2, 3, 6])
-@pytest.mark.parametrize("first", range(0, WHOLE, 3))
+@for_each("world_size", [2, 3, 6])
+@for_each("first", range(0, WHOLE, 3))
 def test_any_number_of_ranks_may_go_on(
     data: TrainingData, whole: list[list[TrainingScene]], first: int, world_size: int
 ) -> None:
@@ -131,7 +132,7 @@ def test_any_number_of_ranks_may_go_on(
     )
 
 
-@pytest.mark.parametrize("workers", [0, 2, 5])
+@for_each("workers", [0, 2, 5])
 def test_the_number_of_threads_changes_nothing(
     data: TrainingData, whole: list[list[TrainingScene]], workers: int
 ) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.for_each import for_each
 from tests.train.kit import tiny_run
 from train.data.workers import MOST_THREADS, Machine, fitting_workers, this_machine
 
@@ -20,7 +21,7 @@ def system(root: Path, files: dict[str, str]) -> Path:
     return root
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("files", "cores", "free"),
     [
         ({}, 16.0, None),
@@ -61,7 +62,6 @@ def system(root: Path, files: dict[str, str]) -> Path:
             None,
         ),
     ],
-    ids=["nothing", "memory", "quota", "no quota", "group of a job", "files held", "old groups"],
 )
 def test_a_machine_is_what_its_files_say(
     files: dict[str, str],
@@ -76,7 +76,7 @@ def test_a_machine_is_what_its_files_say(
     assert found == Machine(cores=cores, free_bytes=free, processes=2)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("machine", "on_card", "threads", "said"),
     [
         (Machine(cores=2), False, 1, "1 thread decodes samples, by 2 cores"),

@@ -10,6 +10,7 @@ from storage.conventions import camera_rays, log10_radiance
 from storage.metrics import object_psnr_log_db, psnr_linear_db, psnr_log_db
 from storage.records.scene import Scene
 from storage.seeds import rng_for
+from tests.for_each import for_each
 from tests.train.toy import toy_sample, toy_scene
 from train.data.scenes import training_scene
 from train.evaluation.error_colours import ERROR_WHITE, error_picture
@@ -44,7 +45,7 @@ def hits_one_by_one(scene: Scene, view: int, resolution: int) -> np.ndarray:
     return mask
 
 
-@pytest.mark.parametrize("index", [0, 1])
+@for_each("index", [0, 1])
 def test_hits_are_those_of_a_ray_tracer(index: int) -> None:
     scene = toy_scene(index, boxes=1)
     masks = hit_masks(scene, 12)

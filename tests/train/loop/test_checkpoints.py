@@ -1,6 +1,7 @@
 """Which checkpoints stay, and that a kill while one is saved leaves the one before it whole."""
 
 import dataclasses
+import json
 import os
 import subprocess
 import sys
@@ -14,7 +15,9 @@ from model.neural_renderer import NeuralRenderer
 from model.open import find_network, open_network
 from model.weights import encode_weights
 from storage.errors import TrilightError
+from storage.settings.described import settings_record
 from tests.conftest import ROOT
+from tests.for_each import for_each
 from tests.train.kit import tiny_run
 from train.folder import RunFolder
 from train.going_on import going_on
@@ -34,13 +37,15 @@ ALONE = Crew(device=torch.device("cpu"))
 CASES = [("fsync", "before"), ("replace", "before"), ("replace", "after"), ("unlink", "before")]
 
 CHILD = """
-import os, signal, sys
+import json, os, signal, sys
 from pathlib import Path
-from tests.train.kit import tiny_run
+from storage.settings.described import from_record
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.state import new_state
+from train.settings import TrainSettings
 
-settings, state = tiny_run(), new_state(tiny_run())
+settings = from_record(TrainSettings, json.loads(sys.argv[2]))
+state = new_state(settings)
 
 def keep(folder, step):
     state.step = state.skipped_steps = step
@@ -58,7 +63,7 @@ def killed(folder, name, when):
     setattr(os, name, die)
     keep(folder, 2)
 
-for case in sys.argv[2:]:
+for case in sys.argv[3:]:
     child = os.fork()
     if child == 0:
         killed(Path(sys.argv[1]) / case, *case.split())
@@ -72,7 +77,9 @@ for case in sys.argv[2:]:
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with one of each case, which a killed process has left."""
     folder, cases = tmp_path_factory.mktemp("killed"), [" ".join(case) for case in CASES]
-    subprocess.run([sys.executable, "-c", CHILD, str(folder), *cases], cwd=ROOT, check=True)
+    settings = json.dumps(settings_record(tiny_run()))
+    command = [sys.executable, "-c", CHILD, str(folder), settings, *cases]
+    subprocess.run(command, cwd=ROOT, check=True)
     return folder
 
 
@@ -98,7 +105,7 @@ def test_the_one_where_the_decay_begins_stays(tmp_path: Path) -> None:
     assert saved_steps(tmp_path) == [20, 24]
 
 
-@pytest.mark.parametrize(("call", "when"), CASES)
+@for_each(("call", "when"), CASES)
 def test_killed_while_saving_leaves_a_whole_one(killed: Path, call: str, when: str) -> None:
     folder = killed / f"{call} {when}"
     newest = resumed_checkpoint(folder, ALONE, pytest.fail)
@@ -133,7 +140,7 @@ def lock(path: Path) -> None:
     path.mkdir()
 
 
-@pytest.mark.parametrize("damage", [cut, flip, lock])
+@for_each("damage", [cut, flip, lock])
 def test_a_damaged_newest_one_is_named_and_the_one_before_it_is_used(
     damage: Callable[[Path], None], tmp_path: Path
 ) -> None:

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from train.loop.crew import Crew, choose_device, join_crew
 
 
@@ -17,7 +18,7 @@ def test_without_torchrun_a_process_is_alone(monkeypatch: pytest.MonkeyPatch) ->
         assert (crew.share.rank, crew.share.world_size) == (0, 1)
 
 
-@pytest.mark.parametrize(("local_rank", "order"), [(0, "made waited"), (1, "waited made")])
+@for_each(("local_rank", "order"), [(0, "made waited"), (1, "waited made")])
 def test_the_first_process_of_each_machine_makes_a_thing_before_the_others(
     monkeypatch: pytest.MonkeyPatch, local_rank: int, order: str
 ) -> None:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.for_each import for_each
 from tests.train.kit import tiny_run, trained
 from tests.train.loop.test_optim import with_gradients
 from tests.train.toy import toy_sample, write_toy_dataset
@@ -88,7 +89,7 @@ def test_kernels_update_as_the_host_does_but_for_rounding(
         torch.testing.assert_close(found, wanted, rtol=2e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize("applied", [True, False])
+@for_each("applied", [True, False])
 def test_kernels_move_as_the_host_does_or_touch_nothing(applied: bool) -> None:
     generator = torch.Generator().manual_seed(0)
     x, goal = (torch.randn(5, 7, generator=generator) for _ in range(2))

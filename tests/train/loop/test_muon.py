@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tests.for_each import for_each
 from train.loop import muon as muon_file
 from train.loop.crew import Crew
 from train.loop.muon import fitting_precision, muon, orthogonal, shared_out
@@ -72,7 +73,7 @@ def test_every_singular_value_follows_the_polynomial() -> None:
         np.testing.assert_allclose(found, expected, rtol=0, atol=3 * GAIN * 2**-24)
 
 
-@pytest.mark.parametrize("length", [0.0, 1e-30, 1e-9, 1e25])
+@for_each("length", [0.0, 1e-30, 1e-9, 1e25])
 def test_no_length_of_a_matrix_breaks_it(length: float) -> None:
     """What is shorter than 1e-7 stays short; squares may underflow or overflow, to a step of 0."""
     matrix = length * torch.randn(12, 8, generator=torch.Generator().manual_seed(0))
@@ -161,7 +162,7 @@ def test_the_processor_answers() -> None:
     )
 
 
-@pytest.mark.parametrize("processes", [2, 3])
+@for_each("processes", [2, 3])
 def test_processes_that_share_the_work_move_alike(
     processes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,7 @@ import torch
 from model.base_widths import BaseWidths
 from model.renderformer import RenderFormer
 from model.width_scales import width_scales
+from tests.for_each import for_each
 from tests.train.kit import tiny_run
 from train.loop.muon import orthogonal
 from train.loop.optim import Updater
@@ -62,7 +63,7 @@ def test_without_muon_it_is_torchs_adamw() -> None:
         assert torch.equal(ours, theirs)
 
 
-@pytest.mark.parametrize(("precision", "beside"), [("bfloat16", 0.05), ("float32", 1e-4)])
+@for_each(("precision", "beside"), [("bfloat16", 0.05), ("float32", 1e-4)])
 def test_muon_moves_every_direction_of_a_matrix_about_as_far(
     precision: Precision, beside: float
 ) -> None:
@@ -101,7 +102,7 @@ def test_without_a_gradient_every_weight_shrinks_by_its_rate(
         torch.testing.assert_close(ours.detach(), (1 - 0.5 * rate) * old, rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("precision", ["bfloat16", "float32"])
+@for_each("precision", ["bfloat16", "float32"])
 def test_with_muon_vectors_are_moved_as_without(precision: Precision) -> None:
     def moved_by(settings: TrainSettings) -> dict[str, torch.Tensor]:
         model = with_gradients()

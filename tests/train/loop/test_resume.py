@@ -8,6 +8,7 @@ import torch
 from storage.errors import TrilightError
 from storage.settings.described import from_record
 from tests.extensions_kit import EXAMPLES, loaded, written
+from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, make_batch
@@ -60,7 +61,7 @@ def load(path: Path) -> TrainState:
     return resumed_state(checkpoint, going_on(checkpoint.header, typed, DIGEST, {}))
 
 
-@pytest.mark.parametrize("steps", [0, 3])
+@for_each("steps", [0, 3])
 def test_a_loaded_state_goes_on_to_the_bit(tmp_path: Path, steps: int) -> None:
     state = trained(steps)
     path = tmp_path / "checkpoint"

@@ -5,6 +5,7 @@ import math
 import pytest
 
 from storage.settings.described import from_record, settings_record
+from tests.for_each import for_each
 from tests.train.kit import tiny_run
 from train.loop.schedule import decay_begins, learning_rate
 from train.runs import RUNS, named_run
@@ -40,7 +41,7 @@ def test_a_wsd_rate_rises_stays_and_falls_at_the_end() -> None:
     assert learning_rate(500, settings) == found[99], "no restart after the end"
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.2, 0.5])
+@for_each("share", [0.0, 0.1, 0.2, 0.5])
 def test_a_longer_wsd_run_has_the_same_rates_until_the_decay(share: float) -> None:
     short = tiny_run(schedule="wsd", num_steps=60, warmup_steps=7, decay_share=share)
     begins = decay_begins(short)

@@ -1,15 +1,19 @@
 """Laws of one step: a mean over views, whatever the batches; what is not finite changes nothing."""
 
 import copy
+import functools
 import math
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from model.layers import Norm
 from model.renderformer import count_parameters
+from tests.for_each import for_each
+from tests.model.kit import awake, tiny_config
 from tests.train.kit import tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, bucket_scenes, make_batch
@@ -84,10 +88,8 @@ def ruin_gradient(state: TrainState, batch: TrainingBatch) -> None:
     state.model.decoder.token_W.register_hook(lambda gradient: gradient * math.inf)
 
 
-@pytest.mark.parametrize(
-    ("muon_rate", "precision"), [(0.0, "bfloat16"), (3.0, "bfloat16"), (3.0, "float32")]
-)
-@pytest.mark.parametrize("ruin", [ruin_target, ruin_weight, ruin_gradient])
+@for_each(("muon_rate", "precision"), [(0.0, "bfloat16"), (3.0, "bfloat16"), (3.0, "float32")])
+@for_each("ruin", [ruin_target, ruin_weight, ruin_gradient])
 def test_a_step_that_is_not_finite_changes_nothing(
     ruin: Callable[[TrainState, TrainingBatch], None], muon_rate: float, precision: Precision
 ) -> None:
@@ -110,17 +112,17 @@ def test_a_step_that_is_not_finite_changes_nothing(
 
 
 def test_the_mean_follows_the_weights_faster_at_first() -> None:
-    settings = tiny_run(ema_decay=0.7)
+    settings = tiny_run(ema_decay=0.5)
     state = new_state(settings)
     assert state.mean_model is not None and state.shown is state.mean_model
     batch = make_batch(scenes(2))
     by_hand = state.model.decoder.rays.weight.detach().clone()
-    for updates in range(30):
+    for updates in range(12):
         stepper(state, settings).step([batch], 3e-3)
         state.step += 1
-        decay = min(0.7, (1 + updates) / (10 + updates))
+        decay = min(0.5, (1 + updates) / (10 + updates))
         by_hand = decay * by_hand + (1 - decay) * state.model.decoder.rays.weight.detach()
-    # float32, 30 updates
+    # float32, 12 updates
     torch.testing.assert_close(state.mean_model.decoder.rays.weight, by_hand, rtol=0, atol=1e-6)
     assert (by_hand - state.model.decoder.rays.weight).abs().max() > 1e-4
     assert new_state(tiny_run()).shown is not None and new_state(tiny_run()).mean_model is None
@@ -147,6 +149,27 @@ def test_bfloat16_rounds_products_but_no_position() -> None:
     assert 0 < (rounded - exact).abs().max() < 0.05
     for ours, theirs in zip(seen["bfloat16"], seen["float32"], strict=True):
         assert ours.dtype == torch.float32 and torch.equal(ours, theirs)
+
+
+@for_each("family", ["linear", "dpt"])
+def test_bfloat16_rounds_neither_rays_nor_materials_nor_the_last_layers(family: str) -> None:
+    """As model.precision says; norms keep the type that they get, and layers are rounded."""
+    network, found = awake(tiny_config(family), torch.float32), dict[str, str]()
+
+    def note(name: str, module: nn.Module, given: tuple[Tensor, ...], output: Tensor) -> None:
+        kept = isinstance(module, Norm) and output.dtype == given[0].dtype
+        found[name] = "kept" if kept else str(output.dtype).removeprefix("torch.")
+
+    for name, module in network.named_modules():
+        if isinstance(module, Norm | nn.Linear | nn.Conv2d):
+            module.register_forward_hook(functools.partial(note, name))
+    assert predicted(network, make_batch(scenes(2)), RESOLUTION, "bfloat16").dtype == torch.float32
+    exact = {"encoder.tokens.material", "encoder.tokens.normal", "decoder.rays"}
+    exact |= {"decoder.head.last"} | ({"decoder.head.widen"} if family == "dpt" else set())
+    assert {name: found[name] for name in exact} == dict.fromkeys(exact, "float32")
+    norms = {name: kind for name, kind in found.items() if name.endswith("norm")}
+    assert len(norms) > 10 and set(norms.values()) == {"kept"}
+    assert found["decoder.layers.0.ffn.down"] == "bfloat16"
 
 
 def test_a_step_asks_no_generator() -> None:
@@ -197,9 +220,9 @@ def test_a_fresh_network_learns_eight_pictures() -> None:
     drawn = scenes(4)
     targets = torch.cat([scene.target_VRR3 for scene in drawn])
     median_error = (targets - targets.median(dim=0).values).abs().mean().item()
-    reports = [step(state, bucket_scenes(drawn, cost, 16), grad_clip=1.0) for _ in range(150)]
+    reports = [step(state, bucket_scenes(drawn, cost, 16), grad_clip=1.0) for _ in range(100)]
     assert reports[0].loss == pytest.approx(targets.mean().item(), rel=1e-4)  # a black start
-    assert reports[-1].loss < 0.7 * median_error  # measured: 0.53
+    assert reports[-1].loss < 0.7 * median_error  # measured: 0.59
     assert min(report.grad_norm for report in reports) > 0.01
 
 

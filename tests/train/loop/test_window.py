@@ -12,9 +12,10 @@ from model.config import ModelConfig
 from model.costs import Workload, training_flops
 from model.renderformer import RenderFormer
 from storage.seeds import rng_for
+from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL
 from tests.train.toy import toy_sample
-from train.data.buckets import MOST_WASTE, bucket_scenes, make_batch
+from train.data.buckets import MOST_WASTE, TrainingBatch, bucket_scenes, make_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.loop.window import device_peak
 
@@ -24,7 +25,10 @@ DEEPER = dataclasses.replace(TINY_MODEL, encoder_layers=2, decoder_layers=2)
 
 def counted(config: ModelConfig, scenes: list[TrainingScene]) -> int:
     """Count a real forward and backward pass; the plain attention is the one that counts all."""
-    batch = make_batch(scenes)
+    return counted_batch(config, make_batch(scenes))
+
+
+def counted_batch(config: ModelConfig, batch: TrainingBatch) -> int:
     with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
         RenderFormer(config)(batch.scenes, RESOLUTION).sum().backward()
     return int(counter.get_total_flops())
@@ -35,7 +39,7 @@ def flops(num_triangles: int) -> int:
     return training_flops(DEEPER, workload)
 
 
-@pytest.mark.parametrize("boxes", [1, 5])
+@for_each("boxes", [1, 5])
 def test_the_formula_says_what_any_scene_needs(boxes: int) -> None:
     scene = with_triangles(training_scene(toy_sample(0), RESOLUTION), 12 * boxes)
     # a first layer needs no gradient of its inputs, which our factor of 3 counts: below 10 %
@@ -57,14 +61,10 @@ def with_triangles(scene: TrainingScene, count: int) -> TrainingScene:
 def test_batching_wastes_less_than_it_may() -> None:
     """Counted by torch, against the sum of single scenes, over lengths as they are drawn."""
     one = training_scene(toy_sample(0), RESOLUTION)
-    lengths = rng_for(0, "lengths").integers(10, 300, 12)
+    lengths = rng_for(0, "lengths").integers(10, 300, 7)
     scenes = [with_triangles(one, int(length)) for length in lengths]
     batches = bucket_scenes(scenes, flops, 16)
-    together = 0
-    for batch in batches:
-        with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
-            RenderFormer(DEEPER)(batch.scenes, RESOLUTION).sum().backward()
-        together += counter.get_total_flops()
+    together = sum(counted_batch(DEEPER, batch) for batch in batches)
     alone = sum(counted(DEEPER, [scene]) for scene in scenes)
     assert 1 < together / alone < 1 + MOST_WASTE
     assert len(batches) < len(scenes)

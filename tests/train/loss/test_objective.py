@@ -10,6 +10,7 @@ from torch import Tensor
 from storage.conventions import preview_srgb8, srgb8
 from storage.errors import TrilightError
 from storage.seeds import rng_for
+from tests.for_each import for_each
 from tests.train.loss.test_lpips import small_weights
 from train.loss.lpips import Lpips
 from train.loss.ms_ssim import SCALE_WEIGHTS, ms_ssim, ssim
@@ -36,7 +37,7 @@ def test_the_tone_map_is_the_one_that_people_see() -> None:
     assert tone_mapped(torch.tensor([-0.5])).item() == 0
 
 
-@pytest.mark.parametrize("resolution", [12, 40])
+@for_each("resolution", [12, 40])
 def test_ssim_is_that_of_scikit_image(resolution: int) -> None:
     a, b = noisy_pair(resolution)
     for ours, x, y in zip(ssim(a, b).tolist(), a.numpy(), b.numpy(), strict=True):
@@ -82,7 +83,7 @@ def test_ms_ssim_has_a_finite_gradient_even_at_its_opposite() -> None:
         ms_ssim(a[..., :8, :8], a[..., :8, :8])
 
 
-@pytest.mark.parametrize("term", ["lpips", "ms_ssim", "none"])
+@for_each("term", ["lpips", "ms_ssim", "none"])
 def test_the_loss_adds_up_its_terms(term: str) -> None:
     lpips = Lpips(*small_weights())
     settings = LossSettings(perceptual=term, perceptual_weight=0.05)  # type: ignore[arg-type]

@@ -10,6 +10,7 @@ from torch import nn
 
 from model.config import smoke
 from model.renderformer import RenderFormer
+from tests.for_each import for_each
 from tests.train.kit import tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import make_batch
@@ -29,7 +30,7 @@ def test_layers_are_named_for_people() -> None:
     assert layer_of("a.b.c.3") == "a.b"
 
 
-@pytest.mark.parametrize("clip", [1e9, 1e-3])
+@for_each("clip", [1e9, 1e-3])
 def test_the_figures_are_those_of_an_update_before_clipping(clip: float) -> None:
     settings = tiny_run(grad_clip=clip)
     state = new_state(settings)
