@@ -196,8 +196,8 @@ def bombs() -> Iterator[tuple[str, Make, str]]:
     yield "2^40 prims by ancestors", text(inner), "refused"
     instanced = doubled.replace("ARC", "instanceable = true\nreferences") + 'def Mesh "L40" {}'
     yield "2^40 instances", text(instanced), "refused"
-    chain = "".join(f'def "L{i}" (references = </L{i + 1}>) {{}}\n' for i in range(3000))
-    yield "a chain of 3000", text(chain), "refused"
+    chain = "".join(f'def "L{i}" (references = </L{i + 1}>) {{}}\n' for i in range(2100))
+    yield "a chain of 2100", text(chain), "refused"
     met = "".join(
         f'def "{n}{i}" (references = [</A{i + 1}>, </B{i + 1}>]) {{}}\n'
         for i in range(30)
@@ -208,12 +208,12 @@ def bombs() -> Iterator[tuple[str, Make, str]]:
         nested = text('def "a" {\n' * deep + "}\n" * deep)
         # USD's parser calls itself at every level, and crashes: that costs the child
         yield f"{deep} prims deep", nested, "refused" if deep < 1000 else "ended"
-    many, places = "0, " * 100_001, "(0, 0, 0), " * 100_001
+    many, places = "0, " * 2001, "(0, 0, 0), " * 2001
     instancer = (
         'def PointInstancer "i" {\nrel prototypes = </floor>\n'
         f"int[] protoIndices = [{many}]\npoint3f[] positions = [{places}]\n}}"
     )
-    yield "100001 instances", text(instancer), "refused"
+    yield "2001 instances", text(instancer), "refused"
     own = 'def PointInstancer "i" {\nrel prototypes = </i>\nint[] protoIndices = [0]\n'
     yield "an instancer of itself", text(own + "point3f[] positions = [(0, 0, 0)]\n}"), "refused"
     for end in ("1e18", "inf", "nan"):

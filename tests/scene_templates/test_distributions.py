@@ -13,7 +13,7 @@ import pytest
 from pipeline.builds.named import named_build
 from scene_templates.settings import SceneSettings
 from storage.settings.changes import changed
-from tests.scene_templates.balls import MANY, Drawn, drawn, drawn_once
+from tests.scene_templates.balls import MANY, Drawn, drawn
 from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row
 from tests.scene_templates.sampled_facts import (
     Stated,
@@ -36,6 +36,9 @@ def _stated(rows: tuple[Row, ...], *, published: bool) -> Stated:
         triangle_colours_share=0.0 if published else 0.5,
     )
 
+
+FEWER = 1200
+"""Scenes in which everything that is wrong below is noticed."""
 
 STATED = {
     "pretrain-256": _stated(DEFAULT, published=False),
@@ -108,7 +111,7 @@ def _surface_tables(scenes: list[Drawn], stated: Stated) -> Table:
     ],
 )
 def test_everything_is_distributed_as_stated(build: str) -> None:
-    require_plausible(_table(drawn_once(_settings(build), MANY), STATED[build]))
+    require_plausible(_table(drawn(_settings(build), MANY), STATED[build]))
 
 
 def test_the_second_training_stage_draws_the_same() -> None:
@@ -139,17 +142,9 @@ WRONG: list[tuple[str, Mapping[str, Any], set[str]]] = [
             "placement.overlap_share": 0.9,
             "placement.orientation": "uniform",
             "materials.albedo_sum": [0.91, 1.0],
-            "materials.roughness_log": [0.08, 1.055],
+            "materials.roughness_log": [0.1, 1.055],
             "materials.coloured_share": 0.7,
-        },
-        {"families", "light counts", "scale x", "scale y", "scale z", "overlaps", "euler y"}
-        | {"object albedo sum", "shell albedo sum", "object coloured", "shell coloured"}
-        | {"object roughness", "shell roughness"},
-    ),
-    (
-        "renderformer-v1-256",
-        {
-            "families.object_scale": [0.8, 1.7],
+            "families.object_scale": [0.8, 1.5],
             "families.smooth_share": 0.6,
             "placement.inside": True,
             "lights.total_emission": [2500, 4700],
@@ -157,7 +152,10 @@ WRONG: list[tuple[str, Mapping[str, Any], set[str]]] = [
             "materials.roughness_clip": [0.03, 1.0],
             "materials.coloured_specular_share": 0.01,
         },
-        {"sizes 0.8 to 1.8", "sizes 1.4 to 1.6", "object smooth", "shell smooth special"}
+        {"families", "light counts", "scale x", "scale y", "scale z", "overlaps", "euler y"}
+        | {"object albedo sum", "shell albedo sum", "object coloured", "shell coloured"}
+        | {"object roughness", "shell roughness"}
+        | {"sizes 0.8 to 1.8", "sizes 1.4 to 1.6", "object smooth", "shell smooth special"}
         | {"centre x", "centre y", "centre z", "radiance"}
         | {"object specular ratio", "object roughness", "object specular is grey"},
     ),
@@ -178,12 +176,12 @@ WRONG: list[tuple[str, Mapping[str, Any], set[str]]] = [
 """A build, what is changed behind its back, and some of what must be noticed."""
 
 
-@pytest.mark.parametrize(("build", "changes", "rows"), WRONG, ids=["plan", "ranges", "kinds"])
+@pytest.mark.parametrize(("build", "changes", "rows"), WRONG, ids=["ranges", "kinds"])
 def test_a_wrong_distribution_is_noticed(
     build: str, changes: Mapping[str, Any], rows: set[str]
 ) -> None:
     wrong = changed(_settings(build), changes)
-    table = _table(drawn(wrong, 1500), STATED[build])
+    table = _table(drawn(wrong, FEWER), STATED[build])
     assert rows <= set(implausible(table))
     # What has not been changed is not blamed.
     unchanged = {"object red", "object green", "object blue", "shell red", "shell green"}

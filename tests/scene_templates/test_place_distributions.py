@@ -4,7 +4,10 @@ Each is drawn by itself, since in a whole scene one hides the other. The line be
 defect is that of `statistics`.
 """
 
+import itertools
 import math
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +31,7 @@ from tests.scene_templates.statistics import (
     uniform,
 )
 
-COUNT = 2000
+COUNT = 800
 
 
 def _placements(
@@ -68,18 +71,19 @@ def test_shared_rooms_are_drawn_as_stated() -> None:
         assert len({(one.scale, one.translation) for one in patches}) == 1
 
 
-@pytest.mark.parametrize(
-    ("shell", "rows"),
-    [
-        (SharedRoom(square_share=0.4), {"square"}),
+def test_a_wrong_room_is_noticed() -> None:
+    cases: Iterable[Any] = [
+        (SharedRoom(square_share=0.35), {"square"}),
         (SharedRoom(scale=(1.0, 1.3)), {"scale x", "scale y", "scale z"}),
-        (SharedRoom(shift=0.04), {"move x", "move y"}),
-        (SharedRoom(raise_z=(0.0, 0.25)), {"move z"}),
-        (SharedRoom(tilt_deg=2.2), {"floor tilt 0", "wall0 tilt 2", "wall1 tilt 1"}),
-    ],
-    ids=["square", "scale", "shift", "raise", "tilt"],
-)
-def test_a_wrong_room_is_noticed(shell: SharedRoom, rows: set[str]) -> None:
+        (SharedRoom(shift=0.03), {"move x", "move y"}),
+        (SharedRoom(raise_z=(0.0, 0.2)), {"move z"}),
+        (SharedRoom(tilt_deg=1.5), {"floor tilt 0", "wall0 tilt 2", "wall1 tilt 1"}),
+    ]
+    for case in cases:
+        _check_a_wrong_room_is_noticed(*case)
+
+
+def _check_a_wrong_room_is_noticed(shell: SharedRoom, rows: set[str]) -> None:
     assert rows <= set(implausible(_shared_room_table(shell)))
 
 
@@ -90,7 +94,7 @@ def _sides_table(stage: int, drawn_policy: Policy, stated_policy: Policy) -> Tab
     rng = np.random.default_rng(stage)
     for family in (stage_1_families if stage == 1 else stage_2_families)(drawn_policy):
         parts = TEMPLATES[family.template].parts
-        for _ in range(250):
+        for _ in range(100):
             patches = family.shell.room_rand(rng, parts).patches
             for part, at in zip(parts, patches, strict=True):
                 assert at.reach == 1
@@ -109,11 +113,17 @@ def _sides_table(stage: int, drawn_policy: Policy, stated_policy: Policy) -> Tab
     return {" ".join(key): uniform(values, *stated[key]) for key, values in found.items()}
 
 
-@pytest.mark.parametrize("policy", ["original", "de-biased"])
-@pytest.mark.parametrize("stage", [1, 2])
-def test_separate_sides_are_drawn_as_published(stage: int, policy: Policy) -> None:
+def test_separate_sides_are_drawn_as_published() -> None:
+    cases: Iterable[Any] = itertools.product(["original", "de-biased"], [1, 2])
+    for case in cases:
+        _check_separate_sides_are_drawn_as_published(*case)
+
+
+def _check_separate_sides_are_drawn_as_published(policy: Policy, stage: int) -> None:
     table = _sides_table(stage, policy, policy)
     require_plausible(table)
+    if policy == "original":
+        return  # that one policy is told from the other is seen once
     other: Policy = "original" if policy == "de-biased" else "de-biased"
     mistaken = set(implausible(_sides_table(stage, other, policy)))
     # The policies differ in every spin, in the tilts of the box, in stage 2 in some floors, and in
@@ -166,11 +176,11 @@ def test_a_single_object_is_placed_evenly_and_rests_half_the_time() -> None:
     changes: dict[str, object] = {
         "placement.resting_share": 0.7,
         "families.shell.raise_z": [0.5, 0.5],
-        "families.object_scale": [0.8, 1.6],
+        "families.object_scale": [0.8, 1.5],
     }
     for name, row in zip(changes, ("rests", "height", "size"), strict=True):
         wrong = template_settings("plane", {**ROOM, name: changes[name]})
-        assert row in implausible(_place_table(drawn(wrong, COUNT // 4)))
+        assert row in implausible(_place_table(drawn(wrong, 300)))
 
 
 @pytest.mark.slow
@@ -223,8 +233,12 @@ def _light_centres(sector: Sector, **changes: object) -> NDArray[np.float64]:
     return np.stack([one.triangle.mean(axis=0) for one in drawn_ones])
 
 
-@pytest.mark.parametrize("name", list(TEMPLATES))
-def test_lights_hang_evenly_in_their_sector(name: str) -> None:
+def test_lights_hang_evenly_in_their_sector() -> None:
+    for name in list(TEMPLATES):
+        _check_lights_hang_evenly_in_their_sector(name)
+
+
+def _check_lights_hang_evenly_in_their_sector(name: str) -> None:
     sector = TEMPLATES[name].lights
     centres = _light_centres(sector, target_jitter=0.0)
     distance = np.linalg.norm(centres, axis=1)
@@ -272,18 +286,22 @@ def _roll_twin(sector: Sector) -> list[float]:
     rng = np.random.default_rng(1)
     return [
         _roll(np.array([0, 0, 1]) + rng.uniform(-0.1, 0.1, size=3), sector.direction_rand(rng))
-        for _ in range(4 * COUNT)
+        for _ in range(2 * COUNT)
     ]
 
 
-@pytest.mark.parametrize("name", list(TEMPLATES))
-def test_cameras_are_drawn_as_stated(name: str) -> None:
+def test_cameras_are_drawn_as_stated() -> None:
+    for name in list(TEMPLATES):
+        _check_cameras_are_drawn_as_stated(name)
+
+
+def _check_cameras_are_drawn_as_stated(name: str) -> None:
     require_plausible(_camera_table(TEMPLATES[name].cameras))
 
 
 def test_wrong_cameras_are_noticed() -> None:
-    wrong = {"fov_deg": (30.0, 57.0), "distance": (1.5, 1.9), "up_jitter": 0.14}
-    table = _camera_table(TEMPLATES["wall"].cameras, **wrong, target_jitter=0.16)
+    wrong = {"fov_deg": (30.0, 54.0), "distance": (1.5, 1.85), "up_jitter": 0.2}
+    table = _camera_table(TEMPLATES["wall"].cameras, **wrong, target_jitter=0.13)
     assert set(implausible(table)) == {
         "fov",
         "distance",

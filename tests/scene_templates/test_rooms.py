@@ -1,6 +1,9 @@
 """Shells: 128 triangles each, flat, facing the room, and without gaps at their seams."""
 
 import dataclasses
+import itertools
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,9 +49,13 @@ def _shells(ranges: SharedRoom, name: str, count: int) -> list[tuple[ShellPart, 
     return [one.layout.shell for one in drawn(settings, count)]
 
 
-@pytest.mark.parametrize("ranges", [SQUARE, LOOSE], ids=["square", "loose"])
-@pytest.mark.parametrize("name", list(TEMPLATES))
-def test_parts_are_flat_patches_of_128_faces_that_face_the_room(
+def test_parts_are_flat_patches_of_128_faces_that_face_the_room() -> None:
+    cases: Iterable[Any] = itertools.product([SQUARE, LOOSE], list(TEMPLATES))
+    for case in cases:
+        _check_parts_are_flat_patches_of_128_faces_that_face_the_room(*case)
+
+
+def _check_parts_are_flat_patches_of_128_faces_that_face_the_room(
     ranges: SharedRoom, name: str
 ) -> None:
     for shell in _shells(ranges, name, 20):
@@ -107,10 +114,14 @@ def test_in_square_rooms_walls_stand_exactly_on_the_floors_edge(name: str) -> No
             assert gaps.max() < ROUNDING
 
 
-@pytest.mark.parametrize("ranges", [SQUARE, LOOSE], ids=["square", "loose"])
-@pytest.mark.parametrize("name", ["wall", "corner", "open_box"])
-def test_nothing_shines_through_the_seams(ranges: SharedRoom, name: str) -> None:
+def test_nothing_shines_through_the_seams() -> None:
     """From the middle of the room, a look at any point near a seam meets a floor or wall."""
+    cases: Iterable[Any] = itertools.product([SQUARE, LOOSE], ["wall", "corner", "open_box"])
+    for case in cases:
+        _check_nothing_shines_through_the_seams(*case)
+
+
+def _check_nothing_shines_through_the_seams(ranges: SharedRoom, name: str) -> None:
     for seed in range(60):
         room, patches = _room(ranges, name, seed)
         rng = np.random.default_rng([seed, 1])

@@ -8,7 +8,7 @@ from storage.seeds import rng_for
 from tests.scene_templates.named_draws import stated_table
 from tests.scene_templates.statistics import implausible, require_plausible
 
-MANY = 2000
+MANY = 1000
 
 
 def _drawn() -> StatedDraws:
@@ -33,14 +33,12 @@ def test_each_is_distributed_as_stated() -> None:
     assert not implausible({"nothing": 1.0})
 
 
-@pytest.mark.parametrize(
-    ("name", "stated"),
-    [("number", (-2.0, 6.0)), ("count", (3, 10)), ("it holds", 0.4), ("word", ("a", "b"))],
-)
-def test_another_statement_would_be_noticed(name: str, stated: object) -> None:
-    made = _drawn().made
-    object.__setattr__(made[name], "stated", stated)
-    assert implausible(stated_table(made))
+def test_another_statement_would_be_noticed() -> None:
+    wrong = {"number": (-2.0, 6.0), "count": (3, 10), "it holds": 0.45, "word": ("a", "b")}
+    for name, stated in wrong.items():
+        made = _drawn().made
+        object.__setattr__(made[name], "stated", stated)
+        assert implausible(stated_table(made)), name
 
 
 def test_directions_are_unit_vectors_between_the_elevations() -> None:

@@ -17,12 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.assets.attempt import AssetAttempt
-from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings
 from pipeline.isolation import ChildLimits, IsolatedChild, preload
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import ObjectRecord
-from tests.pipeline.assets.meshes_by_hand import record_of
 
 LIMITS = ChildLimits(memory_bytes=3 << 30, wall_s=60, cpu_s=20, calls_per_child=50)
 CALLS = "calls.jsonl"
@@ -44,6 +42,8 @@ def recorded_attempt(source: Path, settings: AssetSettings, method: str) -> Asse
     if not (once and marker.exists()):
         marker.touch()
         _ACTIONS[action](source)
+    from pipeline.assets.prepare import prepare_asset  # late: a child that dies pays for none of it
+
     attempt = prepare_asset(source, settings, method)
     missed = plan.get(f"{method} misses")
     return _without(attempt, int(missed)) if missed else attempt
@@ -134,7 +134,8 @@ class Bench:
         self.root.mkdir(parents=True, exist_ok=True)
         if not (self.root / PLAN).exists():
             self.set()
-        preload(["pipeline.assets.decimation.pymeshlab_filters", "tests.pipeline.assets.child_kit"])
+        heavy = ("pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters")
+        preload([*heavy, "tests.pipeline.assets.child_kit"])
         self.child = IsolatedChild(limits=self.limits, setup=nothing)
 
     def set(self, **plan: str) -> None:
@@ -151,4 +152,6 @@ class Bench:
         return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
     def record(self, name: str) -> ObjectRecord:
+        from tests.pipeline.assets.meshes_by_hand import record_of
+
         return record_of(self.root / name, name)

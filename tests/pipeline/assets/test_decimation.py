@@ -25,18 +25,19 @@ def p99(mesh: TriangleMesh, budget: int, method: str) -> float:
     return Surface(mesh, UNIFORM).deviation(decimate(mesh, budget, method)).two_way(99)
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("budget", [1000, 300])
-def test_budgets_are_met(method: str, budget: int) -> None:
-    result = decimate(cleaned(knot()), budget, method)
-    # A budget is worth little if much of it stays unused.
-    assert USED.get(method, 0.8) * budget <= len(result.faces) <= budget
+def test_budgets_are_met_and_the_error_falls_with_them() -> None:
+    for method in METHODS:
+        _check_budgets_are_met_and_the_error_falls_with_them(method)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_error_falls_with_the_budget(method: str) -> None:
+def _check_budgets_are_met_and_the_error_falls_with_them(method: str) -> None:
     mesh = cleaned(knot())
-    errors = [p99(mesh, budget, method) for budget in (1600, 800, 400, 200)]
+    surface, errors = Surface(mesh, UNIFORM), []
+    for budget in (1600, 800, 300):
+        result = decimate(mesh, budget, method)
+        # A budget is worth little if much of it stays unused.
+        assert USED.get(method, 0.8) * budget <= len(result.faces) <= budget
+        errors.append(surface.deviation(result).two_way(99))
     assert errors == sorted(errors)
     # Cells of clustering at 1600 faces are 1/19 of the box; vertices move by a good part of half.
     assert errors[0] < 0.02

@@ -111,24 +111,26 @@ def with_repeated_corners(mesh: TriangleMesh) -> TriangleMesh:
 def test_faces_with_repeated_corners_are_dropped(
     outcome: Callable[..., Outcome], tmp_path: Path
 ) -> None:
-    dirty, _ = outcome(write_obj(tmp_path / "a.obj", with_repeated_corners(knot())))
-    tidy, _ = outcome(write_obj(tmp_path / "b.obj", knot()))
+    settings = AssetSettings(budgets=(500,))
+    dirty, _ = outcome(write_obj(tmp_path / "a.obj", with_repeated_corners(knot(80))), settings)
+    tidy, _ = outcome(write_obj(tmp_path / "b.obj", knot(80)), settings)
     assert check(dirty).geometry_sha256 == check(tidy).geometry_sha256
     assert dirty is not None and dirty.source.repaired
     assert tidy is not None and not tidy.source.repaired
-    assert dirty.source.num_faces_read == 3840 + 1280
+    assert dirty.source.num_faces_read == 1920 + 640
 
 
 def test_both_sides_of_every_face_count_once(
     outcome: Callable[..., Outcome], tmp_path: Path
 ) -> None:
-    both = joined(knot(), TriangleMesh(positions=knot().positions, faces=knot().faces[:, ::-1]))
-    asset, _ = outcome(write_obj(tmp_path / "a.obj", both))
-    assert check(asset).source.num_faces == 3840
+    one = knot(80)
+    both = joined(one, TriangleMesh(positions=one.positions, faces=one.faces[:, ::-1]))
+    asset, _ = outcome(write_obj(tmp_path / "a.obj", both), AssetSettings(budgets=(500,)))
+    assert check(asset).source.num_faces == 1920
     assert asset is not None and asset.source.watertight
 
 
-@pytest.mark.parametrize("pages", [8, 9, 200, 400])
+@pytest.mark.parametrize("pages", [8, 9, 400])
 def test_many_faces_on_one_edge_end(
     outcome: Callable[..., Outcome], tmp_path: Path, pages: int
 ) -> None:
@@ -145,10 +147,11 @@ def test_many_faces_on_one_edge_end(
 def test_a_random_soup_ends_with_a_reason(
     outcome: Callable[..., Outcome], tmp_path: Path, profile: str
 ) -> None:
-    settings = AssetSettings(budgets=(700,), profile=profile)  # type: ignore[arg-type]
-    asset, reason = outcome(write_obj(tmp_path / "a.obj", soup(1500)), settings)
+    settings = AssetSettings(budgets=(500,), profile=profile)  # type: ignore[arg-type]
+    asset, reason = outcome(write_obj(tmp_path / "a.obj", soup(1000)), settings)
     assert asset is None
-    assert reason in {"area_changed", "budget_missed", "error_over_bound", "crashed_signal_11"}
+    geometric = {"area_changed", "bbox_escaped", "budget_missed", "error_over_bound"}
+    assert reason in {*geometric, "crashed_signal_11"}
 
 
 @pytest.mark.slow
@@ -165,7 +168,8 @@ def test_a_polygon_of_fifty_thousand_corners_ends(
 
 
 def test_a_wide_fan_is_kept_from_pymeshlab(outcome: Callable[..., Outcome], tmp_path: Path) -> None:
-    asset, reason = outcome(write_obj(tmp_path / "a.obj", polygon(2000)))
+    path = write_obj(tmp_path / "a.obj", polygon(600))
+    asset, reason = outcome(path, AssetSettings(budgets=(500,)))
     assert reason == ""
     used = {level.record.method for level in check(asset).levels}
     assert used <= {"meshoptimizer", "meshoptimizer_sloppy"}
@@ -181,10 +185,8 @@ def test_five_thousand_boxes_do_not_fit_into_240_triangles(
     assert reason in {"area_changed", "error_over_bound", "parts_lost", "budget_missed"}
 
 
-def test_five_hundred_boxes_do_not_fit_either(
-    outcome: Callable[..., Outcome], tmp_path: Path
-) -> None:
-    path = write_obj(tmp_path / "a.obj", boxes(500))
+def test_fifty_boxes_do_not_fit_either(outcome: Callable[..., Outcome], tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "a.obj", boxes(50))
     asset, reason = outcome(path, AssetSettings(budgets=(240,)))
     assert asset is None
     assert reason in {"area_changed", "error_over_bound", "parts_lost", "budget_missed"}
@@ -202,11 +204,10 @@ def test_a_floor_of_two_triangles_is_an_object(
         assert asset is not None and asset.source.front_share == pytest.approx(0.5, abs=0.2)
 
 
-@pytest.mark.parametrize("scale", [1e-200, 1e-30, 1e-10, 1e10, 1e12, 1e200])
-def test_sizes_that_are_no_sizes(
-    outcome: Callable[..., Outcome], tmp_path: Path, scale: float
-) -> None:
-    assert outcome(write_obj(tmp_path / "a.obj", moved(sphere(), scale)))[1] == "extent_range"
+def test_sizes_that_are_no_sizes(outcome: Callable[..., Outcome], tmp_path: Path) -> None:
+    for scale in (1e-200, 1e-10, 1e10, 1e200):
+        path = write_obj(tmp_path / f"{scale}.obj", moved(sphere(), scale))
+        assert outcome(path)[1] == "extent_range", scale
 
 
 @pytest.mark.parametrize("write", [write_ply, write_obj], ids=["ply", "obj"])

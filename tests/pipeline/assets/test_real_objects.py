@@ -36,8 +36,8 @@ def records(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Obje
 
 
 def test_a_cross_section_of_them(records: list[ObjectRecord]) -> None:
-    """Every ninth: open banners, flat tiles, many-part furniture, and a scan among them."""
-    for record in records[::9]:
+    """One in twenty-seven, a scan among them; all of them are a slow test."""
+    for record in records[::27]:
         check(prepare(Path(record.path), SETTINGS))
 
 

@@ -18,7 +18,7 @@ from tests.pipeline.assets.meshes_by_hand import geometry, knot, mesh_of, moved,
 BUDGETS = (1000, 500)
 SETTINGS = AssetSettings(budgets=BUDGETS)
 QUICK = settings(
-    max_examples=5,
+    max_examples=2,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
@@ -40,8 +40,9 @@ def test_any_scale_and_place_give_the_same_bytes(
     tmp_path: Path, scale: float, offset: tuple[float, float, float], method: str
 ) -> None:
     """Offsets are in extents: text keeps 17 digits, which leaves 1e-13 of the object here."""
-    plain = prepare(write_obj(tmp_path / "a.obj", knot()), SETTINGS, method)
-    elsewhere = moved(moved(knot(), 1.0, offset), scale)
+    source = knot(segments=60)
+    plain = prepare(write_obj(tmp_path / "a.obj", source), SETTINGS, method)
+    elsewhere = moved(moved(source, 1.0, offset), scale)
     again = prepare(write_obj(tmp_path / "b.obj", elsewhere), SETTINGS, method)
     assert geometry(again) == geometry(plain)
     assert again.levels[0].record.quality == plain.levels[0].record.quality
@@ -61,7 +62,7 @@ def placed(mesh: TriangleMesh, source: TriangleMesh) -> TriangleMesh:
     return moved(mesh, (high - low).max(), (low + high) / 2)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_turn_keeps_budgets_and_surfaces(tmp_path: Path, straight: Asset, seed: int) -> None:
     """Turn, then prepare; or prepare, then turn: both are near the same source.
 

@@ -20,8 +20,12 @@ from tests.pipeline.assets.stage_kit import FIRST, SECOND, SETTINGS, THIRD, made
 
 @pytest.fixture(autouse=True)
 def source(bench: Bench) -> Path:
-    """3840 faces: every level needs a method."""
-    return write_obj(bench.root / "knot.obj", knot())
+    """1440 faces: every level needs a method."""
+    return write_obj(bench.root / "knot.obj", small_knot())
+
+
+def small_knot() -> TriangleMesh:
+    return knot(segments=60)
 
 
 def test_the_first_method_is_enough_where_it_works(bench: Bench) -> None:
@@ -115,7 +119,7 @@ def test_the_second_run_makes_nothing_and_says_the_same(bench: Bench) -> None:
 
 
 def test_copies_are_made_once_and_keep_their_names(bench: Bench) -> None:
-    write_obj(bench.root / "copy.obj", knot())
+    write_obj(bench.root / "copy.obj", small_knot())
     prepared, _ = run(bench, "knot.obj", "copy.obj")
     assert [asset.record.uid for asset in prepared] == ["knot.obj", "copy.obj"]
     assert prepared[0].path == prepared[1].path
@@ -163,5 +167,5 @@ def test_a_file_that_the_system_will_not_open_is_refused_today_only(bench: Bench
     _, (failure,) = run(bench, "loop.obj")
     assert failure.reason == "unreadable_file"
     loop.unlink()
-    write_obj(loop, knot())
+    write_obj(loop, small_knot())
     assert run(bench, "loop.obj")[1] == []

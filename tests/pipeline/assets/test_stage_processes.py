@@ -50,8 +50,8 @@ def sources(tmp_path: Path) -> Path:
     folder = tmp_path / "sources"
     Bench(folder)
     for number in range(3):
-        write_obj(folder / f"knot{number}.obj", knot(segments=150 + 10 * number))
-    write_obj(folder / "copy.obj", knot(segments=150))
+        write_obj(folder / f"knot{number}.obj", knot(segments=60 + 4 * number))
+    write_obj(folder / "copy.obj", knot(segments=60))
     write_obj(folder / "ball.obj", sphere())
     return folder
 
@@ -81,10 +81,10 @@ def calls(sources: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def test_three_processes_make_each_object_once(sources: Path) -> None:
-    first, *others = [finish(process) for process in [start(sources) for _ in range(3)]]
+def test_two_processes_make_each_object_once(sources: Path) -> None:
+    first, other = [finish(process) for process in [start(sources) for _ in range(2)]]
     assert len(first) == 5
-    assert others == [first, first]
+    assert other == first
     assert first["copy.obj"] == first["knot0.obj"]
     assert len(set(first.values())) == 4
     assert len(calls(sources)) == 4

@@ -1,6 +1,7 @@
 """USD files as objects: what of a stage is the object, and what is refused by name."""
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from tests.pipeline.assets.own.usd_kit import (
     usd_mesh,
 )
 from tests.pipeline.assets.stage_kit import run
+from tests.pipeline.case_folders import with_folders
 
 SETTINGS = AssetSettings()
 BOX = moved(cube(), scale=[1.0, 0.5, 0.25])
@@ -75,9 +77,12 @@ def _turned_round(mesh: TriangleMesh) -> float:
     return float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
 
 
-@pytest.mark.parametrize("left_handed", [False, True])
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_windings_stay_outward(tmp_path: Path, left_handed: bool, mirrored: bool) -> None:
+def test_windings_stay_outward(tmp_path: Path) -> None:
+    for folder, case in with_folders(tmp_path, itertools.product([False, True], [False, True])):
+        _check_windings_stay_outward(folder, *case)
+
+
+def _check_windings_stay_outward(tmp_path: Path, left_handed: bool, mirrored: bool) -> None:
     stage = new_stage()
     mesh = BOX if not left_handed else dataclasses.replace(BOX, faces=BOX.faces[:, ::-1])
     made = usd_mesh(stage, mesh)
@@ -142,8 +147,12 @@ REFUSED: dict[str, tuple[str, Callable[[Usd.Stage], object]]] = {
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_would_give_another_mesh_is_refused(tmp_path: Path, name: str) -> None:
+def test_what_would_give_another_mesh_is_refused(tmp_path: Path) -> None:
+    for folder, name in with_folders(tmp_path, REFUSED):
+        _check_what_would_give_another_mesh_is_refused(folder, name)
+
+
+def _check_what_would_give_another_mesh_is_refused(tmp_path: Path, name: str) -> None:
     reason, change = REFUSED[name]
     folder = tmp_path / "objects"
     folder.mkdir()

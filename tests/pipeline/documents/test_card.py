@@ -19,6 +19,7 @@ from pipeline.documents.rights import encode_licences, rights_of
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.records.objects import read_objects_lock, write_objects_lock
 from storage.records.profiles import Profile
+from tests.pipeline.case_folders import with_folders
 from tests.pipeline.documents.dataset_by_hand import (
     edit_manifest,
     five_scenes,
@@ -42,6 +43,7 @@ def card_of(dataset: Dataset) -> tuple[dict[str, Any], str]:
     return yaml.safe_load(front), body
 
 
+@pytest.mark.usefixtures("bare_reports")
 def test_the_front_matter_says_what_hubs_ask(tmp_path: Path) -> None:
     dataset = five_scenes(tmp_path)
     write_documents(dataset)
@@ -59,13 +61,22 @@ def test_the_front_matter_says_what_hubs_ask(tmp_path: Path) -> None:
         assert found == {path.name for path in tmp_path.glob("*.tar") if split in path.name}
 
 
-@pytest.mark.parametrize(
-    ("licence", "spelling"),
-    [("CC0-1.0", "cc0-1.0"), ("CC-BY-SA-4.0", "cc-by-sa-4.0"), ("ODC-By-1.0", "odc-by"),
-     ("GPL-3.0-only", "gpl-3.0"), ("LicenseRef-user-provided", "other"),
-     ("MIT OR (my own: one)", "other")],
-)  # fmt: skip
-def test_one_licence_is_stated_as_the_hub_spells_it(
+def test_one_licence_is_stated_as_the_hub_spells_it(tmp_path: Path) -> None:
+    for folder, case in with_folders(
+        tmp_path,
+        [
+            ("CC0-1.0", "cc0-1.0"),
+            ("CC-BY-SA-4.0", "cc-by-sa-4.0"),
+            ("ODC-By-1.0", "odc-by"),
+            ("GPL-3.0-only", "gpl-3.0"),
+            ("LicenseRef-user-provided", "other"),
+            ("MIT OR (my own: one)", "other"),
+        ],
+    ):
+        _check_one_licence_is_stated_as_the_hub_spells_it(folder, *case)
+
+
+def _check_one_licence_is_stated_as_the_hub_spells_it(
     tmp_path: Path, licence: str, spelling: str
 ) -> None:
     dataset = five_scenes(tmp_path)
@@ -109,10 +120,11 @@ def test_the_example_of_the_card_runs_as_it_stands(tmp_path: Path, profiles: lis
     assert printed.getvalue().splitlines() == ["(5, 3) (16, 16, 3) 3"] * 2
 
 
+@pytest.mark.usefixtures("bare_reports")
 def test_equal_datasets_have_equal_documents(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither place, clock, language nor order of work is in them."""
+    """Neither place, clock nor language is in them; of the report's figures see test_report."""
     first, second = five_scenes(tmp_path / "a"), five_scenes(tmp_path / "other" / "b")
     write_documents(first)
     os.utime(second.folder.manifest, (0, 0))
@@ -132,8 +144,12 @@ HOSTILE = (
 )
 
 
-@pytest.mark.parametrize("value", HOSTILE)
-def test_text_from_outside_stays_text(tmp_path: Path, value: str) -> None:
+def test_text_from_outside_stays_text(tmp_path: Path) -> None:
+    for folder, value in with_folders(tmp_path, HOSTILE):
+        _check_text_from_outside_stays_text(folder, value)
+
+
+def _check_text_from_outside_stays_text(tmp_path: Path, value: str) -> None:
     dataset = five_scenes(tmp_path)
     folder = dataset.folder
     objects = [*read_objects_lock(folder.objects_lock), locked("z", value, title=value)]

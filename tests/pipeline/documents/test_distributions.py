@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from storage.dataset.dataset import open_dataset
 from storage.errors import TrilightError
 from storage.records.quantities import QUANTITIES, STATISTICS, summary
 from storage.records.sample import Sample
+from tests.pipeline.case_folders import with_folders
 from tests.pipeline.documents.dataset_by_hand import five_scenes, furnished, sample, write_dataset
 from tests.scenes_by_hand import tiny_scene
 from tests.textured_by_hand import sky, textured_scene
@@ -37,47 +39,43 @@ def test_uses_of_objects(found: Distributions) -> None:
     assert found.licences == {"CC-BY-4.0": (1, 1, 1), "CC0-1.0": (3, 2, 5)}
 
 
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        ("objects_per_scene", [1, 2, 0, 2, 1]),
-        ("triangles_per_scene", [5, 7, 3, 7, 5]),
-        ("triangles_per_object", [2] * 6),
-        # five floors, six objects whose triangles are half red and half green
-        ("diffuse", [0.5] * 5 + [(0.6 + 0.4) / 2] * 6),
-        ("specular", [0.2] * 5 + [0.1] * 6),
-        ("albedo_sum", [0.7] * 5 + [(0.7 + 0.5) / 2] * 6),
-        ("roughness", [0.5] * 5 + [0.3] * 6),
-        ("textures_per_scene", [0] * 5),
-        ("texture_width", []),
-        ("skies_per_scene", [0] * 5),
-        ("sky_radiance", []),
-        ("sky_peak", []),
-        ("sky_half_light_deg", []),
-        ("lights_per_scene", [1] * 5),
-        ("total_emission", [100] * 5),
-        # the middle of the light is (0, -1/30, 2), and half of 0.2 x 0.2 its area
-        ("light_distance", [(4 + 1 / 900) ** 0.5] * 5),
-        ("light_size", [0.02**0.5] * 5),
-        ("camera_distance", [5**0.5] * 10),
-        ("elevation_deg", [np.degrees(np.arctan(0.5))] * 10),
-        ("azimuth_deg", [0, 90] * 5),
-        ("fov_deg", [45, 40] * 5),
-        ("noise_floor_db", [38, 38, 42, 42, 41.5, 41.5, 41.5, 41.5, 44, 44]),
-        ("noise_floor_linear_db", [33.25] * 10),
-        ("object_noise_floor_db", [40.5] * 10),
-        ("coverage", [0.25] * 8 + [0.5] * 2),
-        ("spp", [256, 256] + [128] * 8),
-        ("camera_attempt", [0] * 4 + [0, 0, 2, 2] + [0] * 2),
-    ],
-)
-def test_values(found: Distributions, name: str, values: list[float]) -> None:
-    assert np.sort(found.all(name)) == pytest.approx(np.sort(values), rel=FLOAT32)
+VALUES: list[tuple[str, Sequence[float]]] = [
+    ("objects_per_scene", [1, 2, 0, 2, 1]),
+    ("triangles_per_scene", [5, 7, 3, 7, 5]),
+    ("triangles_per_object", [2] * 6),
+    # five floors, six objects whose triangles are half red and half green
+    ("diffuse", [0.5] * 5 + [(0.6 + 0.4) / 2] * 6),
+    ("specular", [0.2] * 5 + [0.1] * 6),
+    ("albedo_sum", [0.7] * 5 + [(0.7 + 0.5) / 2] * 6),
+    ("roughness", [0.5] * 5 + [0.3] * 6),
+    ("textures_per_scene", [0] * 5),
+    ("texture_width", []),
+    ("skies_per_scene", [0] * 5),
+    ("sky_radiance", []),
+    ("sky_peak", []),
+    ("sky_half_light_deg", []),
+    ("lights_per_scene", [1] * 5),
+    ("total_emission", [100] * 5),
+    # the middle of the light is (0, -1/30, 2), and half of 0.2 x 0.2 its area
+    ("light_distance", [(4 + 1 / 900) ** 0.5] * 5),
+    ("light_size", [0.02**0.5] * 5),
+    ("camera_distance", [5**0.5] * 10),
+    ("elevation_deg", [np.degrees(np.arctan(0.5))] * 10),
+    ("azimuth_deg", [0, 90] * 5),
+    ("fov_deg", [45, 40] * 5),
+    ("noise_floor_db", [38, 38, 42, 42, 41.5, 41.5, 41.5, 41.5, 44, 44]),
+    ("noise_floor_linear_db", [33.25] * 10),
+    ("object_noise_floor_db", [40.5] * 10),
+    ("coverage", [0.25] * 8 + [0.5] * 2),
+    ("spp", [256, 256] + [128] * 8),
+    ("camera_attempt", [0] * 4 + [0, 0, 2, 2] + [0] * 2),
+]
 
 
-def test_every_quantity_is_tested() -> None:
-    (mark,) = test_values.pytestmark  # type: ignore[attr-defined]
-    assert {name for name, _ in mark.args[1]} == set(QUANTITIES)
+def test_values(found: Distributions) -> None:
+    for name, values in VALUES:
+        assert np.sort(found.all(name)) == pytest.approx(np.sort(values), rel=FLOAT32), name
+    assert {name for name, _ in VALUES} == set(QUANTITIES)
 
 
 def test_values_belong_to_their_split(found: Distributions) -> None:
@@ -186,8 +184,14 @@ def _without_cameras() -> Sample:
     return dataclasses.replace(plain, views=plain.views[:1], radiance_rgb=one)
 
 
-@pytest.mark.parametrize("make", [_without_template, _of_words, _unlawful, _without_cameras])
-def test_a_bad_sample_is_one_clear_line(tmp_path: Path, make: object) -> None:
+def test_a_bad_sample_is_one_clear_line(tmp_path: Path) -> None:
+    for folder, make in with_folders(
+        tmp_path, [_without_template, _of_words, _unlawful, _without_cameras]
+    ):
+        _check_a_bad_sample_is_one_clear_line(folder, make)
+
+
+def _check_a_bad_sample_is_one_clear_line(tmp_path: Path, make: object) -> None:
     assert callable(make)
     dataset = write_dataset(tmp_path, {"train-000000.tar": [make()]})
     with pytest.raises(TrilightError, match="sample 000000007: .*trilight verify"):

@@ -5,7 +5,6 @@ import io
 
 import matplotlib
 import numpy as np
-import pytest
 from PIL import Image
 
 from pipeline.documents.figures import (
@@ -25,7 +24,7 @@ def picture(markup: Markup) -> Image.Image:
     return Image.open(io.BytesIO(base64.b64decode(data)))
 
 
-VALUES = {
+VALUES: dict[str, list[float]] = {
     "none": [],
     "one": [3.5],
     "equal": [2.5] * 9,
@@ -37,12 +36,14 @@ VALUES = {
 }
 
 
-@pytest.mark.parametrize("values", VALUES.values(), ids=VALUES.keys())
-def test_any_values_can_be_drawn(values: list[float]) -> None:
+def test_any_values_can_be_drawn() -> None:
+    marks = {"a": 3.0, "b": None, "c": np.nan}
     with drawing():
-        figure, axes = panels(2, polar=(1,))
-        histogram(axes[0], values, "x", ylabel="y", marks={"a": 3.0, "b": None, "c": np.nan})
-        rose(axes[1], values, "directions")
+        figure, axes = panels(len(VALUES) + 4, polar=(0, 1, 2, 3))
+        for axis, name in zip(axes, ("none", "equal", "wide", "not finite"), strict=False):
+            rose(axis, VALUES[name], "directions")
+        for axis, (name, values) in zip(axes[4:], VALUES.items(), strict=True):
+            histogram(axis, values, name, ylabel="y", marks=marks)
         drawn = picture(encoded(figure, "alt"))
     assert drawn.size[0] > 800
     assert len(drawn.getcolors(1 << 24) or []) > 20

@@ -1,5 +1,8 @@
 """The one way to make HTML escapes everything that is not its own."""
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -51,16 +54,28 @@ def test_addresses_become_links(url: str) -> None:
     assert (tags.tags, tags.links, "".join(tags.text)) == (["a"], [url], url)
 
 
-@pytest.mark.parametrize(
-    "url",
-    [
-        "", "javascript:alert(1)", "JaVaScript:alert(1)", " https://example.org",
-        "java\nscript:alert(1)", "data:text/html,x", "file:///etc/passwd", "//example.org",
-        "https://", "https://me:secret@example.org", "https://[broken", "https://e.org/\u202egro",
-        "a file.glb", HARM,
-    ],
-)  # fmt: skip
-def test_other_addresses_stay_text(url: str) -> None:
+def test_other_addresses_stay_text() -> None:
+    cases: Iterable[Any] = [
+        "",
+        "javascript:alert(1)",
+        "JaVaScript:alert(1)",
+        " https://example.org",
+        "java\nscript:alert(1)",
+        "data:text/html,x",
+        "file:///etc/passwd",
+        "//example.org",
+        "https://",
+        "https://me:secret@example.org",
+        "https://[broken",
+        "https://e.org/\u202egro",
+        "a file.glb",
+        HARM,
+    ]
+    for url in cases:
+        _check_other_addresses_stay_text(url)
+
+
+def _check_other_addresses_stay_text(url: str) -> None:
     tags = read(outside_link(url).encode())
     assert (tags.tags, "".join(tags.text)) == ([], url)
 

@@ -33,6 +33,7 @@ def test_shards_are_spread_over_each_split(dataset: Dataset) -> None:
     assert names == ["test-000010.tar", *(f"train-{row:06d}.tar" for row in (0, 3, 6, 9))]
 
 
+@pytest.mark.usefixtures("bare_reports")
 def test_documents_of_a_sample_say_so(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -127,6 +127,7 @@ def test_equal_scenes_have_equal_pages() -> None:
     assert page_of(sample(0, furnished(["a"]))) == page_of(sample(0, furnished(["a"])))
 
 
+@pytest.mark.usefixtures("bare_reports")
 def test_the_commands_run_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shards = {"train-000000.tar": [sample(index, furnished(["a"])) for index in (3, 4)]}
     dataset = write_dataset(tmp_path / "data", shards)
@@ -153,6 +154,7 @@ def test_the_commands_run_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert after == before
 
 
+@pytest.mark.usefixtures("bare_reports")
 def test_the_report_names_the_stored_passes(tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path, {"train-000000.tar": [sample(0, furnished([]))]})
 

@@ -25,6 +25,7 @@ def checked(folder: Path) -> list[str]:
     return sorted(line.partition(": ")[0] for line in done.stdout.splitlines())
 
 
+@pytest.mark.usefixtures("bare_reports")
 def test_documents_that_are_written_again_have_their_sums(tmp_path: Path) -> None:
     dataset = five_scenes(tmp_path / "set")
     root = dataset.folder.root

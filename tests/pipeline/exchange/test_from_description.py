@@ -65,8 +65,14 @@ def _slowly(point: Point, obj: PlainObj, transform: dict[str, Any]) -> Point:
     return x * sx + tx, y * sy + ty, z * sz + tz
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
 def test_examples_have_the_triangles_of_their_files(
+    examples: dict[str, Scene], shared: Path
+) -> None:
+    for name in EXAMPLES:
+        _check_examples_have_the_triangles_of_their_files(examples, shared, name)
+
+
+def _check_examples_have_the_triangles_of_their_files(
     examples: dict[str, Scene], shared: Path, name: str
 ) -> None:
     scene = examples[name]
@@ -76,8 +82,14 @@ def test_examples_have_the_triangles_of_their_files(
         assert (scene.object_index == row).sum() == len(obj.triangles)
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
 def test_every_corner_of_the_examples_is_where_a_slow_twin_puts_it(
+    examples: dict[str, Scene], shared: Path
+) -> None:
+    for name in EXAMPLES:
+        _check_every_corner_of_the_examples_is_where_a_slow_twin_puts_it(examples, shared, name)
+
+
+def _check_every_corner_of_the_examples_is_where_a_slow_twin_puts_it(
     examples: dict[str, Scene], shared: Path, name: str
 ) -> None:
     for row, stated in enumerate(_json(shared, name).values()):
@@ -110,14 +122,24 @@ BOUNDS = {
 }
 
 
-@pytest.mark.parametrize("name", BOUNDS)
-def test_examples_are_as_large_as_they_should_be(examples: dict[str, Scene], name: str) -> None:
+def test_examples_are_as_large_as_they_should_be(examples: dict[str, Scene]) -> None:
+    for name in BOUNDS:
+        _check_examples_are_as_large_as_they_should_be(examples, name)
+
+
+def _check_examples_are_as_large_as_they_should_be(examples: dict[str, Scene], name: str) -> None:
     points = examples[name].vertex_positions
     np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], BOUNDS[name], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
 def test_examples_have_the_materials_and_kinds_of_their_files(
+    examples: dict[str, Scene], shared: Path
+) -> None:
+    for name in EXAMPLES:
+        _check_examples_have_the_materials_and_kinds_of_their_files(examples, shared, name)
+
+
+def _check_examples_have_the_materials_and_kinds_of_their_files(
     examples: dict[str, Scene], shared: Path, name: str
 ) -> None:
     scene = examples[name]
@@ -227,8 +249,12 @@ REFUSED: list[tuple[tuple[str | int, ...], dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("path", "change", "message"), REFUSED)
-def test_what_means_nothing_is_refused_by_name(
+def test_what_means_nothing_is_refused_by_name() -> None:
+    for case in REFUSED:
+        _check_what_means_nothing_is_refused_by_name(*case)
+
+
+def _check_what_means_nothing_is_refused_by_name(
     path: tuple[str | int, ...], change: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(TrilightError) as caught:

@@ -11,14 +11,14 @@ from typing import Any
 
 import h5py
 import numpy as np
-import pytest
 import trimesh
 
-from pipeline.exchange.convert import convert_scene
+from pipeline.exchange.convert import convert_scene, write_scene
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.renderformer_json import described_files
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene
+from tests.pipeline.case_folders import with_folders
 from tests.pipeline.scenes.example_scenes import EXAMPLES, example_scene
 from tests.scenes_by_hand import LIGHT, tiny_scene
 
@@ -41,11 +41,17 @@ def shape_of(value: Any) -> Any:
 
 
 def written(scene: Scene, folder: Path) -> dict[str, Any]:
-    """Return what `trilight convert` writes beside the meshes."""
+    """Return what is written beside the meshes."""
+    write_scene(folder / "a.json", scene)
+    return dict(json.loads((folder / "a.json").read_text()))
+
+
+def converted(scene: Scene, folder: Path, name: str) -> Path:
+    """Return what `trilight convert` writes, by a child."""
     (folder / "a.safetensors").write_bytes(encode_scene(scene))
     source = scene_source(str(folder / "a.safetensors"))
-    convert_scene(source, folder / "a.json", budget=None, done=lambda finished, of: None)
-    return dict(json.loads((folder / "a.json").read_text()))
+    convert_scene(source, folder / name, budget=None, done=lambda finished, of: None)
+    return folder / name
 
 
 def assert_usable(described: dict[str, Any], scene: Scene, folder: Path) -> None:
@@ -71,22 +77,43 @@ def assert_usable(described: dict[str, Any], scene: Scene, folder: Path) -> None
     assert len(found) == len(want)
 
 
-@pytest.mark.parametrize("name", list(EXAMPLES))
 def test_published_scenes_are_written_as_the_published_converter_reads(
+    shared: Path, tmp_path: Path
+) -> None:
+    for folder, name in with_folders(tmp_path, list(EXAMPLES)):
+        _check_published_scenes_are_written_as_the_published_converter_reads(shared, folder, name)
+
+
+def _check_published_scenes_are_written_as_the_published_converter_reads(
     shared: Path, tmp_path: Path, name: str
 ) -> None:
     scene = example_scene(shared, name)
     assert_usable(written(scene, tmp_path), scene, tmp_path)
+    if name == "init-template":
+        (tmp_path / "converted").mkdir()
+        described = json.loads(converted(scene, tmp_path / "converted", "a.json").read_text())
+        assert_usable(described, scene, tmp_path / "converted")
 
 
-@pytest.mark.parametrize(
-    "names",
-    [("light/../x", "light\\..\\x"), ("A", "a"), (".", ".."), ("ü" * 200, "ü" * 100), ("", "\0")],
+NAMES = (
+    ("light/../x", "light\\..\\x"),
+    ("A", "a"),
+    (".", ".."),
+    ("ü" * 200, "ü" * 100),
+    ("", "\0"),
 )
-def test_any_names_become_names_of_files(tmp_path: Path, names: tuple[str, str]) -> None:
-    objects = (SceneObject(name=names[0], kind="shell"), SceneObject(name=names[1], kind="emitter"))
-    scene = dataclasses.replace(tiny_scene(), objects=objects)
-    assert_usable(written(scene, tmp_path), scene, tmp_path)
+
+
+def test_any_names_become_names_of_files(tmp_path: Path) -> None:
+    for number, (shell, emitter) in enumerate(NAMES):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        objects = (
+            SceneObject(name=shell, kind="shell"),
+            SceneObject(name=emitter, kind="emitter"),
+        )
+        scene = dataclasses.replace(tiny_scene(), objects=objects)
+        assert_usable(written(scene, folder), scene, folder)
 
 
 def test_light_beyond_half_floats_is_said_to_be_cut_off() -> None:
@@ -97,11 +124,8 @@ def test_light_beyond_half_floats_is_said_to_be_cut_off() -> None:
 
 def test_our_hdf5_has_what_the_published_program_takes(shared: Path, tmp_path: Path) -> None:
     """Every array that it loads, of one number of triangles and of views, finite in half floats."""
-    scene = example_scene(shared, "crystals")
-    (tmp_path / "a.safetensors").write_bytes(encode_scene(scene))
-    source = scene_source(str(tmp_path / "a.safetensors"))
-    convert_scene(source, tmp_path / "a.h5", budget=None, done=lambda finished, of: None)
-    with h5py.File(tmp_path / "a.h5") as file:
+    scene = example_scene(shared, "init-template")
+    with h5py.File(converted(scene, tmp_path, "a.h5")) as file:
         found = {name: np.array(file[name]).astype(np.float32) for name in file}
     count, views = scene.num_triangles, scene.num_views
     assert {name: array.shape for name, array in found.items()} == {

@@ -1,6 +1,7 @@
 """RenderFormer's example scenes, built in this process, and a second reader of their OBJ files."""
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,9 @@ EXAMPLES = {
 """Triangles of each scene: the faces of its OBJ files, counted with grep, a quad as two."""
 
 
+@cache
 def example_scene(shared: Path, name: str) -> Scene:
-    """Return an example scene with the cameras of its file."""
+    """Return an example scene with the cameras of its file; nobody may change it."""
     scene, _ = build_scene(
         (shared / "renderformer_scenes").resolve(),
         f"{name}.json",

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
@@ -42,11 +43,11 @@ def test_attempts_differ_but_keep_what_was_planned(pool: list[PooledAsset]) -> N
             assert len(rows_of(scene, "emitter")) == plan.num_lights
 
 
-@pytest.mark.parametrize("max_triangles", [532, 700, 1536, 4096])
+@pytest.mark.parametrize("max_triangles", [532, 1536])
 def test_the_budget_is_never_exceeded(pool: list[PooledAsset], max_triangles: int) -> None:
     settings = changed(SETTINGS, {"max_triangles": max_triangles, "num_views": 1})
     totals = []
-    for index in range(60):
+    for index in range(24):
         try:
             scene = compose_scene(settings, pool, seed=1, scene_index=index, attempt=0)
         except Rejected as rejected:
@@ -62,19 +63,30 @@ def test_the_budget_is_never_exceeded(pool: list[PooledAsset], max_triangles: in
     assert len(totals) >= 10
 
 
-@pytest.mark.parametrize("name", [name for name in BUILDS if name != "benchmark-v1-mini"])
-def test_no_build_exceeds_its_budget(pool: list[PooledAsset], name: str) -> None:
-    """Shell and lights included; and each build has scenes that come near it."""
-    settings = named_build(name, changes={"scenes.num_views": 1}).scenes
-    fullest = 0.0
-    # Of the excursions one set of those with ten thousand triangles is enough.
-    for index in range(24 if settings.excursions else 40):
-        most = settings.of_scene(index).max_triangles
-        with contextlib.suppress(Rejected):
-            scene = compose_scene(settings, pool, seed=2, scene_index=index, attempt=0)
-            fullest = max(fullest, scene.num_triangles / most)
-    # A level of the small pool is a quarter of the next finer one, so that little is ever left.
-    assert 0.75 < fullest <= 1
+def _require_within_budget(pool: list[PooledAsset], names: Iterable[str], scenes: int) -> None:
+    """Shell and lights included; and each build has scenes that come near its budget."""
+    for name in names:
+        settings = named_build(name, changes={"scenes.num_views": 1}).scenes
+        fullest = 0.0
+        for index in range(scenes):
+            most = settings.of_scene(index).max_triangles
+            with contextlib.suppress(Rejected):
+                scene = compose_scene(settings, pool, seed=2, scene_index=index, attempt=0)
+                fullest = max(fullest, scene.num_triangles / most)
+        # A level of the small pool is a quarter of the next finer one: little is ever left.
+        assert 0.75 < fullest <= 1, (name, fullest)
+
+
+def test_two_builds_keep_their_budgets(pool: list[PooledAsset]) -> None:
+    _require_within_budget(pool, ("smoke", "finetune-512"), scenes=16)
+
+
+@pytest.mark.slow
+def test_no_build_exceeds_its_budget(pool: list[PooledAsset]) -> None:
+    with_maps_or_many_triangles = {"textured-256", "sky-256", "out-of-range", "out-of-range-2"}
+    plain = set(BUILDS) - with_maps_or_many_triangles - {"benchmark-v1-mini"}
+    _require_within_budget(pool, sorted(plain), scenes=40)
+    _require_within_budget(pool, sorted(with_maps_or_many_triangles), scenes=16)
 
 
 def test_every_scene_keeps_the_laws_of_the_record(scenes: list[Scene]) -> None:
@@ -132,8 +144,8 @@ def test_about_half_of_the_objects_touch_the_floor(scenes: list[Scene]) -> None:
         floor = planes_of(scene)[0]
         heights = [points_of(scene, row) @ floor[:3] + floor[3] for row in rows_of(scene, "object")]
         touches += [height.min() < TOUCH for height in heights]
-    # 400 objects: a standard deviation of 0.025, four of which are 0.1.
-    assert 0.4 < np.mean(touches) < 0.6
+    # 200 objects: a standard deviation of 0.035, four of which are 0.14.
+    assert 0.36 < np.mean(touches) < 0.64
 
 
 def test_shading_normals_face_the_side_of_their_triangle(scenes: list[Scene]) -> None:
@@ -174,7 +186,7 @@ def test_a_scene_without_objects_is_a_scene(pool: list[PooledAsset]) -> None:
 
 def test_real_objects_compose(real_pool: list[PooledAsset]) -> None:
     """Thin, open, doubled and many-part meshes as people publish them keep every law."""
-    for index in range(40):
+    for index in range(12):
         scene = first_scene(SETTINGS, real_pool, seed=0, scene_index=index)
         scene.check()
         assert scene.num_triangles <= SETTINGS.max_triangles

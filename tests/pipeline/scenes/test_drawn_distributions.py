@@ -51,7 +51,7 @@ def test_where_all_fit_every_object_is_as_likely_in_every_place() -> None:
     require_plausible(table)
 
 
-@pytest.mark.parametrize("total", [90, 70, 45])
+@pytest.mark.parametrize("total", [70])
 def test_where_not_all_fit_each_draw_is_even_among_what_does(total: int) -> None:
     """Against the odds of every triple, one draw at a time: the simplest must fit after each."""
     odds: dict[str, float] = {}
@@ -77,7 +77,7 @@ def _enumerate(drawn: str, odds: float, left: int, count: int, found: dict[str, 
 @pytest.fixture(scope="module")
 def published(pool: list[PooledAsset]) -> list[Scene]:
     settings = named_build("renderformer-v1-256", changes={"scenes.num_views": 2}).scenes
-    return [first_scene(settings, pool, seed=0, scene_index=index) for index in range(300)]
+    return [first_scene(settings, pool, seed=0, scene_index=index) for index in range(200)]
 
 
 def _composed_table(
@@ -136,7 +136,7 @@ def test_how_far_meshes_shift_sizes(pool: list[PooledAsset]) -> None:
     settings = named_build("pretrain-256").scenes
     coarse = [MeshShape(entry.locked.uid, entry.asset.levels[-1], "box") for entry in pool]
     sizes: dict[int, list[float]] = {1: [], 2: [], 3: []}
-    for index in range(500):
+    for index in range(200):
         plan = scene_plan(settings, seed=0, scene_index=index)
         rng = rng_for(0, "scene", index, 0)
         shapes = [coarse[row] for row in rng.integers(len(coarse), size=plan.num_objects)]
@@ -145,8 +145,8 @@ def test_how_far_meshes_shift_sizes(pool: list[PooledAsset]) -> None:
         sizes[plan.num_objects] += [
             (4 * placement.pose.radius - low) / (high - low) for placement in layout.objects
         ]
-    # Samples of 170, 330 and 500 add up to 0.10, 0.07 and 0.06 of chance, with odds of 1 in 20.
-    for count, most in ((1, 0.18), (2, 0.19), (3, 0.23)):
+    # Samples of 70, 130 and 200 add up to 0.16, 0.12 and 0.10 of chance, with odds of 1 in 20.
+    for count, most in ((1, 0.24), (2, 0.24), (3, 0.27)):
         values = np.sort(sizes[count])
         assert np.abs(values - np.arange(len(values)) / len(values)).max() < most
 

@@ -37,11 +37,11 @@ def _meeting(scene: Scene) -> int:
 def test_meshes_do_not_meet_where_the_plan_says_so(scenes: list[Scene]) -> None:
     """Scenes are rounded to float32, a ten-millionth of a unit: none of these is so near."""
     pairs = 0
-    for index, scene in enumerate(scenes):
+    for index, scene in enumerate(scenes[:60]):
         if not scene_plan(SETTINGS, seed=3, scene_index=index).overlaps:
             assert _meeting(scene) == 0, index
             pairs += len(rows_of(scene, "object")) // 2
-    assert pairs > 80
+    assert pairs > 25
 
 
 def test_meshes_may_meet_where_the_plan_lets_them(pool: list[PooledAsset]) -> None:
@@ -67,7 +67,7 @@ def test_spheres_may_overlap_while_meshes_do_not(scenes: list[Scene]) -> None:
             for k, (a, r) in enumerate(spheres)
             for b, s in spheres[:k]
         )
-    assert overlapping > 20
+    assert overlapping > 8
 
 
 def _pose(rng: np.random.Generator, radius: float) -> Pose:
@@ -84,7 +84,7 @@ def test_meets_agrees_with_the_slow_twin_and_is_symmetric(pool: list[PooledAsset
     rng = np.random.default_rng(0)
     coarse = [MeshShape(entry.locked.uid, entry.asset.levels[-1], "box") for entry in pool]
     found = []
-    for _ in range(150):
+    for _ in range(60):
         one, other = (coarse[row] for row in rng.integers(len(coarse), size=2))
         pose, its_pose = _pose(rng, rng.uniform(0.1, 0.5)), _pose(rng, rng.uniform(0.1, 0.5))
         soup, its_soup = _soup(one, pose), _soup(other, its_pose)
@@ -92,7 +92,7 @@ def test_meets_agrees_with_the_slow_twin_and_is_symmetric(pool: list[PooledAsset
         assert one.meets(pose, other, its_pose) == twin
         assert other.meets(its_pose, one, pose) == twin
         found.append(twin)
-    assert 30 < sum(found) < 120
+    assert 12 < sum(found) < 48
 
 
 def test_a_mesh_inside_another_meets_it() -> None:

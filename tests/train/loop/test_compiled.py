@@ -88,15 +88,10 @@ def _check(
 
 
 @pytest.mark.slow  # Dynamo traces every layer
-def test_layers_of_a_stage_share_a_graph_for_every_length(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four functions, and two graphs more: each stage's first layer is asked something else."""
-    _check(monkeypatch, "eager", "linear", QUICK, 6)
-
-
-@pytest.mark.slow
 def test_three_kinds_of_pass_are_three_times_as_many_graphs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Layers of a stage share a graph for every length: four functions, two graphs more a kind."""
     _check(monkeypatch, "eager", "linear", PASSES, 15)
 
 

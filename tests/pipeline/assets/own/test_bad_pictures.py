@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from pipeline.assets.own.picture import Picture
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
@@ -29,6 +28,7 @@ from tests.pipeline.assets.own.textured_kit import (
     textured_obj,
     textured_tree,
 )
+from tests.pipeline.case_folders import with_folders
 
 F = 0.04 + 0.96 / 21
 TOLERANCE = 0.02
@@ -57,8 +57,12 @@ UNREADABLE: dict[str, tuple[str, bytes]] = {
 }
 
 
-@pytest.mark.parametrize("name", UNREADABLE)
-def test_bad_pictures_are_lost_with_a_reason(tmp_path: Path, name: str) -> None:
+def test_bad_pictures_are_lost_with_a_reason(tmp_path: Path) -> None:
+    for folder, name in with_folders(tmp_path, UNREADABLE):
+        _check_bad_pictures_are_lost_with_a_reason(folder, name)
+
+
+def _check_bad_pictures_are_lost_with_a_reason(tmp_path: Path, name: str) -> None:
     reason, data = UNREADABLE[name]
     path = textured_glb(tmp_path / "a.glb", data)
     assert lost(path) == reason
@@ -102,8 +106,12 @@ OUTSIDE = [
 ]
 
 
-@pytest.mark.parametrize("uri", OUTSIDE)
-def test_pictures_do_not_lead_out(tmp_path: Path, uri: str) -> None:
+def test_pictures_do_not_lead_out(tmp_path: Path) -> None:
+    for folder, uri in with_folders(tmp_path, OUTSIDE):
+        _check_pictures_do_not_lead_out(folder, uri)
+
+
+def _check_pictures_do_not_lead_out(tmp_path: Path, uri: str) -> None:
     (tmp_path / "secret.png").write_bytes(picture_bytes(CORNERS))
     folder = tmp_path / "objects"
     folder.mkdir()
@@ -178,8 +186,12 @@ FORMS: dict[str, bytes] = {
 }
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_forms_of_pictures(tmp_path: Path, form: str) -> None:
+def test_forms_of_pictures(tmp_path: Path) -> None:
+    for folder, form in with_folders(tmp_path, FORMS):
+        _check_forms_of_pictures(folder, form)
+
+
+def _check_forms_of_pictures(tmp_path: Path, form: str) -> None:
     asset = prepare_asset(textured_glb(tmp_path / "a.glb", FORMS[form]), KEEP)
     places = {(-0.25, 0.25): 40, (0.25, 0.25): 200, (-0.25, -0.25): 120, (0.25, -0.25): 250}
     for place, code in places.items():

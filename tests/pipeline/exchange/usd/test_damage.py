@@ -15,7 +15,7 @@ from storage.errors import TrilightError
 from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_scene
 
-COPIES = 150
+COPIES = 60
 LIMITS = ChildLimits(memory_bytes=4 << 30, wall_s=60, calls_per_child=1000)
 
 
@@ -65,7 +65,7 @@ def test_damage_ends_in_one_line(
 ) -> None:
     """Native code may even crash there: that costs the child, which the command says in a line.
 
-    These 900 files crash nothing (usd-core 26.11); what comes out of the reader is TrilightError.
+    These 360 files crash nothing (usd-core 26.11); what comes out of the reader is TrilightError.
     """
     data, refused = whole_file(tmp_path, suffix, ours), 0
     for seed in range(COPIES):
@@ -102,11 +102,14 @@ ODD: list[tuple[str, str, Any]] = [
 ]
 
 
-@pytest.mark.parametrize(("path", "kind", "value"), ODD)
-def test_values_of_another_kind_are_refused_or_noted(
-    tmp_path: Path, path: str, kind: str, value: Any
-) -> None:
+def test_values_of_another_kind_are_refused_or_noted(tmp_path: Path) -> None:
     """A layer may call an attribute of a schema by any type; so may one that a person wrote."""
+    for number, (path, kind, value) in enumerate(ODD):
+        (tmp_path / str(number)).mkdir()
+        _require_refused_or_lawful(tmp_path / str(number), path, kind, value)
+
+
+def _require_refused_or_lawful(tmp_path: Path, path: str, kind: str, value: Any) -> None:
     stage = Usd.Stage.Open(str(write_stage(tmp_path)))
     prim_path, name = path.split(".")
     prim = stage.GetPrimAtPath(prim_path)
@@ -120,6 +123,6 @@ def test_values_of_another_kind_are_refused_or_noted(
     try:
         found = read_usd(tmp_path / "odd.usda", None, None, "")
     except TrilightError as error:
-        assert str(error).startswith("odd.usda: ") and str(error).isprintable()
+        assert str(error).startswith("odd.usda: ") and str(error).isprintable(), (path, kind)
     else:
         found.scene.check()

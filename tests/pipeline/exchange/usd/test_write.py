@@ -1,6 +1,7 @@
 """A scene in USD: valid by USD's own judges, exact on the way back, and nothing of this machine."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,6 +19,7 @@ from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene
+from tests.pipeline.case_folders import with_folders
 from tests.pipeline.exchange.usd.usd_validators import errors_of
 from tests.scenes_by_hand import LIGHT, tiny_scene
 
@@ -64,9 +66,14 @@ def odd_scene() -> Scene:
     )
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-@pytest.mark.parametrize("scene", [tiny_scene(), odd_scene()], ids=["tiny", "odd"])
-def test_every_validator_of_usd_agrees(tmp_path: Path, scene: Scene, suffix: str) -> None:
+def test_every_validator_of_usd_agrees(tmp_path: Path) -> None:
+    for folder, case in with_folders(
+        tmp_path, itertools.product(SUFFIXES, [tiny_scene(), odd_scene()])
+    ):
+        _check_every_validator_of_usd_agrees(folder, *case)
+
+
+def _check_every_validator_of_usd_agrees(tmp_path: Path, suffix: str, scene: Scene) -> None:
     assert errors_of(written(tmp_path, scene, f"a{suffix}")) == []
 
 
@@ -76,9 +83,14 @@ def test_validators_would_see_a_mistake(tmp_path: Path) -> None:
     assert errors_of(stage)
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-@pytest.mark.parametrize("scene", [tiny_scene(), odd_scene()], ids=["tiny", "odd"])
-def test_there_and_back_is_exact(tmp_path: Path, scene: Scene, suffix: str) -> None:
+def test_there_and_back_is_exact(tmp_path: Path) -> None:
+    for folder, case in with_folders(
+        tmp_path, itertools.product(SUFFIXES, [tiny_scene(), odd_scene()])
+    ):
+        _check_there_and_back_is_exact(folder, *case)
+
+
+def _check_there_and_back_is_exact(tmp_path: Path, suffix: str, scene: Scene) -> None:
     path = tmp_path / f"a{suffix}"
     write_usd(path, scene)
     back = read_exact(Sdf.Layer.FindOrOpen(str(path)))
@@ -130,7 +142,7 @@ def scenes(draw: st.DrawFn) -> Scene:
     )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(scene=scenes(), suffix=st.sampled_from(SUFFIXES))
 def test_any_scene_comes_back(tmp_path_factory: Any, scene: Scene, suffix: str) -> None:
     path = tmp_path_factory.mktemp("usd") / f"a{suffix}"
@@ -244,8 +256,12 @@ def edits() -> Iterable[tuple[str, str, Any]]:
     yield "/Scene/Objects/floor", "instanceable", True
 
 
-@pytest.mark.parametrize(("path", "field", "value"), list(edits()))
-def test_what_was_changed_is_no_longer_ours(
+def test_what_was_changed_is_no_longer_ours(tmp_path: Path) -> None:
+    for folder, case in with_folders(tmp_path, list(edits())):
+        _check_what_was_changed_is_no_longer_ours(folder, *case)
+
+
+def _check_what_was_changed_is_no_longer_ours(
     tmp_path: Path, path: str, field: str, value: Any
 ) -> None:
     write_usd(tmp_path / "a.usda", tiny_scene())

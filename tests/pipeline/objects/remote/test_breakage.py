@@ -54,7 +54,7 @@ def test_one_dead_link_costs_one_object(
     message: str,
 ) -> None:
     monkeypatch.setattr(remote_source, "MAX_BYTES", 1000)
-    monkeypatch.setattr(remote_url, "_SILENCE_S", 0.3)
+    monkeypatch.setattr(remote_url, "_SILENCE_S", 0.15)
     for name in "abc":
         site.put(f"{name}.obj", f"content of {name}")
     breaks(site)
