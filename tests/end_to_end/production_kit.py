@@ -1,6 +1,7 @@
 """The production path, private to a test: PostgreSQL, what `make serve` starts, a Dask cluster."""
 
 import contextlib
+import json
 import os
 import re
 import shlex
@@ -11,7 +12,7 @@ import sys
 import tempfile
 import time
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -186,6 +187,16 @@ def copy_of_the_project(folder: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(ROOT / name, target)
     (folder / ".venv").symlink_to(ROOT / ".venv")
+
+
+def copy_objects(source: Path, target: Path, rows: Sequence[Mapping[str, str]]) -> Path:
+    """Copy some objects of a folder, with the rows of `objects.jsonl` that state their licenses."""
+    for row in rows:
+        path = target / row["path"]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(source / row["path"], path)
+    (target / "objects.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return target
 
 
 def start_served(environment: dict[str, str]) -> None:

@@ -30,6 +30,7 @@ from storage.records.material import EMISSION, PUBLISHED_COLUMNS
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
 from tests.columns_kit import COAT, TINT, WITH_COAT, declared
+from tests.for_each import for_each
 from tests.model.kit import awake, tiny_config
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import FLOOR, tiny_scene
@@ -101,7 +102,7 @@ def test_composed_scenes_differ_in_the_column_alone() -> None:
     assert np.array_equal(plain.c2w, scene.c2w)
 
 
-@pytest.mark.parametrize("number", [2.0, float("nan")])
+@for_each("number", [2.0, float("nan")])
 def test_a_draw_outside_of_the_range_is_named(number: float) -> None:
     wrong = dataclasses.replace(COAT, draw=lambda rng, count: np.full((count, 1), number))
     with declared(wrong), pytest.raises(TrilightError, match="'coat': its draw returned"):
@@ -177,7 +178,7 @@ def test_the_published_form_refuses_it(tmp_path: Path) -> None:
         save_published(awake(config), tmp_path)
 
 
-@pytest.mark.parametrize("form", ["safetensors", "usdc"])
+@for_each("form", ["safetensors", "usdc"])
 def test_a_composed_scene_comes_back_from_exact_forms(tmp_path: Path, form: str) -> None:
     scene = composed(0)
     assert write_scene(tmp_path / f"a.{form}", scene) == ()
@@ -186,7 +187,7 @@ def test_a_composed_scene_comes_back_from_exact_forms(tmp_path: Path, form: str)
     assert scene_digest(back) == scene_digest(scene)
 
 
-@pytest.mark.parametrize("form", ["json", "h5"])
+@for_each("form", ["json", "h5"])
 def test_other_forms_say_that_they_lose_it(tmp_path: Path, form: str) -> None:
     notes = write_scene(tmp_path / f"a.{form}", composed(0))
     assert any("materials.coat" in note for note in notes)

@@ -18,6 +18,7 @@ from storage.dataset.manifest import shard_row
 from storage.dataset.verify import verify_dataset
 from tests.end_to_end.conftest import kill_one, marked_environment, num_meshes, processes_with
 from tests.end_to_end.production_kit import call, postgres, served, start_served, stop_served
+from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import five_scenes
 
 KILLS = int(os.environ.get("TRILIGHT_CHAOS_KILLS", "4"))
@@ -108,7 +109,7 @@ DAMAGES: dict[str, tuple[str, bytes | None]] = {
 """What must never be seen, by what the watcher says of it: a file, and its bytes, if any."""
 
 
-@pytest.mark.parametrize("told", ["", *DAMAGES])
+@for_each("told", ["", *DAMAGES])
 def test_the_watcher_tells_what_must_not_be_seen(tmp_path: Path, told: str) -> None:
     out, whole = tmp_path / "set", tmp_path / "whole"
     five_scenes(whole)

@@ -27,6 +27,7 @@ from storage.seeds import rng_for
 from storage.settings.changes import changed
 from tests.end_to_end.conftest import Trilight
 from tests.extensions_kit import EXAMPLES, loaded, room_for_extensions
+from tests.for_each import for_each
 from tests.scene_templates.balls import one_drawn
 from tests.scenes_by_hand import tiny_scene
 from train.evaluation.metrics import METRICS, picture_scores
@@ -50,7 +51,7 @@ def test_there_is_one_of_each() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", FILES)
+@for_each("name", FILES)
 def test_an_example_is_short_and_shows_its_command(name: str) -> None:
     text = (EXAMPLES / name).read_text()
     assert 20 <= len(text.splitlines()) <= 60

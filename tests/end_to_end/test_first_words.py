@@ -6,13 +6,14 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from infra.cli.leaving import temporary_folder
 from tests.end_to_end.conftest import command
+from tests.for_each import for_each
 
 SCENE = "{}"
 LONG = {
@@ -47,16 +48,14 @@ def silent_url() -> Iterator[str]:
         yield f"http://127.0.0.1:{server.getsockname()[1]}/set"
 
 
-@pytest.mark.parametrize("name", LONG)
-def test_words_come_first_and_ctrl_c_is_answered(
-    name: str, silent_url: str, tmp_path: Path
-) -> None:
-    (tmp_path / "scene.json").write_text(SCENE)
-    # verify has nothing slow to import: only a wait outlasts the signal's way
-    words = tuple(silent_url if word == "SILENT" else word for word in LONG[name])
-    run = _started(words, tmp_path)
+def _leave(words: tuple[str, ...], folder: Path, begun: Callable[[], bool]) -> None:
+    """Interrupt a command that has spoken once something has begun, and read how it leaves."""
+    run = _started(words, folder)
     assert run.stdout is not None
     assert run.stdout.readline().rstrip().endswith(" ...")
+    while not begun():
+        assert run.poll() is None
+        time.sleep(0.02)
     run.send_signal(signal.SIGINT)
     _, errors = run.communicate(timeout=60)
     assert run.returncode == 130, errors
@@ -64,14 +63,19 @@ def test_words_come_first_and_ctrl_c_is_answered(
     assert errors == f"{told}{shlex.join(['trilight', *words])}\n"
 
 
+@pytest.mark.slow
+@for_each("name", LONG)
+def test_words_come_first_and_ctrl_c_is_answered(
+    name: str, silent_url: str, tmp_path: Path
+) -> None:
+    (tmp_path / "scene.json").write_text(SCENE)
+    # verify has nothing slow to import: only a wait outlasts the signal's way
+    words = tuple(silent_url if word == "SILENT" else word for word in LONG[name])
+    _leave(words, tmp_path, lambda: True)
+
+
 def test_plan_leaves_no_scenes_behind_at_ctrl_c(tmp_path: Path) -> None:
-    run = _started(LONG["plan"], tmp_path)
-    while not list(tmp_path.glob("trilight-plan-*")):
-        assert run.poll() is None
-        time.sleep(0.05)
-    run.send_signal(signal.SIGINT)
-    run.communicate(timeout=60)
-    assert run.returncode == 130
+    _leave(LONG["plan"], tmp_path, lambda: bool(list(tmp_path.glob("trilight-plan-*"))))
     assert not list(tmp_path.glob("trilight-plan-*"))
 
 

@@ -4,11 +4,10 @@ import re
 import shlex
 from pathlib import Path
 
-import pytest
-
 from storage.extensions import is_reference
 from tests.command_line import trilight
 from tests.conftest import ROOT
+from tests.for_each import for_each
 
 PAGES = [
     ROOT / "CONTRIBUTING.md",
@@ -35,7 +34,7 @@ SHOWN = [words for example in EXAMPLES for words in _shown_in(example)]
 NAMES = sorted({words[1] for words in [*COMMANDS, *SHOWN] if words[0] == "trilight"})
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@for_each("page", PAGES)
 def test_a_page_is_one_screen_and_leads_somewhere(page: Path) -> None:
     text = page.read_text()
     assert len(text.splitlines()) <= SCREEN or page.name == "CONTRIBUTING.md"
@@ -54,7 +53,7 @@ def test_every_example_has_a_page_and_every_page_a_command() -> None:
     assert all(_commands(page) for page in PAGES)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@for_each("name", NAMES)
 def test_options_that_are_shown_exist(name: str) -> None:
     known = trilight([name, "--help"], env={"COLUMNS": "300"}).stdout
     for words in (*COMMANDS, *SHOWN):

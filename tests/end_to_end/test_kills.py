@@ -10,6 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +28,10 @@ from tests.end_to_end.conftest import (
 )
 
 ARGUMENTS = (
-    "generate", "smoke", "--objects", "builtin:24", "--scenes", "24",
+    "generate", "smoke", "--objects", "builtin:24", "--scenes", "16",
     "--resolution", "32", "--noise-floor", "20", "--seed", "0",
 )  # fmt: skip
-KILLS = 6
+KILLS = 4
 
 
 def _start(out: Path, workers: int, environment: dict[str, str]) -> "subprocess.Popen[bytes]":
@@ -51,11 +52,27 @@ def _wait_until_nobody_is_left(mark: str) -> None:
     assert not left
 
 
-def _undisturbed(folder: Path) -> str:
-    """Return the digest of the dataset that nobody disturbs, made with a cache of its own."""
-    environment = {**os.environ, "TRILIGHT_CACHE": str(folder / "cache-whole")}
-    assert _start(folder / "whole", 1, environment).wait() == 0
-    return open_dataset(str(folder / "whole")).digest
+@dataclass(frozen=True, kw_only=True)
+class Whole:
+    """A dataset that nothing disturbed, made with an empty cache."""
+
+    folder: Path
+    cache: Path
+    digest: str
+    seconds: float
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    folder, started = tmp_path_factory.mktemp("undisturbed"), time.monotonic()
+    environment = {**os.environ, "TRILIGHT_CACHE": str(folder / "cache")}
+    assert _start(folder / "set", 1, environment).wait() == 0
+    return Whole(
+        folder=folder / "set",
+        cache=folder / "cache",
+        digest=open_dataset(str(folder / "set")).digest,
+        seconds=time.monotonic() - started,
+    )
 
 
 def _wait_until(run: "subprocess.Popen[bytes]", reached: Callable[[], bool]) -> None:
@@ -66,21 +83,17 @@ def _wait_until(run: "subprocess.Popen[bytes]", reached: Callable[[], bool]) -> 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path) -> None:
-    started = time.monotonic()
-    expected = _undisturbed(tmp_path)
-    whole_s = time.monotonic() - started
-
+def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path, whole: Whole) -> None:
     rng = np.random.default_rng(0)
     mark, environment = marked_environment()
     cache = tmp_path / "cache"
     environment["TRILIGHT_CACHE"] = str(cache)
     for number in range(KILLS):
         run = _start(tmp_path / "killed", 2, environment)
-        pause_s = rng.uniform(0.1, 0.5) * whole_s
+        pause_s = rng.uniform(0.1, 0.5) * whole.seconds
         if number == 0:  # while meshes are made
             _wait_until(run, lambda: num_meshes(cache) > 5)
-            assert num_meshes(cache) < num_meshes(tmp_path / "cache-whole")
+            assert num_meshes(cache) < num_meshes(whole.cache)
             pause_s = 0.0
         try:
             run.wait(timeout=pause_s)
@@ -90,10 +103,10 @@ def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path) -> None:
             run.wait()
         _wait_until_nobody_is_left(mark)
         for shard in (tmp_path / "killed").glob("*.tar"):
-            assert shard.read_bytes() == (tmp_path / "whole" / shard.name).read_bytes()
+            assert shard.read_bytes() == (whole.folder / shard.name).read_bytes()
     assert _start(tmp_path / "killed", 2, environment).wait() == 0
     _wait_until_nobody_is_left(mark)
-    assert open_dataset(str(tmp_path / "killed")).digest == expected
+    assert open_dataset(str(tmp_path / "killed")).digest == whole.digest
     assert verify_dataset(tmp_path / "killed").problems == []
     # young leftovers may be somebody's work on another machine; old ones go with the next run
     cleaned = tmp_path / "killed" / ".staging" / "cleaned"
@@ -105,9 +118,8 @@ def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_kills_of_children_end_in_the_same_digest(tmp_path: Path) -> None:
+def test_kills_of_children_end_in_the_same_digest(tmp_path: Path, whole: Whole) -> None:
     """While meshes are made, with an empty store, and while pictures are; fork servers too."""
-    expected = _undisturbed(tmp_path)
     rng, out, cache = np.random.default_rng(0), tmp_path / "killed", tmp_path / "cache"
     mark, environment = marked_environment()
     environment["TRILIGHT_CACHE"] = str(cache)
@@ -123,12 +135,12 @@ def test_kills_of_children_end_in_the_same_digest(tmp_path: Path) -> None:
                 run = _start(out, 2, environment)
             time.sleep(0.02)
         if what == "meshes":
-            assert num_meshes(cache) < num_meshes(tmp_path / "cache-whole")
+            assert num_meshes(cache) < num_meshes(whole.cache)
         killed[what] += kill_one("multiprocessing.forkserver", mark, rng)
     run.wait()
     assert _start(out, 2, environment).wait() == 0
     assert min(killed["meshes"], killed["scenes"]) > 0
-    assert open_dataset(str(out)).digest == expected
+    assert open_dataset(str(out)).digest == whole.digest
     assert [row for row in open_dataset(str(out)).failures() if is_passing(row.reason)] == []
     _wait_until_nobody_is_left(mark)
 

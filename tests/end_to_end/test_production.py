@@ -29,7 +29,7 @@ from tests.end_to_end.production_kit import (
     served,
 )
 
-MANY, FEW = 40, 12
+MANY, FEW = 24, 12
 """Scenes, four to a shard: so many that a second worker, which looks for work every ten seconds and
 then starts a process, comes before the first has made them all; and three shards."""
 SMALL: dict[str, Any] = {

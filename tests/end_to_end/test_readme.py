@@ -1,5 +1,6 @@
 """The commands of README and tutorials do what is said; those of all pages exist."""
 
+import json
 import os
 import re
 import shlex
@@ -7,10 +8,12 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
+from storage.dataset.dataset import open_dataset
 from tests.command_line import trilight
 from tests.conftest import ROOT
-from tests.end_to_end.production_kit import copy_of_the_project
+from tests.end_to_end.production_kit import copy_objects, copy_of_the_project
 from tests.end_to_end.tutorial_kit import answer_of, shell_lines, steps_of, tutorial, viewed
 
 README = ROOT / "README.md"
@@ -141,12 +144,14 @@ def _view(command: str, folder: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
-    """README's, in order; only its own dataset and training are smaller."""
+    """README's, in order; only its objects, dataset and training are fewer."""
     copy_of_the_project(tmp_path)
+    rows = [json.loads(row) for row in (shared / "objects/objects.jsonl").open()]
+    objects = copy_objects(shared / "objects", tmp_path / "objects", rows[:32])
     for command in _shell_lines(README):
         if command in NOT_RUN_HERE:
             continue
-        command = command.replace("FOLDER", shlex.quote(str(shared / "objects")))
+        command = command.replace("FOLDER", shlex.quote(str(objects)))
         command = command.replace("--scenes 64", "--scenes 12 --resolution 64")
         command = command.replace("/mine", "/readme")
         command = command.replace("make dataset", "make dataset SCENES=6")
@@ -154,7 +159,13 @@ def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
             _view(command, tmp_path)
         else:
             _run(command.replace("--out runs/readme", "--out runs/readme --steps 60"), tmp_path)
-    assert (tmp_path / "data" / "smoke" / "contact_sheet.png").stat().st_size > 10_000
+    made = tmp_path / "data" / "smoke"
+    with Image.open(made / "contact_sheet.png") as sheet:
+        assert min(sheet.size) > 400
+        assert len(sheet.getcolors(1 << 24) or []) > 1000  # pictures, not an empty sheet
+    assert open_dataset(str(made)).digest in (made / "README.md").read_text()
+    for name in ("LICENSE.md", "attribution.csv", "croissant.json", "report.html"):
+        assert (made / name).stat().st_size > 100
     assert (tmp_path / "runs" / "readme" / "validation_sheet.png").exists()
 
 

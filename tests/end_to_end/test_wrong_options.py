@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
-import pytest
+from tests.for_each import for_each
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("arguments", "message"),
     [
         (("--runner", "ray"), "--runner is 'ray'"),

@@ -9,6 +9,7 @@ from typing_extensions import TypeAliasType
 
 from storage import array_hints
 from storage.array_hints import array_scalar
+from tests.for_each import for_each
 
 _Kept = TypeVar("_Kept", bound=np.generic)
 AliasOfLater = TypeAliasType(  # what numpy 2.5 has in the place of NDArray
@@ -16,7 +17,7 @@ AliasOfLater = TypeAliasType(  # what numpy 2.5 has in the place of NDArray
 )
 
 
-@pytest.mark.parametrize("scalar", [np.float32, np.int64, np.floating[Any]])
+@for_each("scalar", [np.float32, np.int64, np.floating[Any]])
 def test_the_scalar_is_read_of_either(scalar: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert array_scalar(NDArray[scalar]) == scalar
     monkeypatch.setattr(array_hints, "NDArray", AliasOfLater)

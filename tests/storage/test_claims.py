@@ -17,6 +17,7 @@ from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.conftest import ROOT
+from tests.for_each import for_each
 
 HOLD = """
 import sys, time
@@ -96,7 +97,7 @@ def test_leftovers_are_cleared_only_where_nobody_works(tmp_path: Path) -> None:
         assert young.exists()  # of another machine, perhaps, that our locks do not reach
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("number", "passes"),
     [(errno.ENOSPC, True), (errno.EDQUOT, True), (errno.EIO, True), (errno.EACCES, False)],
 )

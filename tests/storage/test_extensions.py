@@ -24,6 +24,7 @@ from storage.extensions import (
 from storage.registry import Registry
 from tests.conftest import ROOT
 from tests.extensions_kit import room_for_extensions, written
+from tests.for_each import for_each
 
 WORDS: Registry[str] = Registry("word", str, {"one": "1"}, decides=("data",))
 """A table to which the extensions of these tests add."""
@@ -62,7 +63,7 @@ def test_processes_that_start_from_here_load_the_same(tmp_path: Path) -> None:
     assert ran.stdout == "7\n"
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("text", "message"),
     [
         ("x = 1\nfoo bar\n", "extension own.py, line 2: SyntaxError: invalid syntax."),
@@ -89,10 +90,11 @@ def test_mistakes_in_a_file_are_one_line_that_names_it(
     assert "\n" not in str(caught.value)
     assert list(WORDS) == ["one"]  # what it had added before is taken back
     path.write_text(ADDS)
-    load_extension(path)  # and mended, it loads
+    with room_for_extensions():
+        load_extension(path)  # and mended, it loads
 
 
-@pytest.mark.parametrize("name", ["nowhere.py", "folder.py", "own.txt", f"a{os.pathsep}b.py"])
+@for_each("name", ["nowhere.py", "folder.py", "own.txt", f"a{os.pathsep}b.py"])
 def test_what_is_no_file_of_python_is_named(tmp_path: Path, name: str) -> None:
     (tmp_path / "folder.py").mkdir()
     (tmp_path / "own.txt").touch()
@@ -128,7 +130,7 @@ def test_what_decides_nothing_is_not_recorded(tmp_path: Path) -> None:
     assert set(recorded("weights")) == {"silent.py"}
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("before", "now", "message"),
     [
         ({}, {"a.py": "1"}, "begun without the extension a.py; leave --extend a.py away"),

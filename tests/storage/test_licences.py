@@ -1,7 +1,5 @@
 """What licences ask for, and which may meet."""
 
-import pytest
-
 from pipeline.objects.licences import DEFAULT_ALLOWED, UNKNOWN, USER_PROVIDED
 from storage.licences import (
     DUTIES,
@@ -11,9 +9,10 @@ from storage.licences import (
     share_alike_camp,
     union_of_duties,
 )
+from tests.for_each import for_each
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("licence", "duties"),
     [
         ("CC0-1.0", ()),
@@ -32,7 +31,7 @@ def test_duties_by_identifier(licence: str, duties: tuple[str, ...]) -> None:
     assert licence_url(licence) is not None
 
 
-@pytest.mark.parametrize(
+@for_each(
     "licence",
     [USER_PROVIDED, UNKNOWN, "MIT OR Apache-2.0", "CC-BY", "CC-XX-4.0", "", "CC-BY-4.0\nx: y"],
 )

@@ -8,13 +8,14 @@ from pipeline.executors.array_task import shards_of_place
 from pipeline.executors.registry import INDEX_VARIABLES, find_executor
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges, numbers_of
+from tests.for_each import for_each
 from tests.pipeline.making.tiny_scenes_kit import tiny_order
 
 PLACE = "JOB_COMPLETION_INDEX"
 GIVEN = {"TASKS": "0-1,7", "SHARDS_PER_TASK": "4"}
 
 
-@pytest.mark.parametrize(("scheduler", "variable"), INDEX_VARIABLES.items())
+@for_each(("scheduler", "variable"), INDEX_VARIABLES.items())
 def test_a_place_is_a_task_that_is_missing(scheduler: str, variable: str) -> None:
     shares = [shards_of_place({**GIVEN, variable: str(place)}, scheduler) for place in range(3)]
     assert shares == ["0:4", "4:8", "28:32"]
@@ -22,7 +23,7 @@ def test_a_place_is_a_task_that_is_missing(scheduler: str, variable: str) -> Non
     assert shards_of_place(alone, scheduler) == "5:6"  # a single job of AWS Batch has no place
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("environment", "message"),
     [
         ({}, "TASKS is not set; expected .* as trilight submit kubernetes makes it"),

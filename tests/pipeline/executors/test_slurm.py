@@ -11,6 +11,7 @@ from pipeline.executors.slurm import shards_of_task
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
@@ -47,7 +48,7 @@ def test_a_stated_number_of_shards_depends_on_the_task_alone() -> None:
     assert shards_of_task(alone, unknown) == "8:12"
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("environment", "message"),
     [
         ({}, r"SLURM_ARRAY_TASK_ID is not set; expected a task of a Slurm array\. Submit"),
@@ -70,7 +71,7 @@ def test_an_array_makes_the_dataset_that_one_process_makes(
     finished = Undocumented()
     monkeypatch.setattr("pipeline.executors.slurm.ThreadRunner", lambda: finished)
     monkeypatch.setattr("pipeline.executors.threads.ThreadRunner", Undocumented)
-    alone, shared = (tiny_order(out=str(tmp_path / name), scenes=20) for name in ("one", "set"))
+    alone, shared = (tiny_order(out=str(tmp_path / name), scenes=12) for name in ("one", "set"))
     find_executor("threads", None, None).make(alone, None)
     slurm = find_executor("slurm", None, None)
     for task in (2, 0, 1):
@@ -79,7 +80,7 @@ def test_an_array_makes_the_dataset_that_one_process_makes(
             monkeypatch.setenv(name, value)
         slurm.make(shared, None)
     assert finished.finished == 1
-    assert len(scenes) == 40
+    assert len(scenes) == 24
     assert verify_dataset(tmp_path / "set").problems == []
     one, array = (open_dataset(str(tmp_path / name)) for name in ("one", "set"))
     assert array.digest == one.digest

@@ -18,6 +18,7 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
 from tests.command_line import trilight
+from tests.for_each import for_each
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 FAKE = """#!/bin/bash
@@ -41,7 +42,7 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("numbers", "text"),
     [((), ""), ((4,), "4"), ((3, 2, 1, 0, 7, 7), "0-3,7"), ((0, 2, 3), "0,2-3")],
 )

@@ -9,6 +9,7 @@ from pipeline.flows import dataset_flows as building
 from pipeline.flows.orders import DatasetInRuns, dataset_in_runs
 from pipeline.making.tasks import shard_ranges
 from storage.errors import TrilightError
+from tests.for_each import for_each
 
 
 def _parameters(**given: Any) -> dict[str, Any]:
@@ -47,7 +48,7 @@ def test_there_are_no_more_ranges_than_shards() -> None:
     assert shard_ranges(7, 1) == ["0:7"]
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("given", "message"),
     [
         ({"flow_runs": 0}, "flow_runs is 0; expected a whole number from 1"),

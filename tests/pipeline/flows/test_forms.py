@@ -16,6 +16,7 @@ from pipeline.flows.orders import dataset_order
 from pipeline.flows.prefect_runner import may_pass
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import EnvironmentFailure, TrilightError
+from tests.for_each import for_each
 
 CANARY = "CANARY-7f3a"
 FLOWS = {
@@ -33,7 +34,7 @@ def _defaults(**given: Any) -> dict[str, Any]:
     return {**plain, "changes": None, **given}
 
 
-@pytest.mark.parametrize("name", FLOWS)
+@for_each("name", FLOWS)
 def test_every_parameter_has_a_sentence_and_a_default(name: str) -> None:
     flow = FLOWS[name]
     assert flow.name == name
@@ -78,7 +79,7 @@ def test_changes_become_dotted_names() -> None:
     assert dataset_order(_defaults()) == DatasetOrder()
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("parameters", "message"),
     [
         ({"build": "nonsense"}, "build"),
@@ -97,7 +98,7 @@ def test_wrong_values_are_refused_by_name(parameters: dict[str, Any], message: s
         generate_scenes.validate_parameters(parameters)
 
 
-@pytest.mark.parametrize(
+@for_each(
     "source",
     [
         f"https://user:{CANARY}@host/folder",
@@ -125,7 +126,7 @@ def test_secrets_are_refused_before_a_run_exists(source: str) -> None:
         generate_scenes.validate_parameters({"objects": harmless})
 
 
-@pytest.mark.parametrize("name", ["prepare-assets", "generate-scenes", "build-dataset"])
+@for_each("name", ["prepare-assets", "generate-scenes", "build-dataset"])
 def test_a_place_to_write_to_holds_no_secret(name: str) -> None:
     for out in (f"s3://me:{CANARY}@bucket/set", f"s3://bucket/set?key={CANARY}"):
         with pytest.raises(ParameterTypeError, match="out"):

@@ -13,6 +13,7 @@ import pytest
 from pipeline.flows.guarded_server import Door
 from storage.cache import open_private, private_folder
 from storage.errors import TrilightError
+from tests.for_each import for_each
 
 PORT = 4200
 
@@ -41,7 +42,7 @@ def _answer(kind: str = "http", **headers: str) -> list[MutableMapping[str, Any]
     return sent
 
 
-@pytest.mark.parametrize(
+@for_each(
     "host",
     ["127.0.0.1:4200", "localhost:4200", "localhost", "10.1.2.3:4200", "[::1]:4200", "server:4200",
      "SERVER", "my-host"],
@@ -55,7 +56,7 @@ def test_own_names_and_addresses_are_answered(host: str) -> None:
         assert _answer("websocket", host=host, **origin) == [{"type": "websocket.accept"}]
 
 
-@pytest.mark.parametrize(
+@for_each(
     "host",
     ["evil.example", f"evil.example:{PORT}", "localhost.evil.example", "127.0.0.1.evil.example",
      "me@evil.example", "127.0.0.1@evil.example", "2130706433", "0x7f.1", "server.", "",
@@ -71,7 +72,7 @@ def test_other_names_are_refused(host: str) -> None:
         assert closed["type"] == "websocket.close"
 
 
-@pytest.mark.parametrize(
+@for_each(
     "origin",
     ["http://evil.example", "null", "", f"http://127.0.0.1:{PORT + 1}", "http://127.0.0.1",
      f"http://localhost:{PORT}", f"http://127.0.0.1:{PORT}.evil.example", "file://"],

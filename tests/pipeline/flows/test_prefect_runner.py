@@ -9,9 +9,10 @@ import pytest
 
 from pipeline.flows import prefect_runner as runner
 from pipeline.flows.limits import GPU_LIMIT
+from tests.for_each import for_each
 
 
-@pytest.mark.parametrize(("variant", "held"), [("cuda_ad_rgb", [1]), ("llvm_ad_rgb", [])])
+@for_each(("variant", "held"), [("cuda_ad_rgb", [1]), ("llvm_ad_rgb", [])])
 def test_rendering_on_a_card_takes_its_limit(
     monkeypatch: pytest.MonkeyPatch, variant: str, held: list[int]
 ) -> None:

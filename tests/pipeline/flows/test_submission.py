@@ -15,6 +15,7 @@ from pipeline.flows.dataset_flows import generate_scenes
 from pipeline.flows.submission import WHOLE, looks, parameters, server, submit, workers_online
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
+from tests.for_each import for_each
 
 
 class Server:
@@ -64,7 +65,7 @@ def test_the_only_deployment_and_one_that_is_named() -> None:
         assert run.deployment == f"generate-scenes/{deployments[-1]}"
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("deployments", "wanted", "complaint"),
     [
         ([], None, "no deployment of the flow generate-scenes. Run make serve"),

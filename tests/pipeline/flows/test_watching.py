@@ -16,9 +16,10 @@ from pipeline.flows.watching import Watched, report_url, small_picture, usd_per_
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.run import TaskOutcome
 from storage.errors import TrilightError
+from tests.for_each import for_each
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("base", "url"),
     [
         ("", None),  # a link that leads nowhere is none
@@ -88,7 +89,7 @@ def test_a_page_shows_the_scenes_and_where_their_report_is(
     monkeypatch.delenv("TRILIGHT_PUBLIC_URL", raising=False)
     out = tmp_path / "set"
     out.mkdir()
-    Image.effect_noise((3000, 2000), 80).save(out / "contact_sheet.png")
+    Image.effect_noise((1200, 800), 80).save(out / "contact_sheet.png")
     statistics = SimpleNamespace(lines=lambda: [("views", "16")])
     outcome: Any = SimpleNamespace(
         num_shards=1, num_shards_planned=1, digest="d", statistics=statistics
@@ -121,7 +122,7 @@ def test_a_run_that_fails_says_so_in_its_summary(
     assert "core-hours" in rows["cost of this run"]
 
 
-@pytest.mark.parametrize("text", ["cheap", "-1", "nan", "inf", ""])
+@for_each("text", ["cheap", "-1", "nan", "inf", ""])
 def test_a_price_that_is_none_is_named_at_the_start(
     monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:

@@ -3,7 +3,6 @@
 import json
 import os
 import pickle  # noqa: TID251 - what an attacker would send
-import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -25,9 +24,19 @@ from pipeline.isolation.answers import (
     encode_result,
 )
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
-from tests.pipeline.isolation.test_isolation import _nothing, double
+from tests.for_each import for_each
+from tests.pipeline.isolation.called import (
+    anything,
+    deaf,
+    double,
+    large,
+    length_of,
+    lie,
+    nothing,
+    taken_over,
+)
 
-LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=2, calls_per_child=100)
+LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=1.5, calls_per_child=100)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,7 +130,7 @@ def test_a_long_head_is_not_even_read() -> None:
         decode_answer(memoryview(sent), find)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("error", "kind"),
     [
         (("rejected", "no_faces", "nothing\x1b[2Jthere"), Rejected),
@@ -146,28 +155,14 @@ class Hostile:
         return Path.touch, (self.path,)
 
 
-def taken_over(pieces: list[bytes], pause_s: float) -> int:
-    """Write to whatever leads out of this process, in place of an answer."""
-    for file in range(3, 40):
-        try:
-            leads_out = stat.S_ISSOCK(os.fstat(file).st_mode)
-        except OSError:
-            continue
-        for piece in pieces if leads_out else ():
-            os.write(file, piece)
-            time.sleep(pause_s)
-    time.sleep(60)
-    return 0
-
-
 @pytest.fixture
 def child() -> Iterator[IsolatedChild]:
-    child = IsolatedChild(limits=LIMITS, setup=_nothing)
+    child = IsolatedChild(limits=LIMITS, setup=nothing)
     yield child
     child.close()
 
 
-@pytest.mark.parametrize("form", ["frame", "connection", "inner"])
+@for_each("form", ["frame", "connection", "inner"])
 def test_a_hostile_pickle_makes_no_file(child: IsolatedChild, tmp_path: Path, form: str) -> None:
     code = pickle.dumps(Hostile(tmp_path / "made"))
     sent = {
@@ -184,52 +179,26 @@ def test_a_hostile_pickle_makes_no_file(child: IsolatedChild, tmp_path: Path, fo
     assert (tmp_path / "made").exists(), "the bytes are hostile indeed"
 
 
-@pytest.mark.parametrize(
-    ("pieces", "pause_s", "said"),
-    [
-        ([(1 << 60).to_bytes(8, "little")], 0.0, "nonsense: its answer would have"),
-        ([(100).to_bytes(8, "little"), b"half"], 0.0, "timeout_wall"),
-        ([(200).to_bytes(8, "little"), *([b"x"] * 60)], 0.1, "timeout_wall"),
-    ],
-    ids=["endless", "half", "in trickles"],
-)
-def test_an_answer_that_never_ends_does(
-    child: IsolatedChild, pieces: list[bytes], pause_s: float, said: str
-) -> None:
+def test_an_answer_that_never_ends_does() -> None:
+    """Neither its length nor its pieces, each of which comes in time, hold its owner."""
+    limits = ChildLimits(memory_bytes=2 << 30, wall_s=1, calls_per_child=100)
+    child = IsolatedChild(limits=limits, setup=nothing)
+    endless, trickle = (1 << 60).to_bytes(8, "little"), (200).to_bytes(8, "little")
     began_s = time.monotonic()
-    with pytest.raises(ChildFailed, match=said):
-        child.call(taken_over, pieces, pause_s)
-    assert time.monotonic() - began_s < LIMITS.wall_s + 10  # a busy machine starts a child in that
-
-
-def deaf() -> int:
-    """Answer, then read nothing more."""
-    child_side = next(file for file in range(3, 40) if _is_socket(file))
-    answer = b"".join(encode_result(1, deaf))
-    os.write(child_side, len(answer).to_bytes(8, "little") + answer)
-    time.sleep(60)
-    return 0
-
-
-def _is_socket(file: int) -> bool:
     try:
-        return stat.S_ISSOCK(os.fstat(file).st_mode)
-    except OSError:
-        return False
-
-
-def length_of(data: bytes) -> int:
-    return len(data)
+        with pytest.raises(ChildFailed, match="nonsense: its answer would have"):
+            child.call(taken_over, [endless], 0.0)
+        with pytest.raises(ChildFailed, match="timeout_wall"):
+            child.call(taken_over, [trickle, *([b"x"] * 199)], 0.1)
+    finally:
+        child.close()
+    assert time.monotonic() - began_s < 15  # a busy machine starts a child in that
 
 
 def test_a_child_that_reads_no_more_is_given_up(child: IsolatedChild) -> None:
-    child.call(deaf)
+    child.call(deaf, b"".join(encode_result(1, deaf)))
     with pytest.raises(ChildFailed, match="timeout_wall"):
         child.call(length_of, bytes(8 << 20))
-
-
-def lie() -> int:
-    return "seven"  # type: ignore[return-value]
 
 
 def test_who_returns_what_it_does_not_declare_is_told(child: IsolatedChild) -> None:
@@ -237,22 +206,13 @@ def test_who_returns_what_it_does_not_declare_is_told(child: IsolatedChild) -> N
         child.call(lie)
 
 
-def anything() -> object:
-    return 1
-
-
 def test_a_function_whose_answer_cannot_be_checked_is_not_called(child: IsolatedChild) -> None:
     with pytest.raises(TypeError, match="declare what it is"):
         child.call(anything)
 
 
-def large() -> tuple[NDArray[np.float32], bytes]:
-    return np.arange(3 << 20, dtype=np.float32), bytes(1 << 20)
-
-
 def test_large_values_come_whole(child: IsolatedChild) -> None:
-    array, data = child.call(large)
-    assert np.array_equal(array, large()[0]) and data == bytes(1 << 20)
+    assert child.call(large) == large()
 
 
 def test_a_builtin_returns_nothing() -> None:

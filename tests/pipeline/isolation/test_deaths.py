@@ -1,9 +1,9 @@
 """What ends a child is tried again in a fresh one, and who is to blame is told apart."""
 
-import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -12,99 +12,85 @@ from pipeline.isolation import (
     ChildLimits,
     IsolatedChild,
     call_with_retries,
+    deaths,
     is_passing,
 )
-from pipeline.isolation.deaths import ENDS
+from pipeline.isolation.deaths import ENDS, with_retries
 from storage.errors import EnvironmentFailure
-from tests.pipeline.isolation.test_isolation import _nothing, crash, divide, double, kill_itself
+from tests.for_each import for_each
+from tests.pipeline.isolation.called import (
+    count_and_die,
+    die_by,
+    double,
+    fail_set_up,
+    nothing,
+    set_up_dying,
+)
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=9)
-
-
-def die_by(number: int) -> None:
-    if number != signal.SIGKILL:  # tests under nohup have children that ignore SIGHUP
-        signal.signal(number, signal.SIG_DFL)
-    os.kill(os.getpid(), number)
-
-
-def count_and_die(folder: str, number: int, times: int) -> int:
-    """End this process by a signal in the first `times` calls; return how many there were."""
-    calls = len(list(Path(folder).iterdir())) + 1
-    (Path(folder) / f"call-{calls}").touch()
-    if calls <= times:
-        os.kill(os.getpid(), number)
-    return calls
-
-
-def set_up_dying(folder: str, number: int, times: int) -> None:
-    count_and_die(folder, number, times)
-
-
-def fail_set_up(folder: str) -> None:
-    count_and_die(folder, 0, 0)
-    raise ModuleNotFoundError("a library is broken")
 
 
 def child_with(setup, *args: object) -> IsolatedChild:  # type: ignore[no-untyped-def]
     return IsolatedChild(limits=LIMITS, setup=setup, setup_args=args)
 
 
+@pytest.fixture(autouse=True)
+def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(deaths, "_PAUSE_S", 0.0)
+
+
 @pytest.fixture
 def child() -> Iterator[IsolatedChild]:
-    child = child_with(_nothing)
+    child = child_with(nothing)
     yield child
     child.close()
 
 
-@pytest.mark.parametrize(
+def test_a_signal_of_native_code_is_told_from_one_of_somebody_else(child: IsolatedChild) -> None:
+    with pytest.raises(ChildFailed, match="SIGSEGV") as caught:
+        child.call(die_by, signal.SIGSEGV)
+    assert (caught.value.reason, caught.value.is_verdict) == ("crashed_signal_11", True)
+    with pytest.raises(ChildFailed, match="SIGTERM") as caught:
+        child.call(die_by, signal.SIGTERM)
+    assert (caught.value.reason, caught.value.is_verdict) == ("killed", False)
+
+
+@for_each(
     ("number", "reason"),
     [
-        (signal.SIGSEGV, "crashed_signal_11"),
         (signal.SIGABRT, "crashed_signal_6"),
         (signal.SIGFPE, "crashed_signal_8"),
         (signal.SIGKILL, "killed"),
-        (signal.SIGTERM, "killed"),
         (signal.SIGHUP, "killed"),
         (signal.SIGBUS, "killed"),
         (signal.SIGXCPU, "killed"),  # a limit of somebody else: these children have none
     ],
 )
-def test_a_signal_of_native_code_is_told_from_one_of_somebody_else(
-    child: IsolatedChild, number: signal.Signals, reason: str
+def test_ends_by_other_signals_are_told_apart_by_the_status(
+    child: IsolatedChild, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, reason: str
 ) -> None:
-    with pytest.raises(ChildFailed, match=number.name) as caught:
-        child.call(die_by, number)
-    assert caught.value.reason == reason
-    assert caught.value.is_verdict == reason.startswith("crashed_signal")
+    ended = SimpleNamespace(exitcode=-number, join=lambda timeout_s: None)
+    monkeypatch.setattr(child, "_process", ended)
+    death = child._death()
+    assert (death.reason, death.is_verdict) == (reason, reason != "killed")
+    assert number.name in death.message
 
 
-@pytest.mark.parametrize(("number", "tries"), [(signal.SIGKILL, 3), (signal.SIGSEGV, 2)])
-def test_the_same_call_is_made_again(
-    child: IsolatedChild, tmp_path: Path, number: int, tries: int
-) -> None:
-    assert call_with_retries(child, count_and_die, str(tmp_path), number, tries - 1) == tries
+def test_the_same_call_is_made_again(child: IsolatedChild, tmp_path: Path) -> None:
+    assert call_with_retries(child, count_and_die, str(tmp_path), signal.SIGKILL, 2) == 3
 
 
-@pytest.mark.parametrize(
-    ("function", "tries", "is_verdict"),
-    [(kill_itself, 3, False), (divide, 3, False), (crash, 2, True)],
-)
-def test_tries_end(function, tries: int, is_verdict: bool) -> None:  # type: ignore[no-untyped-def]
-    calls = 0
+@for_each(("reason", "end"), ENDS.items())
+def test_tries_end(reason: str, end: deaths.End) -> None:
+    calls: list[str] = []
 
-    class Counting(IsolatedChild):
-        def call(self, function, *args):  # type: ignore[no-untyped-def]
-            nonlocal calls
-            calls += 1
-            return super().call(function, *args)
+    def fail() -> None:
+        calls.append(reason)
+        raise ChildFailed(reason, "as ever")
 
-    child = Counting(limits=LIMITS, setup=_nothing)
-    try:
-        with pytest.raises(ChildFailed) as caught:
-            call_with_retries(child, function)
-    finally:
-        child.close()
-    assert (calls, caught.value.is_verdict) == (tries, is_verdict)
+    with pytest.raises(ChildFailed) as caught:
+        with_retries(fail)
+    assert (len(calls), caught.value.is_verdict) == (end.tries, end.is_verdict)
 
 
 def test_every_end_has_tries_and_only_two_are_verdicts() -> None:
@@ -114,6 +100,8 @@ def test_every_end_has_tries_and_only_two_are_verdicts() -> None:
         "crashed_signal",
     }
     assert all(1 <= end.tries <= 3 for end in ENDS.values())
+    tries = {name: ENDS[name].tries for name in ("killed", "exception", "crashed_signal")}
+    assert tries == {"killed": 3, "exception": 3, "crashed_signal": 2}
     assert not is_passing("degenerate")
 
 

@@ -1,8 +1,6 @@
 """Native code may crash, hang, or eat memory in a child, and costs one call."""
 
-import ctypes
 import os
-import signal
 import subprocess
 import sys
 import textwrap
@@ -17,66 +15,27 @@ import pytest
 from pipeline.isolation import ChildClosed, ChildFailed, ChildLimits, IsolatedChild
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from tests.conftest import ROOT
+from tests.for_each import for_each
+from tests.pipeline.isolation.called import (
+    burn,
+    crash,
+    divide,
+    double,
+    eat_memory,
+    hang,
+    mistake,
+    nothing,
+    prepare,
+    process_id,
+    reject,
+)
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=2, calls_per_child=3)
 
 
-def _prepare(folder: str) -> None:
-    (Path(folder) / f"started-{os.getpid()}").touch()
-
-
-def _nothing() -> None:
-    """Set up nothing."""
-
-
-def double(value: int) -> int:
-    return 2 * value
-
-
-def reject() -> None:
-    raise Rejected("no_faces", "nothing there")
-
-
-def mistake() -> None:
-    raise TrilightError("output: cannot be written.")
-
-
-def crash() -> None:
-    ctypes.string_at(0)
-
-
-def eat_memory() -> int:
-    return len(bytearray(8 << 30))
-
-
-def hang() -> None:
-    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])  # as stubborn as native code
-    time.sleep(60)
-
-
-def burn(seconds: float) -> int:
-    """Use processor time, and none of it waiting."""
-    start = time.process_time()
-    while time.process_time() - start < seconds:
-        pass
-    return os.getpid()
-
-
-def process_id() -> int:
-    return os.getpid()
-
-
-def kill_itself() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def divide() -> float:
-    return 1 / 0
-
-
 @pytest.fixture
 def child(tmp_path: Path) -> Iterator[IsolatedChild]:
-    child = IsolatedChild(limits=LIMITS, setup=_prepare, setup_args=(str(tmp_path),))
+    child = IsolatedChild(limits=LIMITS, setup=prepare, setup_args=(str(tmp_path),))
     yield child
     child.close()
 
@@ -89,13 +48,11 @@ def test_results_and_rejections_come_back(child: IsolatedChild) -> None:
         child.call(mistake)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("function", "reason"),
     [
         (crash, "crashed_signal_11"),
         (eat_memory, "out_of_memory"),
-        (hang, "timeout_wall"),
-        (kill_itself, "killed"),
         (divide, "exception: .*ZeroDivisionError"),
     ],
 )
@@ -106,13 +63,13 @@ def test_a_failure_costs_one_call(child: IsolatedChild, function, reason: str) -
 
 
 def test_a_child_that_cannot_be_set_up_stops_the_run(tmp_path: Path) -> None:
-    child = IsolatedChild(limits=LIMITS, setup=_prepare, setup_args=(str(tmp_path / "nowhere"),))
+    child = IsolatedChild(limits=LIMITS, setup=prepare, setup_args=(str(tmp_path / "nowhere"),))
     with pytest.raises(TrilightError, match=r"cannot be set up.*FileNotFoundError.*doctor"):
         child.call(double, 1)
     child.close()
 
 
-@pytest.mark.parametrize("times", [1, 3])
+@for_each("times", [1, 3])
 def test_a_fork_server_that_is_killed_is_replaced(
     child: IsolatedChild, monkeypatch: pytest.MonkeyPatch, times: int
 ) -> None:
@@ -127,12 +84,12 @@ def test_a_fork_server_that_is_killed_is_replaced(
         real(popen, process)
 
     monkeypatch.setattr(popen_forkserver.Popen, "_launch", launch)
+    child.retire()
     if times < 3:
         assert child.call(double, 4) == 8
     else:
         with pytest.raises(EnvironmentFailure, match="cannot be started"):
             child.call(double, 4)
-    child.close()
 
 
 def test_a_child_is_replaced_after_its_calls(child: IsolatedChild, tmp_path: Path) -> None:
@@ -152,7 +109,7 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
 
     caller = threading.Thread(target=wait)
     caller.start()
-    time.sleep(0.5)
+    time.sleep(0.2)
     child.close()
     caller.join(10)
     assert not caller.is_alive()
@@ -165,7 +122,7 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
 def test_processor_seconds_are_for_one_call_each() -> None:
     """A call that uses them up ends its child; several that stay below do not add up."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, cpu_s=1, calls_per_child=9)
-    child = IsolatedChild(limits=limits, setup=_nothing)
+    child = IsolatedChild(limits=limits, setup=nothing)
     try:
         assert len({child.call(burn, 0.6) for _ in range(3)}) == 1
         with pytest.raises(ChildFailed, match="timeout_cpu: used its 1 processor seconds"):
@@ -176,11 +133,13 @@ def test_processor_seconds_are_for_one_call_each() -> None:
 
 
 def test_waiting_uses_no_processor_seconds() -> None:
-    limits = ChildLimits(memory_bytes=2 << 30, wall_s=1, cpu_s=1, calls_per_child=9)
-    child = IsolatedChild(limits=limits, setup=_nothing)
+    """It uses the time of its call, and costs no more than that."""
+    limits = ChildLimits(memory_bytes=2 << 30, wall_s=1.5, cpu_s=1, calls_per_child=9)
+    child = IsolatedChild(limits=limits, setup=nothing)
     try:
         with pytest.raises(ChildFailed, match="timeout_wall"):
             child.call(hang)
+        assert child.call(double, 4) == 8
     finally:
         child.close()
 
@@ -217,11 +176,11 @@ def test_children_die_with_a_parent_that_is_killed(tmp_path: Path) -> None:
             import sys
             sys.path.insert(0, {str(ROOT)!r})
             from pipeline.isolation import ChildLimits, IsolatedChild
-            from tests.pipeline.isolation import test_isolation as t
+            from tests.pipeline.isolation import called as t
             if __name__ == "__main__":
                 limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
                 folder = {str(tmp_path)!r}
-                child = IsolatedChild(limits=limits, setup=t._prepare, setup_args=(folder,))
+                child = IsolatedChild(limits=limits, setup=t.prepare, setup_args=(folder,))
                 child.call(t.hang)
             """
         )

@@ -12,25 +12,27 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, call_with_retries, waiting
+from pipeline.isolation import (
+    ChildFailed,
+    ChildLimits,
+    IsolatedChild,
+    call_with_retries,
+    deaths,
+    waiting,
+)
 from tests.conftest import ROOT
-from tests.pipeline.isolation.test_isolation import _nothing, process_id
+from tests.pipeline.isolation.called import nothing, process_id, wait_for
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
 
 
-def wait_for(path: str) -> int:
-    while not Path(path).exists():
-        time.sleep(0.02)
-    return os.getpid()
-
-
 @pytest.fixture
 def child(monkeypatch: pytest.MonkeyPatch) -> Iterator[IsolatedChild]:
-    """Looked at twenty times a second, and given up after one."""
+    """Looked at twenty times a second, and given up after three quarters of one."""
     monkeypatch.setattr(waiting, "LOOK_S", 0.05)
-    monkeypatch.setattr(waiting, "LOOKS_BEFORE_KILL", 20)
-    child = IsolatedChild(limits=LIMITS, setup=_nothing)
+    monkeypatch.setattr(waiting, "LOOKS_BEFORE_KILL", 15)
+    monkeypatch.setattr(deaths, "_PAUSE_S", 0.0)
+    child = IsolatedChild(limits=LIMITS, setup=nothing)
     yield child
     child.close()
 
@@ -65,7 +67,7 @@ def test_a_child_that_is_continued_in_time_answers_itself(
         while not caplog.records:
             time.sleep(0.01)
         os.kill(first, signal.SIGCONT)
-        time.sleep(1.5)  # longer than a child may be stopped: looks at one that runs do not count
+        time.sleep(1.0)  # longer than a child may be stopped: looks at one that runs do not count
         (tmp_path / "go").touch()
 
     threading.Thread(target=go_on).start()
@@ -88,7 +90,7 @@ sys.path.insert(0, {root!r})
 from called import wait_for
 from pipeline.isolation import ChildLimits, IsolatedChild
 
-limits = ChildLimits(memory_bytes=2 << 30, wall_s=5, calls_per_child=9)
+limits = ChildLimits(memory_bytes=2 << 30, wall_s=2, calls_per_child=9)
 child = IsolatedChild(limits=limits, setup=int)
 print(child.call(wait_for, __file__), flush=True)
 print(child.call(wait_for, __file__ + ".go"), flush=True)
@@ -110,7 +112,7 @@ def test_a_command_that_is_stopped_as_a_whole_goes_on_where_it_was(tmp_path: Pat
         assert process.stdout is not None
         first = process.stdout.readline()
         os.killpg(process.pid, signal.SIGTSTP)
-        time.sleep(6)
+        time.sleep(2.5)
         assert waiting._is_stopped(process.pid) and waiting._is_stopped(int(first))
         (tmp_path / "program.py.go").touch()
         os.killpg(process.pid, signal.SIGCONT)

@@ -9,12 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from pipeline.isolation.values import DTYPES, Bytes, NotAsDeclared, form_of, pack
+from tests.for_each import for_each
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +72,7 @@ INNERS = st.builds(Inner, count=st.integers(), share=st.none() | st.floats(allow
 PLAIN = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
 
 
+@settings(max_examples=50)
 @given(
     st.tuples(INNERS, INNERS),
     st.binary(),
@@ -101,7 +103,7 @@ def test_numbers_of_numpy_become_pythons_and_keep_their_value() -> None:
     assert [type(each) for each in found] == [float, int, bool]
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("value", "hint"),
     [
         (True, int),
@@ -123,13 +125,13 @@ def test_a_value_of_another_type_is_not_sent(value: Any, hint: Any) -> None:
         crossed(value, hint)
 
 
-@pytest.mark.parametrize("hint", [object, set[int], Callable[[], int], type, np.ndarray])
+@for_each("hint", [object, set[int], Callable[[], int], type, np.ndarray])
 def test_a_type_that_could_not_be_checked_is_refused(hint: Any) -> None:
     with pytest.raises(TypeError, match="declare what it is"):
         form_of(hint)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("data", "hint"),
     [
         (["object", [1], "C"], NDArray[Any]),

@@ -1,6 +1,7 @@
 """A bucket on a real S3 server, and machines that make a dataset of tiny scenes in it."""
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,45 +23,35 @@ OUT = "s3://shards/set"
 
 
 @contextlib.contextmanager
-def empty_bucket(port: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Give the driver of an empty server with a bucket `shards`, which the environment names."""
+def empty_bucket(
+    port: int, monkeypatch: pytest.MonkeyPatch, *, keep_driver: bool = False
+) -> Iterator[Any]:
+    """Give the driver of an empty server with a bucket `shards`, which the environment names.
+
+    Args:
+        port: of the server.
+        monkeypatch: takes the environment back.
+        keep_driver: whether the driver of the test before is used, which costs less than a new one.
+    """
     for name, value in {**CREDENTIALS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(tries, "PAUSE_S", 0.0)
     monkeypatch.setattr(bucket_publication, "_PATIENCE_S", 0.0)
     control(port, "reset")
-    remote_url._driver_of.cache_clear()
+    if not keep_driver:
+        remote_url._driver_of.cache_clear()
     place = remote_url.parse_url("s3://shards", what="bucket")
     assert isinstance(place, remote_url.RemoteUrl)
-    driver = remote_url.open_driver(place)
+    driver = remote_url._driver_of(place, os.getpid())
+    driver.invalidate_cache()
     driver.mkdir("shards")
     yield driver
-    remote_url._driver_of.cache_clear()
+    if not keep_driver:
+        remote_url._driver_of.cache_clear()
 
 
 class Killed(BaseException):
     """Ends a maker between two requests, as SIGKILL would: locks go with it, and nothing else."""
-
-
-@contextlib.contextmanager
-def killed_before(monkeypatch: pytest.MonkeyPatch, method: str, ending: str) -> Iterator[None]:
-    """Expect a maker to be killed before it writes a file of such a name.
-
-    Args:
-        monkeypatch: takes it back.
-        method: `write` or `create`, of the bucket.
-        ending: of the file's name.
-    """
-    real = getattr(remote_bucket.Bucket, method)
-
-    def killed(self: Any, name: str, content: Any) -> Any:
-        if name.endswith(ending):
-            raise Killed
-        return real(self, name, content)
-
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(remote_bucket.Bucket, method, killed)
-        yield
 
 
 class Writes:

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from storage.remote import url as remote_url
 from tests.pipeline.making.bucket_kit import Machines, empty_bucket
 from tests.s3_server import s3_server
 
@@ -15,15 +16,23 @@ def _bare(bare_reports: None) -> None:
     """No test here looks at a figure."""
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def moto() -> Iterator[int]:
     with s3_server() as port:
         yield port
 
 
+@pytest.fixture(scope="module")
+def _own_drivers() -> Iterator[None]:
+    """Keep the drivers of buckets for the tests of one file."""
+    remote_url._driver_of.cache_clear()
+    yield
+    remote_url._driver_of.cache_clear()
+
+
 @pytest.fixture
-def bucket(moto: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    with empty_bucket(moto, monkeypatch) as driver:
+def bucket(moto: int, _own_drivers: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    with empty_bucket(moto, monkeypatch, keep_driver=True) as driver:
         yield driver
 
 

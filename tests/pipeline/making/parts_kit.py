@@ -8,7 +8,6 @@ from pipeline.making import asked_objects, object_parts, pipeline
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.objects.listing import Listing
 from pipeline.objects.sources import ListedObjects
-from tests.pipeline.making.test_accept_maps import noise, png
 from tests.pipeline.making.test_object_parts import Mesher, _records
 from tests.pipeline.making.tiny_scenes_kit import tiny_order, without_rendering
 
@@ -46,27 +45,8 @@ def parts_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[objec
     return order
 
 
-def parts_order(
-    out: str, scenes: int, shards: str | None = None, textures: Path | None = None
-) -> DatasetOrder:
+def parts_order(out: str, scenes: int) -> DatasetOrder:
     """Return an order whose first cycle of splits has six shards of four scenes."""
     changes: dict[str, float] = {"scenes.num_views": 2, "splits.object_parts": PARTS}
     changes["splits.shards_per_cycle"] = 6
-    if textures:
-        changes |= {"scenes.textures.share": 0.5, "scenes.textures.own_share": 1.0}
-    return tiny_order(
-        out=out,
-        objects="builtin:",
-        scenes=scenes,
-        changes=changes,
-        shards=shards,
-        textures=str(textures) if textures else None,
-        map_licence="CC0-1.0" if textures else None,
-    )
-
-
-def textures_in(folder: Path, *seeds: int) -> Path:
-    """Write textures of noise; return the folder."""
-    for seed in seeds:
-        png(folder / f"cloth{seed}.png", noise(seed))
-    return folder
+    return tiny_order(out=out, objects="builtin:", scenes=scenes, changes=changes)

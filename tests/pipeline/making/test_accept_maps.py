@@ -11,6 +11,7 @@ import pytest
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.documents.attribution import encode_attribution
+from pipeline.making import accept_maps as accepting
 from pipeline.making.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.own_maps import own_maps
@@ -24,6 +25,7 @@ from storage.errors import Rejected, TrilightError
 from storage.records.objects import SKY, TEXTURE, decode_objects_lock, encode_objects_lock
 from storage.records.texture import MapSource
 from storage.seeds import rng_for
+from tests.infra.child_here import ChildHere
 from tests.pipeline.objects.maps.map_files import exr, noise, png, sun_map
 from tests.pipeline.scenes.small_pool import small_pool
 from tests.scenes_by_hand import tiny_sample
@@ -58,6 +60,7 @@ def accepted(settings: BuildSettings, tmp_path_factory: pytest.TempPathFactory) 
     folders = ((TEXTURE, str(root / "textures")), (SKY, str(root / "skies")))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRILIGHT_CACHE", str(root / "cache"))
+        patch.setattr(accepting, "IsolatedChild", ChildHere)
         return accept_maps(MapFolders(folders=folders), settings, workers=1)
 
 

@@ -14,10 +14,11 @@ from pipeline.making.pipeline import make_dataset, prepare_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
-@pytest.mark.parametrize("source", ["OBJECTZ", "empty", "builtin:many", "env:TRILIGHT_NOWHERE"])
+@for_each("source", ["OBJECTZ", "empty", "builtin:many", "env:TRILIGHT_NOWHERE"])
 def test_a_mistyped_source_leaves_nothing_behind(
     source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

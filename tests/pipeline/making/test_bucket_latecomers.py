@@ -12,6 +12,7 @@ from pipeline.making import bucket_publication
 from pipeline.making import publication as publications
 from pipeline.making.accept_objects import trusted_objects
 from pipeline.making.frozen_pool import AssetAway
+from pipeline.making.pipeline import make_dataset
 from pipeline.making.prepare_isolated import asset_store
 from pipeline.making.publication import Publication
 from pipeline.shards import mirror
@@ -22,9 +23,11 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures
 from storage.records.sample import sample_key
-from tests.pipeline.making.bucket_kit import OUT, Machines
+from tests.pipeline.making.bucket_kit import OUT, Killed, Machines
 from tests.pipeline.making.frozen_kit import asked, frozen, prepared
+from tests.pipeline.making.parts_kit import parts_by_hand
 from tests.pipeline.making.test_publication import _dataset, _locked, make_tiny_shard
+from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order
 from tests.scenes_by_hand import tiny_sample
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
@@ -204,6 +207,26 @@ def test_who_waited_and_then_lists_more_writes_the_documents(
 def _told(names: Any, read: list[str]) -> list[str]:
     read += (found := list(names))
     return found
+
+
+def test_what_a_killed_machine_has_prepared_is_not_prepared_again(
+    bucket: Any, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = parts_by_hand(tmp_path, monkeypatch)
+    order = tiny_order(out=OUT, objects="builtin:", scenes=4)
+
+    def killed(self: mirror.Mirror, lock: bytes) -> None:
+        raise Killed
+
+    machines.use("a")
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(mirror.Mirror, "freeze", killed)
+        make_dataset(order, Undocumented())
+    assert len(made) == 60
+    made.clear()
+    machines.use("b")
+    make_dataset(order, Undocumented())
+    assert made == [0, 1, 2, 3], "scenes alone"
 
 
 def test_who_comes_later_trusts_the_index_of_the_first(bucket: Any, machines: Machines) -> None:

@@ -17,6 +17,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.verify import verify_dataset
 from storage.records.objects import Failure, read_failures, read_objects_lock
 from storage.records.sample import Sample, encode_sample, sample_key
+from tests.for_each import for_each
 from tests.pipeline.making.derive_kit import finished, scenes
 
 MERGE = Derive(operation="merge")
@@ -101,30 +102,25 @@ def test_a_merge_of_a_merge_nests(tmp_path: Path) -> None:
     assert derivation.sources[1]["key_offset"] == 12
 
 
-@pytest.mark.parametrize(
-    "derive",
-    [
-        MERGE,
-        Derive(operation="select", selection=Selection(split="train")),
-        Derive(operation="reshard", scenes_per_shard=3),
-    ],
-    ids=lambda derive: derive.operation,
-)
-def test_equal_inputs_give_equal_bytes_wherever_they_lie(tmp_path: Path, derive: Derive) -> None:
+def test_equal_inputs_give_equal_bytes_wherever_they_lie(tmp_path: Path) -> None:
     """All files, documents too; neither clock nor place is in them."""
     results = []
     for place in ("one", "two/deeper"):
         a = finished(tmp_path / place / "a", scenes(0))
         b = finished(tmp_path / place / "b", scenes(1), seed=1)
-        sources = [a, b] if derive.operation == "merge" else [a]
-        made(tmp_path / place / "c", derive, *sources)
-        results.append(bytes_of(tmp_path / place / "c"))
+        made(tmp_path / place / "merge", MERGE, a, b)
+        select = Derive(operation="select", selection=Selection(split="train"))
+        reshard = Derive(operation="reshard", scenes_per_shard=3)
+        for derive in (select, reshard):
+            shards_made(tmp_path / place / derive.operation, derive, a)
+        results.append(bytes_of(tmp_path / place))
         assert not [path.name for path in (tmp_path / place).iterdir() if path.name[0] == "."]
     assert results[0] == results[1]
-    assert {"README.md", "LICENSE.md", "croissant.json", "attribution.csv"} <= set(results[0])
+    documents = ("README.md", "LICENSE.md", "croissant.json", "attribution.csv")
+    assert {f"merge/{name}" for name in documents} <= set(results[0])
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("selection", "keys"),
     [
         (Selection(split="train"), [0, 1, 2, 3]),

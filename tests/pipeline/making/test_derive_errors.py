@@ -19,7 +19,9 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import write_manifest
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
+from tests.for_each import for_each
 from tests.pipeline.making.derive_kit import TEST_OBJECT, TRAIN_OBJECT, finished, scenes
+from tests.pipeline.making.test_derive_dataset import shards_made
 from tests.pipeline.making.test_publication import ENVIRONMENT, _build
 
 MERGE = Derive(operation="merge")
@@ -67,9 +69,8 @@ def test_a_leak_between_splits_is_named_by_asset(tmp_path: Path) -> None:
     assert "object 'x' is in test of" in refused(tmp_path / "c", MERGE, a, b)
     train_only = tmp_path / "train"
     derive = Derive(operation="select", selection=Selection(split="train"))
-    derive_dataset([str(a)], derive, train_only)
-    derive_dataset([str(train_only), str(b)], MERGE, tmp_path / "c")  # as the message advises
-    assert verify_dataset(tmp_path / "c").problems == []
+    shards_made(train_only, derive, a)
+    shards_made(tmp_path / "c", MERGE, train_only, b)  # as the message advises
 
 
 def test_the_same_scene_twice_is_refused(tmp_path: Path) -> None:
@@ -79,7 +80,7 @@ def test_the_same_scene_twice_is_refused(tmp_path: Path) -> None:
     assert "expected each scene once" in refused(tmp_path / "c", MERGE, a, a)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("group", "values", "name"),
     [
         ("renders", {"resolution": 32}, "renders.resolution is 32; expected 16"),
@@ -121,7 +122,7 @@ def test_damage_and_what_is_not_finished_are_refused(tmp_path: Path) -> None:
     assert "secret" not in refused(out, reshard, "https://u:secret@example.org/a?token=x")
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("derive", "expected"),
     [
         (Derive(operation="select", selection=Selection(template="no")), "none of the 6 scenes"),

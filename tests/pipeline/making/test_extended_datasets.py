@@ -22,6 +22,7 @@ from storage.dataset.manifest import read_manifest, write_manifest
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions, written
+from tests.for_each import for_each
 from tests.pipeline.making.test_publication import ENVIRONMENT, begin_tiny, make_tiny_shard
 
 TEMPLATE = EXAMPLES / "template.py"
@@ -91,7 +92,7 @@ def test_children_know_what_is_registered() -> None:
         child.close()
 
 
-@pytest.mark.parametrize("extended", [{}, {"trap.py": "0" * 64}])
+@for_each("extended", [{}, {"trap.py": "0" * 64}])
 def test_a_dataset_never_causes_an_import(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extended: dict[str, str]
 ) -> None:

@@ -1,15 +1,17 @@
 """Frozen objects are opened where a scene draws them, and trusted for what the lock says."""
 
+import dataclasses
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipeline.making import asked_objects, frozen_pool, pipeline
+from pipeline.making import asked_objects, frozen_pool, pipeline, restore_object
 from pipeline.making.accept_objects import accept_objects, trusted_objects
 from pipeline.making.attempt_scene import SceneAttempt
-from pipeline.making.freeze_objects import AcceptedObjects
+from pipeline.making.freeze_objects import AcceptedObjects, require_same
 from pipeline.making.frozen_pool import AssetAway, OpenedPool
 from pipeline.making.prepare_isolated import asset_store
 from pipeline.making.publication import Publication
@@ -18,7 +20,8 @@ from pipeline.scenes.pool import PooledAsset, fits_of
 from storage.errors import TrilightError
 from storage.records.asset import Asset, decode_asset
 from storage.records.object_index import ObjectIndex
-from storage.records.objects import read_objects_lock
+from storage.records.objects import TEXTURE, read_objects_lock
+from tests.pipeline.documents.dataset_by_hand import locked
 from tests.pipeline.making.frozen_kit import SOURCE, asked, begun, build, frozen, prepared
 from tests.pipeline.scenes.small_pool import first_scene
 
@@ -182,3 +185,21 @@ def test_an_object_that_is_away_is_brought_back_for_the_same_attempt(
     child: object = None
     pipeline.make_scene("train", 7, 1, child, restore)  # type: ignore[arg-type]
     assert calls == [("train", 7, 0), ("a", "1"), ("train", 7, 0), ("b", "2"), ("train", 7, 0)]
+
+
+def test_an_object_that_is_there_again_is_found(tmp_path: Path) -> None:
+    """A worker that lives long has listed the source before."""
+    source = ("builtin:4", None, tmp_path / "objects", ("MIT", "CC0-1.0"))
+    uid = restore_object._listed(*source).allowed[0].uid
+    shutil.rmtree(tmp_path / "objects")
+    record = restore_object.found_again(*source, uid)
+    assert record is not None and Path(record.path).exists()
+
+
+def test_a_frozen_row_that_is_gone_or_has_changed_is_named() -> None:
+    row = locked("texture:cloth", kind=TEXTURE)
+    require_same("textures", {row.uid: row}, [row, locked("a")])
+    with pytest.raises(TrilightError, match="'texture:cloth' is missing or no longer usable"):
+        require_same("textures", {row.uid: row}, [])
+    with pytest.raises(TrilightError, match="'texture:cloth' has changed"):
+        require_same("textures", {row.uid: row}, [dataclasses.replace(row, licence="MIT")])

@@ -8,11 +8,13 @@ import pytest
 from PIL import Image
 
 from pipeline.exchange.usd.write import write_usd
+from pipeline.making import inspect_scene as inspecting
 from pipeline.making.inspect_scene import ROWS, VIEWS, seen_into, turntable_poses
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.scene import ObjectKind, SceneObject
 from tests.command_line import trilight
+from tests.infra.child_here import use_children_here
 from tests.scenes_by_hand import tiny_scene
 
 KINDS: tuple[tuple[str, ObjectKind], ...] = (
@@ -22,7 +24,10 @@ KINDS: tuple[tuple[str, ObjectKind], ...] = (
 )
 
 
-def test_a_summary_and_a_sheet(tmp_path: Path) -> None:
+def test_a_summary_and_a_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_children_here(monkeypatch)
+    monkeypatch.setattr(inspecting, "_RESOLUTION", 32)
+    monkeypatch.setattr(inspecting, "_SPP", 16)
     write_usd(tmp_path / "a.usdz", tiny_scene())
     words = ["inspect", str(tmp_path / "a.usdz"), "--turntable", str(tmp_path / "t.png"), "--json"]
     result = trilight(words)

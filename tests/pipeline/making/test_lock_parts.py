@@ -2,7 +2,6 @@
 
 import dataclasses
 import shutil
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -10,17 +9,14 @@ import pytest
 from pipeline.builds.named import named_build
 from pipeline.making.lock_parts import LockPart
 from pipeline.making.pipeline import make_dataset
-from pipeline.making.publication import Publication
-from pipeline.making.run import Run, ShardJob
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.settings import SplitSettings
-from storage.dataset.splits import part_of_object, part_of_shard, shard_name, split_of_shard
-from storage.digests import sha256_of_file
+from storage.dataset.splits import part_of_object, part_of_shard, split_of_shard
 from storage.errors import TrilightError
 from storage.records.lock_rows import LockRows
-from storage.records.objects import OBJECT, TEXTURE, read_objects_lock
-from tests.pipeline.making.parts_kit import PARTS, parts_by_hand, parts_order, textures_in
+from storage.records.objects import read_objects_lock
+from tests.pipeline.making.parts_kit import PARTS, parts_by_hand, parts_order
 from tests.pipeline.making.tiny_scenes_kit import Undocumented
 
 SPLITS = SplitSettings(scenes_per_shard=4, shards_per_cycle=6, object_parts=PARTS)
@@ -87,74 +83,6 @@ def test_scenes_begin_with_the_first_part(tmp_path: Path, made_in_order: list[ob
     assert make_dataset(parts_order(str(out), 28), Undocumented()).digest == outcome.digest
     assert made_in_order == [0, 1, 2, 3]
     assert read_objects_lock(out / "objects.lock.jsonl") == later
-
-
-def test_a_kill_between_lock_and_manifest_leaves_a_part_to_be_frozen(
-    tmp_path: Path, made_in_order: list[object], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "set"
-    make_dataset(parts_order(str(out), 8), Undocumented())
-    before = (out / "objects.lock.jsonl").read_bytes()
-
-    def killed(publication: Publication, **changes: object) -> None:
-        if "objects_lock_sha256" in changes:
-            raise KeyboardInterrupt
-        write(publication, **changes)
-
-    write = Publication._write
-    monkeypatch.setattr(Publication, "_write", killed)
-    with pytest.raises(KeyboardInterrupt):
-        make_dataset(parts_order(str(out), 28), Undocumented())
-    assert (out / "objects.lock.jsonl").read_bytes() != before
-    monkeypatch.setattr(Publication, "_write", write)
-    make_dataset(parts_order(str(out), 28), Undocumented())
-    frozen = open_dataset(str(out)).manifest.objects_lock_sha256
-    assert frozen == sha256_of_file(out / "objects.lock.jsonl")
-    assert len(read_objects_lock(out / "objects.lock.jsonl")) == 60
-
-
-def test_render_children_are_those_of_a_part(
-    tmp_path: Path, made_in_order: list[object], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A process that makes shards of two parts must not draw from the first of them alone."""
-    out, keys = tmp_path / "set", []
-    make_dataset(parts_order(str(out), 28), Undocumented())
-    job = Run.job
-
-    def noted(run: Run, num_at_once: int) -> ShardJob:
-        keys.append(job(run, num_at_once).lock_sha256)
-        return job(run, num_at_once)
-
-    monkeypatch.setattr(Run, "job", noted)
-    for number in (0, 6):
-        (out / shard_name(number, SPLITS)).unlink()
-    make_dataset(parts_order(str(out), 28), Undocumented())
-    assert len(keys) == len(set(keys)) == PARTS
-
-
-def test_textures_of_the_user_serve_every_part(tmp_path: Path, made_in_order: list[object]) -> None:
-    """They are frozen with the first; one more is none of this dataset, one less an error."""
-    out, textures = tmp_path / "set", textures_in(tmp_path / "textures", 1, 2)
-
-    def make(scenes: int) -> str:
-        order = parts_order(str(out), scenes, textures=textures)
-        return make_dataset(order, Undocumented()).digest
-
-    make(8)
-    textures_in(textures, 3)
-    digest = make(28)
-    rows = read_objects_lock(out / "objects.lock.jsonl")
-    kinds = Counter(row.kind for row in rows)
-    assert kinds == {OBJECT: 60, TEXTURE: 2}
-    folder = DatasetFolder(out)
-    assert read_objects_lock(folder.lock_part("maps")) == [r for r in rows if r.kind == TEXTURE]
-    shutil.rmtree(folder.staged_locks)  # as whoever deletes .staging
-    (out / "train-000000.tar").unlink()
-    assert make(28) == digest
-    (textures / "cloth1.png").unlink()
-    (out / "train-000000.tar").unlink()
-    with pytest.raises(TrilightError, match="'texture:cloth1' is missing or no longer usable"):
-        make(28)
 
 
 def _splits(out: Path) -> SplitSettings:

@@ -6,6 +6,7 @@ import pytest
 
 from pipeline.making.machine import cores_owned, visible_gpus
 from storage.errors import TrilightError
+from tests.for_each import for_each
 
 
 def test_cores_are_those_of_the_affinity_unless_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -24,7 +25,7 @@ def test_cores_are_those_of_the_affinity_unless_said(monkeypatch: pytest.MonkeyP
         cores_owned()
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("value", "cards"),
     [("0,2", ("0", "2")), ("GPU-1a", ("GPU-1a",)), ("", ()), ("-1", ())],
 )

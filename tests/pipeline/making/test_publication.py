@@ -23,6 +23,7 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import Failure, LockedObject, read_failures
 from storage.records.sample import Sample, sample_key
+from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 ENVIRONMENT = {"mitsuba_variant": "llvm_ad_rgb", "libraries": {"mitsuba": "3.9.1"}}
@@ -156,7 +157,7 @@ def test_a_deleted_shard_is_made_again(tmp_path: Path) -> None:
     assert verify_dataset(tmp_path).problems == []
 
 
-@pytest.mark.parametrize("fast", [False, True])
+@for_each("fast", [False, True])
 def test_damage_is_named(tmp_path: Path, fast: bool) -> None:
     shard = _dataset(tmp_path).manifest.shards[0]
     name = shard.name
@@ -199,7 +200,7 @@ def test_two_makers_are_kept_apart(tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.parametrize("name", ["README.md", "LICENSE.md"])
+@for_each("name", ["README.md", "LICENSE.md"])
 def test_documents_of_others_are_not_replaced(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("theirs")
     with pytest.raises(TrilightError, match=rf"{name} is there.*another --out"):
@@ -239,7 +240,7 @@ def test_shards_without_a_manifest_are_not_touched(tmp_path: Path) -> None:
         _begin(tmp_path, _build())
 
 
-@pytest.mark.parametrize("name", BUILDS)
+@for_each("name", BUILDS)
 def test_every_build_is_json_and_has_a_stable_digest(name: str) -> None:
     build = named_build(name)
     assert build.build == name.removesuffix("-mini")  # the mini is the other's beginning
@@ -249,7 +250,7 @@ def test_every_build_is_json_and_has_a_stable_digest(name: str) -> None:
     ]
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("arguments", "message"),
     [
         ({"name": "nonsense"}, "build 'nonsense' is unknown; expected one of smoke"),

@@ -1,7 +1,11 @@
-"""`trilight revisit`, from a finished dataset to a new one, with real children and pictures."""
+"""`trilight revisit`, from a finished dataset to a new one, with real pictures.
+
+One dataset is made by a real child; the others are made in this process, which costs no start.
+"""
 
 import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,29 +16,39 @@ from infra.cli.changes import Shared
 from infra.cli.dataset_changes import with_shared
 from infra.repair import repair
 from pipeline.executors.threads import ThreadRunner
+from pipeline.isolation import IsolatedChild
+from pipeline.making import render_children
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset
 from pipeline.making.revisit_order import Revisit, revisit_order
+from pipeline.renders.renderer import SceneRenderer
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.shard import iterate_samples
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.sample import Sample
 from storage.records.scene_facts import lights
+from tests.for_each import for_each
+from tests.infra.child_here import ChildHere
 from tests.pipeline.making.tiny_scenes_kit import Undocumented
 
 TINY = {
     "renders.max_spp": 16,
     "renders.min_spp": 16,
-    "splits.scenes_per_shard": 2,
+    "splits.scenes_per_shard": 1,
     "storage.profile": "compact",
 }
 
 
-def generated(out: Path, num_views: int) -> Dataset:
-    changes = {**TINY, "scenes.num_views": num_views}
+def generated(out: Path, num_views: int, **changes: Any) -> Dataset:
     order = DatasetOrder(
-        build="smoke", objects="builtin:24", out=str(out), scenes=3, resolution=16, changes=changes
+        build="smoke",
+        objects="builtin:12",
+        out=str(out),
+        scenes=2,
+        resolution=16,
+        changes={**TINY, "scenes.num_views": num_views, **changes},
+        workers=1,
     )
     make_dataset(order, Undocumented())
     return open_dataset(str(out))
@@ -42,7 +56,7 @@ def generated(out: Path, num_views: int) -> Dataset:
 
 def order_of(source: Path, out: Path, **asked: Any) -> DatasetOrder:
     order = revisit_order(Revisit(dataset=str(source), out=str(out), **asked))
-    return with_shared(order, Shared(like=str(source)))
+    return dataclasses.replace(with_shared(order, Shared(like=str(source))), workers=1)
 
 
 def revisited(source: Path, out: Path, **asked: Any) -> Dataset:
@@ -66,14 +80,31 @@ def samples(dataset: Dataset) -> list[Sample]:
 
 
 @pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def here() -> Iterator[pytest.MonkeyPatch]:
+    """Make scenes in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(render_children, "IsolatedChild", ChildHere)
+        yield patch
+        render_children.close_children()
+
+
+@pytest.fixture(scope="module")
+def source(here: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return generated(tmp_path_factory.mktemp("source") / "one", 1)
 
 
-def test_another_view_is_that_of_a_dataset_with_more_views(source: Dataset, tmp_path: Path) -> None:
-    """Copied pictures and new ones are those of `generate` with two views, byte for byte."""
-    more = revisited(source.folder.root, tmp_path / "more", cameras="2")
-    fresh = generated(tmp_path / "fresh", 2)
+def test_another_view_is_that_of_a_dataset_with_more_views(
+    source: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Copied pictures and new ones are those of `generate` with two views, byte for byte.
+
+    So are the passes that are stored beside both of them.
+    """
+    passes = {"storage.passes": ["depth"]}
+    monkeypatch.setattr(render_children, "IsolatedChild", IsolatedChild)
+    more = revisited(source.folder.root, tmp_path / "more", cameras="2", changes=passes)
+    monkeypatch.setattr(render_children, "IsolatedChild", ChildHere)
+    fresh = generated(tmp_path / "fresh", 2, **passes)
     found, expected = members(more), members(fresh)
     assert found.keys() == expected.keys()
     for name in expected:
@@ -86,22 +117,26 @@ def test_another_view_is_that_of_a_dataset_with_more_views(source: Dataset, tmp_
             assert now == then
         else:
             assert found[name] == expected[name], name
+    before = {name: data for name, data in members(source).items() if name.endswith(".exr")}
+    assert before and before == {name: found[name] for name in before}
+    assert {name for name in found if ".0." in name} - before.keys() == {
+        name.replace(".0.exr", ".0.passes.exr") for name in before
+    }
     assert more.objects_lock() == source.objects_lock()
     assert [(entry.name, entry.split) for entry in more.manifest.shards] == [
         (entry.name, entry.split) for entry in source.manifest.shards
     ]
 
 
-def test_a_kept_picture_is_copied_and_not_rendered(source: Dataset, tmp_path: Path) -> None:
-    """With passes stored beside it, each picture stays the file that it was."""
-    changes = {"storage.passes": ["depth"]}
-    kept = revisited(source.folder.root, tmp_path / "kept", changes=changes)
+def test_a_kept_picture_is_copied_and_not_rendered(
+    source: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No path is traced where all pictures are kept."""
+    monkeypatch.setattr(SceneRenderer, "view_steps", None)
+    kept = revisited(source.folder.root, tmp_path / "kept", shards="0:1")
     before, now = members(source), members(kept)
-    pictures = {name: data for name, data in before.items() if name.endswith(".exr")}
-    assert pictures
-    assert {name: now[name] for name in pictures} == pictures
-    added = {name for name in now if name not in before}
-    assert added == {name.replace(".0.exr", ".0.passes.exr") for name in pictures}
+    pictures = {name: data for name, data in now.items() if name.endswith(".exr")}
+    assert pictures and pictures == {name: before[name] for name in pictures}
 
 
 def test_lights_materials_and_resolution_change_on_request(source: Dataset, tmp_path: Path) -> None:
@@ -125,7 +160,7 @@ def test_lights_materials_and_resolution_change_on_request(source: Dataset, tmp_
         assert (step["dataset_digest"], step["key"]) == (source.digest, then.key)
 
 
-@pytest.mark.parametrize("asked", [{"lights": "new"}, {"materials": "new"}, {"seed": 1}])
+@for_each("asked", [{"lights": "new"}, {"materials": "new"}, {"seed": 1}])
 def test_a_kept_camera_is_rendered_again_where_it_would_see_something_else(
     source: Dataset, tmp_path: Path, asked: dict[str, Any]
 ) -> None:
@@ -150,19 +185,19 @@ def test_given_cameras_are_those_of_every_scene(source: Dataset, tmp_path: Path)
 def test_a_run_goes_on_after_a_kill_and_a_bad_shard_is_repaired(
     source: Dataset, tmp_path: Path
 ) -> None:
+    """The run that nothing disturbs is the expectation."""
     asked = {"cameras": "new:1", "seed": 9}
+    digest = revisited(source.folder.root, tmp_path / "whole", **asked).digest
     first = order_of(source.folder.root, tmp_path / "set", shards="0:1", **asked)
-    make_dataset(first, ThreadRunner())
+    make_dataset(first, Undocumented())
     order = order_of(source.folder.root, tmp_path / "set", **asked)
-    digest = make_dataset(order, ThreadRunner()).digest
+    make_dataset(order, ThreadRunner())
     shard = open_dataset(str(tmp_path / "set")).manifest.shards[0].name
     (tmp_path / "set" / shard).write_bytes(b"not a shard")
     repair(str(tmp_path / "set"), [shard], objects=None, scenes_from=None)
     again = open_dataset(str(tmp_path / "set"))
     assert again.digest == digest
     assert not verify_dataset(again).problems
-    whole = revisited(source.folder.root, tmp_path / "whole", **asked)
-    assert whole.digest == digest
 
 
 def test_another_source_is_refused(source: Dataset, tmp_path: Path) -> None:
@@ -174,7 +209,7 @@ def test_another_source_is_refused(source: Dataset, tmp_path: Path) -> None:
     assert not (tmp_path / "set" / "manifest.json").exists()
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("asked", "message"),
     [({"cameras": "new:2"}, "draws no cameras"), ({"lights": "new"}, "draws no lights")],
 )
@@ -203,7 +238,7 @@ def test_a_damaged_source_is_named(source: Dataset, tmp_path: Path) -> None:
     assert not (tmp_path / "set" / shard.name).exists()
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("asked", "message"),
     [
         ({"cameras": "bogus"}, "--cameras is 'bogus'; expected keep; a number"),

@@ -24,6 +24,7 @@ from storage.records.passes.stored import passes_exr
 from storage.records.sample import sample_key
 from storage.settings.changes import json_or_word
 from storage.settings.described import from_record
+from tests.for_each import for_each
 from tests.pipeline.making.test_publication import ENVIRONMENT, _locked
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
@@ -60,7 +61,7 @@ def finished(root: Path, settings: BuildSettings) -> Publication:
     return publication
 
 
-@pytest.mark.parametrize("name", BUILDS)
+@for_each("name", BUILDS)
 def test_what_stores_none_has_the_record_from_before_there_were_any(name: str) -> None:
     """Every build's: settings stand in shards and digests."""
     settings = named_build(name)

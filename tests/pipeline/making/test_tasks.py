@@ -11,6 +11,7 @@ from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece, TaskSizes, TasksLef
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
+from tests.for_each import for_each
 
 
 def _scenes(tasks: list[tuple[Piece, ...]]) -> list[int]:
@@ -57,7 +58,7 @@ def test_sizes_follow_what_is_measured_on_the_way() -> None:
     assert len(_scenes([next(tasks)])) == TASK_S
 
 
-@pytest.mark.parametrize("at_once", [2, 8])
+@for_each("at_once", [2, 8])
 def test_several_at_once_all_have_work_until_the_end(at_once: int) -> None:
     """Fast scenes, of which one task could take all: nobody gets more than half of a share."""
     sizes = TaskSizes()
@@ -86,7 +87,7 @@ def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
     assert sum(rounds) == MOST_TASKS
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("changes", "message"),
     [
         ({"build": "nonsense"}, "build 'nonsense'"),

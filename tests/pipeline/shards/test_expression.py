@@ -5,6 +5,7 @@ import pytest
 
 from pipeline.shards.expression import condition
 from storage.errors import TrilightError
+from tests.for_each import for_each
 
 VALUES = {
     "key": "000000007",
@@ -20,7 +21,7 @@ VALUES = {
 }
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("text", "holds"),
     [
         ("triangles_per_scene > 3999", True),
@@ -50,7 +51,7 @@ def test_a_condition_says_what_it_asks_for() -> None:
     assert condition('max(roughness) < 1 and split == "test"').names == {"roughness", "split"}
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("text", "says"),
     [
         ("roughness < 0.3", "expected min(...), max(...) or mean(...)"),

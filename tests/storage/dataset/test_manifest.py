@@ -18,11 +18,12 @@ from infra.bench.subjects.manifests import (
 from storage.dataset import json_pieces
 from storage.dataset.json_pieces import entries
 from storage.dataset.manifest import decode_head, read_head, read_manifest, write_manifest
+from tests.for_each import for_each
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
     lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
-    max_leaves=12,
+    max_leaves=8,
 )
 
 
@@ -34,7 +35,7 @@ def read(text: str, piece_bytes: int = 1) -> list[tuple[str, Any]]:
         json_pieces.PIECE_BYTES = before
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None, max_examples=40)  # a busy machine is no failure
 @given(st.dictionaries(st.text(), JSON), st.sampled_from([None, 1]), st.sampled_from([1, 7, 4096]))
 def test_entries_are_those_of_the_object(
     record: dict[str, Any], indent: int | None, piece_bytes: int
@@ -48,7 +49,7 @@ def test_entries_are_those_of_the_object(
     assert read(f" {text}\n", piece_bytes) == expected
 
 
-@pytest.mark.parametrize(
+@for_each(
     "text",
     ["", "[]", "3", "{", '{"a"', '{"a": 1', '{"a": 1,}', '{"a": [1,]}', '{"a": [1 2]}',
      '{"a" 1}', "{1: 2}", '{"a": 1} 2', '{"a": tru}', '{"a": [1}', '{"a": 1 "b": 2}'],

@@ -17,6 +17,7 @@ from storage.digests import sha256_of_file
 from storage.errors import TrilightError
 from storage.records.profiles import PROFILES, Profile, keeps_law
 from storage.records.sample import encode_sample
+from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_sample
 
 MEMBERS = {"json": b"{}", "scene.safetensors": b"abc", "0.exr": b"x" * 1000}
@@ -52,7 +53,7 @@ def test_bytes_are_pinned(tmp_path: Path) -> None:
 PINNED = "34fe3b8b9ef7e13f706ad65041b050257f8fafe56d80fb5364e220a7f4e3a41c"
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@for_each("profile", PROFILES)
 def test_stock_webdataset_reads_a_shard(tmp_path: Path, profile: Profile) -> None:
     """In three lines, which stand in docs/reference/formats.md; it undoes `.gz` by itself."""
     import OpenEXR
@@ -85,7 +86,7 @@ def test_the_headers_find_every_member(tmp_path: Path) -> None:
     assert found == {f"00000000{i}.{suffix}": d for i in range(2) for suffix, d in MEMBERS.items()}
 
 
-@pytest.mark.parametrize("kept_blocks", range(1, 20))
+@for_each("kept_blocks", range(1, 20))
 def test_a_shard_cut_at_any_block_is_refused(tmp_path: Path, kept_blocks: int) -> None:
     whole, cut = tmp_path / "whole.tar", tmp_path / "cut.tar"
     write_shard(whole, [("000000000", MEMBERS), ("000000001", MEMBERS)])
@@ -114,7 +115,7 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("entries", HOSTILE.values(), ids=HOSTILE.keys())
+@for_each("entries", HOSTILE.values())
 def test_hostile_members_are_refused(
     tmp_path: Path, entries: list[tarfile.TarInfo | tuple[str, bytes]]
 ) -> None:
@@ -150,7 +151,7 @@ def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
     assert finished.exists()
 
 
-@pytest.mark.parametrize("place", ["/proc/nowhere/file", "/dev/null/file"])
+@for_each("place", ["/proc/nowhere/file", "/dev/null/file"])
 def test_an_unwritable_place_is_one_clear_line(place: str) -> None:
     with pytest.raises(TrilightError, match="cannot write file"), atomic_writer(Path(place)):
         pass

@@ -16,11 +16,12 @@ from storage.dataset.shard_places import expanded, listed_shards
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
+from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import five_scenes
 from tests.scenes_by_hand import tiny_sample
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("pattern", "names"),
     [
         ("a.tar", ["a.tar"]),
@@ -34,7 +35,7 @@ def test_patterns(pattern: str, names: list[str]) -> None:
     assert expanded(pattern) == names
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("patterns", "message"),
     [
         (["pipe:touch x; echo a.tar"], "pipe: command"),
@@ -174,7 +175,7 @@ def audited() -> Iterator[list[str]]:
         state["on"] = False
 
 
-@pytest.mark.parametrize(("spoil", "message"), HOSTILE.values(), ids=HOSTILE.keys())
+@for_each(("spoil", "message"), HOSTILE.values())
 def test_hostile_shards_are_refused_and_run_nothing(
     tmp_path: Path, spoil: Callable[[Path], None], message: str
 ) -> None:

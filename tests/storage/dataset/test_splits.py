@@ -18,6 +18,7 @@ from storage.dataset.splits import (
 )
 from storage.errors import TrilightError
 from storage.seeds import rng_for, seed_for
+from tests.for_each import for_each
 
 SETTINGS = SplitSettings(scenes_per_shard=4)
 shard_indices = st.integers(0, 10_000)
@@ -67,7 +68,7 @@ def test_a_split_without_objects_is_one_clear_line() -> None:
     require_objects({"train": 5}, {"train"})
 
 
-@pytest.mark.parametrize(
+@for_each(
     "changes",
     [{"scenes_per_shard": 0}, {"shards_per_cycle": 5}, {"held_out_objects": 0.5}],
 )

@@ -11,6 +11,7 @@ from safetensors.numpy import save
 from pipeline.objects.ply import encode_ply
 from storage.errors import TrilightError
 from storage.records.asset import Asset, Level, LevelRecord, decode_asset, encode_asset
+from tests.for_each import for_each
 from tests.pipeline.scenes.small_pool import QUALITY, SOURCE
 
 
@@ -53,13 +54,13 @@ def test_equal_assets_have_equal_files(asset: Asset) -> None:
     assert encode_asset(decode_asset(encode_asset(asset))) == encode_asset(asset)
 
 
-@pytest.mark.parametrize("data", [b"", b"hello", bytes(100), b"\xff" * 100])
+@for_each("data", [b"", b"hello", bytes(100), b"\xff" * 100])
 def test_what_is_no_asset_is_said_to_be_none(data: bytes) -> None:
     with pytest.raises(TrilightError):
         decode_asset(data)
 
 
-@pytest.mark.parametrize(
+@for_each(
     "metadata",
     [
         None,
@@ -78,7 +79,7 @@ def test_another_safetensors_file_is_refused_in_one_line(metadata: dict[str, str
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("keep", [0.2, 0.9])
+@for_each("keep", [0.2, 0.9])
 def test_an_asset_that_was_cut_off(asset: Asset, keep: float) -> None:
     data = encode_asset(asset)
     with pytest.raises(TrilightError):
@@ -93,7 +94,7 @@ def test_judgements_follow_from_the_facts() -> None:
     assert dataclasses.replace(SOURCE, num_faces=SOURCE.num_faces_read - 1).repaired
 
 
-@pytest.mark.parametrize("num_faces", [0, 1, 300])
+@for_each("num_faces", [0, 1, 300])
 def test_ply_reads_back_in_another_program(num_faces: int) -> None:
     rng = np.random.default_rng(1)
     positions = rng.random((50, 3)).astype(np.float32)

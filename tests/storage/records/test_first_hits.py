@@ -9,6 +9,7 @@ from storage.errors import TrilightError
 from storage.records.first_hits import FirstHits, SeenFrom, first_hits
 from storage.records.scene import Scene
 from storage.records.surfaces import MISS
+from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_scene
 
 RESOLUTION = 24
@@ -60,7 +61,7 @@ def _by_search(
     return triangle, depth, clear
 
 
-@pytest.mark.parametrize("view", [0, 1])
+@for_each("view", [0, 1])
 def test_a_search_through_all_triangles_finds_the_same(view: int) -> None:
     scene = _many_triangles()
     hits = first_hits(scene, view=view, resolution=RESOLUTION)

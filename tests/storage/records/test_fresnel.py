@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from storage.records.fresnel import constant_albedos
+from tests.for_each import for_each
 
 
-@pytest.mark.parametrize(("f0", "f90"), [(0.04, 1.0), (0.0, 0.0), (0.02, 0.5), (1.0, 1.0)])
-@pytest.mark.parametrize("metal", [0.0, 0.3, 1.0])
+@for_each(("f0", "f90"), [(0.04, 1.0), (0.0, 0.0), (0.02, 0.5), (1.0, 1.0)])
+@for_each("metal", [0.0, 0.3, 1.0])
 def test_the_lobe_has_the_cosine_weighted_mean_of_schlick(
     f0: float, f90: float, metal: float
 ) -> None:

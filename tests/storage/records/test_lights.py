@@ -26,6 +26,7 @@ from storage.records.lights import (
 )
 from storage.records.sample import Sample, decode_sample, encode_sample
 from storage.records.scene import SceneObject
+from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 
@@ -62,7 +63,7 @@ def _faults(sample: Sample, **renders: Any) -> list[str]:
     return list(check_sample(sample, "train", _manifest(**renders), {}))
 
 
-@pytest.mark.parametrize("count", [1, 2, 8, MAX_LIGHTS])
+@for_each("count", [1, 2, 8, MAX_LIGHTS])
 def test_lights_come_back_exactly_and_in_order(count: int) -> None:
     lights = _lights(count)
     back = decode_lights_exr(encode_lights_exr(lights), (count, 16, 16))
@@ -96,7 +97,7 @@ def test_a_sum_beyond_half_floats_is_seen() -> None:
     assert np.isinf(sum_of_lights(rounded_to_half(lights))).all()
 
 
-@pytest.mark.parametrize("shape", [(3, 16, 16), (2, 8, 16), (2, 16, 24), (MAX_LIGHTS + 1, 16, 16)])
+@for_each("shape", [(3, 16, 16), (2, 8, 16), (2, 16, 24), (MAX_LIGHTS + 1, 16, 16)])
 def test_another_shape_is_refused(shape: tuple[int, int, int]) -> None:
     with pytest.raises(
         TrilightError, match="lights: |channels are light0.B, .*; expected light0.B"
@@ -104,7 +105,7 @@ def test_another_shape_is_refused(shape: tuple[int, int, int]) -> None:
         decode_lights_exr(encode_lights_exr(_lights(2)), shape)
 
 
-@pytest.mark.parametrize("keep", [0, 10, 300, -100])
+@for_each("keep", [0, 10, 300, -100])
 def test_a_truncated_file_is_refused(keep: int) -> None:
     data = encode_lights_exr(_lights(2, 64))
     with pytest.raises(TrilightError, match="picture"):

@@ -10,6 +10,7 @@ from storage.records.environment import Environment
 from storage.records.lookup import environment_values, texture_values, textured_rows
 from storage.records.material import DIFFUSE, ROUGHNESS
 from storage.records.texture import Texture
+from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, LIGHT
 from tests.textured_by_hand import colour_texture, number_texture, sky, textured_scene
 
@@ -72,7 +73,7 @@ def _slow(texture: Texture, u: float, v: float) -> np.ndarray:
     return total
 
 
-@pytest.mark.parametrize("texture", [colour_texture(), number_texture()])
+@for_each("texture", [colour_texture(), number_texture()])
 def test_a_texture_is_the_sum_of_its_tents(texture: Texture) -> None:
     places = [(0, 0), (0.5, 0.5), (1, 1), (-0.25, 1.25), (0.999, 0.001), (7.3, -12.8)]
     for u, v in places:

@@ -25,6 +25,7 @@ from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene_file import decode_arrays, encode_arrays, scene_digest
 from storage.settings.ranges import Within
 from tests.columns_kit import COAT, TINT, WAVES, declared
+from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, tiny_sample, tiny_scene
 
 
@@ -34,7 +35,7 @@ def test_the_published_columns_stand_where_files_and_kernels_expect_them() -> No
     assert material_width() == 10
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("changes", "message"),
     [
         ({"name": "Clear coat"}, "has the name; expected lower case letters"),
@@ -112,7 +113,7 @@ def test_a_sample_carries_its_columns_and_an_older_one_is_completed() -> None:
         decode_sample("0", members)
 
 
-@pytest.mark.parametrize(
+@for_each(
     "stated",
     [
         "",

@@ -11,6 +11,7 @@ from storage.licences import share_alike_camp
 from storage.records.lock_rows import LockRows
 from storage.records.object_index import IndexedObject, ObjectIndex, write_object_index
 from storage.records.objects import LockedObject, write_objects_lock
+from tests.for_each import for_each
 
 LICENCES = ("CC0-1.0", "CC-BY-SA-4.0", "MIT", "CC-BY-SA-3.0")
 SPLITS = ("train", "test", "train", "validation", "train")
@@ -36,7 +37,7 @@ def _rows(count: int) -> list[LockedObject]:
     ]
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 100])
+@for_each("count", [0, 1, 2, 3, 100])
 def test_every_row_is_found_by_its_uid(tmp_path: Path, count: int) -> None:
     rows = _rows(count)
     write_objects_lock(tmp_path / "lock", rows)

@@ -20,6 +20,7 @@ from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import decode_scene_file, encode_scene
 from storage.records.texture import MAX_MAPS_BYTES, Texture
+from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 from tests.textured_by_hand import (
     colour_texture,
@@ -60,8 +61,8 @@ SCENES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("name", SCENES)
+@for_each("profile", PROFILES)
+@for_each("name", SCENES)
 def test_a_sample_comes_back(name: str, profile: Profile) -> None:
     sample = dataclasses.replace(tiny_sample(), scene=SCENES[name])
     members = encode_sample(sample, profile)
@@ -75,7 +76,7 @@ def test_a_sample_comes_back(name: str, profile: Profile) -> None:
     )
 
 
-@pytest.mark.parametrize("name", SCENES)
+@for_each("name", SCENES)
 def test_a_scene_file_comes_back(name: str) -> None:
     data = encode_scene(SCENES[name])
     back = decode_scene_file(data, "a.safetensors")
@@ -212,7 +213,7 @@ HOSTILE: dict[str, tuple[Callable[[Members], object], str]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", HOSTILE)
+@for_each("name", HOSTILE)
 def test_a_hostile_sample_is_one_line(name: str) -> None:
     change, message = HOSTILE[name]
     members = encode_sample(textured_sample())
@@ -276,7 +277,7 @@ SCENE_FILES: dict[str, tuple[Callable[[dict[str, Any], dict[str, Any]], object],
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SCENE_FILES)
+@for_each("name", SCENE_FILES)
 def test_a_hostile_scene_file_is_one_line(name: str) -> None:
     change, message = SCENE_FILES[name]
     data = encode_scene(textured_scene(environment=sky()))

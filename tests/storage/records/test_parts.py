@@ -23,6 +23,7 @@ from storage.records.parts import (
     sum_of_parts,
 )
 from storage.records.sample import PartFloor, Sample, decode_sample, decode_scene, encode_sample
+from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_sample
 
 SIZE = (16, 16)
@@ -86,8 +87,8 @@ def test_the_names_are_those_of_other_renderers_in_alphabetical_order() -> None:
         assert names == tuple(sorted(names))
 
 
-@pytest.mark.parametrize("lights", [None, 1, 3])
-@pytest.mark.parametrize("names", KNOWN_PARTS)
+@for_each("lights", [None, 1, 3])
+@for_each("names", KNOWN_PARTS)
 def test_parts_come_back_exactly(names: tuple[str, ...], lights: int | None) -> None:
     parts = _parts(names, SIZE if lights is None else (lights, *SIZE))
     data = encode_parts_exr(parts)
@@ -102,7 +103,7 @@ def test_parts_come_back_exactly(names: tuple[str, ...], lights: int | None) -> 
     np.testing.assert_array_equal(channels[f"{prefix}{names[1]}.G"].pixels, green[..., 1])
 
 
-@pytest.mark.parametrize("names", KNOWN_PARTS)
+@for_each("names", KNOWN_PARTS)
 def test_the_stored_sum_is_exact(names: tuple[str, ...]) -> None:
     """Parts and picture, each through its own file: the sum of the one is the other, bitwise."""
     for seed in range(5):
@@ -115,7 +116,7 @@ def test_the_stored_sum_is_exact(names: tuple[str, ...]) -> None:
         np.testing.assert_allclose(picture, exact, rtol=2**-11 + 4 * 2**-24, atol=6e-8)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("names", "size", "lights", "message"),
     [
         (KNOWN_PARTS[1], SIZE, None, "channels are direct.B"),
@@ -132,8 +133,8 @@ def test_other_parts_are_refused(
         decode_parts_exr(data, names, size, lights)
 
 
-@pytest.mark.parametrize("lights", [False, True])
-@pytest.mark.parametrize("names", KNOWN_PARTS)
+@for_each("lights", [False, True])
+@for_each("names", KNOWN_PARTS)
 def test_a_sample_with_parts_comes_back_and_verify_accepts_it(
     names: tuple[str, ...], lights: bool
 ) -> None:
@@ -160,7 +161,7 @@ def test_a_sample_without_parts_is_written_as_ever() -> None:
     assert back.parts_rgb is None and all(view.parts is None for view in back.views)
 
 
-@pytest.mark.parametrize(
+@for_each(
     "parts",
     [{}, 3, {"direct": {}}, {"direct": vars(FLOOR), "glossy": vars(FLOOR)},
      {"direct": vars(FLOOR), "indirect": {**vars(FLOOR), "noise_floor_db": True}},

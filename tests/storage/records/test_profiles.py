@@ -30,6 +30,7 @@ from storage.records.profiles import (
 )
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import ARRAY_FIELDS
+from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
 from tests.scenes_by_hand import tiny_sample
 
@@ -45,7 +46,7 @@ def noisy_picture(noise_db: float, resolution: int = 64) -> NDArray[np.float32]:
     return np.where(disc, np.maximum(noisy, 0), 0).astype(np.float32)
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@for_each("profile", PROFILES)
 def test_arrays_come_back_exactly(profile: Profile) -> None:
     sample = tiny_sample()
     back = decode_sample(sample.key, encode_sample(sample, profile))
@@ -54,7 +55,7 @@ def test_arrays_come_back_exactly(profile: Profile) -> None:
     assert encode_sample(sample, profile) == encode_sample(tiny_sample(), profile)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("floor_db", "level"),
     [(20.0, 200), (40.0, 100), (45.0, None), (50.0, None), (60.0, None), (85.0, None)],
 )
@@ -84,7 +85,7 @@ def test_the_law_means_a_tenth_of_the_mean_square() -> None:
         assert keeps_law(picture, (10 ** (1 + rms) - 1) * np.ones_like(picture), 40.0) == kept
 
 
-@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+@for_each("wrong", [np.nan, np.inf])
 def test_what_is_not_finite_never_keeps_the_law(wrong: float) -> None:
     picture = np.ones((8, 8, 3), np.float32)
     stored = picture.copy()
@@ -92,7 +93,7 @@ def test_what_is_not_finite_never_keeps_the_law(wrong: float) -> None:
     assert not keeps_law(picture, stored, 1.0)
 
 
-@pytest.mark.parametrize("floor_db", [91.0, 100.0, np.nan, np.inf])
+@for_each("floor_db", [91.0, 100.0, np.nan, np.inf])
 def test_a_floor_that_nothing_can_beat_is_packed_without_loss(floor_db: float) -> None:
     picture = noisy_picture(30.0)
     assert pack_picture(picture, floor_db, "compact") == encode_exr(picture)
@@ -152,7 +153,7 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize(("members", "message"), HOSTILE.values(), ids=HOSTILE.keys())
+@for_each(("members", "message"), HOSTILE.values())
 def test_hostile_arrays_are_refused(members: dict[str, bytes], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
         unpack_arrays(members)

@@ -12,6 +12,7 @@ from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_exr
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import ARRAY_FIELDS
+from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_sample
 
 
@@ -32,7 +33,7 @@ def test_equal_samples_give_equal_bytes() -> None:
     assert encode_sample(tiny_sample()) == encode_sample(tiny_sample())
 
 
-@pytest.mark.parametrize("suffix", ["json", "scene.safetensors", "1.exr"])
+@for_each("suffix", ["json", "scene.safetensors", "1.exr"])
 def test_a_missing_member_is_named(suffix: str) -> None:
     members = encode_sample(tiny_sample())
     del members[suffix]
@@ -40,7 +41,7 @@ def test_a_missing_member_is_named(suffix: str) -> None:
         decode_sample("000000000", members)
 
 
-@pytest.mark.parametrize("version", [None, 1, 99, "2", [2]])
+@for_each("version", [None, 1, 99, "2", [2]])
 def test_another_schema_version_is_refused(version: object) -> None:
     members = encode_sample(tiny_sample())
     record = json.loads(members["json"])
@@ -77,7 +78,7 @@ def test_half_floats_keep_eleven_bits() -> None:
     assert (abs(back - picture) <= picture * 2**-11).all()
 
 
-@pytest.mark.parametrize("compression", ["ZIP", "DWAB"])
+@for_each("compression", ["ZIP", "DWAB"])
 def test_float32_pictures_of_other_tools_are_read(compression: str) -> None:
     """Exact values that half floats do not hold; below 0 only where the codec put them there."""
     picture = np.full((16, 16, 3), 1.00001, np.float32)
@@ -94,7 +95,7 @@ def test_float32_pictures_of_other_tools_are_read(compression: str) -> None:
         assert (back >= 0).all()
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -1e-6, 65505.0])
+@for_each("value", [np.nan, np.inf, -1e-6, 65505.0])
 def test_what_a_half_float_cannot_hold_is_refused(value: float) -> None:
     picture = np.zeros((8, 8, 3), np.float32)
     picture[3, 2, 1] = value
@@ -102,7 +103,7 @@ def test_what_a_half_float_cannot_hold_is_refused(value: float) -> None:
         encode_exr(picture)
 
 
-@pytest.mark.parametrize("keep", [0, 10, 300, -100])
+@for_each("keep", [0, 10, 300, -100])
 def test_a_truncated_picture_is_refused(keep: int) -> None:
     data = encode_exr(np.random.default_rng(0).random((64, 64, 3)).astype(np.float32))
     with pytest.raises(TrilightError, match="picture"):

@@ -7,6 +7,7 @@ import pytest
 
 from storage.errors import TrilightError
 from storage.records.scene import ARRAY_FIELDS, SceneObject
+from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_scene
 
 
@@ -20,8 +21,8 @@ def test_a_valid_scene_passes() -> None:
     tiny_scene().check()
 
 
-@pytest.mark.parametrize("field", [n for n, (d, _) in ARRAY_FIELDS.items() if d is np.float32])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@for_each("field", [n for n, (d, _) in ARRAY_FIELDS.items() if d is np.float32])
+@for_each("value", [np.nan, np.inf, -np.inf])
 def test_non_finite_values_are_named(field: str, value: float) -> None:
     array = getattr(tiny_scene(), field)
     index = tuple(size - 1 for size in array.shape)
@@ -29,7 +30,7 @@ def test_non_finite_values_are_named(field: str, value: float) -> None:
         tiny_scene(**_changed(field, index, value)).check()
 
 
-@pytest.mark.parametrize("field", ARRAY_FIELDS)
+@for_each("field", ARRAY_FIELDS)
 def test_another_dtype_or_shape_is_named(field: str) -> None:
     array = getattr(tiny_scene(), field)
     with pytest.raises(TrilightError, match=f"{field} has dtype"):
@@ -58,7 +59,7 @@ BROKEN = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "message"), BROKEN)
+@for_each(("changes", "message"), BROKEN)
 def test_a_broken_law_names_field_value_and_index(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
         tiny_scene(**changes).check()

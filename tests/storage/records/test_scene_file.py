@@ -20,6 +20,7 @@ from storage.records.scene_file import (
     read_scene_file,
     scene_digest,
 )
+from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 KEY = "trilight_scene"
@@ -88,7 +89,7 @@ def _lawless(arrays: dict[str, Any]) -> None:
     arrays["faces"] = arrays["faces"] + np.uint32(7)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("change", "message"),
     [
         (_drop, "missing or not expected: 'faces'"),
@@ -105,7 +106,7 @@ def test_arrays_are_exactly_those_of_a_scene(
         decode_scene_file(_remade(arrays=change), "a.safetensors")
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("change", "message"),
     [
         ({"schema_version": 99}, "schema version 99"),
@@ -123,7 +124,7 @@ def test_metadata_are_exactly_those_of_a_scene(change: dict[str, Any], message: 
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("field", "value"), [("kind", "lamp"), ("name", 3), ("uid", ["x"])])
+@for_each(("field", "value"), [("kind", "lamp"), ("name", 3), ("uid", ["x"])])
 def test_fields_of_objects_are_checked(field: str, value: Any) -> None:
     with pytest.raises(TrilightError, match=rf"objects\[1\].{field} is "):
         decode_scene_file(
@@ -155,7 +156,7 @@ def test_a_shape_that_claims_too_much_is_refused_before_any_array_is_made() -> N
         decode_scene_file(len(bomb).to_bytes(8, "little") + bomb + data[8 + length :], "a")
 
 
-@pytest.mark.parametrize("kept", [0, 7, 8, 100, -1])
+@for_each("kept", [0, 7, 8, 100, -1])
 def test_a_cut_file_is_refused(kept: int) -> None:
     with pytest.raises(TrilightError, match="^a: "):
         decode_scene_file(encode_scene(tiny_scene())[:kept], "a")

@@ -10,6 +10,14 @@ from storage.digests import sha256_hex
 from storage.remote import tries, url
 from tests.http_server import Site, serve
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
+from tests.s3_server import s3_server
+
+
+@pytest.fixture(scope="session")
+def moto() -> Iterator[int]:
+    """Run an S3 server; returns its port."""
+    with s3_server() as port:
+        yield port
 
 
 @pytest.fixture

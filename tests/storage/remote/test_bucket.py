@@ -12,16 +12,16 @@ from storage.errors import EnvironmentFailure, TrilightError
 from storage.remote import bucket as remote_bucket
 from storage.remote.tries import with_tries
 from storage.remote.url import RemoteUrl
+from tests.for_each import for_each
 from tests.pipeline.making.bucket_kit import empty_bucket
-from tests.s3_server import s3_server
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
 pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
 
 
 @pytest.fixture
-def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    with s3_server() as port, empty_bucket(port, monkeypatch) as driver:
+def bucket(moto: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    with empty_bucket(moto, monkeypatch) as driver:
         yield driver
 
 
@@ -56,7 +56,7 @@ def test_a_server_that_ignores_conditions_is_refused(
         place.require_create()
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("out", "message"),
     [
         ("s3://ada:hunter2@shards/set", "out 's3://shards/set' came with a user or password"),

@@ -24,34 +24,28 @@ SHARD = "train-000000.tar"
 DATASET = f"hf://datasets/{REPOSITORY}"
 
 READ = """
+import pathlib
 from storage.dataset.dataset import open_dataset
+from storage.dataset.shard_places import listed_shards
+from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
-dataset = open_dataset(sys.argv[1])
-said = []
+verified = [verify_dataset(sys.argv[1], fast=fast).bad_shards for fast in (True, False)]
+dataset, read = open_dataset(sys.argv[1]), []
 for shard in dataset.manifest.shards:
     try:
         for sample in dataset.read_shard(shard):
-            said.append(sha256_hex(b"".join(encode_sample(sample).values())))
+            read.append(sha256_hex(b"".join(encode_sample(sample).values())))
     except TrilightError as error:
-        said.append(str(error))
-"""
-
-VERIFY = """
-from storage.dataset.verify import verify_dataset
-said = [verify_dataset(sys.argv[1], fast=fast).bad_shards for fast in (True, False)]
-"""
-
-REPLACE = """
-import pathlib
-from storage.dataset.shard_places import listed_shards
-(place,) = listed_shards([sys.argv[1]])
-said = []
-for _ in range(2):
-    with place.open() as stream:
-        said.append(len(stream.read()))
-    pathlib.Path(sys.argv[2]).write_bytes(bytes(7))
+        read.append(str(error))
+replaced = []
+if len(sys.argv) > 2:
+    (place,) = listed_shards([sys.argv[2]])
+    for _ in range(2):
+        with place.open() as stream:
+            replaced.append(len(stream.read()))
+        pathlib.Path(sys.argv[3]).write_bytes(bytes(7))
 """
 
 
@@ -61,10 +55,11 @@ def hub(local: Dataset) -> Iterator[str]:
         yield url
 
 
-def run(hub: str, cache: Path, code: str, *arguments: str) -> list[str]:
-    """Run code in a process that knows this hub; returns what it said."""
+def run(hub: str, cache: Path, *arguments: str) -> tuple[list[list[str]], list[str], list[int]]:
+    """Run READ in a process that knows this hub; returns its bad shards, samples and sizes."""
+    code = f"import json, sys\n{READ}\nprint(json.dumps([verified, read, replaced]))"
     ran = subprocess.run(
-        [sys.executable, "-c", f"import json, sys\n{code}\nprint(json.dumps(said))", *arguments],
+        [sys.executable, "-c", code, DATASET, *arguments],
         cwd=ROOT,
         env={**os.environ, "HF_ENDPOINT": hub, "HF_HOME": str(cache.parent / "hub")},
         capture_output=True,
@@ -72,33 +67,32 @@ def run(hub: str, cache: Path, code: str, *arguments: str) -> list[str]:
         check=False,
     )
     assert ran.returncode == 0, ran.stderr
-    return list(json.loads(ran.stdout))
+    verified, read, replaced = json.loads(ran.stdout)
+    return verified, read, replaced
 
 
 def test_a_repository_holds_the_same_dataset(hub: str, cache: Path, local: Dataset) -> None:
+    """A shard that is replaced is fetched again.
+
+    The package remembers listings; without a hash, only a fresh one tells the new file.
+    """
     expected = [
         sha256_hex(b"".join(encode_sample(sample).values()))
         for shard in local.manifest.shards
         for sample in local.read_shard(shard)
     ]
-    assert run(hub, cache, READ, DATASET) == expected
+    path = local.folder.root / SHARD
+    size = path.stat().st_size
+    verified, read, replaced = run(hub, cache, f"{DATASET}/{SHARD}", str(path))
+    assert (verified, read, replaced) == ([[], []], expected, [size, 7])
 
 
 def test_missing_and_changed_shards_are_named(hub: str, cache: Path, local: Dataset) -> None:
-    assert run(hub, cache, VERIFY, DATASET) == [[], []]
     content = bytearray((local.folder.root / SHARD).read_bytes())
     content[-700] ^= 1
     (local.folder.root / SHARD).write_bytes(content)
     (local.folder.root / "test-000005.tar").unlink()
-    fast, full = run(hub, cache, VERIFY, DATASET)
+    (fast, full), said, _ = run(hub, cache)
     assert (fast, set(full)) == (["test-000005.tar"], {"test-000005.tar", SHARD})
-    said = run(hub, cache, READ, DATASET)
     assert any("no such file" in line for line in said)
     assert any("sha256 differs, 2 times" in line for line in said)
-
-
-def test_a_shard_that_is_replaced_is_fetched_again(hub: str, cache: Path, local: Dataset) -> None:
-    """The package remembers listings; without a hash, only a fresh one tells the new file."""
-    path = local.folder.root / SHARD
-    size = path.stat().st_size
-    assert run(hub, cache, REPLACE, f"{DATASET}/{SHARD}", str(path)) == [size, 7]

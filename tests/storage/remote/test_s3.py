@@ -14,19 +14,12 @@ from storage.errors import TrilightError
 from storage.records.sample import encode_sample
 from storage.remote import fetch, tries
 from storage.remote import url as remote_url
-from tests.s3_server import CREDENTIALS, Line, control, s3_server
+from tests.s3_server import CREDENTIALS, Line, control
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
 pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
 
 SHARD = "train-000000.tar"
-
-
-@pytest.fixture(scope="module")
-def moto() -> Iterator[int]:
-    """Run the server; returns its port."""
-    with s3_server() as port:
-        yield port
 
 
 @pytest.fixture

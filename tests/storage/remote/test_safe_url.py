@@ -1,11 +1,10 @@
 """What is shown of a URL: enough to find the place, nothing that opens it."""
 
-import pytest
-
 from storage.remote.safe_url import public_text, safe_text, safe_url
+from tests.for_each import for_each
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("url", "shown"),
     [
         ("https://host/a/b.glb", "https://host/a/b.glb"),
@@ -35,7 +34,7 @@ def test_urls(url: str, shown: str) -> None:
     assert safe_url(shown) == shown
 
 
-@pytest.mark.parametrize(
+@for_each(
     "text",
     [
         "404, message='Not Found', url='https://ada:s3cret@host/a?sig=s3cret'",
@@ -61,7 +60,7 @@ def test_plain_messages_stay() -> None:
         assert safe_text(text) == text
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("text", "published"),
     [
         ("https://ada:s3cret@host/a?id=7#top", "https://host/a?id=7#top"),

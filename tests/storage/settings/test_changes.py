@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from storage.errors import TrilightError
 from storage.settings.changes import changed
 from storage.settings.described import checked
+from tests.for_each import for_each
 
 
 @checked()
@@ -176,7 +177,7 @@ WRONG: list[tuple[str, Any, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "value", "message"), WRONG, ids=lambda part: str(part)[:30])
+@for_each(("name", "value", "message"), WRONG)
 def test_a_mistake_is_one_line_that_says_what_to_do(name: str, value: Any, message: str) -> None:
     with pytest.raises(TrilightError) as caught:
         changed(TREE, {name: value})
@@ -211,7 +212,7 @@ class Spans:
     many: tuple[Span, ...] = (Span(), Span())
 
 
-@pytest.mark.parametrize("names", [("low", "high"), ("high", "low")])
+@for_each("names", [("low", "high"), ("high", "low")])
 def test_values_that_only_fit_each_other_come_in_any_order(names: tuple[str, str]) -> None:
     numbers = {"low": 8, "high": 16}
     for group in ("one", "many"):
@@ -241,7 +242,7 @@ class Car:
     wheels: int = 4
 
 
-@pytest.mark.parametrize("backwards", [False, True])
+@for_each("backwards", [False, True])
 def test_a_group_with_presets_may_be_named_and_then_changed(backwards: bool) -> None:
     changes = {"engine": "large", "engine.power": 8, "wheels": 3}
     ordered = dict(reversed(changes.items())) if backwards else changes
@@ -249,7 +250,7 @@ def test_a_group_with_presets_may_be_named_and_then_changed(backwards: bool) -> 
     assert changed(Car(), {"engine": "small"}) == Car(engine=Engine(power=2))
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("changes", "message"),
     [
         (

@@ -20,6 +20,7 @@ from pipeline.executors.arrays.machines import ArrayMachines
 from pipeline.executors.registry import EXECUTORS, INDEX_VARIABLES
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
+from tests.for_each import for_each
 
 IMAGE = "registry.example/trilight@sha256:1"
 WHERE = {"aws-batch": "spot-queue", "google-batch": "us-central1", "sky": "aws"}
@@ -73,7 +74,7 @@ def _container(on: str, form: ArrayForm) -> tuple[list[str], dict[str, str], int
     return words[at + 1 :], dict(option.split("=", 1) for option in options), number
 
 
-@pytest.mark.parametrize("on", FORMS)
+@for_each("on", FORMS)
 def test_every_place_makes_what_is_missing_and_nothing_else(made: Made, on: str) -> None:
     assert FORMS.keys() == INDEX_VARIABLES.keys()
     _, form = made(on)
@@ -130,7 +131,7 @@ def test_the_pod_has_the_rights_of_the_other_manifests(made: Made) -> None:
     assert not pod["automountServiceAccountToken"]
 
 
-@pytest.mark.parametrize("missing", [MISSING, [3]])
+@for_each("missing", [MISSING, [3]])
 def test_aws_takes_definition_and_job(made: Made, missing: list[int]) -> None:
     session = pytest.importorskip("botocore.session", reason="make setup-all")
     validate = pytest.importorskip("botocore.validate", reason="make setup-all")
@@ -169,7 +170,7 @@ def test_sky_takes_pool_and_job(made: Made) -> None:
     assert form.afterwards == [["sky", "jobs", "pool", "down", "--yes", form.name]]
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("on", "machines", "message"),
     [
         ("kubernetes", {"image": None}, "--image is not given"),
@@ -189,7 +190,7 @@ def test_what_a_scheduler_lacks_is_named(
         made(on, **machines)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("asked", "message"),
     [
         ({"out": "data/mine"}, "--out is data/mine; expected a bucket"),
@@ -197,7 +198,7 @@ def test_what_a_scheduler_lacks_is_named(
         ({"objects": "builtin:", "skies": "file:///skies"}, "--skies is file:///skies, a folder"),
     ],
 )
-@pytest.mark.parametrize("on", FORMS)
+@for_each("on", FORMS)
 def test_files_of_this_machine_are_refused(on: str, asked: dict[str, str], message: str) -> None:
     given: dict[str, Any] = {"scenes": 8, "out": "gs://sets/mine", **asked}
     order = DatasetOrder(**given)

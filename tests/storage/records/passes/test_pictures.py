@@ -14,6 +14,7 @@ from storage.records.passes.declared import PASSES, declared_passes
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
 from tests.columns_kit import COAT, WAVES, declared
+from tests.for_each import for_each
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.pipeline.scenes.slow_rays import first_hits as slow_first_hits
 from tests.scenes_by_hand import tiny_scene
@@ -24,7 +25,7 @@ EXACT = 1e-9
 """Double precision on corners within some metres, with grazing triangles costing some digits."""
 
 
-@pytest.mark.parametrize("view", [0, 1])
+@for_each("view", [0, 1])
 def test_laws_of_the_centre_rays(view: int) -> None:
     scene, resolution = room(0), 48
     seen = view_passes(scene, view=view, resolution=resolution)
@@ -129,7 +130,7 @@ def _mirrored(scene: Scene) -> Scene:
     )
 
 
-@pytest.mark.parametrize("a_side", [2, 3])
+@for_each("a_side", [2, 3])
 def test_averages_are_those_of_a_plain_loop(a_side: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A finer picture has the rays of the grid; blocks of rows join to the same picture."""
     scene, resolution = room(0), 12
@@ -264,7 +265,7 @@ def test_a_single_pixel_and_a_place_far_away() -> None:
     np.testing.assert_allclose(here["position_m"] + away, far["position_m"], atol=2e-4)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("arguments", "complaint"),
     [
         ({"view": 2}, "view is 2; expected 0 to 1"),

@@ -22,6 +22,7 @@ from storage.records.passes.stored import (
     picture_passes,
 )
 from storage.records.sample import Sample, decode_sample, encode_sample
+from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_sample
 from tests.storage.records.passes.view_kit import room
 
@@ -34,7 +35,7 @@ def with_passes(names: tuple[str, ...]) -> Sample:
     return dataclasses.replace(sample, passes_exr=packed)
 
 
-@pytest.mark.parametrize("rays_a_side", [1, 2])
+@for_each("rays_a_side", [1, 2])
 def test_every_pass_comes_back_from_a_file(rays_a_side: int) -> None:
     scene = room(0)
     data = passes_exr(scene, ALL, view=1, resolution=32, rays_a_side=rays_a_side)
@@ -114,7 +115,7 @@ def test_more_triangles_than_float32_counts_are_refused(monkeypatch: pytest.Monk
         with_passes(("triangle",))
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("channels", "resolution", "message"),
     [
         ({"A": 16, "Q.V": 16}, 16, "channels are A, Q.V; expected A"),

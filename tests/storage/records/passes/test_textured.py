@@ -1,13 +1,13 @@
 """Passes of textured scenes: coordinates and material columns in closed form, on a flat floor."""
 
 import numpy as np
-import pytest
 
 from storage.records.exr import channel_names, decode_channels
 from storage.records.first_hits import first_hits
 from storage.records.lookup import texture_values
 from storage.records.passes.pictures import view_passes
 from storage.records.passes.stored import decode_passes_exr, passes_exr, picture_passes
+from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, tiny_scene
 from tests.textured_by_hand import sky, textured_scene
 
@@ -15,7 +15,7 @@ RESOLUTION = 24
 COLUMNS = ("material_diffuse", "material_specular", "material_roughness", "material_emission")
 
 
-@pytest.mark.parametrize("view", [0, 1])
+@for_each("view", [0, 1])
 def test_coordinates_and_columns_are_those_of_the_point(view: int) -> None:
     """The floor's coordinates are 0.7 times x and y; its columns are what the textures say."""
     scene = textured_scene()
