@@ -12,6 +12,23 @@ settings.load_profile("untimed")
 
 ROOT = Path(__file__).parents[1]
 
+SLOW_KINDS = {
+    "benchmarks": "an experiment measured for real",
+    "browser": "a page in headless Chromium",
+    "commands": "what documents tell a reader to type, as processes",
+    "every": "every preset, object or example scene, where quick tests take two",
+    "gpu": "steps on a GPU that is not there",
+    "hostile": "hundreds of hostile inputs",
+    "kills": "processes that are killed, stopped or starved",
+    "memory": "sizes at the end of a range, and memory that must stay flat",
+    "packaging": "the wheel, the site, the machine's own report",
+    "references": "pictures and scenes compared with another program's",
+    "servers": "Prefect, a database, a cluster or a bucket",
+    "statistics": "means over many samples or draws",
+    "training": "networks that learn, are compiled, or train in several processes",
+}
+"""The argument of every `slow` mark: why a test cannot be quick."""
+
 
 @pytest.fixture
 def bare_reports(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -29,7 +46,16 @@ def shared() -> Path:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Have each worker begin with tests that may last long: one that came last kept two waiting."""
+    """Deal the tests to the workers, those that may last long first; check the kinds of slow ones.
+
+    A long test that came last kept the other workers waiting.
+    """
+    for item in items:
+        for mark in item.iter_markers("slow"):
+            if len(mark.args) != 1 or mark.args[0] not in SLOW_KINDS:
+                raise pytest.UsageError(
+                    f"{item.nodeid}: slow{mark.args}; expected one of {', '.join(SLOW_KINDS)}"
+                )
     workers = getattr(config, "workerinput", {}).get("workercount", 1)
     long = sorted(filter(_patience_s, items), key=_patience_s, reverse=True)
     rest = [item for item in items if not _patience_s(item)]  # in order: they share fixtures

@@ -64,7 +64,7 @@ def environment(tmp_path: Path) -> Iterator[dict[str, str]]:
         yield one
 
 
-@pytest.mark.slow
+@pytest.mark.slow("servers")
 @pytest.mark.timeout(1800)
 def test_an_array_is_asked_for_watched_and_outlives_its_flow(
     tmp_path: Path, environment: dict[str, str]

@@ -82,7 +82,7 @@ def _read(name: str, place: Path | str, environment: dict[str, str], *more: str)
     return call(["-m", "trilight", name, str(place), *more], environment, RUN_S)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("servers")
 @pytest.mark.timeout(3600)
 def test_a_bucket_as_output_from_two_machines_and_a_flow(
     driver: Any, environment: dict[str, str], tmp_path: Path

@@ -127,7 +127,7 @@ def test_the_watcher_tells_what_must_not_be_seen(tmp_path: Path, told: str) -> N
     assert all(told in line for line in wrong), wrong
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 @pytest.mark.timeout(3600)
 def test_kills_of_everything_end_in_the_same_digest(tmp_path: Path) -> None:
     size = ["--scenes", str(SCENES), "--resolution", "32", "--noise-floor", "20"]

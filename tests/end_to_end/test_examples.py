@@ -190,7 +190,7 @@ TINY = (
 )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 @pytest.mark.timeout(1800)
 def test_data_of_one_s_own_files_by_the_real_command(
     copied: Callable[[str], Path], trilight: Trilight, tmp_path: Path
@@ -229,7 +229,7 @@ def test_data_of_one_s_own_files_by_the_real_command(
     assert "relative_mse" in (tmp_path / "j" / "evaluation.md").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 @pytest.mark.timeout(900)
 def test_a_run_of_one_s_own_file_by_the_real_command(
     copied: Callable[[str], Path], trilight: Trilight, tmp_path: Path

@@ -63,7 +63,7 @@ def _leave(words: tuple[str, ...], folder: Path, begun: Callable[[], bool]) -> N
     assert errors == f"{told}{shlex.join(['trilight', *words])}\n"
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 @for_each("name", LONG)
 def test_words_come_first_and_ctrl_c_is_answered(
     name: str, silent_url: str, tmp_path: Path

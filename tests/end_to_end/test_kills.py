@@ -81,7 +81,7 @@ def _wait_until(run: "subprocess.Popen[bytes]", reached: Callable[[], bool]) -> 
         time.sleep(0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 @pytest.mark.timeout(3600)
 def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path, whole: Whole) -> None:
     rng = np.random.default_rng(0)
@@ -116,7 +116,7 @@ def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path, whole: Whole) -
     assert not list((tmp_path / "killed").rglob("*.part"))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 @pytest.mark.timeout(3600)
 def test_kills_of_children_end_in_the_same_digest(tmp_path: Path, whole: Whole) -> None:
     """While meshes are made, with an empty store, and while pictures are; fork servers too."""
@@ -145,7 +145,7 @@ def test_kills_of_children_end_in_the_same_digest(tmp_path: Path, whole: Whole) 
     _wait_until_nobody_is_left(mark)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 @pytest.mark.parametrize("moment", ["meshes", "scenes"])
 def test_ctrl_c_says_what_to_do_and_leaves_nobody(tmp_path: Path, moment: str) -> None:
     """On a terminal, where progress bars hide the cursor: it is back, and the words come last."""

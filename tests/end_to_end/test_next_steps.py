@@ -28,7 +28,7 @@ def _ran(trilight: Trilight, *words: str, status: int = 0) -> list[list[str]]:
     return _next_steps(result.stdout)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 def test_what_generate_names_runs_for_eight_scenes(trilight: Trilight, tmp_path: Path) -> None:
     """Eight scenes are two shards, both for training: no validation split is there.
 
@@ -56,7 +56,7 @@ def test_what_generate_names_runs_for_eight_scenes(trilight: Trilight, tmp_path:
     _ran(trilight, *train, "--steps", "4")
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 def test_an_unfinished_set_names_the_command_that_finishes_it(
     trilight: Trilight, tmp_path: Path
 ) -> None:
@@ -77,7 +77,7 @@ def test_an_unfinished_set_names_the_command_that_finishes_it(
     _ran(trilight, *steps[0])
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 @pytest.mark.parametrize("count", [1, 3])
 def test_what_assets_names_runs_with_however_few_objects(
     count: int, trilight: Trilight, tmp_path: Path
@@ -90,7 +90,7 @@ def test_what_assets_names_runs_with_however_few_objects(
     _ran(trilight, *generate, *small, *SMALL, "--set", "scenes.num_views=1")
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 def test_what_plan_names_is_what_was_priced(trilight: Trilight, tmp_path: Path) -> None:
     asked = ("--objects", "builtin:40", "--seed", "3", "--set", "scenes.num_views=1", *SMALL)
     (generate,) = _ran(trilight, "plan", "smoke", "--scenes", "4", "--samples", "4", *asked)

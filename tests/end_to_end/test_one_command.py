@@ -14,7 +14,7 @@ from tests.end_to_end.production_kit import copy_objects
 SMALL = ("--resolution", "32", "--noise-floor", "20", "--scenes", "4")
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 def test_real_objects_with_their_licences(trilight: Trilight, shared: Path, tmp_path: Path) -> None:
     rows = [json.loads(row) for row in (shared / "objects/objects.jsonl").open()]
     refusable = [row for row in rows if row["licence"] != "CC0-1.0"]

@@ -63,7 +63,7 @@ def quality(folder: Path) -> Path:
 PAGES: tuple[Callable[[Path], Path], ...] = (report, scene, run, gallery, quality)
 
 
-@pytest.mark.slow  # a browser
+@pytest.mark.slow("browser")  # a browser
 def test_no_page_is_wider_than_its_window(tmp_path: Path) -> None:
     found = []
     with browser() as page:

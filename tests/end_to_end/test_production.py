@@ -70,7 +70,7 @@ def test_the_readme_serves_runs_and_stops_as_is_done_here() -> None:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.slow("servers")
 @pytest.mark.timeout(3600)
 def test_four_ways_one_digest(tmp_path: Path) -> None:
     _generate(tmp_path / "plain", MANY)
@@ -142,7 +142,7 @@ def _refuses_secrets(tmp_path: Path, environment: dict[str, str], database: Post
             assert not path.is_file() or CANARY.encode() not in path.read_bytes(), path
 
 
-@pytest.mark.slow
+@pytest.mark.slow("servers")
 @pytest.mark.timeout(1800)
 def test_the_lines_of_the_readme_need_nothing_exported(tmp_path: Path) -> None:
     """In a checkout: serve, a run, stop. Its cache is empty but for objects made before."""
@@ -168,7 +168,7 @@ def test_the_lines_of_the_readme_need_nothing_exported(tmp_path: Path) -> None:
     assert not (checkout / "prefect.toml").is_symlink()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("servers")
 def test_ranges_at_the_same_time_and_who_is_last_finishes(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "trilight", "generate", "smoke", *OPTIONS]
     command += ["--scenes", str(FEW)]

@@ -141,7 +141,7 @@ def _view(command: str, folder: Path) -> None:
         assert b"<title>Trilight view</title>" in answer_of(address, "")
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 @pytest.mark.timeout(1800)
 def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
     """README's, in order; only its objects, dataset and training are fewer."""
@@ -169,7 +169,7 @@ def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
     assert (tmp_path / "runs" / "readme" / "validation_sheet.png").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 @pytest.mark.timeout(5400)
 @pytest.mark.skipif(
     "TRILIGHT_TUTORIALS" not in os.environ,
@@ -196,7 +196,7 @@ def test_the_tutorials_run(tmp_path: Path) -> None:
         assert (tmp_path / made).stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 @pytest.mark.timeout(1800)
 def test_the_whole_line_runs(tmp_path: Path) -> None:
     copy_of_the_project(tmp_path)

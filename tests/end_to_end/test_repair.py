@@ -14,7 +14,7 @@ SMALL = (
 )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 def test_bad_and_missing_shards_are_made_anew(
     trilight: Trilight, refused: Callable[..., str], tmp_path: Path
 ) -> None:

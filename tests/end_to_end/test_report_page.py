@@ -16,7 +16,7 @@ COMMANDS = """[...document.querySelectorAll('.chosen')].filter(line => line.offs
     .map(line => line.querySelector('code').innerText).join()"""
 
 
-@pytest.mark.slow  # a browser
+@pytest.mark.slow("browser")  # a browser
 def test_a_person_looks_around(tmp_path: Path) -> None:
     dataset = five_scenes(tmp_path)
     report = write_report(dataset, dataset_distributions(dataset))

@@ -30,7 +30,7 @@ def scenes(shared: Path, tmp_path: Path) -> Path:
     return tmp_path / "scenes"
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 def test_existing_scenes_become_a_dataset(
     trilight: Trilight, refused: Callable[..., str], scenes: Path, tmp_path: Path
 ) -> None:
@@ -94,7 +94,7 @@ def test_bad_scenes_are_one_clear_line(
         assert message in refused("generate", "smoke", "--out", "set", *arguments)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 def test_a_bad_file_and_a_dark_scene_cost_themselves(
     trilight: Trilight, refused: Callable[..., str], scenes: Path, tmp_path: Path
 ) -> None:

@@ -22,7 +22,7 @@ EVIL = "evil.example"
 RESOLVED = f"--host-resolver-rules=MAP {EVIL} 127.0.0.1"
 DESKTOP, PHONE = (1280, 900), (400, 800)
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.slow("servers"), pytest.mark.timeout(1800)]
 
 
 class Server:

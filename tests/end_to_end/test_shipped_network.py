@@ -16,7 +16,7 @@ SCENES = (
 """As its training scenes were made (`model/builtin/README.md`)."""
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_its_pictures_come_from_the_scene_it_is_shown(trilight: Trilight, tmp_path: Path) -> None:
     made = trilight("generate", "smoke", *SCENES, "--out", "set")
     assert made.returncode == 0, made.stderr

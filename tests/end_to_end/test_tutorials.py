@@ -48,7 +48,7 @@ TOYS = {
 """What a page says of scenes that the toys have none of."""
 ASKED = {"dataset.html": "rows", "scene.html": "scene", "folder.html": "folder", "run.html": "run"}
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.slow("commands"), pytest.mark.timeout(900)]
 
 
 def toy_room(index: int) -> Scene:

@@ -25,7 +25,7 @@ DRAWING = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 DESKTOP, PHONE = (1280, 900), (390, 844)
 PATIENCE_S = 120.0
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.slow("browser"), pytest.mark.timeout(900)]
 
 
 def viewed(source: Path) -> contextlib.AbstractContextManager[str]:

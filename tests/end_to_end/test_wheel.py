@@ -15,7 +15,7 @@ from storage.records.scene_file import encode_scene, read_scene_file
 from tests.conftest import ROOT
 from tests.scenes_by_hand import tiny_scene
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.slow("packaging"), pytest.mark.timeout(1800)]
 
 Run = Callable[..., str]
 

@@ -104,7 +104,10 @@ def test_one_triangle_is_an_object(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("method", "rings"),
-    [pytest.param("pymeshlab_collapse", 251, marks=pytest.mark.slow), ("meshoptimizer", 51)],
+    [
+        pytest.param("pymeshlab_collapse", 251, marks=pytest.mark.slow("memory")),
+        ("meshoptimizer", 51),
+    ],
 )
 def test_as_many_faces_as_scans_have(tmp_path: Path, method: str, rings: int) -> None:
     ball = sphere(rings=rings, columns=400)

@@ -52,7 +52,7 @@ SCENES = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.slow("statistics")
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
 def test_a_guided_picture_has_the_light_of_an_unguided_one(scene: Scene) -> None:
     tracer = VectorTracer(scene, max_depth=10, rr_depth=2)

@@ -106,7 +106,7 @@ def test_scenes_at_an_end_keep_their_laws(pool: list[PooledAsset], end: End) -> 
             _require_scene_or_reason(pool, name, field, end)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("memory")
 def test_a_scene_is_filled_to_the_most_triangles(pool: list[PooledAsset]) -> None:
     """As above; it takes seconds."""
     _require_scene_or_reason(pool, "fill_to", dict(SCENE_FIELDS)["fill_to"], "high")

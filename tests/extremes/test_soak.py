@@ -8,7 +8,7 @@ SCENES = 600
 """Sixty to a tenth; twelve shards of 50, each packed and published; three children of 200 calls."""
 
 
-@pytest.mark.slow
+@pytest.mark.slow("memory")
 def test_nothing_grows_and_nothing_stays_behind() -> None:
     """Times are not looked at: other work would decide them."""
     found = soaked("builtin:24", SCENES)

@@ -42,7 +42,7 @@ def child() -> Iterator[IsolatedChild]:
     child.close()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("hostile")
 def test_every_object_ends_well(tmp_path: Path, child: IsolatedChild) -> None:
     for number, (name, make, expected) in enumerate(usd_cases.cases()):
         (tmp_path / str(number)).mkdir()

@@ -29,7 +29,7 @@ def test_a_machine_on_which_all_probes_end_well_lacks_nothing(
     assert [finding for finding in findings if finding.state == "missing"] == []
 
 
-@pytest.mark.slow
+@pytest.mark.slow("packaging")
 def test_a_machine_that_passes_tests_lacks_nothing() -> None:
     assert [finding for finding in doctor.examine() if finding.state == "missing"] == []
 

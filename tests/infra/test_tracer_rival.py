@@ -93,7 +93,7 @@ def test_without_a_path_tracer_it_says_so_and_the_network_is_timed_all_the_same(
         TracerRival(20, most_views=4, num_scenes=2).measure(network, samples)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("references")
 def test_it_is_timed_beside_the_network_and_traces_the_stored_scene() -> None:
     rival = TracerRival(16, most_views=4, num_scenes=2)
     network = new_state(tiny_run()).model

@@ -54,7 +54,7 @@ def test_a_lit_plane_is_as_bright_as_lamberts_formula_says() -> None:
 
 @pytest.mark.parametrize(
     ("tracer", "count"),
-    [(load_tracer, 32), pytest.param(PluginTracer, 4, marks=pytest.mark.slow)],
+    [(load_tracer, 32), pytest.param(PluginTracer, 4, marks=pytest.mark.slow("statistics"))],
 )
 def test_unequal_lights_add_up_as_lamberts_formula_says(tracer: Any, count: int) -> None:
     """Picked by power from 4 or 32 of them, of areas 1 : 100, brightness 1 : 1000, either way up.

@@ -20,13 +20,13 @@ from tests.sky_maps import COLOURS, POLES, constant, one_sun, six_poles, smooth
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
-TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow)]
+TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow("statistics"))]
 
 
 @pytest.mark.parametrize(
     ("tracer", "shape"),
     [(load_tracer, sphere), (load_tracer, box),
-     pytest.param(PluginTracer, sphere, marks=pytest.mark.slow)],
+     pytest.param(PluginTracer, sphere, marks=pytest.mark.slow("statistics"))],
 )  # fmt: skip
 def test_white_and_convex_things_vanish_in_a_white_sky(shape: Any, tracer: Any) -> None:
     """The furnace: radiance 1 from everywhere, and a Lambert surface of albedo 1 sends out 1."""

@@ -41,7 +41,7 @@ def test_direct_light_is_that_of_paths_of_two_edges(llvm: None, roughness: float
     assert apart < 5 * of_mean + 0.005 * float(theirs.mean.mean())
 
 
-@pytest.mark.slow
+@pytest.mark.slow("statistics")
 @pytest.mark.parametrize("sky", SKIES.values(), ids=SKIES.keys())
 @pytest.mark.parametrize("num_lights", [0, 2])
 def test_direct_light_of_a_sky_is_that_of_paths_of_two_edges(

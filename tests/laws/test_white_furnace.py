@@ -17,7 +17,7 @@ from tests.pipeline.renders.scene_kit import furnace, join, material, quad, sphe
 CASES = [(0.01, 0.02), (0.1, 0.3), (0.5, 1.0), (1.0, 0.02), (1.0, 0.7)]
 """Roughness and cosine."""
 
-TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow)]
+TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow("statistics"))]
 EAVG: dict[Any, float] = {load_tracer: 0.409, PluginTracer: 0.377}
 
 

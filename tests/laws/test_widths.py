@@ -126,9 +126,9 @@ CASES = [
     pytest.param(tokens_of, 0.0, id="tokens, AdamW"),
     pytest.param(tokens_of, 3.0, id="tokens, Muon"),
     pytest.param(one_head_of, 0.0, id="wider heads, AdamW"),
-    pytest.param(one_head_of, 3.0, id="wider heads, Muon", marks=pytest.mark.slow),
-    pytest.param(hits_of, 0.0, id="hits, AdamW", marks=pytest.mark.slow),
-    pytest.param(hits_of, 3.0, id="hits, Muon", marks=pytest.mark.slow),
+    pytest.param(one_head_of, 3.0, id="wider heads, Muon", marks=pytest.mark.slow("training")),
+    pytest.param(hits_of, 0.0, id="hits, AdamW", marks=pytest.mark.slow("training")),
+    pytest.param(hits_of, 3.0, id="hits, Muon", marks=pytest.mark.slow("training")),
 ]
 
 

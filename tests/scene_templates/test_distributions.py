@@ -105,9 +105,9 @@ def _surface_tables(scenes: list[Drawn], stated: Stated) -> Table:
 @pytest.mark.parametrize(
     "build",
     [
-        pytest.param("pretrain-256", marks=pytest.mark.slow),
+        pytest.param("pretrain-256", marks=pytest.mark.slow("statistics")),
         "renderformer-v1-256",
-        pytest.param("renderformer-v1-512", marks=pytest.mark.slow),
+        pytest.param("renderformer-v1-512", marks=pytest.mark.slow("statistics")),
     ],
 )
 def test_everything_is_distributed_as_stated(build: str) -> None:

@@ -183,7 +183,7 @@ def test_a_single_object_is_placed_evenly_and_rests_half_the_time() -> None:
         assert row in implausible(_place_table(drawn(wrong, 300)))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("statistics")
 def test_how_far_crowding_shifts_sizes_and_shares() -> None:
     """The price of objects that do not meet, with solid balls: the most crowded there are.
 

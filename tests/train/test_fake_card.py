@@ -19,7 +19,7 @@ from tests.train.loss.test_lpips import small_weights
 from tests.train.toy import write_toy_dataset
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE
 
-pytestmark = pytest.mark.slow  # a process and a library of its own
+pytestmark = pytest.mark.slow("gpu")  # a process and a library of its own
 
 
 @pytest.fixture(scope="module")

@@ -67,7 +67,7 @@ def score(state: TrainState, scene: TrainingScene, target: TrainingScene) -> flo
     return psnr_log_db(predict(state.shown, scene)[0], wanted)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_one_picture_is_learned_by_heart() -> None:
     """64 x 64 pixels, one view; the toy's pictures have no noise."""
     sample = toy_sample(0, resolution=64)
@@ -76,7 +76,7 @@ def test_one_picture_is_learned_by_heart() -> None:
     assert score(state, scene, scene) > 40  # measured: 44.7, highlights and all
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_a_picture_comes_from_its_own_scene() -> None:
     """Four scenes under the same camera: only the tokens tell them apart."""
     first = toy_scene(0)
@@ -94,7 +94,7 @@ def test_a_picture_comes_from_its_own_scene() -> None:
         assert score(state, scene, scene) > score(state, other, scene) + 3
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_unseen_scenes_look_better_than_any_stored_picture(tmp_path: Path) -> None:
     """Than the median one, and than the closest of all training views, which knows the answer."""
     folder = write_toy_dataset(

@@ -53,7 +53,9 @@ def _run(**model: object) -> TrainSettings:
     return dataclasses.replace(run, num_steps=4, validate_every=4, checkpoint_every=2)
 
 
-@pytest.mark.parametrize("kind", ["bundles", pytest.param("hits", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", ["bundles", pytest.param("hits", marks=pytest.mark.slow("training"))]
+)
 def test_a_run_that_was_stopped_ends_like_one_that_was_not(
     dataset: Dataset, tmp_path: Path, kind: str
 ) -> None:

@@ -319,7 +319,7 @@ def test_a_run_that_recovers_goes_on_and_counts(
     assert losses[4] is None and losses[12] > 0, "a row without a finite step has no loss"
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_it_learns_scenes_that_it_has_never_seen(tmp_path: Path) -> None:
     dataset = write_toy_dataset(tmp_path / "data", train=96, validation=12, per_shard=32)
     settings = tiny_run(

@@ -44,7 +44,7 @@ def test_it_holds_code_and_no_outputs(notebook: Path) -> None:
         assert set(re.findall(r"\btrilight\.(\w+)", code)) <= set(trilight.__all__)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 @for_each("notebook", NOTEBOOKS)
 def test_it_runs(notebook: Path, tmp_path: Path) -> None:
     ran = subprocess.run(

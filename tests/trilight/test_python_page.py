@@ -19,7 +19,7 @@ def test_the_page_is_a_program() -> None:
     compile("\n".join(CODE), "python.md", "exec")
 
 
-@pytest.mark.slow
+@pytest.mark.slow("commands")
 def test_the_page_runs(tmp_path: Path) -> None:
     """As one program without `if __name__ == "__main__"`, in a folder of its own."""
     program = tmp_path / "program.py"

@@ -25,7 +25,7 @@ def ready(kind: str) -> Callable[[], int]:
     return work
 
 
-@pytest.mark.slow
+@pytest.mark.slow("benchmarks")
 def test_what_lets_the_lock_go_is_told_from_what_holds_it() -> None:
     holds, lets_go = with_lock_time(ready, "python"), with_lock_time(ready, "zlib")
     if "lock_s" not in holds:

@@ -42,7 +42,7 @@ def test_bfloat16_is_not_float32(tmp_path: Path) -> None:
     assert 30 < rounded.values["psnr_log_db, dB"] < 99
 
 
-@pytest.mark.slow
+@pytest.mark.slow("benchmarks")
 def test_our_renderer_beside_plain_mitsuba(tmp_path: Path) -> None:
     found = measured("frontier", tmp_path)
     db = {name: row.values["psnr_log_db, dB"] for name, row in found.items()}
@@ -50,7 +50,7 @@ def test_our_renderer_beside_plain_mitsuba(tmp_path: Path) -> None:
     assert found["trilight 46 dB"].values["other side at equal error, times"] > 0
 
 
-@pytest.mark.slow
+@pytest.mark.slow("benchmarks")
 def test_rungs_come_nearer_with_samples_and_with_what_is_traced(tmp_path: Path) -> None:
     found = measured("rungs-64", tmp_path)
     db = {name: row.values["psnr_log_db, dB"] for name, row in found.items()}

@@ -72,7 +72,7 @@ def test_mistakes_and_the_first_words_come_before_torch(tmp_path: Path) -> None:
     assert "train needs PyTorch, which is not installed" in said["steps"]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 def test_a_run_that_is_stopped_says_what_goes_on_and_that_does(tmp_path: Path) -> None:
     """As printed, in a folder with a blank in its name; threads wait without burning a core."""
     data = write_toy_dataset(tmp_path / "the data", train=4, validation=0, resolution=16)

@@ -65,7 +65,7 @@ def _patterns(nav: Any) -> Iterator[str]:
             yield from _patterns(entry)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("packaging")
 def test_every_page_is_built_and_in_the_navigation(site: Path) -> None:
     shown = (site / "index.html").read_text()
     for page in (ROOT / "docs").rglob("*.md"):
@@ -75,7 +75,7 @@ def test_every_page_is_built_and_in_the_navigation(site: Path) -> None:
         assert f'href="{uri}"' in shown or uri == "index.html", uri
 
 
-@pytest.mark.slow
+@pytest.mark.slow("packaging")
 def test_nothing_is_fetched_from_a_server(site: Path) -> None:
     pages = list(site.rglob("*.html"))
     assert len(pages) > 60
@@ -84,14 +84,14 @@ def test_nothing_is_fetched_from_a_server(site: Path) -> None:
     assert "var __index" in (site / "search" / "search_index.js").read_text()[:20]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("packaging")
 def test_files_beside_docs_are_pages_too(site: Path) -> None:
     page = (site / "tutorials" / "a-cluster.html").read_text()
     assert 'href="../source/infra/slurm/generate.sbatch.html"' in page
     assert "SHARDS_PER_TASK" in (site / "source/infra/slurm/generate.sbatch.html").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("packaging")
 def test_a_link_that_leads_nowhere_is_found(tmp_path: Path) -> None:
     for name in ("docs", "infra", "storage"):
         shutil.copytree(ROOT / name, tmp_path / name)

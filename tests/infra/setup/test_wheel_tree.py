@@ -73,7 +73,7 @@ def _imported(module: ast.Module) -> set[str]:
     return {name.partition(".")[0] for name in names}
 
 
-@pytest.mark.slow
+@pytest.mark.slow("packaging")
 def test_every_module_of_the_tree_compiles(tree: Path) -> None:
     for path in sorted((tree / FACE).rglob("*.py")):
         source = path.read_text()

@@ -132,7 +132,7 @@ def test_extremes_stay_finite(factor: float) -> None:
     assert _MOST_DOUBT < 80, "e^-80 is near the smallest float"
 
 
-@pytest.mark.slow  # torch traces nine taps forth and back
+@pytest.mark.slow("training")  # torch traces nine taps forth and back
 def test_a_level_may_be_compiled() -> None:
     """As on a card; here by tracing alone, without a compiler."""
     torch._dynamo.reset()

@@ -84,7 +84,7 @@ def _irradiance_twin(scene: Scene, place: np.ndarray, normal: np.ndarray) -> np.
     return total
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 @for_each("sky", [smooth(), one_sun(1e6)])
 def test_light_of_a_sky_is_that_of_all_its_texels_with_shadows(sky: Environment) -> None:
     scene = corner(sky=sky)

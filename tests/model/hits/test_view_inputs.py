@@ -98,7 +98,9 @@ def test_equal_arguments_equal_numbers_and_another_seed_another_noise() -> None:
     assert not np.array_equal(one.pixels, other.pixels)
 
 
-@pytest.mark.parametrize("resolution", [8, 100, pytest.param(1024, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "resolution", [8, 100, pytest.param(1024, marks=pytest.mark.slow("training"))]
+)
 def test_any_width_shows_the_same_scene(resolution: int) -> None:
     """Means of a picture and of one with 16 rays a pixel; 64 pixels see a highlight by chance."""
     tolerance = 0.03 if resolution > 8 else 0.2

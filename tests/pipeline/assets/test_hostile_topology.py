@@ -154,7 +154,7 @@ def test_a_random_soup_ends_with_a_reason(
     assert reason in {*geometric, "crashed_signal_11"}
 
 
-@pytest.mark.slow
+@pytest.mark.slow("hostile")
 @pytest.mark.parametrize("profile", ["faithful", "uniform"])
 def test_a_polygon_of_fifty_thousand_corners_ends(
     outcome: Callable[..., Outcome], tmp_path: Path, profile: str
@@ -175,7 +175,7 @@ def test_a_wide_fan_is_kept_from_pymeshlab(outcome: Callable[..., Outcome], tmp_
     assert used <= {"meshoptimizer", "meshoptimizer_sloppy"}
 
 
-@pytest.mark.slow
+@pytest.mark.slow("hostile")
 def test_five_thousand_boxes_do_not_fit_into_240_triangles(
     outcome: Callable[..., Outcome], tmp_path: Path
 ) -> None:

@@ -53,7 +53,7 @@ def test_copies_in_other_colours_share_their_geometry(records: list[ObjectRecord
     assert sorted(groups.values()) == [2, 2, 3, 4, 7]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("every")
 def test_all_of_them(records: list[ObjectRecord]) -> None:
     assert len(records) == 148
     for record in records:

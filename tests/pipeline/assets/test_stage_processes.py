@@ -90,7 +90,7 @@ def test_two_processes_make_each_object_once(sources: Path) -> None:
     assert len(calls(sources)) == 4
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 def test_after_a_kill_the_next_run_makes_only_what_is_missing(sources: Path) -> None:
     """The second object never ends in the first run; its child dies with its owner."""
     plan = sources / "plan.json"
@@ -114,7 +114,7 @@ def test_after_a_kill_the_next_run_makes_only_what_is_missing(sources: Path) -> 
     assert [call["name"] for call in calls(sources)[3:]] == ["knot1.obj", "knot1.obj"]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 def test_half_written_files_are_never_read(sources: Path) -> None:
     """A writer that was killed leaves a file with another ending beside the place of its own."""
     whole = finish(start(sources))

@@ -21,7 +21,7 @@ from storage.records.sample import Sample, encode_sample, sample_key
 from storage.records.scene import Scene
 
 
-@pytest.mark.slow
+@pytest.mark.slow("every")
 def test_the_scenes_are_the_published_ones(tmp_path: Path) -> None:
     """All that decides them: built-in objects, the mesh stage and its libraries, the templates."""
     full = BUILDS["benchmark-v1"]

@@ -10,7 +10,7 @@ from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import SceneSource, load_source
 from pipeline.isolation import ChildLimits, IsolatedChild
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow("memory")
 
 WARM, SCENES = 100, 400
 PAGE = 4096

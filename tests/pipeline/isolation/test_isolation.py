@@ -118,7 +118,7 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
         child.call(double, 1)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 def test_processor_seconds_are_for_one_call_each() -> None:
     """A call that uses them up ends its child; several that stay below do not add up."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, cpu_s=1, calls_per_child=9)

@@ -31,7 +31,7 @@ def _start(words: Sequence[str], environment: dict[str, str]) -> "subprocess.Pop
     )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 def test_arrays_that_are_killed_end_in_the_digest_of_one_that_was_not(
     bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -206,7 +206,7 @@ def test_the_command_prints_json_and_nothing_else(few: Path, tmp_path: Path) -> 
     assert (out / "quality.html").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 def test_the_command_for_people(few: Path, tmp_path: Path) -> None:
     """Epsilon as a share in percent; the table names what was refused."""
     out = tmp_path / "out"
@@ -247,7 +247,7 @@ def test_epsilons_are_shares_or_percent(text: str, share: float) -> None:
     assert settings.budgets == (4096,)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 def test_own_materials_make_textured_meshes_and_pictures(source: Path, tmp_path: Path) -> None:
     settings = AssetSettings(budgets=(100_000,), own_materials=OwnMaterialSettings(keep=True))
     folder, out = tmp_path / "few", tmp_path / "out"

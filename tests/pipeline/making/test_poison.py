@@ -24,7 +24,7 @@ from tests.pipeline.making import poison
 from tests.pipeline.making.bucket_kit import OUT, empty_bucket
 from tests.s3_server import control, s3_server
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow("kills")
 """Children that die and are started again take a minute together."""
 
 SHARD_BYTES = 174_000

@@ -51,7 +51,7 @@ def test_a_small_reference_is_that_of_its_own_width() -> None:
     assert np.median(ratio) == pytest.approx(1, abs=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("references")
 @pytest.mark.usefixtures("llvm")
 def test_plain_mitsuba_comes_to_the_same_picture() -> None:
     """With other samples of another sampler: its error falls with samples, towards our picture."""

@@ -24,7 +24,7 @@ FLOOR = [[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]]
 
 GREY = material(diffuse=0.5)
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow("references")
 
 
 @pytest.fixture(autouse=True)

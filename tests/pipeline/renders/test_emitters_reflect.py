@@ -17,7 +17,7 @@ DIM = 0.125
 PANEL = np.array([[-0.5, 1.0, 0.5], [0.5, 1.0, 0.5], [0.0, 1.0, 1.5]])
 BRIGHT = np.array([[-0.5, 0.0, 2.5], [0.5, 0.0, 2.5], [0.0, 0.4, 2.5]])
 RADIANCE = 20.0
-TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow)]
+TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow("statistics"))]
 
 
 def _panel_in_a_mirror(panel: Part) -> Scene:
@@ -43,7 +43,7 @@ def _reflected(scene: Scene, albedo: float) -> Any:
 @pytest.mark.parametrize(
     ("tracer", "diffuse"),
     [(load_tracer, 0.0), (load_tracer, 1.0),
-     pytest.param(PluginTracer, 0.4, marks=pytest.mark.slow)],
+     pytest.param(PluginTracer, 0.4, marks=pytest.mark.slow("statistics"))],
 )  # fmt: skip
 def test_a_panel_shows_its_emission_and_what_it_reflects(tracer: Any, diffuse: float) -> None:
     scene = _panel_in_a_mirror(light(PANEL, DIM, diffuse))

@@ -43,7 +43,7 @@ def _reference(shared: Path, file: str) -> NDArray[np.float32]:
     return decode_exr((shared / "cycles_reference" / file).read_bytes())
 
 
-@pytest.mark.slow
+@pytest.mark.slow("every")
 @pytest.mark.parametrize(
     ("name", "least_db"), [("cbox", 76), ("cbox-bunny", 74), ("crystals", 71), ("tree", 65)]
 )
@@ -63,7 +63,7 @@ def test_direct_light_is_that_of_cycles(
     assert np.median(abs(ours - theirs)[lit] / theirs[lit]) < 0.001
 
 
-@pytest.mark.slow
+@pytest.mark.slow("every")
 @pytest.mark.parametrize("form", ["usdz", "json", "h5"])
 def test_what_was_converted_is_still_that_of_cycles(
     shared: Path, tmp_path: Path, llvm: None, form: str
@@ -76,7 +76,7 @@ def test_what_was_converted_is_still_that_of_cycles(
     assert psnr_linear_db(ours, _blocks(_reference(shared, "cbox.direct_raw.exr"))) > 76
 
 
-@pytest.mark.slow
+@pytest.mark.slow("every")
 @pytest.mark.parametrize(
     ("name", "spp", "least_db", "least_block_db"),
     [

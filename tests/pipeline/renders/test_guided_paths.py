@@ -56,7 +56,7 @@ def _means(tracer: VectorTracer, scene: Scene, seeds: range) -> tuple[float, flo
     return float(means.mean()), float(means.std(ddof=1) / np.sqrt(len(means)))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("statistics")
 def test_light_paths_know_how_camera_paths_are_guided() -> None:
     """The mean of a scene that only a mirror lights, guided and not.
 
@@ -106,7 +106,7 @@ _ADAPTIVE = RenderSettings(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.slow("statistics")
 def test_adaptive_guided_views_keep_the_light() -> None:
     """Guided where first samples were noisy, more samples where they were: and no light is lost.
 

@@ -95,7 +95,7 @@ def test_direct_light_is_what_paths_of_two_edges_find() -> None:
     assert parts["indirect"].mean() > 0.1 * parts["direct"].mean()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("statistics")
 def test_mitsuba_finds_the_same_direct_and_indirect_light() -> None:
     """Its stock integrator with two edges, and with all less that; rough, so that both agree."""
     from pipeline.renders.plugin_tracer import PluginTracer

@@ -167,7 +167,7 @@ def _counted(way: str, read: Callable[..., object], reads: list[str]) -> Callabl
     return counted
 
 
-@pytest.mark.slow
+@pytest.mark.slow("memory")
 def test_memory_stays_flat_over_two_hundred_different_scenes() -> None:
     resident = []
     for index in range(200):

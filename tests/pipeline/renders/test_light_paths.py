@@ -55,7 +55,7 @@ def _leaning() -> Scene:
     return join([floor, wall, lamp], eye=(0, -0.2, 2), target=(0, 0.3, 0), fov_deg=40)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("statistics")
 @pytest.mark.parametrize(
     ("scene", "max_depth"),
     [(_matt(), 10), (_leaning(), 3), (_ball(0.6), 3),
@@ -77,7 +77,7 @@ def test_light_paths_alone_carry_all_indirect_light(scene: Scene, max_depth: int
 
 @pytest.mark.parametrize(
     ("scene", "max_depth"),
-    [(_ball(0.3), 10), pytest.param(_ball(0.3, lamp_diffuse=1.0), 2, marks=pytest.mark.slow),
+    [(_ball(0.3), 10), pytest.param(_ball(0.3, lamp_diffuse=1.0), 2, marks=pytest.mark.slow("statistics")),
      (_ball(0.3, lamp_diffuse=0.5, closed=True), 3)],
     ids=["glossy", "white emitters", "closed"],
 )  # fmt: skip

@@ -144,7 +144,7 @@ def _block_estimate(scene: Scene, *, per_light: bool) -> Estimate:
     return Estimate(mean=stack.mean(axis=0), error=stack.std(axis=0, ddof=1) / np.sqrt(12))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("statistics")
 def test_both_tracers_switch_the_same_light_on(llvm: None) -> None:
     from pipeline.renders.plugin_tracer import PluginTracer
     from pipeline.renders.vector_tracer import VectorTracer

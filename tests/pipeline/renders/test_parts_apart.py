@@ -128,7 +128,7 @@ def test_what_has_no_lobe_shows_none_of_its_light_once_denoised(llvm: None) -> N
     assert rim.sum() < 90 and (diffuse & ~rim).sum() > 300 and (specular & ~rim).sum() > 90
 
 
-@pytest.mark.slow
+@pytest.mark.slow("statistics")
 def test_floors_of_parts_are_honest(llvm: None) -> None:
     """On average over samples; of one set of samples a floor is itself an estimate.
 

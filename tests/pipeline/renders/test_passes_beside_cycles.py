@@ -18,7 +18,7 @@ from tests.pipeline.scenes.example_scenes import example_scene
 
 RESOLUTION = 128
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow("references")
 
 
 def _blender(scene: Scene, folder: Path) -> dict[str, NDArray[np.float32]]:

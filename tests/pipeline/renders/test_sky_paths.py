@@ -53,7 +53,7 @@ def open_scene(sky: Environment | None, num_lights: int = 2) -> Scene:
 
 @pytest.mark.parametrize(
     ("name", "num_lights"),
-    [("sun", 2), *(pytest.param(*case, marks=pytest.mark.slow)
+    [("sun", 2), *(pytest.param(*case, marks=pytest.mark.slow("statistics"))
                    for case in (("smooth", 0), ("night", 2)))],
 )  # fmt: skip
 def test_both_integrators_agree_within_their_noise(

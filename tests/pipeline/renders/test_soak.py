@@ -38,7 +38,7 @@ def _resident_bytes() -> int:
         return int(stream.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-@pytest.mark.slow
+@pytest.mark.slow("memory")
 def test_a_thousand_scenes_leave_nothing_behind(variant: Variant) -> None:
     parents, children, means = [], [], []
     child = IsolatedChild(limits=LIMITS, setup=set_up, setup_args=(variant,))

@@ -63,7 +63,7 @@ def _noise(seed: int, channels: int, low: float, high: float) -> Texture:
 
 
 LAMP = light(np.array([[-1, -1, 3], [2, -1, 3], [0, 1, 2.5]]), 5.0)
-TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow)]
+TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow("statistics"))]
 
 
 def test_corners_have_their_colours() -> None:
@@ -136,7 +136,7 @@ _MAPS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.slow("statistics")
 @pytest.mark.parametrize("name", list(_MAPS))
 def test_pictures_agree_with_stock_bitmaps_within_noise(
     name: str, monkeypatch: pytest.MonkeyPatch

@@ -73,7 +73,7 @@ def _adapted(
     return samples
 
 
-@pytest.mark.slow
+@pytest.mark.slow("statistics")
 def test_the_mean_stays_unbiased_where_tiles_are_chosen_by_rare_light() -> None:
     """Where a half chose for itself, tiles that found a flash would be diluted: 8 % were missing.
 

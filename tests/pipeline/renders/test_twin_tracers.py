@@ -57,7 +57,7 @@ def test_both_integrators_agree_within_their_noise(monkeypatch: pytest.MonkeyPat
     assert len(score) > 90 and abs(score.mean()) < 0.35
 
 
-@pytest.mark.slow
+@pytest.mark.slow("references")
 @pytest.mark.usefixtures("llvm")
 def test_the_fallback_agrees_within_noise_where_lobes_are_not_rough() -> None:
     """`roughconductor` has the separable Smith term; it differs from ours in rough lobes only."""
@@ -78,7 +78,7 @@ def test_the_fallback_agrees_within_noise_where_lobes_are_not_rough() -> None:
     assert (tracer.hits(camera) != plugins.hits(camera)).sum() <= 1
 
 
-@pytest.mark.slow
+@pytest.mark.slow("references")
 @pytest.mark.usefixtures("llvm")
 def test_how_far_the_fallbacks_rough_metal_is_off() -> None:
     """Measured: 4.5 % of the direct light, of which noise is 0.2 to 0.6 %."""

@@ -72,7 +72,7 @@ def test_only_a_right_picture_on_a_card_leads_to_the_denoiser(
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 def test_another_integrator_agrees_with_the_stored_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     """Mitsuba's own, around our BRDF: the stored numbers are not only what our kernels say."""
     scene = probe_scene()

@@ -81,7 +81,7 @@ def test_two_builds_keep_their_budgets(pool: list[PooledAsset]) -> None:
     _require_within_budget(pool, ("smoke", "finetune-512"), scenes=16)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("every")
 def test_no_build_exceeds_its_budget(pool: list[PooledAsset]) -> None:
     with_maps_or_many_triangles = {"textured-256", "sky-256", "out-of-range", "out-of-range-2"}
     plain = set(BUILDS) - with_maps_or_many_triangles - {"benchmark-v1-mini"}

@@ -53,7 +53,7 @@ def _from_workers(workers: int) -> dict[str, dict[int, str]]:
         }
 
 
-@pytest.mark.slow
+@pytest.mark.slow("kills")
 def test_one_and_three_processes_make_the_same_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     """One of them is held to one processor and one thread, which no other is."""
     here = {build: _digests(build, indices) for build, indices in SCENES.items()}

@@ -55,7 +55,7 @@ def test_facts_agree_with_the_slow_twin(scenes: list[Scene]) -> None:
         assert facts.depth <= depth + 1e-5  # the box of an object is nearer than the object
 
 
-@pytest.mark.slow
+@pytest.mark.slow("every")
 def test_accepted_views_hold_on_a_finer_grid_that_shares_no_ray(scenes: list[Scene]) -> None:
     for scene in scenes[::25]:
         for view in range(scene.num_views):

@@ -102,7 +102,7 @@ def test_stock_webdataset_sees_samples_as_before(dataset: Dataset) -> None:
     assert len(pictures) == len(records) == 4
 
 
-@pytest.mark.slow
+@pytest.mark.slow("every")
 def test_stock_datasets_sees_samples_as_before(dataset: Dataset, tmp_path: Path) -> None:
     """Hugging Face's reader skips names without a point."""
     load_dataset = pytest.importorskip("datasets").load_dataset

@@ -103,7 +103,7 @@ def transformed(
     return symmetry(training_scene(sample, RESOLUTION, lights_apart=True))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("statistics")
 @for_each("name", sorted(SYMMETRIES))
 def test_the_path_traced_picture_is_the_transformed_one(
     name: str, scene: Scene, passes: NDArray[np.float32]

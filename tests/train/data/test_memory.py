@@ -68,7 +68,7 @@ def peak_bytes(folder: Path, num_shards: int) -> int:
     return int(peak)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("memory")
 def test_the_reader_holds_as_much_of_a_large_set_as_of_a_small_one(shards: Path) -> None:
     """6 shards of 1.4 MB and 30: what is read grows by 33 MB, more when it is unpacked."""
     more = sum(path.stat().st_size for path in shards.iterdir()) * (SHARDS - 6) // SHARDS

@@ -307,7 +307,7 @@ def test_without_a_path_tracer_the_report_says_why(
     assert "is not shown: TRILIGHT" in (tmp_path / "out" / "evaluation.md").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("references")
 def test_the_command_shows_the_path_tracer_in_the_networks_time(
     dataset: Dataset, tmp_path: Path
 ) -> None:

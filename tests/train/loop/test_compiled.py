@@ -87,7 +87,7 @@ def _check(
     assert counter.frame_count == before, "another length is no other graph"
 
 
-@pytest.mark.slow  # Dynamo traces every layer
+@pytest.mark.slow("training")  # Dynamo traces every layer
 def test_three_kinds_of_pass_are_three_times_as_many_graphs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -95,13 +95,13 @@ def test_three_kinds_of_pass_are_three_times_as_many_graphs(
     _check(monkeypatch, "eager", "linear", PASSES, 15)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_inductor_computes_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """It guards on more than the lengths' being variables, so the second pass has graphs too."""
     _check(monkeypatch, "inductor", "linear", QUICK, 12)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_no_way_back_of_the_head_is_a_scatter() -> None:
     """Sums by atomics were 17 of 195 ms of a step of Base on an H100, and in any order."""
     fusion = Fusion(4, deepest=True)

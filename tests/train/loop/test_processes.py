@@ -219,7 +219,7 @@ def wait_for_step(out: Path, step: int, process: "subprocess.Popen[str]") -> Non
         time.sleep(0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_several_processes_that_are_stopped_go_on_to_the_bit(
     dataset: Dataset, undisturbed: Callable[[int], Path], tmp_path: Path
 ) -> None:
@@ -240,7 +240,7 @@ def test_several_processes_that_are_stopped_go_on_to_the_bit(
     same_to_the_bit(out, undisturbed(processes))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_processes_that_are_killed_at_random_are_restarted_to_the_bit(
     dataset: Dataset, undisturbed: Callable[[int], Path], tmp_path: Path
 ) -> None:
@@ -260,7 +260,7 @@ def test_processes_that_are_killed_at_random_are_restarted_to_the_bit(
     assert len([text for text in texts if text.endswith("on cpu, 2 processes")]) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_a_job_of_slurm_whose_time_is_up_goes_on_to_the_bit(
     dataset: Dataset, undisturbed: Callable[[int], Path], tmp_path: Path
 ) -> None:

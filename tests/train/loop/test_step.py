@@ -226,7 +226,7 @@ def test_a_fresh_network_learns_eight_pictures() -> None:
     assert min(report.grad_norm for report in reports) > 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_the_large_network_takes_steps() -> None:
     """All 483 M parameters, on a processor: one scene, one window of 64 pixels, 8 GB of memory."""
     changes = {"resolution": 64, "precision": "float32", "loss.perceptual": "ms_ssim"}

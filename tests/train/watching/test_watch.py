@@ -53,7 +53,7 @@ def test_a_row_tells_parts_memory_and_layers_and_spikes_name_their_scenes(
     assert read_notes(result.folder.notes)[0]["text"] == "began on cpu, 1 process"
 
 
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_of_two_processes_the_slow_one_and_the_hanging_one_are_named(
     dataset: Dataset, tmp_path: Path
 ) -> None:

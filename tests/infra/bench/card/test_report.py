@@ -80,7 +80,7 @@ def _is_of_its_steps(run: dict[str, Any]) -> None:
     assert profile["kernels"] > 1000
 
 
-@pytest.mark.slow
+@pytest.mark.slow("benchmarks")
 def test_the_command_measures_all_on_a_processor(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

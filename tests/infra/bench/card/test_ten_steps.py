@@ -39,7 +39,7 @@ def test_the_least_time_is_that_of_the_products() -> None:
     assert least_ms("pretrain", 1, PROCESSOR, {"float32": 1e9}) is None
 
 
-@pytest.mark.slow
+@pytest.mark.slow("benchmarks")
 def test_on_a_card_with_too_little_memory_fewer_scenes_are_taken(tmp_path: Path) -> None:
     """All of a step on the card that is not there: LPIPS, Muon, a DPT head, bfloat16."""
     with card_process(tmp_path) as process:

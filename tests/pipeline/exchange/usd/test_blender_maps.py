@@ -20,7 +20,7 @@ from tests.pipeline.exchange.usd.blender_kit import ours
 from tests.sky_maps import as_sky, six_poles
 from tests.textured_by_hand import number_texture, textured_scene
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow("references")
 
 RESOLUTION, SPP = 48, 256
 

@@ -14,7 +14,7 @@ from storage.metrics import psnr_linear_db
 from storage.records.material import EMISSION
 from tests.pipeline.exchange.usd.blender_kit import ours, run_blender
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow("references")
 
 RESOLUTION, SPP = 192, 128
 WATTS, AREA = 60.0, 0.8 * 0.5

@@ -14,7 +14,7 @@ from storage.records.scene import Scene
 from tests.pipeline.exchange.usd.blender_kit import ours, run_blender
 from tests.pipeline.scenes.example_scenes import example_scene
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow("references")
 
 RESOLUTION, SPP = 96, 256
 
