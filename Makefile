@@ -20,11 +20,12 @@ dataset: setup  ## scenes of built-in objects, verified: 24, or SCENES=N
 	trilight generate smoke --objects builtin: --out data/smoke --scenes $(SCENES)
 	trilight verify data/smoke
 
-test: setup-all  ## the tests that take minutes, on two cores; a third of that is waiting, hence four workers
-	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE python -m pytest -n 4 --dist worksteal
+# three workers on two cores: some of the time is waiting, and each worker imports all tests
+test: setup-all  ## the quick tests, in five minutes on two cores
+	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE python -m pytest -n 3 --dist worksteal
 
 # only files that have one are looked through: each worker imports all that it looks through
-test-slow: setup-all  ## the others, which wait for servers and children much of the time
+test-slow: setup-all  ## the others, of the kinds in tests/conftest.py, in twenty minutes
 	python -m pytest -m slow -n 3 --dist worksteal $$(grep -rl --include='test_*.py' 'mark\.slow' tests)
 
 test-elsewhere: setup-all  ## the most telling ones, as other processors would run them

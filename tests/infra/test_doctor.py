@@ -4,7 +4,7 @@ import pytest
 
 from infra import doctor
 from pipeline.isolation import confinement
-from tests.infra.cases import case
+from tests.for_each import case
 
 
 def _responds(name: str, code: str, *, found: str, **_: str) -> doctor.Finding:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from infra.tracer_rival import LADDER, Level, Price, TracerRival, chosen_level
 from storage.errors import TrilightError
 from storage.records.sample import Sample
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.train.kit import tiny_run
 from tests.train.toy import toy_sample
 from train.loop.state import new_state

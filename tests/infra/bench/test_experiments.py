@@ -15,8 +15,8 @@ from infra.bench.pages import read_block, write_pages
 from infra.bench.run import RESULTS, lacking, newest_run
 from infra.bench.table import markdown
 from storage.errors import TrilightError
+from tests.for_each import case
 from tests.infra.bench.bench_kit import TINY
-from tests.infra.cases import case
 
 EVERY = every_experiment()
 

@@ -3,7 +3,7 @@
 import pytest
 
 from infra.bench.growth import fitted_exponent, is_steady
-from tests.infra.cases import case
+from tests.for_each import case
 
 SIZES = (100, 1_000, 10_000, 250_000)
 

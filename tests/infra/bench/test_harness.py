@@ -25,8 +25,8 @@ from infra.bench.store import Run, Store
 from infra.bench.table import markdown, printed, shown
 from storage.errors import TrilightError
 from storage.intervals import mean_interval
+from tests.for_each import case
 from tests.infra.bench.bench_kit import FIGURES, TINY, calls, experiment
-from tests.infra.cases import case
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,7 @@ import pytest
 
 from infra.bench.sides.lock_simulation import Part, samples_a_second
 from infra.bench.sides.lock_time import with_lock_time
-from tests.infra.cases import case
+from tests.for_each import case
 
 
 def ready(kind: str) -> Callable[[], int]:

@@ -6,7 +6,7 @@ import pytest
 
 from infra.bench.pages import read_block, write_block
 from storage.errors import TrilightError
-from tests.infra.cases import case
+from tests.for_each import case
 
 BEGIN, END = "<!-- kind:begin -->", "<!-- kind:end -->"
 

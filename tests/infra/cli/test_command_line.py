@@ -15,7 +15,7 @@ from infra.setup.command_line_page import Command, every_command
 from storage.settings.described import option_of
 from tests.command_line import trilight
 from tests.conftest import ROOT
-from tests.infra.cases import case
+from tests.for_each import case
 
 ALL = {found.name: found for found in every_command()}
 TYPED = "pre"

@@ -20,7 +20,7 @@ from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
 from tests.command_line import trilight
 from tests.crash import crash
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.infra.child_here import use_processes
 from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene

@@ -11,7 +11,7 @@ from model.open import open_network
 from model.weights import encode_weights
 from storage.errors import TrilightError
 from tests.command_line import trilight
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.model.kit import awake, tiny_config
 from tests.model.published.test_convert import publishable
 

@@ -2,7 +2,7 @@
 
 from storage.errors import TrilightError
 from tests.command_line import trilight
-from tests.infra.cases import case
+from tests.for_each import case
 
 
 def test_a_price_that_is_none_is_refused_before_anything_is_done() -> None:

@@ -30,7 +30,7 @@ from storage.records.scene_file import encode_scene, scene_digest
 from storage.settings.described import option_words
 from tests.command_line import trilight
 from tests.crash import crash
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.infra.child_here import use_processes
 from tests.infra.rendering.render_kit import SMALL, mistake, render
 from tests.scenes_by_hand import tiny_sample, tiny_scene

@@ -18,7 +18,7 @@ from infra.rendering.way_table import (
 from pipeline.renders.variant import choose_variant
 from storage.records.scene_file import encode_scene
 from tests.command_line import trilight
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.scenes_by_hand import tiny_scene
 
 pytestmark = pytest.mark.usefixtures("children_here")

@@ -16,7 +16,7 @@ from storage.errors import TrilightError
 from storage.settings.changes import changed
 from storage.settings.described import settings_record
 from tests.command_line import trilight
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.pipeline.making.test_publication import begin_tiny
 from train.runs import RUNS, named_run
 

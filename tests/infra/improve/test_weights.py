@@ -6,7 +6,7 @@ import pytest
 
 from infra.improve.weights import Lesson, next_weights
 from storage.errors import TrilightError
-from tests.infra.cases import case
+from tests.for_each import case
 
 BASE = {"a": 1.0, "b": 1.0, "c": 2.0}
 LESSON = Lesson(loss_before=0.3, loss=0.2, core_s=2.0)

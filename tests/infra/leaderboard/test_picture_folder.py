@@ -10,7 +10,7 @@ from infra.leaderboard.picture_folder import FolderContestant, folder_contestant
 from pipeline.exchange.exports.scenes import picture_name
 from storage.errors import TrilightError
 from storage.records.exr import encode_channels
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.train.toy import toy_sample
 
 VIEWS = [("000000000", 0), ("000000000", 1), ("000000001", 0), ("000000001", 1)]

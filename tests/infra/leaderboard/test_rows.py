@@ -6,7 +6,7 @@ import pytest
 
 from infra.leaderboard.rows import UNKNOWN_MACHINE, BoardRow, BoardRows, RowKey
 from storage.errors import TrilightError
-from tests.infra.cases import case
+from tests.for_each import case
 
 KEY = RowKey(width=64, scene="000000001", view=0, name="somebody", digest="d")
 ROW = BoardRow(scores={"psnr_log_db": 30.0, "lpips": None}, first_s=0.5, further_s=0.25)

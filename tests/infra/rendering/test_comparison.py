@@ -7,7 +7,7 @@ import pytest
 
 from infra.rendering.comparison import Frame, flicker
 from pipeline.exchange.open_scene import SceneSource
-from tests.infra.cases import case
+from tests.for_each import case
 
 
 def frame(name: str, key: str | None, error: float) -> Frame:

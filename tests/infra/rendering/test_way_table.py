@@ -18,7 +18,7 @@ from infra.rendering.way_table import (
 )
 from pipeline.renders.variant import Variant
 from storage.settings.described import settings_record
-from tests.infra.cases import case
+from tests.for_each import case
 
 VARIANT = Variant(name="llvm_ad_rgb", libllvm="", note="")
 

@@ -29,7 +29,7 @@ from infra.rendering.ways import (
 from pipeline.renders.preview_parts import all_parts
 from pipeline.renders.settings import Filtered
 from storage.errors import TrilightError
-from tests.infra.cases import case
+from tests.for_each import case
 
 FILTERS: tuple[Filtered, ...] = ("fast", "high")
 

@@ -3,7 +3,7 @@
 import pytest
 
 from infra.run_page.axes import Axis, axis_of, short_number
-from tests.infra.cases import case
+from tests.for_each import case
 
 VALUES: list[tuple[list[float], bool]] = [
     ([3.0], False),

@@ -5,7 +5,7 @@ import pytest
 
 from infra.run_page.thinned import MOST_POINTS, thinned
 from storage.seeds import rng_for
-from tests.infra.cases import case
+from tests.for_each import case
 
 
 def test_a_curve_becomes_short_and_loses_no_spike() -> None:

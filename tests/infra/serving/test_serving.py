@@ -21,7 +21,7 @@ from infra.serving.local import running, start, stop
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from pipeline.flows.prefect_server import TOLD_BY_ITS_STARTER, wait_until_healthy
 from storage.errors import TrilightError
-from tests.infra.cases import case
+from tests.for_each import case
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(120)"]
 

@@ -12,7 +12,7 @@ from infra.serving.train_model import RunChanges, TrainOrder, train_model, train
 from storage.errors import TrilightError
 from storage.settings.described import described
 from tests.command_line import trilight
-from tests.infra.cases import case
+from tests.for_each import case
 from train.runs import RUNS, named_run
 from train.settings import TrainSettings
 

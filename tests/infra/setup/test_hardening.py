@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.infra.setup.hardening_rules import (
     faults_of_manifests,
     faults_of_services,

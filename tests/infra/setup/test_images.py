@@ -12,7 +12,7 @@ import yaml
 from infra.setup.locks import read_lock
 from pipeline.flows.orders import DatasetInRuns
 from tests.conftest import ROOT
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.infra.setup.manifests_kit import IMAGES, MANIFESTS, containers
 
 BIN = Path(sys.executable).parent

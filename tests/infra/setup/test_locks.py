@@ -14,7 +14,7 @@ from packaging.utils import canonicalize_name
 from infra.setup.locks import LockedPackage, read_lock, write_lock
 from infra.setup.sbom import PLACE, bill_of_materials
 from tests.conftest import ROOT
-from tests.infra.cases import case
+from tests.for_each import case
 
 LOCKS = sorted((ROOT / "requirements").glob("*.txt"))
 

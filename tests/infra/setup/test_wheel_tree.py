@@ -12,7 +12,7 @@ import pytest
 
 from infra.setup.wheel_tree import FACE, PACKAGES, with_prefix, write_wheel_tree
 from tests.conftest import ROOT
-from tests.infra.cases import case
+from tests.for_each import case
 
 
 @pytest.fixture(scope="module")

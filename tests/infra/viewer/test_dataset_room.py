@@ -21,7 +21,7 @@ from storage.conventions import preview_srgb8
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
 from storage.records.sample import Sample
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.infra.viewer.served_kit import Asker, served
 from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
 

@@ -13,7 +13,7 @@ from infra.viewer.wanted import Wanted, wanted_of
 from pipeline.renders.results import Sampling
 from storage.errors import TrilightError
 from storage.records.scene import Scene
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.infra.viewer.served_kit import served
 from tests.scenes_by_hand import tiny_scene
 

@@ -8,7 +8,7 @@ import pytest
 from infra.viewer.edits import edited
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import textured_scene
 

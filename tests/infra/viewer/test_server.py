@@ -9,7 +9,7 @@ from infra.viewer.guard import MAX_BODY_BYTES, MAX_PATH, refusal
 from infra.viewer.server import Answer, PageServer, Question, Route, json_answer
 from infra.viewer.static_files import STATIC
 from storage.errors import TrilightError
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.infra.viewer.served_kit import Asker, served
 
 PORT, WORD = 4711, "secret"

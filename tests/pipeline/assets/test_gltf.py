@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.assets.reading.load import load_mesh
 from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings
+from tests.for_each import with_folders
 from tests.pipeline.assets.meshes_by_hand import (
     geometry,
     gltf_tree,
@@ -18,7 +19,6 @@ from tests.pipeline.assets.meshes_by_hand import (
     sphere,
     write_glb,
 )
-from tests.pipeline.case_folders import with_folders
 
 BALL = sphere(rings=5, columns=8)
 

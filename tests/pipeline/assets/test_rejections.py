@@ -16,6 +16,7 @@ import pytest
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings, GateSettings
 from storage.errors import Rejected
+from tests.for_each import with_folders
 from tests.pipeline.assets.meshes_by_hand import (
     gltf_tree,
     knot,
@@ -28,7 +29,6 @@ from tests.pipeline.assets.meshes_by_hand import (
     write_ply,
     write_stl,
 )
-from tests.pipeline.case_folders import with_folders
 
 BALL = sphere(rings=5, columns=8)
 

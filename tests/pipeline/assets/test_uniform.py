@@ -8,8 +8,8 @@ import pytest
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings
 from storage.records.asset import LevelQuality
+from tests.for_each import with_folders
 from tests.pipeline.assets.meshes_by_hand import cube, knot, moved, prepare, sphere, write_obj
-from tests.pipeline.case_folders import with_folders
 
 UNIFORM = "pymeshlab_uniform"
 

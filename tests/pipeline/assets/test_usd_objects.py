@@ -14,6 +14,7 @@ from pipeline.assets.reading.load import load_mesh
 from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings
 from storage.records.asset import decode_asset
+from tests.for_each import with_folders
 from tests.pipeline.assets.child_kit import Bench
 from tests.pipeline.assets.meshes_by_hand import as_rows, cube, geometry, moved, prepare, reason_of
 from tests.pipeline.assets.own.textured_kit import CORNERS, KEEP, UV_UP, lost, picture_bytes
@@ -28,7 +29,6 @@ from tests.pipeline.assets.own.usd_kit import (
     usd_mesh,
 )
 from tests.pipeline.assets.stage_kit import run
-from tests.pipeline.case_folders import with_folders
 
 SETTINGS = AssetSettings()
 BOX = moved(cube(), scale=[1.0, 0.5, 0.25])

@@ -19,7 +19,7 @@ from pipeline.documents.rights import encode_licences, rights_of
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.records.objects import read_objects_lock, write_objects_lock
 from storage.records.profiles import Profile
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 from tests.pipeline.documents.dataset_by_hand import (
     edit_manifest,
     five_scenes,

@@ -13,7 +13,7 @@ from storage.dataset.dataset import open_dataset
 from storage.errors import TrilightError
 from storage.records.quantities import QUANTITIES, STATISTICS, summary
 from storage.records.sample import Sample
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 from tests.pipeline.documents.dataset_by_hand import five_scenes, furnished, sample, write_dataset
 from tests.scenes_by_hand import tiny_scene
 from tests.textured_by_hand import sky, textured_scene

@@ -8,7 +8,7 @@ from pipeline.scenes.pool import PooledAsset
 from scene_templates.layout_rand import scene_plan
 from scene_templates.settings import SceneSettings
 from storage.records.scene import Scene
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 from tests.pipeline.exchange.exchange_kit import (
     assert_h5_keeps_light,
     assert_json_keeps_light,

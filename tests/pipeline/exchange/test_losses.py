@@ -15,7 +15,7 @@ from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, columns_in_use, laid_out
 from storage.records.scene import Scene, SceneObject
 from tests.columns_kit import COAT, TINT, WAVES, declared
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import sky, textured_scene
 

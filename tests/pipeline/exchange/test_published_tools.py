@@ -18,7 +18,7 @@ from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.renderformer_json import described_files
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 from tests.pipeline.scenes.example_scenes import EXAMPLES, example_scene
 from tests.scenes_by_hand import LIGHT, tiny_scene
 

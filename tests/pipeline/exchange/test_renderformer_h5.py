@@ -18,7 +18,7 @@ from pipeline.exchange.renderformer_h5 import (
 from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 from tests.pipeline.scenes.example_scenes import example_scene
 from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
 

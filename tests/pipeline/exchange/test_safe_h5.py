@@ -15,7 +15,7 @@ import pytest
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from storage.errors import TrilightError
 from tests.conftest import ROOT
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 from tests.scenes_by_hand import tiny_sample
 
 SHAPE = (3, 3, 3)

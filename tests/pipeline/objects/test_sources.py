@@ -16,7 +16,7 @@ from pipeline.objects.sources import FoundObjects, find_objects
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
 from storage.remote.safe_url import printable
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 
 
 def touch(folder: Path, *names: str) -> None:

@@ -77,7 +77,8 @@ def test_light_paths_alone_carry_all_indirect_light(scene: Scene, max_depth: int
 
 @pytest.mark.parametrize(
     ("scene", "max_depth"),
-    [(_ball(0.3), 10), pytest.param(_ball(0.3, lamp_diffuse=1.0), 2, marks=pytest.mark.slow("statistics")),
+    [(_ball(0.3), 10),
+     pytest.param(_ball(0.3, lamp_diffuse=1.0), 2, marks=pytest.mark.slow("statistics")),
      (_ball(0.3, lamp_diffuse=0.5, closed=True), 3)],
     ids=["glossy", "white emitters", "closed"],
 )  # fmt: skip

@@ -15,7 +15,7 @@ from pipeline.usd import stage as opening
 from pipeline.usd.stage import OpenedUsd, quietly
 from pipeline.usd.texture_nodes import asset_bytes
 from storage.errors import TrilightError
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 from tests.scenes_by_hand import tiny_scene
 
 HEAD = "#usda 1.0\n"

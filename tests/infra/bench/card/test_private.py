@@ -3,7 +3,7 @@
 import pytest
 
 from infra.bench.card.private import own_names, without_traces
-from tests.infra.cases import case
+from tests.for_each import case
 
 REPLACED = [
     ("llvm_ad_rgb, /usr/lib/x86_64/libLLVM.so.19", "llvm_ad_rgb, <path>"),

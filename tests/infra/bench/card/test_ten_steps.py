@@ -13,8 +13,8 @@ from infra.bench.card.predicted import h100_row, least_ms
 from infra.bench.card.step_profile import REST, kind_of, summed
 from infra.bench.card.ten_steps import steps_of_run
 from model.costs import training_flops
+from tests.for_each import case
 from tests.infra.bench.card import fake_cases
-from tests.infra.cases import case
 from tests.train.fake_card import card_process
 from train.runs import RUNS, named_run
 

@@ -5,7 +5,7 @@ import pytest
 
 from infra.bench.sides.machine_costs import PROBED_PX, Timed, costs_of
 from infra.rendering.way_table import shipped_table
-from tests.infra.cases import case
+from tests.for_each import case
 
 CORES = 8
 

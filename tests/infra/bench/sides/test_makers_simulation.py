@@ -14,7 +14,7 @@ from infra.bench.sides.makers_simulation import (
     Protocol,
     simulated,
 )
-from tests.infra.cases import case
+from tests.for_each import case
 
 FLEET = Fleet(
     machines=4, num_shards=40, scenes_per_shard=2, scene_core_s=8.0, spread=0.0, slow_share=0.0,

@@ -14,7 +14,7 @@ from infra.bench.sides.networks import (
 )
 from model.costs import Workload
 from model.published.config import PublishedConfig
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.model.published.test_convert import publishable
 
 CONFIG = PublishedConfig(model=publishable("dpt"), texture_patch=8)

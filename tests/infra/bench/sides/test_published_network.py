@@ -13,7 +13,7 @@ from model.published.config import PublishedConfig
 from model.published.convert import from_published, to_published
 from model.renderformer import ELU_ALPHA
 from model.scene_tensors import SceneTensors
-from tests.infra.cases import case
+from tests.for_each import case
 from tests.model.kit import awake, random_scene, render
 from tests.model.published.test_convert import publishable
 

@@ -13,6 +13,7 @@ import numpy as np
 from pipeline.assets.own.picture import Picture
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from storage.conventions import linear_from_srgb8
+from tests.for_each import with_folders
 from tests.pipeline.assets.meshes_by_hand import prepare as prepare_asset
 from tests.pipeline.assets.meshes_by_hand import reason_of, write_glb
 from tests.pipeline.assets.own.textured_kit import (
@@ -28,7 +29,6 @@ from tests.pipeline.assets.own.textured_kit import (
     textured_obj,
     textured_tree,
 )
-from tests.pipeline.case_folders import with_folders
 
 F = 0.04 + 0.96 / 21
 TOLERANCE = 0.02

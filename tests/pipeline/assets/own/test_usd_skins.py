@@ -10,6 +10,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 from storage.conventions import linear_from_srgb8
 from storage.records.asset import Asset
+from tests.for_each import with_folders
 from tests.pipeline.assets.meshes_by_hand import geometry, prepare, sphere, write_glb
 from tests.pipeline.assets.own.test_own_skins import SLOPE, STORED, F
 from tests.pipeline.assets.own.textured_kit import (
@@ -37,7 +38,6 @@ from tests.pipeline.assets.own.usd_kit import (
     textured_usd,
     usd_mesh,
 )
-from tests.pipeline.case_folders import with_folders
 
 
 def assert_corners(asset: Asset) -> None:

@@ -13,7 +13,7 @@ from pipeline.exchange.gltf.read import GltfScene, read_gltf
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 from tests.pipeline.exchange.exchange_kit import row_at
 from tests.pipeline.exchange.gltf_kit import BLUE, GREEN, GREY, PICTURE, RED, UV, png, quad
 from tests.pipeline.exchange.gltf_kit import write_gltf as written

@@ -18,7 +18,7 @@ from storage.errors import TrilightError
 from storage.records.lookup import texture_values
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 from tests.scenes_by_hand import FLOOR, tiny_scene
 from tests.textured_by_hand import colour_texture, corner_uv, number_texture, sky, textured_scene
 

@@ -14,7 +14,7 @@ from pipeline.exchange.usd.write import write_usd
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
 from storage.records.exr import encode_channels
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 from tests.pipeline.exchange.exchange_kit import row_at
 from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.textured_by_hand import textured_scene

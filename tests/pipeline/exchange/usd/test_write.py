@@ -19,7 +19,7 @@ from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 from tests.pipeline.exchange.usd.usd_validators import errors_of
 from tests.scenes_by_hand import LIGHT, tiny_scene
 

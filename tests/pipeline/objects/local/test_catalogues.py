@@ -12,7 +12,7 @@ import pytest
 from pipeline.objects.sources import find_objects
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 
 ALLOWED = ["CC0-1.0", "MIT", "LicenseRef-unknown"]
 

@@ -13,7 +13,7 @@ from pipeline.objects.remote import source as remote_source
 from pipeline.objects.sources import FoundObjects, find_objects, list_objects
 from storage.errors import TrilightError
 from storage.remote.url import PACKAGES, RemoteUrl, open_driver, parse_url
-from tests.pipeline.case_folders import with_folders
+from tests.for_each import with_folders
 
 
 def test_folders_of_this_machine() -> None:
