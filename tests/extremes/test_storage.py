@@ -75,11 +75,19 @@ def test_compact_keeps_the_law_or_loses_nothing(make: Callable[[int], NDArray[np
     for resolution in RESOLUTIONS:
         picture = make(resolution)
         for floor_db in (10.0, 45.0, 80.0, 90.0):
-            case = f"{resolution} pixels, {floor_db} dB"
-            back = decode_exr(pack_picture(picture, floor_db, "compact"))
-            assert np.isfinite(back).all(), case
-            assert (back >= 0).all(), case
-            assert np.array_equal(back, picture) or keeps_law(picture, back, floor_db), case
+            _check_compact(picture, floor_db, f"{resolution} pixels, {floor_db} dB")
+
+
+def test_a_compact_picture_of_two_chunks_keeps_the_law_or_loses_nothing() -> None:
+    """A chunk of DWAB is 256 lines."""
+    _check_compact(_denormals(264), 45.0, "264 pixels")
+
+
+def _check_compact(picture: NDArray[np.float32], floor_db: float, case: str) -> None:
+    back = decode_exr(pack_picture(picture, floor_db, "compact"))
+    assert np.isfinite(back).all(), case
+    assert (back >= 0).all(), case
+    assert np.array_equal(back, picture) or keeps_law(picture, back, floor_db), case
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -161,11 +169,13 @@ def test_the_ends_of_integers_are_packed_exactly() -> None:
     scene = _counted_to_the_end()
     scene.check()
     sample = dataclasses.replace(tiny_sample(), scene=scene)
-    back = decode_sample("0", encode_sample(sample)).scene
-    for name in ("faces", "material_index", "object_index"):
-        found, wanted = getattr(back, name), getattr(scene, name)
-        assert found.dtype == wanted.dtype and np.array_equal(found, wanted)
-    assert back.objects == scene.objects
+    for profile in PROFILES:
+        back = decode_sample("0", encode_sample(sample, profile)).scene
+        for name in ("faces", "material_index", "object_index"):
+            found, wanted = getattr(back, name), getattr(scene, name)
+            case = f"{name}, {profile}"
+            assert found.dtype == wanted.dtype and np.array_equal(found, wanted), case
+        assert back.objects == scene.objects, profile
 
 
 NUMBERS = {

@@ -32,7 +32,7 @@ def test_direct_light_is_that_of_paths_of_two_edges(llvm: None, roughness: float
     """Pixels are sampled on a grid of 2 x 2 and not all over: at rims, 3 % of a block of 16."""
     scene = corner(roughness=roughness)
     ours = _traced_blocks(scene, None)
-    theirs = render_blocks(scene, max_depth=2, passes=6)
+    theirs = render_blocks(scene, max_depth=2, passes=8)
     at_rims = 0.03 * theirs.mean.max()
     assert_agree(Estimate(mean=ours.mean, error=np.hypot(ours.error, at_rims)), theirs)
     both = np.hypot(ours.error, theirs.error)
@@ -50,7 +50,7 @@ def test_direct_light_of_a_sky_is_that_of_paths_of_two_edges(
     """With lamps beside it, and without any."""
     scene = open_scene(sky, num_lights)
     ours = _traced_blocks(scene, None, passes=24)
-    theirs = render_blocks(scene, max_depth=2, passes=6)
+    theirs = render_blocks(scene, max_depth=2, passes=8)
     at_rims = 0.03 * theirs.mean.max()  # as above
     assert_agree(Estimate(mean=ours.mean, error=np.hypot(ours.error, at_rims)), theirs)
     both = np.hypot(ours.error, theirs.error)

@@ -188,11 +188,12 @@ def test_the_gallery_is_bounded_and_old_pages_go(tmp_path: Path) -> None:
 
 
 def test_writing_elsewhere_gives_the_same_bytes_and_leaves_the_dataset_alone(
-    tmp_path: Path, dataset: Dataset
+    tmp_path: Path, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = dataset.folder.root
     before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
     found = dataset_distributions(dataset)
+    monkeypatch.setenv("LC_ALL", "de_DE.UTF-8")
     report = write_report(dataset, found, out=DatasetFolder(tmp_path))
     assert report == tmp_path / "report.html"
     written = {path.relative_to(tmp_path): path.read_bytes() for path in pages(report)}

@@ -2,12 +2,14 @@
 
 import base64
 import io
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.documents import report
 from pipeline.documents.card import encode_card
 from pipeline.documents.distributions import Distributions, dataset_distributions
 from pipeline.documents.report import write_report
@@ -22,6 +24,14 @@ from tests.scenes_by_hand import tiny_scene
 from tests.textured_by_hand import sky, textured_scene
 
 
+@pytest.fixture(scope="module", autouse=True)
+def figures_of_maps_alone() -> Iterator[None]:
+    """The others take seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "_SECTIONS", {"maps": report._SECTIONS["maps"]})
+        yield
+
+
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """A textured scene below a seen sky, a textured one, and a plain one, with their report."""
@@ -29,9 +39,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     scenes = [textured_scene(environment=dusk), textured_scene(), tiny_scene()]
     shards = {"train-000000.tar": [sample(key, scene) for key, scene in enumerate(scenes)]}
     dataset = write_dataset(tmp_path_factory.mktemp("maps"), shards)
-    with pytest.MonkeyPatch.context() as patch:  # figures take seconds; here those of maps alone
-        patch.setattr("pipeline.documents.report._SECTIONS", {"maps": maps_section})
-        write_report(dataset, dataset_distributions(dataset))
+    write_report(dataset, dataset_distributions(dataset))
     return dataset
 
 
@@ -51,8 +59,9 @@ def test_the_report_counts_maps(dataset: Dataset) -> None:
 
 
 def test_a_plain_dataset_has_no_such_section(tmp_path: Path) -> None:
-    found = dataset_distributions(five_scenes(tmp_path))
+    found = dataset_distributions(plain := five_scenes(tmp_path))
     assert (maps_section(found), maps_in_words(found)) == ("", {})
+    assert "#maps" not in read(write_report(plain, found).read_bytes()).links
 
 
 def test_the_card_says_how_many(dataset: Dataset) -> None:

@@ -62,7 +62,9 @@ def _nothing_to_fetch(done: int, total: int) -> None:
     raise AssertionError("these sources lie on this machine")
 
 
-def run(source: Path | str, out: Path, settings: AssetSettings | None = None) -> AssetReport:
+def run(
+    source: Path | str, out: Path, settings: AssetSettings | None = None, workers: int = 1
+) -> AssetReport:
     counts: list[int] = []
     report = make_assets(
         str(source),
@@ -70,7 +72,7 @@ def run(source: Path | str, out: Path, settings: AssetSettings | None = None) ->
         settings or AssetSettings(budgets=(BUDGET,)),
         allowed_licences=DEFAULT_ALLOWED,
         licence=None,
-        workers=1,
+        workers=workers,
         downloaded=_nothing_to_fetch,
         planned=counts.append,
         done=lambda: counts.append(-1),
@@ -83,7 +85,7 @@ def run(source: Path | str, out: Path, settings: AssetSettings | None = None) ->
 @pytest.fixture(scope="module")
 def made(source: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AssetReport]:
     out = tmp_path_factory.mktemp("made") / "out"
-    return out, run(source, out)
+    return out, run(source, out, workers=2)
 
 
 def test_every_object_has_its_outcome(made: tuple[Path, AssetReport]) -> None:

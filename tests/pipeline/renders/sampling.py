@@ -81,7 +81,9 @@ def assert_agree(a: Estimate, b: Estimate, *, slack: float = 0.0, name: str = ""
     Errors of few passes are themselves uncertain: more of them are allowed, so that one value in a
     hundred thousand is off. `name` is the case, where a test compares several.
     """
-    few = sum(each.freedom for each in (a, b) if np.any(each.error))
+    freedoms = [each.freedom for each in (a, b) if np.any(each.error)]
+    assert min(freedoms, default=np.inf) >= 7, "too few passes to compare"
+    few = sum(freedoms)
     sigmas = max(SIGMAS, float(stats.t.isf(5e-6, few))) if few else SIGMAS
     error = np.hypot(a.error, b.error)
     allowed = sigmas * error + slack * np.abs(b.mean) + 1e-7

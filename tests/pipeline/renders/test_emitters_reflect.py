@@ -48,7 +48,7 @@ def _reflected(scene: Scene, albedo: float) -> Any:
 def test_a_panel_shows_its_emission_and_what_it_reflects(tracer: Any, diffuse: float) -> None:
     scene = _panel_in_a_mirror(light(PANEL, DIM, diffuse))
     estimate = render_blocks(
-        scene, block=4, passes=4, tracer=tracer(scene, max_depth=3, rr_depth=9)
+        scene, block=4, passes=16, tracer=tracer(scene, max_depth=3, rr_depth=9)
     )
     # The mirror blurs by 1e-4 and returns all light; twins of emitters stand 1e-4 off.
     assert_agree(estimate, exact(DIM + _reflected(scene, diffuse)), slack=2e-3)
@@ -57,7 +57,7 @@ def test_a_panel_shows_its_emission_and_what_it_reflects(tracer: Any, diffuse: f
 @pytest.mark.usefixtures("llvm")
 def test_a_black_panel_is_as_dim_with_a_bright_light_as_without() -> None:
     scene = _panel_in_a_mirror(light(PANEL, DIM))
-    estimate = render_blocks(scene, passes=4)
+    estimate = render_blocks(scene, passes=16)
     # The tail of the mirror's lobe is the only way to the bright light.
     assert_agree(estimate, exact(np.full((8, 8, 3), DIM)), slack=2e-3)
 

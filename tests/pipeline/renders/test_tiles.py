@@ -207,16 +207,18 @@ def test_sums_over_chosen_pixels_are_those_of_the_passes() -> None:
 
 def test_chosen_tiles_give_the_same_bits_on_any_number_of_threads() -> None:
     scene = lit_scene()
-    settings = RenderSettings(
-        resolution=32, noise_floor_db=90.0, min_spp=32, max_spp=256, per_light=True
-    )
-    digests = []
-    for threads in (1, 2):
-        set_threads(threads)
-        renderer = SceneRenderer(scene, settings)
-        view = renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), 1)
-        digests.append(digest(view))
-        assert view.at_cap and abs(view.spp - 256) <= 8
-    assert digests[0] == digests[1]
+    view_of = scene.c2w[0], float(scene.fov_deg[0])
+    for per_light, max_spp in ((False, 128), (True, 256)):
+        settings = RenderSettings(
+            resolution=32, noise_floor_db=90.0, min_spp=32, max_spp=max_spp, per_light=per_light
+        )
+        digests = []
+        for threads in (1, 2):
+            set_threads(threads)
+            renderer = SceneRenderer(scene, settings)
+            view = renderer.render_view(*view_of, 1)
+            digests.append(digest(view))
+            assert view.at_cap and abs(view.spp - max_spp) <= 8
+        assert digests[0] == digests[1], f"per light: {per_light}"
     alike = dataclasses.replace(settings, max_spp=128)
-    assert digest(SceneRenderer(scene, alike).render_view(scene.c2w[0], 40.0, 1)) != digests[0]
+    assert digest(SceneRenderer(scene, alike).render_view(*view_of, 1)) != digests[0]

@@ -126,7 +126,14 @@ def test_composed_scenes_of_the_published_recipe_are_as_planned(
     assert "objects" in implausible(_composed_table(fewer, pool, rows))
 
 
-def test_how_far_meshes_shift_sizes(pool: list[PooledAsset]) -> None:
+@pytest.mark.parametrize(
+    ("num_scenes", "bounds"),
+    [(200, (0.24, 0.24, 0.27)),
+     pytest.param(500, (0.18, 0.19, 0.23), marks=pytest.mark.slow("statistics"))],
+)  # fmt: skip
+def test_how_far_meshes_shift_sizes(
+    pool: list[PooledAsset], num_scenes: int, bounds: tuple[float, ...]
+) -> None:
     """Sizes are drawn again where meshes meet; they claim far less than their spheres.
 
     The greatest distance of the distribution functions stays below 0.12 for two and 0.17 for three
@@ -136,7 +143,7 @@ def test_how_far_meshes_shift_sizes(pool: list[PooledAsset]) -> None:
     settings = named_build("pretrain-256").scenes
     coarse = [MeshShape(entry.locked.uid, entry.asset.levels[-1], "box") for entry in pool]
     sizes: dict[int, list[float]] = {1: [], 2: [], 3: []}
-    for index in range(200):
+    for index in range(num_scenes):
         plan = scene_plan(settings, seed=0, scene_index=index)
         rng = rng_for(0, "scene", index, 0)
         shapes = [coarse[row] for row in rng.integers(len(coarse), size=plan.num_objects)]
@@ -145,8 +152,9 @@ def test_how_far_meshes_shift_sizes(pool: list[PooledAsset]) -> None:
         sizes[plan.num_objects] += [
             (4 * placement.pose.radius - low) / (high - low) for placement in layout.objects
         ]
-    # Samples of 70, 130 and 200 add up to 0.16, 0.12 and 0.10 of chance, with odds of 1 in 20.
-    for count, most in ((1, 0.24), (2, 0.24), (3, 0.27)):
+    # Samples of 70, 130 and 200 add up to 0.16, 0.12 and 0.10 of chance, with odds of 1 in 20;
+    # those of 170, 330 and 500 add 0.10, 0.07 and 0.06.
+    for count, most in enumerate(bounds, start=1):
         values = np.sort(sizes[count])
         assert np.abs(values - np.arange(len(values)) / len(values)).max() < most
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -55,12 +55,22 @@ ROUNDING = 1e-5
 
 CHOSEN = [index for index in range(74) if index == 0 or index % 37 > 3] + [38]
 """Half a turn: 37 values in two layouts each; of the slow subdivisions the two with the fewest."""
+LEFT_OUT = sorted(set(range(74)) - set(CHOSEN))
+
+
+@pytest.fixture(
+    scope="module",
+    params=[CHOSEN, pytest.param(LEFT_OUT, marks=pytest.mark.slow("every"))],
+    ids=["chosen", "left out"],
+)
+def indices(request: pytest.FixtureRequest) -> list[int]:
+    return list(request.param)
 
 
 @pytest.fixture(scope="module")
-def strange(pool: list[PooledAsset]) -> list[Scene]:
+def strange(pool: list[PooledAsset], indices: list[int]) -> list[Scene]:
     """None is rejected sixteen times."""
-    return [first_scene(SETTINGS, pool, seed=SEED, scene_index=index) for index in CHOSEN]
+    return [first_scene(SETTINGS, pool, seed=SEED, scene_index=index) for index in indices]
 
 
 def _value(scene: Scene, axis: str) -> float:
@@ -68,14 +78,16 @@ def _value(scene: Scene, axis: str) -> float:
     return float(excursion["value"] if excursion["axis"] == axis else MEDIAN[axis])
 
 
-def test_every_value_is_planned_in_every_layout_and_composed(strange: list[Scene]) -> None:
+def test_every_value_is_planned_in_every_layout_and_composed(
+    strange: list[Scene], indices: list[int]
+) -> None:
     found = []
     for index in range(148):
         excursion = SETTINGS.excursion_of(index)
         assert excursion is not None
         template = scene_plan(SETTINGS, seed=SEED, scene_index=index).family.template
         found.append((excursion.axis, excursion.value, template))
-    for scene, index in zip(strange, CHOSEN, strict=True):
+    for scene, index in zip(strange, indices, strict=True):
         axis, value, template = found[index]
         assert scene.provenance["excursion"] == {"axis": axis, "value": value}
         assert scene.provenance["template"] == template
@@ -202,8 +214,8 @@ def test_lights_hang_outside_but_for_those_that_are_put_inside(strange: list[Sce
         assert count == _value(scene, "lights_inside")
 
 
-def test_everything_else_is_at_its_median(strange: list[Scene]) -> None:
-    for index, scene in zip(CHOSEN, strange, strict=True):
+def test_everything_else_is_at_its_median(strange: list[Scene], indices: list[int]) -> None:
+    for index, scene in zip(indices, strange, strict=True):
         plan = scene_plan(SETTINGS, seed=SEED, scene_index=index)
         assert plan.overlaps == (scene.provenance["excursion"]["axis"] == "objects")
         floor = scene.vertex_positions[scene.faces[scene.object_index == 0].ravel()]
@@ -228,11 +240,18 @@ MAPPED = (38, 39, 42, 44, 45, 46, 48)
 """Of the twelve values of maps: all surfaces textured, both ends of the widths, and skies."""
 
 
-def test_axes_of_maps_have_the_value_that_they_name(pool: list[PooledAsset]) -> None:
+@pytest.mark.parametrize(
+    "mapped",
+    [MAPPED, pytest.param(range(37, 49), marks=pytest.mark.slow("every"))],
+    ids=["chosen", "all"],
+)
+def test_axes_of_maps_have_the_value_that_they_name(
+    pool: list[PooledAsset], mapped: Sequence[int]
+) -> None:
     """All else, and whether a scene has any map, is as without them."""
     settings = named_build("out-of-range-2").scenes
     found = {}
-    for index in MAPPED:
+    for index in mapped:
         scene = first_scene(settings, pool, seed=SEED, scene_index=index)
         axis, value = scene.provenance["excursion"].values()
         found[axis, value] = scene
@@ -243,7 +262,7 @@ def test_axes_of_maps_have_the_value_that_they_name(pool: list[PooledAsset]) -> 
             if not (textured and other == "roughness"):
                 assert abs(MEASURED[other](scene) / MEDIAN[other] - 1) < ROUNDING, (axis, other)
     axes = ("textured", "texture_tile_m", "sky", "sky_seen", "sun_to_sky")
-    assert {axis for axis, _ in found} == set(axes) and len(found) == len(MAPPED)
+    assert {axis for axis, _ in found} == set(axes) and len(found) == len(mapped)
     for (axis, value), scene in found.items():
         sky = scene.environment
         if sky is not None:
