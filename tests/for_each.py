@@ -34,6 +34,7 @@ def for_each(names: str | Sequence[str], values: Iterable[Any]) -> Callable[[Tes
     """
     words = [word.strip() for word in names.split(",")] if isinstance(names, str) else list(names)
     rows = [value if len(words) > 1 else (value,) for value in values]
+    assert rows, "no values: the test would pass without a run"
 
     def decorate(test: Test) -> Test:
         signature = inspect.signature(test)

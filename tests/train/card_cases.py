@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from model.neural_renderer import NeuralRenderer
-from model.open import save_published
 from model.renderformer import RenderFormer
 from storage.dataset.training_data import open_training_data
 from tests.train.fake_card import CARD, fake_card
@@ -45,7 +44,7 @@ def one_step_of(run: str, size: str) -> TrainSettings:
 
 
 def train_and_judge(run: str, size: str, data: str, lpips: str, out: Path) -> None:
-    """Train by train_run, evaluate, render, and export what can be exported."""
+    """Train by train_run, evaluate and render."""
     settings = one_step_of(run, size)
     with fake_card():
         start, crew = Start(lpips=lpips), Crew(device=CARD)
@@ -65,8 +64,6 @@ def train_and_judge(run: str, size: str, data: str, lpips: str, out: Path) -> No
         (view, *_) = judged_views(contest, lambda: None)
         assert view.scores["network"]["lpips"] is not None
         assert NeuralRenderer(network).render(toy_scene(0), RESOLUTION).shape[1:] == (64, 64, 3)
-        if settings.model.head == "dpt":
-            save_published(network, out / "published")
 
 
 def resume(data: str, lpips: str, out: Path) -> None:

@@ -1,7 +1,7 @@
 """A step of each kind of network on a graphics card that is not there (fake_card).
 
 On tensors without numbers: forward, loss with LPIPS, backward, clipping, Muon, running mean,
-validation, evaluation, checkpoint, export. A module that stayed behind shows here alone.
+validation, evaluation, checkpoint. A module that stayed behind shows here alone.
 """
 
 import re

@@ -80,5 +80,6 @@ def test_a_run_that_was_stopped_ends_like_one_that_was_not(
     whole = trained(run, data, tmp_path)
     weights = whole.folder.weights.read_bytes()
     (tmp_path / "checkpoints/step-000000003.safetensors").unlink()
+    whole.folder.weights.unlink()
     again = trained(run, data, tmp_path, resume=True)
     assert again.folder.weights.read_bytes() == weights

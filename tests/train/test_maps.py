@@ -64,6 +64,7 @@ def test_a_run_that_was_stopped_ends_like_one_that_was_not(
     run = _run() if kind == "bundles" else _run(view_stage="hits")
     weights = trained(run, data, tmp_path).folder.weights.read_bytes()
     (tmp_path / "checkpoints/step-000000004.safetensors").unlink()
+    (tmp_path / "model.safetensors").unlink()
     assert trained(run, data, tmp_path, resume=True).folder.weights.read_bytes() == weights
     network = open_network(tmp_path / "model.safetensors")
     assert network.config.sky_cells == 48

@@ -99,19 +99,20 @@ class StopAfterEachStep(TrainProgress):
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-@for_each("quick", [True, False])
+@for_each("muon_rate, quick", [(0.0, True), (3.0, True), (3.0, False)])
 def test_resumed_after_every_step_is_uninterrupted(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick: bool
+    dataset: Dataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    muon_rate: float,
+    quick: bool,
 ) -> None:
-    """With Muon, a running mean, every symmetry that toy scenes have, and a perceptual term.
-
-    AdamW alone is in test_run.
-    """
+    """With a running mean, every symmetry that toy scenes have, and a perceptual term."""
     have_bfloat16(monkeypatch, quick)
     settings = tiny_run(
         num_steps=4,
         ema_decay=0.9,
-        muon_rate=3.0,
+        muon_rate=muon_rate,
         loss=LossSettings(perceptual="ms_ssim", noise_half=0.01),
         log_every=1,
         validate_every=4,

@@ -43,19 +43,19 @@ from tests.command_line import trilight
 for token, words in json.loads(sys.argv[1]):
     os.environ["HF_TOKEN"] = token
     ended = trilight(["push", *words])
-    print(json.dumps([ended.exit_code, ended.stdout, ended.stderr]))
+    print(json.dumps([ended.exit_code, ended.stdout, ended.stderr, os.listdir(sys.argv[2])]))
 """
 
 
 def pushed(
-    asked: Sequence[tuple[str, list[str]]], settings: Mapping[str, str]
-) -> list[tuple[int, str, str]]:
+    asked: Sequence[tuple[str, list[str]]], settings: Mapping[str, str], there: Path
+) -> list[tuple[int, str, str, list[str]]]:
     """Push with tokens in a process of its own: the package reads where the hub is at import.
 
     Returns:
-        The exit status, stdout and stderr of each push.
+        The exit status, stdout and stderr of each push, and what the hub holds after it.
     """
-    command = [sys.executable, "-c", PUSHES, json.dumps(asked)]
+    command = [sys.executable, "-c", PUSHES, json.dumps(asked), str(there)]
     done = subprocess.run(
         command, cwd=ROOT, env=settings, capture_output=True, text=True, timeout=300, check=False
     )
@@ -69,9 +69,10 @@ def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path:
     with hub_for_uploads(there, TOKEN) as (url, made):
         words = [str(dataset.folder.root), "ada/set", "--json"]
         asked = [("hf_other", words), (TOKEN, [*words, "--private"]), (TOKEN, words)]
-        refused, public, result = pushed(asked, settings_of(url, TOKEN, tmp_path / "home"))
+        refused, public, result = pushed(asked, settings_of(url, TOKEN, tmp_path / "home"), there)
     assert refused[0] == 1 and "set HF_TOKEN" in refused[1] + refused[2]
     assert public[0] == 1 and "already and public" in public[1] + public[2]
+    assert refused[3] == public[3] == [], "a refused push has sent nothing"
     assert result[0] == 0, result[2]
     said = json.loads(result[1])
     assert said["address"] == f"{url}/datasets/ada/set"

@@ -22,6 +22,7 @@ DOCKERFILES = sorted(IMAGES.glob("*.Dockerfile"))
 
 
 def test_dockerfiles_pass_hadolint() -> None:
+    assert DOCKERFILES
     for path in DOCKERFILES:
         with case(path.name):
             tool = BIN / "hadolint"

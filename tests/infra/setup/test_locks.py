@@ -20,6 +20,7 @@ LOCKS = sorted((ROOT / "requirements").glob("*.txt"))
 
 
 def test_every_package_of_a_lock_has_a_digest() -> None:
+    assert LOCKS
     for path in LOCKS:
         with case(path.name):
             rows = read_lock(path)

@@ -78,7 +78,7 @@ def _value(scene: Scene, axis: str) -> float:
     return float(excursion["value"] if excursion["axis"] == axis else MEDIAN[axis])
 
 
-def test_every_value_is_planned_in_every_layout_and_composed(
+def test_every_value_is_planned_in_every_layout_and_scenes_are_as_planned(
     strange: list[Scene], indices: list[int]
 ) -> None:
     found = []
