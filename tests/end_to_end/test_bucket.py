@@ -100,7 +100,7 @@ def test_a_bucket_as_output_from_two_machines_and_a_flow(
     for run in runs:
         said.append(run.communicate(timeout=RUN_S)[0])
         assert run.returncode == 0, said[-1]
-    reader = _machine(environment, tmp_path / "four")
+    reader = _machine(environment, tmp_path / "one")  # its meshes are made
     said.append(call(["-c", FLOW], reader, RUN_S))
     _same_files(driver, plain, "shards/set")
     _same_files(driver, plain, "shards/flow")
