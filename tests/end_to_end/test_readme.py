@@ -156,11 +156,11 @@ def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
         command = command.replace("/mine", "/readme")
         # set-up would lead the environment, which is lent, to the copy
         lent = "--old-file .venv/.dataset-ready"
-        command = command.replace("make dataset", f"make {lent} dataset SCENES=6")
+        command = command.replace("make dataset", f"make {lent} dataset SCENES=4")
         if command.startswith("trilight view"):
             _view(command, tmp_path)
         else:
-            _run(command.replace("--out runs/readme", "--out runs/readme --steps 60"), tmp_path)
+            _run(command.replace("--out runs/readme", "--out runs/readme --steps 20"), tmp_path)
     made = tmp_path / "data" / "smoke"
     with Image.open(made / "contact_sheet.png") as sheet:
         assert min(sheet.size) > 400
@@ -202,6 +202,6 @@ def test_the_tutorials_run(tmp_path: Path) -> None:
 @pytest.mark.timeout(1800)
 def test_the_whole_line_runs(tmp_path: Path) -> None:
     copy_of_the_project(tmp_path)
-    _run("sh examples/whole_line.sh", tmp_path)
+    _run("OBJECTS=builtin:24 SCENES=6 NOISE_FLOOR=20 sh examples/whole_line.sh", tmp_path)
     assert (tmp_path / "data" / "whole-line" / "both.png").stat().st_size > 1_000
     assert (tmp_path / "runs" / "whole-line" / "evaluation" / "evaluation.md").exists()
