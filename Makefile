@@ -26,7 +26,7 @@ test: setup-all  ## the quick tests, in five minutes on two cores
 
 # only files that have one are looked through: each worker imports all that it looks through
 test-slow: setup-all  ## the others, of the kinds in tests/conftest.py, in twenty minutes
-	python -m pytest -m slow -n 3 --dist worksteal $$(grep -rl --include='test_*.py' 'mark\.slow' tests)
+	python -m pytest -m slow -n 3 --dist loadfile --no-loadscope-reorder $$(grep -rl --include='test_*.py' 'mark\.slow' tests)
 
 test-elsewhere: setup-all  ## the most telling ones, as other processors would run them
 	python -m tests.elsewhere

@@ -46,29 +46,41 @@ def shared() -> Path:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deal the tests to the workers, those that may last long first; check the kinds of slow ones.
-
-    A long test that came last kept the other workers waiting.
-    """
+    """Check the kinds of slow tests, and have workers begin with the tests that may last long."""
     for item in items:
         for mark in item.iter_markers("slow"):
             if len(mark.args) != 1 or mark.args[0] not in SLOW_KINDS:
                 raise pytest.UsageError(
                     f"{item.nodeid}: slow{mark.args}; expected one of {', '.join(SLOW_KINDS)}"
                 )
-    workers = getattr(config, "workerinput", {}).get("workercount", 1)
+    if config.getoption("markexpr") == "slow":
+        items[:] = _order_files(items)
+    else:
+        workers = getattr(config, "workerinput", {}).get("workercount", 1)
+        items[:] = _deal_items(items, workers)
+
+
+def _order_files(items: list[pytest.Item]) -> list[pytest.Item]:
+    """Put files first that may last long; whole files are dealt, for they share servers."""
+    longest: dict[Path, float] = {}
+    for item in items:
+        longest[item.path] = max(longest.get(item.path, 0.0), _patience_s(item))
+    return sorted(items, key=lambda item: -longest[item.path])
+
+
+def _deal_items(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
+    """Deal long tests to the workers first: one that came last kept the others waiting."""
     long = sorted(filter(_patience_s, items), key=_patience_s, reverse=True)
     rest = [item for item in items if not _patience_s(item)]  # in order: they share fixtures
     dealt: list[pytest.Item] = []
     for worker in range(workers):
-        own = long[worker::workers]
-        room = (len(items) * (worker + 1)) // workers - len(dealt) - len(own)
-        dealt += [*own, *rest[:room]]
+        first = long[worker::workers]
+        room = (len(items) * (worker + 1)) // workers - len(dealt) - len(first)
+        dealt += [*first, *rest[:room]]
         rest = rest[room:]
-    items[:] = [*dealt, *rest]
+    return [*dealt, *rest]
 
 
 def _patience_s(item: pytest.Item) -> float:
-    """Return the timeout that a test itself states, s: who lasts long does. Files share servers."""
-    stated = (each.args[0] for each in item.own_markers if each.name == "timeout")
-    return max(map(float, stated), default=0.0)
+    """Return the longest timeout that a test or its file states, s."""
+    return max((float(mark.args[0]) for mark in item.iter_markers("timeout")), default=0.0)

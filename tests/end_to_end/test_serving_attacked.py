@@ -16,6 +16,7 @@ import pytest
 
 from tests.end_to_end.browser_kit import Browser, browser
 from tests.end_to_end.production_kit import START_S, free_port, served
+from tests.for_each import for_each
 
 ATTACK = (Path(__file__).parent / "attack.html").read_text()
 EVIL = "evil.example"
@@ -119,7 +120,7 @@ def test_requests_of_strangers_are_refused(server: Server) -> None:
     assert len(refused) == 55 and server.num_runs() == 0
 
 
-@pytest.mark.parametrize("wish", WISHES, ids=lambda wish: next(iter(wish)))
+@for_each("wish", WISHES)
 def test_nobody_chooses_what_runs_the_flow(server: Server, wish: dict[str, Any]) -> None:
     """With the password: neither for a run nor for a deployment, whose runs are then refused."""
     deployment = f"/api/deployments/{server.deployment()}"
