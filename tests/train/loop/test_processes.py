@@ -182,7 +182,7 @@ def test_passes_that_add_up_train_as_one_batch(
     same_to_rounding(run_here(dataset, tmp_path, scenes_per_pass=1), alone)
 
 
-LONGER = {"num_steps": 30, "validate_every": 10, "checkpoint_every": 10, "muon_rate": 3.0}
+LONGER = {"num_steps": 60, "validate_every": 20, "checkpoint_every": 20, "muon_rate": 3.0}
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +196,7 @@ def undisturbed(
 
 
 def same_to_the_bit(out: Path, whole: Path) -> None:
-    names = ("model.safetensors", "checkpoints/step-000000030.safetensors", "validation_sheet.png")
+    names = ("model.safetensors", "checkpoints/step-000000060.safetensors", "validation_sheet.png")
     for name in names:
         assert (out / name).read_bytes() == (whole / name).read_bytes(), name
     assert curve(out) == curve(whole)
@@ -234,7 +234,7 @@ def test_several_processes_that_are_stopped_go_on_to_the_bit(
     _, errors = torchrun.communicate()
     assert torchrun.returncode != 0
     stopped = saved_steps(out / "checkpoints")[-1]
-    assert 0 < stopped < 30
+    assert 0 < stopped < 60
     assert f"stopped at step {stopped} by a signal" in errors
     run(dataset, out, processes, "--resume", **LONGER)
     same_to_the_bit(out, undisturbed(processes))
@@ -251,7 +251,7 @@ def test_processes_that_are_killed_at_random_are_restarted_to_the_bit(
     words = command(dataset, out, 2, **LONGER)
     words.insert(words.index("--standalone"), "--max-restarts=1")
     torchrun = started(words, TORCH_DISABLE_SHARE_RDZV_TCP_STORE="1")  # as in train.sbatch
-    wait_for_step(out, int(rng.integers(1, 29)), torchrun)
+    wait_for_step(out, int(rng.integers(1, 59)), torchrun)
     os.kill(children(torchrun.pid)[rng.integers(2)], signal.SIGKILL)
     _, errors = torchrun.communicate()
     assert torchrun.returncode == 0, errors
