@@ -25,7 +25,7 @@ test: setup-all  ## the quick tests, in five minutes on two cores
 	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE python -m pytest -n 3 --dist worksteal
 
 # only files that have one are looked through: each worker imports all that it looks through
-test-slow: setup-all  ## the others, of the kinds in tests/conftest.py, in twenty minutes
+test-slow: setup-all  ## the others, of the kinds in tests/conftest.py, in 25 minutes
 	python -m pytest -m slow -n 3 --dist loadfile --no-loadscope-reorder $$(grep -rl --include='test_*.py' 'mark\.slow' tests)
 
 test-elsewhere: setup-all  ## the most telling ones, as other processors would run them
