@@ -1,4 +1,4 @@
-"""One process, several, and passes added up: the same training. With real processes."""
+"""One process, several, and passes added up: the same training. With real processes of torchrun."""
 
 import contextlib
 import functools
@@ -17,7 +17,6 @@ from safetensors.numpy import load_file
 
 from storage.dataset.dataset import Dataset
 from storage.seeds import rng_for
-from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.infra.slurm.fake_slurm import commands_in
 from tests.train.toy import write_toy_dataset
@@ -52,50 +51,16 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=9, validation=2, per_shard=3)
 
 
-def order(dataset: Dataset, out: Path, *rest: str, **changes: object) -> list[str]:
-    """Return what a person types after `trilight`."""
-    words = ["train", "smoke", "--data", str(dataset.folder.root)]
-    words += ["--out", str(out), "--device", "cpu", *rest]
-    for name, value in (SMALL | changes).items():
-        words += ["--set", f"{name}={json.dumps(value)}"]
-    return words
-
-
 def command(dataset: Dataset, out: Path, processes: int, *rest: str, **changes: object) -> list:
-    """Return the command with torchrun."""
+    """Return what a person types; alone without torchrun."""
+    run = ["-m", "trilight", "train", "smoke", "--data", str(dataset.folder.root)]
+    run += ["--out", str(out), "--device", "cpu", *rest]
+    for name, value in (SMALL | changes).items():
+        run += ["--set", f"{name}={json.dumps(value)}"]
+    if processes == 1:
+        return [sys.executable, *run]
     launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
-    words = order(dataset, out, *rest, **changes)
-    return [sys.executable, *launcher, "-m", "trilight", *words]
-
-
-FORKED = """
-import os, sys
-import torch._dynamo, torch.utils.tensorboard, train.run
-import torch.distributed as dist
-from tests.command_line import trilight
-
-def is_done(rank, processes):
-    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(processes)}
-    ended = trilight(sys.argv[2:])
-    sys.stderr.write(ended.stderr)
-    return ended.exit_code == 0
-
-processes = int(sys.argv[1])
-store = dist.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
-os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port)}
-os.environ["TORCHELASTIC_USE_AGENT_STORE"] = "True"
-ranks = {}
-for rank in range(processes):
-    ranks[rank] = os.fork()
-    if ranks[rank] == 0:
-        done = False
-        try:
-            done = is_done(rank, processes)
-        finally:
-            os._exit(0 if done else 1)
-sys.exit(any([os.waitpid(ranks[rank], 0)[1] for rank in ranks]))
-"""
-"""Runs as many processes as torchrun would, with the modules loaded once."""
+    return [sys.executable, *launcher, *run]
 
 
 def children(pid: int) -> list[int]:
@@ -114,20 +79,15 @@ def environment() -> dict[str, str]:
 
 
 def run(dataset: Dataset, out: Path, processes: int, *rest: str, **changes: object) -> Path:
-    finished(command(dataset, out, processes, *rest, **changes))
-    return out
-
-
-def finished(words: list) -> None:
     done = subprocess.run(
-        words, cwd=ROOT, env=environment(), capture_output=True, text=True, check=False
+        command(dataset, out, processes, *rest, **changes),
+        cwd=ROOT,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
-
-
-def run_here(dataset: Dataset, out: Path, **changes: object) -> Path:
-    done = trilight(order(dataset, out, **changes))
-    assert done.exit_code == 0, done.output
     return out
 
 
@@ -137,7 +97,7 @@ def weights(out: Path) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def alone(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run_here(dataset, tmp_path_factory.mktemp("alone"))
+    return run(dataset, tmp_path_factory.mktemp("alone"), 1)
 
 
 def same_to_rounding(ours: Path, theirs: Path) -> None:
@@ -165,21 +125,22 @@ def curve(out: Path) -> list[dict]:
     return [{name: row[name] for name in CURVE if name in row} for row in rows]
 
 
-def test_several_processes_train_as_one(dataset: Dataset, alone: Path, tmp_path: Path) -> None:
-    """Three, because the sum of two numbers has but one order."""
-    words = order(dataset, tmp_path)
-    finished([sys.executable, "-c", FORKED, "3", *words])
-    same_to_rounding(tmp_path, alone)
-    settings = json.loads((tmp_path / "settings.json").read_text())
-    assert settings["processes"] == 3
-    rows = [row["step"] for row in read_rows(tmp_path / "metrics.jsonl") if "loss" in row]
+@pytest.mark.parametrize("processes", [2, pytest.param(3, marks=pytest.mark.slow("training"))])
+def test_several_processes_train_as_one(
+    dataset: Dataset, alone: Path, tmp_path: Path, processes: int
+) -> None:
+    several = run(dataset, tmp_path / "several", processes)
+    same_to_rounding(several, alone)
+    settings = json.loads((several / "settings.json").read_text())
+    assert settings["processes"] == processes
+    rows = [row["step"] for row in read_rows(several / "metrics.jsonl") if "loss" in row]
     assert rows == [2, 4, 6, 8], "one process writes"
 
 
 def test_passes_that_add_up_train_as_one_batch(
     dataset: Dataset, alone: Path, tmp_path: Path
 ) -> None:
-    same_to_rounding(run_here(dataset, tmp_path, scenes_per_pass=1), alone)
+    same_to_rounding(run(dataset, tmp_path / "passes", 1, scenes_per_pass=1), alone)
 
 
 LONGER = {"num_steps": 60, "validate_every": 20, "checkpoint_every": 20, "muon_rate": 3.0}
@@ -267,7 +228,7 @@ def test_a_job_of_slurm_whose_time_is_up_goes_on_to_the_bit(
     """The job file itself, on two nodes with one process each that are not there (fake_slurm)."""
     (place := tmp_path / "slurm").mkdir()
     place_of_run = ["--out", str(tmp_path / "job")]
-    words = [word for word in order(dataset, tmp_path / "job", **LONGER)[1:]
+    words = [word for word in command(dataset, tmp_path / "job", 1, **LONGER)[4:]
              if word not in place_of_run]  # fmt: skip
     options = ["--nodes=2", "--gpus-per-node=1", "--cpus-per-task=1"]
     script = ROOT / "infra/slurm/train.sbatch"
@@ -284,3 +245,17 @@ def test_a_job_of_slurm_whose_time_is_up_goes_on_to_the_bit(
     assert job.returncode == 0, errors
     assert "by a signal, nothing is lost" in errors
     same_to_the_bit(tmp_path / "job", undisturbed(2))
+
+
+@pytest.mark.slow("training")
+def test_a_batch_that_cannot_be_shared_is_named(dataset: Dataset, tmp_path: Path) -> None:
+    done = subprocess.run(
+        command(dataset, tmp_path, 2, scenes_per_step=5),
+        cwd=ROOT,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode != 0
+    assert "a batch of 5 scenes is not divisible by 2 ranks" in done.stderr
