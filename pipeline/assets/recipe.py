@@ -1,16 +1,17 @@
 """The recipe by name: its methods and what can change its results; loads no mesh library."""
 
-import functools
-import hashlib
-import re
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
 from pipeline.assets.settings import Profile
 from storage.errors import TrilightError
 
 _LIBRARIES = ("embreex", "libigl", "meshoptimizer", "numpy", "pymeshlab", "trimesh")
+
+
+def library_versions() -> dict[str, str]:
+    """Return the version of each library that the mesh stage calls, or `absent`."""
+    return {name: _installed(name) for name in _LIBRARIES}
 
 
 def _installed(name: str) -> str:
@@ -20,8 +21,22 @@ def _installed(name: str) -> str:
         return "absent"
 
 
-RECIPE = " ".join(["assets-2", *(f"{name}={_installed(name)}" for name in _LIBRARIES)])
-"""The number advances by hand whenever the same source would give other bytes."""
+_WITH_PYMESHLAB = (
+    "assets-2 embreex=4.4.0.post1 libigl=2.6.3 meshoptimizer=0.2.30a0 numpy=2.4.6 "
+    "pymeshlab=2025.7.post1 trimesh=5.2.0"
+)
+"""Number 2, and the versions with which it began: a constant, since asset files hold it.
+
+Where a source gives another outcome, by a change here or in a library, the next number follows:
+`assets-3`, without versions. `tests/pipeline/assets/test_recipe.py` fails until it does.
+"""
+
+RECIPE = (
+    _WITH_PYMESHLAB
+    if _installed("pymeshlab") != "absent"
+    else _WITH_PYMESHLAB.replace("pymeshlab=2025.7.post1", "pymeshlab=absent")
+)
+"""What asset files and their names in the asset store say of how they were made."""
 
 _METHODS: Mapping[Profile, tuple[str, ...]] = {
     "faithful": ("pymeshlab_collapse", "meshoptimizer", "meshoptimizer_sloppy"),
@@ -49,28 +64,3 @@ def methods_of(profile: Profile) -> tuple[str, ...]:
             "profile uniform: pymeshlab is not installed; run `make setup`, or use faithful."
         )
     return tuple(name for name in _METHODS[profile] if not name.startswith("pymeshlab"))
-
-
-_IMPORT = re.compile(
-    rb"^[ \t]*(?:from [\w.]+ import (?:\([^)]*\)|[^\n]*)|import [^\n]*)\n", re.MULTILINE
-)
-"""A statement as ruff writes it. Python 3.11's `ast` fails now and then where threads parse."""
-
-
-_HERE = Path(__file__).parent
-
-
-@functools.cache
-def code_sha256(*folders: Path) -> str:
-    """Return the digest of this stage's own source: another program may give another outcome.
-
-    By default that is this folder and the one that reads USD.
-
-    Import statements are left out: they say where things are, not what they do, and differ between
-    a checkout and a wheel.
-    """
-    digest = hashlib.sha256()
-    for folder in folders or (_HERE, _HERE.parent / "usd"):
-        for path in sorted(folder.rglob("*.py")):
-            digest.update(_IMPORT.sub(b"", path.read_bytes()))
-    return digest.hexdigest()

@@ -1,6 +1,7 @@
 """Stage "assets": every object becomes a prepared asset or a rejection, each made only once."""
 
 import dataclasses
+import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
@@ -9,7 +10,7 @@ from pathlib import Path
 
 from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.reading.source_file import needs_child, read_source
-from pipeline.assets.recipe import methods_of
+from pipeline.assets.recipe import library_versions, methods_of
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.store import AssetStore
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
@@ -17,6 +18,8 @@ from storage.digests import sha256_hex
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level, decode_asset
 from storage.records.objects import Failure, ObjectRecord
+
+_LOG = logging.getLogger(__name__)
 
 BorrowChild = Callable[[], AbstractContextManager[IsolatedChild]]
 
@@ -60,6 +63,7 @@ def prepare_assets(
         TrilightError: the store cannot be written, or a needed library is not installed.
     """
     methods = methods_of(settings.profile)
+    _LOG.info("prepare %d objects with %s", len(records), library_versions())
 
     def prepare(record: ObjectRecord) -> PreparedAsset | Failure:
         try:

@@ -1,9 +1,9 @@
 """The asset store: what became of each source, made once and shared by every dataset and process.
 
-An outcome's name says what it depends on: the bytes of the source, the settings, the recipe and
-the code of this stage. It is either an asset file or a refusal. Whoever makes one holds a lock that
-ends with the process, so that others wait for the outcome instead of making it too. The folder may
-be deleted while nobody uses it; then it is made again.
+An outcome's name says what it depends on: the bytes of the source, the settings and the recipe. It
+is either an asset file or a refusal. Whoever makes one holds a lock that ends with the process, so
+that others wait for the outcome instead of making it too. The folder may be deleted while nobody
+uses it; then it is made again.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from pipeline.assets.recipe import RECIPE, code_sha256
+from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
 from storage.atomic import TEMPORARY_SUFFIX, write_atomically, write_error
 from storage.digests import canonical_json, sha256_hex
@@ -41,7 +41,7 @@ class AssetStore:
 
     def key(self, kind: str, source_sha256: str, settings: AssetSettings) -> str:
         """Return the name of the outcome of a source file of a kind and a digest."""
-        parts = [kind, source_sha256, asdict(settings), RECIPE, code_sha256()]
+        parts = [kind, source_sha256, asdict(settings), RECIPE]
         return sha256_hex(canonical_json(parts))[:32]
 
     def asset_path(self, key: str) -> Path:

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalise
 from pipeline.assets.mesh import TriangleMesh
-from pipeline.assets.recipe import RECIPE
+from pipeline.assets.recipe import RECIPE, library_versions
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset
 from pipeline.documents.attribution import encode_attribution
@@ -230,6 +230,7 @@ def _write(
         "repaired": report.num_repaired,
         "rejected": len(report.failures),
         "recipe": RECIPE,
+        "libraries": library_versions(),
         "settings": settings_record(settings),
     }
     write_atomically(folder.summary, json.dumps(summary, indent=1, sort_keys=True).encode())

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from pipeline.assets.recipe import RECIPE, code_sha256
+from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset
 from pipeline.isolation import is_passing
@@ -110,7 +110,7 @@ class ObjectPart:
     ) -> None:
         self.records = records
         of_objects = [_facts(record, looks) for record in records]
-        facts = [of_objects, asdict(settings), RECIPE, code_sha256()]
+        facts = [of_objects, asdict(settings), RECIPE]
         name = sha256_hex(canonical_json(facts))[:32]
         self.file = shared / name[:2] / f"{name}.jsonl"
         """Beside the dataset, for its other makers."""

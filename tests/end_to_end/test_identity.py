@@ -1,0 +1,21 @@
+"""What every restructuring keeps byte for byte: see identity.py."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pipeline.making.environment import vector_extension
+from tests.end_to_end.identity import KEPT, PARTS, SETS, digests_of
+
+
+@pytest.mark.slow("every")
+@pytest.mark.parametrize("name", [*PARTS, *SETS])
+def test_what_is_made_is_what_was_made(
+    name: str, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    kept = json.loads(KEPT.read_bytes()).get(vector_extension())
+    if kept is None:
+        pytest.skip(f"no digests of processors with {vector_extension()}: write them on main")
+    assert digests_of(name, tmp_path) == kept[name]
