@@ -1,0 +1,271 @@
+"""The draw of mutants: changes of single lines that a test must notice, chosen by a seed.
+
+`python -m tests.mutants.draw [N]` prints the first N of each kind and package, as lines of JSON.
+The list beside this file holds the first two of each that can change what a program does.
+"""
+
+import ast
+import hashlib
+import io
+import itertools
+import json
+import re
+import subprocess
+import sys
+import tarfile
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+SEED = 20261127
+COMMIT = "dbd5de6f792d44ec2c4508b01f4f70e28e08787f"
+"""The source that is drawn from, whatever became of it since."""
+PACKAGES = ("storage", "scene_templates", "pipeline", "model", "train", "infra", "trilight")
+KINDS = ("sign", "bound", "order", "guard", "constant")
+REMOVED = re.compile(
+    r"infra/(bench|fake_card|improve|run_page|setup)/.*|infra/serving/improve_loop\.py"
+    r"|infra/cli/(bench|bench_card|improve|layer_plot)\.py|infra/viewer/run_room\.py"
+    r"|pipeline/executors/arrays/(aws_batch|google_batch|sky)\.py|pipeline/renders/plugin_.*\.py"
+    r"|pipeline/making/(lock|object)_parts\.py|pipeline/documents/gallery_controls\.py"
+    r"|model/(texture_cells|projected|empty_bundles|layer_errors)\.py|model/sky/.*"
+    r"|train/loss/half_features\.py"
+)
+"""Files that no mutant is drawn from: the commits after the draw remove them."""
+SIGNS = {ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*")}
+BOUNDS = {ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">")}
+ONE_WAY = (ast.Sub, ast.Div, ast.FloorDiv, ast.Mod, ast.Pow, ast.MatMult)
+"""Operations whose operands cannot be swapped."""
+NAMES = (ast.Name, ast.Attribute)
+SIMPLE = (ast.Assign, ast.AnnAssign, ast.AugAssign, ast.Expr)
+
+
+@dataclass(frozen=True)
+class Change:
+    """One place of a file and what stands there instead."""
+
+    kind: str
+    first: int
+    """Offset of the first character that is replaced."""
+    last: int
+    """Offset after the last."""
+    text: str
+    """The replacement."""
+
+
+class Source:
+    """A file, its tree, and the places of its nodes."""
+
+    def __init__(self, path: str, text: str) -> None:
+        self.path, self.text, self.tree = path, text, ast.parse(text)
+        self.starts = [0]
+        for line in text.splitlines(keepends=True):
+            self.starts.append(self.starts[-1] + len(line))
+
+    def span(self, node: ast.AST) -> tuple[int, int]:
+        """Return the offsets of a node; its columns count bytes."""
+        return (
+            self._offset(node.lineno, node.col_offset),  # type: ignore[attr-defined]
+            self._offset(node.end_lineno, node.end_col_offset),  # type: ignore[attr-defined]
+        )
+
+    def of(self, node: ast.AST) -> str:
+        """Return the text of a node."""
+        first, last = self.span(node)
+        return self.text[first:last]
+
+    def definitions(self) -> Iterator[tuple[str, int, int]]:
+        """Yield the dotted name and the first and last offset of each function and class."""
+        yield "<module>", 0, len(self.text)
+        yield from self._definitions(self.tree, "")
+
+    def _definitions(self, parent: ast.AST, prefix: str) -> Iterator[tuple[str, int, int]]:
+        for node in ast.iter_child_nodes(parent):
+            name = prefix
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                name = f"{prefix}.{node.name}".lstrip(".")
+                top = min([node.lineno, *(each.lineno for each in node.decorator_list)])
+                yield name, self.starts[top - 1], self.span(node)[1]
+            yield from self._definitions(node, name)
+
+    def _offset(self, lineno: int, column: int) -> int:
+        start = self.starts[lineno - 1]
+        line = self.text[start : self.starts[lineno]]
+        return start + len(line.encode()[:column].decode())
+
+
+def changes(source: Source) -> Iterator[Change]:
+    """Yield every change that may be drawn from a file."""
+    nodes = list(ast.walk(source.tree))
+    hidden = {each for node in nodes for part in _hidden(node) for each in ast.walk(part)}
+    for node in nodes:
+        if node not in hidden:
+            for find in (_signs, _bounds, _orders, _guards, _constants):
+                yield from find(source, node)
+
+
+def _hidden(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield messages and sentences below fields, and strings that are names of fields and draws."""
+    parts = list[ast.AST | None]()
+    if isinstance(node, ast.Raise | ast.JoinedStr):
+        yield node
+    elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+        yield node.value
+    elif isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("rng_for", "seed_for"):
+        parts += node.args
+    elif isinstance(node, ast.ClassDef):
+        parts += [each for each in node.body if isinstance(each, ast.Assign | ast.AnnAssign)]
+    elif isinstance(node, ast.AnnAssign | ast.arg):
+        parts += [node.annotation]
+    elif isinstance(node, ast.FunctionDef):
+        parts += [node.returns]
+    elif isinstance(node, ast.Compare) and getattr(node.left, "id", "") == "__name__":
+        parts += node.comparators
+    for each in (each for part in filter(None, parts) for each in ast.walk(part)):
+        if isinstance(each, ast.Constant) and isinstance(each.value, str):
+            yield each
+
+
+def _is_text(node: ast.AST) -> bool:
+    """Return whether operands are joined or formatted, and not added or divided."""
+    joined = isinstance(node, ast.JoinedStr | ast.List | ast.Tuple)
+    return joined or isinstance(getattr(node, "value", None), str)
+
+
+def _between(
+    source: Source, left: ast.AST, right: ast.AST, words: tuple[str, str], kind: str
+) -> Change:
+    first = source.text.index(words[0], source.span(left)[1], source.span(right)[0])
+    return Change(kind, first, first + len(words[0]), words[1])
+
+
+def _signs(source: Source, node: ast.AST) -> Iterator[Change]:
+    if isinstance(node, ast.BinOp | ast.AugAssign) and type(node.op) in SIGNS:
+        left = node.left if isinstance(node, ast.BinOp) else node.target
+        right = node.right if isinstance(node, ast.BinOp) else node.value
+        if not (_is_text(left) or _is_text(right)):
+            yield _between(source, left, right, SIGNS[type(node.op)], "sign")
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        yield Change("sign", *source.span(node), source.of(node.operand))
+
+
+def _bounds(source: Source, node: ast.AST) -> Iterator[Change]:
+    if isinstance(node, ast.Compare):
+        sides = itertools.pairwise([node.left, *node.comparators])
+        for op, (left, right) in zip(node.ops, sides, strict=True):
+            if type(op) in BOUNDS:
+                yield _between(source, left, right, BOUNDS[type(op)], "bound")
+    elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "range":
+        end = node.args[min(len(node.args) - 1, 1)]
+        if not isinstance(end, ast.Starred):
+            yield Change("bound", *source.span(end), f"({source.of(end)}) - 1")
+
+
+def _orders(source: Source, node: ast.AST) -> Iterator[Change]:
+    if isinstance(node, ast.Call) and not any(isinstance(a, ast.Starred) for a in node.args):
+        for left, right in itertools.pairwise(node.args):
+            yield from _swapped(source, left, right)
+        if getattr(node.func, "id", "") == "sorted" and "reverse" not in source.of(node):
+            _, last = source.span(node)
+            yield Change("order", last - 1, last, ", reverse=True)")
+    elif isinstance(node, ast.BinOp) and isinstance(node.op, ONE_WAY):
+        if not (_is_text(node.left) or _is_text(node.right)):
+            yield from _swapped(source, node.left, node.right)
+    for body in (getattr(node, name, None) for name in ("body", "orelse", "finalbody")):
+        if isinstance(body, list):
+            for above, below in itertools.pairwise(body):
+                are_simple = isinstance(above, SIMPLE) and isinstance(below, SIMPLE)
+                if are_simple and _are_ordered(above, below):
+                    yield from _swapped(source, above, below)
+
+
+def _swapped(source: Source, left: ast.AST, right: ast.AST) -> Iterator[Change]:
+    (first, end), (start, last) = source.span(left), source.span(right)
+    one, other = source.of(left), source.of(right)
+    if one != other:
+        yield Change("order", first, last, other + source.text[end:start] + one)
+
+
+def _are_ordered(above: ast.AST, below: ast.AST) -> bool:
+    return bool(_stored(above) & _loaded(below) or _stored(below) & _loaded(above))
+
+
+def _stored(node: ast.AST) -> set[str]:
+    """Return the names that a statement may change: targets, and what it calls a method of."""
+    targets = [*getattr(node, "targets", []), getattr(node, "target", None)]
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+        targets.append(node.value.func)
+    return set[str]().union(*(_loaded(target) for target in targets if target is not None))
+
+
+def _loaded(node: ast.AST) -> set[str]:
+    """Return the names in a statement; each attribute of `self` is one."""
+    texts = [ast.unparse(each) for each in ast.walk(node) if isinstance(each, NAMES)]
+    return {text for text in texts if re.fullmatch(r"(?!self$)\w+|self\.\w+", text)}
+
+
+def _guards(source: Source, node: ast.AST) -> Iterator[Change]:
+    leaves = ast.Raise | ast.Return | ast.Continue
+    if isinstance(node, ast.If) and isinstance(node.body[-1], leaves):
+        yield Change("guard", *source.span(node.test), "False")
+
+
+def _constants(source: Source, node: ast.AST) -> Iterator[Change]:
+    if not isinstance(node, ast.Constant) or isinstance(node.value, bool):
+        return
+    text, span = source.of(node), source.span(node)
+    if isinstance(node.value, int):
+        yield Change("constant", *span, str(node.value + 1))
+    elif isinstance(node.value, float):
+        yield Change("constant", *span, str(2 * node.value or 1.0))
+    elif re.fullmatch(r"[\"'][^\s\"']+[\"']", text):
+        yield Change("constant", *span, f"{text[:-1]}_{text[-1]}")
+
+
+def described(source: Source, change: Change) -> dict[str, str]:
+    """Return where a change is: by its function and the lines, which are told apart by others."""
+    inside = [d for d in source.definitions() if d[1] <= change.first and change.last <= d[2]]
+    name, top, bottom = min(inside, key=lambda each: each[2] - each[1])
+    text = source.text
+    first, last = text.rindex("\n", 0, change.first) + 1, text.index("\n", change.last)
+    while text.count(text[first:last].strip(), top, bottom) > 1:
+        first = text.rindex("\n", 0, first - 1) + 1
+    first += len(text[first:last]) - len(text[first:last].lstrip())
+    changed = text[first : change.first] + change.text + text[change.last : last]
+    place = {"path": source.path, "function": name}
+    return {**place, "source": text[first:last], "changed": changed}
+
+
+def _key(*parts: object) -> bytes:
+    return hashlib.sha256(":".join(map(str, (SEED, *parts))).encode()).digest()
+
+
+def _sources() -> Iterator[Source]:
+    """Yield the files of the commit that mutants are drawn from."""
+    command = ["git", "archive", COMMIT, *PACKAGES]
+    archive = subprocess.run(command, capture_output=True, check=True).stdout
+    with tarfile.open(fileobj=io.BytesIO(archive)) as files:
+        for member in files:
+            file = files.extractfile(member)
+            if file and member.name.endswith(".py") and not REMOVED.fullmatch(member.name):
+                yield Source(member.name, file.read().decode())
+
+
+def drawn(number: int) -> Iterator[dict[str, str]]:
+    """Yield the first mutants of each kind and package: lines in the order of their hashes."""
+    places = defaultdict[tuple[str, str, Source, int], list[Change]](list)
+    for source in _sources():
+        for change in changes(source):
+            line = source.text.count("\n", 0, change.first) + 1
+            places[source.path.split("/")[0], change.kind, source, line].append(change)
+    for package, kind in itertools.product(PACKAGES, KINDS):
+        lines = [each for each in places if each[:2] == (package, kind)]
+        lines.sort(key=lambda each: _key(kind, each[2].path, each[3]))
+        for n, place in enumerate(lines[:number], 1):
+            change = min(places[place], key=lambda each: _key(each.first, each.last, each.text))
+            name = {"id": f"{package}-{kind}-{n}", "package": package, "kind": kind}
+            yield name | described(place[2], change)
+
+
+if __name__ == "__main__":
+    for mutant in drawn(int(sys.argv[1]) if len(sys.argv) > 1 else 2):
+        sys.stdout.write(json.dumps(mutant, ensure_ascii=False) + "\n")
