@@ -10,7 +10,7 @@ from tests.for_each import case
 def test_every_page_is_made() -> None:
     for name, page in PAGES.items():
         with case(name):
-            assert page().startswith("# ") and "\n|---" in page()
+            assert page().startswith("# ") and "\n| --- |" in page()
 
 
 def test_the_page_of_passes_names_every_pass() -> None:
