@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 export PATH := $(abspath $(BIN)):$(PATH)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: setup setup-all dataset test test-slow test-elsewhere train release serve stop lint lock sbom third-party settings docs clean
+.PHONY: setup setup-all dataset test test-slow test-elsewhere train release serve stop lint lock docs clean
 
 setup: $(VENV)/.dataset-ready  ## what making data needs
 
@@ -39,10 +39,13 @@ RELEASE_SCENES := 1024
 RELEASE_PIXELS := 128
 RELEASE_SHARD := 32
 
+# beside them: the bill of materials and the licenses of what is installed
 release: setup-all  ## dataset, network and pictures to publish, in $(RELEASE); an hour or two of two cores, goes on where it stopped
 	trilight generate smoke --objects builtin: --out '$(RELEASE)/dataset' --scenes $(RELEASE_SCENES) --resolution $(RELEASE_PIXELS) \
 		--set splits.scenes_per_shard=$(RELEASE_SHARD) --set 'storage.passes=[depth,normal,object]'
 	python -m infra.release '$(RELEASE)'
+	python -m infra.setup.sbom '$(RELEASE)/sbom.cdx.json'
+	pip-licenses --from=mixed --with-urls --format=markdown --output-file='$(RELEASE)/third-party.md'
 
 serve: setup  ## Prefect's server, a pool, a worker and the flows as deployments, on this machine
 	python -m infra.serving.local start
@@ -56,21 +59,8 @@ lint: setup-all  ## format, style, types, layers
 	mypy
 	lint-imports
 
-lock: setup-all  ## write the lock files anew from requirements/*.in, and docs/sbom.cdx.json
+lock: setup-all  ## write the lock files anew from requirements/*.in
 	infra/setup/lock.sh
-
-sbom: setup-all  ## write docs/sbom.cdx.json anew: what is installed, as CycloneDX
-	python -m infra.setup.sbom
-
-third-party: setup-all  ## write docs/third_party.md anew
-	python -m infra.setup.third_party
-
-settings: setup-all  ## write settings.md, passes.md, quantities.md, surfaces-and-skies.md and command-line.md of docs/reference anew
-	python -m infra.setup.settings_page
-	python -m infra.setup.passes_page
-	python -m infra.setup.quantities_page
-	python -m infra.setup.maps_page
-	python -m infra.setup.command_line_page
 
 docs: $(VENV)/.docs-ready  ## the documentation as a site that opens from disk: site/index.html
 	mkdocs build --strict --quiet

@@ -2,7 +2,7 @@
 
 Light is linear: the picture of a scene is the sum of its pictures by each group of lights alone. A
 group's scene has no other emitter. That is exact but for what emitters do to each other's light,
-which they block and reflect: a few small triangles do it to little (measured in docs/log). Leaving
+which they block and reflect: a few small triangles do it to little (study S32). Leaving
 them as black triangles is worse, since emitters are hidden from the camera and such triangles not.
 """
 

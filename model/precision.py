@@ -4,7 +4,7 @@ The layers of both stages and the head may be rounded. Always float32, whatever 
 positions and rotary angles with their sines, the rotation itself, ray directions and their layer,
 normals and their octaves, materials, the learned tokens, and a head's last layers, whose rounding
 would be seen as bands. All of that is a hundredth of the work; rounding it too cost 7 dB on a
-trained network (docs/tradeoffs.md has every part alone). `trilight model NAME --errors` measures
+trained network (study S68). `trilight model NAME --errors` measures
 what is left, layer by layer.
 
 Weights are rounded once, when the network is made ready, and not at every use (autocast): equally
@@ -44,8 +44,8 @@ PRECISIONS = {
     "tf32": PrecisionChoice(dtype=torch.float32, tf32=True, needs_cuda=True),
     "float16": PrecisionChoice(dtype=torch.float16, needs_cuda=True),
 }
-"""Every choice by name. docs/tradeoffs.md has speeds and errors of bfloat16, and the errors that
-float16's numbers make; how fast float16 is, and all of tf32, was not measured."""
+"""Every choice by name. Studies S67 and S68 have speeds and errors of bfloat16, and
+the errors that float16's numbers make; float16's speed and all of tf32 were not measured."""
 
 
 REDUCED = (torch.bfloat16, torch.float16)

@@ -1,7 +1,7 @@
 """`StatedDraws`: random numbers that are drawn by name from a stated range, and remembered.
 
 What a surface or a sky is drawn from is written once, where it is drawn. The tests compare what was
-drawn with what was stated, and docs/reference/surfaces-and-skies.md is made of it.
+drawn with what was stated, and the reference page of surfaces and skies is made of it.
 """
 
 from collections.abc import Mapping, Sequence

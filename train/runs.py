@@ -63,7 +63,7 @@ def builtin() -> TrainSettings:
 def hits() -> TrainSettings:
     """Return the run of a small network whose first hits and direct light are traced.
 
-    It asks no scene tokens: beside what is traced they bring nothing at this size (docs/log).
+    It asks no scene tokens: beside what is traced they bring nothing at this size (study S72).
     """
     return dataclasses.replace(
         builtin(),
@@ -187,13 +187,13 @@ def paper_finetune_large() -> TrainSettings:
 def pretrain() -> TrainSettings:
     """Return our first stage: half the paper's steps, all symmetries, less weight for noisy views.
 
-    Which of these choices helps was measured in small trainings (docs/log); at this size none
+    Which of these choices helps was measured in small trainings (study S79); at this size none
     has been. Half the steps with Muon are as good as all with AdamW at 1 million parameters, four
     seeds (-4.7 to 2.8 % of the error); here they are what we would pay.
 
     The rate is where Muon's error is least from 0.28 to 21 million parameters, and follows the
     width from 64 on (`base_widths`): two seeds, 2,000 steps of four scenes at 32 pixels, on an H100
-    (`trilight bench learning-rates`; docs/log/2026-11-26-rates-on-a-card.md). Parabolas have their
+    (`trilight bench learning-rates`, study S80). Parabolas have their
     least error between 6.2e-4 and 8.5e-4 at each width, with no trend. That it is the best at
     Base, of 195 million, in steps of 128 scenes or over 250,000 of them, nobody has measured.
     """

@@ -21,7 +21,7 @@ class PassesAsked:
     out: Path
     """Folder for the files SCENE.VIEW.passes.exr."""
     passes: tuple[str, ...] = ("depth", "normal", "object")
-    """Passes, one or several with commas between them; docs/reference/passes.md lists all."""
+    """Passes, one or several with commas between them; the reference page Passes lists all."""
     scene: str | None = None
     """Key of the only scene; by default all."""
     view: Annotated[int | None, Within(0, 10_000)] = None

@@ -61,7 +61,7 @@ class Selected:
     all."""
     where: str | None = None
     """Keep only the scenes for which this condition holds, such as "max(roughness) < 0.3 and
-    lights_per_scene > 1" (docs/reference/quantities.md has the names); by default all."""
+    lights_per_scene > 1" (the reference page Quantities has the names); by default all."""
 
     @property
     def selection(self) -> Selection:

@@ -1,8 +1,7 @@
-"""Writes docs/reference/command-line.md: every command with its options, as --help shows them."""
+"""The page of commands: every command with its options, as --help shows them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from cyclopts import App
@@ -10,11 +9,9 @@ from cyclopts import App
 from infra.cli.commands import COMMANDS, app
 from pipeline.documents.markdown import table
 
-FILE = Path(__file__).parents[2] / "docs/reference/command-line.md"
-
 _HEAD = """# Command line
 
-Made by `make settings` from the classes of settings that the commands take, which are also what is
+Made from the classes of settings that the commands take, which are also what is
 checked and what Prefect's forms show: an option has the name of the field that it fills, `-` for
 `_`, and a second, shorter word where one is given. An option that may be repeated is written once
 for each value: `--data A --data B`. What the settings within settings are, which `--set` changes,
@@ -53,11 +50,6 @@ class Command:
     """In the order of the help."""
 
 
-def main() -> None:
-    """Write the file."""
-    FILE.write_text(command_line_page())
-
-
 def every_command() -> list[Command]:
     """Return every command that does something, those within groups included."""
     return [found for name in COMMANDS for found in _commands(app[name], name)]
@@ -84,7 +76,7 @@ def _option(argument: Any) -> Option:
 
 
 def command_line_page() -> str:
-    """Return docs/reference/command-line.md."""
+    """Return every command with its options, as --help shows them."""
     parts = [_HEAD]
     for found in every_command():
         parts.append(f"## `trilight {found.name}`\n\n{found.help}\n")
@@ -94,7 +86,3 @@ def command_line_page() -> str:
         ]
         parts.append(table(("option", "takes", "meaning"), rows) + "\n")
     return "\n".join(parts)
-
-
-if __name__ == "__main__":
-    main()

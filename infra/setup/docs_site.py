@@ -1,4 +1,6 @@
-"""MkDocs hook: files of the checkout that a page links to become pages of the site.
+"""MkDocs hook: adds the pages that the program declares, and those of linked files.
+
+Pages of the reference that `generated_pages` makes are in no file: each build makes them.
 
 Pages of docs/ link to files beside that folder (`../../examples/template.py`), which a reader of
 the checkout can follow. A site holds only its own folder, so each of those files gets a page under
@@ -14,13 +16,15 @@ from typing import Any
 
 from mkdocs.structure.files import File, Files, InclusionLevel
 
+from infra.setup.generated_pages import PAGES
+
 ROOT = Path(__file__).parents[2]
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#:\s]+)(#[^)\s]*)?\)")
 """A relative link or picture: bang, words, target, anchor."""
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add a page for every file outside docs/ that a page links to, and for theirs in turn."""
+    """Add the generated pages, and one for every file outside docs/ that is linked to."""
     waiting = [f"docs/{file.src_uri}" for file in files.documentation_pages()]
     known = set(waiting)
     while waiting:
@@ -34,6 +38,8 @@ def on_files(files: Files, config: Any) -> Files:
             files.append(added)
             if target.endswith(".md"):
                 waiting.append(target)
+    for name, page_text in PAGES.items():
+        files.append(File.generated(config, f"reference/{name}.md", content=page_text()))
     return files
 
 

@@ -30,4 +30,3 @@ rm "$cuda"
 
 cd ..
 python -m infra.setup.hashes requirements/*.txt
-python -m infra.setup.sbom

@@ -1,98 +1,76 @@
-"""Writes docs/sbom.cdx.json: all packages of the locks, as a bill of materials in CycloneDX 1.6.
+"""Writes the bill of materials of a release: the packages of all locks, in CycloneDX 1.6.
 
-The form is a list of names, versions and licences, and the locks are complete: a generator would
-bring more packages to list than lines of this file. The same locks give the same bytes, so there
-is neither a time nor a serial number in it.
+    python -m infra.setup.sbom FILE
+
+The same locks give the same bytes: neither a time nor a serial number is in it. Licenses are those
+that pip-licenses finds for what is installed.
 """
 
 import json
 import re
+import subprocess
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from infra.setup.locks import read_lock
-from infra.setup.third_party import THREE_SHA256
 
 ROOT = Path(__file__).parents[2]
-PLACE = "docs/sbom.cdx.json"
-_ROW = re.compile(r"^\| ([^|]+) \| [^|]+ \| ([^|]+) \|$", re.MULTILINE)
+THREE_VERSION = "0.180.0"
+THREE_SHA256 = {
+    "three.core.min.js": "61ba0df005b05991361d040d8ff670e1aadfd0ce7aeebd1fdb0725957a8957de",
+    "three.module.min.js": "e2b5ee6bccd38fd6d8a2428546b83c5f2426d84b152ef82be8055556e3b40eb6",
+}
+"""Files of three.js (MIT) in infra/viewer/static/three, as `build/` of its npm package has them."""
 
 
-def bill_of_materials(root: Path) -> dict[str, Any]:
+def bill_of_materials(root: Path, licenses: Mapping[str, str]) -> dict[str, Any]:
     """Return the bill of a checkout; ValueError where a lock cannot be read."""
     locks: dict[tuple[str, str], list[str]] = {}
     for path in sorted((root / "requirements").glob("*.txt")):
         for row in read_lock(path):
-            locks.setdefault((_plain(row.name), row.version), []).append(path.stem)
-    licences = _licences((root / "docs/third_party.md").read_text())
+            locks.setdefault((plain_name(row.name), row.version), []).append(path.stem)
+    components = []
+    for (name, version), listed in sorted(locks.items()):
+        components.append(_component("pypi", name, version, licenses.get(name)))
+        components[-1]["scope"] = "required" if "dataset" in listed else "optional"
+    three = _component("npm", "three", THREE_VERSION, "MIT")
+    three["components"] = [
+        {"type": "file", "name": name, "hashes": [{"alg": "SHA-256", "content": digest}]}
+        for name, digest in THREE_SHA256.items()
+    ]
+    about = {"component": {"type": "application", "name": "trilight", "bom-ref": "trilight"}}
     return {
         "bomFormat": "CycloneDX",
         "specVersion": "1.6",
         "version": 1,
-        "metadata": {
-            "component": {"type": "application", "name": "trilight", "bom-ref": "trilight"}
-        },
-        "components": [
-            *(_component(*pin, licences, locks[pin]) for pin in sorted(locks)),
-            _three(),
-        ],
+        "metadata": about,
+        "components": [*components, three],
     }
 
 
-def write_bill(root: Path) -> None:
-    """Write the bill of a checkout in its place."""
-    text = json.dumps(bill_of_materials(root), indent=1, ensure_ascii=False)
-    (root / PLACE).write_text(text + "\n")
+def installed_licenses() -> dict[str, str]:
+    """Return the license of each installed package; some packages give its whole text."""
+    command = [sys.executable, "-m", "piplicenses", "--format=json", "--from=mixed"]
+    rows = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    return {plain_name(row["Name"]): row["License"].strip().splitlines()[0][:80] for row in rows}
 
 
-def _component(
-    name: str, version: str, licences: dict[str, str], locks: list[str]
-) -> dict[str, Any]:
-    reference = f"pkg:pypi/{name}@{version}"
-    found: dict[str, Any] = {
-        "type": "library",
-        "bom-ref": reference,
-        "name": name,
-        "version": version,
-        "purl": reference,
-        "scope": "required" if "dataset" in locks else "optional",
-        "properties": [{"name": "trilight:lock", "value": lock} for lock in locks],
-    }
-    if name in licences:
-        found["licenses"] = [{"license": {"name": licences[name]}}]
-    return found
-
-
-def _three() -> dict[str, Any]:
-    reference = "pkg:npm/three@0.180.0"
-    files = [
-        {
-            "type": "file",
-            "name": name,
-            "bom-ref": f"{reference}#{name}",
-            "hashes": [{"alg": "SHA-256", "content": digest}],
-        }
-        for name, digest in THREE_SHA256.items()
-    ]
-    return {
-        "type": "library",
-        "bom-ref": reference,
-        "name": "three",
-        "version": "0.180.0",
-        "purl": reference,
-        "licenses": [{"license": {"id": "MIT"}}],
-        "components": files,
-    }
-
-
-def _licences(page: str) -> dict[str, str]:
-    """Return what docs/third_party.md says by package; files of three.js have more columns."""
-    return {_plain(name.strip()): licence.strip() for name, licence in _ROW.findall(page)}
-
-
-def _plain(name: str) -> str:
+def plain_name(name: str) -> str:
+    """Return the name of a package as indices compare it."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
+def _component(source: str, name: str, version: str, license_name: str | None) -> dict[str, Any]:
+    url = f"pkg:{source}/{name}@{version}"
+    found: dict[str, Any] = {"type": "library", "bom-ref": url, "name": name, "version": version}
+    found["purl"] = url
+    if license_name:
+        found["licenses"] = [{"license": {"name": license_name}}]
+    return found
+
+
 if __name__ == "__main__":
-    write_bill(ROOT)
+    bill = bill_of_materials(ROOT, installed_licenses())
+    Path(sys.argv[1]).write_text(json.dumps(bill, indent=1, ensure_ascii=False) + "\n")

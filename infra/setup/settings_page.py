@@ -1,11 +1,10 @@
-"""Writes docs/reference/settings.md: every setting with its meaning, range and default."""
+"""The page of settings: every setting with its meaning, range and default."""
 
 import dataclasses
 import inspect
 import re
 import typing
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, get_args
 
 from infra.improve.order import ImproveOrder
@@ -24,8 +23,6 @@ from train.evaluation.order import EvaluationOrder
 from train.settings import TrainSettings
 from train.watching.settings import WatchSettings
 
-FILE = Path(__file__).parents[2] / "docs/reference/settings.md"
-
 ROOTS: dict[str, tuple[type, ...]] = {
     "Scene": (Scene,),
     "Generate": (DatasetInRuns, BuildSettings),
@@ -41,7 +38,7 @@ ROOTS: dict[str, tuple[type, ...]] = {
 
 _HEAD = """# Settings
 
-Made by `make settings` from the descriptions at the fields (`storage/settings/described.py`), which
+Made from the descriptions at the fields (`storage/settings/described.py`), which
 are also what is checked and what the command line and Prefect's forms show: a value outside is
 refused in one line that names the field. Tests go to both ends of every range and one step outside
 (`tests/extremes/test_ranges.py`), and run what both ends make where that is cheap. Laws between
@@ -54,13 +51,8 @@ run records ([Carry on a run](../how-to/carry-on-a-run.md)).
 """
 
 
-def main() -> None:
-    """Write the file."""
-    FILE.write_text(settings_page())
-
-
 def settings_page() -> str:
-    """Return docs/reference/settings.md."""
+    """Return every setting with its meaning, range and default."""
     parts = [_HEAD]
     for command, roots in ROOTS.items():
         parts.append(f"## {command}\n")
@@ -131,7 +123,3 @@ def _first_sentence(doc: str) -> str:
     """Return a text up to its first full stop before a space, in one line."""
     found = re.match(r".*?(?<! al)\.(?=\s|$)", " ".join(doc.split()))
     return found[0] if found else doc
-
-
-if __name__ == "__main__":
-    main()

@@ -7,7 +7,7 @@ unbiased whatever the table says. Bins are squares of the octahedral map (Engelh
 
 The path tracer draws a share of its directions from the table and the others by the BRDF. The
 density of this mixture is the c_i of pipeline.renders.light_kernel for i > 1. At x1 the path tracer
-is not guided: light paths land there, and guiding there too made pictures no better (docs/log).
+is not guided: light paths land there, and guiding there too made pictures no better (study S18).
 """
 
 from dataclasses import dataclass

@@ -6,7 +6,7 @@ triangle, and bilinearly looked up there; both repeat.
 
 A colour takes 16 bytes in a kernel and a number 4: 6 to 12 MB for the usual scene, and 2.9 GB for
 the largest one that storage admits (MAX_MAPS_BYTES of 8-bit colours), twice while it is loaded. In
-8 bits, decoded in the kernel, they would take a quarter; a pass took 5 to 8 % longer (docs/log).
+8 bits, decoded in the kernel, they would take a quarter; a pass took 5 to 8 % longer (study S28).
 """
 
 from typing import Any

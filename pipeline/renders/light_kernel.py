@@ -24,7 +24,7 @@ the densities, per area at each vertex, are
 
 The path tracer carries the ratio L / P * product of C+_i r_i / (c_i C-_(i+1)), a light path its
 inverse, once for `hit` and once for `pick`. Roulette is in none of them. Direct light (k = 2) never
-lands: the stratified picks of the path tracer had 4 to 25 times less variance there (docs/log).
+lands: the stratified picks of the path tracer had 4 to 25 times less variance there (study S6).
 
 Light from an environment map is found by the path tracer alone: its paths have no third density.
 Where there is one, `pick` goes by the share of the lamps too, and `land` does not.

@@ -51,7 +51,7 @@ _SMALLEST_STEP = 1e-4
 of float32 values are rounding."""
 
 _LINEAR_STANDARD_ERRORS = 2.0
-"""Of one, 3 to 10 % of the linear floors of 16 scenes were more than 1 dB too good (docs/log)."""
+"""Of one, 3 to 10 % of the linear floors of 16 scenes were more than 1 dB too good (study S16)."""
 
 Curve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """What errors are taken in, of radiance."""

@@ -3,7 +3,7 @@
 Per path it does what Mitsuba's `path` integrator does with `hide_emitters` (same depth count, same
 roulette), for the one kind of surface and the one kind of emitter that a `Scene` has. An emitter
 reflects as any surface does, by its material row, and what is black ends the path. Leaving out
-virtual calls makes it 1.8 times as fast (docs/log), and one kernel serves every scene, view and
+virtual calls makes it 1.8 times as fast (study S1), and one kernel serves every scene, view and
 number of emitters.
 
 Both are weighed against light tracing too (pipeline.renders.light_kernel has the formulas), unless

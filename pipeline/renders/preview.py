@@ -29,7 +29,7 @@ MOST_SPP = 4096
 
 FAST_SPP = 16
 """Up to so many samples the fast filter is the better trade: more samples cost less than the better
-filter, 0.5 core-seconds at 256 pixels, and bring as much (docs/log)."""
+filter, 0.5 core-seconds at 256 pixels, and bring as much (study S21)."""
 
 
 def usual_filter(spp: int) -> Filtered:

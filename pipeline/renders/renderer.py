@@ -276,7 +276,7 @@ class SceneRenderer:
 
         Parts are denoised apart, each as a picture of its own. In five scenes direct light, whose
         shadows the noise of all other light would hide, was 4 dB better on average than its share
-        of one denoised picture, indirect light 0.2 dB worse, and the sum 0.4 dB better (docs/log).
+        of one denoised picture, indirect light 0.2 dB worse, and the sum 0.4 dB better (study S9).
         """
         require_bounded(pictures_rgb)
         if quality == "off":
@@ -297,7 +297,7 @@ def _denoised_lights(
     Lights apart are shares of one denoised picture, pixel by pixel and channel by channel: of all
     light together, in proportion to what each is when it is denoised alone. The sum of pictures
     that were denoised alone carries the bias of each: in four scenes it was 1.7 to 5.2 dB worse
-    than this one, and claimed a floor up to 5.9 dB better than the truth (docs/log).
+    than this one, and claimed a floor up to 5.9 dB better than the truth (study S8).
     """
     raw = lights_rgb.sum(axis=0)
     together = with_mean_of(denoise(raw, features, quality), raw)

@@ -19,12 +19,12 @@ PASS_SPP = (64, 16, 4)
 """Samples per pixel of one pass of a half, from best to cheapest: squares, as the sampler needs.
 
 A pass of 64 is stratified finer than four of 16: 0.1 to 0.3 dB less error on sampled scenes, and 1
-to 2 dB in the median pixel of the easy ones (docs/log). The small ones are for quick previews.
+to 2 dB in the median pixel of the easy ones (study S3). The small ones are for quick previews.
 """
 
 FIRST_SPP = 64
 """Samples of a picture before its floor is measured. With 32, in pictures of 256 pixels, 5 of 50
-floors that were reached at once were over 1 dB too good: no sample had met a glint (docs/log)."""
+floors that were reached at once were over 1 dB too good: no sample had met a glint (study S17)."""
 
 _MANY_PIXELS_PX = 128
 """A narrower picture has too few pixels for FIRST_SPP samples of each to tell its error."""
@@ -96,7 +96,7 @@ class RenderSettings:
     """Longest path in edges: 1 sees emitters alone, 2 adds direct light."""
     rr_depth: Depth = 2
     """Depth in edges from which Russian roulette may end a path. 2 instead of 5 takes 20 % less
-    time for the same error on sampled scenes (docs/log)."""
+    time for the same error on sampled scenes (study S2)."""
     aux_spp: Annotated[int, Within(PASS_SPP[-1], PASS_SPP[0], unit="samples")] = 16
     """Rays per pixel for the albedo and normal pictures that guide the denoiser, on a regular grid.
     16 cost a quarter of 64 and are 0.06 dB worse at 256 samples; pictures beyond 60 dB want 64."""

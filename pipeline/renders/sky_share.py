@@ -4,7 +4,7 @@ Lamps weigh area x radiance. In that unit a map weighs 2 pi R^2 times its mean r
 radius of the scene. But most of a smooth map is found by directions that the surface draws, and
 samples that pick it are taken from the lamps: picked by its whole power, a bright constant map had
 twice the error. So a map weighs what it has in peaks, its mean less its median, and at least as
-much as the average lamp (docs/log).
+much as the average lamp (study S29).
 """
 
 import numpy as np

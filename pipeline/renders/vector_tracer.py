@@ -38,7 +38,7 @@ from storage.seeds import seed_for
 
 LIGHT_PATHS = 0.25
 """Light paths for each camera path: a quarter has most of the gain, and the whole then takes 1.1 to
-1.4 times as long (docs/log)."""
+1.4 times as long (study S5)."""
 
 PHOTON_PATHS = 1 << 19
 """Light paths from which path guiding learns a scene: 0.3 core-seconds. Four times as many made

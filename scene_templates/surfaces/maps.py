@@ -31,7 +31,7 @@ class SurfaceMaps:
     roughness: NDArray[np.float32]
     """[H, W, 1] roughness; the GGX width is its square."""
     parameters: Mapping[str, tuple[Any, ...]]
-    """What was drawn, by the names of docs/reference/surfaces-and-skies.md."""
+    """What was drawn, by the names of the reference page of surfaces and skies."""
     source: MapSource = field(default_factory=MapSource)
     """Whose it is; what is drawn is ours."""
 

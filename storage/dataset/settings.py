@@ -89,7 +89,7 @@ class StorageSettings:
     that a picture already has."""
     passes: tuple[str, ...] = ()
     """Passes to store beside each picture, such as [depth,normal,object]; by default none, since
-    they can be computed from a stored scene at any time (docs/reference/passes.md)."""
+    they can be computed from a stored scene at any time (reference page Passes)."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "passes", pass_names(self.passes))

@@ -6,7 +6,7 @@
         \"\"\"Width of a square picture.\"\"\"
 
 From type, range, unit, sentence and default come the check of every value (pydantic), the complaint
-about a wrong one, the command line, Prefect's forms, docs/reference/settings.md and the records in
+about a wrong one, the command line, Prefect's forms, the page of settings and the records in
 manifests and checkpoints. Laws between fields stay in `__post_init__`. What streams shards does not
 import this file: tests/architecture/test_light_imports.py.
 """

@@ -178,7 +178,7 @@ def served(
 
 
 def copy_of_the_project(folder: Path) -> None:
-    """Copy what git tracks, and lend the environment: set-up is proved elsewhere (docs/log)."""
+    """Copy what git tracks, and lend the environment: set-up is proved elsewhere (study S64)."""
     listed = subprocess.run(
         ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout

@@ -83,6 +83,6 @@ def test_the_denoiser_takes_fireflies_away_and_two_percent_of_the_light_at_most(
     assert pictures.max() < 3 * many.mean(axis=0).max()
     (mean, error), (true, _) = _mean(pictures), _mean(many)
     # Measured over 48 seeds: 0.9, 0.4 and 0.8 % less light with 8, 32 and 128 samples, each known
-    # to 0.1 to 0.4 %. The bound is the one that docs/tradeoffs.md states.
+    # to 0.1 to 0.4 %. Study S24.
     assert error < 0.005 * true
     assert abs(mean - true) < 0.02 * true

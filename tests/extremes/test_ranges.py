@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.setup.settings_page import FILE, ROOTS, reachable, settings_page
+from infra.setup.settings_page import ROOTS, reachable
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
@@ -169,10 +169,6 @@ def test_what_is_checked_is_what_is_declared() -> None:
         Group(share=1.0)
     expected = "group: SHARE is 1.0; expected a number from 0 to below 1 parts."
     assert str(caught.value) == expected
-
-
-def test_the_page_of_ranges_is_current() -> None:
-    assert FILE.read_text() == settings_page(), "run make settings"
 
 
 ARRAYS = declared_ranges(Scene)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 MOST_THREADS = 8
 """More threads of one process wait for Python's lock. Where they only decode, two to three fill it
-(docs/tradeoffs.md); tracing for the view stage `hits` lets it go."""
+(study S56); tracing for the view stage `hits` lets it go."""
 
 SCENES_AT_WORK = 4
 """Memory that a thread takes, in scenes as a batch holds them: what it decodes, and what waits."""

@@ -3,7 +3,7 @@
 Layer by layer, not the whole network: the layers of a stage share their code, so it is compiled
 once for all of them. Lengths and numbers of scenes are variables in it; what is compiled anew is
 one scene beside several, a mask or none, and judging beside training. CUDA graphs are not used: a
-step's kernels take longer than their launches (docs/tradeoffs.md).
+step's kernels take longer than their launches (study S88).
 """
 
 from collections.abc import Iterator

@@ -19,7 +19,7 @@ def fitting_precision(crew: Crew) -> Precision:
 
     bfloat16 on a card and where the processor has AVX512_BF16, as all with AMX do. Elsewhere such a
     product is emulated: with AVX2 alone a step takes 12 times as long as in float32
-    (docs/log/2026-11-24-muon.md). torch's own question, `_is_mkldnn_bf16_supported`, also says yes
+    (study S83). torch's own question, `_is_mkldnn_bf16_supported`, also says yes
     where AVX-512 emulates it. One answer for all, since every process moves its copy of the weights
     itself, and copies must not drift apart. All processes must call it.
     """

@@ -3,7 +3,7 @@
     python -m tests.pipeline.renders.stored_pictures
 
 Each is the mean of many independent passes, with the variance of one pass at every pixel. Make them
-anew only when the light itself is meant to change, and say so in docs/log.
+anew only when the light itself is meant to change, and say so in docs/results/studies.md.
 """
 
 from dataclasses import dataclass

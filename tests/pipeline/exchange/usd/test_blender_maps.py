@@ -64,7 +64,7 @@ def test_textures_and_sky_are_where_we_show_them(tmp_path: Path, record_property
     agreement = _db(scene, theirs)
     record_property("psnr_linear_db", round(agreement, 2))
     print(f"as it is: {agreement:.2f} dB")  # noqa: T201
-    assert agreement > 36  # the aim of docs/log/2026-11-25-textured-exchange.md
+    assert agreement > 36  # the aim of study S53
     for name, other in wrong.items():
         found = _db(other, theirs)
         print(f"{name}: {found:.2f} dB")  # noqa: T201

@@ -1,6 +1,6 @@
 """Files of an array as schedulers take them, by their schemas where these are installed.
 
-Google's and SkyPilot's are not; docs/log/2026-11-25-arrays.md says how they were asked once.
+Google's and SkyPilot's are not.
 """
 
 import json

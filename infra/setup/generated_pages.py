@@ -1,0 +1,233 @@
+"""Pages of the reference that are made when the site is built, from what the program declares."""
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+
+from infra.setup.command_line_page import command_line_page
+from infra.setup.settings_page import settings_page
+from pipeline.documents.markdown import table
+from pipeline.shards.expression import TEXTS
+from scene_templates.skies.draw import SkyMapSettings
+from scene_templates.skies.draws import PALEST, SkyDraws
+from scene_templates.skies.families import OUR_SKIES, SKIES
+from scene_templates.skies.texels import SkyTexels
+from scene_templates.stated_draws import StatedDraw
+from scene_templates.surfaces.draw import SurfaceMapSettings
+from scene_templates.surfaces.draws import LEAST_TINT, SurfaceDraws
+from scene_templates.surfaces.families import OUR_SURFACES, SURFACES
+from scene_templates.surfaces.texels import Texels
+from storage.records.passes.declared import MOTION, Pass, declared_passes
+from storage.records.quantities import QUANTITIES
+from storage.seeds import rng_for
+
+_PASSES = """# Passes: what a pixel sees
+
+Made from the table in `storage/records/passes/declared.py`. Passes are functions
+of a stored scene and a camera, so that they need not be stored: `trilight.view_passes(scene)`
+returns them as arrays, with row 0 on top, in the conventions of [Formats](formats.md).
+
+- Emitters are hidden from cameras, as in the pictures: rays pass through them. So the emission of
+  what is seen is always 0.
+- Embree finds the triangle that a ray meets, in single precision. The point on the triangle is then
+  computed in double precision from its stored corners.
+- By default a pixel has one ray, through its centre, and every pass is exactly what that ray meets.
+  With `rays_a_side=4`, a pixel has 4 x 4 rays on a regular grid. A pass whose averaging is
+  `surfaces` is then the mean over the rays that meet a surface; times `coverage` it is the mean
+  over the whole pixel, which other renderers write. A pass whose averaging is `centre ray` is never
+  averaged.
+- Means of normals are shorter than 1 where a pixel sees several normals. Means of depths and
+  positions may lie between surfaces: for geometry, take one ray and more pixels.
+- Where nothing is met, ids are -1, depths infinite, and other quantities NaN.
+- Material columns are those of the point that is seen, with its textures. Scenes without textures
+  have no texture coordinates: there, the pass `uv` is NaN, and left out where all passes are asked
+  for, and of files: a file has the channels `uv.U` and `uv.V` exactly where its scene has textures.
+
+A view of 256 x 256 pixels of a scene with 1,500 triangles takes 0.04 core-seconds with all passes,
+and 0.9 with 4 x 4 rays a pixel: 1.3 to 1.5 million rays a core-second; making Embree's
+tree adds 0.2 core-seconds for 100,000 triangles. Passes were compared with
+Mitsuba's `aov` integrator: positions differ by 0.7 micrometres at most and normals by 5e-6, which
+is its single precision. Two of its passes mean something else. Its depth begins at the near plane
+of the camera. Its albedo leaves out the specular lobe where that is narrow: it is wrong on glossy
+surfaces (`tests/pipeline/renders/test_passes.py`). Beside Blender's Cycles (four RenderFormer
+scenes, 128 x 128, one ray a pixel) positions differ by 7 micrometres at most, normals by 0.02
+degrees in 99 of 100 pixels, and diffuse colours not at all; Cycles turns normals at rims by up to
+26 degrees, and counts what is scattered more than once into its glossy colour.
+
+## Asked for, or stored
+
+`trilight passes SRC --passes depth,normal,object --out FOLDER` writes one OpenEXR file a view, of a
+dataset or of any scene that `trilight convert` reads. `--set storage.passes=[depth,normal,object]`
+makes `trilight generate` store the same bytes in the shards, as `000000123.0.passes.exr`; by
+default nothing is stored. `sample.view_passes(["depth_axis_m"])` of a sample of a dataset returns
+the same numbers, whether they are stored or not: ids as int32, others as float32. `motion_px` needs
+a second moment or camera and is not stored. The pages of a dataset's report show small pictures of
+depth, normals, object ids, diffuse albedo and roughness, computed when they are written.
+
+- All channels are 32-bit floats, compressed without loss (ZIP). Ids below 2^24 are exact in them;
+  scenes with more triangles are refused.
+- `Z`, `A`, `N`, `P` and `Ng` are the names that compositors and viewers of OpenEXR use for depth,
+  alpha and layers of normals and positions. Other layers have the name of the pass, and channels
+  have one letter. Blender 4.5 opens the files as layers and takes `Depth` and `Alpha` from them
+  (`tests/pipeline/renders/test_passes_beside_cycles.py`); nobody has opened them in Nuke yet.
+- `A` is `coverage`, and is in every file. Numbers are not multiplied by it. Where it is 0, nothing
+  is met: ids are -1, depths infinite, and other channels 0 instead of NaN.
+
+The table says how many kB of a view of 256 x 256 pixels each pass takes (mean of 6 views of 3
+scenes with about 1,500 triangles, 2026-11-23). Depth, normal and object together take 400 kB, and
+all passes 2,450 kB, which is many times the compact picture. Computing and writing takes 0.05
+core-seconds a view for the three and 0.12 for all; reading a stored file takes 0.004 and 0.03. So
+storing pays where many readers want one pass without Embree. ZSTD would save a quarter, but only
+readers of OpenEXR from 3.4 on know it.
+
+## The passes
+"""
+
+_STORED_KB = {
+    "triangle": 24,
+    "object": 8,
+    "barycentric": 731,
+    "hit": 3,
+    "coverage": 2,
+    "depth_axis_m": 219,
+    "depth_ray_m": 242,
+    "position_m": 635,
+    "geometric_normal": 62,
+    "geometric_normal_camera": 61,
+    "shading_normal": 173,
+    "shading_normal_camera": 170,
+    "material_diffuse": 31,
+    "material_specular": 16,
+    "material_roughness": 9,
+    "material_emission": 5,
+}
+"""Measured size of a file with the pass and `coverage`."""
+
+_QUANTITIES = """# What can be asked of a scene
+
+Made from `storage/records/quantities.py` and `pipeline/shards/expression.py`.
+
+```sh
+trilight shards list DATA --where 'max(roughness) < 0.3 and lights_per_scene > 1'
+trilight shards select DATA --out NEW --where 'template in ("plane", "room") and min(coverage) > 0'
+trilight shards select DATA --out NEW --where 'min(noise_floor_linear_db) >= 35 and not any(at_cap)'
+```
+
+A condition compares numbers (`<`, `<=`, `>`, `>=`, `==`, `!=`, with `+`, `-`, `*`, `/`) and texts
+(`==`, `!=`, `in`), joined by `and`, `or` and `not`. What a scene has several of goes through
+`min(...)`, `max(...)` or `mean(...)`, truths through `any(...)` or `all(...)`. Of no values at all
+these are not a number, and no comparison with that holds. Nothing else is carried out.
+"""
+
+_KINDS = {"text": "a text", "texts": "texts", "truths": "truths"}
+
+_MAPS = """# Surfaces and skies: what they are drawn from
+
+Made from the draws themselves: `scene_templates/surfaces` and
+`scene_templates/skies` state each range where they draw from it, and tests compare what comes out
+with it. [Surfaces and skies](../explanation/surfaces-and-skies.md) says how they are made. Colours
+are linear, with Rec.709 primaries.
+
+The tables are those of natural colours (`SurfaceMapSettings.natural_share`,
+`SkyMapSettings.coloured_share`). A natural base colour is the stated one times a tint, whose
+channels are uniform from {least_tint:g} to 1. In the other surfaces, each channel of each base
+colour is uniform in `SurfaceMapSettings.albedo`. Natural lights are black bodies; a mired is a
+million over the temperature in kelvin. In the other skies, each channel of each light is uniform
+from {palest:g} to 1, and the colour is then scaled to a mean of 1. What is drawn several times,
+such as the power of each lamp, stands once.
+"""
+
+_SEEDS = 32
+"""Draws of each family, so that what it draws only sometimes is seen too."""
+
+
+def passes_page() -> str:
+    """Return the page: every pass with its meaning, channels, unit and averaging."""
+    rows = [_row(each) for each in declared_passes()]
+    columns = (
+        *("pass", "shorter", "what it means", "channels", "unit", "frame", "averaging"),
+        *("in OpenEXR", "kB"),
+    )
+    return f"{_PASSES}\n{table(columns, rows)}\n"
+
+
+def _row(each: Pass) -> tuple[str, ...]:
+    channels = " ".join(each.channels) or "1"
+    stored = each.name != MOTION
+    return (
+        f"`{each.name}`",
+        f"`{each.short}`" if each.short and stored else "",
+        *(each.means, channels, each.unit, each.frame, each.averaging),
+        " ".join(f"`{channel}`" for channel in each.exr_channels) if stored else "",
+        str(_STORED_KB.get(each.name, "")),
+    )
+
+
+def quantities_page() -> str:
+    """Return the page: what can be asked of a scene in `--where`."""
+    numbers = [
+        (f"`{name}`", "a number" if each.per == "scene" else f"numbers, for each {each.per}",
+         each.label)
+        for name, each in QUANTITIES.items()
+    ]  # fmt: skip
+    others = [(f"`{name}`", _KINDS[kind], means) for name, (kind, means) in TEXTS.items()]
+    return f"{_QUANTITIES}\n{table(('name', 'what it is', 'of what'), [*numbers, *others])}\n"
+
+
+def maps_page() -> str:
+    """Return the page: what every procedural surface and sky is drawn from."""
+    parts = [_MAPS.format(least_tint=LEAST_TINT, palest=PALEST), "## Surfaces\n"]
+    for name in OUR_SURFACES:
+        parts += _family(name, SURFACES[name], surface_draws(name))
+    parts.append("## Skies\n")
+    for name in OUR_SKIES:
+        parts += _family(name, SKIES[name], sky_draws(name))
+    return "\n".join(parts)
+
+
+def surface_draws(name: str) -> Mapping[str, StatedDraw]:
+    """Return all that a family of surfaces draws by name, in natural colours."""
+    made: dict[str, StatedDraw] = {}
+    albedo = SurfaceMapSettings().albedo
+    for seed in range(_SEEDS):
+        draws = SurfaceDraws(rng_for(seed, "page"), natural_share=1.0, albedo=albedo)
+        SURFACES[name](draws, Texels(1))
+        made |= draws.made
+    return _but(made, "natural colours", ": tint")
+
+
+def sky_draws(name: str) -> Mapping[str, StatedDraw]:
+    """Return all that a family of skies draws by name, in natural colours."""
+    made: dict[str, StatedDraw] = {}
+    settings = SkyMapSettings()
+    for seed in range(_SEEDS):
+        draws = SkyDraws(
+            rng_for(seed, "page"),
+            coloured_share=0.0,
+            sun_elevation_deg=settings.sun_elevation_deg,
+            sun_to_sky=settings.sun_to_sky,
+        )
+        SKIES[name](draws, SkyTexels(1))
+        made |= draws.made
+    return _but(made, "coloured lights")
+
+
+def _but(made: Mapping[str, StatedDraw], *said_above: str) -> dict[str, StatedDraw]:
+    return {label: draw for label, draw in made.items() if not label.endswith(said_above)}
+
+
+def _family(
+    name: str, family: Callable[..., object], made: Mapping[str, StatedDraw]
+) -> Iterator[str]:
+    yield f"### `{name}`\n\n{' '.join((inspect.getdoc(family) or '').split())}\n"
+    yield table(("drawn", "distribution"), [(label, str(draw)) for label, draw in made.items()])
+    yield ""
+
+
+PAGES: dict[str, Callable[[], str]] = {
+    "settings": settings_page,
+    "command-line": command_line_page,
+    "passes": passes_page,
+    "quantities": quantities_page,
+    "surfaces-and-skies": maps_page,
+}
+"""Pages below docs/reference by their names."""
