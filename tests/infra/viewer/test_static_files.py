@@ -45,7 +45,6 @@ def test_every_element_that_a_script_asks_for_is_in_its_page() -> None:
     scripts = {
         "scene.html": ("scene.js", "pictures.js", "edits.js", "ask.js"),
         "dataset.html": ("dataset.js", "ask.js"),
-        "run.html": ("run.js", "ask.js"),
         "folder.html": ("folder.js", "ask.js"),
     }
     for page, names in scripts.items():
