@@ -39,6 +39,13 @@ def test_cells_and_titles_are_text() -> None:
     assert not {"script", "iframe"} & set(tags.tags)
 
 
+def test_only_the_script_of_a_page_runs() -> None:
+    text = page("x", "y", script="show()").decode()
+    assert "<script>show()</script>" in text
+    # sha256 of "show()", as openssl dgst -binary | base64 gives it
+    assert "script-src 'sha256-bZcXq6A55386WOhnm+CkmXOdvD/gkjsQT5fkz6gxfg8='\"" in text
+
+
 def test_only_the_last_columns_are_numbers() -> None:
     assert str(table(("a", "b"), [("x", 1)], numbers=1)).count('class="n"') == 2
     assert "class" not in table((), [("x", "y")])
