@@ -22,7 +22,7 @@ from tests.pipeline.documents.dataset_by_hand import (
     sample,
     write_dataset,
 )
-from tests.pipeline.documents.pages_read import HARM, Tags, read
+from tests.pipeline.documents.pages_read import HARM, Tags, read, text_of
 
 ACTIVE = {"script", "iframe", "link", "object", "embed", "form", "base"}
 
@@ -34,10 +34,6 @@ def report_of(dataset: Dataset, max_scenes: int = 48) -> Path:
 def pages(report: Path) -> dict[Path, Tags]:
     files = [report, *sorted((report.parent / "report").glob("*"))]
     return {path: read(path.read_bytes()) for path in files}
-
-
-def text_of(tags: Tags) -> str:
-    return " ".join(" ".join(tags.text).split())
 
 
 def hostile(root: Path) -> Dataset:
