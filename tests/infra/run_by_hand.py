@@ -9,13 +9,13 @@ from tests.train.kit import tiny_run
 from train.folder import RunFolder
 
 
-def write_run(root: Path, *, steps: int = 12) -> None:
-    """Write settings and a log of `steps` steps with validations and a spike."""
+def write_run(root: Path) -> None:
+    """Write settings and a log of 12 steps with validations and a spike."""
     folder = RunFolder(root)
     root.mkdir(parents=True)
     folder.settings.write_text(json.dumps({"settings": settings_record(tiny_run())}))
     rows: list[dict[str, Any]] = []
-    for step in range(2, steps + 1, 2):
+    for step in range(2, 13, 2):
         rows.append({"step": step, "loss": 1 / step, "views_per_s": 3.0})
         if step % 4 == 0:
             scores = {"log_l1": 0.1, "psnr_log_db_median": 20.0}

@@ -32,10 +32,7 @@ def test_every_file_that_a_page_names_is_there() -> None:
         if path.suffix not in (".html", ".js"):
             continue
         text = path.read_text()
-        for place in re.findall(r'(?:src|href)="static/([^"]+)"', text):
-            assert (STATIC / place).is_file(), (path, place)
-            named += 1
-        for place in re.findall(r'from "\./([^"]+)"', text):
+        for place in re.findall(r'(?:(?:src|href)="static|from "\.)/([^"]+)"', text):
             assert (STATIC / place).is_file(), (path, place)
             named += 1
     assert named > 15
