@@ -47,19 +47,9 @@ class RunFolder:
         return self.root / "notes.jsonl"
 
     @property
-    def pictures(self) -> Path:
-        """Small pictures of some validations (watching.pictures)."""
-        return self.root / "pictures"
-
-    @property
     def watching(self) -> Path:
         """Stacks of a step that hung, and traces of the profiler."""
         return self.root / "watching"
-
-    @property
-    def page(self) -> Path:
-        """All of it on one page, which `trilight train` and `trilight inspect` write."""
-        return self.root / "index.html"
 
     @property
     def summary(self) -> Path:

@@ -2,8 +2,6 @@
 
 from collections.abc import Mapping
 
-from train.folder import RunFolder
-
 
 class TrainProgress:
     """Receives the events of a run: noted, then begin, then advance and validated in turns.
@@ -32,9 +30,6 @@ class TrainProgress:
 
     def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
         """The validation split was judged after `step` steps (evaluation.scores)."""
-
-    def recorded(self, folder: RunFolder) -> None:
-        """Something new stands in the folder of the run: a row of its log, a note, a picture."""
 
     def hung(self, text: str) -> None:
         """A step does not end and the run was asked to stop then; called from another thread.

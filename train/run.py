@@ -105,7 +105,7 @@ def train_run(
     recorder = None
     if crew.is_first:
         recorder = _recorder(state, settings, folder, judge, progress, watched)
-        _note_beginning(folder, state, crew, judge, early.texts, resumed=start.resume)
+        _note_beginning(folder, state, crew, early.texts, resumed=start.resume)
     trainer = Trainer(
         state=state,
         settings=settings,
@@ -182,7 +182,6 @@ def _note_beginning(
     folder: RunFolder,
     state: TrainState,
     crew: Crew,
-    judge: Judge | None,
     notes: Sequence[str],
     *,
     resumed: bool,
@@ -190,10 +189,7 @@ def _note_beginning(
     """Write down that a call of the trainer began or went on, and what it said until now."""
     how = "went on" if resumed else "began"
     many = "process" if crew.world_size == 1 else "processes"
-    began = f"{how} on {crew.device}, {crew.world_size} {many}"
-    rival = {"median_log_l1": judge.median_scores["log_l1"]} if judge else {}
-    add_note(folder.notes, state.step, began, **rival)
-    for text in notes:
+    for text in (f"{how} on {crew.device}, {crew.world_size} {many}", *notes):
         add_note(folder.notes, state.step, text)
 
 

@@ -5,8 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from infra.run_page.page import write_run_page
-from infra.run_page.page_progress import PageProgress
 from infra.torch_library import require_torch
 from train.runs import changed_run, named_run
 from train.settings import TrainSettings
@@ -66,7 +64,7 @@ def train_network(
         workers: threads that decode samples; as many as the machine has to spare unless said.
         device: cpu or cuda; by default cuda where there is one.
         watched: how the run is watched, such as WatchSettings(profile=5).
-        progress: receives the progress of the run; unless given, the run's page is kept up to date.
+        progress: receives the progress of the run; by default nothing does.
 
     Raises:
         TrilightError: PyTorch is not installed, a setting or the data is refused, or the folder
@@ -94,10 +92,9 @@ def train_network(
         crew=Crew(device=choose_device(device)),
         workers=workers,
         watched=watched,
-        progress=PageProgress() if progress is None else progress,
+        progress=progress,
     )
     assert result is not None  # the first process of a crew of one
-    write_run_page(Path(out))
     return result
 
 

@@ -37,15 +37,14 @@ COMMANDS = {
     "verify": "Check every hash, member and law of a dataset; exit 1 with a list of what is wrong."
     "\n\nAn unfinished dataset is checked as far as it exists; the exit status is 1 then too.",
     "inspect": "Rewrite report, gallery and contact sheet, and print what the dataset holds."
-    "\n\nFor the folder of a training run, its page index.html is rewritten: curves, pictures, "
-    "layers, spikes, notes and settings."
+    "\n\nFor the folder of a training run, its progress and last figures are printed."
     "\n\nFor a dataset that is read-only or on a server, only a summary is printed, unless --out "
     "names a folder. For a scene file, its summary and what could not be carried over are printed.",
     "view": "Open a page on this machine: turn a scene in 3D beside its path traced picture and "
-    "those of networks, browse a dataset, or see the pictures of a training run over steps.",
+    "those of networks, or browse a dataset.",
     "model": "Print parameters, FLOPs and memory by precision of a named size or of a checkpoint.",
     "status": "Report a dataset's progress, estimated finish and failures; needs no server.",
-    "train": "Train a model; writes checkpoints, curves and pictures on one page, and a sheet."
+    "train": "Train a model; writes checkpoints, curves and pictures for TensorBoard, and a sheet."
     "\n\nTo train with processes on several machines, run torchrun -m trilight train ...",
     "evaluate": "Evaluate a network; writes evaluation.json, evaluation.md and sheets of pictures.",
     "improve": "Generate, train and judge in rounds, and generate next where a core-second teaches "

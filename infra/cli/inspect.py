@@ -18,8 +18,7 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.options import Shown, command
-from infra.run_page.page import write_run_page
-from infra.run_page.record import facts_of, is_run, read_record
+from infra.run_record import is_run, run_facts, tensorboard_command
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.sampled import described_shards
@@ -88,16 +87,13 @@ def inspect(asked: Inspected, shown: Shown) -> None:
 
 
 def _inspect_run(root: Path, *, json: bool) -> None:
-    """Write the page of a run, and say how far it is."""
-    page = write_run_page(root)
-    record = read_record(root)
+    """Say how far a run is."""
+    facts = run_facts(root)
     if json:
-        print_json(facts_of(record))
+        print_json(facts)
         return
-    print_rows(
-        str(root), [(name.replace("_", " "), str(v)) for name, v in facts_of(record).items()]
-    )
-    look_at(f"Look at {page}")
+    print_rows(str(root), [(name.replace("_", " "), str(value)) for name, value in facts.items()])
+    look_at(f"Curves and pictures: {tensorboard_command(root)}")
 
 
 def _require_shards(opened: Dataset) -> None:

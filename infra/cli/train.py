@@ -5,7 +5,6 @@ import os
 import shlex
 import sys
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -16,13 +15,12 @@ from rich.text import Text
 from infra.cli.changes import Shared, all_changes, run_record
 from infra.cli.console import console, look_at, print_rows, progress_bars
 from infra.cli.options import Shown, command
-from infra.run_page.page import write_run_page
-from infra.run_page.page_progress import PageProgress
-from infra.run_page.record import is_run
+from infra.run_record import tensorboard_command
 from infra.torch_library import require_torch
 from infra.train_order import TrainOrder
 from storage.errors import TrilightError
 from storage.settings.described import option_words
+from train.progress import TrainProgress
 from train.runs import in_proportion, named_run
 from train.settings import TrainSettings
 from train.watching.settings import WatchSettings
@@ -32,8 +30,8 @@ if TYPE_CHECKING:
     from train.result import TrainResult
 
 
-class _BarProgress(PageProgress):
-    """Shows a run as a progress bar, each validation as a line, and all of it as a page."""
+class _BarProgress(TrainProgress):
+    """Shows a run as a progress bar, and each validation as a line."""
 
     def __init__(self, bars: Bars) -> None:
         self._bars = bars
@@ -87,8 +85,8 @@ class _BarProgress(PageProgress):
         _end(text, 1)
 
 
-class _QuietProgress(PageProgress):
-    """Shows nothing but the page."""
+class _QuietProgress(TrainProgress):
+    """Shows nothing."""
 
     def hung(self, text: str) -> None:
         _end(text, 1)
@@ -159,10 +157,6 @@ def _trained(
             again = [] if order.restartable else ["--resume"]
             command = shlex.join(["trilight", *typed, *again])
             raise Stopped(stopped.step, command) from stopped
-        finally:
-            if crew.is_first and is_run(Path(order.place)):
-                with suppress(TrilightError):  # no reason to lose what else is said
-                    write_run_page(Path(order.place))
 
 
 def _announce(order: TrainOrder, settings: TrainSettings) -> None:
@@ -195,8 +189,8 @@ def _report(result: "TrainResult") -> None:
         ("weights", str(result.folder.weights)),
     ]
     print_rows("Training finished", rows)
-    if result.scores is not None:
-        look_at(f"Look at {result.folder.sheet} and {result.folder.page}")
+    sheet = "" if result.scores is None else f"Look at {result.folder.sheet}\n"
+    look_at(f"{sheet}Curves and pictures: {tensorboard_command(result.folder.root)}")
 
 
 def _said(event: "Event") -> str:

@@ -1,4 +1,4 @@
-"""`trilight view`: a page on this machine to look at scenes, a dataset or a training run."""
+"""`trilight view`: a page on this machine to look at scenes or a dataset."""
 
 import os
 import signal
@@ -20,8 +20,8 @@ class Viewed:
     """What to look at, and where the page is."""
 
     source: str
-    """A scene in any form that render reads, a folder of such files, a dataset (folder or URL), or
-    the folder of a training run."""
+    """A scene in any form that render reads, a folder of such files, or a dataset (folder or
+    URL)."""
     checkpoint: str | None = None
     """A network to show beside the two that come with Trilight, in any form that render takes; by
     default only these."""

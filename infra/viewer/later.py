@@ -4,7 +4,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Protocol
 
-from infra.run_page.record import is_run
+from infra.run_record import is_run, tensorboard_command
 from infra.viewer.server import Answer, Question, Route, routed
 from infra.viewer.static_files import static_routes
 from storage.dataset.layout import DatasetFolder
@@ -34,7 +34,10 @@ def page_of(source: str) -> str:
     path = Path(source)
     if path.is_dir():
         if is_run(path):
-            return "run.html"
+            raise TrilightError(
+                f"{source}: the folder of a training run; expected scenes or a dataset. Its curves "
+                f"and pictures: `{tensorboard_command(path)}`."
+            )
         if DatasetFolder(path).manifest.exists():
             return "dataset.html"
         from infra.viewer.scene_list import scene_list  # slow: formats
@@ -43,7 +46,7 @@ def page_of(source: str) -> str:
         return "folder.html"
     if not Path(source.rpartition(_KEY)[0] or source).exists():
         raise TrilightError(
-            f"{source}: no such file; expected a scene, or the folder of a dataset or a run."
+            f"{source}: no such file; expected a scene, a folder of scenes, or a dataset."
         )
     return "scene.html"
 

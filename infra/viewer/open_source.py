@@ -1,4 +1,4 @@
-"""Opens what SRC of `trilight view` means: one scene or many, a dataset, or the folder of a run."""
+"""Opens what SRC of `trilight view` means: one scene or many, or a dataset."""
 
 import os
 from pathlib import Path
@@ -6,7 +6,6 @@ from pathlib import Path
 from infra.viewer.dataset_room import DatasetRoom
 from infra.viewer.folder_room import FolderRoom, scene_room
 from infra.viewer.later import PageRoom, page_of
-from infra.viewer.run_room import RunRoom
 from infra.viewer.scene_list import scene_list
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
@@ -19,8 +18,8 @@ def opened_room(source: str, *, checkpoint: str | None, threads: int | None) -> 
     """Open a source.
 
     Args:
-        source: a scene as `trilight render` takes it, a folder of such files, a dataset (folder or
-            URL), or a run's folder.
+        source: a scene as `trilight render` takes it, a folder of such files, or a dataset
+            (folder or URL).
         checkpoint: a network to show beside the built-in ones.
         threads: of the tracer; None for one for each core.
 
@@ -28,8 +27,6 @@ def opened_room(source: str, *, checkpoint: str | None, threads: int | None) -> 
         TrilightError: the source is unusable.
     """
     page = page_of(source)
-    if page == "run.html":
-        return RunRoom(Path(source))
     if page == "folder.html":
         return FolderRoom(scene_list(Path(source)), _tracer(threads), checkpoint)
     if page == "dataset.html":

@@ -40,9 +40,8 @@ def scene_list(root: Path) -> SceneList:
             break
     if not names:
         raise TrilightError(
-            f"{root}: neither a dataset nor a run, and holds no scene; expected a folder that "
-            "`trilight generate` or `trilight train` wrote, or files "
-            f"{' '.join(readable())} in it."
+            f"{root}: no dataset, and holds no scene; expected a folder that `trilight generate` "
+            f"wrote, or files {' '.join(readable())} in it."
         )
     return SceneList(root=root, names=tuple(names[:MOST_FILES]), is_cut=len(names) > MOST_FILES)
 

@@ -1,10 +1,14 @@
 """The gallery of a report: cards that lead to a page of each scene."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
-from pipeline.documents.gallery_controls import CardFacts, card_facts, gallery_controls
+from pipeline.documents.gallery_controls import (
+    CardFacts,
+    card_attributes,
+    card_facts,
+    gallery_controls,
+)
 from pipeline.documents.html import Markup, element, image, joined, png_uri
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, preview
 from storage.atomic import write_atomically
@@ -20,19 +24,9 @@ MOST_SCENES = 1000
 _CARD_PX = 176
 
 
-@dataclass(frozen=True, kw_only=True)
-class Gallery:
-    """Cards that lead to the pages of scenes."""
-
-    markup: Markup
-    """The cards with their filters."""
-    style: str
-    """What the filters need in the page's style."""
-
-
 def write_gallery(
     dataset: Dataset, failures: Sequence[Failure], out: DatasetFolder, max_scenes: int
-) -> Gallery:
+) -> Markup:
     """Write the pages of up to `max_scenes` scenes and return the cards that lead to them.
 
     Pages of scenes that are no longer shown are deleted.
@@ -62,14 +56,12 @@ def write_gallery(
         facts.append(card_facts(sample, entry.split))
     _remove_others(out, names)
     shown = f"{len(chosen)} of {dataset.manifest.num_samples} scenes, by their first view."
-    controls = gallery_controls(facts)
-    rows = zip(cards, controls.classes, controls.places, strict=True)
     linked = [
-        element("a", card, href=link, class_=classes, style=places)
-        for (card, link), classes, places in rows
+        element("a", card, href=link, class_="card", **attributes)
+        for (card, link), attributes in zip(cards, card_attributes(facts), strict=True)
     ]
-    parts = [element("p", shown), controls.markup, element("div", *linked, class_="cards")]
-    return Gallery(markup=joined(parts), style=controls.style)
+    gallery = element("div", *linked, class_="cards")
+    return joined([element("p", shown), gallery_controls(facts), gallery])
 
 
 def _card(sample: Sample, split: str) -> Markup:

@@ -1,10 +1,11 @@
-"""HTML pages that run no script and load nothing; text from outside never becomes markup.
+"""HTML pages that load nothing, and in which text from outside never becomes markup.
 
 Every function here escapes what it is given, unless it is `Markup`, which only these functions and
 the documents themselves make.
 """
 
 import base64
+import hashlib
 import html
 from collections.abc import Iterable, Sequence
 from urllib.parse import urlsplit
@@ -109,12 +110,18 @@ def table(
     return element("table", joined(lines), **attributes)
 
 
-def page(title: str, body: str, *, style: str = "") -> bytes:
-    """Return a whole page; `style` is added to that of all pages."""
+def page(title: str, body: str, *, style: str = "", script: str = "") -> bytes:
+    """Return a whole page; `style` is added to that of all pages, and `script` alone runs."""
+    policy = ""
+    if script:
+        sha256 = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        allowed = f"script-src 'sha256-{sha256}'"
+        policy = f'<meta http-equiv="Content-Security-Policy" content="{allowed}">'
+        body = joined([body, Markup(f"<script>{script}</script>")])
     text = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width">'
-        f"<title>{escape(title)}</title><style>{STYLE}{style}</style></head><body>\n"
+        f"{policy}<title>{escape(title)}</title><style>{STYLE}{style}</style></head><body>\n"
         f"{escape(body)}\n</body></html>\n"
     )
     # a lone surrogate, which JSON from outside may hold, has no UTF-8

@@ -1,7 +1,7 @@
 """`report.html`: a gallery of a dataset and its distributions, for people to look at.
 
-The report is one file without scripts; the pages of its gallery lie beside it in `report/`. It
-tells nothing of the clock or the machine: equal datasets give equal reports.
+The report is one file, whose only script filters its gallery; the pages of the gallery lie beside
+it in `report/`. It tells nothing of the clock or the machine: equal datasets give equal reports.
 """
 
 import json
@@ -11,6 +11,7 @@ from pathlib import Path
 from pipeline.documents import report_sections
 from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.gallery import write_gallery
+from pipeline.documents.gallery_controls import CONTROLS_SCRIPT, CONTROLS_STYLE
 from pipeline.documents.html import Markup, element, joined, page, table
 from pipeline.documents.report_maps import maps_section
 from pipeline.documents.scene_passes import passes_command
@@ -78,14 +79,15 @@ def write_report(
         element("p", *(element("a", name, href=f"#{name}") for name in anchors), class_="toc"),
         element("p", element("code", "trilight view .", class_="command"), _VIEWED),
         element("h2", "Gallery", id="gallery"),
-        gallery.markup,
+        gallery,
         element("h2", "In numbers"),
         _overview(dataset, found),
         *made.values(),
         _settings(dataset),
     ]
     title = f"Dataset {dataset.manifest.build}"
-    data = page(title, joined(body), style=_STYLE + gallery.style)
+    style = _STYLE + CONTROLS_STYLE
+    data = page(title, joined(body), style=style, script=CONTROLS_SCRIPT)
     write_atomically(folder.report, data)
     return folder.report
 

@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 
 from infra.release.page import write_page
-from infra.run_page.page import write_run_page
 from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.quality_page import Pair, encode_quality_page
 from pipeline.documents.report import write_report
 from tests.end_to_end.browser_kit import browser
 from tests.infra.release.test_release import beside
-from tests.infra.run_page.run_by_hand import write_run
 from tests.pipeline.documents.dataset_by_hand import five_scenes
 from tests.pipeline.documents.rows_by_hand import row
 from tests.pipeline.documents.test_quality_page import failure
@@ -37,11 +35,6 @@ def scene(folder: Path) -> Path:
     return min((folder / "report").glob("*.html"))
 
 
-def run(folder: Path) -> Path:
-    write_run(folder)
-    return write_run_page(folder)
-
-
 def gallery(folder: Path) -> Path:
     digest = f"smoke, digest {'0123456789abcdef' * 4}"
     shown = [beside("000000001", 31.0), beside("000000002", 28.0)]
@@ -60,7 +53,7 @@ def quality(folder: Path) -> Path:
     return page
 
 
-PAGES: tuple[Callable[[Path], Path], ...] = (report, scene, run, gallery, quality)
+PAGES: tuple[Callable[[Path], Path], ...] = (report, scene, gallery, quality)
 
 
 @pytest.mark.slow("browser")  # a browser

@@ -1,4 +1,4 @@
-"""A dataset's report in a browser: what a person filters, sorts and enlarges, without a script."""
+"""A dataset's report in a browser: what a person filters, sorts and enlarges."""
 
 from pathlib import Path
 
@@ -14,6 +14,7 @@ SHOWN = """[...document.querySelectorAll('.card')].filter(card => card.offsetPar
     .map(card => card.innerText.slice(0, 9)).join()"""
 COMMANDS = """[...document.querySelectorAll('.chosen')].filter(line => line.offsetParent)
     .map(line => line.querySelector('code').innerText).join()"""
+PICK = """document.querySelector('[name="{}"][value="{}"]').click()"""
 
 
 @pytest.mark.slow("browser")  # a browser
@@ -28,16 +29,21 @@ def test_a_person_looks_around(tmp_path: Path) -> None:
             assert page.run("document.querySelector('.cards').offsetTop") < 844
             everything = page.run(SHOWN)
             assert everything == "000000000,000000001,000000002,000000003,000000020"
-            page.run("document.getElementById('layout-1').click()")
+            page.run(PICK.format("layout", "plane"))
             assert page.run(SHOWN) == "000000000,000000002,000000003"
             assert page.run(COMMANDS).endswith("--out ../selected --template plane")
-            page.run("document.getElementById('split-2').click()")
+            page.run(PICK.format("split", "test"))
             assert page.run(SHOWN) == ""
-            page.run("document.getElementById('layout-0').click()")
-            page.run("document.getElementById('split-0').click()")
-            page.run("document.getElementById('order-3').click()")  # most triangles
+            page.run(PICK.format("layout", ""))
+            page.run(PICK.format("split", ""))
+            page.run(PICK.format("order", "2"))  # most triangles
             assert sorted(page.run(SHOWN).split(",")) == sorted(everything.split(","))
             assert page.run(SHOWN) != everything and page.run(COMMANDS) == ""
+            page.call("Emulation.setScriptExecutionDisabled", value=True)
+            page.open(f"{report.as_uri()}?{width}&bare")
+            assert page.run(SHOWN) == everything
+            assert not page.run("document.querySelector('.filters').offsetParent")
+            page.call("Emulation.setScriptExecutionDisabled", value=False)
             page.run("document.querySelector('.card').click()")
             page.until("document.querySelector('.zoom')")
             page.run("document.querySelector('.zoom').click()")

@@ -46,7 +46,7 @@ TOYS = {
     "--template toy --out data/corners"
 }
 """What a page says of scenes that the toys have none of."""
-ASKED = {"dataset.html": "rows", "scene.html": "scene", "folder.html": "folder", "run.html": "run"}
+ASKED = {"dataset.html": "rows", "scene.html": "scene", "folder.html": "folder"}
 
 pytestmark = [pytest.mark.slow("commands"), pytest.mark.timeout(900)]
 
@@ -137,7 +137,7 @@ def apart(line: str, desk: Path) -> None:
     ("page", "made"),
     [
         ("look-around", ["data/corners/report.html", "data/files/more/room.usdz"]),
-        ("read-the-reports", ["data/mine/templates.png", "runs/mine/index.html"]),
+        ("read-the-reports", ["data/mine/templates.png", "data/mine/report.html"]),
         ("stand-on-a-leaderboard", ["boards/mine/leaderboard.png", "data/for-others/views.csv"]),
         ("publish", ["data/small/gallery/index.html", "data/hub/manifest.json"]),
         ("mix-datasets", ["runs/mixed/model.safetensors"]),

@@ -15,7 +15,6 @@ from storage.records.scene_file import read_scene_file
 from tests.end_to_end.browser_kit import Browser, browser
 from tests.end_to_end.conftest import command
 from tests.end_to_end.tutorial_kit import viewed as served_page
-from tests.infra.run_page.run_by_hand import write_run
 from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
 from tests.scenes_by_hand import tiny_scene
 
@@ -243,21 +242,6 @@ def test_a_folder_of_scene_files_is_browsed_by_keyboard(
     page.tab_to("#back")
     page.press("Enter")
     page.until("document.body?.classList.contains('folder')")
-
-
-def test_a_run_shows_its_pictures_over_steps(page: Browser, tmp_path: Path) -> None:
-    write_run(tmp_path / "run")
-    pictures = tmp_path / "run" / "pictures"
-    (pictures / "step-000000008.png").write_bytes((pictures / "target.png").read_bytes())
-    with viewed(tmp_path / "run") as address:
-        opened(page, address, PHONE)
-        assert fits(page)
-        assert page.run("document.getElementById('caption').textContent") == "step 8"
-        page.tab_to("#step")
-        page.press("ArrowLeft")
-        assert page.run("document.getElementById('caption').textContent") == "step 4"
-        page.until("document.getElementById('picture').naturalWidth === 4")
-        assert page.run("document.querySelectorAll('#curves path').length") == 3
 
 
 def test_a_page_of_another_origin_reads_nothing(

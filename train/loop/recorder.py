@@ -1,4 +1,4 @@
-"""What the first process writes during a run beside checkpoints: its log, notes and pictures."""
+"""What the first process writes during a run beside checkpoints: its log and notes."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -17,7 +17,6 @@ from train.loop.state import TrainState
 from train.progress import TrainProgress
 from train.settings import TrainSettings
 from train.watching.notes import add_note
-from train.watching.pictures import keep_pictures
 from train.watching.rows import read_rows
 from train.watching.scalars import scalars
 from train.watching.weights_and_biases import BiasesBoard
@@ -50,7 +49,7 @@ class Board:
 
 
 class Recorder:
-    """Writes log, notes and pictures, and reports to the progress display."""
+    """Writes log, notes and curves, and reports to the progress display."""
 
     def __init__(
         self,
@@ -76,7 +75,6 @@ class Recorder:
         self._log.append(row)
         for board in self._boards:
             board.scalars(row)
-        self.progress.recorded(self._folder)
 
     def note(self, step: int, text: str) -> None:
         """Tell the user something, and keep it; a sentence without its full stop."""
@@ -102,9 +100,10 @@ class Recorder:
         judgement = self._judge.judge(state.shown, between)
         self.row({"step": state.step, "validation": judgement.scores})
         sheet = drawn_validation_sheet(self._settings, self._judge, judgement, state.step)
+        median = {"median_picture_log_l1": self._judge.median_scores["log_l1"]}
         for board in self._boards:
+            board.scalars({"step": state.step, "validation": median})
             board.sheet(state.step, sheet)
-        keep_pictures(self._folder, self._judge, judgement, state.step)
         self.progress.validated(step=state.step, scores=judgement.scores)
 
     def close(self) -> None:

@@ -12,7 +12,7 @@ from storage.dataset.shard import scan_members
 from storage.errors import TrilightError
 from storage.records.sample import PartFloor
 from tests.command_line import trilight
-from tests.infra.run_page.run_by_hand import write_run
+from tests.infra.run_by_hand import write_run
 from tests.pipeline.documents.dataset_by_hand import (
     five_scenes,
     furnished,
@@ -38,12 +38,11 @@ def test_the_report_stands_in_the_dataset(tmp_path: Path) -> None:
     assert len(list((tmp_path / "report").iterdir())) == 5
 
 
-def test_the_page_stands_in_a_run(tmp_path: Path) -> None:
-    write_run(tmp_path / "run")
-    printed = inspect(tmp_path / "run")
-    assert "index.html" in printed.replace("\n", "") and "steps planned" in printed
-    assert (tmp_path / "run/index.html").exists()
-    assert json.loads(inspect(tmp_path / "run", "--json"))["steps"] == 12
+def test_a_run_is_summed_up_and_the_command_that_shows_it_named(tmp_path: Path) -> None:
+    write_run(tmp_path / "my run")
+    printed = inspect(tmp_path / "my run")
+    assert f"tensorboard --logdir '{tmp_path}/my run'" in printed and "steps planned" in printed
+    assert json.loads(inspect(tmp_path / "my run", "--json"))["steps"] == 12
 
 
 @pytest.mark.usefixtures("bare_reports")

@@ -50,6 +50,17 @@ def wanted(engine: str = "traced", **changes: Any) -> Wanted:
     return wanted_of(request(engine, **changes), {engine: None}, 2)
 
 
+def room_of(painters: dict[str, Painter], target_px: int | None = None) -> SceneRoom:
+    scene, notes = tiny_scene(), ("a note",)
+    return SceneRoom(name="tiny", scene=scene, notes=notes, painters=painters, target_px=target_px)
+
+
+def until_begun(easel: Easel, job: Job) -> Job:
+    while job.state != "working":
+        easel.news(job.id, job.version)
+    return job
+
+
 def over(easel: Easel, job: Job) -> Job:
     while job.state in ("waiting", "working"):
         easel.news(job.id, job.version)
@@ -70,9 +81,7 @@ def test_a_finished_picture_is_kept_and_an_equal_question_costs_nothing() -> Non
 def test_who_asks_for_another_gives_up_the_one_at_hand() -> None:
     slow, quick = GreyPainter(0.1, waits=True), GreyPainter(0.5)
     easel = Easel(tiny_scene(), {"traced": slow, "hits": quick})
-    given_up = easel.ask(wanted())
-    while given_up.state != "working":
-        easel.news(given_up.id, given_up.version)
+    given_up = until_begun(easel, easel.ask(wanted()))
     never_begun = easel.ask(wanted(fov=50.0))
     last = over(easel, easel.ask(wanted("hits")))
     assert (given_up.state, never_begun.state, last.state) == ("cancelled", "cancelled", "done")
@@ -97,13 +106,8 @@ def test_a_failure_is_a_sentence_and_the_next_picture_comes() -> None:
 
 
 def test_the_end_waits_for_the_picture_at_hand() -> None:
-    slow = GreyPainter(0.1, waits=True)
-    room = SceneRoom(
-        name="tiny", scene=tiny_scene(), notes=(), painters={"traced": slow}, target_px=None
-    )
-    job = room.easel.ask(wanted())
-    while job.state != "working":
-        room.easel.news(job.id, job.version)
+    room = room_of({"traced": GreyPainter(0.1, waits=True)})
+    until_begun(room.easel, room.easel.ask(wanted()))
     room.close()
     assert room.easel._thread is not None and not room.easel._thread.is_alive()
 
@@ -153,10 +157,7 @@ def test_the_page_of_a_scene_is_told_all_of_it() -> None:
         "traced": GreyPainter(0.4, floor_db=40.0),
         "target": TargetPainter(TARGETS, ()),
     }
-    room = SceneRoom(
-        name="tiny", scene=tiny_scene(), notes=("a note",), painters=painters, target_px=16
-    )
-    with served(room) as asker:
+    with served(room_of(painters, 16)) as asker:
         facts = asker.ask("api/scene")[1]
         assert (facts["triangles"], facts["lights"], facts["views"]) == (3, 1, 2)
         for engine in ("target", "traced"):
@@ -166,22 +167,17 @@ def test_the_page_of_a_scene_is_told_all_of_it() -> None:
                 told = asker.ask(f"api/picture/{number}?after={told['version']}")[1]
         assert told["truth"] == "target" and told["floor_db"] == 40.0
         assert told["prices"] == [{"spp": 64, "core_s": 0.25, "floor_db": 40.0}]
-        assert asker.ask(f"api/shown/{number}?ev=1&tone=plain")[1][:4] == b"\x89PNG"
-        assert asker.ask(f"api/shown/{number}?as=error")[1][:4] == b"\x89PNG"
-        assert asker.ask(f"api/shown/{number}?ev=nan")[0] == 422
-        assert asker.ask(f"api/shown/{number}?ev=x")[0] == 422
+        for query in ("ev=1&tone=plain", "as=error"):
+            assert asker.ask(f"api/shown/{number}?{query}")[1][:4] == b"\x89PNG"
+        for path in (f"shown/{number}?ev=nan", f"shown/{number}?ev=x", "shown/77"):
+            assert asker.ask(f"api/{path}")[0] == 422
         assert asker.ask("api/texture/0")[0] == asker.ask("api/sky.bin")[0] == 404
-        assert asker.ask("api/shown/77")[0] == 422
 
 
 def test_a_scene_is_saved_with_its_changes_and_nothing_is_written_here() -> None:
     for form in [".glb", ".usda", ".safetensors", ".h5"]:
         with case(form):
-            room = SceneRoom(
-                name="tiny", scene=tiny_scene(), notes=(), painters={"traced": GreyPainter(0.4)},
-                target_px=None,
-            )  # fmt: skip
-            with served(room) as asker:
+            with served(room_of({"traced": GreyPainter(0.4)})) as asker:
                 edits = {"lamps": {"1": {"gain": 2}}}
                 plain = asker.ask("api/export", {"form": form})
                 changed = asker.ask("api/export", {"form": form, "edits": edits})

@@ -8,20 +8,21 @@ import pytest
 from infra.viewer.later import LaterRoom, page_of
 from infra.viewer.server import NotThere, Question
 from storage.errors import TrilightError
-from tests.infra.run_page.run_by_hand import write_run
+from tests.infra.run_by_hand import write_run
 from tests.infra.viewer.test_server import EchoRoom
 
 
 def test_the_page_of_a_source(tmp_path: Path) -> None:
     write_run(tmp_path / "run")
     (tmp_path / "set").mkdir()
-    with pytest.raises(TrilightError, match="neither a dataset nor a run, and holds no scene"):
+    with pytest.raises(TrilightError, match="no dataset, and holds no scene"):
         page_of(str(tmp_path / "set"))
     (tmp_path / "set" / "room.glb").touch()
     assert page_of(str(tmp_path / "set")) == "folder.html"
     (tmp_path / "set" / "manifest.json").write_text("{}")
     (tmp_path / "a.tar").touch()
-    assert page_of(str(tmp_path / "run")) == "run.html"
+    with pytest.raises(TrilightError, match=r"a training run; .* `tensorboard --logdir /.*/run`"):
+        page_of(str(tmp_path / "run"))
     assert page_of(str(tmp_path / "set")) == "dataset.html"
     assert page_of("https://example.org/set") == "dataset.html"
     for scene in ("a.tar", "a.tar::000000000"):

@@ -35,6 +35,11 @@ class Tags(HTMLParser):
         self.text.append(data)
 
 
+def text_of(tags: Tags) -> str:
+    """Return the text of a page with single spaces."""
+    return " ".join(" ".join(tags.text).split())
+
+
 def read(page: bytes) -> Tags:
     tags = Tags()
     tags.feed(page.decode())

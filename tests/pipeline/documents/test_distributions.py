@@ -12,7 +12,6 @@ from pipeline.documents.distributions import Distributions, dataset_distribution
 from storage.dataset.dataset import open_dataset
 from storage.errors import TrilightError
 from storage.records.quantities import QUANTITIES, STATISTICS, summary
-from storage.records.sample import Sample
 from tests.for_each import with_folders
 from tests.pipeline.documents.dataset_by_hand import five_scenes, furnished, sample, write_dataset
 from tests.scenes_by_hand import tiny_scene
@@ -165,37 +164,18 @@ def test_each_shard_is_reported(tmp_path: Path) -> None:
     assert names == ["test-000005.tar", "train-000000.tar", "train-000001.tar"]
 
 
-def _without_template() -> Sample:
-    return sample(7, furnished([]).with_provenance({}))
-
-
-def _of_words() -> Sample:
-    return sample(7, furnished([]), noise_floor_db="quiet")
-
-
-def _unlawful() -> Sample:
-    scene = furnished(["a"])
-    return sample(7, dataclasses.replace(scene, faces=scene.faces + np.uint32(50)))
-
-
-def _without_cameras() -> Sample:
-    plain = sample(7, furnished([]))
-    one = plain.radiance_rgb[:1]
-    return dataclasses.replace(plain, views=plain.views[:1], radiance_rgb=one)
-
-
 def test_a_bad_sample_is_one_clear_line(tmp_path: Path) -> None:
-    for folder, make in with_folders(
-        tmp_path, [_without_template, _of_words, _unlawful, _without_cameras]
-    ):
-        _check_a_bad_sample_is_one_clear_line(folder, make)
-
-
-def _check_a_bad_sample_is_one_clear_line(tmp_path: Path, make: object) -> None:
-    assert callable(make)
-    dataset = write_dataset(tmp_path, {"train-000000.tar": [make()]})
-    with pytest.raises(TrilightError, match="sample 000000007: .*trilight verify"):
-        dataset_distributions(dataset)
+    plain, scene = sample(7, furnished([])), furnished(["a"])
+    bad = [
+        sample(7, furnished([]).with_provenance({})),
+        sample(7, furnished([]), noise_floor_db="quiet"),
+        sample(7, dataclasses.replace(scene, faces=scene.faces + np.uint32(50))),
+        dataclasses.replace(plain, views=plain.views[:1], radiance_rgb=plain.radiance_rgb[:1]),
+    ]
+    for folder, made in with_folders(tmp_path, bad):
+        dataset = write_dataset(folder, {"train-000000.tar": [made]})
+        with pytest.raises(TrilightError, match="sample 000000007: .*trilight verify"):
+            dataset_distributions(dataset)
 
 
 def test_bad_failures_are_one_clear_line(tmp_path: Path) -> None:

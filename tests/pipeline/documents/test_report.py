@@ -1,4 +1,4 @@
-"""`report.html` and its gallery: inert, complete, and the same whenever it is written."""
+"""`report.html` and its gallery: harmless, complete, and the same whenever it is written."""
 
 import re
 from pathlib import Path
@@ -22,7 +22,7 @@ from tests.pipeline.documents.dataset_by_hand import (
     sample,
     write_dataset,
 )
-from tests.pipeline.documents.pages_read import HARM, Tags, read
+from tests.pipeline.documents.pages_read import HARM, Tags, read, text_of
 
 ACTIVE = {"script", "iframe", "link", "object", "embed", "form", "base"}
 
@@ -34,10 +34,6 @@ def report_of(dataset: Dataset, max_scenes: int = 48) -> Path:
 def pages(report: Path) -> dict[Path, Tags]:
     files = [report, *sorted((report.parent / "report").glob("*"))]
     return {path: read(path.read_bytes()) for path in files}
-
-
-def text_of(tags: Tags) -> str:
-    return " ".join(" ".join(tags.text).split())
 
 
 def hostile(root: Path) -> Dataset:
@@ -74,11 +70,11 @@ def test_text_from_outside_stays_text(tmp_path: Path) -> None:
     shown = pages(report_of(hostile(tmp_path)))
     assert len(shown) == 2
     for path, tags in shown.items():
-        assert not ACTIVE & set(tags.tags)
+        own = ["script"] * (path.name == "report.html")
+        assert [tag for tag in tags.tags if tag in ACTIVE] == own
         assert not any(name.startswith("on") for name in tags.names)
         assert not any("javascript" in link for link in tags.links)
-        data = path.read_bytes()
-        assert not re.search(rb"<script|@import|url\(", data)
+        assert not re.search(rb"@import|url\(", path.read_bytes())
         assert "".join(tags.text).count(HARM) >= 4
     # the address is shown on the page of the scene, and is no link
     assert "javascript:alert(3)" in text_of(shown[tmp_path / "report" / "000000000.html"])

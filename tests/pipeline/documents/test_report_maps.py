@@ -19,7 +19,7 @@ from pipeline.documents.scene_maps import maps_section as maps_of_scene
 from storage.dataset.dataset import Dataset
 from storage.records.texture import MapSource, Texture
 from tests.pipeline.documents.dataset_by_hand import five_scenes, sample, write_dataset
-from tests.pipeline.documents.pages_read import HARM, read
+from tests.pipeline.documents.pages_read import HARM, read, text_of
 from tests.scenes_by_hand import tiny_scene
 from tests.textured_by_hand import sky, textured_scene
 
@@ -43,19 +43,14 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return dataset
 
 
-def words(data: bytes | str) -> str:
-    tags = read(data if isinstance(data, bytes) else data.encode())
-    return " ".join(" ".join(tags.text).split())
-
-
 def test_the_report_counts_maps(dataset: Dataset) -> None:
-    page = dataset.folder.report.read_bytes()
-    text = words(page)
+    page = read(dataset.folder.report.read_bytes())
+    text = text_of(page)
     assert "scenes textured 2 66.7% scenes below a sky 1 33.3%" in text
     assert "objects textured 0 0.0% floors and walls textured 2 66.7%" in text
     assert "texture colours 0 2 texture roughness 2" in text and "sky sky 0 1" in text
     assert "mean radiance of a sky 1 0.250 0.250 0.250 0.250" in text
-    assert "#maps" in read(page).links
+    assert "#maps" in page.links
 
 
 def test_a_plain_dataset_has_no_such_section(tmp_path: Path) -> None:
@@ -72,10 +67,10 @@ def test_the_card_says_how_many(dataset: Dataset) -> None:
 
 
 def test_a_scene_shows_its_maps(dataset: Dataset) -> None:
-    text = words((dataset.folder.report_pages / "000000000.html").read_bytes())
+    text = text_of(read((dataset.folder.report_pages / "000000000.html").read_bytes()))
     assert "colours 0 (diffuse) roughness sky 0 (environment, seen)" in text
     assert "sky 0 (environment, seen): mean radiance 0.25, brightest texel 1 times that" in text
-    plain = words((dataset.folder.report_pages / "000000002.html").read_bytes())
+    plain = text_of(read((dataset.folder.report_pages / "000000002.html").read_bytes()))
     assert "Textures and environment" not in plain
 
 

@@ -24,7 +24,6 @@ from train.loop.optim import Updater
 from train.loop.state import TrainState, mean_share, new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective
-from train.watching.notes import read_notes
 from train.watching.rows import read_rows
 
 CPU = torch.device("cpu")
@@ -133,7 +132,7 @@ def test_a_run_that_learns_late_is_the_same_run(
     assert first[1] is None
     assert rows[0]["loss"] == pytest.approx(sum(loss or 0 for loss in first) / 3)
     assert [row["skipped_steps"] for row in rows] == [1, 2]
-    skips = [note for note in read_notes(window.notes) if "was skipped" in note["text"]]
+    skips = [note for note in read_rows(window.notes) if "was skipped" in note["text"]]
     assert [note["step"] for note in skips] == [2, 7]
     assert all("its scenes were 0000" in note["text"] for note in skips)
 

@@ -44,3 +44,6 @@ def test_curves_and_sheets_survive_a_resume(
     assert shown == pytest.approx({row["step"]: row["loss"] for row in rows}, rel=1e-6)
     assert [event.step for event in events.Scalars("validation/log_l1")] == [4, 8, 12]
     assert {event.step for event in events.Images("validation")} == {4, 8, 12}
+    assert result.median_scores is not None
+    median = [event.value for event in events.Scalars("validation/median_picture_log_l1")]
+    assert median == pytest.approx([result.median_scores["log_l1"]] * 3, rel=1e-6)

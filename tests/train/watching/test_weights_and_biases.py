@@ -1,4 +1,4 @@
-"""What is logged to Weights & Biases, by a stand-in; and what is said where it is missing."""
+"""A row as single numbers, and what of it is logged to Weights & Biases, by a stand-in."""
 
 import sys
 from pathlib import Path
@@ -12,8 +12,9 @@ from storage.errors import TrilightError
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train.watching.rows import read_rows
+from train.watching.scalars import scalars
 from train.watching.settings import WatchSettings
-from train.watching.weights_and_biases import require_wandb
+from train.watching.weights_and_biases import BiasesBoard, require_wandb
 
 
 class StandIn(ModuleType):
@@ -41,16 +42,21 @@ class StandIn(ModuleType):
         self.finished += 1
 
 
+@pytest.fixture
+def package(monkeypatch: pytest.MonkeyPatch) -> StandIn:
+    package = StandIn()
+    monkeypatch.setitem(sys.modules, "wandb", package)
+    return package
+
+
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=4, validation=1, per_shard=4)
 
 
 def test_rows_and_sheets_of_a_run_are_logged_offline(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dataset: Dataset, package: StandIn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    package = StandIn()
-    monkeypatch.setitem(sys.modules, "wandb", package)
     monkeypatch.delenv("WANDB_MODE", raising=False)
     settings, out = tiny_run(num_steps=4), tmp_path / "mine"
     result = trained(
@@ -69,11 +75,9 @@ def test_rows_and_sheets_of_a_run_are_logged_offline(
     assert package.metrics == [("*", "step")] and package.finished == 1
 
 
-def test_a_mode_of_the_users_own_is_obeyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from train.watching.weights_and_biases import BiasesBoard
-
-    package = StandIn()
-    monkeypatch.setitem(sys.modules, "wandb", package)
+def test_a_mode_of_the_users_own_is_obeyed(
+    package: StandIn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("WANDB_MODE", "online")
     BiasesBoard("light", tmp_path, {})
     assert package.begun["mode"] == "online"
@@ -89,3 +93,26 @@ def test_where_it_is_missing_a_run_that_asks_for_it_does_not_begin(
             tiny_run(), [str(dataset.folder.root)], tmp_path, watched=WatchSettings(wandb="light")
         )
     assert list(tmp_path.iterdir()) == []
+
+
+def test_groups_become_names_and_what_is_no_number_is_left_out() -> None:
+    row = {
+        "step": 4,
+        "loss": 0.5,
+        "l1": None,
+        "time_s": {"data": 1.0},
+        "memory_mb": {"process": 2.0},
+        "layers": {"decoder.head": [1.0, 2.0, None]},
+        "own_s": [0.1, 0.2],
+    }
+    assert scalars(row) == {
+        "train/loss": 0.5,
+        "time_s/data": 1.0,
+        "memory_mb/process": 2.0,
+        "grad_norm/decoder.head": 1.0,
+        "weight_norm/decoder.head": 2.0,
+        "own_s/process 0": 0.1,
+        "own_s/process 1": 0.2,
+    }
+    assert scalars({"step": 4, "validation": {"log_l1": 0.1}}) == {"validation/log_l1": 0.1}
+    assert scalars({"step": 4, "spike": {"value": 3.0, "keys": ["a"]}}) == {}

@@ -1,0 +1,71 @@
+"""How far a training run is, from its folder and without torch."""
+
+import json
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from storage.errors import TrilightError
+from train.folder import RunFolder
+from train.watching.rows import read_rows
+
+FIGURES = {
+    "training_loss": ("loss",),
+    "validation_log_l1": ("validation", "log_l1"),
+    "validation_psnr_log_db_median": ("validation", "psnr_log_db_median"),
+    "views_per_s": ("views_per_s",),
+}
+"""Figures of which the last is told, and where they stand in a row of the log."""
+
+
+def is_run(root: Path) -> bool:
+    """Return whether a folder is one that a training wrote."""
+    folder = RunFolder(root)
+    return folder.settings.is_file() and folder.metrics.is_file()
+
+
+def tensorboard_command(root: Path) -> str:
+    """Return the command that shows curves and pictures of a run."""
+    return shlex.join(["tensorboard", "--logdir", str(root)])
+
+
+def run_facts(root: Path) -> dict[str, Any]:
+    """Return how far a run is, as JSON values; what is not known yet is left out.
+
+    Raises:
+        TrilightError: the folder holds no run, or a file that is damaged.
+    """
+    if not is_run(root):
+        raise TrilightError(f"{root}: no run here; expected a folder that `trilight train` wrote.")
+    folder = RunFolder(root)
+    try:
+        settings = json.loads(folder.settings.read_text())["settings"]
+        rows = read_rows(folder.metrics)
+        step, planned = max((row["step"] for row in rows), default=0), settings["num_steps"]
+        facts = {
+            "run": settings.get("run"),
+            "steps": step,
+            "steps_planned": planned,
+            "finished": folder.summary.exists() and step >= planned,
+            "spikes": sum("spike" in row for row in rows),
+        }
+        latest = {name: _latest(rows, names) for name, names in FIGURES.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise TrilightError(
+            f"{root}: settings.json or metrics.jsonl of the run is not readable ({error}). Restore "
+            "it from a copy."
+        ) from error
+    return facts | {name: value for name, value in latest.items() if value is not None}
+
+
+def _latest(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> float | None:
+    """Return the last finite number of a figure."""
+    for row in reversed(rows):
+        value: Any = row
+        for name in names:
+            value = value.get(name) if isinstance(value, Mapping) else None
+        if isinstance(value, int | float) and math.isfinite(value):
+            return value
+    return None
