@@ -250,5 +250,7 @@ def decode_config(text: str) -> ModelConfig:
         fields = without_removed(json.loads(text), REMOVED, "network: model")
         lists = {name: tuple(value) for name, value in fields.items() if isinstance(value, list)}
         return ModelConfig(**fields | lists)
+    except TrilightError:
+        raise
     except (TypeError, ValueError, AttributeError) as error:
         raise TrilightError(f"model config: not readable ({error}).") from error
