@@ -43,7 +43,7 @@ def test_a_checkpoint_is_described_and_published(tmp_path: Path) -> None:
     path.write_bytes(encode_weights(model))
     target = tmp_path / "published"
     text = printed(str(path), "--publish", str(target), "--json", "--resolution", "64")
-    assert json.loads(text)["config"]["window_bundles"] == 2
+    assert json.loads(text)["config"]["window_bundles"] == 8
     again = open_network(str(target))
     for (name, a), b in zip(again.named_parameters(), model.parameters(), strict=True):
         assert torch.equal(a, b), name
