@@ -53,7 +53,6 @@ class BaseWidths:
             num_heads=self.width // self.head_width,
             hidden_width=in_proportion(config.hidden_width),
             rope_num_freqs=1,
-            projected_freqs=0,
             dpt_features=in_proportion(config.dpt_features),
             dpt_channels=tuple(map(in_proportion, config.dpt_channels)),
             pixel_width=self.pixel_width if config.pixel_width else 0,

@@ -6,11 +6,10 @@ size cannot change: two stages, QK-norm over the full width, SwiGLU, RMSNorm bef
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, material_columns
-from storage.records.texture import TEXTURED
 from storage.registry import Registry
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -25,6 +24,9 @@ VERTEX_COORDINATES = 9
 
 NUM_TAPS = 4
 """Decoder layers that a DPT head reads (Ranftl et al. 2021)."""
+
+REMOVED: Mapping[str, Any] = {"projected_freqs": 0, "texture_cells": 0, "sky_cells": 0}
+"""Settings of earlier versions that files of networks may name, at the values that meant none."""
 
 HITS_PX = 8
 """Pictures of the view stage `hits` are a multiple of so many pixels wide."""
@@ -55,9 +57,6 @@ class ModelConfig:
     """Rotary frequencies per coordinate; 2 x 9 x rope_num_freqs may not exceed the head width."""
     rope_max_freq: Annotated[float, Within(1, 1000, unit="radians per metre")]
     """Highest rotary frequency in radians per metre; the lowest is 1, the rest log-spaced."""
-    projected_freqs: Annotated[int, Within(0, 64)] = 0
-    """bundles: rotary frequencies of each of the two picture coordinates at which a token lands, in
-    pairs of the head that vertices leave free; with 0, bundles are not told where tokens land."""
     register_eps: Annotated[float, Within(0, 1)] = 0.0
     """Added to the number of triangles by which the registers' mean position is divided; the
     published weights use 1e-5."""
@@ -98,12 +97,6 @@ class ModelConfig:
     """hits: whether anchors ask the scene's tokens; false leaves out the view-independent stage."""
     material_columns: tuple[str, ...] = PUBLISHED_COLUMNS
     """Material columns that the network reads, in the order of its input."""
-    texture_cells: Annotated[int, Within(0, 64, unit="cells")] = 0
-    """Cells along a side of the square in which a textured triangle's token is told its texture;
-    with 0, it is told the mean of the whole material. 4 or 8 suit triangles of some 30 pixels."""
-    sky_cells: Literal[0, 48, 192] = 0
-    """Tokens that are told the light of a sky, each by an equal part of the sphere; a scene without
-    a sky has none of them. With 0, the scene's tokens know no sky."""
     sky_rays: Annotated[int, Within(0, 64, unit="rays")] = 0
     """hits: rays towards the sky from each point that is shaded; with 0, the network knows no sky.
     0 with bundles."""
@@ -111,20 +104,13 @@ class ModelConfig:
     def __post_init__(self) -> None:
         if self.width % self.num_heads or self.head_width % 2:
             _wrong(f"width {self.width} in {self.num_heads} heads", "even heads of equal width")
-        if self.free_pairs < 0:
-            most = self.head_width // (2 * VERTEX_COORDINATES)
+        most = self.head_width // (2 * VERTEX_COORDINATES)
+        if self.rope_num_freqs > most:
             _wrong(f"rope_num_freqs {self.rope_num_freqs}", f"at most {most} for this head width")
-        if 2 * self.projected_freqs > self.free_pairs:
-            _wrong(
-                f"projected_freqs {self.projected_freqs} beside rope_num_freqs "
-                f"{self.rope_num_freqs}",
-                f"at most {self.free_pairs // 2} for this head width",
-            )
         if self.window_bundles % 2:
             _wrong(f"window_bundles {self.window_bundles}", "0 or an even number")
         _check_columns(self.material_columns)
         self._check_hits()
-        self._check_maps()
         if self.head == "dpt":
             self._check_dpt()
         elif self.dpt_features or self.dpt_channels or self.dpt_taps:
@@ -154,46 +140,20 @@ class ModelConfig:
                     f"and patch_px {self.patch_px}",
                     f"linear, 0 and {HITS_PX}",
                 )
-            if self.projected_freqs or self.demodulated:
-                _wrong("projected_freqs or demodulated with view_stage hits", "0 and false")
+            if self.demodulated:
+                _wrong("demodulated with view_stage hits", "false")
         elif any([*needed.values(), self.gather_rays, self.filter_width, not self.scene_tokens]):
             _wrong("fields of hits beside view_stage bundles", "0, and scene_tokens true")
+        elif self.sky_rays:
+            _wrong(f"sky_rays {self.sky_rays} with view_stage bundles", "0")
         elif self.demodulated != (self.hit_rays > 0):
             expected = "1 or more" if self.demodulated else "0, or demodulated true"
             _wrong(f"hit_rays {self.hit_rays} with view_stage bundles", expected)
-
-    def _check_maps(self) -> None:
-        for name in ("texture_cells", "sky_cells"):
-            if getattr(self, name) and not self.scene_tokens:
-                _wrong(f"{name} {getattr(self, name)} without scene_tokens", "0")
-        if self.texture_cells and (unread := set(TEXTURED) - set(self.material_columns)):
-            _wrong(f"texture_cells {self.texture_cells} without columns {sorted(unread)}", "0")
-        if self.sky_rays and self.view_stage != "hits":
-            _wrong(f"sky_rays {self.sky_rays} with view_stage bundles", "0")
-        if self.sky_cells and self.view_stage == "hits" and not self.sky_rays:
-            _wrong(
-                f"sky_cells {self.sky_cells} with view_stage hits", "0, or sky_rays of 1 or more"
-            )
-
-    @property
-    def knows_sky(self) -> bool:
-        """Whether the network is told the light of an environment."""
-        return bool(self.sky_rays if self.view_stage == "hits" else self.sky_cells)
 
     @property
     def head_width(self) -> int:
         """Width of one attention head."""
         return self.width // self.num_heads
-
-    @property
-    def vertex_pairs(self) -> int:
-        """Pairs of channels of a head that vertices turn: the first ones."""
-        return VERTEX_COORDINATES * self.rope_num_freqs
-
-    @property
-    def free_pairs(self) -> int:
-        """Pairs of channels of a head that no vertex turns."""
-        return self.head_width // 2 - self.vertex_pairs
 
     @property
     def picture_px(self) -> int:

@@ -34,8 +34,7 @@ class LinearHead(nn.Module):
         self.patch_px = config.patch_px
         self.taps = (config.decoder_layers - 1,)
         self.norm = Norm(config.width, eps=LAYER_NORM_EPS)
-        self.channels = picture_channels(config)
-        self.last = nn.Linear(config.width, self.channels * config.patch_px**2)
+        self.last = nn.Linear(config.width, picture_channels(config) * config.patch_px**2)
 
     def forward(self, taps_MQW: Sequence[Tensor]) -> Tensor:
         """Return pictures [M, channels, R, R]."""
@@ -143,8 +142,7 @@ class DptHead(nn.Module):
         )
         self.halve = nn.Conv2d(features, features // 2, 3, padding=1)
         self.widen = nn.Conv2d(features // 2, LAST_CHANNELS, 3, padding=1)
-        self.channels = picture_channels(config)
-        self.last = nn.Conv2d(LAST_CHANNELS, self.channels, 1)
+        self.last = nn.Conv2d(LAST_CHANNELS, picture_channels(config), 1)
 
     def forward(self, taps_MQW: Sequence[Tensor]) -> Tensor:
         """Return pictures [M, channels, R, R]."""

@@ -130,8 +130,7 @@ class CrossAttention(nn.Module):
     """Attention of ray bundles to the tokens of their scene.
 
     Keys and values are projected once per scene and rotated once per view: the rotation is what
-    carries the camera. Queries stand at the camera's origin, where the rotation is the identity,
-    but for where on the picture they are, if keys are told that too (model.projected).
+    carries the camera. Queries stand at the camera's origin, where the rotation is the identity.
     """
 
     def __init__(self, width: int, num_heads: int) -> None:
@@ -152,24 +151,14 @@ class CrossAttention(nn.Module):
         return k_BHND, split_heads(self.v(normed_BNW), self.num_heads)
 
     def forward(
-        self,
-        x_BVQW: Tensor,
-        keys_values: KeysValues,
-        rotation_BVNA: Rotation,
-        keys: Keys,
-        rotation_QA: Rotation | None = None,
+        self, x_BVQW: Tensor, keys_values: KeysValues, rotation_BVNA: Rotation, keys: Keys
     ) -> Tensor:
-        """[B, V, Q, W] -> [B, V, Q, W]; keys turn by the first rotation, queries by the second.
-
-        `keys` are those of scenes, or packed for each view of each.
-        """
+        """[B, V, Q, W] -> [B, V, Q, W]; `keys` are those of scenes, or packed for each view."""
         num_views = x_BVQW.shape[1]
         k_BHND, v_BHND = keys_values
         k_BVHND = rotate(k_BHND[:, None], *rotation_BVNA)
         v_BVHND = v_BHND[:, None].expand_as(k_BVHND)
         q_BVHQD = split_heads(self.q_norm(self.q(x_BVQW)), self.num_heads)
-        if rotation_QA is not None:
-            q_BVHQD = rotate(q_BVHQD, *rotation_QA)
         if isinstance(keys, Tensor):
             keys = keys.repeat_interleave(num_views, dim=0)
         attended = attend(q_BVHQD.flatten(0, 1), k_BVHND.flatten(0, 1), v_BVHND.flatten(0, 1), keys)
@@ -220,15 +209,12 @@ class DecoderLayer(nn.Module):
         x_BVQW: Tensor,
         keys_values: KeysValues,
         rotation_BVNA: Rotation,
-        rotation_QA: Rotation | None,
         keys: Keys,
         windows: Windows | None,
     ) -> Tensor:
         """[B, V, Q, W] -> [B, V, Q, W]; `keys_values` are those of this layer's `cross`."""
         views = x_BVQW.shape[:2]
-        x_BVQW = x_BVQW + self.cross(
-            self.cross_norm(x_BVQW), keys_values, rotation_BVNA, keys, rotation_QA
-        )
+        x_BVQW = x_BVQW + self.cross(self.cross_norm(x_BVQW), keys_values, rotation_BVNA, keys)
         x_MQW = torch.flatten(x_BVQW, 0, 1)
         x_MQW = x_MQW + self.self_attention(self.self_norm(x_MQW), windows=windows)
         return (x_MQW + self.ffn(self.ffn_norm(x_MQW))).unflatten(0, views)

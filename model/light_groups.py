@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.sky.symmetries import scaled
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 
@@ -34,17 +33,17 @@ def light_groups(scene: Scene, most: int) -> list[LightGroup]:
     Emitting triangles that touch are one lamp and stay together, since the faces of a lamp block
     each other's light. Lamps within the bounding box of an object are never grouped with others:
     networks are trained on lights that hang outside. What has no area gives no light and is left
-    out. A sky lights the first group.
+    out.
 
     Args:
-        scene: passes `Scene.check`.
+        scene: passes `Scene.check`, and has no environment.
         most: emitting triangles of a group; only a single lamp may have more.
 
     Returns:
         One group with the very scene, at a share of 1, where that is enough.
     """
     emitting_E = np.flatnonzero(scene.triangle_emits)
-    if not len(emitting_E):  # a sky alone
+    if not len(emitting_E):
         return [LightGroup(scene=scene, share=1.0)]
     corners_E33 = scene.vertex_positions[scene.faces[emitting_E]].astype(np.float64)
     lamp_E = _lamps(corners_E33)
@@ -56,10 +55,7 @@ def light_groups(scene: Scene, most: int) -> list[LightGroup]:
     lit = [
         (lamps, power / sum(powers)) for lamps, power in zip(groups, powers, strict=True) if power
     ]
-    return [
-        _group(scene, emitting_E[~np.isin(lamp_E, lamps)], share, has_sky=number == 0)
-        for number, (lamps, share) in enumerate(lit)
-    ]
+    return [_group(scene, emitting_E[~np.isin(lamp_E, lamps)], share) for lamps, share in lit]
 
 
 def _lamps(corners_E33: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -123,16 +119,14 @@ def _emitted_power(
     return area_E * emission_E3.mean(axis=1, dtype=np.float64)
 
 
-def _group(scene: Scene, others: NDArray[np.int64], share: float, *, has_sky: bool) -> LightGroup:
+def _group(scene: Scene, others: NDArray[np.int64], share: float) -> LightGroup:
     materials = scene.materials.copy()
     materials[:, EMISSION] /= share
-    sky = scene.environment if has_sky else None
     alone = dataclasses.replace(
         scene,
         faces=np.delete(scene.faces, others, axis=0),
         material_index=np.delete(scene.material_index, others),
         object_index=np.delete(scene.object_index, others),
         materials=materials,
-        environment=None if sky is None else scaled(sky, 1 / share),
     )
     return LightGroup(scene=alone, share=share)

@@ -157,8 +157,6 @@ class NeuralRenderer:
         c2w: ArrayLike,
         fov_deg: float,
         resolution: int,
-        *,
-        skip_empty_bundles: bool = False,
     ) -> NDArray[np.float32]:
         """Return the picture [R, R, 3] of one camera, linear radiance of at least 0.
 
@@ -167,18 +165,16 @@ class NeuralRenderer:
             c2w: [4, 4] camera to world.
             fov_deg: full field of view in degrees.
             resolution: as in `render`.
-            skip_empty_bundles: compute no bundle that no triangle can reach, and leave it black;
-                the others see fewer of their kind then, and change (docs/tradeoffs.md).
 
         Raises:
-            TrilightError: the resolution is none for this network, or its windows have to be whole.
+            TrilightError: the resolution is none for this network.
         """
         self.require_resolution(resolution)
         c2w_44 = torch.as_tensor(np.asarray(c2w, np.float32), device=self.device)
         angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
         total = torch.zeros(resolution, resolution, 3, dtype=torch.float64)
         for encoded, share in prepared.groups:
-            log10_RR3 = _decode(self._model, encoded, c2w_44, angle, resolution, skip_empty_bundles)
+            log10_RR3 = _decode(self._model, encoded, c2w_44, angle, resolution)
             total += share * radiance(log10_RR3.double().cpu()).clamp(min=0)
         picture: NDArray[np.float32] = total.numpy().astype(np.float32)
         return picture
@@ -207,13 +203,13 @@ class NeuralRenderer:
         """Return the scene with the light of its sky alone, or without it where it is not known."""
         sky = scene.environment
         if sky is not None:
-            known = self._model.config.knows_sky
+            known = self._model.config.sky_rays
             sky = dataclasses.replace(sky, is_seen=False) if known else None
         return dataclasses.replace(scene, environment=sky)
 
     def _notes(self, scene: Scene, num_groups: int) -> tuple[str, ...]:
         notes = []
-        knows_sky = self._model.config.knows_sky
+        knows_sky = self._model.config.sky_rays
         if scene.environment is not None and not knows_sky:
             notes.append(
                 "the scene has an environment, whose light this network does not know: it is "
@@ -258,16 +254,11 @@ def _encode(model: RenderFormer, scene: Scene, device: torch.device) -> EncodedS
 
 
 def _decode(
-    model: RenderFormer,
-    encoded: EncodedScene,
-    c2w_44: Tensor,
-    fov_deg: Tensor,
-    resolution: int,
-    skip_empty_bundles: bool,
+    model: RenderFormer, encoded: EncodedScene, c2w_44: Tensor, fov_deg: Tensor, resolution: int
 ) -> Tensor:
     """Return log10(1 + radiance) [R, R, 3] from one camera."""
     camera = Cameras(c2w_BV44=c2w_44[None, None], fov_deg_BV=fov_deg[None, None])
-    return model.decode(encoded, camera, resolution, skip_empty_bundles=skip_empty_bundles)[0, 0]
+    return model.decode(encoded, camera, resolution)[0, 0]
 
 
 def _free_bytes(device: torch.device) -> int | None:

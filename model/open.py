@@ -4,7 +4,6 @@ ours, shipped      builtin:hits (builtin: for short), builtin:tokens
 our own            model.safetensors of `trilight train`, or the folder that holds one
 published, local   a folder with config.json and model.safetensors
 published, hub     microsoft/renderformer-v1-base, microsoft/renderformer-v1.1-swin-large
-published, cells   cells:PLACE, either of the two with its texture input as wide as it was
 
 A caller may add forms: `open_network(place, network_of_run)` also opens the checkpoints of training
 (train.loop.checkpoints).
@@ -54,9 +53,6 @@ BUILTIN_NETWORKS = {
     BUILTIN_TOKENS: _SHIPPED / "tokens" / WEIGHTS_NAME,
 }
 """File of each network that comes along, by its name; its card, README.md, is beside it."""
-
-CELLS = "cells:"
-"""Before the place of published weights: their texture input is not folded (model.published)."""
 
 MAX_CONFIG_BYTES = 1 << 16
 """A published config.json has about 1 KiB."""
@@ -114,24 +110,17 @@ def find_network(place: str | Path, *finders: Finder) -> FoundNetwork:
         TrilightError: there is none, or it holds pickled code.
     """
     source = str(place)
-    with_cells = source.startswith(CELLS)
-    source = source.removeprefix(CELLS)
     if source.startswith(BUILTIN) and source not in BUILTIN_NETWORKS:
         raise TrilightError(
             f"checkpoint {source}: no such network comes along; "
             f"{expected_one_of(source, sorted(BUILTIN_NETWORKS))}."
         )
     path = BUILTIN_NETWORKS.get(source, Path(source))
-    for finder in () if with_cells else finders:
+    for finder in finders:
         if found := finder(path):
             return found
     weights = _weights_file(source, path)
     metadata = read_metadata(weights)
-    if CONFIG_KEY in metadata and with_cells:
-        raise TrilightError(
-            f"checkpoint {place}: not published weights, but a network that says itself whether it "
-            f"reads cells of textures (texture_cells); expected {source}."
-        )
     if CONFIG_KEY in metadata:
         return FoundNetwork(
             path=weights,
@@ -143,7 +132,7 @@ def find_network(place: str | Path, *finders: Finder) -> FoundNetwork:
         path=weights,
         trained=PUBLISHED_RANGE,
         any_width=False,
-        open=lambda: _published(weights, with_cells),
+        open=lambda: _published(weights),
     )
 
 
@@ -170,10 +159,9 @@ def _weights_file(source: str, path: Path) -> Path:
     return weights
 
 
-def _published(weights: Path, with_cells: bool) -> RenderFormer:
+def _published(weights: Path) -> RenderFormer:
     tensors, _ = read_tensors(weights)
-    config = _read_config(weights.parent / CONFIG_NAME)
-    return from_published(tensors, config, cells=with_cells)
+    return from_published(tensors, _read_config(weights.parent / CONFIG_NAME))
 
 
 def _has_pickles(folder: Path) -> bool:

@@ -136,7 +136,6 @@ def token_places(
         positions_BN33=torch.cat([registers_BR33, triangles_BT33], dim=1),
         scale_BN11=scale_BN11,
         is_key_BN=is_key_BN,
-        num_registers=num_registers,
         lengths=None if num_triangles is None else tuple(num_registers + n for n in num_triangles),
     )
 

@@ -22,9 +22,8 @@ from model.hits.tracing import (
 from model.image_head import blacken
 from model.positions import TriangleRotary, token_places
 from model.precision import tf32
-from model.scene_tensors import Cameras, SceneBatch, batch_with_cells, in_units
+from model.scene_tensors import Cameras, SceneBatch, in_units
 from model.sky.known import require_known
-from model.sky.tokens import sky_batch, without_absent
 from model.triangle_encoder import TriangleEncoder
 from model.view_decoder import ViewDecoder
 from storage.errors import TrilightError
@@ -65,7 +64,7 @@ class RenderFormer(nn.Module):
         """
         if batch.albedo_BVRR6 is None and self.config.view_stage == "bundles":
             return self.decode(self.encode(batch), batch.cameras, resolution)
-        self._require(resolution, skip_empty_bundles=False)
+        self._require(resolution)
         if self.config.view_stage == "bundles":
             return self._bundles(
                 self._encoded(batch), batch.cameras, resolution, batch.albedo_BVRR6
@@ -106,28 +105,22 @@ class RenderFormer(nn.Module):
         """Return the scenes after the view-independent stage, if there is one."""
         for sky in batch.skies or ():
             require_known(sky, self.config)
-        registers = self.config.num_registers
-        skies = sky_batch(batch.skies, self.config.sky_cells, batch.triangles_BT33)
         places = token_places(
             batch.triangles_BT33,
             batch.is_triangle_BT,
-            num_registers=registers + (0 if skies is None else self.config.sky_cells),
+            num_registers=self.config.num_registers,
             eps=self.config.register_eps,
             num_triangles=batch.num_triangles,
         )
-        if skies is not None:
-            places = without_absent(places, skies, registers)
         keys_values: tuple[KeysValues, ...] = ()
         packing = None
         if self.encoder is not None:
             packing = self.encoder.packing(places)
-            batch = batch_with_cells(batch, self.config.texture_cells)
             if sides_BT12 is not None and unit_B3 is not None:
                 sides_BT12 = sides_BT12 / unit_B3.repeat(1, 4)[:, None]
                 batch = in_units(batch, unit_B3)
             with tf32(self.tf32):
-                sky_BSW = None if skies is None else self.encoder.sky(skies, unit_B3)
-                context_BNW = self.encoder(batch, places, sides_BT12, sky_BSW, packing)
+                context_BNW = self.encoder(batch, places, sides_BT12, packing)
                 keys_values = self.decoder.keys_values(context_BNW, places, packing)
         return EncodedScene(
             places=places,
@@ -137,14 +130,7 @@ class RenderFormer(nn.Module):
             surfaces=surfaces,
         )
 
-    def decode(
-        self,
-        scene: EncodedScene,
-        cameras: Cameras,
-        resolution: int,
-        *,
-        skip_empty_bundles: bool = False,
-    ) -> Tensor:
+    def decode(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
         """Return the pictures [B, V, R, R, 3] of any views of encoded scenes.
 
         On a CPU, views asked for one by one are as fast as together, in half the memory.
@@ -153,14 +139,11 @@ class RenderFormer(nn.Module):
             scene: of `encode`.
             cameras: B scenes by V views.
             resolution: a multiple of `config.picture_px`.
-            skip_empty_bundles: compute no bundle that no triangle can reach, and leave it black.
-                The others change a little, for the bundles of a view see each other.
 
         Raises:
-            TrilightError: the resolution is another, or empty bundles are to be skipped by a
-                network with windows, which have to be whole.
+            TrilightError: the resolution is another.
         """
-        self._require(resolution, skip_empty_bundles)
+        self._require(resolution)
         if isinstance(self.decoder, HitDecoder):
             with tf32(self.tf32):
                 traced = traced_cameras(scene.traced, cameras, resolution, self.config)
@@ -169,9 +152,7 @@ class RenderFormer(nn.Module):
         if self.config.demodulated:
             rays = self.config.hit_rays
             albedo_BVRR6 = albedo_of_cameras(scene.surfaces, cameras, resolution, rays)
-        return self._bundles(
-            scene, cameras, resolution, albedo_BVRR6, skip_empty_bundles=skip_empty_bundles
-        )
+        return self._bundles(scene, cameras, resolution, albedo_BVRR6)
 
     def _bundles(
         self,
@@ -179,40 +160,21 @@ class RenderFormer(nn.Module):
         cameras: Cameras,
         resolution: int,
         albedo_BVRR6: Tensor | None,
-        *,
-        skip_empty_bundles: bool = False,
     ) -> Tensor:
         """Return the pictures of ray bundles; `albedo` is that of a demodulated network."""
         with tf32(self.tf32):
-            if skip_empty_bundles:
-                pictures = [
-                    self.decoder.where_seen(scene.only(index), cameras.only(index), resolution)
-                    for index in range(len(cameras.fov_deg_BV))
-                ]
-                picture_BVRRC = torch.cat(pictures)
-            else:
-                picture_BVRRC = self.decoder(scene, cameras, resolution)
+            picture_BVRRC: Tensor = self.decoder(scene, cameras, resolution)
         if not self.config.demodulated or albedo_BVRR6 is None:
             return picture_BVRRC
         return composed(picture_BVRRC, albedo_BVRR6)
 
-    def _require(self, resolution: int, skip_empty_bundles: bool) -> None:
+    def _require(self, resolution: int) -> None:
         picture_px = self.config.picture_px
         if resolution < picture_px or resolution % picture_px:
             unit = "a window of ray bundles" if self.config.window_bundles else "a ray bundle"
             raise TrilightError(
                 f"resolution {resolution}: expected a multiple of {picture_px}, the width of "
                 f"{unit}. Choose the next one."
-            )
-        if skip_empty_bundles and self.config.view_stage == "hits":
-            raise TrilightError(
-                "skip_empty_bundles: this network's view stage has no ray bundles, it knows what "
-                "each pixel's rays hit. Render without it."
-            )
-        if skip_empty_bundles and self.config.window_bundles:
-            raise TrilightError(
-                "skip_empty_bundles: this network's view stage attends in windows, which have to "
-                "be whole. Render without it."
             )
 
     def recompute_activations(self, wanted: bool) -> None:
@@ -233,8 +195,6 @@ class RenderFormer(nn.Module):
             tokens.append(self.decoder.token_W)
         for token in tokens:
             nn.init.normal_(token, std=TOKEN_STD, generator=generator)
-        for weight in [] if self.encoder is None else self.encoder.zero_start():
-            nn.init.zeros_(weight)
         blacken(self.decoder.head)
 
 

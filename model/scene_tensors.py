@@ -23,13 +23,11 @@ from torch import Tensor
 from model.hits.textures import SurfaceTextures, surface_textures
 from model.hits.traced import Traced, stack_traced
 from model.sky.known import shining
-from model.texture_cells import TextureCells, stack_cells, texture_cells
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, chosen_columns, laid_out, material_columns
 from storage.records.scene import MAX_POSITION_M, Scene
-from storage.records.texture import TEXTURED
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,8 +55,6 @@ class SceneTensors:
     textures: SurfaceTextures | None = None
     """What such a network reads at each hit in the place of material columns; `material_TM` holds
     the means. None where nothing is textured."""
-    cells: TextureCells | None = None
-    """What tokens are told of textures, for a network with `texture_cells` (`with_cells`)."""
     sky: Environment | None = None
     """Light from far away; None where there is none, or none but black."""
 
@@ -79,10 +75,6 @@ class Cameras:
     """As in SceneTensors."""
     fov_deg_BV: Tensor
     """As in SceneTensors."""
-
-    def only(self, index: int) -> "Cameras":
-        """Return the views of one scene."""
-        return Cameras(c2w_BV44=self.c2w_BV44[[index]], fov_deg_BV=self.fov_deg_BV[[index]])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,8 +103,6 @@ class SceneBatch:
     """As in SceneTensors; None where a scene has None."""
     textures: tuple[SurfaceTextures | None, ...] | None = None
     """Those of each scene; None where no scene has any."""
-    cells: TextureCells | None = None
-    """Those of all scenes; None where no scene has any."""
     skies: tuple[Environment | None, ...] | None = None
     """That of each scene; None where no scene has any."""
 
@@ -177,41 +167,6 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
     )
 
 
-def with_cells(scene: SceneTensors, cells_a_side: int) -> SceneTensors:
-    """Return a scene with what tokens are told of its textures; itself where it has none, or for 0.
-
-    It is the last step before a batch: cells have the order of vertices and channels at this time.
-    """
-    if not cells_a_side or scene.textures is None:
-        return scene
-    cells = _cells(scene.textures, scene.material_TM, scene.columns, cells_a_side)
-    return dataclasses.replace(scene, cells=cells)
-
-
-def batch_with_cells(batch: SceneBatch, cells_a_side: int) -> SceneBatch:
-    """Return a batch with what `with_cells` gives its scenes; itself where they have it."""
-    if not cells_a_side or batch.textures is None or batch.cells is not None:
-        return batch
-    found = [
-        None
-        if textures is None
-        else _cells(textures, material_TM[: len(textures.rows_T3)], batch.columns, cells_a_side)
-        for textures, material_TM in zip(batch.textures, batch.material_BTM, strict=True)
-    ]
-    cells = stack_cells(found)
-    if cells is not None:
-        cells = cells.converted(lambda each: each.to(batch.material_BTM.device))
-    return dataclasses.replace(batch, cells=cells)
-
-
-def _cells(
-    textures: SurfaceTextures, material_TM: Tensor, columns: tuple[str, ...], cells_a_side: int
-) -> TextureCells | None:
-    places = {column.name: part for column, part in laid_out(columns)}
-    numbers_TC = torch.cat([material_TM[:, places[name]] for name in TEXTURED], dim=-1)
-    return texture_cells(textures, numbers_TC.detach().float().cpu().numpy(), cells_a_side)
-
-
 def tensors_of(scenes: SceneTensors | SceneBatch) -> dict[str, Tensor]:
     """Return the fields that are tensors, by name."""
     return {name: value for name, value in vars(scenes).items() if isinstance(value, Tensor)}
@@ -222,8 +177,6 @@ def converted(scenes: Scenes, convert: Callable[[Tensor], Tensor]) -> Scenes:
     fields: dict[str, Any] = {name: convert(each) for name, each in tensors_of(scenes).items()}
     if scenes.traced is not None:
         fields["traced"] = scenes.traced.converted(convert)
-    if scenes.cells is not None:
-        fields["cells"] = scenes.cells.converted(convert)
     return dataclasses.replace(scenes, **fields)
 
 
@@ -259,7 +212,6 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
         traced=stack_traced(traced, longest) if len(traced) == len(scenes) else None,
         albedo_BVRR6=torch.stack(albedo) if len(albedo) == len(scenes) else None,
         textures=None if all(each is None for each in textures) else textures,
-        cells=stack_cells([scene.cells for scene in scenes]),
         skies=None if all(each is None for each in skies) else skies,
     )
 

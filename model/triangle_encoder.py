@@ -6,7 +6,6 @@ Where it is enters through rotary positions alone. Registers stand at the mean o
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear
 
 from model.attention import Keys
 from model.config import ModelConfig
@@ -22,8 +21,6 @@ from model.positions import (
 )
 from model.precision import as_given
 from model.scene_tensors import SceneBatch
-from model.sky.tokens import SkyTokens
-from model.texture_cells import CHANNELS, TextureCells
 from storage.records.material import material_width
 
 SIDE_LIGHTS = 12
@@ -35,7 +32,6 @@ class TriangleTokens(nn.Module):
 
     The published network reads a 13 x 32 x 32 texture whose cells are all equal; that is a linear
     map of the ten numbers (its tangent-space normal is constant), at a thousandth of the input.
-    Where a triangle is textured, what its cells hold beyond their mean is a second linear map.
     """
 
     def __init__(self, config: ModelConfig) -> None:
@@ -47,33 +43,17 @@ class TriangleTokens(nn.Module):
         self.normal = nn.Linear(encoded_normal_width(self.octaves), config.width)
         self.normal_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
         self.light = nn.Linear(SIDE_LIGHTS, config.width) if config.view_stage == "hits" else None
-        inputs = CHANNELS * config.texture_cells**2
-        # no layer of its own: 0 at the start, and nothing else is drawn otherwise for its sake
-        self.cells_WC = nn.Parameter(torch.zeros(config.width, inputs)) if inputs else None
 
     def forward(
-        self,
-        material_BTM: Tensor,
-        normals_BT33: Tensor,
-        light_BTL: Tensor | None = None,
-        cells: TextureCells | None = None,
+        self, material_BTM: Tensor, normals_BT33: Tensor, light_BTL: Tensor | None = None
     ) -> Tensor:
         """Return tokens [B, T, W], float32 under autocast too.
 
         `light` is what the triangles' sides receive, in units of the scene's mean light; networks
-        with the view stage `hits` are told so. `cells` are those of textured triangles, whose rows
-        of `material` hold their means; every other token stays as it is, to the bit.
+        with the view stage `hits` are told so.
         """
         with as_given(material_BTM.device):
-            material_BTW = self.material(material_BTM)
-            if self.cells_WC is not None and cells is not None:
-                told_KW = linear(cells.apart_KCPP.flatten(1).to(material_BTW.dtype), self.cells_WC)
-                at = (cells.scene_K, cells.triangle_K)
-                material_BTW = material_BTW.index_put(at, told_KW, accumulate=True)
-            elif self.cells_WC is not None and torch.is_grad_enabled():
-                # a step without textures has a gradient of 0: resumed runs need every memory
-                material_BTW = material_BTW + 0 * self.cells_WC.sum()
-            material_BTW = self.material_norm(material_BTW)
+            material_BTW = self.material_norm(self.material(material_BTM))
             normal_BTW = self.normal_norm(self.normal(encode_normals(normals_BT33, self.octaves)))
             tokens_BTW = self.token_W + material_BTW + normal_BTW
             if self.light is None or light_BTL is None:
@@ -90,7 +70,6 @@ class TriangleEncoder(nn.Module):
         self.recompute = False
         self.columns = config.material_columns
         self.tokens = TriangleTokens(config)
-        self.sky = SkyTokens(config) if config.sky_cells else None
         self.registers_NW = nn.Parameter(torch.zeros(config.num_registers, config.width))
         self.layers = nn.ModuleList(
             EncoderLayer(config.width, config.num_heads, config.hidden_width)
@@ -106,26 +85,17 @@ class TriangleEncoder(nn.Module):
         batch: SceneBatch,
         places: TokenPlaces,
         light_BTL: Tensor | None = None,
-        sky_BSW: Tensor | None = None,
         packing: Packing | None = None,
     ) -> Tensor:
-        """Return the context [B, N, W] with N = registers + cells of the sky + triangles.
+        """Return the context [B, N, W] with N = registers + triangles.
 
-        `light_BTL` is as in TriangleTokens, `sky_BSW` of SkyTokens; None where no scene has a sky.
-        With a packing the context is one row of all tokens that exist, [1, P, W].
+        `light_BTL` is as in TriangleTokens. With a packing the context is one row of all tokens
+        that exist, [1, P, W].
         """
         materials = batch.material_of(self.columns)
-        cells = None if self.tokens.cells_WC is None else batch.cells
-        if cells is not None:
-            materials = cells.means_in(materials, self.columns)
-        tokens_BTW = self.tokens(materials, batch.normals_BT33, light_BTL, cells)
-        parts = [self.registers_NW.expand(len(tokens_BTW), -1, -1), tokens_BTW]
-        if sky_BSW is not None:
-            parts.insert(1, sky_BSW)
-        elif self.sky is not None and torch.is_grad_enabled():
-            # a step without skies has gradients of 0: resumed runs need every memory
-            parts[1] = tokens_BTW + 0 * sum(weight.sum() for weight in self.sky.parameters())
-        x_BNW = torch.cat(parts, dim=1).to(dtype_of(self.layers))
+        tokens_BTW = self.tokens(materials, batch.normals_BT33, light_BTL)
+        registers_BRW = self.registers_NW.expand(len(tokens_BTW), -1, -1)
+        x_BNW = torch.cat([registers_BRW, tokens_BTW], dim=1).to(dtype_of(self.layers))
         rotation = world_rotation(self.rotary, places)
         keys: Keys = places.is_key_BN
         if packing is not None:
@@ -141,7 +111,3 @@ class TriangleEncoder(nn.Module):
     def learned_tokens(self) -> list[nn.Parameter]:
         """Return the tokens that are learned as they are: drawn small at the start."""
         return [self.tokens.token_W, self.registers_NW]
-
-    def zero_start(self) -> list[nn.Parameter]:
-        """Return the weights that begin at 0, so that a network begins as it would without them."""
-        return [] if self.tokens.cells_WC is None else [self.tokens.cells_WC]

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from model.config import ModelConfig
-from model.empty_bundles import blacken_absent, bundles_that_see, fill_absent
 from model.encoded_scene import EncodedScene, KeysValues, TokenPlaces
 from model.image_head import build_head, stack_taps
 from model.layers import TOKEN_NORM_EPS, DecoderLayer, Norm, dtype_of, run_layer
@@ -23,7 +22,6 @@ from model.positions import (
     packed_camera_rotation,
 )
 from model.precision import as_given
-from model.projected import PictureRotary
 from model.rays import bundle_rays, ray_directions
 from model.rounding import rounded_call, rounded_parts_of
 from model.scene_tensors import Cameras
@@ -31,9 +29,6 @@ from model.windows import Windows, cut_windows
 
 Cuts = tuple[Windows | None, Windows | None]
 """Windows of even and of odd layers; None where every bundle sees all others."""
-
-Rotations = tuple[Rotation, Rotation | None]
-"""Of keys [B, V, N, A] and of bundles [Q, A]; None where bundles do not turn."""
 
 
 class ViewDecoder(nn.Module):
@@ -44,7 +39,6 @@ class ViewDecoder(nn.Module):
         self.rotary = rotary
         self.patch_px = config.patch_px
         self.window_bundles = config.window_bundles
-        self.projected = PictureRotary(config) if config.projected_freqs else None
         self.recompute = False
         self.token_W = nn.Parameter(torch.zeros(config.width))
         self.rays = nn.Linear(3 * config.patch_px**2, config.width)
@@ -74,54 +68,22 @@ class ViewDecoder(nn.Module):
         is_turned = scene.packing is not None
         fov_deg_BV = cameras.fov_deg_BV.T if is_turned else cameras.fov_deg_BV
         x_BVQW = self.bundle_tokens(fov_deg_BV, resolution)
-        rotations = self._rotations(scene, cameras, resolution)
+        rotation = camera_rotation(self.rotary, scene.places, cameras.c2w_BV44)
+        if scene.packing is not None:
+            rotation = packed_camera_rotation(rotation, scene.packing)
         cuts = self._cuts(resolution // self.patch_px, x_BVQW.device)
-        taps = self._taps(x_BVQW, scene, rotations, cuts)
+        taps = self._taps(x_BVQW, scene, rotation, cuts)
         weights = rounded_parts_of(self.head, self.head.rounded_parts(), x_BVQW.device)
         picture_MCRR = rounded_call(self.head, weights, taps)
         picture_BVRRC = picture_MCRR.movedim(1, -1).unflatten(0, fov_deg_BV.shape)
         return picture_BVRRC.transpose(0, 1) if is_turned else picture_BVRRC
 
-    def where_seen(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
-        """Return what `forward` returns for one scene, from the bundles that see it alone.
-
-        The others are black and cost nothing. View by view, as each keeps its own number of
-        bundles; a DPT, which also reads what lies around those, is given their mean there.
-        """
-        x_1VQW = self.bundle_tokens(cameras.fov_deg_BV, resolution)
-        sees_VQ = bundles_that_see(scene.places, cameras, resolution, self.patch_px)[0]
-        (cos, sin), asks = self._rotations(scene, cameras, resolution)
-        pictures = []
-        for view, sees_Q in enumerate(sees_VQ):
-            picture_CRR = x_1VQW.new_zeros((self.head.channels, resolution, resolution))
-            if sees_Q.any():
-                x_11QW = x_1VQW[:, [view]][:, :, sees_Q]
-                keys = cos[:, [view]], sin[:, [view]]
-                some = None if asks is None else (asks[0][sees_Q], asks[1][sees_Q])
-                taps_1QW = self._taps(x_11QW, scene, (keys, some), (None, None))
-                filled_1QW = [fill_absent(tap_1QW, sees_Q) for tap_1QW in taps_1QW]
-                picture_CRR = blacken_absent(self.head(filled_1QW)[0], sees_Q, self.patch_px)
-            pictures.append(picture_CRR)
-        return torch.stack(pictures).movedim(1, -1)[None]
-
-    def _rotations(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Rotations:
-        """Return the rotations of keys [B, V, N, A], or packed [1, V, P, A]; and of bundles."""
-        keys_BVNA = camera_rotation(self.rotary, scene.places, cameras.c2w_BV44)
-        bundles_QA = None
-        if self.projected is not None:
-            per_side = resolution // self.patch_px
-            bundles_QA = self.projected.of_bundles(per_side, keys_BVNA)
-            keys_BVNA = self.projected.of_tokens(keys_BVNA, scene.places, cameras, per_side)
-        if scene.packing is not None:
-            keys_BVNA = packed_camera_rotation(keys_BVNA, scene.packing)
-        return keys_BVNA, bundles_QA
-
     def _taps(
-        self, x_BVQW: Tensor, scene: EncodedScene, rotations: Rotations, cuts: Cuts
+        self, x_BVQW: Tensor, scene: EncodedScene, rotation: Rotation, cuts: Cuts
     ) -> list[Tensor]:
-        """Return what the head reads, [B V, Q, W] each."""
+        """Return what the head reads, [B V, Q, W] each; keys turn by `rotation`."""
         x_BVQW = x_BVQW.to(dtype_of(self.layers))
-        keys = scene.keys(views=rotations[0][0].shape[1])
+        keys = scene.keys(views=rotation[0].shape[1])
         outputs = {}
         for index, (layer, keys_values) in enumerate(
             zip(self.layers, scene.keys_values, strict=True)
@@ -130,7 +92,7 @@ class ViewDecoder(nn.Module):
                 layer,
                 x_BVQW,
                 keys_values,
-                *rotations,
+                rotation,
                 keys,
                 cuts[index % 2],
                 recompute=self.recompute,

@@ -14,10 +14,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load, save
 from torch import Tensor
 
-from model.config import ModelConfig
+from model.config import REMOVED, ModelConfig
 from model.renderformer import RenderFormer
 from storage.errors import TrilightError
 from storage.records.safe_read import MAX_HEADER_BYTES, safetensors_header
+from storage.removed import without_removed
 
 RANGE_KEY = "trilight_trained_range"
 """Metadata entry of a weights file."""
@@ -221,10 +222,7 @@ _LATER = (
     "pixel_width",
     "filter_width",
     "scene_tokens",
-    "projected_freqs",
     "demodulated",
-    "texture_cells",
-    "sky_cells",
     "sky_rays",
 )
 
@@ -243,10 +241,16 @@ def encode_config(config: ModelConfig) -> str:
 
 
 def decode_config(text: str) -> ModelConfig:
-    """Return the configuration of its JSON; raises TrilightError where it is none."""
+    """Return the configuration of its JSON.
+
+    Raises:
+        TrilightError: it is none, or uses what was removed.
+    """
     try:
-        fields = json.loads(text)
+        fields = without_removed(json.loads(text), REMOVED, "network: model")
         lists = {name: tuple(value) for name, value in fields.items() if isinstance(value, list)}
         return ModelConfig(**fields | lists)
+    except TrilightError:
+        raise
     except (TypeError, ValueError, AttributeError) as error:
         raise TrilightError(f"model config: not readable ({error}).") from error

@@ -18,7 +18,6 @@ from storage.dataset.training_data import TrainingData
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.extensions import recorded
-from storage.settings.described import settings_record
 from train.data.mixture import RECORD, mixture_of
 from train.folder import RunFolder
 from train.going_on import Event, GoingOn, event_records, going_on
@@ -42,6 +41,7 @@ from train.progress import TrainProgress
 from train.result import pretty_json
 from train.settings import TrainSettings
 from train.start import Start
+from train.stored_settings import stored_settings
 from train.watching.rows import read_rows
 
 
@@ -209,7 +209,7 @@ def _write_settings(
         **(more or {}),
     }
     now = {
-        "settings": settings_record(settings),
+        "settings": stored_settings(settings),
         "data_digest": data_digest,
         **({RECORD: state.mixture.record()} if state.mixture else {}),
         "history": event_records(state.history),

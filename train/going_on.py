@@ -16,6 +16,7 @@ from storage.settings.changes import changed, differences
 from storage.settings.described import described, from_record, settings_record
 from train.loop.schedule import decay_begins
 from train.settings import TrainSettings
+from train.stored_settings import known_settings
 
 DATA = "data"
 """Name by which a decision names other data; its value is the start of their digest, behind
@@ -80,7 +81,8 @@ def going_on(
         TrilightError: settings or data that differ and are no decision; all are named, with both
             values and both ways on. A decision that no run can take, or one of execution.
     """
-    step, before = header["step"], from_record(TrainSettings, header["settings"])
+    step = header["step"]
+    before = from_record(TrainSettings, known_settings(header["settings"], "resume"))
     old, past = settings_record(before), events_of(header.get("history", ()))
     named = {name: value for name, value in decisions.items() if name != DATA}
     _require_meaning(named)

@@ -50,11 +50,6 @@ Perceptual = Literal["lpips", "ms_ssim", "none"]
 weights."""
 
 
-LpipsPrecision = Literal["float32", "float16"]
-"""Precision of the features that LPIPS compares. A card multiplies `float32` in TF32; `float16`
-rounds to as many bits, in half the bytes, and overflows above 65504."""
-
-
 @checked("train settings")
 class LossSettings:
     """Terms of the loss (Zeng et al. 2025, section 4) and the weights of views."""
@@ -63,8 +58,6 @@ class LossSettings:
     """Perceptual term of the loss, on tone-mapped pictures."""
     perceptual_weight: Annotated[float, Within(0, 1000)] = 0.05
     """Weight of the perceptual term beside the L1 error of log10(1 + radiance)."""
-    lpips_precision: Annotated[LpipsPrecision, EXECUTION] = "float32"
-    """Precision of the features of LPIPS while training; validation and evaluation use float32."""
     noise_half: Annotated[float, Within(0, 10)] = 0.0
     """Root mean square noise of log10(1 + radiance) at which a view has half the weight of a
     noiseless one; 0 gives all views the same weight."""

@@ -104,10 +104,12 @@ def run_record(shared: Shared) -> dict[str, Any]:
     """Return the settings of the run that is to be followed, without its name.
 
     Raises:
-        TrilightError: the folder is not that of a run.
+        TrilightError: the folder is not that of a run, or the run uses what was removed.
     """
     if shared.like is None:
         return {}
+    from train.stored_settings import known_settings  # it brings the checker of settings along
+
     path = Path(shared.like) / "settings.json"
     try:
         settings = dict(json.loads(path.read_bytes())["settings"])
@@ -115,4 +117,5 @@ def run_record(shared: Shared) -> dict[str, Any]:
         raise TrilightError(
             f"--like {shared.like}: {path} cannot be read; expected the folder of a run."
         ) from error
-    return {name: value for name, value in settings.items() if name != "run"}
+    known = known_settings(settings, f"--like {shared.like}")
+    return {name: value for name, value in known.items() if name != "run"}

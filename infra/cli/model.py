@@ -1,13 +1,10 @@
-"""`trilight model`: what a network is and costs; its errors by precision; its export."""
+"""`trilight model`: what a network is and costs; its export."""
 
 import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from rich.table import Table
-
-from infra.cli.console import console, first_words, print_json, print_rows
-from infra.cli.layer_plot import plot_layer_errors
+from infra.cli.console import first_words, print_json, print_rows
 from infra.cli.options import Shown, command
 from storage.errors import TrilightError, expected_one_of
 from storage.settings.described import checked
@@ -16,7 +13,6 @@ from storage.settings.ranges import Within
 if TYPE_CHECKING:
     from model.config import ModelConfig
     from model.costs import Costs, Workload
-    from model.layer_errors import LayerError
     from model.renderformer import RenderFormer
 
 
@@ -36,12 +32,8 @@ class Counted:
 
 @checked()
 class Written:
-    """Further measurements and files."""
+    """Files to write."""
 
-    errors: bool = False
-    """Also measure the error of each precision against float64, layer by layer."""
-    plot: Path | None = None
-    """Picture of those errors to write, which implies --errors; by default none is written."""
     publish: Path | None = None
     """Folder to export the checkpoint to, under the published names; by default it is not exported.
     """
@@ -65,20 +57,12 @@ def model(counted: Counted, written: Written, shown: Shown) -> None:
         triangles=counted.triangles, views=counted.views, resolution=counted.resolution
     )
     found = costs(config, workload)
-    measured = _errors(network, config) if written.errors or written.plot else {}
-    if written.plot:
-        plot_layer_errors(measured, f"{name}, random scene", written.plot)
     if written.publish:
         _publish(name, network, written.publish)
     if shown.json:
-        errors = {
-            precision: list(map(dataclasses.asdict, rows)) for precision, rows in measured.items()
-        }
-        print_json(_as_json(name, config, workload, found) | ({"errors": errors} if errors else {}))
+        print_json(_as_json(name, config, workload, found))
         return
     _report(name, workload, found)
-    for precision, rows in measured.items():
-        _report_errors(precision, rows)
 
 
 def _open(name: str) -> "RenderFormer":
@@ -102,19 +86,6 @@ def _require_pictures(config: "ModelConfig", resolution: int) -> None:
             f"--resolution is {resolution}; expected a multiple of {config.picture_px}, as this "
             "network's ray bundles and windows need."
         )
-
-
-def _errors(network: "RenderFormer | None", config: "ModelConfig") -> "dict[str, list[LayerError]]":
-    """Return the errors of the precisions of a CPU, of a checkpoint or of random weights."""
-    from model.layer_errors import PROBE_RESOLUTION, layer_errors, probe_batch, random_network
-    from model.precision import PRECISIONS
-
-    network = network or random_network(config)
-    return {
-        name: layer_errors(network, probe_batch(), PROBE_RESOLUTION, name)
-        for name, precision in PRECISIONS.items()
-        if not precision.needs_cuda
-    }
 
 
 def _publish(name: str, network: "RenderFormer | None", folder: Path) -> None:
@@ -166,14 +137,3 @@ def _report(name: str, workload: "Workload", counted: "Costs") -> None:
     print_rows(
         f"{name}: {workload.triangles} triangles, {views} of {workload.resolution} pixels", rows
     )
-
-
-def _report_errors(precision: str, rows: "list[LayerError]") -> None:
-    table = Table(
-        "layer", "peak", "relative error", "largest error", box=None, title_justify="left"
-    )
-    table.title = f"{precision} against float64, random scene"
-    for row in rows:
-        numbers = (row.peak, row.relative_error, row.max_error)
-        table.add_row(row.layer, *(f"{number:.2e}" for number in numbers))
-    console.print(table)

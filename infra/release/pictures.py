@@ -103,7 +103,6 @@ def _engines(resolution: int, checkpoint: str) -> Mapping[str, Engine]:
         precision="float32",
         resolution=resolution,
         lights_per_pass=MAX_LIGHTS,
-        skip_empty_bundles=False,
         threads=None,
     )
     started = {NETWORK: network.start(_unwatched)}

@@ -178,8 +178,6 @@ class NeuralPlan:
     """Width of pictures."""
     lights_per_pass: int
     """Most emitting triangles of a group (model.light_groups)."""
-    skip_empty_bundles: bool
-    """Whether what no triangle reaches stays black (model.empty_bundles)."""
     threads: int | None
     """Of the processor; None for as many as torch takes."""
     name: str = "neural"
@@ -217,7 +215,7 @@ class NeuralEngine:
                 "precision": plan.precision,
                 "resolution": plan.resolution,
                 "lights_per_pass": plan.lights_per_pass,
-                "skip_empty_bundles": plan.skip_empty_bundles,
+                "skip_empty_bundles": False,  # removed: pictures made earlier are kept
             },
             "environment": {"torch": torch.__version__, "device": renderer.device.type},
         }
@@ -229,13 +227,7 @@ class NeuralEngine:
         seconds = time.perf_counter() - began
 
         def render(camera: ShotCamera, name: str) -> Rendered:
-            picture = renderer.view(
-                prepared,
-                camera.c2w,
-                camera.fov_deg,
-                plan.resolution,
-                skip_empty_bundles=plan.skip_empty_bundles,
-            )
+            picture = renderer.view(prepared, camera.c2w, camera.fov_deg, plan.resolution)
             too_bright = int((picture > HALF_FLOAT_MAX).any(axis=-1).sum())
             facts: dict[str, Fact] = {
                 "passes": len(prepared.groups),

@@ -197,7 +197,6 @@ def _neural(asked: Asked, checkpoint: str, resolution: int) -> NeuralPlan:
         precision=asked.precision,
         resolution=resolution,
         lights_per_pass=asked.lights_per_pass,
-        skip_empty_bundles=asked.skip_empty_bundles,
         threads=asked.threads,
     )
 

@@ -84,8 +84,6 @@ class Asked:
     lights_per_pass: Annotated[int, Within(1, 65_535, unit="triangles")] = 8
     """neural: maximum number of emitting triangles in one pass; the pictures of the passes are
     added up."""
-    skip_empty_bundles: bool = False
-    """neural: leave ray bundles that no triangle reaches black, which is faster and less exact."""
     albedo_over_one: AlbedoOverOne = "scale"
     """How to treat a material of a RenderFormer scene whose diffuse and specular albedos add up to
     more than 1: scale multiplies both by one factor, refuse leaves the scene out."""

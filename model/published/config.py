@@ -125,13 +125,8 @@ def encode_published(config: PublishedConfig) -> dict[str, Any]:
     doubled = model.rope_max_freq == _max_freq(model.rope_num_freqs, doubled=True)
     if model.head != "dpt":
         _unpublished("head linear", "dpt")
-    if model.projected_freqs or model.demodulated:
-        _unpublished(
-            f"projected_freqs {model.projected_freqs}, demodulated {model.demodulated}",
-            "0 and false",
-        )
-    if model.texture_cells:
-        _unpublished(f"texture_cells {model.texture_cells}", "0")
+    if model.demodulated:
+        _unpublished("demodulated True", "False")
     if model.material_columns != PUBLISHED_COLUMNS:
         _unpublished(f"material_columns {model.material_columns}", f"{PUBLISHED_COLUMNS}")
     if model.window_bundles not in (0, WINDOW_BUNDLES):

@@ -4,11 +4,9 @@ All layers are copied under another name but one. The published material encoder
 texture. Its input is always the same 13 numbers in every cell (x, y) with x + y <= P, and zero
 elsewhere, and three of them, the tangent-space normal, are always (0.5, 0.5, 1). So its weights may
 be summed over those cells, and the normal's share of the result belongs to the bias: the same
-function at a thousandth of the input and 10 million fewer weights (P = 32). Where materials are
-textured, what cells hold beyond their mean may be read by the very weights (`of_cells`).
+function at a thousandth of the input and 10 million fewer weights (P = 32).
 """
 
-import dataclasses
 from collections.abc import Mapping
 
 import torch
@@ -17,7 +15,6 @@ from torch import Tensor
 from model.config import NUM_TAPS, ModelConfig
 from model.published.config import PublishedConfig
 from model.renderformer import RenderFormer
-from model.texture_cells import CHANNELS
 from model.weights import network_of, require_tensors
 from storage.errors import TrilightError
 
@@ -25,17 +22,11 @@ FREQUENCY_TOLERANCE = 1e-6
 """Largest relative difference of the stored frequencies from the formula's: float32's rounding."""
 
 
-def from_published(
-    tensors: Mapping[str, Tensor], config: PublishedConfig, *, cells: bool = False
-) -> RenderFormer:
+def from_published(tensors: Mapping[str, Tensor], config: PublishedConfig) -> RenderFormer:
     """Return the network of published tensors, float32, in evaluation mode on the CPU.
 
     Args:
         tensors, config: as published.
-        cells: whether to keep what tells the cells of a texture apart. Scenes without textures
-            have the same pictures, to the bit. What it says of others nobody has trained: all cells
-            were equal there, so they had equal gradients, and their weights still differ as they
-            were drawn.
 
     Raises:
         TrilightError: names or shapes are not those of the configuration, each listed; or the
@@ -59,13 +50,7 @@ def from_published(
         for kind in ("weight", "bias"):
             if f"{theirs}.{kind}" in single:
                 state[f"{ours}.{kind}"] = single[f"{theirs}.{kind}"]
-    described = config.model
-    if cells:
-        described = dataclasses.replace(described, texture_cells=config.texture_patch)
-        state["encoder.tokens.cells_WC"] = of_cells(
-            single[f"{TEXTURE}.weight"], config.texture_patch
-        )
-    model = network_of(described, state)
+    model = network_of(config.model, state)
     for name in FREQUENCIES:
         _require_frequencies(name, single[name], model.encoder.rotary.freqs_F)
     return model
@@ -207,18 +192,6 @@ def fold(weight_WC: Tensor, bias_W: Tensor, patch: int) -> tuple[Tensor, Tensor]
     bias = bias_W.double() + (thirteen[:, NORMAL] * normal).sum(dim=1)
     ten = torch.cat([thirteen[:, : NORMAL.start], thirteen[:, NORMAL.stop :]], dim=1)
     return ten.to(weight_WC.dtype), bias.to(bias_W.dtype)
-
-
-def of_cells(weight_WC: Tensor, patch: int) -> Tensor:
-    """Return the weight [W, 7 P P] of what cells hold beyond their triangle's mean.
-
-    The published layer is linear: on cells it is `fold` of their mean, and this of the rest. Cells
-    that it reads beyond the longest side (x + y = P) hold the mean. Which axis of its texture is
-    which nothing published says; here it is as in its successor: rows, then columns.
-    """
-    cells = weight_WC.unflatten(1, (TEXTURE_CHANNELS, patch, patch))[:, :CHANNELS]
-    place = torch.arange(patch, device=weight_WC.device)
-    return (cells * (place[:, None] + place <= patch)).flatten(1)
 
 
 def unfold(weight_WC: Tensor, bias_W: Tensor, patch: int) -> tuple[Tensor, Tensor]:

@@ -1,1 +1,1 @@
-"""Light from far away, for networks: directions drawn by it, cells of it, and its symmetries."""
+"""Light from far away, for networks: directions drawn by it, and its symmetries."""

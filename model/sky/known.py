@@ -23,12 +23,11 @@ def require_known(sky: Environment | None, config: "ModelConfig") -> None:
     """
     if sky is None:
         return
-    if not config.knows_sky:
-        setting = "model.sky_rays=16" if config.view_stage == "hits" else "model.sky_cells=48"
+    if not config.sky_rays:
         raise TrilightError(
             "scene: it has an environment, and this network does not know its light; expected "
-            f"none. Use a network that knows skies ({setting}), or scenes without one "
-            "(scenes.skies.share=0)."
+            "none. Use a network of hits that knows skies (model.sky_rays=16), or scenes without "
+            "one (scenes.skies.share=0)."
         )
     if sky.is_seen:
         raise TrilightError(

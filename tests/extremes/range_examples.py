@@ -52,7 +52,7 @@ ASKED = Asked(
     source="a.json", out=Path("a.exr"), engine="mitsuba", checkpoint=None, resolution=64,
     noise_floor_db=40.0, max_spp=64, view=0, orbit=None, arc_deg=360.0, cameras=None, fps=24,
     tone_map="plain", exposure_ev=0.0, precision="float32", lights_per_pass=8,
-    skip_empty_bundles=False, seed=0, threads=None,
+    seed=0, threads=None,
 )  # fmt: skip
 SMOKE = named_build("smoke")
 RUN = named_run("smoke")
@@ -137,8 +137,6 @@ BESIDE: dict[tuple[type, str, End], dict[str, Any]] = {
     (ModelConfig, "decoder_layers", "low"): {"dpt_taps": (0, 0, 0, 0)},
     (ModelConfig, "patch_px", "low"): _LINEAR,
     (ModelConfig, "patch_px", "high"): _LINEAR,
-    (ModelConfig, "projected_freqs", "high"): {"width": 2 * (9 + 128), "num_heads": 1,
-                                               "rope_num_freqs": 1},
     (ModelConfig, "dpt_features", "low"): _LINEAR,
     (ModelConfig, "dpt_taps", "high"): {"decoder_layers": 256},
     **{(ModelConfig, name, "high"): _LINEAR | _HITS

@@ -203,12 +203,7 @@ NETWORKS: dict[str, ModelConfig] = {
         LEAST, normal_octaves=16, rope_max_freq=1000.0, register_eps=1.0, num_registers=64
     ),
     "most frequencies": dataclasses.replace(LEAST, width=18 * 64, rope_num_freqs=64),
-    "most projected frequencies": dataclasses.replace(
-        LEAST, width=2 * (9 + 128), projected_freqs=64, num_registers=1
-    ),
     "most rays of demodulated pixels": dataclasses.replace(LEAST, demodulated=True, hit_rays=8),
-    "most cells of a sky": dataclasses.replace(LEAST, sky_cells=192),
-    "most texture cells": dataclasses.replace(LEAST, texture_cells=64),
     "narrowest dpt": tiny_config("dpt", dpt_features=2, dpt_channels=(1, 1, 1, 1)),
 }
 

@@ -55,7 +55,6 @@ def test_base_takes_a_batch_on_the_meta_device() -> None:
         ({"rope_num_freqs": 0}, "from 1"),
         ({"rope_max_freq": 0.5}, "from 1"),
         ({"dpt_features": 4}, "dpt fields beside a linear head"),
-        ({"projected_freqs": 2}, "projected_freqs 2 beside rope_num_freqs 1; expected at most 1"),
         ({"demodulated": True}, "hit_rays 0 with view_stage bundles; expected 1 or more"),
         ({"hit_rays": 1}, "hit_rays 1 with view_stage bundles; expected 0, or demodulated true"),
         ({"head": "mlp"}, "head is 'mlp'; expected dpt or linear"),

@@ -15,7 +15,7 @@ from model.scene_tensors import batch_scenes
 from tests.for_each import for_each
 from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
 
-REPAIRED = tiny_config(patch_px=4, projected_freqs=1, demodulated=True, hit_rays=1)
+REPAIRED = tiny_config(patch_px=4, demodulated=True, hit_rays=1)
 
 
 @for_each(

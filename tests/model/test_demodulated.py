@@ -20,7 +20,7 @@ from tests.model.kit import RESOLUTION, awake, random_scene, render, tiny_config
 DEMODULATED = tiny_config(demodulated=True, hit_rays=2)
 KINDS = {
     "linear": DEMODULATED,
-    "4 pixels, projected": dataclasses.replace(DEMODULATED, patch_px=4, projected_freqs=1),
+    "4 pixels": dataclasses.replace(DEMODULATED, patch_px=4),
     "windows": dataclasses.replace(DEMODULATED, window_bundles=2),
     "dpt": dataclasses.replace(tiny_config("dpt"), demodulated=True, hit_rays=1),
 }
@@ -118,7 +118,7 @@ def test_albedo_that_a_loader_brings_gives_the_picture_that_the_network_asks_for
 
 
 def test_every_weight_learns() -> None:
-    model = awake(KINDS["4 pixels, projected"], torch.float32)
+    model = awake(KINDS["4 pixels"], torch.float32)
     model(batch_scenes([scene_tensors(corner())]), RESOLUTION).mean().backward()
     for name, weight in model.named_parameters():
         assert weight.grad is not None and weight.grad.abs().max() > 0, name
@@ -135,13 +135,7 @@ def test_it_begins_with_equal_light_everywhere() -> None:
 
 def test_a_renderer_shows_what_the_network_computes() -> None:
     scene = corner()
-    model = awake(KINDS["4 pixels, projected"], torch.float32)
+    model = awake(KINDS["4 pixels"], torch.float32)
     shown = NeuralRenderer(model).render(scene, RESOLUTION)[0]
     expected = radiance(picture(model, scene).double()).numpy()
     np.testing.assert_allclose(shown, expected, rtol=1e-5, atol=1e-6)  # rounded to float32
-    renderer = NeuralRenderer(model)
-    prepared = renderer.prepare(scene)
-    skipped = renderer.view(
-        prepared, scene.c2w[0], float(scene.fov_deg[0]), RESOLUTION, skip_empty_bundles=True
-    )
-    assert (skipped[expected.max(axis=-1) == 0] == 0).all() and skipped.max() > 0

@@ -96,7 +96,6 @@ def _flat_picture(
     c2w_44: Tensor,
     fov_deg: Tensor,
     resolution: int,
-    skip_empty_bundles: bool,
 ) -> Tensor:
     """Stand for its second stage: every pixel shows that light."""
     return torch.log10(1 + light_3).expand(resolution, resolution, 3)

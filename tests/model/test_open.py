@@ -152,11 +152,3 @@ def test_a_header_that_claims_the_memory_is_refused(ours: Path) -> None:
     path.write_bytes((1 << 40).to_bytes(8, "little") + path.read_bytes()[8:])
     with pytest.raises(TrilightError, match="the header claims 1099511627776 bytes"):
         open_network(str(path))
-
-
-def test_published_weights_open_with_their_cells(published: Path, ours: Path) -> None:
-    network = open_network(f"cells:{published}")
-    assert network.config.texture_cells == 1  # this family's texture has one cell
-    assert open_network(str(published)).config.texture_cells == 0
-    with pytest.raises(TrilightError, match=f"not published weights.*expected {ours}"):
-        open_network(f"cells:{ours}")

@@ -59,23 +59,6 @@ def test_packing_keeps_what_exists_and_gradients_go_back_there() -> None:
     assert torch.equal(x.grad[..., 0], x.detach()[..., 0] * exists)
 
 
-def test_one_scene_of_a_packed_batch_is_that_scene_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, batch = awake(tiny_config()), _batch()
-    with torch.no_grad():
-        padded = model.encode(batch)
-        monkeypatch.setattr(encoded_scene, "takes_packed", lambda *_: True)
-        row = model.encode(batch)
-        assert row.packing is not None and padded.packing is None
-        for index, length in enumerate(LENGTHS):
-            for found, wanted in zip(
-                row.only(index).keys_values, padded.only(index).keys_values, strict=True
-            ):
-                assert found[0].shape[2] == length + model.config.num_registers
-                for ours, theirs in zip(found, wanted, strict=True):
-                    # float64 sums through some layers, as above
-                    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-11)
-
-
 def test_where_a_mask_says_more_than_lengths_there_is_a_mask() -> None:
     batch = _batch()
     assert batch.num_triangles == LENGTHS

@@ -1,5 +1,6 @@
 """Weights go round through bytes, and nothing else is accepted."""
 
+import json
 from collections.abc import Callable
 
 import pytest
@@ -10,8 +11,15 @@ from torch import Tensor
 from model.weights import CONFIG_KEY, TrainedRange, decode_weights, encode_config, encode_weights
 from storage.errors import TrilightError
 from storage.records.safe_read import safetensors_header
+from storage.removed import LAST_COMMIT
 from tests.for_each import for_each
 from tests.model.kit import awake, tiny_config
+
+
+def with_config(data: bytes, **fields: object) -> bytes:
+    """Return a file of weights whose configuration states more fields."""
+    config = json.loads(safetensors_header(data)["__metadata__"][CONFIG_KEY]) | fields
+    return save(load(data), metadata={CONFIG_KEY: json.dumps(config)})
 
 
 @for_each("head", ["linear", "dpt"])
@@ -78,3 +86,18 @@ def test_equal_networks_give_equal_bytes_in_any_process() -> None:
     assert len(files) == 1
     header = safetensors_header(files.pop())["__metadata__"]
     assert list(header) == sorted(header) and len(header) == 2
+
+
+def test_removed_settings_load_where_they_meant_none() -> None:
+    data = encode_weights(awake(tiny_config(), torch.float32))
+    off = with_config(data, projected_freqs=0, texture_cells=0, sky_cells=0)
+    assert encode_weights(decode_weights(off)) == data
+
+
+@for_each("used", [{"projected_freqs": 7}, {"texture_cells": 4}, {"sky_cells": 48}])
+def test_removed_settings_are_refused_where_they_are_used(used: dict[str, int]) -> None:
+    data = encode_weights(awake(tiny_config(), torch.float32))
+    ((name, value),) = used.items()
+    message = f"^network: model.{name} is {value}: removed since, and commit {LAST_COMMIT} is"
+    with pytest.raises(TrilightError, match=message):
+        decode_weights(with_config(data, **used))

@@ -7,11 +7,13 @@ from typing import Any
 import pytest
 
 from storage.errors import TrilightError
+from storage.removed import LAST_COMMIT
 from storage.settings.described import settings_record
 from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run
 from train.going_on import GoingOn, event_records, events_of, going_on
 from train.settings import AugmentationSettings, TrainSettings
+from train.stored_settings import known_settings, stored_settings
 
 DIGEST = "d" * 64
 OTHER = "0123456789" * 6 + "abcd"
@@ -37,6 +39,31 @@ def following(before: dict[str, Any], going: GoingOn, step: int) -> dict[str, An
 def test_the_same_command_goes_on_and_nothing_happens() -> None:
     going = going_on(header(), tiny_run(), DIGEST, {})
     assert going == GoingOn(settings=tiny_run(), history=(), notes=(), has_decided=False)
+
+
+def test_removed_settings_stand_in_checkpoints_where_they_stood() -> None:
+    """At the values that meant none, so that checkpoints keep their bytes."""
+    stored = stored_settings(tiny_run())
+    assert list(stored["loss"]) == [
+        "perceptual", "perceptual_weight", "lpips_precision", "noise_half"
+    ]  # fmt: skip
+    fields = list(stored["model"])
+    assert fields[fields.index("rope_max_freq") + 1] == "projected_freqs"
+    assert fields[-3:] == ["texture_cells", "sky_cells", "sky_rays"]
+    assert known_settings(stored, "resume") == settings_record(tiny_run())
+    going = going_on(header() | {"settings": stored}, tiny_run(), DIGEST, {})
+    assert going.settings == tiny_run() and not going.history
+
+
+@for_each(
+    ("group", "name", "value"), [("model", "sky_cells", 48), ("loss", "lpips_precision", "float16")]
+)
+def test_runs_that_use_what_was_removed_are_refused(group: str, name: str, value: Any) -> None:
+    begun = header()
+    begun["settings"][group][name] = value
+    message = f"^resume: {group}.{name} is {value!r}: removed since, and commit {LAST_COMMIT} is"
+    with pytest.raises(TrilightError, match=message):
+        going_on(begun, tiny_run(), DIGEST, {})
 
 
 EXECUTED: dict[str, Any] = {

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.open import open_network
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
 from storage.records.retextured import with_textures
@@ -45,36 +44,28 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return write_toy_dataset(folder, train=6, validation=2, per_shard=3, scene_of=_scene)
 
 
-def _run(**model: object) -> TrainSettings:
-    config = tiny_config(sky_cells=48, texture_cells=4)
-    if model:
-        config = hits_config(sky_rays=2, sky_cells=48, texture_cells=4)
-    run = tiny_run(model=config, run="tiny-maps", augmentation=AUGMENTATION)
+def _run() -> TrainSettings:
+    run = tiny_run(model=hits_config(sky_rays=2), run="tiny-maps", augmentation=AUGMENTATION)
     return dataclasses.replace(run, num_steps=4, validate_every=4, checkpoint_every=2)
 
 
-@pytest.mark.parametrize(
-    "kind", ["bundles", pytest.param("hits", marks=pytest.mark.slow("training"))]
-)
+@pytest.mark.slow("training")
 def test_a_run_that_was_stopped_ends_like_one_that_was_not(
-    dataset: Dataset, tmp_path: Path, kind: str
+    dataset: Dataset, tmp_path: Path
 ) -> None:
     """With steps in which no scene has a sky, or a texture."""
     data = [str(dataset.folder.root)]
-    run = _run() if kind == "bundles" else _run(view_stage="hits")
+    run = _run()
     weights = trained(run, data, tmp_path).folder.weights.read_bytes()
     (tmp_path / "checkpoints/step-000000004.safetensors").unlink()
     (tmp_path / "model.safetensors").unlink()
     assert trained(run, data, tmp_path, resume=True).folder.weights.read_bytes() == weights
-    network = open_network(tmp_path / "model.safetensors")
-    assert network.config.sky_cells == 48
-    assert network.encoder.tokens.cells_WC.abs().max() > 0
 
 
 def test_a_run_that_knows_no_sky_is_refused_before_its_first_step(
     dataset: Dataset, tmp_path: Path
 ) -> None:
     run = dataclasses.replace(_run(), model=tiny_config())
-    with pytest.raises(TrilightError, match=r"does not know its light.*model.sky_cells=48"):
+    with pytest.raises(TrilightError, match=r"does not know its light.*model.sky_rays=16"):
         trained(run, [str(dataset.folder.root)], tmp_path / "run")
     assert not list((tmp_path / "run").glob("checkpoints/*"))

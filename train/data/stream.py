@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from model.scene_tensors import with_cells
 from model.sky.known import require_known, shining
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
@@ -227,11 +226,7 @@ class _SceneMaker:
     def _prepared(self, seen: TrainingScene, rng: np.random.Generator) -> TrainingScene:
         """Return a scene with all that its network wants to be told."""
         settings = self._settings
-        if settings.network is None:
-            return seen
-        tensors = with_cells(seen.tensors, settings.network.texture_cells)
-        seen = dataclasses.replace(seen, tensors=tensors)
-        if not settings.network.hit_rays:
+        if settings.network is None or not settings.network.hit_rays:
             return seen
         # these bring the checker of settings along
         from model.demodulated import with_albedo

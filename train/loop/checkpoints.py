@@ -26,7 +26,6 @@ from storage.atomic import atomic_writer, remove_leftovers
 from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
 from storage.records.safe_read import read_safetensors
-from storage.settings.described import settings_record
 from train.data.mixture import RECORD
 from train.folder import RunFolder
 from train.going_on import GoingOn, event_records
@@ -35,6 +34,7 @@ from train.loop.schedule import decay_begins
 from train.loop.state import TrainState, new_state
 from train.loop.step import StepReport
 from train.settings import Precision, TrainSettings
+from train.stored_settings import stored_settings
 
 PREFIX, SUFFIX = "step-", ".safetensors"
 """Names of the files, around the number of the step."""
@@ -71,7 +71,7 @@ def _encoded(
         "skipped_in_a_row": state.skipped_in_a_row,
         "unusable": dict(state.unusable.met),
         "reports": [dataclasses.asdict(report) for report in state.reports],
-        "settings": settings_record(settings),
+        "settings": stored_settings(settings),
         "model": encode_config(settings.model),
         "data_digest": data_digest,
         **({RECORD: state.mixture.record()} if state.mixture else {}),

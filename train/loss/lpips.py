@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 
 from storage.errors import TrilightError
-from train.loss.half_features import from_half, gradient_scale, to_half
 
 BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 """Numbers of the convolutions in torchvision's `features`; a pooling stands between two blocks."""
@@ -102,7 +101,6 @@ class Lpips(nn.Module):
             TrilightError: a tensor is missing or has another shape.
         """
         super().__init__()
-        self._is_half = False
         self.vgg16 = Vgg16(vgg16)
         self.register_buffer("shift_311", torch.tensor(SHIFT).reshape(3, 1, 1))
         self.register_buffer("scale_311", torch.tensor(SCALE).reshape(3, 1, 1))
@@ -139,21 +137,9 @@ class Lpips(nn.Module):
             distance_M = distance_M + weighed_MHW.mean(dim=(1, 2))
         return distance_M
 
-    def use_float16(self) -> "Lpips":
-        """Have features computed in float16 from now on, and return it (loss.half_features)."""
-        self._is_half = True
-        self.vgg16.half()
-        return self
-
     def _features(self, picture_M3RR: Tensor) -> list[Tensor]:
-        normal_M3RR = (2 * picture_M3RR - 1 - self.shift_311) / self.scale_311
-        taps: list[Tensor]
-        if not self._is_half:
-            taps = self.vgg16(normal_M3RR)
-            return taps
-        scale = gradient_scale(picture_M3RR)
-        taps = self.vgg16(to_half(normal_M3RR, scale))
-        return [from_half(tap, scale) for tap in taps]
+        taps: list[Tensor] = self.vgg16((2 * picture_M3RR - 1 - self.shift_311) / self.scale_311)
+        return taps
 
 
 def _unit(x_MCHW: Tensor) -> Tensor:

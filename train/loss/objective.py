@@ -85,7 +85,7 @@ def _dissimilarity(
             f"{VGG16_FILE} and {LINEAR_FILE}, --lpips hub to download them, or another term: "
             "--set loss.perceptual=ms_ssim or none."
         )
-    return lpips.use_float16() if settings.lpips_precision == "float16" else lpips
+    return lpips
 
 
 LOG10_OF_2 = math.log10(2.0)

@@ -7,7 +7,7 @@ import torch
 
 from infra.bench.sides.networks import scene_of
 from model.costs import Workload
-from model.scene_tensors import SceneTensors, batch_scenes, with_cells
+from model.scene_tensors import SceneTensors, batch_scenes
 from train.data.buckets import TrainingBatch
 from train.loss.lpips import BLOCKS, Lpips
 from train.settings import TrainSettings
@@ -54,7 +54,6 @@ def drawn_batch(settings: TrainSettings, scenes: int) -> TrainingBatch:
 
 def _prepared(tensors: SceneTensors, model: "ModelConfig", px: int) -> SceneTensors:
     """Return a scene with what its network wants to be told, as the stream does."""
-    tensors = with_cells(tensors, model.texture_cells)
     if not model.hit_rays:
         return tensors
     from model.demodulated import with_albedo

@@ -24,7 +24,6 @@ from storage.errors import TrilightError
 from storage.records.asset import Asset, decode_asset
 from storage.records.profiles import LAW_DB
 from storage.records.sample import SceneRecord
-from storage.records.scene import Scene
 
 _HDF5_SCENES = 24
 """Written in the published form: half a second each."""
@@ -56,8 +55,6 @@ class SceneCosts:
     """Bytes of all stored pictures."""
     stored_pictures: int
     """Picture files of all views together."""
-    empty_share: float
-    """Ray bundles that can see nothing."""
 
 
 def scene_costs(dataset: Dataset) -> Iterator[SceneCosts]:
@@ -76,18 +73,17 @@ def scene_costs(dataset: Dataset) -> Iterator[SceneCosts]:
             "Generate it with the same TRILIGHT_CACHE."
         )
     assets = {locked.uid: known[locked.asset_sha256] for locked in objects}
-    resolution = int(dataset.manifest.settings["renders"]["resolution"])
     for shard in dataset.manifest.shards:
         with dataset.files.open(shard, checked=False) as stream:
             index = contents_of(stream, shard.name).samples
         for record in dataset.read_scenes(shard):
             members = index[record.key].items()
             sizes = {suffix: member.num_bytes for suffix, member in members}
-            yield _costs(record, sizes, assets, resolution)
+            yield _costs(record, sizes, assets)
 
 
 def _costs(
-    record: SceneRecord, sizes: Mapping[str, int], assets: Mapping[str, Asset], resolution: int
+    record: SceneRecord, sizes: Mapping[str, int], assets: Mapping[str, Asset]
 ) -> SceneCosts:
     scene = record.scene
     counts = np.bincount(scene.object_index, minlength=len(scene.objects))
@@ -109,23 +105,7 @@ def _costs(
         record_bytes=sizes["json"],
         picture_bytes=sum(pictures),
         stored_pictures=len(pictures),
-        empty_share=_empty_share(scene, resolution),
     )
-
-
-def _empty_share(scene: Scene, resolution: int) -> float:
-    import torch
-
-    from model.config import base
-    from model.empty_bundles import bundles_that_see
-    from model.positions import token_places
-    from model.scene_tensors import batch_scenes, scene_tensors
-
-    batch = batch_scenes([scene_tensors(scene)])
-    places = token_places(batch.triangles_BT33, batch.is_triangle_BT, num_registers=0, eps=0)
-    with torch.no_grad():
-        sees = bundles_that_see(places, batch.cameras, resolution, base().patch_px)
-    return 1 - float(sees.double().mean())
 
 
 def _error_within(asset: Asset, num_triangles: int) -> float:
@@ -245,7 +225,6 @@ def _errors(found: Sequence[SceneCosts], settings: Any) -> Iterable[str]:
     middle, low = np.median(floors), np.percentile(floors, 5)
     at_cap = np.mean([capped for one in found for capped in one.at_cap])
     errors = 100 * np.array([error for one in found for error in one.object_errors])
-    empty = 100 * _mean(found, "empty_share")
     yield f"{100 * at_cap:.0f} % of the views end at the cap"
     yield (
         f"stated per view: median {middle:.1f} dB as rendered, {middle - lost:.1f} or more as "
@@ -255,7 +234,6 @@ def _errors(found: Sequence[SceneCosts], settings: Any) -> Iterable[str]:
         f"p99 distance of the objects to their sources: median {np.median(errors):.2f} %, 95th "
         f"percentile {np.percentile(errors, 95):.2f} %, largest {errors.max():.2f} %"
     )
-    yield f"{empty:.0f} % of the ray bundles see nothing, and are computed"
 
 
 EXPERIMENTS = (

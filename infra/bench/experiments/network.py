@@ -1,4 +1,4 @@
-"""The network: its precision, its attention, what it leaves out.
+"""The network: its precision, its attention.
 
 But for `trained-precision` weights are random, since costs do not depend on them. Errors do.
 """
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 PRECISIONS = ("float32", "bfloat16")
 ATTENTION = ("fused", "fused, bfloat16", "fused, with a mask", "torch's own products")
-SKIPPING, WHOLE = "empty bundles skipped", "all bundles"
 
 
 def _bright(workshop: Workshop) -> Any:
@@ -122,37 +121,6 @@ def _attention(effort: Effort) -> "tuple[dict[str, Callable[[], Tensor]], Tensor
     return ways, scores.softmax(dim=-1) @ v.double()
 
 
-def _measure_bundles(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
-    """Measure the view stage of one scene; the lower of two times counts, taken in turns."""
-    import torch
-
-    from infra.bench.sides.networks import log10_psnr_db
-    from model.empty_bundles import bundles_that_see
-    from model.scene_tensors import batch_scenes, scene_tensors
-
-    model, px = _bright(workshop), workshop.effort.network_px
-    batch = batch_scenes([scene_tensors(workshop.subject(turn).scene)])
-    spent: dict[bool, list[float]] = {False: [], True: []}
-    pictures = {}
-    with torch.inference_mode():
-        encoded, cameras = model.encode(batch), batch.cameras
-        sees = bundles_that_see(encoded.places, cameras, px, model.config.patch_px)
-        model.decode(encoded, cameras, px)
-        for skip in (False, True, True, False):
-            started = time.process_time()
-            pictures[skip] = model.decode(encoded, cameras, px, skip_empty_bundles=skip)
-            spent[skip].append(time.process_time() - started)
-    for point in points:
-        yield (
-            point.name,
-            {
-                "core_s": min(spent[point.settings]),
-                "db": log10_psnr_db(pictures[point.settings], pictures[False]),
-                "empty": 100 * (1 - float(sees.double().mean())),
-            },
-        )
-
-
 CORE_S = Column(name="core-seconds of the network", figure="core_s")
 _PRECISION_POINTS = [Point(name=name, default=name == PRECISIONS[0]) for name in PRECISIONS]
 _of_pictures = partial(Experiment, error=DB, better="higher", needs=("torch",))
@@ -205,24 +173,5 @@ EXPERIMENTS = (
         measure=_measure_attention,
         warm_up=True,
         needs=("torch",),
-    ),
-    _of_pictures(
-        name="bundles",
-        title="Empty ray bundles",
-        about="The view stage of built-in scenes by Base with random weights.",
-        covers=("render.skip_empty_bundles",),
-        cost=Column(name="core-seconds of the view stage", figure="core_s", over="mean"),
-        against="the same network with all bundles (100 dB is the same picture)",
-        columns=(Column(name="empty bundles %", figure="empty"),),
-        because=(
-            "Default: none skipped. Bundles attend to each other, so leaving out the empty "
-            "ones changes what the others show, by far more than the saved time is worth."
-        ),
-        points=lambda effort: [
-            Point(name=WHOLE, settings=False, default=True),
-            Point(name=SKIPPING, settings=True),
-        ],
-        turns=scenes,
-        measure=_measure_bundles,
     ),
 )

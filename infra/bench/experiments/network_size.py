@@ -24,8 +24,13 @@ SIZES = (*TABLE_WIDTHS, "tiny", "smoke", "small", "base", "large")
 
 def _size(workshop: Workshop, point: Point, turn: str) -> Figures:
     """Measure the time of one size; its error is that of small trainings, where there are any."""
-    from infra.bench.sides.networks import CPU, forward_of, timed_forward, workload_of
-    from model.layer_errors import random_network
+    from infra.bench.sides.networks import (
+        CPU,
+        forward_of,
+        random_network,
+        timed_forward,
+        workload_of,
+    )
     from model.renderformer import count_parameters
 
     config, workload = _config(point.name), workload_of(workshop.effort)

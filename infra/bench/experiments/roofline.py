@@ -34,8 +34,6 @@ def _points(effort: Effort) -> Sequence[Point]:
             other = not settings.recompute_activations
             how = "recomputed" if other else "not recomputed"
             cases.append((f"{run}, compiled, {how}", Case(run=run, recomputes=other)))
-            half = Case(run=run, lpips_precision="float16")
-            cases.append((f"{run}, compiled, LPIPS in float16", half))
     for run in () if quick else WIDE_RUNS:
         own = named_run(run).model
         cases += [

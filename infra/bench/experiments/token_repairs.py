@@ -21,18 +21,14 @@ PAIRS = 6
 HELD_OUT = 32
 """Scenes that every network is judged on."""
 
-PROJECTED = {"rope_num_freqs": 2, "projected_freqs": 7}
-"""Fourteen pairs of a head of 64 channels turn by the picture; eighteen are left for vertices."""
-
 FINE = {"patch_px": 4}
 DEMODULATED = {"demodulated": True, "hit_rays": 2}
 POINTS: Mapping[str, Mapping[str, Any]] = {
     "smoke: 2 + 4 layers": {},
     "4 + 2 layers, as published": {"encoder_layers": 4, "decoder_layers": 2},
-    "projected positions": PROJECTED,
     "4-pixel bundles": FINE,
     "demodulated": DEMODULATED,
-    "all three": {**PROJECTED, **FINE, **DEMODULATED},
+    "both": {**FINE, **DEMODULATED},
 }
 BASE = next(iter(POINTS))
 
@@ -94,7 +90,6 @@ EXPERIMENTS = (
         f"(with --quick {QUICK_CORE_S:g}) on one thread; every turn is a seed of weights, order "
         "and symmetries.",
         covers=(
-            "train.model.projected_freqs",
             "train.model.patch_px",
             "train.model.demodulated",
             "train.model.hit_rays",

@@ -15,7 +15,5 @@ class Case:
     """A name of CARDS."""
     is_compiled: bool = True
     """Whether layers, head and LPIPS are compiled (an estimate: fusion), or kernel by kernel."""
-    lpips_precision: str | None = None
-    """Precision of the features of LPIPS; None: as the run says."""
     recomputes: bool | None = None
     """Whether activations are recomputed; None: as the run says."""

@@ -40,7 +40,7 @@ def roofline(case: Case) -> RooflineRow:
     """
     if case.card not in CARDS:
         raise TrilightError(f"card {case.card!r}: {expected_one_of(case.card, sorted(CARDS))}.")
-    traced, scenes = _traced(case.run, case.size, case.recomputes, case.lpips_precision)
+    traced, scenes = _traced(case.run, case.size, case.recomputes)
     if case.is_compiled:
         traced = fused(traced, lambda part: part[0] in COMPILED)
     found = predicted(traced, CARDS[case.card])
@@ -70,16 +70,13 @@ def rooflines(cases: Sequence[Case]) -> list[RooflineRow]:
 
 
 @functools.lru_cache(maxsize=1)
-def _traced(
-    run: str, size: str | None, recomputes: bool | None, lpips_precision: str | None
-) -> tuple[Traced, int]:
+def _traced(run: str, size: str | None, recomputes: bool | None) -> tuple[Traced, int]:
     """Return the kernels of a step, and its scenes."""
     from infra.bench.roofline.step import traced_step
     from train.runs import changed_run
 
     changes = {
         **({} if size is None else {"model": size}),
-        **({} if lpips_precision is None else {"loss.lpips_precision": lpips_precision}),
         **({} if recomputes is None else {"recompute_activations": recomputes}),
     }
     settings = changed_run(run, changes)

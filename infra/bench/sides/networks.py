@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import elu
 
 from infra.bench.effort import Effort
@@ -22,14 +22,21 @@ from infra.bench.sides.published_network import published_forward, published_inp
 from infra.bench.subjects.cost_scene import cost_scene
 from model.config import SIZES, ModelConfig, base
 from model.costs import Workload, flops
-from model.layer_errors import probe_batch, random_network
 from model.precision import set_precision
 from model.published.config import PublishedConfig
 from model.published.convert import from_published, to_published
 from model.renderformer import ELU_ALPHA, RenderFormer
-from model.scene_tensors import Cameras, SceneTensors, batch_scenes, converted, scene_tensors
+from model.scene_tensors import (
+    Cameras,
+    SceneBatch,
+    SceneTensors,
+    batch_scenes,
+    converted,
+    scene_tensors,
+)
 from storage.conventions import look_at_c2w, radiance_from_log10
 from storage.metrics import psnr_log_db
+from storage.records.material import material_columns, material_width
 
 PUBLISHED_LENGTH = {256: 1572, 512: 4192}
 """Triangles that the published pipeline pads every scene to, by pixels across the picture."""
@@ -77,7 +84,7 @@ SIDES = (PUBLISHED, EQUAL, DEFAULT)
 RENDERED_MEAN, RENDERED_STD = 0.09, 0.075
 """Mean and spread of log10(1 + radiance) of the 20 pictures in `tests/references`; peak 1."""
 
-_PROBE_PX = 64
+_PROBE_TRIANGLES, _PROBE_PX = 256, 64
 
 CPU = torch.device("cpu")
 
@@ -145,13 +152,40 @@ def published_like(log10_rgb: Tensor) -> Tensor:
     return elu(log10_rgb, alpha=ELU_ALPHA)
 
 
+def random_network(config: ModelConfig) -> RenderFormer:
+    """Return a network with fresh weights, and a last layer that is not yet black."""
+    generator = torch.Generator().manual_seed(0)
+    model = RenderFormer(config)
+    model.initialise(generator)
+    nn.init.xavier_uniform_(model.decoder.head.last.weight, generator=generator)
+    return model.eval()
+
+
+def _probe_batch() -> SceneBatch:
+    """Return a random scene in the nominal shell, always the same, and one camera before it."""
+    generator = torch.Generator().manual_seed(0)
+    centre = torch.rand(_PROBE_TRIANGLES, 1, 3, generator=generator) - 0.5
+    normals = torch.randn(_PROBE_TRIANGLES, 3, 3, generator=generator)
+    c2w_V44 = torch.eye(4)[None].clone()
+    c2w_V44[0, 2, 3] = 2.0
+    scene = SceneTensors(
+        triangles_T33=centre + 0.1 * torch.randn(_PROBE_TRIANGLES, 3, 3, generator=generator),
+        normals_T33=normals / normals.norm(dim=-1, keepdim=True),
+        material_TM=torch.rand(_PROBE_TRIANGLES, material_width(), generator=generator),
+        columns=tuple(column.name for column in material_columns()),
+        c2w_V44=c2w_V44,
+        fov_deg_V=torch.tensor([40.0]),
+    )
+    return batch_scenes([scene])
+
+
 def bright_network(config: ModelConfig) -> RenderFormer:
     """Return a random network whose pictures are as bright and varied as rendered ones."""
     model = random_network(config)
     last = model.decoder.head.last
     assert last.bias is not None
     with torch.no_grad():
-        picture = model(probe_batch(), max(_PROBE_PX, config.picture_px))
+        picture = model(_probe_batch(), max(_PROBE_PX, config.picture_px))
         scale = RENDERED_STD / picture.std()
         last.weight *= scale
         last.bias.copy_(RENDERED_MEAN - scale * picture.mean())

@@ -218,13 +218,6 @@ def test_pictures_need_the_width_that_is_a_multiple_of_eight() -> None:
         NeuralRenderer(network()).render(corner(), 30)
 
 
-def test_there_are_no_bundles_to_skip() -> None:
-    renderer = NeuralRenderer(network())
-    scene = corner()
-    with pytest.raises(TrilightError, match="no ray bundles"):
-        renderer.view(renderer.prepare(scene), scene.c2w[0], 40.0, PX, skip_empty_bundles=True)
-
-
 @for_each(
     ("changes", "message"),
     [

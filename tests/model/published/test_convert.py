@@ -109,7 +109,6 @@ def test_what_was_never_published_is_refused_by_name(fields: dict, message: str)
         ({"head": "linear", "dpt_features": 0, "dpt_channels": (), "dpt_taps": ()}, "head linear"),
         ({"window_bundles": 4}, "window_bundles 4"),
         ({"rope_max_freq": 3.0}, "rope_max_freq 3.0 of 3 frequencies"),
-        ({"projected_freqs": 1}, "projected_freqs 1"),
         ({"demodulated": True, "hit_rays": 1}, "demodulated True"),
     ],
 )

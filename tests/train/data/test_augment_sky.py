@@ -80,7 +80,6 @@ def _below_a_sky() -> StoredSample:
     ("config", "is_known"),
     [
         (tiny_config(), False),
-        (tiny_config(sky_cells=48), True),
         (hits_config(), False),
         (hits_config(sky_rays=2), True),
     ],

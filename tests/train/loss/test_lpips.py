@@ -2,7 +2,6 @@
 
 import itertools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -99,56 +98,6 @@ def test_its_gradient_is_that_of_its_values() -> None:
     # central differences; a ReLU that a step of 1e-6 crosses costs about as much
     assert change == pytest.approx((a.grad * step).sum().item(), rel=1e-4)
     assert not any(weight.requires_grad for weight in lpips.parameters())
-
-
-def _tf32(x: Tensor) -> Tensor:
-    """Return x rounded to 10 bits of mantissa, as a card does before it multiplies."""
-    bits = x.view(torch.int32)
-    return ((bits + 0x1000) & ~0x1FFF).view(torch.float32)
-
-
-def _value_and_gradient(lpips: Lpips, weight: float = 0.05) -> tuple[Tensor, Tensor]:
-    a = pictures("a").requires_grad_()
-    values = lpips(a.double() if lpips.linear_0.dtype == torch.float64 else a, pictures("b"))
-    (weight * values.mean()).backward()
-    assert a.grad is not None
-    return values.detach().double(), a.grad.double() / weight
-
-
-def test_float16_is_as_exact_as_a_cards_float32(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside float64: as near as with every convolution's inputs rounded as TF32 rounds them.
-
-    Gradients that float16 could not hold without their scale, too.
-    """
-    exact = _value_and_gradient(Lpips(*small_weights()).double())
-    half = _value_and_gradient(Lpips(*small_weights()).use_float16())
-    tiny = _value_and_gradient(Lpips(*small_weights()).use_float16(), weight=1e-3)[1]
-    plain = torch.nn.functional.conv2d
-    monkeypatch.setattr(
-        torch.nn.Conv2d,
-        "forward",
-        lambda layer, x: plain(_rounded(x), _rounded(layer.weight), layer.bias, padding=1),
-    )
-    tf32 = _value_and_gradient(Lpips(*small_weights()))
-    for found, card, wanted in zip(half, tf32, exact, strict=True):
-        error, usual = ((each - wanted).norm() / wanted.norm() for each in (found, card))
-        assert 1e-6 < usual < 2e-2 and error < 2 * usual
-    assert (tiny - half[1]).norm() < 1e-2 * half[1].norm()
-
-
-class _Rounded(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        return _tf32(x)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> Tensor:
-        return _tf32(grads[0])
-
-
-def _rounded(x: Tensor) -> Tensor:
-    found: Tensor = _Rounded.apply(x)
-    return found
 
 
 def test_pictures_without_any_feature_have_a_finite_gradient() -> None:

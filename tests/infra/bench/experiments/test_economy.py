@@ -24,11 +24,11 @@ from storage.errors import TrilightError
 from storage.records.asset import Asset
 from storage.records.sample import SceneRecord, encode_sample
 from tests.pipeline.scenes.small_pool import QUALITY, small_pool, with_error
-from tests.train.toy import RESOLUTION, toy_sample
+from tests.train.toy import toy_sample
 
 COSTS = SceneCosts(
     triangles=100, source_faces=400, object_faces=80, spp=(32, 256), at_cap=(False, False),
-    floors_db=(44.0, 40.0), array_bytes=4000, record_bytes=500, picture_bytes=9000, empty_share=0.2,
+    floors_db=(44.0, 40.0), array_bytes=4000, record_bytes=500, picture_bytes=9000,
     object_errors=(0.01, 0.03), stored_pictures=2,
 )  # fmt: skip
 
@@ -45,14 +45,13 @@ def test_a_scene_is_counted_from_its_sample() -> None:
     sizes = {suffix: len(data) for suffix, data in encode_sample(sample).items()}
     record = SceneRecord(key=sample.key, scene=scene, views=sample.views)
     asset = _asset((12, 0.02), (6, 0.05), sources=48)
-    found = _costs(record, sizes, {f"box/{row}": asset for row in boxes}, RESOLUTION)
+    found = _costs(record, sizes, {f"box/{row}": asset for row in boxes})
     assert found.triangles == scene.num_triangles
     assert (found.source_faces, found.object_faces) == (48 * len(boxes), 12 * len(boxes))
     assert found.object_errors == (0.02,) * len(boxes)  # boxes of 12 triangles: the finer level
     assert found.stored_pictures == len(sample.views)
     assert found.array_bytes + found.record_bytes + found.picture_bytes == sum(sizes.values())
     assert found.at_cap == tuple(view.at_cap for view in sample.views)
-    assert 0 <= found.empty_share < 1
 
 
 def _asset(*levels: tuple[int, float], sources: int) -> Asset:
@@ -100,6 +99,6 @@ def test_what_is_left_out_is_told_with_its_error() -> None:
     # a tenth more of the mean square is 0.41 dB
     assert "median 42.0 dB as rendered, 41.6 or more as stored" in words
     assert "median 2.00 %" in words and "largest 3.00 %" in words
-    assert words.startswith("0 % of the views end at the cap") and "20 % of the ray" in words
+    assert words.startswith("0 % of the views end at the cap")
     exact = "; ".join(_errors([COSTS], {**SETTINGS, "storage": {"profile": "lossless"}}))
     assert "42.0 dB as rendered, 42.0 or more as stored" in exact
