@@ -13,7 +13,7 @@ from pipeline.assets.quality.triangles import count_edges
 _DETOUR = 8
 """Sources with more than this many times the budget, and a quarter, are first simplified to it by
 meshoptimizer: its mistakes at that size are far below those of the collapse that follows. Measured
-on 71 objects (docs/log): a third to a twentieth of the time, and no more error."""
+on 71 objects (study S38): a third to a twentieth of the time, and no more error."""
 
 _MAX_VALENCE = 512
 _MAX_FACES_PER_EDGE = 8

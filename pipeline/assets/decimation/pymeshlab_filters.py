@@ -30,7 +30,7 @@ _COLLAPSE = {
     "autoclean": True,
     "selected": False,
 }
-"""The values were chosen on 148 objects (docs/log): the planar term and the check of normals keep
+"""The values were chosen on 148 objects (study S39): the planar term and the check of normals keep
 flat parts from folding, the low boundary weight keeps borders from spiking."""
 
 _REMESH = {
