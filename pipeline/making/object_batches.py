@@ -4,7 +4,7 @@ A batch is some dozens of objects that follow each other in the order of their u
 batches as they claim scenes, in a bucket through the bucket; a kill loses the batches in hand. The
 result of a batch is a small file whose name follows from all that it depends on. It lies beside the
 dataset for its other workers, and in the user's cache for later datasets. A worker that finds it
-there fetches and prepares none of its objects.
+there prepares none of its objects.
 """
 
 import contextlib
@@ -33,14 +33,12 @@ from storage.records.objects import Failure, ObjectRecord
 
 _CACHE = "object-batches"
 """Folder of the user's cache with results for later datasets."""
-_NUM_OBJECTS = 64
-"""Objects of a batch: some minutes of one core where nothing is known yet."""
+_NUM_OBJECTS = 32
+"""Objects of a batch: a minute of one core where nothing is known yet."""
 _WHOLE = (".off", ".ply", ".stl", ".usdz")
 """Suffixes of files that name no other ones; what lies beside the others counts too."""
 _LAYERS = (".usd", ".usda", ".usdc")
 """Of those that may name other objects."""
-_AT_ONCE = 2
-"""Batches that a worker has in hand, so that no child waits for the last object of one."""
 _PAUSES_S = (0.2, 10.0)
 """Between two looks at the batches of others; the first one doubles up to the last."""
 
@@ -237,8 +235,9 @@ def prepare_in_batches(
     first = uuid.uuid4().int % len(batches) if batches else 0
     order = [*range(first, len(batches)), *range(first)]
 
+    at_once = 1 + -(-workers // _NUM_OBJECTS)  # no child waits for the last object of a batch
     # children end first: after Ctrl-C no thread waits for the objects that it has in hand
-    with ThreadPoolExecutor(_AT_ONCE) as threads, MeshWork(work.settings, workers) as meshes:
+    with ThreadPoolExecutor(at_once) as threads, MeshWork(work.settings, workers) as meshes:
         pause_s = _PAUSES_S[0]
         while True:
             for number, batch in enumerate(batches):

@@ -18,8 +18,8 @@ crash costs one attempt.
 
 Files are the truth, and every step may be killed at any moment. A mesh is kept in the asset store,
 a scene in the staging folder, a shard in the dataset; the next run looks at what is there and makes
-the rest. Several runs on one folder share the work (storage.claims), and those on one
-bucket share what is finished (pipeline.shards.mirror).
+the rest. Several runs on one folder share the work (storage.claims), and those on one bucket share
+batches of objects (storage.remote.claims) and what is finished (pipeline.shards.mirror).
 """
 
 import contextlib

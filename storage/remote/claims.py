@@ -51,8 +51,11 @@ class BucketClaims:
             yield claim is not None
         finally:
             if claim is not None:
-                with contextlib.suppress(TrilightError):  # the lease ends it
-                    self._bucket.write(claim, _FREE)
+                self._free(claim)
+
+    def _free(self, claim: str) -> None:
+        with contextlib.suppress(TrilightError):  # the lease ends it
+            self._bucket.write(claim, _FREE)
 
     def _create(self, name: str) -> str | None:
         """Return the file of our claim, or None where another machine holds one."""
