@@ -60,8 +60,9 @@ class BucketPublication(Publication):
 
     @contextlib.contextmanager
     def claim(self, path: Path) -> Iterator[bool]:
-        with super().claim(path) as ours, self._mirror.claim(path, ours) as theirs:
-            yield ours and theirs
+        with contextlib.ExitStack() as stack:
+            here = stack.enter_context(super().claim(path))
+            yield here and stack.enter_context(self._mirror.claim(path))
 
     def send(self, path: Path) -> None:
         self._mirror.send_file(path)

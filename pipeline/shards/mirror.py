@@ -163,16 +163,15 @@ class Mirror:
         return self._bucket.read_start(self._name(path), 1) is not None
 
     @contextlib.contextmanager
-    def claim(self, path: Path, is_wanted: bool) -> Iterator[bool]:
+    def claim(self, path: Path) -> Iterator[bool]:
         """Bring a file here that is in the bucket; hold the claim on one that is not.
 
-        Args:
-            path: the file; its maker sends it before the claim ends.
-            is_wanted: hold the claim of a missing file, which keeps other machines off.
+        Its holder sends the file before the claim ends. Only one process of a machine may ask for
+        the same file at a time.
         """
         self._take(path)
-        if path.exists() or not is_wanted:
-            yield is_wanted
+        if path.exists():
+            yield True
             return
         with self._claims.claimed(self._name(path)) as ours:
             if ours:

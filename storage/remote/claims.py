@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from storage.atomic import write_atomically
+from storage.claims import claimed
 from storage.errors import TrilightError
 from storage.remote.bucket import Bucket
 
@@ -73,6 +74,8 @@ class BucketClaims:
 
     @functools.cached_property
     def _worker(self) -> bytes:
-        if not self._worker_file.exists():
-            write_atomically(self._worker_file, uuid.uuid4().hex.encode())
-        return self._worker_file.read_bytes()
+        path = self._worker_file
+        with claimed(path.with_suffix(".claim"), wait=True):  # other processes are the same worker
+            if not path.exists():
+                write_atomically(path, uuid.uuid4().hex.encode())
+        return path.read_bytes()

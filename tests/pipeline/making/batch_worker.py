@@ -17,19 +17,21 @@ from tests.pipeline.making.batches_kit import use_mesher
 from tests.pipeline.making.tiny_scenes_kit import tiny_order
 
 BATCH = 8
-LEASE_S = 5.0
+LEASE_S = 10.0
 
 
-def prepare(out: str, objects: Path, notes: Path, workers: int, kill_after: int = -1) -> None:
-    """Freeze the objects, beginning when so many workers are there."""
+def prepare(
+    out: str, objects: Path, notes: Path, workers: int, kill_after: int = 1_000_000
+) -> None:
+    """Freeze the objects, preparing none before each of so many workers has a batch in hand."""
     mesher = use_mesher(pytest.MonkeyPatch(), batch=BATCH)
     ours = notes / str(os.getpid())
-    ours.touch()
 
     def note(uid: str) -> None:
+        ours.touch()
         while len(list(notes.iterdir())) < workers:
             time.sleep(0.01)
-        if len(mesher.made) == kill_after:
+        if len(mesher.made) >= kill_after:
             os.kill(os.getpid(), signal.SIGKILL)
         with ours.open("a") as lines:
             lines.write(f"{uid}\n")

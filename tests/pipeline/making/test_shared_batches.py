@@ -25,7 +25,7 @@ pytest.importorskip("moto", reason="needs the package moto with its server (setu
 
 NUM_OBJECTS = 120
 WORKERS = 3
-KILL_AFTER = 20
+KILL_AFTER = BATCH // 2
 
 
 @pytest.fixture
@@ -66,7 +66,6 @@ def test_workers_share_the_objects(
         said, _ = process.communicate(timeout=300)
         assert process.returncode == (-9 if process is killed else 0), said
     made = {path.name: path.read_text().splitlines() for path in notes.iterdir()}
-    assert [len(uids) for uids in made.values()].count(KILL_AFTER) == 1
     assert all(0 < len(uids) < NUM_OBJECTS for uids in made.values())
     times = Counter(uid for uids in made.values() for uid in uids)
     assert len(times) == NUM_OBJECTS
