@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 from infra.cli.console import next_step, note, print_json, print_rows
 from pipeline.objects.licences import USER_PROVIDED
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.lock_parts import known_lock
 from storage.dataset.manifest import Manifest, read_head
 from storage.dataset.statistics import Statistics
-from storage.records.objects import count_by_reason, decode_objects_lock, read_failures
+from storage.records.objects import count_by_reason, read_failures, read_objects_lock
 
 if TYPE_CHECKING:
     from pipeline.making.run import Outcome
@@ -116,8 +115,6 @@ def _print_notes(notes: Sequence[str]) -> None:
 
 
 def _licences(folder: DatasetFolder) -> str:
-    counts = Counter(
-        entry.licence for entry in decode_objects_lock(known_lock(folder), "objects.lock.jsonl")
-    )
+    counts = Counter(entry.licence for entry in read_objects_lock(folder.objects_lock))
     shown = ", ".join(f"{name} ({count})" for name, count in counts.most_common())
     return shown.replace(USER_PROVIDED, f"{USER_PROVIDED}, taken as yours to use")

@@ -86,7 +86,6 @@ BUILD_V1 = BuildSettings(
         one_split=False,
         listed_scenes=None,
         listed_shards=(),
-        object_parts=1,
     ),
     storage=StorageSettings(profile="compact", passes=()),
     revisit=None,
@@ -100,6 +99,5 @@ JUDGING_SPLITS = SplitSettings(
     one_split=True,
     listed_scenes=None,
     listed_shards=(),
-    object_parts=1,
 )
 """Of sets whose scenes are all of the split `test`."""

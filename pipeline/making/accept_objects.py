@@ -1,115 +1,136 @@
 """From a source to frozen objects; where they are frozen already, from the lock and its index."""
 
 import shutil
-from collections.abc import Callable, Container
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from operator import attrgetter
 
 from pipeline.making.accept_maps import AcceptedMaps, accept_maps
 from pipeline.making.asked_objects import AskedObjects
-from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects, require_same
-from pipeline.making.lock_parts import LockPart
-from pipeline.making.object_parts import Proof, cut_objects, prepare_in_parts
-from pipeline.objects.sources import FoundObjects
-from storage.dataset.progress import announce_objects, count_object
+from pipeline.making.freeze_objects import (
+    AcceptedObjects,
+    freeze_objects,
+    frozen_objects,
+    require_same,
+)
+from pipeline.making.object_batches import ObjectWork, PrepareResult, prepare_in_batches
+from pipeline.objects.listing import Fetched
+from pipeline.objects.sources import ListedObjects
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.progress import announce_downloads, announce_objects, count_object
 from storage.errors import TrilightError
 from storage.records.lock_rows import LockRows
 from storage.records.object_index import ObjectIndex
+from storage.records.objects import OBJECT, LockedObject, ObjectRecord
 from storage.remote.safe_url import safe_url
 
 
-def share_mesh_work(order: AskedObjects, part: LockPart) -> FoundObjects | None:
-    """Prepare the objects of a part that is not frozen yet, with all who make it; in no turn.
+def share_mesh_work(order: AskedObjects) -> ListedObjects | None:
+    """Prepare objects that are not frozen yet, with all other workers; outside any mutex.
 
     Returns:
         What the source has, for `accept_objects`, where it has been listed.
 
     Raises:
-        TrilightError: as `find_objects` and `prepare_in_parts`.
+        TrilightError: as `list_objects` and `prepare_in_batches`.
     """
     publication = order.publication
-    with publication.folder.turn("objects"):  # one maker downloads, and the others find it done
+    folder = publication.folder
+    with folder.turn("objects"):  # one worker writes built-in objects, and the others find them
         publication.refresh()
-        if part.frozen(publication) is not None:
+        publication.take_lock()
+        if frozen_objects(publication) is not None:
             return None
-        found = order.found(part)
-        announce_objects(publication.folder, len(found.records))
-    _proofs(found, order, part, enough=lambda: publication.has(part.index))
-    return found
+        listed = order.listed()
+        announce_objects(folder, len(listed.allowed))
+    _prepare(listed, listed.allowed, order, enough=lambda: publication.has(folder.staged_index))
+    return listed
 
 
-def accept_objects(
-    order: AskedObjects, part: LockPart | None = None, found: FoundObjects | None = None
-) -> AcceptedObjects:
+def accept_objects(order: AskedObjects, listed: ListedObjects | None = None) -> AcceptedObjects:
     """Turn a source into frozen meshes: of all its objects, or of those that were frozen before.
 
     Textures and maps of a user's own are frozen with them. Call in the turn `objects`.
 
     Args:
         order: what is asked for.
-        part: what is to be frozen; by default the whole.
-        found: what the source has, where that is known.
+        listed: what the source has, where that is known.
 
     Raises:
-        TrilightError, EnvironmentFailure: as `find_objects` and `freeze_objects`.
+        TrilightError, EnvironmentFailure: as `list_objects` and `freeze_objects`.
     """
     settings, folder = order.settings, order.publication.folder
-    part = part or order.whole
-    if trusted := trusted_objects(order, part):
+    if trusted := trusted_objects(order):
         return trusted
-    frozen = part.frozen(order.publication)
-    shared, found = found is not None, found or order.found(part)
-    maps = _same_maps(accept_maps(order.own, settings, workers=order.workers), order, part)
-    if frozen is None:
-        prepared, rejected = _proofs(found, order, part, again=not shared)
-    else:
-        wanted = _beside(frozen, found)
-        announce_objects(folder, len(wanted.records))
-        proofs, failures = _proofs(wanted, order, part)
-        prepared = [one for one in proofs if one.record.uid in frozen]
-        rejected = [failure for failure in failures if failure.item in frozen]
-    accepted = freeze_objects(order, found, prepared, rejected, maps, part)
-    if part.number is None:
-        shutil.rmtree(folder.staged_parts, ignore_errors=True)
+    frozen = frozen_objects(order.publication)
+    shared, listed = listed is not None, listed or order.listed()
+    maps = _same_maps(accept_maps(order.own, settings, workers=order.workers), order, frozen)
+    wanted = listed.allowed
+    if frozen is not None:
+        wanted = [record for record in wanted if record.uid in frozen]
+        announce_objects(folder, len(wanted))
+    prepared, rejected = _prepare(listed, wanted, order, again=not shared)
+    lost = [failure for failure in rejected if failure.stage == "objects"]
+    listed.require_some(len(wanted) - len(lost), [*listed.refused, *lost])
+    accepted = freeze_objects(order, prepared, [*listed.refused, *rejected], listed.num_found, maps)
+    shutil.rmtree(folder.staged_batches, ignore_errors=True)
     return accepted
 
 
-def _beside(frozen: Container[str], found: FoundObjects) -> FoundObjects:
-    """Return the objects that are frozen, and those that were prepared together with them."""
-    parts = cut_objects(found.records)
-    kept = [part for part in parts if any(record.uid in frozen for record in part)]
-    return replace(found, records=tuple(record for part in kept for record in part))
-
-
-def _same_maps(maps: AcceptedMaps, order: AskedObjects, part: LockPart) -> AcceptedMaps:
+def _same_maps(
+    maps: AcceptedMaps, order: AskedObjects, frozen: dict[str, LockedObject] | None
+) -> AcceptedMaps:
     """Return those of the maps that the dataset was begun with, or all where that is now."""
-    frozen = part.frozen_maps(order.publication)
     if frozen is None:
         return maps
     kept = tuple(row for row in maps.rows if row[0].uid in frozen)
-    require_same(safe_url(order.source), frozen, [entry for entry, _ in kept])
+    of_maps = {uid: entry for uid, entry in frozen.items() if entry.kind != OBJECT}
+    require_same(safe_url(order.source), of_maps, [entry for entry, _ in kept])
     return replace(maps, rows=kept)
 
 
-def _proofs(
-    found: FoundObjects,
+def _prepare(
+    listed: ListedObjects,
+    records: Sequence[ObjectRecord],
     order: AskedObjects,
-    part: LockPart,
     enough: Callable[[], bool] = lambda: False,
     again: bool = True,
-) -> Proof:
-    return prepare_in_parts(
-        [record for record in found.records if part.holds(record.uid)],
-        order.settings.mesh_settings,
-        part.folder.staged_parts,
-        others=order.publication if part.folder.bucket else None,
+) -> PrepareResult:
+    folder = order.publication.folder
+    downloads = _Downloads(listed, folder, len(records))
+    work = ObjectWork(
+        settings=order.settings.mesh_settings,
+        publication=order.publication,
+        fetch=None if listed.listing.is_here else downloads.fetch,
+    )
+    return prepare_in_batches(
+        sorted(records, key=attrgetter("uid")),
+        work,
         workers=order.workers,
-        done=lambda count: count_object(part.folder, count),
+        done=lambda count: count_object(folder, count),
         enough=enough,
         again=again,
     )
 
 
-def trusted_objects(order: AskedObjects, part: LockPart | None = None) -> AcceptedObjects | None:
+class _Downloads:
+    """The downloads of this worker's batches, announced together."""
+
+    def __init__(self, listed: ListedObjects, folder: DatasetFolder, total: int) -> None:
+        self._listed, self._folder, self._total = listed, folder, total
+        self._mutex, self._done = threading.Lock(), 0
+
+    def fetch(self, records: list[ObjectRecord]) -> Fetched:
+        return self._listed.fetch(records, self._announce)
+
+    def _announce(self, done_of_batch: int, batch: int) -> None:
+        with self._mutex:
+            self._done += done_of_batch > 0
+            announce_downloads(self._folder, self._done, self._total)
+
+
+def trusted_objects(order: AskedObjects) -> AcceptedObjects | None:
     """Return the frozen objects by their index, without a look at any of them.
 
     The lock has their digests, by which each is checked where a scene draws it. None where nothing
@@ -119,26 +140,24 @@ def trusted_objects(order: AskedObjects, part: LockPart | None = None) -> Accept
     Raises:
         TrilightError: as `accept_maps`.
     """
-    part = part or order.whole
-    part.take(order.publication)
+    publication = order.publication
+    folder = publication.folder
+    publication.take_lock()
     try:
-        facts = ObjectIndex(part.index).facts
-        lock = LockRows(part.lock)
-        known = facts.lock_bytes, facts.asked
-        if known != (lock.num_bytes, order.digest):
-            return None
-        if not part.is_public(order.publication, facts.lock_sha256):
-            return None
+        facts = ObjectIndex(folder.staged_index).facts
+        lock = LockRows(folder.objects_lock)
     except TrilightError:
         return None
+    known = facts.lock_sha256, facts.lock_bytes, facts.asked
+    if known != (publication.manifest.objects_lock_sha256, lock.num_bytes, order.digest):
+        return None
     found = accept_maps(order.own, order.settings, workers=order.workers)
-    kept = LockRows(part.maps) if facts.num_maps and part.maps.exists() else lock
-    maps = tuple(row for row in found.rows if kept.find(row[0].uid) == row[0])
+    maps = tuple(row for row in found.rows if lock.find(row[0].uid) == row[0])
     if len(maps) != facts.num_maps:  # the long way says which one has changed
         return None
     return AcceptedObjects(
         num_objects=facts.num_objects,
         num_found=facts.num_found,
-        pool=order.pool(part),
+        pool=order.pool,
         maps=maps,
     )

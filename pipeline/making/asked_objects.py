@@ -1,15 +1,12 @@
 """What is asked for where the objects of a dataset are frozen."""
 
 from dataclasses import dataclass
-from functools import partial
 
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.accept_maps import NO_FOLDERS, MapFolders
 from pipeline.making.frozen_pool import FrozenPool
-from pipeline.making.lock_parts import LockPart
 from pipeline.making.publication import Publication
-from pipeline.objects.sources import FoundObjects, list_objects
-from storage.dataset.progress import announce_downloads
+from pipeline.objects.sources import ListedObjects, list_objects
 from storage.digests import canonical_json, sha256_hex
 
 
@@ -36,23 +33,21 @@ class AskedObjects:
         return sha256_hex(canonical_json([self.source, self.licence]))
 
     @property
-    def whole(self) -> LockPart:
-        """All objects, frozen at once."""
-        return LockPart(folder=self.publication.folder, splits=self.settings.splits)
-
-    def pool(self, part: LockPart) -> FrozenPool:
-        """Return where the scenes of a part, once it is frozen, have their objects from."""
+    def pool(self) -> FrozenPool:
+        """Where scenes, once the objects are frozen, have them from."""
+        folder = self.publication.folder
         return FrozenPool(
-            lock=part.lock, index=part.index, source=self.source, licence=self.licence
+            lock=folder.objects_lock,
+            index=folder.staged_index,
+            source=self.source,
+            licence=self.licence,
         )
 
-    def found(self, part: LockPart) -> FoundObjects:
-        """List the source, and download what of a part is not here; raises as `find_objects`."""
-        folder = self.publication.folder
-        listed = list_objects(
+    def listed(self) -> ListedObjects:
+        """List the source; raises as `list_objects`."""
+        return list_objects(
             self.source,
-            work_dir=folder.staged_objects,
+            work_dir=self.publication.folder.staged_objects,
             allowed_licences=self.settings.allowed_licences,
             licence=self.licence,
         )
-        return listed.found(part.holds, partial(announce_downloads, folder))

@@ -1,6 +1,5 @@
 """A dataset is begun in a folder, or gone on with where it is the same one."""
 
-import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
@@ -41,7 +40,6 @@ def begin(
             whole = max(whole, manifest.num_scenes)
         else:
             require_free(folder, _names_in(folder))
-            shutil.rmtree(folder.staged_locks, ignore_errors=True)  # of a dataset that was here
             manifest = Manifest(
                 build=settings.build,
                 settings=settings.as_json(),

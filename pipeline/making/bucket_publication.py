@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,6 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.making.begin_publication import begin, require_free
 from pipeline.making.publication import Publication
 from pipeline.shards.mirror import Mirror
-from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder, parts_of, shard_names_in, shard_names_in_part
 from storage.dataset.manifest import Manifest, read_head, read_manifest
@@ -19,13 +18,7 @@ from storage.dataset.settings import SplitSettings
 from storage.dataset.shard_notes import ShardNote, note_shard, noted_names
 from storage.dataset.splits import shard_name
 from storage.errors import TrilightError
-from storage.records.objects import (
-    Failure,
-    LockedObject,
-    encode_failures,
-    encode_objects_lock,
-    write_objects_lock,
-)
+from storage.records.objects import LockedObject, encode_objects_lock
 from storage.remote.bucket import Bucket
 from storage.remote.url import RemoteUrl, parse_url
 
@@ -65,25 +58,17 @@ class BucketPublication(Publication):
             with self._turn():
                 self._write(objects_lock_sha256=theirs)
 
-    def take(self, files: Iterable[Path]) -> None:
-        self._mirror.take(files)
+    @contextlib.contextmanager
+    def claim(self, path: Path) -> Iterator[bool]:
+        with contextlib.ExitStack() as stack:
+            here = stack.enter_context(super().claim(path))
+            yield here and stack.enter_context(self._mirror.claim(path))
 
     def send(self, path: Path) -> None:
         self._mirror.send_file(path)
 
     def has(self, path: Path) -> bool:
         return path.exists() or self._mirror.has(path)
-
-    def freeze_lock_part(
-        self, path: Path, rows: Iterable[LockedObject], failures: Iterable[Failure] = ()
-    ) -> None:
-        lock = encode_objects_lock(rows)
-        self._mirror.freeze_part(path, lock, encode_failures(failures))
-        write_atomically(path, lock)
-
-    def restore_lock_part(self, path: Path, rows: Iterable[LockedObject]) -> None:
-        if not path.exists():  # the lock is made of all parts, by whoever finishes
-            write_objects_lock(path, rows)
 
     def _note(self, note: ShardNote) -> None:
         if self.folder.shard(note.shard.name).exists():  # else another machine has sent it
@@ -116,14 +101,10 @@ class BucketPublication(Publication):
             if self.left_to_others:
                 self._mirror.take_finished()
             else:
-                if self.in_parts:
-                    self.add_failures(self._mirror.take_parts_of_lock())
                 with self._turn():
                     self._mirror.take_listed(self.manifest)
             listed = super().finish()
             if listed and not self.left_to_others:
-                if self.in_parts:
-                    self._mirror.send_lock()
                 self._mirror.send_manifest()
                 self._mirror.say_listed(self.manifest.num_scenes)
             news = self.learn_plan()
@@ -194,8 +175,7 @@ def begin_dataset(
     mirror = Mirror(folder)
     is_new = not mirror.is_begun()
     if is_new:
-        require_free(folder, names := mirror.names())
-        _require_no_parts(folder, names)
+        require_free(folder, mirror.names())
         url = parse_url(folder.bucket, what="out")
         assert isinstance(url, RemoteUrl)
         Bucket(url).require_create()
@@ -207,16 +187,6 @@ def begin_dataset(
     in_bucket = BucketPublication(folder, publication.manifest, settings.splits, mirror)
     in_bucket.learn_plan()
     return in_bucket
-
-
-def _require_no_parts(folder: DatasetFolder, names: set[str]) -> None:
-    place = folder.staged_locks.relative_to(folder.root).as_posix()
-    if left := sorted(name for name in names if name.startswith(place)):
-        raise TrilightError(
-            f"{folder.shown}: {left[0]} is there but no manifest.json: objects of another dataset "
-            "are frozen here; expected an empty folder or a dataset. Delete .staging, or choose "
-            "another --out."
-        )
 
 
 def joined(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
@@ -237,6 +207,6 @@ def forget_empty(folder: DatasetFolder) -> None:
     while alone in the folder; whoever was at it all the same finds out (`Publication.refresh`).
     """
     with contextlib.suppress(TrilightError):  # an unreadable one is told of by whoever needs it
-        frozen = read_head(folder.manifest).objects_lock_sha256 or folder.lock_parts()
+        frozen = read_head(folder.manifest).objects_lock_sha256
         if not (frozen or folder.shard_files()) and not any(folder.staged_samples.rglob("*.tar")):
             folder.manifest.unlink()

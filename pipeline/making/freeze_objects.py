@@ -12,14 +12,11 @@ from pipeline.isolation import is_passing
 from pipeline.making.accept_maps import NO_MAPS, AcceptedMaps
 from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.frozen_pool import FrozenPool
-from pipeline.making.lock_parts import LockPart
-from pipeline.making.object_parts import ProvedObject
+from pipeline.making.object_batches import PreparedObject
 from pipeline.making.publication import Publication
 from pipeline.making.revisited_scenes import RevisitedScenes
-from pipeline.objects.sources import FoundObjects
 from storage.conventions import SPLITS
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
-from storage.digests import sha256_of_file
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.object_index import IndexedObject, write_object_index
 from storage.records.objects import (
@@ -54,20 +51,19 @@ class AcceptedObjects:
 
 def freeze_objects(
     order: AskedObjects,
-    found: FoundObjects,
-    prepared: list[ProvedObject],
+    prepared: list[PreparedObject],
     rejected: list[Failure],
+    num_found: int,
     maps: AcceptedMaps = NO_MAPS,
-    part: LockPart | None = None,
 ) -> AcceptedObjects:
     """Freeze the objects at the first time, and later require that they are the same.
 
     Args:
         order: what is asked for.
-        found: what the source has.
-        prepared, rejected: what the mesh stage made of it, or later of what is frozen.
+        prepared: objects that the mesh stage accepted, or later those of them that are frozen.
+        rejected: refusals of the source, and of the mesh stage.
+        num_found: number of objects in the source.
         maps: textures and maps of the user's own, which are frozen with the objects.
-        part: of the lock that `prepared` is; by default the whole.
 
     Raises:
         TrilightError: no object is accepted, a split has none, or the objects are not those that
@@ -75,46 +71,41 @@ def freeze_objects(
         EnvironmentFailure: one of those could not be prepared this time.
     """
     publication, settings = order.publication, order.settings
-    part = part or order.whole
-    shown, frozen = safe_url(order.source), part.frozen(publication)
+    shown, frozen = safe_url(order.source), frozen_objects(publication)
     passing = [failure for failure in rejected if is_passing(failure.reason)]
     if frozen is not None:
         for failure in passing:
             require_tried(shown, failure)
-    failures = [*found.failures, *rejected, *maps.failures]
-    publication.add_failures(failures)
+    publication.add_failures([*rejected, *maps.failures])
     objects = [_locked(asset, settings) for asset in prepared]
-    own = [entry for entry, _ in maps.rows]
+    locked = [*objects, *(entry for entry, _ in maps.rows)]
     if frozen is None:
-        _require_enough(objects, part, publication, shown)
+        _require_enough(objects, settings, publication, shown)
         _warn_of(shown, passing)
         _tell_of_materials(shown, prepared)
-        part.freeze(publication, objects, own, failures)
+        publication.lock_objects(locked)
     else:
-        require_same(shown, frozen, [*objects, *own])
-        part.restore(publication, objects, own)
-    _index(order, part, [*objects, *own], prepared, found.num_found)
+        require_same(shown, frozen, locked)
+    _index(order, locked, prepared, num_found)
     return AcceptedObjects(
         num_objects=len(objects),
-        num_found=found.num_found,
-        pool=order.pool(part),
+        num_found=num_found,
+        pool=order.pool,
         maps=maps.rows,
     )
 
 
 def _index(
     order: AskedObjects,
-    part: LockPart,
     locked: list[LockedObject],
-    prepared: list[ProvedObject],
+    prepared: list[PreparedObject],
     num_found: int,
 ) -> None:
     """Write the index of the lock, by which later makers trust it."""
-    assets = {asset.record.uid: asset for asset in prepared}
-    rows = [entry for entry in locked if part.number is None or entry.kind == OBJECT]
-    objects, offset = [], 0
-    with part.lock.open("rb") as lines:
-        for line, entry in zip(lines, sorted(rows, key=attrgetter("uid")), strict=True):
+    assets, publication = {asset.record.uid: asset for asset in prepared}, order.publication
+    folder, objects, offset = publication.folder, list[IndexedObject](), 0
+    with folder.objects_lock.open("rb") as lines:
+        for line, entry in zip(lines, sorted(locked, key=attrgetter("uid")), strict=True):
             if entry.kind == OBJECT:
                 asset = assets[entry.uid]
                 objects.append(
@@ -127,15 +118,15 @@ def _index(
                 )
             offset += len(line)
     write_object_index(
-        part.index,
+        folder.staged_index,
         objects,
-        lock_sha256=sha256_of_file(part.lock),
+        lock_sha256=publication.manifest.objects_lock_sha256,
         lock_bytes=offset,
         asked=order.digest,
         num_found=num_found,
         num_maps=len(locked) - len(objects),
     )
-    order.publication.send(part.index)
+    publication.send(folder.staged_index)
 
 
 def frozen_objects(publication: Publication) -> dict[str, LockedObject] | None:
@@ -145,7 +136,7 @@ def frozen_objects(publication: Publication) -> dict[str, LockedObject] | None:
     return {entry.uid: entry for entry in read_objects_lock(publication.folder.objects_lock)}
 
 
-def _locked(asset: ProvedObject, settings: BuildSettings) -> LockedObject:
+def _locked(asset: PreparedObject, settings: BuildSettings) -> LockedObject:
     record = asset.record
     return LockedObject(
         uid=record.uid,
@@ -160,15 +151,15 @@ def _locked(asset: ProvedObject, settings: BuildSettings) -> LockedObject:
 
 
 def _require_enough(
-    locked: list[LockedObject], part: LockPart, publication: Publication, source: str
+    locked: list[LockedObject], settings: BuildSettings, publication: Publication, source: str
 ) -> None:
     if not locked:
         raise TrilightError(
             f"objects {source!r}: none was accepted; expected at least one usable object with an "
             f"allowed licence. The reasons are in {publication.folder.failures}."
         )
-    shards = filter(part.has_shard, range(publication.num_shards))
-    needed = {split_of_shard(index, part.splits) for index in shards}
+    shards = range(publication.num_shards)
+    needed = {split_of_shard(index, settings.splits) for index in shards}
     require_objects(
         {split: sum(entry.split == split for entry in locked) for split in SPLITS}, needed
     )
@@ -205,7 +196,7 @@ def _warn_of(source: str, passing: list[Failure]) -> None:
         )
 
 
-def _tell_of_materials(source: str, prepared: list[ProvedObject]) -> None:
+def _tell_of_materials(source: str, prepared: list[PreparedObject]) -> None:
     """Say which objects get drawn materials although their own were asked for."""
     reasons = Counter(asset.without_own for asset in prepared if asset.without_own)
     if reasons:

@@ -18,8 +18,8 @@ crash costs one attempt.
 
 Files are the truth, and every step may be killed at any moment. A mesh is kept in the asset store,
 a scene in the staging folder, a shard in the dataset; the next run looks at what is there and makes
-the rest. Several runs on one folder share the work (storage.claims), and those on one
-bucket share what is finished (pipeline.shards.mirror).
+the rest. Several runs on one folder share the work (storage.claims), and those on one bucket share
+batches of objects (storage.remote.claims) and what is finished (pipeline.shards.mirror).
 """
 
 import contextlib
@@ -42,7 +42,6 @@ from pipeline.making.attempt_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.making.bucket_publication import joined
 from pipeline.making.dataset_order import DatasetOrder, generate_words
 from pipeline.making.freeze_objects import AcceptedObjects
-from pipeline.making.lock_parts import LockPart, lock_parts
 from pipeline.making.machine import cores_owned
 from pipeline.making.publication import Publication
 from pipeline.making.render_children import (
@@ -88,8 +87,7 @@ def make_dataset(
         TrilightError: what the user can mend; what is finished is safe.
     """
     with _begun(order) as run:  # objects, meshes
-        for part in _by_parts(run):
-            make_shards(part, runner, watch)  # scenes, renders, shards
+        make_shards(run, runner, watch)  # scenes, renders, shards
         finished = run.publication.finish()
         run.require_within_budget()
         statistics = None
@@ -113,7 +111,6 @@ def _begun(order: DatasetOrder) -> Iterator[Run]:
     with joined(folder):
         own = map_folders(order, settings)
         publication = begun_publication(order, settings, folder)
-        part = None
         if listed or order.revisits:
             with folder.turn("objects"):
                 publication.refresh()
@@ -123,9 +120,7 @@ def _begun(order: DatasetOrder) -> Iterator[Run]:
                     else accept_revisited(order.revisits or "", settings, publication)
                 )
         else:
-            shards = _wanted_shards(order, settings, publication)
-            part = lock_parts(folder, settings.splits, shards)[0]
-            accepted = accept_part(order, settings, publication, own, part)
+            accepted = _accept_together(order, settings, publication, own)
         write_asked(folder, generate_words(order))
         yield Run(
             order=order,
@@ -133,44 +128,13 @@ def _begun(order: DatasetOrder) -> Iterator[Run]:
             listed=listed,
             publication=publication,
             accepted=accepted,
-            part=part,
         )
 
 
-def _wanted_shards(
-    order: DatasetOrder, settings: BuildSettings, publication: Publication
-) -> list[int]:
-    """Return the shards whose parts an order asks for, those that are missing first."""
-    if settings.splits.object_parts == 1:
-        return []
-    wanted = order.shard_range() or range(publication.num_shards)
-    return [*publication.missing_shards(wanted), *wanted]
-
-
-def _by_parts(run: Run) -> Iterator[Run]:
-    """Yield the run for each part of the objects whose shards are missing, frozen when it is due.
-
-    Where objects are frozen as a whole, that is the run as it is.
-    """
-    yield run
-    if run.part is None or run.part.number is None:
-        return
-    everything, own = replace(run, part=None), map_folders(run.order, run.settings)
-    folder, splits = run.publication.folder, run.settings.splits
-    for part in lock_parts(folder, splits, everything.missing_shards()):  # none: all are there
-        if part != run.part:
-            accepted = accept_part(run.order, run.settings, run.publication, own, part)
-            yield replace(run, accepted=accepted, part=part)
-
-
-def accept_part(
-    order: DatasetOrder,
-    settings: BuildSettings,
-    publication: Publication,
-    own: MapFolders,
-    part: LockPart,
+def _accept_together(
+    order: DatasetOrder, settings: BuildSettings, publication: Publication, own: MapFolders
 ) -> AcceptedObjects:
-    """Return the frozen objects of a part: at once where they are known, else made with others."""
+    """Return the frozen objects: at once where they are known, else prepared with other workers."""
     asked = AskedObjects(
         source=object_source(settings, order.objects),
         licence=order.licence,
@@ -179,12 +143,12 @@ def accept_part(
         workers=cores_owned(),
         own=own,
     )
-    if trusted := trusted_objects(asked, part):
+    if trusted := trusted_objects(asked):
         return trusted
-    found = share_mesh_work(asked, part)
+    listed = share_mesh_work(asked)
     with publication.folder.turn("objects"):  # one maker freezes, and the others find it done
         publication.refresh()
-        return accept_objects(asked, part, found)
+        return accept_objects(asked, listed)
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from storage.atomic import write_atomically
+from storage.claims import claimed
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import (
     DatasetFolder,
@@ -18,7 +19,6 @@ from storage.dataset.layout import (
     shard_names_in,
     shard_names_in_part,
 )
-from storage.dataset.lock_parts import known_lock
 from storage.dataset.manifest import (
     Manifest,
     ShardEntry,
@@ -44,7 +44,6 @@ from storage.records.objects import (
     encode_objects_lock,
     read_failures,
     write_failures,
-    write_objects_lock,
 )
 
 _LOOKS = 7
@@ -102,14 +101,20 @@ class Publication:
 
     def lock_objects(self, objects: list[LockedObject]) -> None:
         """Freeze the objects of the dataset."""
+        lock = encode_objects_lock(objects)
         with self._turn():
-            self._write_lock(encode_objects_lock(objects))
+            write_atomically(self.folder.objects_lock, lock)
+            self._write(objects_lock_sha256=sha256_hex(lock))
 
     def take_lock(self) -> None:
         """Have the lock and its index here, where another machine has frozen the objects."""
 
-    def take(self, files: Iterable[Path]) -> None:
-        """Have files below the folder's `.staging` here, as far as they are with the dataset."""
+    def claim(self, path: Path) -> contextlib.AbstractContextManager[bool]:
+        """Hold the claim on a file that one worker makes; yield whether it is ours.
+
+        Where it is, another worker may have made the file in the meantime.
+        """
+        return claimed(path.with_suffix(".claim"))
 
     def send(self, path: Path) -> None:
         """Bring a file of the folder to where the dataset is: here it is."""
@@ -117,43 +122,6 @@ class Publication:
     def has(self, path: Path) -> bool:
         """Return whether a file of the folder is where the dataset is."""
         return path.exists()
-
-    def freeze_lock_part(
-        self, path: Path, rows: Iterable[LockedObject], failures: Iterable[Failure] = ()
-    ) -> None:
-        """Freeze a part of the lock, and what was rejected on the way to it, once.
-
-        Args:
-            path: its file (DatasetFolder.lock_part).
-            rows: what it holds.
-            failures: as rows of failures.jsonl.
-        """
-        self.add_failures(failures)
-        self.restore_lock_part(path, rows)
-
-    def restore_lock_part(self, path: Path, rows: Iterable[LockedObject]) -> None:
-        """Have the file of a frozen part here, and the lock of all parts that are."""
-        if not path.exists():
-            write_objects_lock(path, rows)
-        self.join_lock_parts()
-
-    def join_lock_parts(self) -> None:
-        """Make the lock of its parts that are here; one that is frozen as a whole stays."""
-        if self.in_parts and self.folder.lock_parts():
-            with self._turn():
-                lock = known_lock(self.folder)
-                if sha256_hex(lock) != self.manifest.objects_lock_sha256:
-                    self._write_lock(lock)
-
-    @property
-    def in_parts(self) -> bool:
-        """Whether the objects are frozen in parts."""
-        return self._splits.object_parts > 1
-
-    def _write_lock(self, lock: bytes) -> None:
-        """Write the lock and what the manifest says of it; call in the turn of the manifest."""
-        write_atomically(self.folder.objects_lock, lock)
-        self._write(objects_lock_sha256=sha256_hex(lock))
 
     def add_shard(self, shard: ShardEntry) -> None:
         """Note a finished shard.
@@ -230,7 +198,6 @@ class Publication:
         """
         if not self._are_all_there():
             return None
-        self.join_lock_parts()
         with self._turn():  # somebody may have planned more
             if not self._are_all_there():
                 return None

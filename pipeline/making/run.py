@@ -13,7 +13,6 @@ from pipeline.making.bucket_publication import begin_dataset
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.environment import environment
 from pipeline.making.freeze_objects import AcceptedObjects
-from pipeline.making.lock_parts import LockPart
 from pipeline.making.machine import visible_gpus
 from pipeline.making.publication import Publication
 from pipeline.objects.sources import look_at_source
@@ -21,7 +20,6 @@ from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry
 from storage.dataset.statistics import Statistics
-from storage.digests import sha256_of_file
 from storage.errors import TrilightError
 from storage.records.objects import Failure
 
@@ -40,13 +38,10 @@ class Run:
     """What is public of the dataset."""
     accepted: AcceptedObjects
     """What scenes are made of."""
-    part: LockPart | None = None
-    """Where objects are frozen in parts: the one that `accepted` is."""
 
     def missing_shards(self) -> list[int]:
         """Return the numbers of the shards that were asked for and are not there."""
-        missing = self.publication.missing_shards(self.order.shard_range())
-        return [index for index in missing if self.part is None or self.part.has_shard(index)]
+        return self.publication.missing_shards(self.order.shard_range())
 
     def num_workers(self) -> int:
         """Return how many tasks run at a time in one process, where the executor does not say."""
@@ -56,16 +51,13 @@ class Run:
 
     def job(self, num_at_once: int) -> "ShardJob":
         """Return what the tasks of this run share, `num_at_once` of them in one process."""
-        manifest, part = self.publication.manifest, self.part
-        frozen = manifest.objects_lock_sha256
-        if part is not None and part.number is not None:
-            frozen = sha256_of_file(part.lock)
+        manifest = self.publication.manifest
         return ShardJob(
             folder=self.publication.folder,
             settings=self.settings,
             environment={} if self.order.accept_environment else manifest.environment,
             accepted=self.accepted,
-            lock_sha256=frozen,
+            lock_sha256=manifest.objects_lock_sha256,
             num_at_once=num_at_once,
             extensions=manifest.extensions,
         )
@@ -73,9 +65,6 @@ class Run:
     def outcome(self, finished: Manifest | None, statistics: Statistics | None) -> "Outcome":
         """Return what the run leaves behind, of a finished dataset with what it holds."""
         publication, listed = self.publication, self.listed
-        num_objects, part = self.accepted.num_objects, self.part
-        if part is not None and part.number is not None:
-            num_objects = part.num_frozen()
         notes: tuple[str, ...] = ()
         if listed and self.accepted.files:
             notes = (*self.accepted.files.notes, *listed.notes(self.settings.scenes.num_views))
@@ -84,7 +73,7 @@ class Run:
         return Outcome(
             digest=finished.dataset_digest if finished else "",
             num_objects_found=self.accepted.num_found,
-            num_objects_used=num_objects,
+            num_objects_used=self.accepted.num_objects,
             num_scenes_given_up=publication.done.given_up,
             failures=tuple(publication.failures),
             num_shards=len(finished.shards) if finished else publication.num_shards_there(),
@@ -122,7 +111,7 @@ class ShardJob:
     accepted: AcceptedObjects
     """What scenes are made of; prepared files are in the user's cache, or are made there again."""
     lock_sha256: str
-    """Digest of the frozen objects, of those of its part where there are several."""
+    """Digest of the frozen objects."""
     num_at_once: int
     """Tasks at a time in one process; they share its cores."""
     extensions: Mapping[str, str]

@@ -29,6 +29,11 @@ class Listing:
     """Brings objects to this machine; returns them with their paths, and a failure for each that
     could not be fetched. Files of this machine are left where they are."""
 
+    @property
+    def is_here(self) -> bool:
+        """Whether the files of all objects are on this machine, with nothing to fetch."""
+        return self.fetch is _here_already
+
 
 def failure(uid: str, reason: str, message: str) -> Failure:
     """Return the row of an object that this stage refuses."""

@@ -20,7 +20,7 @@ from pipeline.objects.licences import (
     require_unstated,
     stated_licence,
 )
-from pipeline.objects.listing import SUFFIXES, Listing
+from pipeline.objects.listing import SUFFIXES, CountDone, Fetched, Listing
 from pipeline.objects.local.folder import list_folder
 from pipeline.objects.objaverse.source import list_objaverse
 from pipeline.objects.remote.source import list_remote
@@ -129,13 +129,11 @@ class FoundObjects:
     failures: tuple[Failure, ...]
     """The other ones, of the stage `objects`, sorted by uid: licence_refused, download_failed,
     too_large_bytes, too_many_buffers, unsafe_name, unknown_uid, link_outside, name_clash."""
-    num_unwanted: int = 0
-    """Objects of the source that were not asked for."""
 
     @property
     def num_found(self) -> int:
         """How many objects the source has."""
-        return len(self.records) + len(self.failures) + self.num_unwanted
+        return len(self.records) + len(self.failures)
 
 
 def _silent(done: int, total: int) -> None:
@@ -179,15 +177,35 @@ class ListedObjects:
         """
         records = [record for record in self.allowed if wanted(record.uid)]
         failures = [failure for failure in self.refused if wanted(failure.item)]
-        num_wanted = len(records) + len(failures)
-        with _said_by(self.source) as value:
-            here, lost = self.listing.fetch(records, downloaded)
-            _require_some(printable(safe_url(value)), here, [*failures, *lost])
+        here, lost = self.fetch(records, downloaded)
+        self.require_some(len(here), [*failures, *lost])
         return FoundObjects(
             records=tuple(sorted(here, key=attrgetter("uid"))),
             failures=tuple(sorted([*failures, *lost], key=attrgetter("item"))),
-            num_unwanted=len(self.allowed) + len(self.refused) - num_wanted,
         )
+
+    @property
+    def num_found(self) -> int:
+        """Number of objects in the source."""
+        return len(self.allowed) + len(self.refused)
+
+    def fetch(self, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
+        """Bring some of the allowed objects here; as `Listing.fetch`."""
+        with _said_by(self.source):
+            return self.listing.fetch(records, downloaded)
+
+    def require_some(self, num_here: int, failures: Sequence[Failure]) -> None:
+        """Raise TrilightError where downloads were tried and none came through."""
+        lost = [failure for failure in failures if failure.reason in _NOT_HAD]
+        if num_here or not lost:
+            return
+        first = min(lost, key=attrgetter("item"))
+        with _said_by(self.source) as value:
+            raise TrilightError(
+                f"objects {printable(safe_url(value))!r}: none of {len(lost)} objects could be "
+                f"downloaded; the first is {first.reason} ({first.message}); expected at least "
+                "one. Check the source and try again."
+            )
 
 
 def list_objects(
@@ -319,15 +337,3 @@ def _listed(
             f"some. Name {BUILTIN} for built-in objects."
         )
     return listing
-
-
-def _require_some(shown: str, here: list[ObjectRecord], failures: list[Failure]) -> None:
-    """Raise TrilightError where downloads were tried and none came through."""
-    lost = [failure for failure in failures if failure.reason in _NOT_HAD]
-    if lost and not here:
-        first = min(lost, key=attrgetter("item"))
-        raise TrilightError(
-            f"objects {shown!r}: none of {len(lost)} objects could be downloaded; the first is "
-            f"{first.reason} ({first.message}); expected at least one. Check the source and try "
-            "again."
-        )

@@ -9,20 +9,22 @@ the manifest follows from the notes, so whoever finds all shards there may write
 A folder here has the manifest without that list; what it notes as sent is what its makers have
 looked at: the parts of the dataset that they were asked for.
 
-Claims do not reach from one machine to another: two machines with the same shards make scenes
-twice, and the first writer of a shard wins. That is wasted work, never wrong.
+Machines claim batches of objects through the bucket (storage.remote.claims). Claims on scenes do
+not reach from one machine to another: two machines with the same shards make scenes twice, and the
+first writer of a shard wins. That is wasted work, never wrong.
 """
 
+import contextlib
 import dataclasses
 import io
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from storage.atomic import write_atomically
 from storage.claims import claimed
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles, read_beside
-from storage.dataset.layout import LOCK_PART, DatasetFolder, place_of_part
+from storage.dataset.layout import DatasetFolder, place_of_part
 from storage.dataset.manifest import (
     SHARD_NAME,
     Manifest,
@@ -44,9 +46,10 @@ from storage.dataset.shard_notes import (
 )
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
-from storage.records.objects import Failure, decode_failures, read_failures, write_failures
+from storage.records.objects import decode_failures, read_failures, write_failures
 from storage.remote.bucket import Bucket
 from storage.remote.cache import shard_cache
+from storage.remote.claims import BucketClaims
 from storage.remote.url import RemoteUrl, parse_url
 
 _PLANNED = ".staging/planned/"
@@ -66,6 +69,7 @@ class Mirror:
         self._folder = folder
         self._bucket = Bucket(url)
         self._files = RemoteDatasetFiles(url)
+        self._claims = BucketClaims(self._bucket, folder.staging / "worker")
         self._names_listed: set[str] | None = None
 
     def names(self) -> set[str]:
@@ -90,8 +94,7 @@ class Mirror:
             TrilightError: the bucket cannot be read.
         """
         folder, theirs = self._folder, self._head()
-        own = self._own_head()
-        if theirs is None or _identity(own) != _identity(theirs) or not self._parts_agree():
+        if theirs is None or _identity(self._own_head()) != _identity(theirs):
             _clear(folder)
         shutil.rmtree(folder.staged_sent, ignore_errors=True)  # `look_at` looks again
         if theirs is None:
@@ -100,11 +103,6 @@ class Mirror:
         if not theirs.objects_lock_sha256:
             self._take_failures()
         write_manifest(folder.manifest, theirs)
-
-    def _parts_agree(self) -> bool:
-        """Return whether the parts of the lock that are here are those of the bucket."""
-        parts = self._folder.lock_parts()
-        return all(self._files.read(self._name(path)) == path.read_bytes() for path in parts)
 
     def take_finished(self) -> None:
         """Bring the finished manifest of the bucket here, and the lock that it names."""
@@ -164,41 +162,25 @@ class Mirror:
         """Return whether a file of the folder is in the bucket."""
         return self._bucket.read_start(self._name(path), 1) is not None
 
-    def take(self, files: Iterable[Path]) -> None:
-        """Bring files here that are in the bucket and not here."""
-        for path in files:
-            if not path.exists() and (data := self._files.read(self._name(path))) is not None:
-                write_atomically(path, data)
+    @contextlib.contextmanager
+    def claim(self, path: Path) -> Iterator[bool]:
+        """Bring a file here that is in the bucket; hold the claim on one that is not.
 
-    def freeze_part(self, path: Path, lock: bytes, failures: bytes) -> None:
-        """Put a part of the frozen objects into the bucket, after what was rejected for it.
-
-        Raises:
-            TrilightError: another machine has frozen another one.
+        Its holder sends the file before the claim ends. Only one process of a machine may ask for
+        the same file at a time.
         """
-        name = self._name(path)
-        self._bucket.write(_rejected_for(name, lock), failures)
-        if not self._bucket.create(name, lock) and self._files.read(name) != lock:
-            raise TrilightError(
-                f"{self._folder.shown}: another worker has frozen {name} in the meantime, and not "
-                "with the same objects; expected the same --objects everywhere. Run the same "
-                "command again to go on with theirs, or choose another --out."
-            )
+        self._take(path)
+        if path.exists():
+            yield True
+            return
+        with self._claims.claimed(self._name(path)) as ours:
+            if ours:
+                self._take(path)  # its last holder may have sent it
+            yield ours
 
-    def take_parts_of_lock(self) -> list[Failure]:
-        """Bring every part of the frozen objects here; return what was rejected for them."""
-        folder = self._folder
-        names = self._bucket.names_in(self._name(folder.staged_locks))
-        self.take(folder.root / name for name in names if name.endswith(LOCK_PART))
-        rejected = (_rejected_for(self._name(one), one.read_bytes()) for one in folder.lock_parts())
-        files = [self._files.read(name) for name in rejected if name in names]
-        return [row for file in files for row in decode_failures(file or b"")]
-
-    def send_lock(self) -> None:
-        """Put the lock of all parts into the bucket, unless it is there; the manifest follows."""
-        path = self._folder.objects_lock
-        if self._files.read(path.name) != path.read_bytes():
-            self._bucket.write(path.name, path)
+    def _take(self, path: Path) -> None:
+        if not path.exists() and (data := self._files.read(self._name(path))) is not None:
+            write_atomically(path, data)
 
     def planned(self) -> int:
         """Return how many scenes somebody has planned at most."""
@@ -352,17 +334,11 @@ class Mirror:
         return path.relative_to(self._folder.root).as_posix()
 
 
-def _rejected_for(part: str, lock: bytes) -> str:
-    """Return the file of what was rejected for a part of these rows: others may have other ones."""
-    return f"{part}.{sha256_hex(lock)[:16]}.failures"
-
-
 def _identity(manifest: Manifest | None) -> object:
     """Return what scenes that are not in a shard yet depend on."""
     if manifest is None:
         return None
-    in_parts = manifest.settings.get("splits", {}).get("object_parts", 1) > 1  # its lock grows
-    frozen = "" if in_parts else manifest.objects_lock_sha256
+    frozen = manifest.objects_lock_sha256
     return (manifest.settings, manifest.environment, frozen, manifest.extensions)
 
 

@@ -201,7 +201,6 @@ class Dataset:
         manifest: Manifest,
         num_listed: int | None = None,
         noted: Sequence[Failure] = (),
-        joined: Callable[[], bytes] | None = None,
     ) -> None:
         """Name what is read.
 
@@ -210,13 +209,11 @@ class Dataset:
             manifest: what it is, with every shard that may be read.
             num_listed: how many of the shards the manifest on the disk lists; all by default.
             noted: what was rejected on the way to the others.
-            joined: returns the lock of its parts, where these are not one file yet.
         """
         self.files = files
         self.manifest = manifest
         self.num_listed = len(manifest.shards) if num_listed is None else num_listed
         self._noted = noted
-        self._joined = joined
 
     @property
     def shown(self) -> str:
@@ -323,14 +320,9 @@ class Dataset:
         with reading(self.shown, shard.name):
             return contents_of(stream, shard.name)
 
-    @property
-    def is_joined(self) -> bool:
-        """Whether the lock is that of parts, and not one file yet."""
-        return self._joined is not None
-
     def lock_bytes(self) -> bytes | None:
         """Return the file of the objects that were used, or None where the dataset has none."""
-        return self._joined() if self._joined else self.files.read("objects.lock.jsonl")
+        return self.files.read("objects.lock.jsonl")
 
     def objects_lock(self) -> list[LockedObject]:
         """Return the objects that were used; none where the dataset has no lock."""

@@ -1,8 +1,7 @@
 """Paths of a dataset folder, and the locks by which several workers share it.
 
 The shards and the files beside them are the dataset. `.staging` holds unfinished work; it may be
-deleted at any time, and is then made again, with one exception: of an unfinished dataset in a
-bucket whose objects are frozen in parts, `.staging/object_locks` says what is frozen.
+deleted at any time, and is then made again.
 
 No folder holds more than 5,000 entries: of files that are numbered, the first 4,096 stand in their
 folder, and each following 4,096 in one of its `part-0001`, `part-0002`, ... The place of a file
@@ -35,9 +34,6 @@ machines, so a worker that seems alone may not be; no file takes an hour to writ
 FILES_PER_FOLDER = 4096
 """Numbered files of one folder; with their sub-folders and what else lies there, below 5,000."""
 
-
-LOCK_PART = ".lock.jsonl"
-"""How files with a part of the lock end."""
 _PART = re.compile(r"part-(\d{4,6})")
 
 
@@ -131,10 +127,8 @@ class DatasetFolder:
     """Built-in objects, written out as files."""
     staged_index = _Below(".staging/objects.index")
     """The index of the frozen objects (storage.records.object_index)."""
-    staged_locks = _Below(".staging/object_locks")
-    """Rows, index and rejections of each part of the lock, where it is frozen in parts."""
-    staged_parts = _Below(".staging/object_parts")
-    """What came of parts of the objects, until they are frozen."""
+    staged_batches = _Below(".staging/object_batches")
+    """Results of the mesh stage by batch, until the objects are frozen."""
     staged_failures = _Below(".staging/failures")
     """Rejections of shards that are packed and not yet noted."""
     staged_entries = _Below(".staging/entries")
@@ -177,14 +171,6 @@ class DatasetFolder:
     def shard_files(self) -> list[Path]:
         """Return every file that is called like a shard, listed in the manifest or not."""
         return sorted(self.root / name for name in shard_names_in(self.root))
-
-    def lock_part(self, name: str) -> Path:
-        """Return the file with the rows of a part of the lock."""
-        return self.staged_locks / f"{name}{LOCK_PART}"
-
-    def lock_parts(self) -> list[Path]:
-        """Return the files of all parts of the lock that are known here."""
-        return sorted(self.staged_locks.glob(f"*{LOCK_PART}"))
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:

@@ -6,7 +6,7 @@ They are apart from the code that reads shards, which does not import pydantic.
 import functools
 import itertools
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import pydantic
 
@@ -40,6 +40,7 @@ class ListedShard:
 class SplitSettings:
     """How objects and scenes are divided into splits and shards."""
 
+    REMOVED: ClassVar = ("object_parts",)
     scenes_per_shard: Annotated[int, Within(1, 1_000_000, unit="scenes")]
     """Number of scenes in a shard; all of them belong to one split."""
     shards_per_cycle: Annotated[int, Within(TEST_SLOT + 1, 1_000_000, unit="shards")] = 8
@@ -47,9 +48,6 @@ class SplitSettings:
     for testing."""
     held_out_objects: Annotated[float, Within(0, 0.5, low_open=True, high_open=True)] = 0.125
     """Share of objects held out for validation; the same share is held out for testing."""
-    object_parts: Annotated[int, Within(1, 10_000, unit="parts")] = 1
-    """Number of parts in which the objects are frozen. Scenes begin when the objects of the first
-    part are ready, and draw from those of their own part only: for catalogues that take days."""
     one_split: bool = False
     """Put all objects and scenes into the split `test`, for a dataset that only serves evaluation.
     """
@@ -62,17 +60,7 @@ class SplitSettings:
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        record = _without_empty(as_usual(self), "listed_shards")
-        if record["object_parts"] == 1:
-            del record["object_parts"]
-        return record
-
-    def __post_init__(self) -> None:
-        if self.object_parts > 1 and (self.listed_shards or self.listed_scenes is not None):
-            raise TrilightError(
-                f"splits.object_parts is {self.object_parts}; expected 1 where scenes are listed, "
-                "since their objects are not drawn."
-            )
+        return _without_empty(as_usual(self), "listed_shards")
 
     @functools.cached_property
     def first_scenes(self) -> tuple[int, ...]:

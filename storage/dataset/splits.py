@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from storage.conventions import SPLITS
 from storage.dataset.layout import numbered
-from storage.digests import sha256_hex
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
@@ -32,17 +31,6 @@ def split_of_object(geometry_sha256: str, settings: "SplitSettings") -> str:
     if position < settings.held_out_objects:
         return "validation"
     return "test" if position < 2 * settings.held_out_objects else "train"
-
-
-def part_of_object(uid: str, settings: "SplitSettings") -> int:
-    """Return the part in which an object is frozen, from its uid."""
-    return int(sha256_hex(uid.encode())[:15], 16) % settings.object_parts
-
-
-def part_of_shard(shard_index: int, settings: "SplitSettings") -> int:
-    """Return the part whose objects a shard draws from: one for each cycle of splits, in turn."""
-    cycle = 1 if settings.one_split else settings.shards_per_cycle
-    return shard_index // cycle % settings.object_parts
 
 
 def split_of_shard(shard_index: int, settings: "SplitSettings") -> str:

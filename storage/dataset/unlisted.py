@@ -2,12 +2,10 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
-from storage.dataset.dataset import Dataset, LocalFiles, RemoteDatasetFiles
-from storage.dataset.layout import LOCK_PART, DatasetFolder
-from storage.dataset.lock_parts import joined_lock
+from storage.dataset.dataset import Dataset, LocalFiles
+from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import SHARD_NAME, number_of_shard
 from storage.dataset.planned import num_planned
 from storage.dataset.shard_notes import (
@@ -27,7 +25,7 @@ def with_unlisted(dataset: Dataset) -> Dataset:
     Raises:
         TrilightError: a note is none.
     """
-    found, joined = _notes(dataset)
+    found = _notes(dataset)
     if not found:
         return dataset
     notes = {note.shard.name: note for note in found}
@@ -36,31 +34,21 @@ def with_unlisted(dataset: Dataset) -> Dataset:
     every = tuple(sorted(shards.values(), key=number_of_shard))
     failures = [failure for note in notes.values() for failure in note.failures]
     manifest = dataclasses.replace(dataset.manifest, shards=every)
-    return Dataset(dataset.files, manifest, dataset.num_listed, failures, joined)
+    return Dataset(dataset.files, manifest, dataset.num_listed, failures)
 
 
-def _notes(dataset: Dataset) -> tuple[list[ShardNote], Callable[[], bytes] | None]:
-    """Return notes, and what returns the lock of its parts where those are more than the file."""
+def _notes(dataset: Dataset) -> list[ShardNote]:
     files, manifest = dataset.files, dataset.manifest
     if isinstance(files, LocalFiles):
         folder = DatasetFolder(files.root)
         noted = filter(SHARD_NAME.fullmatch, noted_names(folder))
-        return [noted_shard(folder, name) for name in noted if folder.shard(name).exists()], None
+        return [noted_shard(folder, name) for name in noted if folder.shard(name).exists()]
     if files.url.scheme not in WRITABLE or len(manifest.shards) >= num_planned(manifest):
-        return [], None
+        return []
     with contextlib.suppress(TrilightError):  # it may be read and not listed
         names, here = Bucket(files.url).names(), DatasetFolder(Path())
         listed = {shard.name for shard in manifest.shards}
         there = sorted(filter(SHARD_NAME.fullmatch, names - listed))
         notes = (note_of(here, name).as_posix() for name in there)
-        found = fetched_notes(files.read, [name for name in notes if name in names], files.shown)
-        return found, _joined(files, names)
-    return [], None
-
-
-def _joined(files: RemoteDatasetFiles, names: set[str]) -> Callable[[], bytes] | None:
-    here = DatasetFolder(Path())
-    place, whole = here.staged_locks.as_posix(), here.objects_lock.as_posix()
-    parts = [name for name in names if name.startswith(place) and name.endswith(LOCK_PART)]
-    every = [*parts, *([whole] if whole in names else [])]
-    return (lambda: joined_lock(files.read(name) or b"" for name in every)) if parts else None
+        return fetched_notes(files.read, [name for name in notes if name in names], files.shown)
+    return []

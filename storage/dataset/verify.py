@@ -151,8 +151,6 @@ def _by_uid(lock: bytes) -> dict[str, LockedObject]:
 
 def _check_lock(lock: bytes | None, dataset: Dataset) -> Iterator[str]:
     manifest = dataset.manifest
-    if dataset.is_joined:  # of parts that the manifest does not know yet
-        return
     if not manifest.objects_lock_sha256:  # a kill may leave it out until the shards are listed
         if dataset.num_listed or (manifest.shards and lock is None):
             yield "objects.lock.jsonl: the manifest has shards but no digest of the lock"

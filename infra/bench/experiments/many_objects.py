@@ -6,7 +6,7 @@ from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_on
 from infra.bench.subjects.many_objects import NUM_REAL, draw_in_child, write_catalogue
 from infra.bench.workshop import Workshop
 from pipeline.assets.settings import AssetSettings
-from pipeline.making.object_parts import proved
+from pipeline.making.object_batches import prepared_object
 from pipeline.making.prepare_isolated import asset_store, prepare_isolated
 
 COUNTS = (10, 1_000, 100_000, 1_000_000)
@@ -19,7 +19,7 @@ def _drawn(workshop: Workshop, point: Point, turn: str) -> Figures:
         prepared, _ = prepare_isolated(
             workshop.objects[:NUM_REAL], AssetSettings(), workers=1, done=lambda: None
         )
-        known = [proved(asset) for asset in prepared]
+        known = [prepared_object(asset) for asset in prepared]
         assets = [(one.asset_name, one.asset_sha256, one.least_triangles) for one in known]
         write_catalogue(folder, assets, point.settings)
         return folder

@@ -12,10 +12,9 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.begin_publication import begin
 from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects
-from pipeline.making.object_parts import proved
+from pipeline.making.object_batches import prepared_object
 from pipeline.making.prepare_isolated import asset_store
 from pipeline.making.publication import Publication
-from pipeline.objects.sources import FoundObjects
 from storage.dataset.layout import DatasetFolder
 from storage.digests import sha256_hex
 from storage.records.asset import encode_asset
@@ -73,6 +72,4 @@ def asked(
 
 def frozen(publication: Publication, objects: Sequence[PreparedAsset]) -> AcceptedObjects:
     """Freeze objects, as after the mesh stage."""
-    found = FoundObjects(records=tuple(asset.record for asset in objects), failures=())
-    proofs = [*map(proved, objects)]
-    return freeze_objects(asked(publication), found, proofs, [])
+    return freeze_objects(asked(publication), [*map(prepared_object, objects)], [], len(objects))

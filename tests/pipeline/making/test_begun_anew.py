@@ -1,6 +1,7 @@
 """A dataset that was begun and of which nothing was made binds nobody."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import pytest
@@ -11,10 +12,14 @@ from pipeline.making.begin_publication import begin
 from pipeline.making.bucket_publication import joined
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset, prepare_dataset
+from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
+from storage.removed import removal_message
 from tests.for_each import for_each
+from tests.pipeline.documents.dataset_by_hand import edit_manifest
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
@@ -69,3 +74,21 @@ def test_who_was_replaced_all_the_same_stops(tmp_path: Path) -> None:
         begin(folder, named_build("smoke", seed=7), {}, 4, accept_environment=False)
         with pytest.raises(TrilightError, match="another dataset has been begun here"):
             mine.lock_objects([])
+
+
+def test_a_dataset_of_removed_settings_is_read_and_not_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_rendering(monkeypatch)
+    order = tiny_order(out=str(tmp_path / "set"), scenes=4)
+    make_dataset(order, Undocumented())
+    dataset = open_dataset(str(tmp_path / "set"))
+    settings = dict(dataset.manifest.settings)
+    settings["splits"] = {**settings["splits"], "object_parts": 2}
+    edit_manifest(dataset, settings=settings)
+    assert verify_dataset(str(tmp_path / "set")).problems == []
+    refusal = re.escape(removal_message("setting 'splits.object_parts'"))
+    with pytest.raises(TrilightError, match=refusal):
+        make_dataset(order, Undocumented())
+    with pytest.raises(TrilightError, match=refusal):
+        named_build("smoke", changes={"splits.object_parts": 2})

@@ -12,7 +12,7 @@ from pipeline.making import bucket_publication
 from pipeline.making import publication as publications
 from pipeline.making.accept_objects import trusted_objects
 from pipeline.making.frozen_pool import AssetAway
-from pipeline.making.pipeline import make_dataset
+from pipeline.making.pipeline import prepare_dataset
 from pipeline.making.prepare_isolated import asset_store
 from pipeline.making.publication import Publication
 from pipeline.shards import mirror
@@ -23,11 +23,11 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures
 from storage.records.sample import sample_key
+from tests.pipeline.making.batches_kit import object_records, use_mesher
 from tests.pipeline.making.bucket_kit import OUT, Killed, Machines
 from tests.pipeline.making.frozen_kit import asked, frozen, prepared
-from tests.pipeline.making.parts_kit import parts_by_hand
 from tests.pipeline.making.test_publication import _dataset, _locked, make_tiny_shard
-from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order
+from tests.pipeline.making.tiny_scenes_kit import tiny_order
 from tests.scenes_by_hand import tiny_sample
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
@@ -212,21 +212,20 @@ def _told(names: Any, read: list[str]) -> list[str]:
 def test_what_a_killed_machine_has_prepared_is_not_prepared_again(
     bucket: Any, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = parts_by_hand(tmp_path, monkeypatch)
-    order = tiny_order(out=OUT, objects="builtin:", scenes=4)
+    monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")
+    mesher = use_mesher(monkeypatch, batch=8)
+    object_records(tmp_path / "objects")
+    order = tiny_order(out=OUT, objects=str(tmp_path / "objects"), scenes=4)
 
     def killed(self: mirror.Mirror, lock: bytes) -> None:
         raise Killed
 
-    machines.use("a")
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(mirror.Mirror, "freeze", killed)
-        make_dataset(order, Undocumented())
-    assert len(made) == 60
-    made.clear()
-    machines.use("b")
-    make_dataset(order, Undocumented())
-    assert made == [0, 1, 2, 3], "scenes alone"
+    for machine in "ab":
+        machines.use(machine)
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(mirror.Mirror, "freeze", killed)
+            prepare_dataset(order)
+    assert len(mesher.made) == 30 == sum(mesher.made.values())
 
 
 def test_who_comes_later_trusts_the_index_of_the_first(bucket: Any, machines: Machines) -> None:

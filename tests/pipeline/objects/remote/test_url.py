@@ -167,7 +167,7 @@ def test_what_is_not_wanted_stays_on_the_server(
     found = listed.found(lambda uid: uid == "b")
     assert [record.uid for record in found.records] == ["b"]
     assert bucket.fetched == ["bucket/b.obj"]
-    assert found.num_found == 3
+    assert listed.num_found == 3
 
 
 def test_a_transfer_that_grows_too_large_is_ended(

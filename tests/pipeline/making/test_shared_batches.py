@@ -1,0 +1,119 @@
+"""Workers in one folder or one bucket: each prepares some objects, and all freeze the same lock."""
+
+import os
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.making.pipeline import prepare_dataset
+from storage.dataset.dataset import open_dataset
+from storage.remote import claims
+from storage.remote.bucket import Bucket
+from storage.remote.url import RemoteUrl, parse_url
+from tests.conftest import ROOT
+from tests.pipeline.making.batch_worker import BATCH
+from tests.pipeline.making.batches_kit import object_records, use_mesher
+from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, Writes
+from tests.pipeline.making.tiny_scenes_kit import tiny_order
+
+pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
+pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
+
+NUM_OBJECTS = 120
+WORKERS = 3
+KILL_AFTER = BATCH // 2
+
+
+@pytest.fixture
+def lock_of_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bytes:
+    """The lock that one worker freezes alone."""
+    monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "alone-cache"))
+    mesher = use_mesher(monkeypatch, batch=BATCH)
+    objects, out = tmp_path / "objects", tmp_path / "alone"
+    object_records(objects, NUM_OBJECTS)
+    prepare_dataset(tiny_order(out=str(out), objects=str(objects), scenes=4))
+    assert set(mesher.made.values()) == {1} and len(mesher.made) == NUM_OBJECTS
+    return (out / "objects.lock.jsonl").read_bytes()
+
+
+def _start(out: str, tmp_path: Path, *numbers: int, cache: str) -> "subprocess.Popen[str]":
+    words = [out, str(tmp_path / "objects"), str(tmp_path / "notes"), *map(str, numbers)]
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.pipeline.making.batch_worker", *words],
+        cwd=ROOT, env={**os.environ, "TRILIGHT_CACHE": str(tmp_path / cache)}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+
+
+@pytest.mark.slow("kills")
+@pytest.mark.parametrize("is_bucket", [False, True], ids=["folder", "bucket"])
+def test_workers_share_the_objects(
+    is_bucket: bool, lock_of_one: bytes, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """One of them is killed, and what it had in hand is prepared by another one."""
+    if is_bucket:
+        request.getfixturevalue("bucket")
+    out, notes = OUT if is_bucket else str(tmp_path / "set"), tmp_path / "notes"
+    notes.mkdir()
+    killed = _start(out, tmp_path, WORKERS, KILL_AFTER, cache="killed")
+    others = [_start(out, tmp_path, WORKERS, cache=str(number)) for number in (1, 2)]
+    for process in (killed, *others):
+        said, _ = process.communicate(timeout=300)
+        assert process.returncode == (-9 if process is killed else 0), said
+    made = {path.name: path.read_text().splitlines() for path in notes.iterdir()}
+    assert all(0 < len(uids) < NUM_OBJECTS for uids in made.values())
+    times = Counter(uid for uids in made.values() for uid in uids)
+    assert len(times) == NUM_OBJECTS
+    twice = {uid for uid, count in times.items() if count > 1}
+    assert twice <= set(made[str(killed.pid)])
+    assert max(times.values()) <= 2 and len(twice) < 2 * BATCH, "the two batches in hand"
+    assert open_dataset(out).lock_bytes() == lock_of_one
+
+
+def test_a_kill_before_any_write_leaves_the_same_lock(
+    lock_of_one: bytes, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The n-th write of each run never happens; two machines take turns until one gets through."""
+    monkeypatch.setattr(claims, "LEASE_S", 0.0)
+    monkeypatch.setattr("pipeline.making.object_batches._NUM_OBJECTS", NUM_OBJECTS // 2)
+    order = tiny_order(out=OUT, objects=str(tmp_path / "objects"), scenes=4)
+    writes, runs = Writes(monkeypatch), 0
+    while True:
+        writes.left, runs = runs, runs + 1
+        machines.use("ab"[runs % 2])
+        try:
+            prepare_dataset(order)
+            break
+        except Killed:
+            pass
+    assert runs > 5
+    assert open_dataset(OUT).lock_bytes() == lock_of_one
+
+
+def _claims(tmp_path: Path, name: str) -> claims.BucketClaims:
+    url = parse_url(OUT, what="bucket")
+    assert isinstance(url, RemoteUrl)
+    return claims.BucketClaims(Bucket(url), tmp_path / name)
+
+
+def test_a_claim_keeps_other_machines_off_until_it_ends(
+    bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends with its block, and for a machine that dies when the lease is over."""
+    a, b = _claims(tmp_path, "a"), _claims(tmp_path, "b")
+    for holder, other in ((a, b), (b, a)):
+        with holder.claimed("x") as ours, other.claimed("x") as theirs, other.claimed("y") as free:
+            assert (ours, theirs, free) == (True, False, True)
+    monkeypatch.setattr(claims.BucketClaims, "_free", lambda self, claim: None)
+    with a.claimed("z") as ours:
+        assert ours
+    with b.claimed("z") as theirs, _claims(tmp_path, "a").claimed("z") as again:
+        assert (theirs, again) == (False, True), "a machine that is started again has its claims"
+    monkeypatch.setattr(claims, "LEASE_S", 0.0)
+    with b.claimed("z") as theirs:
+        assert theirs
