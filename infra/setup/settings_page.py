@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
-from infra.improve.order import ImproveOrder
 from infra.leaderboard.order import LeaderboardOrder
 from infra.rendering.request import Asked
 from infra.serving.train_model import TrainOrder
@@ -33,7 +32,6 @@ ROOTS: dict[str, tuple[type, ...]] = {
     "Render": (Asked,),
     "Plan": (CorePrice,),
     "Train": (TrainOrder, TrainSettings, WatchSettings),
-    "Improve": (ImproveOrder,),
     "Evaluate": (EvaluationOrder,),
     "Leaderboard": (LeaderboardOrder,),
 }

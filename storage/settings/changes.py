@@ -14,7 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from storage.errors import TrilightError, expected_one_of
-from storage.settings.described import field_value, settings_record
+from storage.removed import removal_message
+from storage.settings.described import field_value, removed_fields, settings_record
 
 Settings = TypeVar("Settings")
 
@@ -86,6 +87,8 @@ def _by_field(group: Any, changes: Sequence[Change]) -> Mapping[str, Sequence[Ch
     fields = [field.name for field in dataclasses.fields(group)]
     found: dict[str, list[Change]] = {}
     for path, value, name in changes:
+        if path[0] in removed_fields(type(group)):
+            raise TrilightError(removal_message(f"setting {name!r}"))
         if path[0] not in fields:
             raise TrilightError(
                 f"setting {name!r} does not exist: {path[0]!r} is unknown there; "

@@ -26,6 +26,7 @@ import pydantic
 from pydantic.dataclasses import dataclass
 
 from storage.errors import TrilightError, expected_one_of
+from storage.removed import removal_message
 from storage.settings.execution import is_execution
 from storage.settings.ranges import Within, declared_ranges
 
@@ -135,6 +136,12 @@ def field_sentences(kind: type) -> dict[str, str]:
                 ):
                     sentences[name] = " ".join(text.split())
     return sentences
+
+
+def removed_fields(kind: type) -> Sequence[str]:
+    """Return the names of fields that a class once had (its REMOVED)."""
+    names: Sequence[str] = getattr(kind, "REMOVED", ())
+    return names
 
 
 def option_of(field: str) -> str:
@@ -256,6 +263,8 @@ def _complaint(
         shown[0] = within[1]
     place = option(".".join(shown))
     if first["type"] in ("unexpected_keyword_argument", "unexpected_property"):
+        if steps[-1] in removed_fields(holder):
+            return TrilightError(removal_message(f"{where}{place}"))
         known = [each.name for each in described(holder)]
         return TrilightError(f"{where}{place} does not exist; {expected_one_of(steps[-1], known)}.")
     expected = field.expected if field else expected_of(holder)
