@@ -23,7 +23,7 @@ COMMANDS = {
     "generate": "Turn objects into a verified, resumable dataset; run it again to resume after any "
     "stop.",
     "submit": "Do elsewhere what generate does: by a flow on the workers of a Prefect server, and "
-    "watch it, or as an array of tasks on Slurm, Kubernetes, SkyPilot, AWS or Google Batch.",
+    "watch it, or as an array of tasks on Slurm or Kubernetes.",
     "revisit": "Render the scenes of a finished dataset again, with new cameras, lights, materials "
     "or another resolution; pictures that stay the same are copied.",
     "plan": "Measure a few scenes and predict time, bytes and cost of all, each with an interval.",

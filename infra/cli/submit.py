@@ -9,10 +9,9 @@ from infra.cli.console import first_words, next_step
 from infra.cli.dataset_changes import with_shared
 from infra.cli.flow_runs import FlowRuns, run_flow
 from infra.cli.options import Shown, command
-from infra.cli.submit_array import ArrayAsked, submit_to_array
-from pipeline.executors.arrays.machines import ArrayMachines
-from pipeline.executors.arrays.order import DatasetByArray
-from pipeline.executors.arrays.submission import ARRAYS
+from infra.cli.submit_array import ARRAYS, ArrayAsked, submit_to_array
+from pipeline.executors.array_job import DatasetByArray
+from pipeline.executors.kubernetes_array import KubernetesOptions
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -31,7 +30,7 @@ class Submission:
     flow: str
     """Flow to run: generate-scenes, prepare-assets (objects alone) or build-dataset, or
     make-by-array, which has options of its own; or without any server, as an array of tasks for
-    what is missing: slurm, kubernetes, sky, aws-batch or google-batch."""
+    what is missing: slurm or kubernetes."""
 
     def __post_init__(self) -> None:
         if self.flow not in (*FLOWS, *ARRAYS):
@@ -50,14 +49,14 @@ def submit(
     order: DatasetOrder,
     shared: Shared,
     array: ArrayAsked,
-    machines: ArrayMachines,
+    machines: KubernetesOptions,
     shown: Shown,
 ) -> None:
     if submission.flow in ARRAYS:
         order = with_shared(order, shared)
         submit_to_array(order, submission.flow, array, machines, as_json=shown.json)
         return
-    if (array, machines) != (ArrayAsked(), ArrayMachines()):
+    if (array, machines) != (ArrayAsked(), KubernetesOptions()):
         raise TrilightError(
             f"submit {submission.flow}: --shards-per-task, --at-once, --dry-run and the options of "
             f"machines are those of submit {', '.join(ARRAYS)}; leave them out."
