@@ -6,7 +6,7 @@ pictures and one denoise. Few samples go with guide pictures of few samples.
 
 `render_levels` is what a user of plain Mitsuba would run: stock `path` with its defaults and the
 `independent` sampler, and Open Image Denoise once. Material and emitters are those of
-pipeline.renders.plugin_scene: without its one texture rough metals would lose light, and no number
+tests.oracle.plugin_scene: without its one texture rough metals would lose light, and no number
 of samples would give the right picture. Its emitters are chosen by their power, which is more than
 a user gets without asking, and the denoiser reads our own guide pictures: both favour this side.
 """
@@ -160,7 +160,7 @@ class _Plain:
     def __init__(self, scene: Scene) -> None:
         import mitsuba  # not before `activate`, which says where compiled kernels are kept
 
-        from pipeline.renders.plugin_scene import plugin_scene
+        from tests.oracle.plugin_scene import plugin_scene
 
         self._mi = mitsuba
         self._scene = plugin_scene(scene)
@@ -175,7 +175,7 @@ class _Plain:
 
     def radiance(self, camera: Camera, seed: int, spp: int) -> NDArray[np.float64]:
         """Return the mean of `spp` samples, [R, R, 3]."""
-        from pipeline.renders.plugin_tracer import stock_sensor
+        from tests.oracle.plugin_tracer import stock_sensor
 
         picture = self._mi.render(
             self._scene,

@@ -23,11 +23,12 @@ from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import Chosen, Features, HostSum, Tracer
+from pipeline.renders.tracer import Chosen, Features, Tracer
 from storage.metrics import MAX_DB
 from storage.records.lights import encode_lights_exr
 from storage.records.profiles import pack_picture
 from storage.records.scene import Scene
+from tests.oracle.host_sum import HostSum
 
 Answer = TypeVar("Answer")
 

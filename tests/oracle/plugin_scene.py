@@ -13,9 +13,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.compensated_texture import PLUGIN, register_plugin
-from pipeline.renders.plugin_sky import plugin_sky
-from pipeline.renders.plugin_textures import textured_albedo, textured_slots
 from pipeline.renders.sky_share import lamp_power, shining_sky, sky_share
 from pipeline.renders.tracer import split_triangles
 from storage.errors import Rejected
@@ -23,6 +20,9 @@ from storage.records.lobes import lobes_of, scaled_albedos
 from storage.records.material import EMISSION
 from storage.records.multiscatter import Smith, scattered_again
 from storage.records.scene import Scene
+from tests.oracle.compensated_texture import PLUGIN, register_plugin
+from tests.oracle.plugin_sky import plugin_sky
+from tests.oracle.plugin_textures import textured_albedo, textured_slots
 
 _TWIN_OFFSET = 1e-4
 """World units between a twin and the emitter itself: ten times what shadow rays stop short."""
