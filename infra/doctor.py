@@ -103,15 +103,7 @@ def _renderer() -> Finding:
         return finding
     variant = choose_variant()
     found = ", ".join(part for part in (found, variant.name, variant.libllvm) if part)
-    if variant.name != "scalar_rgb":
-        return Finding(name="renderer", state="ok", found=found)
-    return Finding(
-        name="renderer",
-        state="slower",
-        found=found,
-        consequence=variant.note,
-        mend=f"{_APT} libllvm19",
-    )
+    return Finding(name="renderer", state="ok", found=found)
 
 
 def _denoiser() -> Finding:
@@ -126,7 +118,7 @@ def _denoiser() -> Finding:
             mend="make setup",
         )
     found = f"OIDN {facts['denoiser']}, {facts['denoiser_device']}, {facts['threads']} threads"
-    if variant.name == "cuda_ad_rgb" and variant.note:
+    if variant.note:
         return Finding(
             name="denoiser",
             state="slower",

@@ -37,7 +37,6 @@ ONE_FAMILY_EACH = tuple(
 
 SCENES_V1 = SceneSettings(
     families=ONE_FAMILY_EACH,
-    strata=(),
     families_in_turn=True,
     max_triangles=1536,
     enough_error=0.005,

@@ -9,7 +9,7 @@ An excursion takes a scene beyond the usual range along one axis, while all else
 
 import dataclasses
 from dataclasses import field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import pydantic
 
@@ -20,7 +20,6 @@ from scene_templates.lights import LightSettings
 from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from scene_templates.skies.settings import SkySettings
-from scene_templates.strata import Stratum, stratum_of
 from scene_templates.textures import TextureSettings
 from storage.settings.changes import changed
 from storage.settings.described import checked
@@ -104,16 +103,13 @@ class SceneSettings:
     excursions: tuple[Excursion, ...] = ()
     """Values beyond the usual ranges, for tests out of distribution: scenes take these excursions
     in turn, one each."""
-    strata: tuple[Stratum, ...] = ()
-    """Parts of the scenes with their weights: each scene is drawn within one of them; by default
-    there are none, and every scene is drawn from all of the settings."""
+    REMOVED: ClassVar = ("strata",)
+    """Settings of earlier versions."""
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out textures, skies and strata that there are none of: earlier digests stay."""
+        """Leave out textures and skies that there are none of: earlier digests stay."""
         record: dict[str, Any] = as_usual(self)
-        if not record["strata"]:
-            del record["strata"]
         for name in ("textures", "skies"):
             if not record[name]["own_share"]:
                 del record[name]["own_share"]
@@ -125,37 +121,17 @@ class SceneSettings:
         names = [family.name for family in self.families]
         require(len(set(names)) == len(names), "families", names, "unique names")
         self._check_budget()
-        self._check_strata(names)
         for excursion in self.excursions:
             self._after(excursion)
 
     def of_scene(self, scene_index: int) -> "SceneSettings":
-        """Return what a scene is drawn from: its stratum, if any, changed by its excursion."""
-        stratum, excursion = self.stratum_of(scene_index), self.excursion_of(scene_index)
-        within = self if stratum is None else self._within(stratum)
-        return within if excursion is None else within._after(excursion)
+        """Return what a scene is drawn from: these settings, changed by its excursion."""
+        excursion = self.excursion_of(scene_index)
+        return self if excursion is None else self._after(excursion)
 
     def excursion_of(self, scene_index: int) -> Excursion | None:
         """Return the excursion of a scene; they take turns."""
         return self.excursions[scene_index % len(self.excursions)] if self.excursions else None
-
-    def stratum_of(self, scene_index: int) -> Stratum | None:
-        """Return the stratum of a scene, if there are any."""
-        return stratum_of(self.strata, scene_index) if self.strata else None
-
-    def _within(self, stratum: Stratum) -> "SceneSettings":
-        names = stratum.families or tuple(family.name for family in self.families)
-        families = tuple(family for family in self.families if family.name in names)
-        plain = dataclasses.replace(self, strata=(), families=families)
-        return changed(plain, dict(stratum.changes))
-
-    def _check_strata(self, families: list[str]) -> None:
-        names = [stratum.name for stratum in self.strata]
-        require(len(set(names)) == len(names), "strata", names, "unique names")
-        for stratum in self.strata:
-            known = set(stratum.families) <= set(families)
-            require(known, "strata.families", stratum.families, f"names of {', '.join(families)}")
-            self._within(stratum)
 
     def _after(self, excursion: Excursion) -> "SceneSettings":
         plain = dataclasses.replace(self, excursions=())

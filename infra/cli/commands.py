@@ -22,9 +22,8 @@ COMMANDS = {
     "assets": "Turn objects into clean meshes within a budget or an error; writes quality.html.",
     "generate": "Turn objects into a verified, resumable dataset; run it again to resume after any "
     "stop.",
-    "submit": "Do elsewhere what generate or improve does: by a flow on the workers of a Prefect "
-    "server, and watch it, or as an array of tasks on Slurm, Kubernetes, SkyPilot, AWS or Google "
-    "Batch.",
+    "submit": "Do elsewhere what generate does: by a flow on the workers of a Prefect server, and "
+    "watch it, or as an array of tasks on Slurm or Kubernetes.",
     "revisit": "Render the scenes of a finished dataset again, with new cameras, lights, materials "
     "or another resolution; pictures that stay the same are copied.",
     "plan": "Measure a few scenes and predict time, bytes and cost of all, each with an interval.",
@@ -47,8 +46,6 @@ COMMANDS = {
     "train": "Train a model; writes checkpoints, curves and pictures for TensorBoard, and a sheet."
     "\n\nTo train with processes on several machines, run torchrun -m trilight train ...",
     "evaluate": "Evaluate a network; writes evaluation.json, evaluation.md and sheets of pictures.",
-    "improve": "Generate, train and judge in rounds, and generate next where a core-second teaches "
-    "most; goes on where it stopped.",
     "leaderboard": "Judge every engine, rung and network on one set, with what each costs; writes "
     "table, chart and rows, and goes on where it stopped.",
     "bench": "Measure cost against error; an interrupted run resumes. Without a name, list all.",

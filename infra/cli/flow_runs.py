@@ -1,6 +1,6 @@
 """A flow run from the command line: asked for, watched, and reported when it has ended."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from infra.cli.console import console, note, print_json, print_rows, progress_bars
@@ -71,22 +71,14 @@ def _watched(looks: "Iterable[SeenRun]", *, silent: bool) -> "SeenRun":
     with progress_bars() as bars:
         bar = bars.add_task("percent", total=100, note="", visible=not silent)
         for look in looks:
-            if not silent:
-                _say_changes(look, last, bars.console.print)
+            if not silent and (last is None or last.state != look.state):
+                bars.console.print(look.state)
             scenes = dict(look.tables.get("progress", ())).get("scenes in shards")
-            note = f"scenes {scenes}" if scenes and not look.doing else ""
+            note = f"scenes {scenes}" if scenes else ""
             bars.update(bar, completed=round(look.percent), note=note)
             last = look
     assert last is not None  # a run has at least one look
     return last
-
-
-def _say_changes(look: "SeenRun", before: "SeenRun | None", say: Callable[[str], None]) -> None:
-    """Say a state, and a part of the work, once each."""
-    if before is None or before.state != look.state:
-        say(look.state)
-    if look.doing and (before is None or before.doing != look.doing):
-        say(look.doing)
 
 
 def _report(run: "Submitted", last: "SeenRun", where: str, *, as_json: bool) -> None:

@@ -9,18 +9,14 @@ from infra.cli.console import first_words, next_step
 from infra.cli.dataset_changes import with_shared
 from infra.cli.flow_runs import FlowRuns, run_flow
 from infra.cli.options import Shown, command
-from infra.cli.submit_array import ArrayAsked, submit_to_array
-from infra.improve.order import ImproveOrder
-from pipeline.executors.arrays.machines import ArrayMachines
-from pipeline.executors.arrays.order import DatasetByArray
-from pipeline.executors.arrays.submission import ARRAYS
+from infra.cli.submit_array import ARRAYS, ArrayAsked, submit_to_array
+from pipeline.executors.array_job import DatasetByArray
+from pipeline.executors.kubernetes_array import KubernetesOptions
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.settings.described import checked
 
 app = App(name="submit", usage="trilight submit FLOW BUILD [OPTIONS]")
-IMPROVE = "improve"
-"""A flow with options of its own, those of `trilight improve`."""
 BY_ARRAY = "make-by-array"
 """A flow that asks a scheduler, and shows what its tasks make."""
 FLOWS = ("generate-scenes", "prepare-assets", "build-dataset")
@@ -32,13 +28,13 @@ class Submission:
     """Who is to make it."""
 
     flow: str
-    """Flow to run: generate-scenes, prepare-assets (objects alone) or build-dataset, or improve and
-    make-by-array, which have options of their own; or without any server, as an array of tasks for
-    what is missing: slurm, kubernetes, sky, aws-batch or google-batch."""
+    """Flow to run: generate-scenes, prepare-assets (objects alone) or build-dataset, or
+    make-by-array, which has options of its own; or without any server, as an array of tasks for
+    what is missing: slurm or kubernetes."""
 
     def __post_init__(self) -> None:
         if self.flow not in (*FLOWS, *ARRAYS):
-            served = ", ".join((*FLOWS, BY_ARRAY, IMPROVE))
+            served = ", ".join((*FLOWS, BY_ARRAY))
             raise TrilightError(
                 f"flow {self.flow!r} is unknown; expected one of {served}, or of "
                 f"{', '.join(ARRAYS)}."
@@ -53,14 +49,14 @@ def submit(
     order: DatasetOrder,
     shared: Shared,
     array: ArrayAsked,
-    machines: ArrayMachines,
+    machines: KubernetesOptions,
     shown: Shown,
 ) -> None:
     if submission.flow in ARRAYS:
         order = with_shared(order, shared)
         submit_to_array(order, submission.flow, array, machines, as_json=shown.json)
         return
-    if (array, machines) != (ArrayAsked(), ArrayMachines()):
+    if (array, machines) != (ArrayAsked(), KubernetesOptions()):
         raise TrilightError(
             f"submit {submission.flow}: --shards-per-task, --at-once, --dry-run and the options of "
             f"machines are those of submit {', '.join(ARRAYS)}; leave them out."
@@ -87,17 +83,3 @@ def submit_by_array(order: DatasetByArray, shared: Shared, runs: FlowRuns, shown
     ended = run_flow(BY_ARRAY, given, runs, where=order.place, as_json=shown.json)
     if ended and not shown.json and Path(order.place).is_dir():
         next_step(["verify", order.place], ["inspect", order.place])
-
-
-@app.command(name=IMPROVE, help="Do what improve does, on a worker of a Prefect server; watch it.")
-@command("build")
-def submit_improve(order: ImproveOrder, runs: FlowRuns, shown: Shown) -> None:
-    first_words(
-        f"Submitting improve: {order.rounds} rounds of {order.build} and {order.run}",
-        silent=shown.json,
-    )
-    from pipeline.flows.submission import parameters
-
-    ended = run_flow(IMPROVE, parameters(order), runs, where=order.out, as_json=shown.json)
-    if ended and not shown.json and order.root.is_dir():
-        next_step(["inspect", str(order.root / "run")])

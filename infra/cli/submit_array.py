@@ -1,33 +1,37 @@
-"""`trilight submit slurm`, `kubernetes`, `sky`, `aws-batch`, `google-batch`: what is missing."""
+"""`trilight submit slurm` and `kubernetes`: what is missing, as an array."""
 
 import shlex
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated
 
 from infra.cli.console import console, first_words, next_step, note, print_json, print_rows
-from pipeline.executors.arrays.form import submit_form
-from pipeline.executors.arrays.forms import FORMS
-from pipeline.executors.arrays.job import ArrayJob, array_job
-from pipeline.executors.arrays.machines import ArrayMachines
-from pipeline.executors.arrays.submission import SLURM, submitted
-from pipeline.executors.slurm_array import sbatch_environment, sbatch_words
+from pipeline.executors.array_job import ArrayJob, array_job
+from pipeline.executors.kubernetes_array import (
+    KubernetesOptions,
+    create_words,
+    submit_job,
+    write_manifest,
+)
+from pipeline.executors.slurm_array import sbatch_environment, sbatch_words, submit_array
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 
+SLURM = "slurm"
+ARRAYS = (SLURM, "kubernetes")
+"""The schedulers."""
+
 
 @checked()
 class ArrayAsked:
-    """With slurm, kubernetes, sky, aws-batch or google-batch: how the array is cut."""
+    """With slurm or kubernetes: how the array is cut."""
 
     shards_per_task: Annotated[int | None, Within(1, 10**6, unit="shards")] = None
     """Number of shards of an array task; by default as few as 1000 tasks allow."""
     at_once: Annotated[int | None, Within(1, 10**6, unit="tasks")] = None
-    """Maximum number of tasks that run at the same time; by default the cluster or queue decides,
-    and with sky and google-batch, which pay for every machine, it must be given."""
+    """Maximum number of tasks that run at the same time; by default the cluster decides."""
     sbatch: tuple[str, ...] = ()
     """With slurm: further options of sbatch, such as --sbatch=--partition=cpu; by default there are
     none."""
@@ -36,7 +40,7 @@ class ArrayAsked:
 
 
 def submit_to_array(
-    order: DatasetOrder, on: str, asked: ArrayAsked, machines: ArrayMachines, *, as_json: bool
+    order: DatasetOrder, on: str, asked: ArrayAsked, machines: KubernetesOptions, *, as_json: bool
 ) -> None:
     """Submit the missing shards of a dataset, and say what was submitted; raises TrilightError."""
     _refuse_of_others(on, asked, machines)
@@ -47,21 +51,21 @@ def submit_to_array(
     elif on == SLURM:
         _submit_slurm(job, asked, as_json=as_json)
     else:
-        _submit_form(job, on, asked, machines, as_json=as_json)
+        _submit_kubernetes(job, asked, machines, as_json=as_json)
 
 
-def _refuse_of_others(on: str, asked: ArrayAsked, machines: ArrayMachines) -> None:
-    if on == SLURM and machines != ArrayMachines():
+def _refuse_of_others(on: str, asked: ArrayAsked, machines: KubernetesOptions) -> None:
+    if on == SLURM and machines != KubernetesOptions():
         raise TrilightError(
             "submit slurm: --image, --where and the other options of machines are those of "
-            f"{', '.join(FORMS)}; leave them out, and use --sbatch."
+            "submit kubernetes; leave them out, and use --sbatch."
         )
     if on != SLURM and asked.sbatch:
         raise TrilightError(f"submit {on}: --sbatch is an option of submit slurm; leave it out.")
 
 
 def _submit_slurm(job: ArrayJob, asked: ArrayAsked, *, as_json: bool) -> None:
-    number = None if asked.dry_run else submitted(job, SLURM, ArrayMachines(), asked.sbatch)
+    number = None if asked.dry_run else submit_array(job, asked.sbatch)
     if as_json:
         array = number_ranges(job.tasks)
         print_json({"job": number, "array": array, "shards_per_task": job.per_task})
@@ -73,33 +77,27 @@ def _submit_slurm(job: ArrayJob, asked: ArrayAsked, *, as_json: bool) -> None:
         _say_how_to_go_on(job)
 
 
-def _submit_form(
-    job: ArrayJob, on: str, asked: ArrayAsked, machines: ArrayMachines, *, as_json: bool
+def _submit_kubernetes(
+    job: ArrayJob, asked: ArrayAsked, options: KubernetesOptions, *, as_json: bool
 ) -> None:
-    form = FORMS[on](job, machines)
-    commands = form.written(Path(machines.files))
-    if not asked.dry_run:
-        submit_form(commands, on)
+    manifest = (write_manifest if asked.dry_run else submit_job)(job, options)
+    name, words = manifest.parent.name, create_words(manifest)
     if as_json:
         print_json(
             {
-                "job": form.name,
+                "job": name,
                 "array": number_ranges(job.tasks),
                 "shards_per_task": job.per_task,
-                "files": [str(Path(machines.files) / form.name / file) for file in form.files],
-                "commands": commands,
-                "afterwards": form.afterwards,
+                "files": [str(manifest)],
+                "commands": [words],
                 "submitted": not asked.dry_run,
             }
         )
         return
-    _say(job, form.name, dry_run=asked.dry_run)
+    _say(job, name, dry_run=asked.dry_run)
     if asked.dry_run:
-        _print_commands(commands)
-    if form.afterwards:
-        note("machines of the pool cost money until this is run, after the last task")
-        _print_commands(form.afterwards)
-    if not asked.dry_run:
+        console.print(shlex.join(words), soft_wrap=True, markup=False)
+    else:
         _say_how_to_go_on(job)
 
 
@@ -115,11 +113,6 @@ def _say(job: ArrayJob, name: str | None, *, dry_run: bool) -> None:
 def _say_how_to_go_on(job: ArrayJob) -> None:
     note("the same command submits again what is missing then, once no task is left in the queue")
     next_step(["status", job.order.place])
-
-
-def _print_commands(commands: Sequence[Sequence[str]]) -> None:
-    for command in commands:
-        console.print(shlex.join(command), soft_wrap=True, markup=False)
 
 
 def _say_finished(order: DatasetOrder, *, as_json: bool) -> None:

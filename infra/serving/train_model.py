@@ -66,16 +66,7 @@ def train_model(**parameters: Any) -> None:
 
     Prefect waits for half a minute then; `resume` goes on from there.
     """
-    train_in_process(train_order(parameters))
-
-
-def train_in_process(order: TrainOrder) -> None:
-    """Train within a flow run, whose log says what the process says.
-
-    Raises:
-        TrilightError: it did not end well; what it saved is safe.
-    """
-    log = get_run_logger()
+    order, log = train_order(parameters), get_run_logger()
     cards = len(visible_gpus())
     limit = (
         concurrency(GPU_LIMIT, occupy=min(order.processes, cards), strict=False)

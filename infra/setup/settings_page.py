@@ -7,7 +7,6 @@ import typing
 from collections.abc import Iterator
 from typing import Any, get_args
 
-from infra.improve.order import ImproveOrder
 from infra.leaderboard.order import LeaderboardOrder
 from infra.rendering.request import Asked
 from infra.serving.train_model import TrainOrder
@@ -30,7 +29,6 @@ ROOTS: dict[str, tuple[type, ...]] = {
     "Render": (Asked,),
     "Plan": (CorePrice,),
     "Train": (TrainOrder, TrainSettings, WatchSettings),
-    "Improve": (ImproveOrder,),
     "Evaluate": (EvaluationOrder,),
     "Leaderboard": (LeaderboardOrder,),
 }

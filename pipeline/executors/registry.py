@@ -33,30 +33,18 @@ class Executor:
     """Whether `--workers` says how many tasks run at a time."""
 
 
-def _made_by(module: str, *more: str) -> Make:
+def _made_by(module: str) -> Make:
     """Return the function `make` of a module, which is loaded when a dataset is made.
 
     Loading brings every stage, and for some executors packages that may not be installed.
-
-    Args:
-        module: its name.
-        more: what `make` is given besides.
     """
 
     def make(order: DatasetOrder, address: str | None) -> "Outcome":
-        outcome: Outcome = import_module(module_name(module)).make(order, address, *more)
+        outcome: Outcome = import_module(module_name(module)).make(order, address)
         return outcome
 
     return make
 
-
-INDEX_VARIABLES = {
-    "kubernetes": "JOB_COMPLETION_INDEX",
-    "aws-batch": "AWS_BATCH_JOB_ARRAY_INDEX",
-    "google-batch": "BATCH_TASK_INDEX",
-    "sky": "SKYPILOT_JOB_RANK",
-}
-"""Schedulers whose arrays count from 0, and the variable that tells a task its place."""
 
 EXECUTORS: Registry[Executor] = Registry(
     "runner",
@@ -64,10 +52,7 @@ EXECUTORS: Registry[Executor] = Registry(
     {
         "threads": Executor(make=_made_by("pipeline.executors.threads")),
         "slurm": Executor(make=_made_by("pipeline.executors.slurm")),
-        **{
-            name: Executor(make=_made_by("pipeline.executors.array_task", name))
-            for name in INDEX_VARIABLES
-        },
+        "kubernetes": Executor(make=_made_by("pipeline.executors.kubernetes")),
         "prefect": Executor(make=_made_by("pipeline.flows.on_prefect")),
         "dask": Executor(
             make=_made_by("pipeline.flows.on_dask"), needs_address=True, takes_workers=False

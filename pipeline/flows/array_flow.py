@@ -1,7 +1,7 @@
 """The flow `make-by-array`: a scheduler makes the dataset, Prefect asks for it and shows it.
 
-Slurm, Kubernetes, SkyPilot or a cloud runs the tasks. The worker of this flow stands where one
-would type `trilight submit slurm`; it makes no picture, reads what `trilight status` reads, and may
+Slurm or Kubernetes runs the tasks. The worker of this flow stands where one would type `trilight
+submit slurm`; it makes no picture, reads what `trilight status` reads, and may
 be killed: another run shows the same. Image, machines and accounts are the worker's own
 (TRILIGHT_MACHINES, TRILIGHT_IMAGE), since who may start a run must not choose what runs there.
 """
@@ -19,9 +19,9 @@ from prefect.artifacts import (
 )
 from prefect.logging import get_run_logger
 
-from pipeline.executors.arrays.job import array_job
-from pipeline.executors.arrays.order import DatasetByArray
-from pipeline.executors.arrays.submission import machines_here, submitted
+from pipeline.executors.array_job import DatasetByArray, array_job
+from pipeline.executors.kubernetes_array import options_here, submit_job
+from pipeline.executors.slurm_array import submit_array
 from pipeline.flows.forms import parameters_of
 from pipeline.flows.orders import DATASET_FORMS, order_of, run_name
 from pipeline.flows.watching import Forgiving, small_picture
@@ -52,7 +52,7 @@ def _submit(order: DatasetByArray) -> None:
     on = order.scheduler
     job = array_job(order.dataset, per_task=order.shards_per_task, at_once=order.at_once, on=on)
     if job.tasks:
-        name = submitted(job, on, machines_here())
+        name = submit_array(job) if on == "slurm" else submit_job(job, options_here()).parent.name
         get_run_logger().info(
             "%s has %s: tasks %s of %d shards", on, name, number_ranges(job.tasks), job.per_task
         )

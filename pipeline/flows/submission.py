@@ -30,9 +30,6 @@ from storage.settings.described import described
 
 POLL_S = 1.0
 """Between two looks at a run."""
-WHOLE = "whole"
-"""Key of the progress of a run that makes several datasets, each of which has a progress as well;
-its description says what the run is at."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,9 +57,7 @@ class SeenRun:
     message: str
     """What Prefect says of that state."""
     percent: float
-    """Of the shards that are there, or of the whole where that is several datasets."""
-    doing: str
-    """What a run of several datasets is at; empty for others."""
+    """Of the shards that are there."""
     tables: Mapping[str, Sequence[tuple[str, str]]]
     """Rows of `progress` and, at the end, of `summary`."""
     is_final: bool
@@ -181,9 +176,7 @@ def _look(client: SyncPrefectClient, run: FlowRun) -> SeenRun:
         artifact_filter=ArtifactFilter(flow_run_id=ArtifactFilterFlowRunId(any_=[run.id]))
     )
     in_order = sorted(shown, key=lambda artifact: str(artifact.updated))
-    bars = {artifact.key: artifact for artifact in in_order if artifact.type == "progress"}
-    whole = bars.get(WHOLE)
-    bar = whole or next(reversed(bars.values()), None)
+    bars = [artifact for artifact in in_order if artifact.type == "progress"]
     tables = {
         artifact.key: rows
         for artifact in in_order
@@ -192,8 +185,7 @@ def _look(client: SyncPrefectClient, run: FlowRun) -> SeenRun:
     return SeenRun(
         state=state.name or state.type.value if state else "Pending",
         message=safe_text(state.message or "") if state else "",
-        percent=float(str(bar.data)) if bar else 0.0,
-        doing=(whole.description or "") if whole else "",
+        percent=float(str(bars[-1].data)) if bars else 0.0,
         tables=tables,
         is_final=is_final,
         is_completed=state is not None and state.is_completed(),

@@ -46,11 +46,7 @@ class PathTracer:
             variant: what Mitsuba runs on.
             threads: how many of them.
             sampled: called after each pass of samples.
-
-        Raises:
-            TrilightError: the variant cannot render what the settings ask for.
         """
-        settings.require_variant(variant.name)
         self._settings, self._seed, self._sampled = settings, seed, sampled
         self.identity: Mapping[str, Any] = {
             "seed": str(seed),  # the integers of an EXR header end at 2^31

@@ -200,7 +200,6 @@ def begun_publication(
             cannot be rendered here.
     """
     variant = choose_variant()
-    settings.renders.require_variant(variant.name)
     publication = begin_dataset(
         folder,
         settings,

@@ -62,9 +62,6 @@ class PreviewSettings:
                 f"preview settings: resolution is {self.resolution}; expected a multiple of 8."
             )
 
-    def require_variant(self, name: str) -> None:
-        """Do nothing: every variant of Mitsuba makes previews."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Preview:

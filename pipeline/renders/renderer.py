@@ -81,7 +81,6 @@ class SceneRenderer:
                 picture would be black), "too_many_lights" where more than MAX_PICTURES would be
                 kept apart.
             TrilightError: with `per_light`, where an environment lights the scene too.
-            NotImplementedError: RenderSettings.require_variant refuses the variant.
         """
         require_surfaces(scene)
         self._settings, self._shows_looks, self._used = settings, shows_looks, UsedTime()
@@ -387,8 +386,6 @@ def representable(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
 def set_threads(count: int) -> None:
     """Let Mitsuba and the denoiser of this process use `count` threads; call after `activate`."""
     import drjit
-    import mitsuba
 
-    # In scalar_rgb reflections call Python (compensated_texture): threads would queue for its lock.
-    drjit.set_thread_count(1 if mitsuba.variant() == "scalar_rgb" else count)
+    drjit.set_thread_count(count)
     set_denoiser_threads(count)

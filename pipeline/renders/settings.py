@@ -146,14 +146,6 @@ class RenderSettings:
         """Names of the parts that are stored (storage.records.parts); empty where none are."""
         return part_names(bounces=self.split, lobes=self.split_lobes)
 
-    def require_variant(self, name: str) -> None:
-        """Raise TrilightError where this variant of Mitsuba cannot render what is asked for."""
-        if name == "scalar_rgb" and self.part_names:
-            raise TrilightError(
-                "renders.split or renders.split_lobes is true; expected false where no LLVM "
-                "library is found. Install one: `trilight doctor` says how."
-            )
-
     @property
     def targets_db(self) -> dict[str, float]:
         """The targets that are set, in dB by metric: sampling ends when all of them are reached."""

@@ -1,8 +1,7 @@
-"""`Tracer`: what the renderer asks of Mitsuba, whichever variant runs.
+"""`Tracer`: what the renderer asks of `VectorTracer`, whose module imports Mitsuba.
 
-Two of them exist. `VectorTracer` is a path tracer of our own for the LLVM variant. `PluginTracer`
-is Mitsuba's stock path integrator: it is what `scalar_rgb` can run, and the independent twin that
-the other is tested against. Both estimate the same integral.
+The tests have another one, Mitsuba's stock path integrator (tests/oracle): an independent twin that
+estimates the same integral.
 """
 
 from collections.abc import Mapping
@@ -92,9 +91,6 @@ class Tracer(Protocol):
         Args:
             bounces: keep direct and indirect light apart.
             lobes: keep the diffuse and the specular lobe of the visible surface apart.
-
-        Raises:
-            NotImplementedError: this tracer cannot do that.
         """
 
     def radiance(
@@ -120,30 +116,6 @@ class Tracer(Protocol):
 
     def hits(self, camera: Camera) -> NDArray[np.bool_]:
         """Return whether the ray through each pixel's centre hits a surface, [R, R]."""
-
-
-class HostSum:
-    """A `PassSum` in numpy's memory, for a tracer that returns its passes there anyway."""
-
-    def __init__(self, tracer: Tracer, camera: Camera) -> None:
-        self._tracer, self._camera = tracer, camera
-        self._total = np.zeros((camera.resolution, camera.resolution, 3))
-        self._squares = np.zeros((camera.resolution, camera.resolution))
-
-    def add(self, *, seed: int, spp: int, chosen: Chosen = None) -> None:
-        means = self._tracer.radiance(self._camera, seed=seed, spp=spp, chosen=chosen)
-        mean = means.astype(np.float64)
-        self._total += spp * mean
-        self._squares += spp * np.square(mean.mean(axis=-1))
-
-    def guide(self) -> None:
-        """Do nothing: other tracers are not guided."""
-
-    def read(self) -> NDArray[np.float64]:
-        return self._total[None].copy()
-
-    def read_squares(self) -> NDArray[np.float64]:
-        return self._squares.copy()
 
 
 def split_triangles(scene: Scene) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -42,7 +42,7 @@ _RAYS_LEFT_OUT = "Disabling this ray tracing operation"
 """Dr.Jit only logs this where a kernel is too large for OptiX; it raises no error."""
 
 
-VariantName = Literal["llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"]
+VariantName = Literal["llvm_ad_rgb", "cuda_ad_rgb"]
 
 _ASK = "TRILIGHT_VARIANT"
 
@@ -54,20 +54,21 @@ class Variant:
     name: VariantName
     """Mitsuba's name for it."""
     libllvm: str
-    """The LLVM library that it compiles with; empty for the others."""
+    """The LLVM library that it compiles with; empty on a graphics card."""
     note: str
-    """What the user should know of this choice, such as that it is slow; empty if nothing."""
+    """What the user should know of this choice; empty if nothing."""
     denoiser: DenoiserDevice = "CPU"
     """What Open Image Denoise runs on."""
 
 
 def choose_variant() -> Variant:
-    """Return the fastest variant for processors that works here, or the one that the user names.
+    """Return the variant with the newest LLVM library that works, or the one that the user names.
 
     Later calls read the remembered probes.
 
     Raises:
-        TrilightError: TRILIGHT_VARIANT names none, or one that cannot render here.
+        TrilightError: no LLVM library works here; TRILIGHT_VARIANT names no variant, or one that
+            cannot render here.
         EnvironmentFailure: a probe gave no answer, which says nothing about its library: with
             another one, the same dataset would be of other bytes.
     """
@@ -75,14 +76,7 @@ def choose_variant() -> Variant:
     if asked not in ("", *get_args(VariantName)):
         names = ", ".join(get_args(VariantName))
         raise TrilightError(f"{_ASK} is {asked!r}; expected one of {names}, or nothing.")
-    if asked == "scalar_rgb":
-        return Variant(name="scalar_rgb", libllvm="", note="rendering takes about 35 times as long")
-    if asked == "cuda_ad_rgb":
-        return _on_graphics_card()
-    found = _on_processor()
-    if asked and found.name != asked:
-        raise TrilightError(f"{_ASK} is {asked!r}, but {found.note}; see: trilight doctor")
-    return found
+    return _on_graphics_card() if asked == "cuda_ad_rgb" else _on_processor()
 
 
 def _on_graphics_card() -> Variant:
@@ -106,10 +100,9 @@ def _on_processor() -> Variant:
             return Variant(name="llvm_ad_rgb", libllvm=str(library), note="")
         tried.append(library.name)
     found = f"of {', '.join(tried)} none works with Mitsuba" if tried else "no LLVM library found"
-    return Variant(
-        name="scalar_rgb",
-        libllvm="",
-        note=f"{found}, so rendering takes about 35 times as long",
+    raise TrilightError(
+        f"rendering: {found}; expected LLVM, by which Mitsuba compiles. Install it: "
+        "apt-get install libllvm19."
     )
 
 
@@ -150,8 +143,7 @@ def _works(library: Path) -> bool:
         raise EnvironmentFailure(
             f"{library}: the probe of this LLVM library gave {found.problem}, at {len(_PROBE_S)} "
             "tries; expected a small picture within seconds. Run again when the machine is less "
-            "busy; if the library hangs, name another one by DRJIT_LIBLLVM_PATH, or set "
-            f"{_ASK}=scalar_rgb."
+            "busy; if the library hangs, name another one by DRJIT_LIBLLVM_PATH."
         )
     if found.problem:
         return False

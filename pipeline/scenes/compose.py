@@ -64,8 +64,7 @@ def compose_scene(
     Returns:
         A checked scene with `settings.num_views` cameras. Its provenance holds template, family,
         scene_index, attempt, seed and camera_attempts (per view, the proposal that passed), and
-        where the scene is an excursion its axis and value, where it has a stratum that one's name,
-        and where it has a sky, what was drawn;
+        where the scene is an excursion its axis and value, and where it has a sky, what was drawn;
         "maps" are the uids of a user's own textures and map, where it has any.
 
     Raises:
@@ -148,9 +147,6 @@ def _provenance(
     excursion = settings.excursion_of(scene_index)
     if excursion is not None:
         origin["excursion"] = {"axis": excursion.axis, "value": excursion.value}
-    stratum = settings.stratum_of(scene_index)
-    if stratum is not None:
-        origin["stratum"] = stratum.name
     return origin
 
 

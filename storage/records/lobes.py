@@ -42,12 +42,3 @@ def lobes_of(materials: NDArray[np.float32]) -> Lobes:
     weight = np.divide(s, s + d, out=np.zeros_like(s), where=s + d > 0)
     alpha = np.maximum(alpha_ggx(rows[:, ROUGHNESS]), MIN_ALPHA)
     return Lobes(diffuse=diffuse, specular=specular, alpha=alpha, weight=weight)
-
-
-def scaled_albedos(lobes: Lobes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return d/(1 - w) and s/w, [T, 3] each, 0 where the lobe has no share."""
-    weight = lobes.weight[:, None]
-    zeros = np.zeros_like(lobes.diffuse)
-    diffuse = np.divide(lobes.diffuse, 1 - weight, out=zeros.copy(), where=weight < 1)
-    specular = np.divide(lobes.specular, weight, out=zeros, where=weight > 0)
-    return diffuse, specular

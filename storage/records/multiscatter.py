@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Smith = Literal["correlated", "separable"]
 """Whether the masking of both directions depends on the same height of a facet (our kernel, as
-Cycles) or not (Mitsuba's `roughconductor`). Each needs a table of its own."""
+Cycles) or not (Mitsuba's `roughconductor`, in the tests). Each needs a table of its own."""
 
 X_STEPS, ROUGHNESS_STEPS = 64, 32
 """Size of the table, linear in sqrt(x) and in roughness = sqrt(alpha): exact to 0.25 % between."""

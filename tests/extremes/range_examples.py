@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-from infra.improve.order import ImproveOrder
 from infra.leaderboard.order import LeaderboardOrder
 from infra.rendering.request import Asked
 from infra.serving.train_model import TrainOrder
@@ -35,7 +34,6 @@ from scene_templates.separate_sides import SideRanges
 from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, ViewLaws
 from scene_templates.skies.draw import SkyMapSettings
 from scene_templates.skies.settings import SkySettings
-from scene_templates.strata import Stratum
 from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
 from storage.dataset.settings import ListedShard, SplitSettings
@@ -77,7 +75,6 @@ EXAMPLES: dict[type, Any] = {
     SkySettings: SkySettings(),
     SkyMapSettings: SkyMapSettings(),
     Excursion: Excursion(axis="fov_deg", value=10.0, changes=()),
-    Stratum: Stratum(name="all", weight=1.0, earlier_weights=(1.0,)),
     RenderSettings: SMOKE.renders,
     SplitSettings: SMOKE.splits,
     ListedShard: ListedShard(split="train", scenes=4),
@@ -87,7 +84,6 @@ EXAMPLES: dict[type, Any] = {
     Asked: ASKED,
     CorePrice: CorePrice(),
     TrainOrder: TrainOrder(),
-    ImproveOrder: ImproveOrder(),
     TrainSettings: RUN,
     ModelConfig: tiny(),
     LossSettings: RUN.loss,

@@ -88,15 +88,13 @@ def test_a_probe_that_fails_is_missing(code: str, said: str) -> None:
     assert said in finding.found
 
 
-def test_no_llvm_is_slower_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipeline.renders.variant import Variant
-
-    fallback = Variant(name="scalar_rgb", libllvm="", note="rendering is slower")
-    monkeypatch.setattr(doctor, "choose_variant", lambda: fallback)
+def test_no_llvm_is_missing_and_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.renders.variant.llvm_libraries", list)
     monkeypatch.setattr(doctor, "_probe", _responds)
-    finding = doctor._renderer()
-    assert (finding.state, finding.consequence) == ("slower", "rendering is slower")
-    assert "libllvm19" in finding.mend
+    monkeypatch.setattr(doctor, "CHECKS", {"renderer": doctor._renderer})
+    (finding,) = doctor.examine()
+    assert finding.state == "missing"
+    assert "no LLVM library found" in finding.found and "libllvm19" in finding.found
 
 
 @pytest.mark.parametrize("note", ["", "the card is too old, so pictures are denoised elsewhere"])

@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.plugin_tracer import PluginTracer
 from storage.conventions import camera_rays
 from storage.records.scene import Scene
+from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.renders.closed_forms import lambert_irradiance
 from tests.pipeline.renders.sampling import (
     SIGMAS,

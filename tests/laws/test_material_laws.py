@@ -7,9 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from storage.conventions import alpha_ggx
-from storage.records.lobes import MIN_ALPHA, lobes_of, scaled_albedos
+from storage.records.lobes import MIN_ALPHA, lobes_of
 from storage.records.multiscatter import scattered_again
 from storage.records.scene import Scene
+from tests.oracle.plugin_scene import scaled_albedos
 from tests.pipeline.renders.closed_forms import lambert_irradiance
 from tests.pipeline.renders.sampling import assert_agree, exact, render_blocks
 from tests.pipeline.renders.scene_kit import (

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.plugin_tracer import PluginTracer
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import camera_rays
 from storage.records.lookup import environment_values
 from storage.records.passes.pictures import view_passes
+from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.renders.sampling import assert_agree, camera_of, render_blocks
 from tests.pipeline.renders.scene_kit import box, join, material, sphere
 from tests.pipeline.renders.test_sky_paths import open_scene

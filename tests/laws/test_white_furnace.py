@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders import plugin_scene, surface_table
+from pipeline.renders import surface_table
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.plugin_tracer import PluginTracer
 from pipeline.renders.tracer import Tracer
 from storage.records.scene import Scene
+from tests.oracle import plugin_scene
+from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.renders.sampling import camera_of
 from tests.pipeline.renders.scene_kit import furnace, join, material, quad, sphere
 

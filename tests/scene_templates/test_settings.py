@@ -20,6 +20,7 @@ from scene_templates.settings import Excursion, SceneSettings, ViewLaws
 from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
 from storage.settings.changes import changed
+from storage.settings.described import from_record, settings_record
 from tests.scene_templates.balls import DEFAULTS, template_settings
 
 GROUPS: dict[type, Any] = {
@@ -168,3 +169,12 @@ def test_the_registry_knows_every_layout() -> None:
         assert template.name == name
         assert template.shell_triangles == 128 * len(template.parts)
         assert template.parts[0] == "floor"
+
+
+def test_strata_are_refused_in_one_sentence() -> None:
+    """They were parts of the scenes with weights; records never held the empty list."""
+    strata = [{"name": "all", "weight": 1}]
+    with pytest.raises(TrilightError, match=r"setting 'strata': removed since, and commit"):
+        changed(DEFAULTS, {"strata": strata})
+    with pytest.raises(TrilightError, match=r"setting 'strata': removed since, and commit"):
+        from_record(SceneSettings, {**settings_record(DEFAULTS), "strata": strata})

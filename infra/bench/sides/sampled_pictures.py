@@ -6,14 +6,18 @@ pictures and one denoise. Few samples go with guide pictures of few samples.
 
 `render_levels` is what a user of plain Mitsuba would run: stock `path` with its defaults and the
 `independent` sampler, and Open Image Denoise once. Material and emitters are those of
-pipeline.renders.plugin_scene: without its one texture rough metals would lose light, and no number
-of samples would give the right picture. Its emitters are chosen by their power, which is more than
-a user gets without asking, and the denoiser reads our own guide pictures: both favour this side.
+tests/oracle/plugin_scene.py, which a checkout alone has: without its one texture rough metals would
+lose light, and no number of samples would give the right picture. Its emitters are chosen by their
+power, which is more than a user gets without asking, and the denoiser reads our own guide pictures:
+both favour this side.
 """
 
+import importlib
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +29,8 @@ from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.preview import denoised, samples_sum
 from pipeline.renders.settings import PASS_SPP, RenderSettings
 from pipeline.renders.tracer import Features, Tracer
+from storage.errors import TrilightError
+from storage.installation import IMPORT_ROOT
 from storage.records.scene import Scene
 from storage.seeds import seed_for
 
@@ -154,16 +160,29 @@ def _features(scene: Scene, camera: Camera) -> tuple[Features, float]:
     return features, time.process_time() - started
 
 
+def _oracle(name: str) -> Any:
+    """Return a module of the tests' oracle; raises TrilightError outside a checkout."""
+    sys.path.append(str(IMPORT_ROOT))
+    try:
+        return importlib.import_module(f"tests.oracle.{name}")
+    except ModuleNotFoundError as error:
+        raise TrilightError(
+            f"plain Mitsuba: no tests/oracle/{name}.py below {IMPORT_ROOT}; expected a checkout. "
+            "Run the experiment from one."
+        ) from error
+    finally:
+        sys.path.remove(str(IMPORT_ROOT))
+
+
 class _Plain:
     """A scene with its integrator."""
 
     def __init__(self, scene: Scene) -> None:
         import mitsuba  # not before `activate`, which says where compiled kernels are kept
 
-        from pipeline.renders.plugin_scene import plugin_scene
-
         self._mi = mitsuba
-        self._scene = plugin_scene(scene)
+        self._scene = _oracle("plugin_scene").plugin_scene(scene)
+        self._sensor = _oracle("plugin_tracer").stock_sensor
         self._path = mitsuba.load_dict(
             {
                 "type": "path",
@@ -175,11 +194,9 @@ class _Plain:
 
     def radiance(self, camera: Camera, seed: int, spp: int) -> NDArray[np.float64]:
         """Return the mean of `spp` samples, [R, R, 3]."""
-        from pipeline.renders.plugin_tracer import stock_sensor
-
         picture = self._mi.render(
             self._scene,
-            sensor=stock_sensor(camera, {"type": "independent", "sample_count": spp}),
+            sensor=self._sensor(camera, {"type": "independent", "sample_count": spp}),
             integrator=self._path,
             seed=self._mi.UInt32(seed),
             spp=spp,

@@ -23,7 +23,7 @@ from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import Chosen, Features, HostSum, Tracer
+from pipeline.renders.tracer import Chosen, Features, Tracer
 from storage.metrics import MAX_DB
 from storage.records.lights import encode_lights_exr
 from storage.records.profiles import pack_picture
@@ -80,13 +80,28 @@ class RememberingTracer:
         return self.ledger.remembered(("hits",), lambda: self._tracer.hits(camera))
 
 
-class RememberingSum(HostSum):
+class RememberingSum:
     """The sum of remembered passes, guided where the renderer asks for it."""
 
-    _tracer: RememberingTracer
+    def __init__(self, tracer: RememberingTracer, camera: Camera) -> None:
+        self._tracer, self._camera = tracer, camera
+        self._total = np.zeros((camera.resolution, camera.resolution, 3))
+        self._squares = np.zeros((camera.resolution, camera.resolution))
+
+    def add(self, *, seed: int, spp: int, chosen: Chosen = None) -> None:
+        means = self._tracer.radiance(self._camera, seed=seed, spp=spp, chosen=chosen)
+        mean = means.astype(np.float64)
+        self._total += spp * mean
+        self._squares += spp * np.square(mean.mean(axis=-1))
 
     def guide(self) -> None:
         self._tracer = self._tracer.guided()
+
+    def read(self) -> NDArray[np.float64]:
+        return self._total[None].copy()
+
+    def read_squares(self) -> NDArray[np.float64]:
+        return self._squares.copy()
 
 
 class Ledger:

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.executors.arrays import job as arrays
+from pipeline.executors import array_job as arrays
 from tests.command_line import trilight
 
 FAKE = """#!/bin/bash
 for word in "$@"; do
-    case $word in file://*) word=${word#file://} ;; esac
-    case $word in */*.yaml | */*.json) test -s "$word" || exit 3 ;; esac
+    case $word in */*.yaml) test -s "$word" || exit 3 ;; esac
 done
 printf '%s\\n' "$(basename "$0") $*" >> "$FAKE_ASKED"
 if [ -n "$FAKE_REFUSES" ]; then echo "AlreadyExists" >&2; exit 1; fi

@@ -13,15 +13,19 @@ from pipeline.flows.submission import SeenRun, Submitted
 from tests.command_line import trilight
 
 RUN = Submitted(
-    id=UUID(int=1), name="a-run", deployment="improve/local", pool="local", page="http://page"
+    id=UUID(int=1),
+    name="a-run",
+    deployment="generate-scenes/local",
+    pool="local",
+    page="http://page",
 )
 
 
-def seen(state: str, doing: str = "", **more: Any) -> SeenRun:
+def seen(state: str, **more: Any) -> SeenRun:
     plain: dict[str, Any] = {"message": "", "percent": 50.0, "tables": {}}
     ended = state in ("Completed", "Crashed")
     told = {**plain, "is_final": ended, "is_completed": state == "Completed", **more}
-    return SeenRun(state=state, doing=doing, **told)
+    return SeenRun(state=state, **told)
 
 
 @pytest.fixture
@@ -39,21 +43,20 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return found
 
 
-def test_a_loop_is_watched_round_by_round(
+def test_a_run_is_watched_to_its_end(
     asked: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    training = "round 1 of 2: train"
-    looks = [seen("Pending"), seen("Running", training), seen("Running", training)]
-    looks.append(seen("Completed", "all rounds are done", tables={"summary": [("rounds", "2")]}))
+    looks = [seen("Pending"), seen("Running"), seen("Running")]
+    looks.append(seen("Completed", tables={"summary": [("scenes", "2")]}))
     monkeypatch.setattr(submission, "looks", lambda client, run: iter(looks))
-    words = ["submit", "improve", "smoke", "--rounds", "2", "--out", str(tmp_path)]
+    words = ["submit", "generate-scenes", "smoke", "--scenes", "2", "--out", str(tmp_path)]
     told = trilight(words).stdout
-    given = {"build": "smoke", "rounds": 2, "out": str(tmp_path)}
-    assert asked == [("improve", None, given)]
-    for line in ("Run a-run of improve/local: http://page", "Pending", training, "rounds  2"):
+    given = {"build": "smoke", "scenes": 2, "out": str(tmp_path)}
+    assert asked == [("generate-scenes", None, given)]
+    for line in ("Run a-run of generate-scenes/local: http://page", "Pending", "scenes  2"):
         assert told.count(line) == 1, told
-    assert f"Next: trilight inspect {tmp_path / 'run'}" in told
-    assert json.loads(trilight([*words, "--json"]).stdout)["summary"] == {"rounds": "2"}
+    assert f"Next: trilight verify {tmp_path}" in told
+    assert json.loads(trilight([*words, "--json"]).stdout)["summary"] == {"scenes": "2"}
 
 
 def test_a_run_that_crashed_is_a_mistake_with_its_reason(
@@ -61,18 +64,15 @@ def test_a_run_that_crashed_is_a_mistake_with_its_reason(
 ) -> None:
     ended = seen("Crashed", message="it was killed.")
     monkeypatch.setattr(submission, "looks", lambda client, run: iter([ended]))
-    failed = trilight(["submit", "improve", "smoke"])
+    failed = trilight(["submit", "generate-scenes", "smoke"])
     assert "ended as Crashed: it was killed. Its log is at http://page" in failed.stderr
 
 
 def test_who_does_not_watch_gets_the_run(asked: list[Any]) -> None:
-    words = ["submit", "improve", "smoke", "--no-watch", "--deployment", "cluster", "--json"]
-    assert json.loads(trilight(words).stdout)["flow_run"] == str(RUN.id)
-    assert asked[0][:2] == ("improve", "cluster")
+    words = ["submit", "generate-scenes", "smoke", "--no-watch", "--deployment", "cluster"]
+    assert json.loads(trilight([*words, "--json"]).stdout)["flow_run"] == str(RUN.id)
+    assert asked[0][:2] == ("generate-scenes", "cluster")
 
 
 def test_a_flow_that_is_none_is_told_those_there_are() -> None:
-    assert (
-        "build-dataset, make-by-array, improve, or of slurm"
-        in trilight(["submit", "x", "smoke"]).mistake
-    )
+    assert "build-dataset, make-by-array, or of slurm" in trilight(["submit", "x", "smoke"]).mistake

@@ -156,7 +156,7 @@ def test_flows_write_to_volumes_whatever_their_form_says() -> None:
         if function == "build_dataset":  # its ranges go to the pool that it is in
             deployment = given.get("deployment", DatasetInRuns().deployment)
             assert deployment == f"generate-scenes/{row['name']}"
-        if function in ("train_model", "improve_loop") and row["name"] != "local":
+        if function == "train_model" and row["name"] != "local":
             assert given["out"].startswith("/data/")
     docker = json.loads((IMAGES / "pool.json").read_text())["job_configuration"]
     assert {volume.partition(":")[2] for volume in docker["volumes"]} == {"/data", "/cache"}
@@ -200,7 +200,7 @@ def test_the_worker_keeps_to_its_namespace_and_jobs_name_the_secret(
 
 def test_deployments_name_flows_that_are_there() -> None:
     found = yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]
-    assert len(found) == 16  # five flows in three ways, and one beside a scheduler
+    assert len(found) == 13  # four flows in three ways, and one beside a scheduler
     assert {row["name"] for row in found} == {"local", "docker", "kubernetes"}
     for row in found:
         path, function = row["entrypoint"].split(":")

@@ -46,7 +46,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(scope="module")
 def asker(dataset: Dataset) -> Iterator[Asker]:
     tracer = ProgressiveTracer(
-        variant=Variant(name="scalar_rgb", libllvm="", note=""), threads=1
+        variant=Variant(name="llvm_ad_rgb", libllvm="", note=""), threads=1
     )  # nothing is traced here
     room = DatasetRoom(dataset, str(dataset.folder.root), tracer, None)
     room.index.wait()

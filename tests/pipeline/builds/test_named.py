@@ -40,7 +40,7 @@ def _check_settings_survive_the_manifest(name: str) -> None:
 _LATER = {
     *("noise_floor_linear_db", "noise_floor_objects_db", "split", "split_lobes", "passes"),
     *("revisit", "listed_shards", "textures", "skies", "source", "own_share", "own_emission"),
-    *("own_materials", "strata"),
+    "own_materials",
 }
 """Settings that no record holds where they say nothing."""
 

@@ -6,7 +6,7 @@ from importlib import import_module
 
 import pytest
 
-from pipeline.executors.registry import EXECUTORS, INDEX_VARIABLES, find_executor
+from pipeline.executors.registry import EXECUTORS, find_executor
 from storage.errors import TrilightError
 from tests.conftest import ROOT
 
@@ -21,8 +21,11 @@ def test_what_an_executor_has_no_use_for_is_named() -> None:
 
 
 def test_every_executor_is_a_module_with_the_same_function() -> None:
-    homes = ("executors.threads", "executors.slurm", "flows.on_prefect", "flows.on_dask")
-    assert set(EXECUTORS) == {"threads", "slurm", "prefect", "dask", *INDEX_VARIABLES}
+    homes = (
+        *("executors.threads", "executors.slurm", "executors.kubernetes"),
+        *("flows.on_prefect", "flows.on_dask"),
+    )
+    assert set(EXECUTORS) == {"threads", "slurm", "kubernetes", "prefect", "dask"}
     for home in homes:
         make = import_module(f"pipeline.{home}").make
         assert make.__code__.co_varnames[: make.__code__.co_argcount] == ("order", "address")

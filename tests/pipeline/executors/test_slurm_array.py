@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.executors.arrays.job import MOST_TASKS, ArrayJob, array_job
+from pipeline.executors.array_job import MOST_TASKS, ArrayJob, array_job
 from pipeline.executors.registry import find_executor
 from pipeline.executors.slurm_array import sbatch_environment, sbatch_words
 from pipeline.making.dataset_order import DatasetOrder

@@ -9,10 +9,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.executors.arrays.job import ArrayJob
-from pipeline.executors.arrays.machines import ArrayMachines
-from pipeline.executors.arrays.order import DatasetByArray
-from pipeline.executors.arrays.submission import machines_here
+from pipeline.executors.array_job import ArrayJob, DatasetByArray
+from pipeline.executors.kubernetes_array import KubernetesOptions, options_here
 from pipeline.executors.registry import find_executor
 from pipeline.flows import array_flow
 from pipeline.flows.array_flow import make_by_array
@@ -47,7 +45,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
     monkeypatch.setattr("pipeline.executors.slurm.ThreadRunner", Undocumented)
     arrays: list[list[int]] = []
 
-    def submitted(job: ArrayJob, on: str, machines: ArrayMachines) -> str:
+    def submit(job: ArrayJob) -> str:
         def work() -> None:
             for task in job.tasks:
                 monkeypatch.setenv("SHARDS_PER_TASK", str(job.per_task))
@@ -59,7 +57,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
         threading.Thread(target=work).start()
         return "4711"
 
-    monkeypatch.setattr(array_flow, "submitted", submitted)
+    monkeypatch.setattr(array_flow, "submit_array", submit)
     return arrays
 
 
@@ -121,13 +119,17 @@ def test_a_page_that_cannot_be_shown_does_not_end_the_run(
 
 def test_machines_are_those_of_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who may start a run chooses neither an image nor an account."""
-    assert not _OWN & set(ArrayMachines.__dataclass_fields__)
-    assert machines_here() == ArrayMachines()
+    assert not _OWN & set(KubernetesOptions.__dataclass_fields__)
+    assert options_here() == KubernetesOptions()
     stated = tmp_path / "machines.json"
     monkeypatch.setenv("TRILIGHT_MACHINES", str(stated))
-    stated.write_text(json.dumps({"where": "a-queue", "cores": 4}))
-    assert machines_here() == ArrayMachines(where="a-queue", cores=4)
-    for text, message in (("{", "cannot be read"), ('{"core": 4}', "core")):
+    stated.write_text(json.dumps({"where": "a-namespace", "cores": 4}))
+    assert options_here() == KubernetesOptions(where="a-namespace", cores=4)
+    for text, message in (
+        ("{", "cannot be read"),
+        ('{"core": 4}', "core"),
+        ('{"on_demand": true}', "removed since"),
+    ):
         stated.write_text(text)
         with pytest.raises(TrilightError, match=message):
-            machines_here()
+            options_here()

@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 from prefect.exceptions import ParameterTypeError
 
-from infra.serving.improve_loop import improve_loop
 from infra.serving.train_model import train_model
 from pipeline.builds.settings import BuildSettings
 from pipeline.flows.array_flow import make_by_array
@@ -25,7 +24,6 @@ FLOWS = {
     "build-dataset": build_dataset,
     "make-by-array": make_by_array,
     "train-model": train_model,
-    "improve": improve_loop,
 }
 
 

@@ -12,7 +12,7 @@ from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.states import Completed, Failed, Running, Scheduled, State
 
 from pipeline.flows.dataset_flows import generate_scenes
-from pipeline.flows.submission import WHOLE, looks, parameters, server, submit, workers_online
+from pipeline.flows.submission import looks, parameters, server, submit, workers_online
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from tests.for_each import for_each
@@ -111,22 +111,9 @@ def test_a_run_is_looked_at_until_it_has_ended() -> None:
     assert [look.state for look in seen] == ["Scheduled", "Running", "Completed"]
     assert [look.is_final for look in seen] == [False, False, True]
     assert seen[-1].is_completed and seen[-1].message == "all there"
-    assert (seen[-1].percent, seen[-1].doing) == (75.0, "")
+    assert seen[-1].percent == 75.0
     assert seen[-1].tables == {"progress": [("scenes in shards", "3 of 4")]}
     assert len(slept) == 2
-
-
-def test_of_a_run_of_several_datasets_the_whole_counts() -> None:
-    served = Server(["local"], (Completed(),))
-    doing = "round 2 of 3: train"
-    strata = [{"stratum": "rough", "share": "50%"}]
-    served.artifacts = [
-        SimpleNamespace(type="progress", data=55.0, key=WHOLE, updated=1, description=doing),
-        SimpleNamespace(type="progress", data=100.0, key="shards", updated=2, description="data"),
-        SimpleNamespace(type="table", data=json.dumps(strata), key="strata", updated=3),
-    ]
-    (look,) = looks(served, uuid4())  # type: ignore[arg-type]
-    assert (look.percent, look.doing, look.tables) == (55.0, doing, {})
 
 
 def test_a_run_that_failed_is_no_success() -> None:

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.executors.arrays.job import array_job
-from pipeline.executors.registry import INDEX_VARIABLES, find_executor
+from pipeline.executors.array_job import array_job
+from pipeline.executors.kubernetes import PLACE
+from pipeline.executors.kubernetes_array import KubernetesOptions, job_manifest
+from pipeline.executors.registry import find_executor
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
 from tests.conftest import ROOT
@@ -20,7 +22,7 @@ from tests.pipeline.making.array_maker import KILL_AFTER_S
 from tests.pipeline.making.bucket_kit import OUT
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
-SLURM = "slurm"
+OPTIONS = KubernetesOptions(image="not pulled", cores=2)
 
 
 def _start(words: Sequence[str], environment: dict[str, str]) -> "subprocess.Popen[str]":
@@ -35,24 +37,26 @@ def _start(words: Sequence[str], environment: dict[str, str]) -> "subprocess.Pop
 def test_arrays_that_are_killed_end_in_the_digest_of_one_that_was_not(
     bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each scheduler's array goes on where the one before was killed."""
+    """Each array goes on where the one before was killed: four of Kubernetes, then one of Slurm."""
     order, rng, killed = tiny_order(out=OUT, scenes=12), np.random.default_rng(0), 0
     without_rendering(monkeypatch)
     monkeypatch.setattr("pipeline.executors.threads.ThreadRunner", Undocumented)
     alone = dataclasses.replace(order, out=str(tmp_path / "whole"))
     find_executor("threads", None, None).make(alone, None)
     missing = [0, 1]
-    for on in (*INDEX_VARIABLES, SLURM):
+    for number, on in enumerate([*4 * ["kubernetes"], "slurm"]):
         job = array_job(order, per_task=2, at_once=None, on=on)
         assert set(job.tasks) <= set(missing)  # only what is missing
         missing = list(job.tasks)
         for place, task in enumerate(job.tasks):
-            variable = {"SLURM_ARRAY_TASK_ID": str(task)}
-            if on != SLURM:
-                after_s = str(rng.uniform(0, 0.4))
-                variable = {INDEX_VARIABLES[on]: str(place), KILL_AFTER_S: after_s}
-            cache = {"TRILIGHT_CACHE": str(tmp_path / f"{on}-{place}")}
-            run = _start(job.words(on), {**job.environment, **variable, **cache})
+            pod = job_manifest(job, OPTIONS)["spec"]["template"]["spec"]["containers"][0]
+            variables = {row["name"]: row["value"] for row in pod["env"]}
+            if on == "slurm":
+                variables["SLURM_ARRAY_TASK_ID"] = str(task)
+            else:
+                variables |= {PLACE: str(place), KILL_AFTER_S: str(rng.uniform(0, 0.4))}
+            variables["TRILIGHT_CACHE"] = str(tmp_path / f"{number}-{place}")
+            run = _start([*pod["command"][:-1], on], variables)
             said, _ = run.communicate(timeout=300)
             assert run.returncode in (0, -9), said
             killed += run.returncode == -9

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.executors.arrays.job import array_job
+from pipeline.executors.array_job import array_job
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.publication import Publication
 from pipeline.shards.mirror import Mirror

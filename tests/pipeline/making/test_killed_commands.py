@@ -96,9 +96,8 @@ def _grey(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:
     return np.full((2, 4, 3), 128, np.uint8)
 
 
-def test_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendering() -> None:
     """The child is killed between two passes of samples; the next one opens the scene again."""
-    monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")  # which compiles nothing
     scene, kills = tiny_scene(), list[int]()
     settings = RenderSettings(resolution=8, min_spp=16, max_spp=64, noise_floor_db=99.0)
     disturbed = False

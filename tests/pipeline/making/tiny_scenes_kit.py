@@ -10,6 +10,7 @@ from pipeline.executors.threads import ThreadRunner
 from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.freeze_objects import AcceptedObjects
+from pipeline.renders.variant import Variant
 from storage.dataset.statistics import Statistics
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
@@ -46,7 +47,8 @@ def without_rendering(
     monkeypatch.setattr("pipeline.making.pipeline.share_mesh_work", lambda *given: None)
     monkeypatch.setattr("pipeline.making.pipeline.accept_objects", accept)
     monkeypatch.setattr("pipeline.making.pipeline.make_scene", make)
-    monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")  # needs no probe
+    unprobed = Variant(name="llvm_ad_rgb", libllvm="", note="")
+    monkeypatch.setattr("pipeline.renders.variant._on_processor", lambda: unprobed)
     return scenes
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.plugin_tracer import PluginTracer
 from storage.conventions import camera_rays
 from storage.records.scene import Scene
+from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.renders.closed_forms import lambert_irradiance
 from tests.pipeline.renders.sampling import assert_agree, exact, render_blocks
 from tests.pipeline.renders.scene_kit import Part, flat, join, light, material, quad

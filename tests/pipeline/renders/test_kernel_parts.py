@@ -98,7 +98,7 @@ def test_direct_light_is_what_paths_of_two_edges_find() -> None:
 @pytest.mark.slow("statistics")
 def test_mitsuba_finds_the_same_direct_and_indirect_light() -> None:
     """Its stock integrator with two edges, and with all less that; rough, so that both agree."""
-    from pipeline.renders.plugin_tracer import PluginTracer
+    from tests.oracle.plugin_tracer import PluginTracer
 
     grey, rough = material(diffuse=0.6), material(diffuse=0.3, specular=0.4, roughness=0.6)
     wall = quad([[-1, 1, 0], [1, 1, 0], [1, 1, 2], [-1, 1, 2]], material(diffuse=[0.7, 0.2, 0.1]))

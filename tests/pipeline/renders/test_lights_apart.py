@@ -146,8 +146,8 @@ def _block_estimate(scene: Scene, *, per_light: bool) -> Estimate:
 
 @pytest.mark.slow("statistics")
 def test_both_tracers_switch_the_same_light_on(llvm: None) -> None:
-    from pipeline.renders.plugin_tracer import PluginTracer
     from pipeline.renders.vector_tracer import VectorTracer
+    from tests.oracle.plugin_tracer import PluginTracer
 
     scene = lit_scene()
     camera = camera_of(scene, 16)

@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 
 from pipeline.builds.named import named_build
-from pipeline.making.path_tracer import PathTracer
 from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.variant import Variant
 from storage.dataset.manifest import Manifest
 from storage.dataset.verify import check_sample
-from storage.errors import Rejected, TrilightError
+from storage.errors import Rejected
 from storage.metrics import MAX_DB, psnr_log_db
 from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import MAX_LIGHTS, rounded_to_half, sum_of_lights
@@ -157,21 +155,6 @@ def test_too_many_pictures_are_rejected(llvm: None) -> None:
     SceneRenderer(scene, _with(SETTINGS, per_light=True))
     with pytest.raises(Rejected, match=f"too_many_lights.*{count} emitters apart; at most 32"):
         SceneRenderer(scene, _with(SETTINGS, per_light=True, split=True))
-
-
-def test_a_variant_without_parts_is_refused_before_anything_is_loaded(llvm: None) -> None:
-    from pipeline.renders.plugin_tracer import PluginTracer
-
-    _with(SETTINGS).require_variant("scalar_rgb")
-    SETTINGS.require_variant("llvm_ad_rgb")
-    message = "split.*is true; expected false.*trilight doctor"
-    with pytest.raises(TrilightError, match=message):
-        SETTINGS.require_variant("scalar_rgb")
-    scalar = Variant(name="scalar_rgb", libllvm="", note="")
-    with pytest.raises(TrilightError, match=message):
-        PathTracer(SETTINGS, seed=0, variant=scalar, threads=1, sampled=lambda now: None)
-    with pytest.raises(NotImplementedError, match="all light together"):
-        PluginTracer(lit_scene(), max_depth=2, rr_depth=2).apart(bounces=True, lobes=False)
 
 
 def test_settings_that_ask_for_nothing_are_those_of_before() -> None:

@@ -31,7 +31,7 @@ AOVS = "d:depth,p:position,g:geo_normal,s:sh_normal,t:prim_index,a:albedo"
 def _mitsuba(scene: Scene, a_side: int) -> NDArray[np.float64]:
     """Return the channels [R, R, 14], of rays on the same grid; 0 where rays meet nothing."""
     load_tracer(scene, max_depth=2, rr_depth=5)  # chooses a variant
-    from pipeline.renders import plugin_scene, plugin_tracer
+    from tests.oracle import plugin_scene, plugin_tracer
 
     picture = plugin_tracer._render(
         plugin_scene.plugin_feature_scene(scene),
@@ -67,7 +67,7 @@ def test_mitsuba_sees_the_same(seed: int, a_side: int) -> None:
 
 
 def _compare_depth(scene: Scene, ours: dict[str, NDArray], theirs: NDArray[np.float64]) -> None:
-    from pipeline.renders.plugin_tracer import _NEAR_CLIP
+    from tests.oracle.plugin_tracer import _NEAR_CLIP
 
     full = ours["coverage"] == 1
     # the piece of a ray before the near plane is longer to the side

@@ -5,7 +5,8 @@ from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.samples import HalfSamples
-from pipeline.renders.tracer import Chosen, HostSum
+from pipeline.renders.tracer import Chosen
+from tests.oracle.host_sum import HostSum
 
 CAMERA = Camera(c2w=np.eye(4), fov_deg=40.0, resolution=8)
 

@@ -12,7 +12,7 @@ from pipeline.renders.vector_tracer import VectorTracer
 from scene_templates.rotations import uniform_rotation
 from storage.records.environment import Environment
 from storage.records.scene import Scene
-from tests.pipeline.renders.kernel_bsdf import exact_twin
+from tests.oracle.kernel_bsdf import exact_twin
 from tests.pipeline.renders.sampling import (
     assert_agree,
     assert_same_light,

@@ -9,13 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.plugin_tracer import PluginTracer
 from storage.records.first_hits import first_hits
 from storage.records.lookup import texture_values
 from storage.records.retextured import with_textures
 from storage.records.scene import Scene
 from storage.records.texture import Texture
-from tests.pipeline.renders.kernel_bsdf import exact_twin
+from tests.oracle.kernel_bsdf import exact_twin
+from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.renders.sampling import (
     Estimate,
     assert_agree,

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.plugin_tracer import PluginTracer
 from storage.records.scene import Scene
 from tests.conftest import ROOT
-from tests.pipeline.renders.kernel_bsdf import exact_twin
+from tests.oracle.kernel_bsdf import exact_twin
+from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.renders.sampling import Estimate, assert_agree, camera_of, render_blocks
 from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
 
@@ -59,7 +59,7 @@ def test_both_integrators_agree_within_their_noise(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.slow("references")
 @pytest.mark.usefixtures("llvm")
-def test_the_fallback_agrees_within_noise_where_lobes_are_not_rough() -> None:
+def test_the_oracle_agrees_within_noise_where_lobes_are_not_rough() -> None:
     """`roughconductor` has the separable Smith term; it differs from ours in rough lobes only."""
     scene = _room(5)
     plugins = PluginTracer(scene, max_depth=10, rr_depth=5)
@@ -80,7 +80,7 @@ def test_the_fallback_agrees_within_noise_where_lobes_are_not_rough() -> None:
 
 @pytest.mark.slow("references")
 @pytest.mark.usefixtures("llvm")
-def test_how_far_the_fallbacks_rough_metal_is_off() -> None:
+def test_how_far_the_oracles_rough_metal_is_off() -> None:
     """Measured: 4.5 % of the direct light, of which noise is 0.2 to 0.6 %."""
     row = material(diffuse=0.05, specular=0.9, roughness=1.0)
     floor = quad([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]], row)
@@ -102,29 +102,25 @@ def _scores(ours: Estimate, theirs: Estimate) -> NDArray[np.float64]:
 
 
 _IN_SCALAR = """
-import json, hashlib
-from pipeline.renders.variant import Variant, activate
-activate(Variant(name="scalar_rgb", libllvm="", note=""))
+import json
+import mitsuba
+mitsuba.set_variant("scalar_rgb")
 import drjit
-from pipeline.renders.renderer import set_threads
-from pipeline.renders.load_tracer import load_tracer
+drjit.set_thread_count(1)  # reflections call Python, where threads queue for its lock
+from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.renders.sampling import camera_of
 from tests.pipeline.renders.test_twin_tracers import _room
 scene = _room(5)
-tracer = load_tracer(scene, max_depth=10, rr_depth=5)
+tracer = PluginTracer(scene, max_depth=10, rr_depth=5)
 camera = camera_of(scene, 16)
-digests = []
-for threads in (1, 2):
-    set_threads(threads)
-    picture = tracer.radiance(camera, seed=1, spp=16)
-    digests.append(hashlib.sha256(picture.tobytes()).hexdigest())
 means = [tracer.radiance(camera, seed=k, spp=16).mean(axis=(0, 1)).tolist() for k in range(8)]
-print(json.dumps([digests, means, int(tracer.hits(camera).sum())]))
+print(json.dumps([means, int(tracer.hits(camera).sum())]))
 """
 
 
 @pytest.mark.usefixtures("llvm")
-def test_the_fallback_variant_agrees_and_is_reproducible() -> None:
+def test_the_oracle_agrees_where_nothing_is_compiled() -> None:
+    """In `scalar_rgb` it shares neither LLVM nor a kernel with ours."""
     result = subprocess.run(
         [sys.executable, "-c", _IN_SCALAR],
         cwd=ROOT,
@@ -133,8 +129,7 @@ def test_the_fallback_variant_agrees_and_is_reproducible() -> None:
         text=True,
         check=True,
     )
-    digests, means, num_hits = json.loads(result.stdout)
-    assert digests[0] == digests[1]
+    means, num_hits = json.loads(result.stdout)
     scene = _room(5)
     ours = render_blocks(scene, resolution=16, block=16)
     error = np.hypot(np.std(means, axis=0, ddof=1) / np.sqrt(len(means)), ours.error[0, 0])

@@ -16,7 +16,10 @@ from pipeline.renders.facts import render_facts
 from pipeline.renders.llvm_libraries import llvm_libraries
 from pipeline.renders.variant import Variant, _Probed, activate, choose_variant
 from storage.errors import EnvironmentFailure, TrilightError
+from storage.records.scene_file import encode_scene
+from tests.command_line import trilight
 from tests.conftest import ROOT
+from tests.scenes_by_hand import tiny_scene
 
 
 @pytest.fixture
@@ -58,14 +61,38 @@ def _must_not_be_asked(variant: Variant) -> _Probed:
     raise AssertionError(f"{variant} was probed again")
 
 
-def test_where_no_library_works_the_fallback_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_no_library_works_it_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    library = tmp_path / "libLLVM-1.so"
+    library.touch()
+    monkeypatch.setattr(variant_module, "llvm_libraries", lambda: [library])
     monkeypatch.setattr(variant_module, "_probe", lambda variant: _Probed(problem="abort"))
     monkeypatch.setattr(variant_module, "_remembered", lambda memory: [])
-    fallback = choose_variant()
-    assert (fallback.name, fallback.libllvm) == ("scalar_rgb", "")
-    assert "none works with Mitsuba" in fallback.note
+    with pytest.raises(TrilightError, match=r"of libLLVM-1.so none works with Mitsuba; .*libllvm"):
+        choose_variant()
     monkeypatch.setattr(variant_module, "llvm_libraries", list)
-    assert choose_variant().note.startswith("no LLVM library found")
+    for asked in ("", "llvm_ad_rgb"):
+        monkeypatch.setenv("TRILIGHT_VARIANT", asked)
+        with pytest.raises(TrilightError, match="no LLVM library found; .*apt-get install libllvm"):
+            choose_variant()
+
+
+def test_commands_that_render_say_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(variant_module, "llvm_libraries", list)
+    scene, out = str(tmp_path / "a.safetensors"), str(tmp_path / "out")
+    Path(scene).write_bytes(encode_scene(tiny_scene()))
+    for words in (
+        ["generate", "smoke", "--out", out],
+        ["render", scene, "--out", str(tmp_path / "a.exr")],
+        ["render", scene, "--out", str(tmp_path / "a.exr"), "--seconds", "1"],
+        ["inspect", scene, "--turntable", str(tmp_path / "a.png")],
+        ["view", scene],
+    ):
+        assert "no LLVM library found; expected" in trilight(words).mistake, words
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.safetensors"]
 
 
 @pytest.mark.parametrize("silent", [1, 2])
@@ -95,12 +122,10 @@ def test_a_probe_without_an_answer_is_tried_again_and_leads_to_no_other_library(
 
 
 def test_the_user_may_name_the_variant(monkeypatch: pytest.MonkeyPatch, variant: Variant) -> None:
-    monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")
-    assert choose_variant().name == "scalar_rgb"
     monkeypatch.setenv("TRILIGHT_VARIANT", variant.name)
     assert choose_variant().name == variant.name
     monkeypatch.setenv("TRILIGHT_VARIANT", "metal")
-    with pytest.raises(TrilightError, match="'metal'; expected one of llvm_ad_rgb, scalar_rgb"):
+    with pytest.raises(TrilightError, match="'metal'; expected one of llvm_ad_rgb, cuda_ad_rgb"):
         choose_variant()
 
 
@@ -148,13 +173,6 @@ def test_a_process_denoises_where_its_variant_says(variant: Variant) -> None:
     for device in ("CUDA", "CPU"):
         activate(dataclasses.replace(variant, denoiser=device))
         assert denoiser._device == device
-
-
-def test_where_llvm_is_asked_for_and_missing_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(variant_module, "llvm_libraries", list)
-    monkeypatch.setenv("TRILIGHT_VARIANT", "llvm_ad_rgb")
-    with pytest.raises(TrilightError, match="no LLVM library found"):
-        choose_variant()
 
 
 def test_asking_does_not_import_mitsuba() -> None:

@@ -10,7 +10,7 @@ import pytest
 from pipeline.renders import variant_probe, vector_tracer
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
 from pipeline.renders.variant_probe import BLOCK, probe_scene, wrong_picture
-from tests.pipeline.renders.kernel_bsdf import exact_twin
+from tests.oracle.kernel_bsdf import exact_twin
 from tests.pipeline.renders.sampling import Estimate, assert_agree, camera_of, render_blocks
 from tests.pipeline.renders.stored_pictures import scenes
 

@@ -11,10 +11,11 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from pipeline.renders import ggx, plugin_scene
+from pipeline.renders import ggx
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
-from pipeline.renders.plugin_tracer import PluginTracer
 from storage.records.scene import Scene
+from tests.oracle import plugin_scene
+from tests.oracle.plugin_tracer import PluginTracer
 
 _PLUGIN = "kernel_bsdf"
 _COLOURS, _NUMBERS = ("diffuse", "specular", "again"), ("alpha", "weight")

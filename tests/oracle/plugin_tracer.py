@@ -1,11 +1,9 @@
 """`PluginTracer`: Mitsuba's own `path` integrator over stock plugins and one texture of our own.
 
-It runs where no LLVM is found (`scalar_rgb`), 35 times slower per sample and with up to twice the
-variance, and `VectorTracer` is compared with it. Six of the 35 are the texture, the only way that
-was found to multiple scattering there (compensated_texture). A Python emitter takes another 5.5
-times as long, hence the twins of `plugin_scene`. Two things differ from `VectorTracer`, neither
-beyond noise in smooth or mostly diffuse scenes: the Smith term of rough lobes, and silhouettes of
-smooth low-poly mirrors, where Mitsuba turns a shading normal over that faces away.
+`VectorTracer` is compared with it. It runs on any variant of Mitsuba. Two things differ from
+`VectorTracer`, neither beyond noise in smooth or mostly diffuse scenes: the Smith term of rough
+lobes, and silhouettes of smooth low-poly mirrors, where Mitsuba turns a shading normal over that
+faces away.
 """
 
 import copy
@@ -16,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
-from pipeline.renders.plugin_scene import (
+from pipeline.renders.tracer import Chosen, Features
+from storage.records.scene import Scene
+from tests.oracle.host_sum import HostSum
+from tests.oracle.plugin_scene import (
     plugin_background,
     plugin_feature_scene,
     plugin_scene,
 )
-from pipeline.renders.tracer import Chosen, Features, HostSum
-from storage.records.scene import Scene
 
 _BLOCK_SIZE = 8
 """Pixels; fixed, because the random numbers of `scalar_rgb` belong to blocks."""
@@ -53,10 +52,6 @@ class PluginTracer:
         return tracer
 
     def apart(self, *, bounces: bool, lobes: bool) -> "PluginTracer":
-        """Raise NotImplementedError: Mitsuba's integrator returns all light together.
-
-        Users hear of it before anything is loaded (RenderSettings.require_variant).
-        """
         raise NotImplementedError("the stock integrator returns all light together")
 
     def radiance(

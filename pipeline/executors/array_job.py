@@ -1,28 +1,51 @@
-"""What is missing of a dataset as an array of tasks, of which every scheduler's form is made.
+"""What is missing of a dataset as an array of tasks, for Slurm and for Kubernetes.
 
 Task K makes `per_task` shards from K times that number on, so that a task means the same whenever
 it is submitted, and what is missing can be submitted alone. Slurm names tasks by these numbers;
-schedulers that count from 0 are given the numbers as TASKS (pipeline.executors.array_task).
+Kubernetes counts from 0, and is given the numbers as TASKS (pipeline.executors.kubernetes).
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 from pipeline.builds.named import BUILDS, named_build
-from pipeline.making.dataset_order import DatasetOrder, generate_words
+from pipeline.making.dataset_order import DatasetOrder
 from storage.dataset.dataset import dataset_files
 from storage.dataset.layout import dataset_folder
 from storage.dataset.progress import missing_shards
 from storage.dataset.splits import shards_for
 from storage.errors import TrilightError
-from storage.number_ranges import number_ranges
 from storage.remote.safe_url import safe_url
 from storage.settings.changes import changed
+from storage.settings.described import checked
+from storage.settings.ranges import Within
 
 MOST_TASKS = 1000
-"""Of one array: a Slurm cluster whose MaxArraySize is not changed refuses task 1001, and clouds
-refuse long environments."""
+"""Of one array: a Slurm cluster whose MaxArraySize is not changed refuses task 1001."""
+
+
+@checked()
+class DatasetByArray(DatasetOrder):
+    """A dataset made by the tasks of a scheduler's array."""
+
+    scheduler: Literal["slurm", "kubernetes", "none"] = "slurm"
+    """Scheduler that is asked for what is missing; none only watches what others have submitted."""
+    shards_per_task: Annotated[int | None, Within(1, 10**6, unit="shards")] = None
+    """Number of shards of an array task; by default as few as 1000 tasks allow."""
+    at_once: Annotated[int | None, Within(1, 10**6, unit="tasks")] = None
+    """Maximum number of tasks that run at the same time; by default the scheduler decides."""
+    quiet_hours: Annotated[float, Within(0.0001, 1000.0, unit="hours")] = 6.0
+    """Longest time without a new scene in hours, waiting in the queue included, after which the run
+    fails; the array is left as it is."""
+
+    @property
+    def dataset(self) -> DatasetOrder:
+        """The dataset alone, as the tasks are asked for it."""
+        return DatasetOrder(
+            **{each.name: getattr(self, each.name) for each in dataclasses.fields(DatasetOrder)}
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,16 +60,6 @@ class ArrayJob:
     """Shards of a task."""
     at_once: int | None
     """Most tasks that run at the same time; None for as many as the scheduler lets."""
-
-    def words(self, runner: str) -> list[str]:
-        """Return the command of each task, `trilight` first."""
-        words = generate_words(self.order)
-        return ["trilight", *words, "--out", self.order.place, "--runner", runner]
-
-    @property
-    def environment(self) -> Mapping[str, str]:
-        """What a task reads where its scheduler counts from 0."""
-        return {"SHARDS_PER_TASK": str(self.per_task), "TASKS": number_ranges(self.tasks)}
 
 
 def array_job(

@@ -1,26 +1,22 @@
-"""What falls to a task of an array that counts from 0, by the variables of its scheduler."""
+"""What falls to a task of an indexed Job, by the variables of Kubernetes."""
 
 from pathlib import Path
 
 import pytest
 
-from pipeline.executors.array_task import shards_of_place
-from pipeline.executors.registry import INDEX_VARIABLES, find_executor
+from pipeline.executors.kubernetes import PLACE, shards_of_place
+from pipeline.executors.registry import find_executor
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges, numbers_of
 from tests.for_each import for_each
 from tests.pipeline.making.tiny_scenes_kit import tiny_order
 
-PLACE = "JOB_COMPLETION_INDEX"
 GIVEN = {"TASKS": "0-1,7", "SHARDS_PER_TASK": "4"}
 
 
-@for_each(("scheduler", "variable"), INDEX_VARIABLES.items())
-def test_a_place_is_a_task_that_is_missing(scheduler: str, variable: str) -> None:
-    shares = [shards_of_place({**GIVEN, variable: str(place)}, scheduler) for place in range(3)]
+def test_a_place_is_a_task_that_is_missing() -> None:
+    shares = [shards_of_place({**GIVEN, PLACE: str(place)}) for place in range(3)]
     assert shares == ["0:4", "4:8", "28:32"]
-    alone = {"TASKS": "5", "SHARDS_PER_TASK": "1"}
-    assert shards_of_place(alone, scheduler) == "5:6"  # a single job of AWS Batch has no place
 
 
 @for_each(
@@ -39,7 +35,7 @@ def test_a_place_is_a_task_that_is_missing(scheduler: str, variable: str) -> Non
 )
 def test_what_is_no_array_is_named(environment: dict[str, str], message: str) -> None:
     with pytest.raises(TrilightError, match=f"--runner kubernetes: .*{message}"):
-        shards_of_place(environment, "kubernetes")
+        shards_of_place(environment)
 
 
 def test_ranges_are_read_as_they_are_written() -> None:
@@ -49,5 +45,5 @@ def test_ranges_are_read_as_they_are_written() -> None:
 
 def test_a_range_of_ones_own_is_refused(tmp_path: Path) -> None:
     order = tiny_order(out=str(tmp_path), scenes=20, shards="0:2")
-    with pytest.raises(TrilightError, match="--shards is 0:2; expected none with --runner sky"):
-        find_executor("sky", None, None).make(order, None)
+    with pytest.raises(TrilightError, match="--shards is 0:2; expected none with"):
+        find_executor("kubernetes", None, None).make(order, None)

@@ -13,16 +13,16 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.compensated_texture import PLUGIN, register_plugin
-from pipeline.renders.plugin_sky import plugin_sky
-from pipeline.renders.plugin_textures import textured_albedo, textured_slots
 from pipeline.renders.sky_share import lamp_power, shining_sky, sky_share
 from pipeline.renders.tracer import split_triangles
 from storage.errors import Rejected
-from storage.records.lobes import lobes_of, scaled_albedos
+from storage.records.lobes import Lobes, lobes_of
 from storage.records.material import EMISSION
 from storage.records.multiscatter import Smith, scattered_again
 from storage.records.scene import Scene
+from tests.oracle.compensated_texture import PLUGIN, register_plugin
+from tests.oracle.plugin_sky import plugin_sky
+from tests.oracle.plugin_textures import textured_albedo, textured_slots
 
 _TWIN_OFFSET = 1e-4
 """World units between a twin and the emitter itself: ten times what shadow rays stop short."""
@@ -51,6 +51,15 @@ def _blend(textures: dict[str, Any]) -> dict[str, Any]:
             "specular_reflectance": {"type": PLUGIN, **specular},
         },
     }
+
+
+def scaled_albedos(lobes: Lobes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return d/(1 - w) and s/w, [T, 3] each, 0 where the lobe has no share."""
+    weight = lobes.weight[:, None]
+    zeros = np.zeros_like(lobes.diffuse)
+    diffuse = np.divide(lobes.diffuse, 1 - weight, out=zeros.copy(), where=weight < 1)
+    specular = np.divide(lobes.specular, weight, out=zeros, where=weight > 0)
+    return diffuse, specular
 
 
 def _material(scene: Scene, row: int) -> Any:

@@ -1,0 +1,241 @@
+"""An array as an indexed Job of Kubernetes, each of whose pods makes one task.
+
+A pod that its node takes along (a spot machine, a drain, an eviction) does not count; one that
+fails is started again so often, each index for itself; one that was asked something wrong (exit
+status 2) fails at once. Indices that are made are not run again, whatever becomes of the others.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import yaml
+
+from pipeline.executors.array_job import ArrayJob
+from pipeline.making.dataset_order import DatasetOrder, generate_words
+from storage.atomic import write_atomically
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.extensions import is_reference
+from storage.number_ranges import number_ranges
+from storage.remote.bucket import WRITABLE
+from storage.settings.described import checked, from_record
+from storage.settings.ranges import Within
+
+MACHINES = "TRILIGHT_MACHINES"
+"""Variable that names a file of JSON: options of machines, such as {"where": "a-namespace"}."""
+_KEPT_S = 86400
+"""How long an ended job stays to be looked at."""
+
+
+@checked()
+class KubernetesOptions:
+    """With kubernetes: the machines."""
+
+    REMOVED: ClassVar = ("on_demand",)
+    """Options of earlier versions."""
+    image: str | None = None
+    """Address of Trilight's image (infra/images/cpu.Dockerfile) as the machines pull it, best by
+    digest; by default TRILIGHT_IMAGE of the environment."""
+    where: str | None = None
+    """Namespace; by default trilight."""
+    account: str | None = None
+    """Service account that may write the bucket; by default the secret trilight-bucket says who."""
+    machine_type: str | None = None
+    """Type of the machines: all must be of one kind of processor. By default the scheduler
+    chooses."""
+    cores: Annotated[int, Within(1, 1024, unit="cores")] = 8
+    """Cores of a task."""
+    memory_gib: Annotated[int, Within(1, 24576, unit="GiB")] = 16
+    """Memory of a task in GiB."""
+    task_hours: Annotated[float, Within(0.1, 336.0, unit="hours")] = 12.0
+    """Maximum time of a task before it counts as lost, in hours."""
+    tries: Annotated[int, Within(1, 10, unit="tries")] = 5
+    """How often a task is started before it is left for the next submission."""
+    files: str = "jobs"
+    """Folder for the manifest of the array, which gets a folder of its own in it."""
+
+
+def options_here() -> KubernetesOptions:
+    """Return the options that whoever started this process has chosen (MACHINES).
+
+    Raises:
+        TrilightError: the file cannot be read, or states no such options.
+    """
+    name = os.environ.get(MACHINES)
+    if not name:
+        return KubernetesOptions()
+    try:
+        record = json.loads(Path(name).read_bytes())
+    except (OSError, ValueError) as error:
+        raise TrilightError(
+            f"{MACHINES}: {name} cannot be read ({error}); expected a file of JSON with options of "
+            'machines, such as {"where": "a-namespace", "cores": 8}.'
+        ) from error
+    return from_record(KubernetesOptions, record)
+
+
+def write_manifest(job: ArrayJob, options: KubernetesOptions) -> Path:
+    """Write the manifest of a job, in a folder of its name, and return the file.
+
+    Raises:
+        TrilightError: a task would need a file of this machine, there is no image, or the folder
+            cannot be written.
+    """
+    manifest = job_manifest(job, options)
+    path = Path(options.files) / manifest["metadata"]["name"] / "job.yaml"
+    write_atomically(path, yaml.safe_dump(manifest, sort_keys=False, width=100).encode())
+    return path
+
+
+def create_words(manifest: Path) -> list[str]:
+    """Return the words of the command that submits a job, `kubectl` first."""
+    return ["kubectl", "create", "--filename", str(manifest)]
+
+
+def submit_job(job: ArrayJob, options: KubernetesOptions) -> Path:
+    """Submit a job and return its manifest.
+
+    Raises:
+        TrilightError: there is no kubectl here, or it refuses; or as `write_manifest`.
+    """
+    path = write_manifest(job, options)
+    if shutil.which("kubectl") is None:
+        raise TrilightError(
+            "submit kubernetes: no kubectl here; expected it installed and logged in. The "
+            "manifest is written; --dry-run prints the command that submits it."
+        )
+    done = subprocess.run(create_words(path), capture_output=True, text=True, check=False)
+    if done.returncode:
+        why = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        raise TrilightError(
+            f"submit kubernetes: kubectl refused ({why}). Where a job of that name has ended, "
+            "delete it, and submit again."
+        )
+    return path
+
+
+def job_manifest(job: ArrayJob, options: KubernetesOptions) -> dict[str, Any]:
+    """Return the manifest of a job; the same array has the same name, which is refused twice.
+
+    Raises:
+        TrilightError: a task would need a file of this machine, or there is no image.
+    """
+    _require_bucket_alone(job.order)
+    words = ["trilight", *generate_words(job.order), "--out", job.order.place]
+    words += ["--runner", "kubernetes"]
+    environment = {
+        "SHARDS_PER_TASK": str(job.per_task),
+        "TASKS": number_ranges(job.tasks),
+        "TRILIGHT_CORES": str(options.cores),  # containers see all cores of a machine
+        "HOME": "/tmp",
+    }
+    said = repr((words, environment, job.at_once, options))
+    return {
+        "apiVersion": "batch/v1",
+        "kind": "Job",
+        "metadata": {
+            "name": f"trilight-{sha256_hex(said.encode())[:12]}",
+            "namespace": options.where or "trilight",
+            "labels": {"app": "trilight-array"},
+        },
+        "spec": {
+            "completionMode": "Indexed",
+            "completions": len(job.tasks),
+            "parallelism": min(job.at_once or len(job.tasks), len(job.tasks)),
+            "backoffLimitPerIndex": options.tries - 1,
+            "podFailurePolicy": {
+                "rules": [
+                    {"action": "Ignore", "onPodConditions": [{"type": "DisruptionTarget"}]},
+                    {
+                        "action": "FailIndex",
+                        "onExitCodes": {"containerName": "task", "operator": "In", "values": [2]},
+                    },
+                ]
+            },
+            "ttlSecondsAfterFinished": _KEPT_S,
+            "template": {
+                "metadata": {"labels": {"app": "trilight-array"}},
+                "spec": _pod(words, environment, options),
+            },
+        },
+    }
+
+
+def _pod(
+    words: Sequence[str], environment: dict[str, str], options: KubernetesOptions
+) -> dict[str, Any]:
+    amounts = {"cpu": str(options.cores), "memory": f"{options.memory_gib}Gi"}
+    mounts = {"tmp": "/tmp", "cache": "/cache", "data": "/data"}
+    pod: dict[str, Any] = {
+        "restartPolicy": "Never",
+        "activeDeadlineSeconds": round(3600 * options.task_hours),
+        "automountServiceAccountToken": False,
+        "securityContext": {
+            "runAsNonRoot": True, "runAsUser": 10001, "fsGroup": 10001,
+            "seccompProfile": {"type": "RuntimeDefault"},
+        },
+        "containers": [
+            {
+                "name": "task",
+                "image": _image(options),
+                "imagePullPolicy": "IfNotPresent",
+                "command": words,
+                "env": [{"name": name, "value": value} for name, value in environment.items()],
+                "envFrom": [{"secretRef": {"name": "trilight-bucket", "optional": True}}],
+                "resources": {"requests": amounts, "limits": dict(amounts)},
+                "securityContext": {
+                    "allowPrivilegeEscalation": False,
+                    "readOnlyRootFilesystem": True,
+                    "capabilities": {"drop": ["ALL"]},
+                },
+                "volumeMounts": [
+                    {"name": name, "mountPath": path} for name, path in mounts.items()
+                ],
+            }
+        ],
+        "volumes": [{"name": name, "emptyDir": {}} for name in mounts],
+    }  # fmt: skip
+    if options.account:
+        pod["serviceAccountName"] = options.account
+    if options.machine_type:
+        pod["nodeSelector"] = {"node.kubernetes.io/instance-type": options.machine_type}
+    return pod
+
+
+def _image(options: KubernetesOptions) -> str:
+    image = options.image or os.environ.get("TRILIGHT_IMAGE")
+    if not image:
+        raise TrilightError(
+            "submit kubernetes: --image is not given; expected the address of Trilight's image as "
+            "the machines pull it, such as registry.example/trilight@sha256:... Build and push "
+            "infra/images/cpu.Dockerfile, or set TRILIGHT_IMAGE."
+        )
+    return image
+
+
+def _require_bucket_alone(order: DatasetOrder) -> None:
+    """Raise TrilightError where a task would need a file of this machine."""
+    if order.place.partition("://")[0] not in WRITABLE:
+        raise TrilightError(
+            f"submit kubernetes: --out is {order.place}; expected a bucket such as "
+            "s3://bucket/folder: the machines share nothing else."
+        )
+    for option, value in (
+        ("--objects", order.objects), ("--textures", order.textures), ("--skies", order.skies),
+    ):  # fmt: skip
+        if value is not None and (":" not in value or value.startswith("file:")):
+            raise TrilightError(
+                f"submit kubernetes: {option} is {value}, a folder of this machine; expected a URL "
+                "or a named source, which every machine can read. Bring it to a bucket."
+            )
+    if is_reference(order.build):
+        raise TrilightError(
+            f"submit kubernetes: the build is {order.build}, a file of this machine; expected a "
+            "name. Put the file into an image of your own, with TRILIGHT_EXTEND, and name its "
+            "build."
+        )
