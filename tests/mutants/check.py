@@ -1,31 +1,34 @@
-"""The mutants of the list, each with its test: `python -m tests.mutants.check [ID...]`.
+"""Whether tests still kill the mutants of the list: `python -m tests.mutants.check [ID...]`.
 
-Each change is made in a copy of the tracked tree, where the test must then fail.
+Each change is made in a copy of the tracked tree; its test must fail there, and pass without it.
 """
 
+import importlib
 import json
 import os
-import queue
 import shutil
 import subprocess
 import sys
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
+from importlib.util import cache_from_source
 from pathlib import Path
+
+import pytest
 
 from tests.conftest import ROOT
 from tests.mutants.draw import Source
 
 LIST = Path(__file__).parent / "mutants.jsonl"
-PATIENCE_S = 300
+LIBRARIES = ("numpy", "scipy.sparse", "torch", "trimesh")
+"""They are imported once, before processes are forked; no mutant changes them."""
+OPTIONS = ("-x", "-m", "", "-p", "no:cacheprovider", "-o", "timeout=300")
 """A test that a change keeps from ending has noticed it."""
 
 
-def copied(folder: Path) -> Path:
-    """Copy the tracked files to an empty folder."""
-    command = ["git", "ls-files", "-z"]
-    names = subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout.decode()
-    for name in filter(None, names.split("\0")):
+def copied_tree(folder: Path) -> Path:
+    """Copy the tracked files into a folder."""
+    names = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True)
+    for name in filter(None, names.stdout.decode().split("\0")):
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, folder / name)
@@ -33,65 +36,63 @@ def copied(folder: Path) -> Path:
 
 
 def changed(text: str, mutant: dict[str, str]) -> str:
-    """Return the text of a file with the change, which must be of one place of its function."""
+    """Return the text of a file with the change, at the one place of its function."""
     for name, first, last in Source(mutant["path"], text).definitions():
         if name == mutant["function"] and text.count(mutant["source"], first, last) == 1:
             place = text.index(mutant["source"], first, last)
             return text[:place] + mutant["changed"] + text[place + len(mutant["source"]) :]
-    raise SystemExit(
-        f"{mutant['id']}: {mutant['path']} has no such lines now; point to their place"
-    )
+    where = f"{mutant['function']} in {mutant['path']}"
+    raise SystemExit(f"{mutant['id']}: its lines are not once in {where}; correct {LIST.name}.")
 
 
-def passes(tree: Path, tests: list[str]) -> bool:
-    """Run tests of a copy; its modules come before those that are installed."""
-    shared = os.environ.get("TRILIGHT_SHARED", str(ROOT.parent / "shared"))
-    env = {**os.environ, "PYTHONPATH": str(tree), "TRILIGHT_SHARED": shared}
-    command = [sys.executable, "-m", "pytest", "-x", "-m", "", "-p", "no:cacheprovider", *tests]
+def write_file(tree: Path, mutant: dict[str, str], *, is_changed: bool) -> None:
+    """Write the file of a mutant, changed or as it is, and forget what was compiled of it."""
+    if "path" in mutant:
+        text = (ROOT / mutant["path"]).read_text()
+        (tree / mutant["path"]).write_text(changed(text, mutant) if is_changed else text)
+        Path(cache_from_source(tree / mutant["path"])).unlink(missing_ok=True)
+
+
+def begin_tests(tree: Path, tests: list[str]) -> int:
+    """Fork a process that runs tests of a copy; return its number."""
+    if number := os.fork():
+        return number
     try:
-        return not subprocess.run(
-            command, cwd=tree, env=env, capture_output=True, timeout=PATIENCE_S, check=False
-        ).returncode
-    except subprocess.TimeoutExpired:
-        return False
-
-
-def survives(tree: Path, mutant: dict[str, str]) -> bool:
-    """Run a mutant's test where its change is made, and take the change back."""
-    path = tree / mutant["path"]
-    text = path.read_text()
-    path.write_text(changed(text, mutant))
-    shutil.rmtree(path.parent / "__pycache__", ignore_errors=True)
-    try:
-        return passes(tree, mutant["test"].split())
+        os.chdir(tree)
+        os.environ["PYTHONPATH"] = sys.path[0] = str(tree)
+        for name in [each for each in sys.modules if each.partition(".")[0] == "tests"]:
+            del sys.modules[name]
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        os._exit(pytest.main([*OPTIONS, *tests]))
     finally:
-        path.write_text(text)
-        shutil.rmtree(path.parent / "__pycache__", ignore_errors=True)
+        os._exit(pytest.ExitCode.INTERNAL_ERROR)
 
 
 def main(ids: list[str]) -> int:
-    """Print what became of each mutant; return how many survived."""
-    listed = [json.loads(line) for line in LIST.read_text().splitlines()]
-    mutants = [each for each in listed if "test" in each and (not ids or each["id"] in ids)]
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as pool:
-        trees = queue.Queue[Path]()
-        for number in range(os.cpu_count() or 1):
-            trees.put(copied(Path(folder, str(number))))
-
-        def outcome(mutant: dict[str, str]) -> bool:
-            tree = trees.get()
-            try:
-                return survives(tree, mutant)
-            finally:
-                trees.put(tree)
-
-        if not passes(trees.queue[0], sorted({each["test"] for each in mutants})):
-            raise SystemExit("a test fails without any change")
-        survived = 0
-        for mutant, alive in zip(mutants, pool.map(outcome, mutants), strict=True):
-            survived += alive
-            sys.stdout.write(f"{mutant['id']}: {'survived' if alive else 'killed'}\n")
-    return survived
+    """Print what became of each mutant; return how many outcomes are not as they must be."""
+    mutants = [json.loads(line) for line in LIST.read_text().splitlines()]
+    jobs = [each for each in mutants if "test" in each and (not ids or each["id"] in ids)]
+    tests = " ".join(sorted({each["test"] for each in jobs}))
+    jobs.insert(0, {"id": "no change", "test": tests})
+    os.environ.setdefault("TRILIGHT_SHARED", str(ROOT.parent / "shared"))
+    list(map(importlib.import_module, LIBRARIES))
+    running, num_wrong = dict[int, tuple[Path, dict[str, str]]](), 0
+    with tempfile.TemporaryDirectory() as folder:
+        trees = [copied_tree(Path(folder, str(number))) for number in range(os.cpu_count() or 1)]
+        while jobs or running:
+            while jobs and trees:
+                tree, mutant = trees.pop(), jobs.pop(0)
+                write_file(tree, mutant, is_changed=True)
+                running[begin_tests(tree, mutant["test"].split())] = tree, mutant
+            number, status = os.wait()
+            tree, mutant = running.pop(number)
+            write_file(tree, mutant, is_changed=False)
+            trees.append(tree)
+            num_wrong += (status != 0) != ("path" in mutant)
+            sys.stdout.write(f"{mutant['id']}: {'killed' if status else 'survived'}\n")
+            sys.stdout.flush()
+    return num_wrong
 
 
 if __name__ == "__main__":
