@@ -1,6 +1,7 @@
 """Whether tests still kill the mutants of the list: `python -m tests.mutants.check [ID...]`.
 
 Each change is made in a copy of the tracked tree; its test must fail there, and pass without it.
+What the list holds with a reason in place of a test (`equivalent`, `removed`) is left out.
 """
 
 import importlib
@@ -21,8 +22,7 @@ from tests.mutants.draw import Source
 LIST = Path(__file__).parent / "mutants.jsonl"
 LIBRARIES = ("numpy", "scipy.sparse", "torch", "trimesh")
 """They are imported once, before processes are forked; no mutant changes them."""
-OPTIONS = ("-x", "-m", "", "-p", "no:cacheprovider", "-o", "timeout=300")
-"""A test that a change keeps from ending has noticed it."""
+OPTIONS = ("-x", "-m", "", "-p", "no:cacheprovider", "-o", "timeout=300")  # no end: it noticed
 
 
 def copied_tree(folder: Path) -> Path:
@@ -35,8 +35,9 @@ def copied_tree(folder: Path) -> Path:
     return folder
 
 
-def changed(text: str, mutant: dict[str, str]) -> str:
+def changed(mutant: dict[str, str]) -> str:
     """Return the text of a file with the change, at the one place of its function."""
+    text = (ROOT / mutant["path"]).read_text() if (ROOT / mutant["path"]).is_file() else ""
     for name, first, last in Source(mutant["path"], text).definitions():
         if name == mutant["function"] and text.count(mutant["source"], first, last) == 1:
             place = text.index(mutant["source"], first, last)
@@ -48,8 +49,8 @@ def changed(text: str, mutant: dict[str, str]) -> str:
 def write_file(tree: Path, mutant: dict[str, str], *, is_changed: bool) -> None:
     """Write the file of a mutant, changed or as it is, and forget what was compiled of it."""
     if "path" in mutant:
-        text = (ROOT / mutant["path"]).read_text()
-        (tree / mutant["path"]).write_text(changed(text, mutant) if is_changed else text)
+        text = changed(mutant) if is_changed else (ROOT / mutant["path"]).read_text()
+        (tree / mutant["path"]).write_text(text)
         Path(cache_from_source(tree / mutant["path"])).unlink(missing_ok=True)
 
 
@@ -73,6 +74,8 @@ def main(ids: list[str]) -> int:
     """Print what became of each mutant; return how many outcomes are not as they must be."""
     mutants = [json.loads(line) for line in LIST.read_text().splitlines()]
     jobs = [each for each in mutants if "test" in each and (not ids or each["id"] in ids)]
+    for mutant in jobs:
+        changed(mutant)  # before any test: what has moved is said at once
     tests = " ".join(sorted({each["test"] for each in jobs}))
     jobs.insert(0, {"id": "no change", "test": tests})
     os.environ.setdefault("TRILIGHT_SHARED", str(ROOT.parent / "shared"))
@@ -90,8 +93,7 @@ def main(ids: list[str]) -> int:
             write_file(tree, mutant, is_changed=False)
             trees.append(tree)
             num_wrong += (status != 0) != ("path" in mutant)
-            sys.stdout.write(f"{mutant['id']}: {'killed' if status else 'survived'}\n")
-            sys.stdout.flush()
+            print(f"{mutant['id']}: {'killed' if status else 'survived'}", flush=True)  # noqa: T201
     return num_wrong
 
 

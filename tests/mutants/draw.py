@@ -19,8 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 SEED = 20261127
-COMMIT = "dbd5de6f792d44ec2c4508b01f4f70e28e08787f"
-"""The source that is drawn from, whatever became of it since."""
+COMMIT = "dbd5de6f792d44ec2c4508b01f4f70e28e08787f"  # its source is drawn from
 PACKAGES = ("storage", "scene_templates", "pipeline", "model", "train", "infra", "trilight")
 KINDS = ("sign", "bound", "order", "guard", "constant")
 REMOVED = re.compile(
@@ -65,7 +64,6 @@ class Source:
         )
 
     def of(self, node: ast.AST) -> str:
-        """Return the text of a node."""
         return self.text[slice(*self.span(node))]
 
     def definitions(self) -> Iterator[tuple[str, int, int]]:
@@ -85,9 +83,9 @@ def changes(source: Source) -> Iterator[Change]:
     """Yield every change that may be drawn from a file."""
     nodes = list(ast.walk(source.tree))
     hidden = {each for node in nodes for part in _hidden(node) for each in ast.walk(part)}
-    for node in (node for node in nodes if node not in hidden):
-        for find in (_signs, _bounds, _orders, _guards, _constants):
-            yield from find(source, node)
+    rules = (_signs, _bounds, _orders, _guards, _constants)
+    for node, find in itertools.product((each for each in nodes if each not in hidden), rules):
+        yield from find(source, node)
 
 
 def _hidden(node: ast.AST) -> Iterator[ast.AST]:
@@ -111,8 +109,8 @@ def _hidden(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _is_text(node: ast.AST) -> bool:
-    joined = ast.JoinedStr | ast.List | ast.Tuple
-    return isinstance(node, joined) or isinstance(getattr(node, "value", None), str)
+    kinds = ast.JoinedStr | ast.List | ast.Tuple
+    return isinstance(node, kinds) or isinstance(getattr(node, "value", None), str)
 
 
 def _between(kind: str, source: Source, left: ast.AST, right: ast.AST, op: Any) -> Change:
@@ -191,15 +189,15 @@ def _guards(source: Source, node: ast.AST) -> Iterator[Change]:
 
 
 def _constants(source: Source, node: ast.AST) -> Iterator[Change]:
-    if not isinstance(node, ast.Constant) or isinstance(node.value, bool):
-        return
-    text, span = source.of(node), source.span(node)
-    if isinstance(node.value, int):
-        yield Change("constant", *span, str(node.value + 1))
-    elif isinstance(node.value, float):
-        yield Change("constant", *span, str(2 * node.value or 1.0))
-    elif re.fullmatch(r"[\"'][^\s\"']+[\"']", text):
-        yield Change("constant", *span, f"{text[:-1]}_{text[-1]}")
+    value: Any = node.value if isinstance(node, ast.Constant) else None
+    if type(value) in (int, float, str):
+        text = new = source.of(node)
+        if not isinstance(value, str):
+            new = str(value + 1 if isinstance(value, int) else 2 * value or 1.0)
+        elif re.fullmatch(r"[\"'][^\s\"']+[\"']", text):
+            new = f"{text[:-1]}_{text[-1]}"
+        if new != text:
+            yield Change("constant", *source.span(node), new)
 
 
 def described(source: Source, change: Change) -> dict[str, str]:
@@ -217,9 +215,8 @@ def described(source: Source, change: Change) -> dict[str, str]:
 
 def _sources() -> Iterator[Source]:
     """Yield the files of the commit that mutants are drawn from."""
-    command = ["git", "archive", COMMIT, *PACKAGES]
-    archive = subprocess.run(command, capture_output=True, check=True).stdout
-    with tarfile.open(fileobj=io.BytesIO(archive)) as files:
+    archive = subprocess.run(["git", "archive", COMMIT, *PACKAGES], capture_output=True, check=True)
+    with tarfile.open(fileobj=io.BytesIO(archive.stdout)) as files:
         for member in files:
             file = files.extractfile(member)
             if file and member.name.endswith(".py") and not REMOVED.fullmatch(member.name):
