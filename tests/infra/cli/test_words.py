@@ -25,4 +25,4 @@ def test_an_optional_field_takes_the_words_that_it_takes_otherwise() -> None:
             with case(each):
                 assert value_of(words, each) == value
                 for ask in (choices_of, kind_of, is_repeated, takes_names):
-                    assert ask(each) == ask(hint)  # type: ignore[operator]
+                    assert ask(each) == ask(hint)
