@@ -13,6 +13,7 @@ from model.precision import set_precision
 from model.renderformer import RenderFormer, count_parameters
 from model.scene_tensors import batch_scenes
 from tests.for_each import for_each
+from tests.model.hits.test_decoder import hits_config
 from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
 
 REPAIRED = tiny_config(patch_px=4, demodulated=True, hit_rays=1)
@@ -58,6 +59,12 @@ def test_sizes_have_the_parameters_that_they_claim(name: str, millions: float) -
     # to the digits claimed
     assert sum(got.parameters.values()) / 1e6 == pytest.approx(millions, abs=0.5)
     assert got.training_bytes == 16 * sum(got.parameters.values())
+
+
+def test_an_encoder_that_is_not_there_has_no_parameters() -> None:
+    config = hits_config(scene_tokens=False)
+    got = costs(config, Workload(triangles=7, views=1, resolution=16))
+    assert sum(got.parameters.values()) == count_parameters(RenderFormer(config))
 
 
 def test_bytes_are_those_of_the_tensors() -> None:

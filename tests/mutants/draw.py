@@ -16,10 +16,10 @@ import tarfile
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 SEED = 20261127
-COMMIT = "dbd5de6f792d44ec2c4508b01f4f70e28e08787f"
-"""The source that is drawn from, whatever became of it since."""
+COMMIT = "dbd5de6f792d44ec2c4508b01f4f70e28e08787f"  # its source is drawn from
 PACKAGES = ("storage", "scene_templates", "pipeline", "model", "train", "infra", "trilight")
 KINDS = ("sign", "bound", "order", "guard", "constant")
 REMOVED = re.compile(
@@ -33,23 +33,18 @@ REMOVED = re.compile(
 """Files that no mutant is drawn from: the commits after the draw remove them."""
 SIGNS = {ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*")}
 BOUNDS = {ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">")}
-ONE_WAY = (ast.Sub, ast.Div, ast.FloorDiv, ast.Mod, ast.Pow, ast.MatMult)
-"""Operations whose operands cannot be swapped."""
-NAMES = (ast.Name, ast.Attribute)
+NON_COMMUTATIVE = (ast.Sub, ast.Div, ast.FloorDiv, ast.Mod, ast.Pow, ast.MatMult)
 SIMPLE = (ast.Assign, ast.AnnAssign, ast.AugAssign, ast.Expr)
 
 
 @dataclass(frozen=True)
 class Change:
-    """One place of a file and what stands there instead."""
+    """What stands in place of the characters from `first` to before `last`."""
 
     kind: str
     first: int
-    """Offset of the first character that is replaced."""
     last: int
-    """Offset after the last."""
     text: str
-    """The replacement."""
 
 
 class Source:
@@ -57,50 +52,40 @@ class Source:
 
     def __init__(self, path: str, text: str) -> None:
         self.path, self.text, self.tree = path, text, ast.parse(text)
-        self.starts = [0]
-        for line in text.splitlines(keepends=True):
-            self.starts.append(self.starts[-1] + len(line))
+        self.lines = text.splitlines(keepends=True)
+        self.starts = [0, *itertools.accumulate(map(len, self.lines))]
 
-    def span(self, node: ast.AST) -> tuple[int, int]:
+    def span(self, node: Any) -> tuple[int, int]:
         """Return the offsets of a node; its columns count bytes."""
+        first, last = self.lines[node.lineno - 1], self.lines[node.end_lineno - 1]
         return (
-            self._offset(node.lineno, node.col_offset),  # type: ignore[attr-defined]
-            self._offset(node.end_lineno, node.end_col_offset),  # type: ignore[attr-defined]
+            self.starts[node.lineno - 1] + len(first.encode()[: node.col_offset].decode()),
+            self.starts[node.end_lineno - 1] + len(last.encode()[: node.end_col_offset].decode()),
         )
 
     def of(self, node: ast.AST) -> str:
-        """Return the text of a node."""
-        first, last = self.span(node)
-        return self.text[first:last]
+        return self.text[slice(*self.span(node))]
 
     def definitions(self) -> Iterator[tuple[str, int, int]]:
         """Yield the dotted name and the first and last offset of each function and class."""
         yield "<module>", 0, len(self.text)
-        yield from self._definitions(self.tree, "")
-
-    def _definitions(self, parent: ast.AST, prefix: str) -> Iterator[tuple[str, int, int]]:
-        for node in ast.iter_child_nodes(parent):
-            name = prefix
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-                name = f"{prefix}.{node.name}".lstrip(".")
-                top = min([node.lineno, *(each.lineno for each in node.decorator_list)])
-                yield name, self.starts[top - 1], self.span(node)[1]
-            yield from self._definitions(node, name)
-
-    def _offset(self, lineno: int, column: int) -> int:
-        start = self.starts[lineno - 1]
-        line = self.text[start : self.starts[lineno]]
-        return start + len(line.encode()[:column].decode())
+        names: dict[ast.AST, str] = {self.tree: ""}
+        for parent in ast.walk(self.tree):
+            for node in ast.iter_child_nodes(parent):
+                names[node] = names[parent]
+                if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                    names[node] = f"{names[parent]}.{node.name}".lstrip(".")
+                    top = min([node.lineno, *(each.lineno for each in node.decorator_list)])
+                    yield names[node], self.starts[top - 1], self.span(node)[1]
 
 
 def changes(source: Source) -> Iterator[Change]:
     """Yield every change that may be drawn from a file."""
     nodes = list(ast.walk(source.tree))
     hidden = {each for node in nodes for part in _hidden(node) for each in ast.walk(part)}
-    for node in nodes:
-        if node not in hidden:
-            for find in (_signs, _bounds, _orders, _guards, _constants):
-                yield from find(source, node)
+    rules = (_signs, _bounds, _orders, _guards, _constants)
+    for node, find in itertools.product((each for each in nodes if each not in hidden), rules):
+        yield from find(source, node)
 
 
 def _hidden(node: ast.AST) -> Iterator[ast.AST]:
@@ -114,10 +99,8 @@ def _hidden(node: ast.AST) -> Iterator[ast.AST]:
         parts += node.args
     elif isinstance(node, ast.ClassDef):
         parts += [each for each in node.body if isinstance(each, ast.Assign | ast.AnnAssign)]
-    elif isinstance(node, ast.AnnAssign | ast.arg):
-        parts += [node.annotation]
-    elif isinstance(node, ast.FunctionDef):
-        parts += [node.returns]
+    elif isinstance(node, ast.AnnAssign | ast.arg | ast.FunctionDef):
+        parts += [node.returns if isinstance(node, ast.FunctionDef) else node.annotation]
     elif isinstance(node, ast.Compare) and getattr(node.left, "id", "") == "__name__":
         parts += node.comparators
     for each in (each for part in filter(None, parts) for each in ast.walk(part)):
@@ -126,24 +109,23 @@ def _hidden(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _is_text(node: ast.AST) -> bool:
-    """Return whether operands are joined or formatted, and not added or divided."""
-    joined = isinstance(node, ast.JoinedStr | ast.List | ast.Tuple)
-    return joined or isinstance(getattr(node, "value", None), str)
+    kinds = ast.JoinedStr | ast.List | ast.Tuple
+    return isinstance(node, kinds) or isinstance(getattr(node, "value", None), str)
 
 
-def _between(
-    source: Source, left: ast.AST, right: ast.AST, words: tuple[str, str], kind: str
-) -> Change:
-    first = source.text.index(words[0], source.span(left)[1], source.span(right)[0])
-    return Change(kind, first, first + len(words[0]), words[1])
+def _between(kind: str, source: Source, left: ast.AST, right: ast.AST, op: Any) -> Change:
+    old, new = (SIGNS | BOUNDS)[type(op)]
+    first = source.text.index(old, source.span(left)[1], source.span(right)[0])
+    return Change(kind, first, first + len(old), new)
 
 
 def _signs(source: Source, node: ast.AST) -> Iterator[Change]:
     if isinstance(node, ast.BinOp | ast.AugAssign) and type(node.op) in SIGNS:
-        left = node.left if isinstance(node, ast.BinOp) else node.target
-        right = node.right if isinstance(node, ast.BinOp) else node.value
-        if not (_is_text(left) or _is_text(right)):
-            yield _between(source, left, right, SIGNS[type(node.op)], "sign")
+        sides = (
+            (node.left, node.right) if isinstance(node, ast.BinOp) else (node.target, node.value)
+        )
+        if not any(map(_is_text, sides)):
+            yield _between("sign", source, *sides, node.op)
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
         yield Change("sign", *source.span(node), source.of(node.operand))
 
@@ -153,7 +135,7 @@ def _bounds(source: Source, node: ast.AST) -> Iterator[Change]:
         sides = itertools.pairwise([node.left, *node.comparators])
         for op, (left, right) in zip(node.ops, sides, strict=True):
             if type(op) in BOUNDS:
-                yield _between(source, left, right, BOUNDS[type(op)], "bound")
+                yield _between("bound", source, left, right, op)
     elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "range":
         end = node.args[min(len(node.args) - 1, 1)]
         if not isinstance(end, ast.Starred):
@@ -167,14 +149,14 @@ def _orders(source: Source, node: ast.AST) -> Iterator[Change]:
         if getattr(node.func, "id", "") == "sorted" and "reverse" not in source.of(node):
             _, last = source.span(node)
             yield Change("order", last - 1, last, ", reverse=True)")
-    elif isinstance(node, ast.BinOp) and isinstance(node.op, ONE_WAY):
+    elif isinstance(node, ast.BinOp) and isinstance(node.op, NON_COMMUTATIVE):
         if not (_is_text(node.left) or _is_text(node.right)):
             yield from _swapped(source, node.left, node.right)
     for body in (getattr(node, name, None) for name in ("body", "orelse", "finalbody")):
         if isinstance(body, list):
             for above, below in itertools.pairwise(body):
-                are_simple = isinstance(above, SIMPLE) and isinstance(below, SIMPLE)
-                if are_simple and _are_ordered(above, below):
+                both = _stored(above) & _loaded(below) or _stored(below) & _loaded(above)
+                if both and isinstance(above, SIMPLE) and isinstance(below, SIMPLE):
                     yield from _swapped(source, above, below)
 
 
@@ -183,10 +165,6 @@ def _swapped(source: Source, left: ast.AST, right: ast.AST) -> Iterator[Change]:
     one, other = source.of(left), source.of(right)
     if one != other:
         yield Change("order", first, last, other + source.text[end:start] + one)
-
-
-def _are_ordered(above: ast.AST, below: ast.AST) -> bool:
-    return bool(_stored(above) & _loaded(below) or _stored(below) & _loaded(above))
 
 
 def _stored(node: ast.AST) -> set[str]:
@@ -199,7 +177,8 @@ def _stored(node: ast.AST) -> set[str]:
 
 def _loaded(node: ast.AST) -> set[str]:
     """Return the names in a statement; each attribute of `self` is one."""
-    texts = [ast.unparse(each) for each in ast.walk(node) if isinstance(each, NAMES)]
+    kinds = ast.Name | ast.Attribute
+    texts = [ast.unparse(each) for each in ast.walk(node) if isinstance(each, kinds)]
     return {text for text in texts if re.fullmatch(r"(?!self$)\w+|self\.\w+", text)}
 
 
@@ -210,15 +189,15 @@ def _guards(source: Source, node: ast.AST) -> Iterator[Change]:
 
 
 def _constants(source: Source, node: ast.AST) -> Iterator[Change]:
-    if not isinstance(node, ast.Constant) or isinstance(node.value, bool):
-        return
-    text, span = source.of(node), source.span(node)
-    if isinstance(node.value, int):
-        yield Change("constant", *span, str(node.value + 1))
-    elif isinstance(node.value, float):
-        yield Change("constant", *span, str(2 * node.value or 1.0))
-    elif re.fullmatch(r"[\"'][^\s\"']+[\"']", text):
-        yield Change("constant", *span, f"{text[:-1]}_{text[-1]}")
+    value: Any = node.value if isinstance(node, ast.Constant) else None
+    if type(value) in (int, float, str):
+        text = new = source.of(node)
+        if not isinstance(value, str):
+            new = str(value + 1 if isinstance(value, int) else 2 * value or 1.0)
+        elif re.fullmatch(r"[\"'][^\s\"']+[\"']", text):
+            new = f"{text[:-1]}_{text[-1]}"
+        if new != text:
+            yield Change("constant", *source.span(node), new)
 
 
 def described(source: Source, change: Change) -> dict[str, str]:
@@ -231,19 +210,13 @@ def described(source: Source, change: Change) -> dict[str, str]:
         first = text.rindex("\n", 0, first - 1) + 1
     first += len(text[first:last]) - len(text[first:last].lstrip())
     changed = text[first : change.first] + change.text + text[change.last : last]
-    place = {"path": source.path, "function": name}
-    return {**place, "source": text[first:last], "changed": changed}
-
-
-def _key(*parts: object) -> bytes:
-    return hashlib.sha256(":".join(map(str, (SEED, *parts))).encode()).digest()
+    return {"path": source.path, "function": name, "source": text[first:last], "changed": changed}
 
 
 def _sources() -> Iterator[Source]:
     """Yield the files of the commit that mutants are drawn from."""
-    command = ["git", "archive", COMMIT, *PACKAGES]
-    archive = subprocess.run(command, capture_output=True, check=True).stdout
-    with tarfile.open(fileobj=io.BytesIO(archive)) as files:
+    archive = subprocess.run(["git", "archive", COMMIT, *PACKAGES], capture_output=True, check=True)
+    with tarfile.open(fileobj=io.BytesIO(archive.stdout)) as files:
         for member in files:
             file = files.extractfile(member)
             if file and member.name.endswith(".py") and not REMOVED.fullmatch(member.name):
@@ -252,6 +225,10 @@ def _sources() -> Iterator[Source]:
 
 def drawn(number: int) -> Iterator[dict[str, str]]:
     """Yield the first mutants of each kind and package: lines in the order of their hashes."""
+
+    def key(*parts: object) -> bytes:
+        return hashlib.sha256(":".join(map(str, (SEED, *parts))).encode()).digest()
+
     places = defaultdict[tuple[str, str, Source, int], list[Change]](list)
     for source in _sources():
         for change in changes(source):
@@ -259,9 +236,9 @@ def drawn(number: int) -> Iterator[dict[str, str]]:
             places[source.path.split("/")[0], change.kind, source, line].append(change)
     for package, kind in itertools.product(PACKAGES, KINDS):
         lines = [each for each in places if each[:2] == (package, kind)]
-        lines.sort(key=lambda each: _key(kind, each[2].path, each[3]))
+        lines.sort(key=lambda each: key(kind, each[2].path, each[3]))
         for n, place in enumerate(lines[:number], 1):
-            change = min(places[place], key=lambda each: _key(each.first, each.last, each.text))
+            change = min(places[place], key=lambda each: key(each.first, each.last, each.text))
             name = {"id": f"{package}-{kind}-{n}", "package": package, "kind": kind}
             yield name | described(place[2], change)
 

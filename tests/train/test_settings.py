@@ -7,6 +7,7 @@ import pytest
 
 from model.base_widths import BaseWidths
 from model.config import SIZES, large
+from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.settings.changes import changed
 from storage.settings.described import settings_record
@@ -22,6 +23,22 @@ def test_named_runs_carry_their_name_and_survive_json(name: str) -> None:
     record = settings_record(settings)
     assert json.loads(json.dumps(record)) == record
     assert record["model"]["width"] == settings.model.width
+
+
+SHIPPED = {
+    "builtin": "f414db1e0417fdce",
+    "hits": "62ab9f9520cd9d79",
+    "hits-tokens": "ca39119c1c965aa5",
+}
+"""Of what a run states beside its name and the defaults. Another digest is another run, which takes
+another name."""
+
+
+def test_the_runs_of_the_shipped_networks_stay_what_they_are() -> None:
+    for name, digest in SHIPPED.items():
+        record = settings_record(named_run(name), stated=True)
+        del record["run"]
+        assert sha256_hex(canonical_json(record))[:16] == digest, name
 
 
 def test_an_unknown_run_is_refused_with_the_known_ones() -> None:

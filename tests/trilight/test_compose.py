@@ -110,6 +110,7 @@ def _described(place: dict[str, object]) -> dict[str, object]:
         (lambda: _lit().add_mesh(([[0, 0, 0]], [[0, 0, 1]])), "vertices 0 to 1; expected 0 to 0"),
         (lambda: _lit().add_mesh(([[0, 0, 0]], np.zeros((0, 3), int))), r"shape \(0, 3\)"),
         (lambda: _lit().add_mesh(TETRAHEDRON, size=0), "size is 0; expected metres above 0"),
+        (lambda: _lit().add_mesh(TETRAHEDRON, size=np.inf), "size is inf; expected metres above"),
         (lambda: _lit().add_mesh(TETRAHEDRON, at=(0, 0)), "at is .*three finite numbers"),  # type: ignore[arg-type]
         (lambda: _lit().add_mesh(([[1, 1, 1]] * 3, [[0, 1, 2]]), size=1), "object1: all vertices"),
         (lambda: _lit().add_builtin("rok"), "did you mean rock"),
@@ -135,5 +136,7 @@ def test_a_file_is_the_mesh_that_its_arrays_are(tmp_path: Path) -> None:
     read = _lit().add_mesh(tmp_path / "it.ply", RED, size=0.5, licence="CC-BY-4.0").scene()
     given = _lit().add_mesh((positions, faces), RED, name="it", size=0.5).scene()
     np.testing.assert_array_equal(read.vertex_positions, given.vertex_positions)
+    here = given.vertex_positions[given.faces[given.object_index == 1]]
+    assert here.mean(axis=(0, 1)) == pytest.approx(np.zeros(3), abs=1e-6), "at the origin"
     assert (read.objects[1].name, read.objects[1].uid) == ("it", "it.ply")
     assert read.objects[1].licence == "CC-BY-4.0"

@@ -8,12 +8,13 @@ import pytest
 
 from infra.release.__main__ import _sum_and_say, _write_network
 from infra.release.page import write_page
-from infra.release.pictures import NETWORK, Beside, chosen_scenes
+from infra.release.pictures import NETWORK, RIVALS, Beside, chosen_scenes
 from infra.release.push import planned_upload
 from model.open import open_network
 from pipeline.documents.sums import SUMS
 from storage.errors import TrilightError
 from tests.command_line import trilight
+from tests.conftest import ROOT
 from tests.pipeline.documents.dataset_by_hand import (
     five_scenes,
     furnished,
@@ -34,6 +35,12 @@ def beside(key: str, network_db: float) -> Beside:
         pictures_rgb={NETWORK: network, "1 sample, filtered": sample},
         psnr_db={NETWORK: network_db, "1 sample, filtered": 30.0},
     )
+
+
+def test_the_previews_are_those_that_the_page_on_publishing_promises() -> None:
+    *first, last = RIVALS
+    words = f"by {', '.join(map(str, first))} and {last} samples with a denoiser"
+    assert words in (ROOT / "docs/how-to/publish.md").read_text()
 
 
 def test_the_page_shows_everybody_and_opens_from_disk(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from infra.rendering import plan
 from infra.rendering.cameras import ShotCamera
 from infra.rendering.engines import MitsubaPlan, NeuralPlan
 from infra.rendering.plan import plan_render
@@ -59,6 +60,22 @@ def test_both_engines_share_the_width_and_have_files_of_their_own(
     assert last.name == "tiny.safetensors, picture 000002"
     assert last.exrs == {name: folder / f"000002.{name}.exr" for name in ("mitsuba", "neural")}
     assert last.png == folder / "000002.png"
+
+
+def test_the_pictures_of_a_turn_share_the_loading_of_its_scene(
+    scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[float] = []
+
+    def priced_ways(*_: object, per_scene: float, **__: object) -> None:
+        told.append(per_scene)
+        raise TrilightError("no way to it")
+
+    monkeypatch.setattr(plan, "priced_ways", priced_ways)
+    for more in ({"out": tmp_path / "x.exr"}, {"out": tmp_path / "turn", "orbit": 3}):
+        with pytest.raises(TrilightError, match="no way"):
+            plan_render(Asked(source=scene, seconds=1.0, **more), HereReader())
+    assert told == [1, 3]
 
 
 def test_what_cannot_be_done_is_said_before_anything_is_made(scene: str, tmp_path: Path) -> None:

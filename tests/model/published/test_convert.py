@@ -16,6 +16,7 @@ from model.published.convert import (
     NORMAL,
     TANGENT_NORMAL,
     TEXTURE_CHANNELS,
+    _require_frequencies,
     fold,
     from_published,
     to_published,
@@ -84,6 +85,15 @@ def test_export_gives_back_what_was_published(shared: Path, name: str) -> None:
         assert tensor.shape == published[key].shape, key
         if not key.startswith("texture_encoder."):
             assert torch.equal(tensor, published[key]), key
+
+
+def test_frequencies_differ_by_their_rounding_alone() -> None:
+    """Others are those of another configuration, with which the same weights mean other places."""
+    formula = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
+    _require_frequencies("freqs", formula * (1 + 0.9e-6), formula)
+    for wrong in (1 - 1.5e-6, 1 + 1.5e-6):
+        with pytest.raises(TrilightError, match="freqs is .*expected a config.json that belongs"):
+            _require_frequencies("freqs", formula * wrong, formula)
 
 
 @for_each(

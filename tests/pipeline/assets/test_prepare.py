@@ -214,6 +214,7 @@ NO_GATES: list[dict[str, Any]] = [
     {"max_outside": 0.0},
     {"area_ratio": (1.1, 1.2)},
     {"area_ratio": (0.0, 1.2)},
+    {"area_ratio": (0.8, 1.0)},
     {"max_normal_error_deg": 91.0},
     {"min_silhouette_iou": 1.1},
     {"max_lost_area": -0.1},

@@ -227,6 +227,15 @@ def _check_limits_of_size(tmp_path: Path, write: Callable[[Path, TriangleMesh], 
     assert reason_of(path, small) == "too_large_bytes"
 
 
+def test_a_header_of_too_many_faces_is_enough(tmp_path: Path) -> None:
+    """They are refused before anything is made of them: what follows may be no faces at all."""
+    path = write_ply(tmp_path / "a.ply", BALL)
+    header, end, body = path.read_bytes().partition(b"end_header\n")
+    path.write_bytes(header + end + b"\xff" * len(body))
+    assert reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
+    assert reason_of(path, AssetSettings(max_source_faces=80)) != "too_many_faces"
+
+
 def test_an_error_beyond_the_bound_is_stated(tmp_path: Path) -> None:
     path = write_obj(tmp_path / "a.obj", knot())
     settings = AssetSettings(budgets=(1000,), gate=GateSettings(max_error_p99=1e-4))

@@ -116,7 +116,10 @@ def test_growing_keeps_the_shards(tmp_path: Path) -> None:
 
 
 def test_scenes_are_rounded_up_to_whole_shards(tmp_path: Path) -> None:
-    assert _begin(tmp_path, _build(), 5).manifest.num_scenes == 8
+    publication = _begin(tmp_path, _build(), 5)
+    assert publication.manifest.num_scenes == 8
+    assert publication.missing_shards() == [0, 1]
+    assert (publication.done.shards, publication.done.shards_asked) == (0, 2)
 
 
 def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:

@@ -42,6 +42,22 @@ def test_bands_have_their_share() -> None:
         assert _shares("stripes", seed, "ground", "band") == pytest.approx(stated, abs=0.02)
 
 
+def test_as_many_bands_are_crossed_as_are_stated() -> None:
+    """On every straight line through the map, but for those that run along the bands."""
+    seen = set()
+    for seed in range(8):
+        settings = SurfaceMapSettings(families=("stripes",), size=256, natural_share=0.0)
+        maps = draw_surface(rng_for(seed, "laid"), settings)
+        along, bands = maps.parameters["run along"][0], maps.parameters["bands"][0]
+        values = maps.diffuse_rgb.astype(float).sum(axis=2)
+        is_band = values > (values.min() + values.max()) / 2
+        for axis, parallel in ((0, "v"), (1, "u")):
+            starts = (is_band & ~np.roll(is_band, 1, axis=axis)).sum(axis=axis)
+            assert (starts == (0 if along == parallel else bands)).all()
+        seen.add(along)
+    assert len(seen) > 2
+
+
 def test_pieces_tile_the_map() -> None:
     rows, columns, size = 4, 3, 96
     pieces = laid(Texels(size), rows, columns, np.array([0.0, 0.5, 0.25, 0.9]))

@@ -16,6 +16,7 @@ from storage.dataset.progress import (
     announce_objects,
     count_object,
     forget_views,
+    missing_shards,
     read_progress,
     read_status,
     tell_views,
@@ -23,6 +24,7 @@ from storage.dataset.progress import (
 from storage.dataset.scene_logs import log_scene, read_scene_logs
 from storage.dataset.shard_notes import note_of
 from storage.errors import TrilightError
+from tests.http_server import serve
 from tests.pipeline.making.test_publication import begin_tiny, make_tiny_shard
 
 
@@ -115,6 +117,20 @@ def test_shards_scenes_and_what_to_do_next(tmp_path: Path) -> None:
     # a shard without its note, as a kill leaves it
     note_of(publication.folder, "train-000001.tar").unlink()
     assert read_status(str(tmp_path)).shards_done == 1
+
+
+def test_only_a_bucket_is_asked_what_it_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a plain server has beyond its manifest nobody can know; asking it would take a while."""
+    pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
+    asked: list[object] = []
+    monkeypatch.setattr(progress, "Bucket", asked.append)
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    begin_tiny(tmp_path, 8)
+    with serve(tmp_path) as site:
+        assert missing_shards(site.url) == [0, 1]
+    assert not asked
 
 
 def test_rate_and_cost_are_those_of_the_logs(tmp_path: Path) -> None:

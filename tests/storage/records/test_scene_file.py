@@ -177,6 +177,15 @@ def test_every_flipped_byte_is_a_scene_or_one_clear_line() -> None:
     assert refused > 100
 
 
+def test_no_file_is_written_that_would_be_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    size = len(encode_scene(tiny_scene()))
+    monkeypatch.setattr("storage.records.scene_file.MAX_FILE_BYTES", size)
+    assert decode_scene_file(encode_scene(tiny_scene()), "a").objects == tiny_scene().objects
+    monkeypatch.setattr("storage.records.scene_file.MAX_FILE_BYTES", size - 1)
+    with pytest.raises(TrilightError, match=f"takes {size} bytes"):
+        encode_scene(tiny_scene())
+
+
 def test_a_large_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     path = tmp_path / "large.safetensors"
     with path.open("wb") as stream:

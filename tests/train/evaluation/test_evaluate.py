@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from infra.judging import plot_excursions
+from infra.judging import _num_scenes, plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
 from storage.dataset.dataset import Dataset
@@ -258,6 +258,14 @@ def test_many_lights_are_judged_in_one_pass_and_in_groups(dataset: Dataset) -> N
     assert found["light passes"]["groups"]["views"] == 1
     page = markdown(found)
     assert "| groups | 1 | 31.00 | 31.00 | 31.00 | 0.5000 |" in page, page
+
+
+def test_as_many_scenes_are_announced_as_are_judged(dataset: Dataset) -> None:
+    shards = open_training_data([str(dataset.folder.root)]).split("train")
+    every = dataclasses.replace(contest(dataset), shards=shards)
+    for most in (1, 3, 4, 99):  # of five scenes in two shards
+        some = dataclasses.replace(every, most_scenes=most)
+        assert _num_scenes(some) == len(list(some.samples())) == min(most, 5)
 
 
 def test_facts_come_from_the_scene() -> None:

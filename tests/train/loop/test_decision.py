@@ -97,6 +97,7 @@ def test_kernels_move_as_the_host_does_or_touch_nothing(applied: bool) -> None:
     decision = Decision(applied=torch.tensor(applied), updates=torch.tensor(30.0), is_late=True)
     share = mean_share(0.99, torch.tensor(30.0, dtype=torch.float64))
     assert float(share) == pytest.approx(mean_share(0.99, 30), rel=1e-7)
+    assert isinstance(share, torch.Tensor) and share.dtype == torch.float32
     for move, by_hand in (
         (lambda y, late: move_towards([y], [goal], 0.05, late), x + 0.05 * (goal - x)),
         (lambda y, late: move_towards([y], [goal], share, late), x + float(share) * (goal - x)),

@@ -11,7 +11,17 @@ from torch import Tensor
 
 from storage.errors import TrilightError
 from storage.seeds import rng_for
-from train.loss.lpips import BLOCKS, LINEAR_FILE, SCALE, SHIFT, VGG16_FILE, Lpips, load_lpips
+from train.loss.lpips import (
+    BLOCKS,
+    LINEAR_FILE,
+    LINEAR_URL,
+    SCALE,
+    SHIFT,
+    VGG16_FILE,
+    VGG16_URL,
+    Lpips,
+    load_lpips,
+)
 
 WIDTHS = (4, 5, 6, 7, 8)
 RESOLUTION = 16
@@ -85,6 +95,22 @@ def test_equal_pictures_are_at_no_distance_and_the_order_does_not_matter() -> No
     assert torch.equal(lpips(a, a), torch.zeros(2))
     torch.testing.assert_close(lpips(a, b), lpips(b, a), rtol=0, atol=0)
     assert (lpips(a, b) > 0).all()
+
+
+def test_the_hub_has_both_files_and_the_large_one_is_checked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    checked, there = {}, dict(zip((VGG16_URL, LINEAR_URL), small_weights(), strict=True))
+
+    def download(url: str, *, check_hash: bool, **_: Any) -> dict[str, Tensor]:
+        checked[url] = check_hash
+        return there[url]
+
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", download)
+    found, (a, b) = load_lpips("hub"), (pictures("a"), pictures("b"))
+    assert found is not None
+    assert torch.equal(found(a, b), Lpips(*small_weights())(a, b))
+    assert checked == {VGG16_URL: True, LINEAR_URL: False}
 
 
 def test_its_gradient_is_that_of_its_values() -> None:

@@ -170,6 +170,20 @@ def test_an_undecimated_level_shows_the_source_within_a_texel(tmp_path: Path) ->
     assert coarse.levels[0].skin.quality.colour_error > 2 * quality.colour_error
 
 
+def test_a_texture_may_be_as_large_as_is_said_and_no_larger(tmp_path: Path) -> None:
+    path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS))
+
+    def side(size: int) -> int:
+        own = dataclasses.replace(OWN, size=size)
+        skin = prepare(path, dataclasses.replace(KEEP, own_materials=own)).levels[0].skin
+        assert skin is not None
+        return max(skin.textures[0].texels.shape[:2])
+
+    wanted = side(OWN.size)
+    assert side(wanted) == wanted < OWN.size
+    assert side(wanted - 1) < wanted
+
+
 def test_materials_change_no_triangle_and_nothing_where_nobody_asks(tmp_path: Path) -> None:
     path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS))
     own, plain = prepare(path, KEEP), prepare(path)
