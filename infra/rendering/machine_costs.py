@@ -8,18 +8,15 @@ sample differ by a factor of two between scenes, and two scenes are not the tabl
 import contextlib
 import importlib.util
 import os
+import tempfile
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from infra.bench.effort import QUICK, Asked
-from infra.bench.experiments.engines import build_within
-from infra.bench.experiments.previews import PROBES
-from infra.bench.experiments.rungs import TRIANGLES, one_view_scene
-from infra.bench.run import RESULTS
-from infra.bench.workshop import Workshop
+from infra.rendering.held_out_scenes import composing_child, held_out_build, held_out_scene
 from infra.rendering.way_table import (
     NETWORK_SCENE,
     NETWORK_VIEW,
@@ -34,6 +31,9 @@ from pipeline.renders.renderer import set_threads
 from pipeline.renders.variant import choose_variant
 from storage.records.scene import Scene
 
+PROBES = (1, 2)
+"""Numbers of the held-out scenes whose parts every machine times."""
+
 PROBED_PX = (64, 256)
 """Widths that are timed; between and beyond them machines differ by what they differ there."""
 
@@ -44,11 +44,11 @@ Timed = dict[tuple[int, int], Mapping[str, float]]
 def measured_costs(table: WayTable) -> PictureCosts:
     """Return what the parts take here, in well under a minute on an idle machine."""
     cores = os.cpu_count() or 1
-    with contextlib.closing(Workshop(QUICK, Asked(), RESULTS)) as workshop:
-        build = build_within(TRIANGLES)
-        child = workshop.render_child(build, BENCHMARK)
-        scenes = [child.call(one_view_scene, build, int(turn.split()[-1])) for turn in PROBES]
-        timed = [_timed(child, scene, cores) for scene in scenes]
+    with tempfile.TemporaryDirectory() as name:
+        child = composing_child(held_out_build(), BENCHMARK, Path(name))
+        with contextlib.closing(child):
+            scenes = [child.call(held_out_scene, index) for index in PROBES]
+            timed = [_timed(child, scene, cores) for scene in scenes]
     mean: Timed = {
         key: {part: float(np.mean([one[key][part] for one in timed])) for part in timed[0][key]}
         for key in timed[0]

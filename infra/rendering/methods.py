@@ -1,21 +1,21 @@
-"""Views of a scene by each rung: nothing traced, lamps alone, all that is traced, paths."""
+"""Methods that make a picture: networks, traced light without a network, the path tracer.
 
-import itertools
-from collections.abc import Callable, Mapping, Sequence
+A method loads a scene and then shows any camera. The benchmark and the leaderboard compare them.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.bench.sides.judged_pictures import Reference, true_error_db
-from infra.bench.sides.shots import SEED, warm_up_denoiser
 from infra.timed_views import Show, TimedViews, timed_views
-from pipeline.renders.noise_floor import clamped_radiance
+from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.preview import PreviewRenderer, PreviewSettings
 from pipeline.renders.renderer import finished
 from pipeline.renders.settings import Filtered
-from storage.conventions import log10_radiance
-from storage.records.first_hits import first_hits
+from pipeline.renders.tracer import Features
 from storage.records.scene import Scene
 
 if TYPE_CHECKING:
@@ -25,30 +25,80 @@ if TYPE_CHECKING:
 View = Callable[[NDArray[np.float32], float], NDArray[np.float32]]
 """Makes the picture [R, R, 3] of a camera to world [4, 4] and its full field of view in degrees."""
 
-Rung = Callable[[Scene], View]
-"""Loads a scene, and returns what shows it; all pictures are of one width."""
+Method = Callable[[Scene], View]
+"""Loads a scene, and returns its view; all pictures are of one width."""
+
+DIRECT_LIGHT, TRACED_LIGHT = "direct light, no network", "all traced light, no network"
+BUILTIN_NETWORKS = ("builtin:", "builtin:tokens")
+"""Networks of every comparison: the better one, and the one that traces nothing."""
+
+SAMPLES: tuple[tuple[int, Filtered], ...] = (
+    (1, "fast"),
+    (1, "high"),
+    (4, "fast"),
+    (4, "high"),
+    (16, "fast"),
+    (16, "high"),
+)
+"""Samples a pixel, and the filter of Open Image Denoise."""
+
+KINDS = ("network", "traced light, no network", "path tracer, denoised")
+
+SAMPLE_SEED = 20_261_122
+"""Seed of the path tracer's samples; no dataset preset and no run uses it."""
+
+_WEIGHTS = "model.safetensors"
+"""File of weights in the folder of a run."""
 
 
-def sampled_rung(resolution: int, spp: int, denoiser: Filtered, *, new_noise: bool = False) -> Rung:
-    """Return paths of so many samples a pixel with one denoise.
+def network_name(label: str) -> str:
+    """Return the name of a network's row."""
+    return f"network {label}"
+
+
+def network_labels(paths: Sequence[str]) -> tuple[str, ...]:
+    """Return short names of networks: the folder of a run, and no path of this machine."""
+    named = [Path(path) for path in paths]
+    return tuple(path.parent.name if path.name == _WEIGHTS else path.name for path in named)
+
+
+def samples_name(level: tuple[int, Filtered]) -> str:
+    """Return the name of the row of so many samples with a filter."""
+    return f"{level[0]} sample{'s' if level[0] > 1 else ''}, {level[1]}"
+
+
+def kind_of(name: str) -> str:
+    """Return the kind, one of KINDS, of a row's name."""
+    if name.startswith("network"):
+        return KINDS[0]
+    return KINDS[1] if name in (DIRECT_LIGHT, TRACED_LIGHT) else KINDS[2]
+
+
+def warm_up_denoiser(resolution: int, quality: Quality = "high") -> None:
+    """Let this process make its filter for pictures of a size."""
+    black = np.zeros((resolution, resolution, 3), np.float32)
+    denoise(black, Features(albedo=black, normal=black), quality)
+
+
+def sampled_method(resolution: int, spp: int, denoiser: Filtered) -> Method:
+    """Return the path tracer with so many samples a pixel and one denoise.
 
     It works in a render child alone. Samples have the same seed in every view, as those of
-    `trilight render --orbit`, unless the views are to have noise of their own.
+    `trilight render --orbit`.
     """
     settings = PreviewSettings(resolution=resolution, spp=spp, denoiser=denoiser)
 
     def load(scene: Scene) -> View:
         renderer = PreviewRenderer(scene, settings)
-        seeds = itertools.count(SEED) if new_noise else itertools.repeat(SEED)
         return lambda c2w, fov_deg: (
-            finished(renderer.view_steps(c2w, fov_deg, next(seeds))).radiance_rgb
+            finished(renderer.view_steps(c2w, fov_deg, SAMPLE_SEED)).radiance_rgb
         )
 
     return load
 
 
-def network_rung(renderer: "NeuralRenderer", resolution: int) -> Rung:
-    """Return what a network shows."""
+def network_method(renderer: "NeuralRenderer", resolution: int) -> Method:
+    """Return the method that shows a network's pictures."""
 
     def load(scene: Scene) -> View:
         prepared = renderer.prepare(scene)
@@ -57,8 +107,8 @@ def network_rung(renderer: "NeuralRenderer", resolution: int) -> Rung:
     return load
 
 
-def lamps_rung(resolution: int) -> Rung:
-    """Return the light that comes from lamps without a bounce, as the view stage `hits` traces it.
+def direct_light_method(resolution: int) -> Method:
+    """Return the method that shows the lamps' light without a bounce, as the stage `hits` has it.
 
     Nothing is gathered or mirrored and no network runs. Smooth surfaces show lamps by points drawn
     on the lamps alone, so that sharp reflections of lamps are noisy.
@@ -91,12 +141,11 @@ def lamps_rung(resolution: int) -> Rung:
     return load
 
 
-def physics_alone() -> "NeuralRenderer":
-    """Return what shows the traced light of the view stage `hits` and has learned nothing.
+def traced_network() -> "NeuralRenderer":
+    """Return a network that shows the traced light of the view stage `hits`, without training.
 
     Every gain is 1, nothing is added or filtered, and gathered light is mixed by how near anchors
-    are. Layers
-    are as small as they can be: what is timed is the tracing.
+    are. Layers are as small as they can be: what is timed is the tracing.
     """
     import dataclasses
 
@@ -107,11 +156,11 @@ def physics_alone() -> "NeuralRenderer":
         encoder_layers=1, decoder_layers=1, hidden_width=1, num_registers=0, pixel_width=1,
         filter_width=0, scene_tokens=False,
     )  # fmt: skip
-    return untaught(smallest)
+    return untrained_network(smallest)
 
 
-def untaught(config: "ModelConfig") -> "NeuralRenderer":
-    """Return a network of hits of any size that shows what is traced, and nothing else."""
+def untrained_network(config: "ModelConfig") -> "NeuralRenderer":
+    """Return a network of hits of any size that shows the traced light, and nothing else."""
     import torch
 
     from model.neural_renderer import NeuralRenderer
@@ -125,37 +174,11 @@ def untaught(config: "ModelConfig") -> "NeuralRenderer":
     return NeuralRenderer(model)
 
 
-def timed_rung(rung: Rung, scene: Scene) -> TimedViews:
+def timed_method(method: Method, scene: Scene) -> TimedViews:
     """Return a scene's first view with its times."""
 
     def load() -> Show:
-        view = rung(scene)
+        view = method(scene)
         return lambda: view(scene.c2w[0], float(scene.fov_deg[0]))
 
     return timed_views(load)
-
-
-def timed_samples(
-    scene: Scene, resolution: int, wanted: Sequence[tuple[int, Filtered]]
-) -> list[TimedViews]:
-    """Return the first view by samples a pixel and filter; runs in a render child."""
-    warm_up_denoiser(resolution)
-    return [timed_rung(sampled_rung(resolution, spp, filtered), scene) for spp, filtered in wanted]
-
-
-def judged(picture: TimedViews, scene: Scene, reference: Reference) -> Mapping[str, float]:
-    """Return the figures of a picture; references' noise is in none of the decibels."""
-    from train.evaluation.metrics import picture_scores
-
-    shown = picture.radiance_rgb
-    hits = first_hits(scene, resolution=len(shown)).met
-    everywhere = np.ones_like(hits)
-    mean = 0.5 * (reference.a_rgb + reference.b_rgb)
-    return {
-        "core_s": picture.first_s,
-        "view_s": picture.further_s,
-        "db": true_error_db(shown, reference, log10_radiance, everywhere)[0],
-        "object_db": true_error_db(shown, reference, log10_radiance, hits)[0],
-        "linear_db": true_error_db(shown, reference, clamped_radiance, everywhere)[0],
-        "ssim": float(picture_scores(shown, mean.astype(np.float32), hits, None)["ssim"] or 0.0),
-    }
