@@ -15,7 +15,7 @@ class BenchOptions:
     """Inputs of the experiments."""
 
     objects: str = "builtin:"
-    """Source of objects for meshes and growth."""
+    """Source of objects for meshes."""
     allow_licences: tuple[str, ...] = ()
     """Licences of objects to allow besides the usual ones; by default there are none."""
     scenes: Path | None = None

@@ -40,7 +40,7 @@ def bench(measured: BenchCommand, options: BenchOptions) -> None:
         from infra.bench.run import results_path, run
         from infra.bench.store import Store
     except ModuleNotFoundError as error:
-        if not (error.name or "").endswith("infra.bench"):
+        if ".bench" not in (error.name or ""):
             raise
         raise TrilightError(
             "bench: an installed Trilight has no experiments; expected a checkout. Clone the "
@@ -102,5 +102,5 @@ def _list_experiments() -> None:
 
     table = Table("experiment", "what it measures", box=None)
     for experiment in every_experiment().values():
-        table.add_row(experiment.name, experiment.about)
+        table.add_row(experiment.name, experiment.title)
     console.print(table)

@@ -21,6 +21,8 @@ THREADS = (0, 1, 2, 4)
 """Decoding threads; with 0 the thread that asks decodes."""
 BATCH, RESOLUTION = 4, 64
 """Scenes of a batch, and width of its pictures in pixels, which are reduced from the stored one."""
+_VIEWS = 4
+"""Most views of a scene that are drawn."""
 _SAMPLES = 32
 """Least samples of a pass over the training data."""
 
@@ -73,7 +75,11 @@ def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
     from train.data.unusable import Unusable
 
     settings = StreamSettings(
-        seed=0, window=2, batch_size=BATCH, resolution=RESOLUTION, views_per_scene=4
+        seed=0,
+        window=2,
+        batch_size=BATCH,
+        resolution=RESOLUTION,
+        views_per_scene=min(_VIEWS, data.num_views or _VIEWS),
     )
     began, core_began = time.perf_counter(), time.process_time()
     stream = stream_batches(

@@ -38,7 +38,7 @@ def settings_of(side: str, seed: int, scale: BenchScale, options: BenchOptions) 
         )
     own = options.set_a if side == SIDE_A else options.set_b
     changes = {"seed": seed, **options.changes, **own}
-    steps = None if "num_steps" in changes else scale.steps
+    steps = changes.pop("num_steps", scale.steps)  # warm-up and decay are in proportion
     return changed_run((options.run or (PRESET,))[0], changes, steps=steps)
 
 

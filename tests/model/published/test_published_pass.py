@@ -7,7 +7,6 @@ import torch
 from safetensors.torch import load_file
 from torch.nn.functional import elu
 
-from infra.bench.sides.published_network import published_forward, published_inputs
 from model.check_reference import read_reference
 from model.published.config import PublishedConfig
 from model.published.convert import from_published, to_published
@@ -15,6 +14,7 @@ from model.renderformer import ELU_ALPHA
 from model.scene_tensors import SceneTensors
 from tests.for_each import case
 from tests.model.kit import awake, random_scene, render
+from tests.model.published.published_pass import published_forward, published_inputs
 from tests.model.published.test_convert import publishable
 
 PATCH = 8

@@ -6,9 +6,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from infra.bench.sides.judged_pictures import Reference
-from infra.bench.sides.kept_references import kept_reference
-from infra.bench.sides.sampled_pictures import first_camera
+from infra.bench.workloads.kept_references import kept_reference
+from infra.rendering.raw_references import Reference, first_camera
 from pipeline.isolation import IsolatedChild
 from tests.train.toy import toy_scene
 

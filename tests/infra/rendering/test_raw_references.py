@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.bench.sides.judged_pictures import (
-    Reference,
-    difference_db,
-    true_error_db,
-)
+from infra.bench.workloads.judged_pictures import difference_db
+from infra.rendering.raw_references import Reference, true_error_db
 from pipeline.renders.noise_floor import clamped_radiance
 from storage.conventions import log10_radiance
 from storage.metrics import psnr_linear_db, psnr_log_db

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from infra.bench.sides.machine_costs import PROBED_PX, Timed, costs_of
+from infra.rendering.machine_costs import PROBED_PX, Timed, costs_of
 from infra.rendering.way_table import shipped_table
 from tests.for_each import case
 

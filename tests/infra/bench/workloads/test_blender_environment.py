@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from infra.bench.sides import blender_environment as environment
+from infra.bench.workloads import blender_environment as environment
 from storage.errors import TrilightError
 
 
