@@ -30,8 +30,7 @@ from storage.seeds import rng_for
 
 _DRAWS = 2000
 _BYTES_PER_TASK_RUN = 19_400
-"""Bytes in Prefect's database: states, events and indices (`trilight bench orchestration`; figures
-in docs/tradeoffs.md, How far the records keep up)."""
+"""Bytes in Prefect's database: states, events and indices (measured, docs/log)."""
 _BYTES_PER_SHARD = 180
 """Bytes of a row of the manifest: 172 of train-000123.tar, 178 of one in a part of the folder."""
 _LONG_TASK_MINUTES = 10

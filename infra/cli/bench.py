@@ -32,6 +32,10 @@ class BenchCommand:
     """Measure nothing: print the table of the newest finished run in the file."""
 
 
+_COLUMNS = 8
+"""Most columns of a table that stay readable side by side; further ones stand below."""
+
+
 @command("names")
 def bench(measured: BenchCommand, options: BenchOptions) -> None:
     try:
@@ -80,10 +84,13 @@ def _print_run(experiment: "Experiment", run: "Run") -> None:
     from infra.bench.rows import table_of
 
     names, *lines = table_of(experiment, run)
-    table = Table(*names, box=None, title=experiment.title, title_justify="left")
-    for line in lines:
-        table.add_row(*map(Text, line))
-    console.print(table)
+    for first in range(1, len(names), _COLUMNS):
+        shown = slice(first, first + _COLUMNS)
+        title = experiment.title if first == 1 else "Further columns"
+        table = Table(names[0], *names[shown], box=None, title=title, title_justify="left")
+        for line in lines:
+            table.add_row(Text(line[0]), *map(Text, line[shown]))
+        console.print(table)
     machine = run.plan["machine"]
     measured_on = (machine.get("gpu"), machine["processor"], f"{machine['cores']} cores")
     notes = [

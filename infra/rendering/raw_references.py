@@ -27,7 +27,7 @@ LEAST_ERROR = 1e-10
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Reference:
+class RawReference:
     """Two halves of raw samples that share nothing."""
 
     a_rgb: NDArray[np.float64]
@@ -42,7 +42,7 @@ def first_camera(scene: Scene, resolution: int) -> Camera:
     return Camera(c2w=pose, fov_deg=float(scene.fov_deg[0]), resolution=resolution)
 
 
-def raw_reference(scene: Scene, camera: Camera, spp: int, *name: int) -> Reference:
+def raw_reference(scene: Scene, camera: Camera, spp: int, *name: int) -> RawReference:
     """Return two halves of raw samples of a view; runs in a render child.
 
     Args:
@@ -61,12 +61,12 @@ def raw_reference(scene: Scene, camera: Camera, spp: int, *name: int) -> Referen
             seed = seed_for(_SEED, "reference", *name, half, number)
             total += tracer.radiance(camera, seed=seed, spp=size)
         halves.append(total / passes)
-    return Reference(a_rgb=halves[0], b_rgb=halves[1])
+    return RawReference(a_rgb=halves[0], b_rgb=halves[1])
 
 
 def true_error_db(
     picture_rgb: NDArray[np.float32],
-    reference: Reference,
+    reference: RawReference,
     curve: Curve,
     pixels: NDArray[np.bool_],
 ) -> tuple[float, float]:

@@ -22,7 +22,7 @@ from infra.rendering.held_out_scenes import composing_child, held_out_build, hel
 from infra.rendering.machine_costs import PROBES
 from infra.rendering.methods import sampled_method
 from infra.rendering.raw_references import (
-    Reference,
+    RawReference,
     first_camera,
     raw_reference,
     true_error_db,
@@ -113,7 +113,7 @@ def table_of(errors: Mapping[int, Errors], costs: Mapping[int, Costs], machine: 
     )
 
 
-def sampled_errors(scene: Scene, px: int, reference: Reference) -> dict[Method, float]:
+def sampled_errors(scene: Scene, px: int, reference: RawReference) -> dict[Method, float]:
     """Return the error of each sampled picture of the first view; runs in a render child."""
     everywhere, found = np.ones((px, px), np.bool_), {}
     for method in ladder(px):

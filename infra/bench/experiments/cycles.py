@@ -16,7 +16,7 @@ from infra.bench.workloads.mapped_scenes import SKIES, mapped_scene
 from infra.bench.workloads.named_scenes import given_scenes
 from infra.bench.workloads.shots import shots
 from infra.bench_options import BenchOptions
-from infra.rendering.raw_references import Reference, first_camera, raw_reference, true_error_db
+from infra.rendering.raw_references import RawReference, first_camera, raw_reference, true_error_db
 from pipeline.exchange.usd.write import write_usd
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.results import RenderedView
@@ -93,7 +93,7 @@ def _cycles_samples(scene: Scene, spp: int, folder: Path, *, is_plain: bool) -> 
     )
 
 
-def agreement_figures(ours: Reference, theirs: CyclesSamples) -> dict[str, float]:
+def agreement_figures(ours: RawReference, theirs: CyclesSamples) -> dict[str, float]:
     """Return how well ours agree with a picture of theirs, in dB, and what of it is not noise.
 
     All pictures are exposed alike, so that nine tenths of the pixels are below EXPOSED: what is
@@ -103,8 +103,8 @@ def agreement_figures(ours: Reference, theirs: CyclesSamples) -> dict[str, float
     level = float(np.quantile((one + other).mean(axis=-1) / 2, 0.9))
     exposure = EXPOSED / level if level > 0 else 1.0
     one, other = one * exposure, other * exposure
-    ours = Reference(a_rgb=ours.a_rgb * exposure, b_rgb=ours.b_rgb * exposure)
-    their_halves = Reference(a_rgb=one, b_rgb=other)
+    ours = RawReference(a_rgb=ours.a_rgb * exposure, b_rgb=ours.b_rgb * exposure)
+    their_halves = RawReference(a_rgb=one, b_rgb=other)
     pixels_db = _linear_db(0.5 * (ours.a_rgb + ours.b_rgb), one)
     seeds_db = _linear_db(one, other)
     blocks = len(ours.a_rgb) // _BLOCK_PX
@@ -123,10 +123,12 @@ def _linear_db(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return float(psnr_linear_db(one.astype(np.float32), other.astype(np.float32)))
 
 
-def _stated_figures(view: RenderedView, ours: Reference, theirs: CyclesSamples) -> dict[str, float]:
+def _stated_figures(
+    view: RenderedView, ours: RawReference, theirs: CyclesSamples
+) -> dict[str, float]:
     """Return a denoised picture's stated error, and its true one to our and to their samples."""
     one, other = (picture.astype(np.float64) for picture in theirs.pictures_rgb)
-    references = {"ours": ours, "theirs": Reference(a_rgb=one, b_rgb=other)}
+    references = {"ours": ours, "theirs": RawReference(a_rgb=one, b_rgb=other)}
     everywhere = np.ones_like(view.hits)
     found = {"stated_db": view.noise_floor_db}
     for name, reference in references.items():

@@ -26,7 +26,7 @@ from infra.bench.workloads.named_scenes import given_scenes, sampled_trials
 from infra.bench.workloads.plain_mitsuba import PlainPicture, render_levels
 from infra.bench.workloads.shots import SEED, shots
 from infra.bench_options import BenchOptions
-from infra.rendering.raw_references import Reference, first_camera, true_error_db
+from infra.rendering.raw_references import RawReference, first_camera, true_error_db
 from pipeline.builds.training import pretrain_256
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.settings import USUAL_FLOOR_DB, RenderSettings
@@ -111,7 +111,7 @@ def _measure(
     return [(point.name, found[point.name]) for point in points]
 
 
-def plain_figures(level: PlainPicture, reference: Reference) -> dict[str, float]:
+def plain_figures(level: PlainPicture, reference: RawReference) -> dict[str, float]:
     """Return cost and true errors of a picture of plain Mitsuba."""
     everywhere = np.ones(level.radiance_rgb.shape[:2], np.bool_)
     db, open_db = true_error_db(level.radiance_rgb, reference, log10_radiance, everywhere)
@@ -160,8 +160,8 @@ _STATED: tuple[tuple[str, str, Over, Callable[[float], float] | None], ...] = (
 
 _WRONG = tuple(
     Column(name=f"{metric}: {words}", figure=f"{name}_{figure}", over=over, then=then)
-    for name, metric in (("log", "psnr_log_db"), ("linear", "linear"), ("object", "objects"))
-    for words, figure, over, then in (_STATED if name == "log" else (_STATED[0], _STATED[-1]))
+    for name, metric in (("log", "log"), ("linear", "linear"), ("object", "objects"))
+    for words, figure, over, then in (_STATED if name == "log" else _STATED[:1])
 )
 
 EXPERIMENT = Experiment(

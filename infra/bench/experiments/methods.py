@@ -26,7 +26,7 @@ from infra.rendering.methods import (
     traced_network,
     warm_up_denoiser,
 )
-from infra.rendering.raw_references import Reference, first_camera, true_error_db
+from infra.rendering.raw_references import RawReference, first_camera, true_error_db
 from infra.timed_views import TimedViews
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
@@ -110,7 +110,7 @@ def timed_samples(scene: Scene, px: int) -> list[TimedViews]:
     return [timed_method(sampled_method(px, *level), scene) for level in SAMPLES]
 
 
-def judged_figures(picture: TimedViews, scene: Scene, reference: Reference) -> Figures:
+def judged_figures(picture: TimedViews, scene: Scene, reference: RawReference) -> Figures:
     """Return the figures of a picture; references' noise is in none of the decibels."""
     from train.evaluation.metrics import picture_scores
 

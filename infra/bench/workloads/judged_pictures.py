@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.raw_references import LEAST_ERROR, Reference, true_error_db
+from infra.rendering.raw_references import LEAST_ERROR, RawReference, true_error_db
 from pipeline.renders.noise_floor import Curve, clamped_radiance, secant_slope
 from pipeline.renders.results import RenderedView
 from storage.conventions import log10_radiance
@@ -11,7 +11,7 @@ from storage.conventions import log10_radiance
 _CURVES = {"log": log10_radiance, "linear": clamped_radiance, "object": log10_radiance}
 
 
-def figures(view: RenderedView, reference: Reference) -> dict[str, float]:
+def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
     """Return stated and true errors of a picture, in dB, with what the reference leaves open."""
     mean = 0.5 * (reference.a_rgb + reference.b_rgb)
     stated_db = {
@@ -39,7 +39,7 @@ def figures(view: RenderedView, reference: Reference) -> dict[str, float]:
     return found
 
 
-def difference_db(ours: Reference, theirs: Reference, curve: Curve) -> float:
+def difference_db(ours: RawReference, theirs: RawReference, curve: Curve) -> float:
     """Return by how much two renderers differ where the noise of both is left out, in dB.
 
     The squared difference is the mean of (A - C) (B - D), of halves A and B of one and C and D of
@@ -51,9 +51,9 @@ def difference_db(ours: Reference, theirs: Reference, curve: Curve) -> float:
     return float(-10 * np.log10(max((weight * product).mean(), LEAST_ERROR)))
 
 
-def shrunk(reference: Reference, resolution: int) -> Reference:
+def shrunk(reference: RawReference, resolution: int) -> RawReference:
     """Return a reference of a smaller width, which divides the first."""
-    return Reference(
+    return RawReference(
         a_rgb=_block_means(reference.a_rgb, resolution),
         b_rgb=_block_means(reference.b_rgb, resolution),
     )

@@ -7,7 +7,7 @@ not depend on whether its reference was there already.
 import numpy as np
 from safetensors.numpy import load, save
 
-from infra.rendering.raw_references import Reference, raw_reference
+from infra.rendering.raw_references import RawReference, raw_reference
 from pipeline.isolation import IsolatedChild
 from pipeline.renders.camera import Camera
 from storage.atomic import write_atomically
@@ -17,7 +17,7 @@ from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
 
 
-def kept_reference(child: IsolatedChild, scene: Scene, camera: Camera, spp: int) -> Reference:
+def kept_reference(child: IsolatedChild, scene: Scene, camera: Camera, spp: int) -> RawReference:
     """Return two halves of raw samples of a view, rendered by a child unless they are kept.
 
     Args:
@@ -35,4 +35,4 @@ def kept_reference(child: IsolatedChild, scene: Scene, camera: Camera, spp: int)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, save(halves))
     kept = load(path.read_bytes())
-    return Reference(a_rgb=kept["a"].astype(np.float64), b_rgb=kept["b"].astype(np.float64))
+    return RawReference(a_rgb=kept["a"].astype(np.float64), b_rgb=kept["b"].astype(np.float64))

@@ -31,7 +31,14 @@ def coarser(path: Path, budgets: Sequence[int], method: str) -> list[TriangleMes
     from pipeline.assets.decimation.by_name import decimate
 
     source = cleaned(raw_mesh(path))
-    return [source, *(clean(decimate(source, budget, method)) for budget in budgets)]
+    meshes = [source, *(clean(decimate(source, budget, method)) for budget in budgets)]
+    return [
+        TriangleMesh(  # of the declared types: a mesh leaves its child with no other
+            positions=np.ascontiguousarray(mesh.positions, np.float64),
+            faces=np.ascontiguousarray(mesh.faces, np.int64),
+        )
+        for mesh in meshes
+    ]
 
 
 def picture_db(meshes: Sequence[TriangleMesh], renders: RenderSettings) -> list[float]:

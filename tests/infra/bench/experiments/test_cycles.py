@@ -8,7 +8,7 @@ import pytest
 from infra.bench.experiments.cycles import agreement_figures
 from infra.bench.workloads.blender_environment import installed_python
 from infra.bench.workloads.cycles import CyclesSamples
-from infra.rendering.raw_references import Reference
+from infra.rendering.raw_references import RawReference
 from tests.infra.bench.bench_kit import measured_rows
 
 PX = 64
@@ -21,7 +21,7 @@ def test_noise_is_no_difference_and_another_picture_is() -> None:
     def noisy(picture: np.ndarray) -> np.ndarray:
         return np.maximum(picture + rng.normal(0, 0.01, picture.shape), 0)
 
-    ours = Reference(a_rgb=noisy(truth), b_rgb=noisy(truth))
+    ours = RawReference(a_rgb=noisy(truth), b_rgb=noisy(truth))
 
     def figures(theirs: np.ndarray) -> dict[str, float]:
         pictures = tuple(noisy(theirs).astype(np.float32) for _ in range(2))

@@ -27,5 +27,5 @@ def test_our_renderer_beside_plain_mitsuba(tmp_path: Path) -> None:
     assert db["mitsuba 512"] > db["mitsuba 64"] > 20  # a picture of something else has below 20
     ours = found["trilight 46 dB"].values
     assert ours["Mitsuba's cost at equal error, times"] > 0
-    assert 0 <= ours["psnr_log_db: over 1 dB worse than stated, %"] <= 100
+    assert 0 <= ours["log: over 1 dB worse than stated, %"] <= 100
     assert found["trilight 40 dB, 256 px"].on_front is None, "another width is no choice here"

@@ -22,7 +22,9 @@ def test_our_profiles_take_fewer_bytes_than_the_published_layout(tmp_path: Path)
 
 
 def test_copies_are_read_by_any_number_of_threads(tmp_path: Path) -> None:
-    members = [encode_sample(toy_sample(number, resolution=64, views=4), "compact") for number in range(2)]
+    members = [
+        encode_sample(toy_sample(number, resolution=64, views=4), "compact") for number in range(2)
+    ]
     count = write_copies(tmp_path, members, copies=4, per_shard=3)
     data = open_training_data([str(tmp_path)])
     assert count == 8 and len(data.split("train").names) == 3

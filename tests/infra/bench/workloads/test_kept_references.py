@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from infra.bench.workloads.kept_references import kept_reference
-from infra.rendering.raw_references import Reference, first_camera
+from infra.rendering.raw_references import RawReference, first_camera
 from pipeline.isolation import IsolatedChild
 from tests.train.toy import toy_scene
 
@@ -18,10 +18,10 @@ class Counting:
     def __init__(self) -> None:
         self.calls = 0
 
-    def call(self, *_: Any) -> Reference:
+    def call(self, *_: Any) -> RawReference:
         self.calls += 1
         rng = np.random.default_rng(self.calls)
-        return Reference(a_rgb=rng.random((8, 8, 3)), b_rgb=rng.random((8, 8, 3)))
+        return RawReference(a_rgb=rng.random((8, 8, 3)), b_rgb=rng.random((8, 8, 3)))
 
 
 def test_a_view_is_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
