@@ -16,6 +16,7 @@ from pathlib import Path
 
 from infra.bench.workloads.cost_scene import cost_scene
 from infra.bench.workloads.manifests import write_copies
+from storage.errors import TrilightError
 from storage.installation import IMPORT_ROOT
 
 _PX, _LIGHTS = 64, 4
@@ -50,10 +51,13 @@ def measure_work(name: str, size: int, folder: Path) -> dict[str, float]:
         name: one of WORK.
         size: how much of it.
         folder: empty.
+
+    Raises:
+        TrilightError: the process failed.
     """
     words = [sys.executable, "-c", _CODE, __name__, name, str(size), str(folder)]
     with subprocess.Popen(
-        words, cwd=IMPORT_ROOT, stdout=subprocess.PIPE, text=True,
+        words, cwd=IMPORT_ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         start_new_session=True,
     ) as process:  # fmt: skip
         peak, done = [0], threading.Event()
@@ -63,7 +67,11 @@ def measure_work(name: str, size: int, folder: Path) -> dict[str, float]:
         done.set()
         watch.join()
     if process.returncode:
-        raise subprocess.CalledProcessError(process.returncode, words[3:], output)
+        said = output.strip().splitlines() or ["no message"]
+        raise TrilightError(
+            f"bench growth: {name} of {size} ended with exit status {process.returncode}: "
+            f"{said[-1]}"
+        )
     return {"seconds": float(json.loads(output.splitlines()[-1])), "peak_bytes": float(peak[0])}
 
 
