@@ -1,5 +1,6 @@
 """`trilight bench`: lists the experiments, measures one, or shows its results."""
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -96,7 +97,10 @@ def _print_run(experiment: "Experiment", run: "Run") -> None:
     notes = [
         experiment.because,
         *run.notes,
-        *(f"{trial} left out: {why}" for trial, why in run.left_out.items()),
+        *(
+            f"{count} of {len(run.plan['trials'])} trials left out: {why}"
+            for why, count in Counter(run.left_out.values()).items()
+        ),
         f"{run.plan['scale']['name']}, {run.date}, {', '.join(filter(None, measured_on))}, "
         f"commit {machine['commit']}",
     ]
