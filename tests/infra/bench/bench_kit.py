@@ -13,7 +13,7 @@ from infra.bench_options import BenchOptions
 from storage.errors import Rejected
 
 TINY = dataclasses.replace(
-    QUICK, scenes=1, resolution=32, max_spp=128, reference_spp=128, picture_px=32, objects=2,
+    QUICK, scenes=1, resolution=32, max_spp=128, reference_spp=128, picture_px=64, objects=2,
     repeats=1, steps=2, held_out=2, growth=1,
 )  # fmt: skip
 

@@ -33,7 +33,7 @@ def test_a_scene_is_one_cluster_with_all_seeds() -> None:
 def test_equal_sides_differ_by_nothing_and_a_step_less_by_something(tmp_path: Path) -> None:
     data = tmp_path / "toy"
     write_toy_dataset(data, train=4, validation=2, resolution=32)
-    shared = {"resolution": 16, "scenes_per_step": 2}
+    shared = {"resolution": 16, "scenes_per_step": 2, "views_per_scene": 2}
     options = BenchOptions(
         data=str(data), changes=shared, set_b={"learning_rate": 0.01}, seeds=1, device="cpu"
     )
