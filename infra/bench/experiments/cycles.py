@@ -42,7 +42,7 @@ _MOST_SCENES = 10
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     kinds = [PLAIN, TEXTURED, SKY, *([GIVEN] if options.scenes else [])]
-    return [Point(name=kind) for kind in kinds]
+    return [Point(name=kind, kind=kind, judged=False) for kind in kinds]
 
 
 def _scene(context: BenchContext, kind: str, index: int) -> Scene:
@@ -144,13 +144,14 @@ EXPERIMENT = Experiment(
     "scenes, of scenes with procedural surfaces, of scenes below skies, and of those in "
     "`--scenes`; the first run installs Blender (GPL-3, 380 MB) in its own environment.",
     cost=Column(name="core-seconds of Cycles", figure="core_s"),
+    error=Column(name="agreement without noise, linear dB", figure="noiseless_db"),
+    better="higher",
     columns=(
         Column(name="by pixel, linear dB", figure="pixels_db"),
         Column(name="at least, dB", figure="pixels_db", over="least"),
         Column(name="Cycles with itself, dB", figure="seeds_db"),
         Column(name="over the aim, least dB", figure="margin_db", over="least"),
         Column(name="means of 8 x 8, dB", figure="blocks_db"),
-        Column(name="without noise, dB", figure="noiseless_db"),
         Column(name="ours brighter by, median %", figure="brightness"),
         Column(name="at most, %", figure="brightness", over="most"),
         Column(name="at least, %", figure="brightness", over="least"),
