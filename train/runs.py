@@ -193,9 +193,9 @@ def pretrain() -> TrainSettings:
 
     The rate is where Muon's error is least from 0.28 to 21 million parameters, and follows the
     width from 64 on (`base_widths`): two seeds, 2,000 steps of four scenes at 32 pixels, on an H100
-    (`trilight bench learning-rates`, study S80). Parabolas have their
-    least error between 6.2e-4 and 8.5e-4 at each width, with no trend. That it is the best at
-    Base, of 195 million, in steps of 128 scenes or over 250,000 of them, nobody has measured.
+    (study S80). Parabolas have their least error between 6.2e-4 and 8.5e-4 at each width, with no
+    trend. That it is the best at Base, of 195 million, in steps of 128 scenes or over 250,000 of
+    them, nobody has measured.
     """
     return dataclasses.replace(
         paper_pretrain(),

@@ -1,159 +1,192 @@
-"""What an experiment declares: its points, what it measures of each, and how a table shows it.
+"""Declarations of experiments: their points, their measure, and the columns of their table.
 
-No heavy library is imported here: the catalogue, the tests and the pages read declarations without
-measuring anything.
+No heavy library is imported here: the list of experiments is made without measuring anything.
 """
 
+import dataclasses
+import importlib.util
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from infra.bench.effort import Asked, Effort
-from storage.errors import TrilightError
+from infra.bench_options import BenchOptions
 
 if TYPE_CHECKING:
-    from infra.bench.workshop import Workshop
+    from infra.bench.context import BenchContext
 
 Figures = Mapping[str, float]
-"""What one turn measures of one point, by name."""
-
-TurnFigures = Iterable[tuple[str, Figures]]
-"""The figures of every point in one turn, in order, by the name of the point."""
+"""Measured numbers of one point in one trial, by name."""
 
 Over = Literal["median", "mean", "least", "most", "p5", "p95", "low", "high", "pair"]
-"""How the figures of all turns become one number; `low` and `high` bound the mean: its 95 %
-interval, bootstrapped over clusters of turns. `pair` is the mean of the differences to the run's
-rival, turn by turn, and has its interval beside it."""
+"""How the figures of all trials become one number; `low` and `high` bound the mean: its 95 %
+interval, bootstrapped over clusters of trials. `pair` is the mean of the differences to the point's
+rival, trial by trial, and has its interval beside it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchScale:
+    """The amount that is measured: numbers that experiments draw their points and trials from."""
+
+    name: str
+    """Name of the scale, `quick` or `full`."""
+    scenes: int
+    """Scenes of the experiments on pictures."""
+    resolution: int
+    """Width of those pictures in pixels, a divisor of 256."""
+    max_spp: int
+    """Most samples per pixel, of fixed numbers and as a cap; a multiple of 128."""
+    reference_spp: int
+    """Samples per pixel of references at 256 pixels."""
+    picture_px: int
+    """Width of pictures where whole samples are made, in pixels."""
+    objects: int
+    """Objects that are decimated."""
+    repeats: int
+    """Counted rounds where the same is done several times."""
+    steps: int
+    """Steps of each paired training, and of each preset on the GPU."""
+    held_out: int
+    """Scenes that paired trainings are judged on."""
+    growth: int
+    """Number of sizes that growth is measured at, each four times the one before."""
+
+
+FULL = BenchScale(
+    name="full", scenes=20, resolution=128, max_spp=1024, reference_spp=512, picture_px=256,
+    objects=24, repeats=3, steps=2000, held_out=64, growth=5,
+)  # fmt: skip
+QUICK = BenchScale(
+    name="quick", scenes=3, resolution=64, max_spp=256, reference_spp=128, picture_px=128,
+    objects=5, repeats=1, steps=100, held_out=16, growth=3,
+)  # fmt: skip
+
+
+def device_of(options: BenchOptions) -> str:
+    """Return the device that is asked for, or the one that torch finds."""
+    if options.device:
+        return options.device
+    if importlib.util.find_spec("torch") is None:
+        return "cpu"
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """One column of the table: a figure of every turn, made one number."""
+    """One column of the table: a figure of every trial, made one number."""
 
     name: str
-    """Its heading, with the unit."""
+    """Heading of the column, with the unit."""
     figure: str
-    """Name of the figure among those that a turn returns."""
+    """Name of the figure among those that a trial returns."""
     over: Over = "median"
-    """How the figures of all turns become one number."""
+    """Reduction of the figures of all trials to one number."""
     then: Callable[[float], float] | None = None
-    """Converts that number, for example `3600 / seconds`; None leaves it as it is."""
+    """Conversion of that number, such as `3600 / seconds`; None leaves it as it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """One setting that is measured."""
+    """One setting that is measured; all but `settings` stands in the results."""
 
     name: str
-    """What the table calls it."""
+    """Name of its row in the table."""
     settings: Any = None
-    """What measuring it needs to know."""
+    """Value that the measure needs to know."""
     default: bool = False
     """Whether this is the product's default."""
     judged: bool = True
     """Whether the point is a choice; False for a yardstick, such as a picture's own noise."""
+    group: str = ""
+    """Name of the points that it is compared with: its panel of the plot, and its front."""
+    kind: str = ""
+    """Name of its color in the plot; by default all have one."""
+    rival: str | None = None
+    """Name of the point that columns over `pair` take the difference to; None of the rival."""
+    size: float | None = None
+    """Size that the costs are plotted against, where they grow with one."""
+
+    def record(self) -> dict[str, Any]:
+        """Return what stands in the results, as JSON values."""
+        return {name: value for name, value in vars(self).items() if name != "settings"}
 
 
-Measure = Callable[["Workshop", Sequence[Point], str], TurnFigures]
-"""Measures all points in one turn. Raises `Rejected` or `ChildFailed` where the turn's scene or
-object cannot be used: the turn then counts for no point."""
+Measure = Callable[["BenchContext", Sequence[Point], str], Iterable[tuple[str, Figures]]]
+"""Measures all points in one trial and yields their figures by name. Raises `Rejected` or
+`ChildFailed` where the trial's scene or object cannot be used: it then counts for no point."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """Cost against error of the settings of one choice."""
+    """One experiment: points that are measured beside each other, trial by trial."""
 
     name: str
-    """On the command line."""
+    """Name on the command line."""
     title: str
-    """Heading of its section."""
+    """Title of the table and of the plot."""
     about: str
     """One sentence: what is measured, and on what."""
     cost: Column
     """The first column; above 0."""
-    points: Callable[[Effort], Sequence[Point]]
+    points: Callable[[BenchScale, BenchOptions], Sequence[Point]]
     """The points, in the order of the table."""
-    asked_points: Callable[[Asked], Sequence[Point]] = lambda asked: ()
-    """Points of what the user asks for, before the others."""
-    rival: Callable[[Asked], str] | None = None
-    """Names the point that columns over `pair` take the others' differences to."""
-    turns: Callable[[Effort], Sequence[str]]
-    """Scenes, objects or repeats: in each turn every point is measured once."""
+    trials: Callable[[BenchScale, BenchOptions], Sequence[str]]
+    """Scenes, objects or repeats: in each trial every point is measured once."""
     measure: Measure = field(repr=False)
-    """Measures a turn."""
+    """Measure of one trial."""
     error: Column | None = None
     """The second column; None where only costs are compared."""
     better: Literal["higher", "lower"] = "lower"
-    """Which direction is better: decibels are higher where pictures agree."""
-    against: str = ""
-    """What the error is measured to."""
+    """Direction in which the error is better: decibels are higher where pictures agree."""
     columns: tuple[Column, ...] = ()
     """Further columns."""
     also_cost: tuple[str, ...] = ()
     """Further columns that count as costs: a point cheaper in any of them is not dominated."""
-    kind: Callable[[str], str] | None = None
-    """Names what a point is one of. The figure then shows every cost as a series of its own, in
-    its unit, and a colour for each kind; without it, cost ratios."""
-    line_of: Callable[[Point], tuple[str, float]] | None = None
-    """Names the line that a point stands on, and where on it. The figure then shows each further
-    column along the lines, and no costs."""
-    size_of: Callable[[Point], tuple[str, float]] | None = None
-    """Names the line that a point stands on, and its size. The figure then shows every cost against
-    the size, with the exponent of its growth."""
-    against_size: str = ""
-    """What the size is, where there is one."""
     because: str = ""
-    """The default and its reason, or what the figures mean."""
-    covers: tuple[str, ...] = ()
-    """Dotted names of the settings that this is about: `build.` as in `--set` of generate, `order.`
-    what a dataset order says, `train.` as in `--set` of train, `render.` an option."""
+    """Meaning of the figures, for the reader of the table."""
     cluster: Callable[[str], str] = str
-    """Names what turns have in common whose figures are alike; by default nothing."""
-    by_point: bool = False
-    """Whether a point is measured without the others of its turn: a run that was interrupted then
-    measures again only what is missing of a turn."""
+    """Name of a trial's cluster: trials of one cluster are alike; by default none is."""
     warm_up: bool = False
-    """Whether one turn that is not counted comes first, where all turns are repeats."""
-    takes_scenes: bool = False
-    """Whether the scenes of the user's folder are turns as well."""
-    needs: tuple[Literal["torch", "blender", "data", "moto"], ...] = ()
+    """Whether one trial that is not counted comes first, where all trials are repeats."""
+    needs: tuple[Literal["torch", "blender", "data"], ...] = ()
     """What the machine or the user has to provide."""
 
 
-def points_of(experiment: Experiment, effort: Effort, asked: Asked) -> list[Point]:
-    """Return all points of an experiment, in the order of the table.
-
-    Raises:
-        TrilightError: two have one name.
-    """
-    points = [*experiment.asked_points(asked), *experiment.points(effort)]
-    names = [point.name for point in points]
-    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
-        raise TrilightError(
-            f"bench {experiment.name}: {twice[0]!r} is there twice; expected each network once, in "
-            "folders of different names."
-        )
-    return points
+def missing_need(experiment: Experiment, options: BenchOptions) -> str:
+    """Return what an experiment needs that is missing; empty if nothing is."""
+    if "torch" in experiment.needs and importlib.util.find_spec("torch") is None:
+        return "torch is not installed; run `make setup-all`"
+    if "data" in experiment.needs and not options.data:
+        return "--data is not given; expected the root of a finished dataset"
+    return ""
 
 
-def percent(share: float) -> float:
-    """Return a share in per cent, for `Column.then`."""
-    return 100 * share
+def percent(fraction: float) -> float:
+    """Return a fraction in per cent, for `Column.then`."""
+    return 100 * fraction
 
 
-def one_by_one(measure: Callable[["Workshop", Point, str], Figures]) -> Measure:
-    """Return a Measure that measures each point on its own, and adds `seconds` to its figures."""
-    import time
-
-    def turn_of(workshop: "Workshop", points: Sequence[Point], turn: str) -> TurnFigures:
-        for point in points:
-            began = time.perf_counter()
-            found = measure(workshop, point, turn)
-            yield point.name, {"seconds": time.perf_counter() - began, **found}
-
-    return turn_of
+def rounds(scale: BenchScale, options: BenchOptions) -> tuple[str, ...]:
+    """Return the trials of an experiment that repeats the same measurement."""
+    return tuple(f"round {number}" for number in range(1, scale.repeats + 1))
 
 
-def repeats(effort: Effort) -> tuple[str, ...]:
-    """Return the turns of an experiment that repeats the same measurement."""
-    return tuple(f"round {number}" for number in range(1, effort.repeats + 1))
+def columns_of(experiment: Experiment) -> tuple[Column, ...]:
+    """Return the columns of a table: cost, error where there is one, and the further ones."""
+    error = (experiment.error,) if experiment.error else ()
+    return (experiment.cost, *error, *experiment.columns)
+
+
+def public_options(options: BenchOptions) -> dict[str, Any]:
+    """Return the options as JSON values that name no folder of this machine."""
+    from infra.rendering.methods import network_labels
+    from storage.digests import sha256_hex
+
+    found = dataclasses.asdict(options)
+    found["scenes"] = options.scenes.name if options.scenes else None
+    found["checkpoint"] = list(network_labels(options.checkpoint))
+    if options.data:
+        name = options.data.rstrip("/").rpartition("/")[2]
+        found["data"] = f"{name} ({sha256_hex(options.data.encode())[:8]})"
+    return found

@@ -1,7 +1,8 @@
-"""Results on disk: one JSON line a point and turn, so that a run goes on where it was killed.
+"""Results on disk: one JSON line a point and trial, so that a killed run resumes.
 
-A file holds the runs of one experiment, one after the other. Of a run the first line is its plan,
-the last one its end; a line that was being written when the power failed is cut off.
+A file holds the runs of one experiment, one after the other. Of a run the first line is its plan
+with machine, commit and date, the last one its end; a line that was being written when the power
+failed is cut off.
 """
 
 import datetime
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from infra.bench.experiment import Figures
+from storage.errors import TrilightError
 
 
 @dataclass(kw_only=True)
@@ -20,46 +22,54 @@ class Run:
     """One run, finished or not."""
 
     plan: Mapping[str, Any]
-    """All that its figures depend on: points, turns, effort, what was asked for, machine."""
+    """All that its figures depend on: points, trials, scale, options, machine."""
     date: str
     """The day on which it began, such as 2026-11-22."""
-    turns: dict[str, dict[str, Figures]] = field(default_factory=dict)
-    """Figures by turn and point."""
+    trials: dict[str, dict[str, Figures]] = field(default_factory=dict)
+    """Figures by trial and point."""
     left_out: dict[str, str] = field(default_factory=dict)
-    """Turns that count for no point: why."""
-    columns: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Columns by point, of results that were converted from an older form."""
+    """Trials that count for no point: why."""
     notes: list[str] = field(default_factory=list)
     """Facts that belong to the result, such as the network's name."""
     seconds: float | None = None
     """Wall time since the run last resumed; None where it has not ended."""
 
-    def whole_turns(self) -> list[str]:
-        """Return the turns in which every point of the plan was measured."""
-        points = set(self.plan["points"])
-        return [turn for turn in self.plan["turns"] if points <= set(self.turns.get(turn, {}))]
+    def whole_trials(self) -> list[str]:
+        """Return the trials in which every point of the plan was measured."""
+        points = {point["name"] for point in self.plan["points"]}
+        return [trial for trial in self.plan["trials"] if points <= set(self.trials.get(trial, {}))]
 
-    def missing_turns(self) -> list[str]:
-        """Return the turns that are still to be measured."""
-        done = {*self.whole_turns(), *self.left_out}
-        return [turn for turn in self.plan["turns"] if turn not in done]
+    def missing_trials(self) -> list[str]:
+        """Return the trials that are still to be measured."""
+        done = {*self.whole_trials(), *self.left_out}
+        return [trial for trial in self.plan["trials"] if trial not in done]
 
 
 class Store:
-    """The runs of one experiment at one effort."""
+    """The runs of one experiment in one file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def runs(self) -> list[Run]:
-        """Return all runs, oldest first; none where there is no file."""
+        """Return all runs, oldest first; none where there is no file.
+
+        Raises:
+            TrilightError: the file holds something else.
+        """
         found: list[Run] = []
-        for line in self._whole_lines():
-            record = json.loads(line)
-            if "plan" in record:
-                found.append(Run(plan=record["plan"], date=record["date"]))
-            else:
-                _take(found[-1], record)
+        for number, line in enumerate(self._whole_lines(), 1):
+            try:
+                record = json.loads(line)
+                if "plan" in record:
+                    found.append(Run(plan=record["plan"], date=record["date"]))
+                else:
+                    _take(found[-1], record)
+            except (ValueError, LookupError, TypeError) as error:
+                raise TrilightError(
+                    f"{self.path}: line {number} is no row of `trilight bench`; expected a file "
+                    "that it wrote. Name another one by --out."
+                ) from error
         return found
 
     def newest(self) -> Run | None:
@@ -76,21 +86,19 @@ class Store:
         self._append({"plan": plain, "date": today})
         return Run(plan=plain, date=today)
 
-    def add(self, run: Run, turn: str, point: str, figures: Figures) -> None:
-        """Write the figures of one point in one turn."""
-        record = {"turn": turn, "point": point, "figures": dict(figures)}
-        self._append(record)
-        _take(run, record)
+    def add(self, run: Run, trial: str, point: str, figures: Figures) -> None:
+        """Write the figures of one point in one trial."""
+        self._write(run, {"trial": trial, "point": point, "figures": dict(figures)})
 
-    def leave_out(self, run: Run, turn: str, why: str) -> None:
-        """Write that a turn counts for no point."""
-        record = {"turn": turn, "left_out": why}
-        self._append(record)
-        _take(run, record)
+    def leave_out(self, run: Run, trial: str, why: str) -> None:
+        """Write that a trial counts for no point."""
+        self._write(run, {"trial": trial, "left_out": why})
 
     def end(self, run: Run, seconds: float, notes: list[str]) -> None:
         """Write that a run has ended."""
-        record = {"seconds": seconds, "notes": notes}
+        self._write(run, {"seconds": seconds, "notes": notes})
+
+    def _write(self, run: Run, record: Mapping[str, Any]) -> None:
         self._append(record)
         _take(run, record)
 
@@ -110,10 +118,8 @@ class Store:
 
 def _take(run: Run, record: Mapping[str, Any]) -> None:
     if "figures" in record:
-        run.turns.setdefault(record["turn"], {})[record["point"]] = record["figures"]
+        run.trials.setdefault(record["trial"], {})[record["point"]] = record["figures"]
     elif "left_out" in record:
-        run.left_out[record["turn"]] = record["left_out"]
-    elif "columns" in record:
-        run.columns[record["point"]] = record["columns"]
+        run.left_out[record["trial"]] = record["left_out"]
     else:
         run.seconds, run.notes = record["seconds"], record["notes"]

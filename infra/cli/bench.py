@@ -1,116 +1,117 @@
-"""`trilight bench`: lists the experiments, runs some, or writes the pages made from results."""
+"""`trilight bench`: lists the experiments, measures one, or shows its results."""
 
-from functools import partial
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.table import Table
+from rich.text import Text
 
-from infra.bench.effort import Asked
-from infra.cli.bench_card import ABOUT, bench_card
-from infra.cli.bench_card import NAME as CARD
+from infra.bench_options import BenchOptions
 from infra.cli.console import console, first_words, progress_bars
 from infra.cli.options import command
+from storage.errors import TrilightError
 from storage.settings.described import checked
 
 if TYPE_CHECKING:
     from infra.bench.experiment import Experiment
-    from infra.bench.store import Store
+    from infra.bench.store import Run
 
 
 @checked()
-class Measured:
-    """The experiments, and where results go."""
+class BenchCommand:
+    """The experiment, and the file of its results."""
 
     names: tuple[str, ...] = ()
-    """Names of experiments or of families of them; by default all are listed and none is run. The
-    name card measures the graphics card here into one file to send back, card RUN ... only the
-    steps of these runs, and card FILE ... shows such files."""
-    share: str | None = None
-    """Measure only a share of the rows, K/N for the K-th of N, into a file of its own beside the
-    results; without one, a later call takes all such files over and measures what they lack. For
-    experiments of days, such as learning-rates: one share for each task of a Slurm array, or for
-    each of some processes on one card. Points that are compared in turns stay together. By default
-    everything is measured."""
+    """Name of an experiment; by default all are listed and none is run."""
     quick: bool = False
-    """Measure for minutes instead of carefully."""
+    """Measure for minutes instead of hours: it shows that all works, and is nothing to quote."""
     out: Path | None = None
-    """Folder for the results; by default docs/bench of the checkout. Of card: the file, by default
-    trilight-card.json."""
-    write_docs: bool = False
-    """Afterwards write the blocks of README.md and docs that are made from the results."""
+    """File for the results, with the plot beside it; by default docs/results/bench/NAME.jsonl of
+    the checkout."""
+    show: bool = False
+    """Measure nothing: print the table of the newest finished run in the file."""
+
+
+_COLUMNS = 8
+"""Most columns of a table that stay readable side by side; further ones stand below."""
 
 
 @command("names")
-def bench(measured: Measured, asked: Asked) -> None:
-    if measured.names[:1] == (CARD,):
-        bench_card(measured.names[1:], measured.out, asked, write_docs=measured.write_docs)
+def bench(measured: BenchCommand, options: BenchOptions) -> None:
+    try:
+        from infra.bench.catalogue import experiment_of
+        from infra.bench.experiment import FULL, QUICK
+        from infra.bench.run import results_path, run
+        from infra.bench.store import Store
+    except ModuleNotFoundError as error:
+        if ".bench" not in (error.name or ""):
+            raise
+        raise TrilightError(
+            "bench: an installed Trilight has no experiments; expected a checkout. Clone the "
+            "repository and run the command there."
+        ) from error
+    if not measured.names:
+        _list_experiments()
         return
-    if measured.names:
-        first_words(f"Measuring {', '.join(measured.names)}")
-    from infra.bench.catalogue import chosen
-    from infra.bench.effort import CAREFUL, QUICK
-    from infra.bench.run import RESULTS, lacking, run, run_share
-    from infra.bench.shares import share_of
-
-    folder, experiments = measured.out or RESULTS, chosen(measured.names)
-    share = None if measured.share is None else share_of(measured.share)
-    effort = QUICK if measured.quick else CAREFUL
-    for experiment in experiments:
-        if (lack := lacking(experiment, asked)) and len(experiments) > 1:
-            console.print(f"{experiment.name}: left out: {lack}")
-            continue
-        with progress_bars() as bars:
-            task = bars.add_task("turns", total=None, note=experiment.name)
-            measure = run if share is None else partial(run_share, share=share)
-            store = measure(
-                experiment,
-                effort,
-                asked,
-                folder=folder,
-                turn_done=lambda done, total: bars.update(task, completed=done, total=total),  # noqa: B023
-            )
-        if share is None:
-            _print(experiment, store)
-        else:
-            console.print(f"Written: {store.path}", style="bold")
-    if measured.write_docs:
-        _write_docs(folder)
-    elif not measured.names:
-        _list()
+    if len(measured.names) > 1:
+        raise TrilightError(
+            f"bench: {len(measured.names)} experiments are named; expected one at a time."
+        )
+    experiment = experiment_of(measured.names[0])
+    scale = QUICK if measured.quick else FULL
+    out = measured.out or results_path(experiment.name, scale)
+    if measured.show:
+        newest = Store(out).newest()
+        if newest is None:
+            raise TrilightError(f"{out}: it has no finished run; leave --show out to measure one.")
+        _print_run(experiment, newest)
+        return
+    first_words(f"Measuring {experiment.name}: {experiment.title}")
+    with progress_bars() as bars:
+        task = bars.add_task("trials", total=None, note=experiment.name)
+        found = run(
+            experiment,
+            scale,
+            options,
+            out,
+            lambda done, total: bars.update(task, completed=done, total=total),
+        )
+    _print_run(experiment, found)
+    console.print(f"Written: {out} and {out.with_suffix('.png').name}", style="bold")
 
 
-def _print(experiment: "Experiment", store: "Store") -> None:
-    from infra.bench.table import printed
+def _print_run(experiment: "Experiment", run: "Run") -> None:
+    from infra.bench.rows import table_of
 
-    found = store.newest()
-    assert found is not None
-    names, *lines = printed(experiment, found)
-    table = Table(*names, box=None, title=experiment.title)
-    for line in lines:
-        table.add_row(*line)
-    console.print(table)
-    for note in (
-        *found.notes,
-        *(f"{turn} left out: {why}" for turn, why in found.left_out.items()),
-    ):
-        console.print(note, soft_wrap=True)
-    console.print(f"Written: {store.path} and {store.path.stem}.png", style="bold")
+    names, *lines = table_of(experiment, run)
+    for first in range(1, len(names), _COLUMNS):
+        shown = slice(first, first + _COLUMNS)
+        title = experiment.title if first == 1 else "Further columns"
+        table = Table(names[0], *names[shown], box=None, title=title, title_justify="left")
+        for line in lines:
+            table.add_row(Text(line[0]), *map(Text, line[shown]))
+        console.print(table)
+    machine = run.plan["machine"]
+    measured_on = (machine.get("gpu"), machine["processor"], f"{machine['cores']} cores")
+    notes = [
+        experiment.because,
+        *run.notes,
+        *(
+            f"{count} of {len(run.plan['trials'])} trials left out: {why}"
+            for why, count in Counter(run.left_out.values()).items()
+        ),
+        f"{run.plan['scale']['name']}, {run.date}, {', '.join(filter(None, measured_on))}, "
+        f"commit {machine['commit']}",
+    ]
+    for note in filter(None, notes):
+        console.print(Text(note), soft_wrap=True)
 
 
-def _write_docs(folder: Path) -> None:
-    from infra.bench.pages import write_pages
+def _list_experiments() -> None:
+    from infra.bench.catalogue import every_experiment
 
-    for page in write_pages(folder):
-        console.print(f"Written: {page}, and its figures", style="bold")
-
-
-def _list() -> None:
-    from infra.bench.catalogue import families
-
-    table = Table("family", "experiment", "what it measures", box=None)
-    for family, experiments in families().items():
-        for experiment in experiments:
-            table.add_row(family, experiment.name, experiment.title)
-    table.add_row("", CARD, ABOUT)
+    table = Table("experiment", "what it measures", box=None)
+    for experiment in every_experiment().values():
+        table.add_row(experiment.name, experiment.title)
     console.print(table)

@@ -48,8 +48,8 @@ def doctor(looked: Looked, shown: Shown) -> None:
 
 
 def _measured(*, silent: bool) -> "Finding":
-    from infra.bench.sides.machine_costs import measured_costs
     from infra.doctor import Finding
+    from infra.rendering.machine_costs import measured_costs
     from infra.rendering.way_table import keep_machine_costs, shipped_table
 
     with console.status("measuring previews"):

@@ -40,7 +40,7 @@ def leaderboard(order: LeaderboardOrder, shown: Shown) -> None:
 
 
 def _row(standing: Any) -> dict[str, str]:
-    from infra.bench.table import shown
+    from infra.cost_tables import number_text
     from infra.leaderboard.page import interval
     from train.evaluation.pairs import METRIC
 
@@ -48,8 +48,8 @@ def _row(standing: Any) -> dict[str, str]:
     ends = interval(lead, 1) if lead is not None else ""
     return {
         "": standing.name,
-        "first, s": "" if standing.first_s is None else shown(standing.first_s),
-        "further": "" if standing.further_s is None else shown(standing.further_s),
+        "first, s": "" if standing.first_s is None else number_text(standing.first_s),
+        "further": "" if standing.further_s is None else number_text(standing.further_s),
         "dB": f"{scores['median']:.1f}",
         "5th": f"{scores['worse_5_percent']:.1f}",
         "lead, dB": "" if lead is None else f"{lead.mean:+.1f}" + (f" ({ends})" if ends else ""),

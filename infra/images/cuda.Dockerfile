@@ -1,10 +1,9 @@
 # Trilight with torch for graphics cards: trains, and renders where TRILIGHT_VARIANT=cuda_ad_rgb.
 #   docker build --file infra/images/cuda.Dockerfile --tag trilight:cuda .
-# What the card here does, as one file to send back, in 15 to 30 minutes
-# (docs/how-to/measure-a-card.md):
-#   docker run --name card --gpus all --ipc=host trilight:cuda \
-#       trilight bench card --out /data/card.json
-#   docker cp card:/data/card.json .
+# What the GPU here does, as one file to send back (docs/how-to/measure.md):
+#   docker run --name gpu --gpus all --ipc=host trilight:cuda \
+#       trilight bench gpu --out /data/gpu.jsonl
+#   docker cp gpu:/data/gpu.jsonl .
 # The driver comes from the host (nvidia-container-toolkit); torch brings CUDA's libraries itself.
 FROM python:3.11.13-slim-bookworm@sha256:86adf8dbadc3d6e82ee5dd2c74bec2e1c2467cdad47886280501df722372d2e1 AS build
 WORKDIR /opt/trilight

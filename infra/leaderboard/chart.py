@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from infra.bench.series_plot import (
+from infra.cost_charts import (
     SeriesPoint,
-    colours_of,
+    colors_of,
     draw_legend,
     draw_points,
     name_points,
@@ -43,16 +43,16 @@ def _plot(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
     )
     figure.suptitle(title, fontsize=12)
     shown = [_points(one) for one in widths]
-    colours = colours_of([point for points in shown for point in points])
+    colors = colors_of([point for points in shown for point in points])
     for axes, one, points in zip(panels.flat, widths, shown, strict=True):
         axes.set_title(f"{one.width} x {one.width} pixels, {one.num_views} views", fontsize=11)
         axes.set_xlabel("core-seconds, one thread", fontsize=_FONT)
         axes.set_ylabel(f"median {METRIC}, higher is better", fontsize=_FONT)
-        draw_points(axes, points, colours)
+        draw_points(axes, points, colors)
         for standing in one.standings:
             if standing.first_s is None:
                 _line_across(axes, standing)
-    draw_legend(figure, _COSTS, colours)
+    draw_legend(figure, _COSTS, colors)
     figure.canvas.draw()  # places are known from here on
     for axes, points in zip(panels.flat, shown, strict=True):
         name_points(axes, points)

@@ -12,9 +12,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.bench.experiments.rungs import KINDS, kind_of, samples_name
-from infra.bench.sides.rung_pictures import Rung, sampled_rung
-from infra.bench.sides.shots import warm_up_denoiser
+from infra.rendering.methods import (
+    KINDS,
+    Method,
+    kind_of,
+    network_method,
+    sampled_method,
+    samples_name,
+    warm_up_denoiser,
+)
 from infra.timed_views import Show, timed_views
 from pipeline.isolation import IsolatedChild, with_retries
 from pipeline.renders.settings import Filtered
@@ -29,7 +35,7 @@ if TYPE_CHECKING:
 
 TRACED_LIGHT, TRACER = KINDS[1], KINDS[2]
 BASELINE, ELSEWHERE = "picture of another scene", "pictures made elsewhere"
-"""Kinds of contestants, beside those of the experiment `rungs`."""
+"""Kinds of contestants, beside those of infra.rendering.methods."""
 
 _REPEATS = 1
 """Counted times after one to warm up: the median over scenes counts, not that over repeats."""
@@ -73,22 +79,22 @@ class Contestant(Protocol):
         """
 
 
-def shown_by(rung: Rung, scene: Scene, *, timed: bool) -> ShownViews:
-    """Return all views of a scene by a rung; core-seconds are of this process, kernels warm."""
+def shown_by(method: Method, scene: Scene, *, timed: bool) -> ShownViews:
+    """Return all views of a scene by a method; core-seconds are of this process, kernels warm."""
     if not timed:
-        return ShownViews(radiance_VRR3=_all_views(rung, scene))
+        return ShownViews(radiance_VRR3=_all_views(method, scene))
 
     def load() -> Show:
-        view = rung(scene)
+        view = method(scene)
         return lambda: view(scene.c2w[0], float(scene.fov_deg[0]))
 
     first = timed_views(load, repeats=_REPEATS)
-    whole = first.radiance_rgb[None] if scene.num_views == 1 else _all_views(rung, scene)
+    whole = first.radiance_rgb[None] if scene.num_views == 1 else _all_views(method, scene)
     return ShownViews(radiance_VRR3=whole, first_s=first.first_s, further_s=first.further_s)
 
 
-def _all_views(rung: Rung, scene: Scene) -> NDArray[np.float32]:
-    view = rung(scene)
+def _all_views(method: Method, scene: Scene) -> NDArray[np.float32]:
+    view = method(scene)
     return np.stack([view(c2w, float(f)) for c2w, f in zip(scene.c2w, scene.fov_deg, strict=True)])
 
 
@@ -96,17 +102,22 @@ def _digest_of(**facts: Any) -> str:
     return sha256_hex(canonical_json({**facts, "trilight": metadata.version("trilight")}))
 
 
-class RungContestant:
-    """A rung that is shown in this process: traced light alone, or a network."""
+class MethodContestant:
+    """A method that is shown in this process: traced light alone, or a network."""
 
     is_timed = True
 
     def __init__(
-        self, name: str, rung_of: Callable[[int], Rung], *, weights: str = "", notes: Sequence[str]
+        self,
+        name: str,
+        method_of: Callable[[int], Method],
+        *,
+        weights: str = "",
+        notes: Sequence[str],
     ) -> None:
-        """Take a rung by its width; `weights` is the digest of what it has learned."""
+        """Take a method by its width; `weights` is the digest of what it has learned."""
         self.name, self.kind, self.notes = name, kind_of(name), notes
-        self._rung_of = functools.lru_cache(rung_of)
+        self._method_of = functools.lru_cache(method_of)
         self._own = _digest_of(name="" if weights else name, weights=weights)
 
     def why_not(self, width: int) -> str:
@@ -119,18 +130,16 @@ class RungContestant:
         import torch
 
         torch.set_num_threads(1)  # core-seconds of waiting threads are not the network's
-        return shown_by(self._rung_of(width), sample.scene, timed=timed)
+        return shown_by(self._method_of(width), sample.scene, timed=timed)
 
 
-class NetworkContestant(RungContestant):
+class NetworkContestant(MethodContestant):
     """A network, at the widths that it can show."""
 
     def __init__(self, name: str, renderer: "NeuralRenderer", notes: Sequence[str]) -> None:
-        from infra.bench.sides.rung_pictures import network_rung
-
         super().__init__(
             name,
-            lambda width: network_rung(renderer, width),
+            lambda width: network_method(renderer, width),
             weights=renderer.digest,
             notes=notes,
         )
@@ -179,7 +188,7 @@ def shown_by_samples(
     """Return all views of a scene by samples a pixel; runs in the child."""
     if timed:
         warm_up_denoiser(width)
-    return shown_by(sampled_rung(width, *level), scene, timed=timed)
+    return shown_by(sampled_method(width, *level), scene, timed=timed)
 
 
 class NearestContestant:

@@ -4,7 +4,7 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 
-from infra.bench.table import shown
+from infra.cost_tables import number_text
 from infra.leaderboard.contest import NOISE
 from infra.leaderboard.standings import Standing, WidthStandings
 from pipeline.documents.attribution import inert
@@ -66,7 +66,7 @@ def _scores_of(one: WidthStandings) -> str:
 
 
 def _seconds(value: float | None) -> str:
-    return "" if value is None else shown(value)
+    return "" if value is None else number_text(value)
 
 
 def _with_tail(name: str, standing: Standing) -> str:

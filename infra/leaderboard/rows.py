@@ -47,7 +47,7 @@ class BoardRow:
     further_s: float | None = None
     """And of a further view."""
     machine: str | None = None
-    """What these were measured on, as infra.bench.machine.processor calls it."""
+    """What these were measured on, as infra.processor.processor calls it."""
     facts: Mapping[str, Any] | None = None
     """What is known of the scene, beside the scores of the reference's own noise."""
 

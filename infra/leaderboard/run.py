@@ -7,10 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from infra.bench.effort import Asked
-from infra.bench.experiments.rungs import LAMPS, PHYSICS, SAMPLES, SHIPPED, network_name
-from infra.bench.machine import processor
-from infra.bench.sides.rung_pictures import lamps_rung, network_rung, physics_alone
 from infra.leaderboard.chart import plot_leaderboard
 from infra.leaderboard.contest import (
     BoardContest,
@@ -22,9 +18,9 @@ from infra.leaderboard.contest import (
 )
 from infra.leaderboard.contestants import (
     Contestant,
+    MethodContestant,
     NearestContestant,
     NetworkContestant,
-    RungContestant,
     SampledContestant,
 )
 from infra.leaderboard.order import LeaderboardOrder
@@ -32,6 +28,18 @@ from infra.leaderboard.page import page, pairs_csv, standings_csv
 from infra.leaderboard.picture_folder import folder_contestants
 from infra.leaderboard.rows import BoardRows
 from infra.leaderboard.standings import WidthStandings, standings_of
+from infra.processor import processor
+from infra.rendering.methods import (
+    BUILTIN_NETWORKS,
+    DIRECT_LIGHT,
+    SAMPLES,
+    TRACED_LIGHT,
+    direct_light_method,
+    network_labels,
+    network_method,
+    network_name,
+    traced_network,
+)
 from infra.tracer_rival import tracing_child
 from pipeline.isolation import IsolatedChild
 from pipeline.renders.variant import choose_variant
@@ -84,7 +92,7 @@ def make_leaderboard(order: LeaderboardOrder, told: Told) -> Leaderboard:
     widths = widths_of(order.width, stored_resolution(shards))
     keys = first_keys(shards, order.scenes)
     views = [(key, view) for key in keys for view in range(opened.num_views)]
-    rival = _names(order.checkpoint or SHIPPED[:1])[0]
+    rival = _names(order.checkpoint or BUILTIN_NETWORKS[:1])[0]
     nearest = _nearest(order, opened, keys)
     with contextlib.ExitStack() as stack:
         contest = BoardContest(
@@ -121,14 +129,14 @@ def widths_of(asked: Sequence[int], stored: int) -> list[int]:
 
 def _names(places: Sequence[str]) -> list[str]:
     """Return what networks are called: by the folder of a run, by no path of this machine."""
-    return [network_name(label) for label in Asked(checkpoint=tuple(places)).network_names]
+    return [network_name(label) for label in network_labels(places)]
 
 
 def _never_lacking(stack: contextlib.ExitStack) -> Iterator[Contestant]:
     """Yield what is traced, which stands on every leaderboard as the networks that come along."""
-    yield RungContestant(LAMPS, lamps_rung, notes=())
-    physics = functools.cache(physics_alone)
-    yield RungContestant(PHYSICS, lambda width: network_rung(physics(), width), notes=())
+    yield MethodContestant(DIRECT_LIGHT, direct_light_method, notes=())
+    traced = functools.cache(traced_network)
+    yield MethodContestant(TRACED_LIGHT, lambda width: network_method(traced(), width), notes=())
     variant = choose_variant()
 
     @functools.cache
@@ -180,7 +188,10 @@ def _networks(order: LeaderboardOrder) -> Iterator[Contestant]:
     """Yield the networks that come along and those asked for, each once."""
     from model.neural_renderer import NeuralRenderer
 
-    places = [*SHIPPED, *(place for place in order.checkpoint if place not in SHIPPED)]
+    places = [
+        *BUILTIN_NETWORKS,
+        *(place for place in order.checkpoint if place not in BUILTIN_NETWORKS),
+    ]
     names = _names(places)
     if twice := [name for name in names if names.count(name) > 1]:
         raise TrilightError(

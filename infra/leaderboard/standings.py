@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from infra.bench.curve import on_front
+from infra.cost_tables import on_front
 from infra.leaderboard.contest import NOISE, JudgedWidth
 from train.evaluation.judged_view import summary
 from train.evaluation.pairs import METRIC, PairedLead, pair

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from infra.bench.machine import processor
+from infra.processor import processor
 from pipeline.renders.preview import MOST_SPP
 from pipeline.renders.settings import Filtered, Resolution
 from pipeline.renders.variant import Variant
@@ -25,7 +25,7 @@ from storage.settings.described import checked, from_record, settings_record
 from storage.settings.ranges import Within
 
 SHIPPED = Path(__file__).with_name("previews.json")
-"""Made by infra.setup.preview_table from results of `trilight bench previews`."""
+"""Measured and written by infra.setup.preview_table."""
 
 NETWORK_SCENE, NETWORK_VIEW = "network scene", "network view"
 """Parts of a picture of the network builtin:tokens, beside pipeline.renders.preview_parts."""

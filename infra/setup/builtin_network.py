@@ -4,7 +4,6 @@
     python -m infra.setup.builtin_network RUN --data SET --evaluation EVALUATION --command "..."
 
 With `--also OTHER`, evaluations of it on other sets, such as benchmark-v1, stand on the card too.
-How it flickers comes from the newest results of `trilight bench flicker-64`, if they are of it.
 
 Only data of objects that ask for nothing (CC0) may be behind it, and only a small file is shipped.
 """
@@ -15,14 +14,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import cyclopts
-import numpy as np
 from cyclopts import Parameter
 
-from infra.bench.experiments.rungs import network_name, samples_name
-from infra.bench.run import RESULTS, store_of
 from model.open import BUILTIN_NETWORKS
 from model.weights import decode_weights, network_digest
-from pipeline.renders.settings import Filtered
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
@@ -79,7 +74,6 @@ def main(
     for each in others:
         lines += ["", *_scores(each)]
     lines += [
-        *_flicker(network_digest(decode_weights(weights))),
         "",
         "```json",
         json.dumps(about["settings"], indent=1, sort_keys=True),
@@ -191,30 +185,6 @@ def _worst(views: Sequence[Mapping[str, Any]]) -> str:
 
 def _lights(count: int) -> str:
     return f"{count} light{'' if count == 1 else 's'}"
-
-
-def _flicker(network: str) -> list[str]:
-    """Return what the newest results of films say of the network; nothing where they are not."""
-    found = [
-        run
-        for effort in ("careful", "quick")
-        if (run := store_of(RESULTS, "flicker-64", effort).newest()) is not None
-    ]
-    if not found or not any(network[:8] in note for note in found[0].notes):
-        return []
-    run = found[0]
-
-    def median(point: str) -> float:
-        return float(np.median([figures[point]["flicker_db"] for figures in run.turns.values()]))
-
-    samples: list[tuple[int, Filtered]] = [(1, "fast"), (4, "fast"), (16, "fast")]
-    rivals = "; ".join(f"{median(name):.1f} by {name}" for name in map(samples_name, samples))
-    return [
-        "",
-        f"Flicker of orbits of 24 frames, {len(run.turns)} scenes of `trilight bench flicker-64` "
-        f"({run.date}), median in dB, more is calmer: {median(network_name('builtin:')):.1f}; "
-        f"the path tracer has {rivals}.",
-    ]
 
 
 def _shown(figures: Mapping[str, Any]) -> str:

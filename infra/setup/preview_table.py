@@ -1,103 +1,186 @@
 """Makes infra/rendering/previews.json, by which `trilight render --seconds` and `--error` choose.
 
-trilight bench previews
-python -m infra.setup.preview_table
+    python -m infra.setup.preview_table
+
+One view each of held-out scenes is rendered by the network builtin:tokens and with more and more
+samples, on one thread, and the parts of a preview are timed: some hours.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+import contextlib
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from infra.bench.experiments.previews import (
-    NETWORK,
-    PROBES,
-    WIDTHS,
-    ladder,
-    part_name,
-    preview_name,
-    timed_names,
+from infra.processor import processor
+from infra.rendering.held_out_scenes import composing_child, held_out_build, held_out_scene
+from infra.rendering.machine_costs import PROBES
+from infra.rendering.methods import sampled_method
+from infra.rendering.raw_references import (
+    RawReference,
+    first_camera,
+    raw_reference,
+    true_error_db,
 )
-from infra.bench.run import RESULTS, store_of
-from infra.bench.store import Run
-from infra.rendering.way_table import SHIPPED, PartCost, PictureCosts, WayError, WayTable
-from pipeline.renders.preview_parts import SCENE
+from infra.rendering.way_table import (
+    NETWORK_SCENE,
+    NETWORK_VIEW,
+    SHIPPED,
+    PartCost,
+    PictureCosts,
+    WayError,
+    WayTable,
+)
+from pipeline.isolation import IsolatedChild
+from pipeline.objects.generated import BENCHMARK
+from pipeline.renders.preview_parts import SCENE, all_parts, timed_parts
+from pipeline.renders.settings import Filtered
 from storage.atomic import write_atomically
-from storage.errors import TrilightError
+from storage.conventions import log10_radiance
+from storage.errors import Rejected
+from storage.records.scene import Scene
 from storage.settings.described import settings_record
+
+if TYPE_CHECKING:
+    from model.neural_renderer import NeuralRenderer
+
+SCENES = 12
+"""Scenes that are judged and timed."""
+
+WIDTHS = {64: (1024, 2048), 128: (256, 512), 256: (64, 128), 512: (16, 128)}
+"""By width in pixels: most samples of a preview, and samples of the references' halves together."""
+
+Method = tuple[int, Filtered]
+"""Samples a pixel and filter; NETWORK is the network builtin:tokens."""
+
+NETWORK: Method = (0, "off")
+
+Errors = Mapping[int, Mapping[Method, float]]
+"""Error in dB of one scene's pictures, by width and method."""
+
+Costs = Mapping[int, Mapping[str, float]]
+"""Core-seconds of one scene's parts, by width and part."""
 
 _SERIAL = (SCENE,)
 """Parts that one thread does, however many there are."""
 
 
 def main() -> None:
-    """Write the file."""
-    import json
-
-    text = json.dumps(settings_record(made_from(RESULTS)), indent=1, sort_keys=True)
+    """Measure, and write the file."""
+    errors, costs = dict[int, Errors](), dict[int, Costs]()
+    with _held_out_child() as (renderer, child):
+        for index in range(SCENES):
+            sys.stdout.write(f"scene {index + 1} of {SCENES}\n")
+            try:
+                scene = child.call(held_out_scene, index)
+            except Rejected:
+                continue
+            errors[index] = {px: _errors_of(renderer, child, scene, px) for px in WIDTHS}
+            costs[index] = {px: _costs_of(renderer, child, scene, px) for px in WIDTHS}
+    table = table_of(errors, costs, f"{processor()}, one thread")
+    text = json.dumps(settings_record(table), indent=1, sort_keys=True)
     write_atomically(SHIPPED, f"{text}\n".encode())
 
 
-def made_from(results: Path) -> WayTable:
-    """Return the table of the newest results in a folder.
+def ladder(px: int) -> tuple[Method, ...]:
+    """Return the samples and filters that are measured at a width."""
+    steps = range(WIDTHS[px][0].bit_length())
+    filters: tuple[Filtered, ...] = ("fast", "high")
+    return tuple((1 << step, each) for step in steps for each in filters)
 
-    Errors are of the scenes that were judged at every width that has results, so that widths differ
-    by nothing else. At a width that has none, errors are those of the nearest one that has.
 
-    Raises:
-        TrilightError: there are no costs or no errors, or no scene was judged at every width.
-    """
-    parts = _newest(results, "preview-parts")
-    found = {px: _newest(results, f"previews-{px}") for px in WIDTHS}
-    runs = {px: run for px, run in found.items() if run is not None}
-    if parts is None or not runs:
-        raise TrilightError(
-            f"{results} holds no results of previews and their parts; run: trilight bench previews"
-        )
-    turns = sorted(set.intersection(*(set(run.whole_turns()) for run in runs.values())))
-    if not turns:
-        raise TrilightError(f"{results}: no scene was judged at every width; measure more of them.")
-    about = parts.plan["machine"]
-    machine = f"{about['processor']}, one thread"
+def part_names() -> tuple[str, ...]:
+    """Return the names of all parts, those of the network included."""
+    return (*all_parts(), NETWORK_SCENE, NETWORK_VIEW)
+
+
+def table_of(errors: Mapping[int, Errors], costs: Mapping[int, Costs], machine: str) -> WayTable:
+    """Return the table of some scenes, by their numbers: medians, and the mean of the PROBES."""
     return WayTable(
-        scenes=len(turns),
-        errors=tuple(error for px, run in runs.items() for error in _errors(run, turns, px)),
-        costs=_costs(machine, parts, parts.whole_turns(), lambda found: float(np.median(found))),
-        probe=_costs(machine, parts, PROBES, lambda found: float(np.mean(found))),
+        scenes=len(errors),
+        errors=tuple(
+            _way_error(px, method, [one[px][method] for one in errors.values()])
+            for px in WIDTHS
+            for method in (NETWORK, *ladder(px))
+        ),
+        costs=_picture_costs(machine, list(costs.values()), np.median),
+        probe=_picture_costs(machine, [costs[index] for index in PROBES], np.mean),
     )
 
 
-def _errors(run: Run, turns: Sequence[str], px: int) -> Iterator[WayError]:
-    def of(point: str) -> dict[str, float]:
-        found = [run.turns[turn][point]["db"] for turn in turns]
-        return {"median_db": round(float(np.median(found)), 2), "least_db": round(min(found), 2)}
-
-    yield WayError(rung="network", spp=0, denoiser="off", width=px, **of(NETWORK))
-    for spp, denoiser in ladder(px):
-        name = preview_name(spp, denoiser)
-        yield WayError(rung="traced", spp=spp, denoiser=denoiser, width=px, **of(name))
+def sampled_errors(scene: Scene, px: int, reference: RawReference) -> dict[Method, float]:
+    """Return the error of each sampled picture of the first view; runs in a render child."""
+    everywhere, found = np.ones((px, px), np.bool_), {}
+    for method in ladder(px):
+        picture = sampled_method(px, *method)(scene)(scene.c2w[0], float(scene.fov_deg[0]))
+        found[method] = true_error_db(picture, reference, log10_radiance, everywhere)[0]
+    return found
 
 
-def _costs(
-    machine: str, run: Run, turns: Sequence[str], over: Callable[[list[float]], float]
+@contextlib.contextmanager
+def _held_out_child() -> "Iterator[tuple[NeuralRenderer, IsolatedChild]]":
+    import torch
+
+    from model.neural_renderer import NeuralRenderer
+
+    torch.set_num_threads(1)  # core-seconds of waiting threads are not the network's
+    with tempfile.TemporaryDirectory() as name:
+        child = composing_child(held_out_build(), BENCHMARK, Path(name), threads=1)
+        with contextlib.closing(child):
+            yield NeuralRenderer.load("builtin:tokens", device="cpu"), child
+
+
+def _errors_of(
+    renderer: "NeuralRenderer", child: IsolatedChild, scene: Scene, px: int
+) -> dict[Method, float]:
+    reference = child.call(raw_reference, scene, first_camera(scene, px), WIDTHS[px][1])
+    picture = renderer.view(renderer.prepare(scene), scene.c2w[0], float(scene.fov_deg[0]), px)
+    everywhere = np.ones((px, px), np.bool_)
+    error_db, _ = true_error_db(picture, reference, log10_radiance, everywhere)
+    return {NETWORK: error_db, **child.call(sampled_errors, scene, px, reference)}
+
+
+def _costs_of(
+    renderer: "NeuralRenderer", child: IsolatedChild, scene: Scene, px: int
+) -> dict[str, float]:
+    found: dict[str, float] = child.call(timed_parts, scene, px, time.process_time)
+    pose, fov_deg = scene.c2w[0], float(scene.fov_deg[0])
+    renderer.view(renderer.prepare(scene), pose, fov_deg, px)  # warms up
+    began = time.process_time()
+    prepared = renderer.prepare(scene)
+    encoded = time.process_time()
+    renderer.view(prepared, pose, fov_deg, px)
+    found[NETWORK_SCENE] = encoded - began
+    found[NETWORK_VIEW] = time.process_time() - encoded
+    return found
+
+
+def _way_error(px: int, method: Method, found: list[float]) -> WayError:
+    return WayError(
+        rung="network" if method == NETWORK else "traced",
+        spp=method[0],
+        denoiser=method[1],
+        width=px,
+        median_db=round(float(np.median(found)), 2),
+        least_db=round(min(found), 2),
+    )
+
+
+def _picture_costs(
+    machine: str, scenes: Sequence[Costs], over: Callable[[list[float]], np.floating]
 ) -> PictureCosts:
     rows = []
     for px in WIDTHS:
-        for part in timed_names():
-            found = [run.turns[turn][part_name(part, px)]["core_s"] for turn in turns]
-            core_s = float(f"{over(found):.4g}")
+        for part in part_names():
+            core_s = float(f"{float(over([one[px][part] for one in scenes])):.4g}")
             serial_s, parallel_s = (core_s, 0.0) if part in _SERIAL else (0.0, core_s)
             rows.append(PartCost(part=part, width=px, serial_s=serial_s, parallel_s=parallel_s))
     return PictureCosts(machine=machine, rows=tuple(rows))
-
-
-def _newest(results: Path, name: str) -> Run | None:
-    """Return the run of most scenes; one that was interrupted counts for those that it has."""
-    runs = [
-        run for effort in ("careful", "quick") for run in store_of(results, name, effort).runs()
-    ]
-    begun = [run for run in runs if run.whole_turns()]
-    return max(begun, key=lambda run: (len(run.whole_turns()), run.date), default=None)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,8 @@ PACKAGES = ("storage", "scene_templates", "pipeline", "model", "train", "infra")
 
 _BESIDE = ("pyproject.toml", "README.md", "LICENSE", "requirements")
 """What a build reads beside the packages."""
+CHECKOUT_ONLY = "infra/bench"
+"""Experiments, which a wheel does not have."""
 _LEFT_OUT = shutil.ignore_patterns("__pycache__", "*.pyc", ".*")
 
 
@@ -36,6 +38,7 @@ def write_wheel_tree(checkout: Path, tree: Path) -> None:
     shutil.copytree(checkout / FACE, tree / FACE, ignore=_LEFT_OUT)
     for package in PACKAGES:
         shutil.copytree(checkout / package, tree / FACE / package, ignore=_LEFT_OUT)
+    shutil.rmtree(tree / FACE / CHECKOUT_ONLY)
     shutil.copy2(checkout / "prefect.yaml", tree / FACE)
     for path in (tree / FACE).rglob("*.py"):
         text = path.read_text(encoding="utf-8")

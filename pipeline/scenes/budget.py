@@ -7,40 +7,9 @@ are near enough or nothing finer fits.
 """
 
 from collections.abc import Sequence
-from typing import TypeVar
 
-import numpy as np
-
-from pipeline.scenes.fitting import FitTable, drawn_rows
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level
-
-Entry = TypeVar("Entry")
-
-
-def drawn_within(
-    rng: np.random.Generator,
-    entries: Sequence[Entry],
-    least: Sequence[int],
-    count: int,
-    num_triangles: int,
-    camps: Sequence[str] = (),
-) -> list[Entry]:
-    """Draw entries with replacement, evenly among those that fit, as `drawn_rows` does.
-
-    Args:
-        rng: where the numbers come from.
-        entries: what to draw from.
-        least: triangles of the coarsest level of each entry.
-        count: how many.
-        num_triangles: for all together.
-        camps: the camp of each entry, "" for an entry without one; empty if no entry has one.
-
-    Raises:
-        Rejected: "over_budget" where not even the simplest fit.
-    """
-    rows = drawn_rows(rng, FitTable.of(least, camps), count, num_triangles)
-    return [entries[row] for row in rows]
 
 
 def levels_within(
@@ -49,7 +18,7 @@ def levels_within(
     """Choose one level per asset, together at most `num_triangles`.
 
     Args:
-        assets: whose coarsest levels fit together (`drawn_within`).
+        assets: whose coarsest levels fit together (`drawn_rows`).
         num_triangles: for all together.
         enough_error: two-way distance to the source (99th percentile, share of the diagonal) from
             which an asset gets no finer.

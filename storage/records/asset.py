@@ -141,11 +141,6 @@ class Asset:
     materials: OwnMaterials | None = None
     """What became of the source's own materials; None where nobody asked for them."""
 
-    def finest_within(self, num_triangles: int) -> Level | None:
-        """Return the finest level of at most `num_triangles` faces, or None."""
-        fitting = [level for level in self.levels if len(level.faces) <= num_triangles]
-        return max(fitting, key=lambda level: len(level.faces), default=None)
-
 
 def encode_asset(asset: Asset) -> bytes:
     """Return the file of an asset; equal assets give equal bytes."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from infra.bench.subjects.cost_scene import cost_scene
+from infra.bench.workloads.cost_scene import cost_scene
 from pipeline.exchange.renderformer_json import described_files
 from storage.errors import TrilightError
 from storage.records.material import EMISSION

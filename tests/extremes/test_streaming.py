@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from infra.bench.subjects.manifests import SAMPLES_PER_SHARD, write_manifest_of
 from pipeline.making.derive_dataset import derive_dataset
 from pipeline.shards.derive import Derive, derive_shards
 from pipeline.shards.finished import open_finished
@@ -18,6 +17,7 @@ from storage.dataset.training_data import open_training_data
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from tests.pipeline.making.derive_kit import finished, scenes
+from tests.storage.dataset.manifests_kit import SAMPLES_PER_SHARD, write_manifest_of
 from tests.train.toy import write_toy_dataset
 from train.data.order import OrderSettings, RankShare, batches_from, windows_from
 from train.data.stream import StreamSettings, stream_batches

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from infra.bench.experiments.rungs import LAMPS, PHYSICS
 from infra.leaderboard import contest as contest_module
 from infra.leaderboard import run as run_module
 from infra.leaderboard.contest import NOISE
@@ -21,6 +20,7 @@ from infra.leaderboard.run import (
     make_leaderboard,
     widths_of,
 )
+from infra.rendering.methods import DIRECT_LIGHT, TRACED_LIGHT
 from model.open import save_published
 from pipeline.exchange.exports.export import export_dataset
 from storage.errors import Rejected, TrilightError
@@ -60,7 +60,7 @@ def order(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Leader
 @pytest.fixture
 def short(order: LeaderboardOrder, monkeypatch: pytest.MonkeyPatch) -> LeaderboardOrder:
     """Return an order of one network beside the nearest picture, without a chart."""
-    monkeypatch.setattr(run_module, "SHIPPED", ("builtin:tokens",))
+    monkeypatch.setattr(run_module, "BUILTIN_NETWORKS", ("builtin:tokens",))
     monkeypatch.setattr(run_module, "_never_lacking", lambda stack: [])
     monkeypatch.setattr(run_module, "plot_leaderboard", lambda *words: None)
     return order
@@ -86,19 +86,19 @@ def test_who_is_asked_for_stands_beside_those_who_never_lack(
     names = [each.name for each in one.standings]
     assert names[:2] == [NOISE, "pictures of perfect"], "the best comes first"
     assert set(names[2:]) == SHIPPED | {
-        LAMPS, PHYSICS, NEAREST_TRAINED, "network renderformer-v1-base",
+        DIRECT_LIGHT, TRACED_LIGHT, NEAREST_TRAINED, "network renderformer-v1-base",
     }  # fmt: skip
     assert board.rival == "network renderformer-v1-base"
     rows = {row["name"]: row for row in tables(asked.out, "leaderboard.csv")}
     assert float(rows["pictures of perfect"]["psnr_log_db_median"]) > 60, "half floats aside"
     assert rows[NOISE]["psnr_log_db_median"] == "100.0" and rows[NOISE]["lead_mean_db"] == ""
-    for name in SHIPPED | {LAMPS, PHYSICS}:
+    for name in SHIPPED | {DIRECT_LIGHT, TRACED_LIGHT}:
         assert float(rows[name]["first_core_s"]) > 0 < float(rows[name]["further_core_s"]), name
     assert rows["pictures of perfect"]["first_core_s"] == ""
     pairs = {(row["name"], row["than"]): row for row in tables(asked.out, "pairs.csv")}
-    lead = pairs[LAMPS, board.rival]
-    assert float(lead["mean_db"]) == float(rows[LAMPS]["lead_mean_db"])
-    assert float(lead["mean_db"]) == -float(pairs[board.rival, LAMPS]["mean_db"])
+    lead = pairs[DIRECT_LIGHT, board.rival]
+    assert float(lead["mean_db"]) == float(rows[DIRECT_LIGHT]["lead_mean_db"])
+    assert float(lead["mean_db"]) == -float(pairs[board.rival, DIRECT_LIGHT]["mean_db"])
     assert float(lead["low_db"]) <= float(lead["mean_db"]) <= float(lead["high_db"])
     page = (asked.out / "leaderboard.md").read_text()
     assert "29.77" in page and "never released" in page and "16 x 16 pixels" in page

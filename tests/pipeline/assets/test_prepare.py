@@ -69,12 +69,6 @@ def test_the_error_holds_on_other_points(asset: Asset) -> None:
             assert np.percentile(way, 98.6) <= level.record.quality.error_p99
 
 
-def test_the_finest_level_within_a_number_is_found(asset: Asset) -> None:
-    level = asset.finest_within(600)
-    assert level is not None and 499 <= len(level.faces) <= 500
-    assert asset.finest_within(200) is None
-
-
 def test_a_source_within_budget_is_kept_once_as_it_is(tmp_path: Path) -> None:
     mesh = sphere(rings=13, columns=24)
     asset = prepare(write_obj(tmp_path / "a.obj", mesh))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from infra.bench.subjects.cost_scene import cost_scene
+from infra.bench.workloads.cost_scene import cost_scene
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import SceneSource, load_source
 from pipeline.isolation import ChildLimits, IsolatedChild

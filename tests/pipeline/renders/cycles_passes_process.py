@@ -2,7 +2,7 @@
 
     python -I cycles_passes_process.py FOLDER
 
-FOLDER holds `scene.npz` and `request.json`, as infra.bench.sides.blender_process takes them.
+FOLDER holds `scene.npz` and `request.json`, as infra.bench.workloads.blender_process takes them.
 Receives `passes.exr`: depth, position, normal, row of the material, diffuse and specular colour, as
 Blender names them. FOLDER/ours.exr, where it is there, is opened as people open passes in Blender,
 and what Blender finds in it is written to `layers.json`.
@@ -30,7 +30,7 @@ _PASSES = (
 
 def main(folder: Path) -> None:
     spec = importlib.util.spec_from_file_location(
-        "blender_process", _ROOT / "infra/bench/sides/blender_process.py"
+        "blender_process", _ROOT / "infra/bench/workloads/blender_process.py"
     )
     assert spec is not None and spec.loader is not None
     blender: Any = importlib.util.module_from_spec(spec)

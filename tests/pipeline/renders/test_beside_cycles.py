@@ -1,4 +1,4 @@
-"""Blender's Cycles, run by infra.bench.sides.cycles, beside closed forms and our pictures.
+"""Blender's Cycles, run by infra.bench.workloads.cycles, beside closed forms and our pictures.
 
 Skips where Blender has not been installed for it: that is 380 MB, which tests do not download.
 """
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.bench.sides.blender_environment import installed_python
-from infra.bench.sides.cycles import Request, cycles_picture
+from infra.bench.workloads.blender_environment import installed_python
+from infra.bench.workloads.cycles import CyclesOptions, cycles_picture
 from pipeline.renders.camera import Camera
 from pipeline.renders.load_tracer import load_tracer
 from storage.records.exr import decode_exr
@@ -35,7 +35,7 @@ def blender() -> None:
 
 
 def _cycles(scene: Scene, resolution: int, spp: int, bounces: int = 8) -> NDArray[np.float32]:
-    request = Request(resolution=resolution, spp=spp, denoise=False, bounces=bounces)
+    request = CyclesOptions(resolution=resolution, spp=spp, denoise=False, bounces=bounces)
     return cycles_picture(scene, 0, request).radiance_rgb
 
 

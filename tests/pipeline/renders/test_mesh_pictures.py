@@ -3,8 +3,8 @@
 import numpy as np
 import trimesh
 
-from infra.bench.sides.shots import fixed_samples
-from infra.bench.subjects.mesh_pictures import picture_db
+from infra.bench.workloads.mesh_pictures import picture_db
+from infra.bench.workloads.shots import fixed_samples
 from pipeline.assets.mesh import TriangleMesh
 
 

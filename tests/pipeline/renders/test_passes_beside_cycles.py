@@ -10,7 +10,7 @@ import OpenEXR
 import pytest
 from numpy.typing import NDArray
 
-from infra.bench.sides.blender_environment import installed_python
+from infra.bench.workloads.blender_environment import installed_python
 from storage.records.passes.pictures import view_passes
 from storage.records.passes.stored import passes_exr
 from storage.records.scene import ARRAY_FIELDS, Scene

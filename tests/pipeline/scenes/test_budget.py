@@ -5,9 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
-from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
+from pipeline.scenes.budget import least_triangles, levels_within
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level, LevelRecord
+from tests.pipeline.scenes.draw_kit import drawn_within
 from tests.pipeline.scenes.small_pool import QUALITY, SOURCE, with_error
 
 Rungs = list[tuple[int, float]]

@@ -11,7 +11,6 @@ import pytest
 import trimesh
 
 from pipeline.builds.named import named_build
-from pipeline.scenes.budget import drawn_within
 from pipeline.scenes.pieces import object_piece, shell_piece
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.shapes import MeshShape
@@ -21,6 +20,7 @@ from scene_templates.rooms import PATCH_FACES, SIDES, PatchPlacement, patch
 from storage.records.material import DIFFUSE
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
+from tests.pipeline.scenes.draw_kit import drawn_within
 from tests.pipeline.scenes.scene_facts import rows_of
 from tests.pipeline.scenes.small_pool import first_scene
 from tests.scene_templates.published import DEFAULT, STAGE_1

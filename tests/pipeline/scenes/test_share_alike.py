@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from pipeline.scenes.budget import drawn_within
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
@@ -15,6 +14,7 @@ from storage.errors import Rejected
 from storage.licences import share_alike_camp
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
+from tests.pipeline.scenes.draw_kit import drawn_within
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 
 LICENCES = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC0-1.0", "cc-by-sa-4.0", "GPL-3.0-only")

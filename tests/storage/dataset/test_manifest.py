@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from infra.bench.subjects.manifests import (
-    SAMPLES_PER_SHARD,
-    memory_of_opening,
-    write_manifest_of,
-)
 from storage.dataset import json_pieces
 from storage.dataset.json_pieces import entries
 from storage.dataset.manifest import decode_head, read_head, read_manifest, write_manifest
 from tests.for_each import for_each
+from tests.storage.dataset.manifests_kit import (
+    SAMPLES_PER_SHARD,
+    memory_of_opening,
+    write_manifest_of,
+)
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),

@@ -1,4 +1,4 @@
-"""The way to the network: the same batches on every device, and on a card beside its kernels."""
+"""The way to the network: the same batches on every device."""
 
 import contextlib
 import dataclasses
@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from storage.conventions import log10_radiance
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import open_training_data
 from tests.for_each import for_each
-from tests.train.fake_card import CARD, fake_card
 from tests.train.toy import write_toy_dataset
-from train.data.arrival import CopyStream, StepScenes, looks_up_itself, step_scenes
+from train.data.arrival import CopyStream, StepScenes, step_scenes
 from train.data.order import RankShare
 from train.data.scenes import stored_levels
 from train.data.stream import StreamSettings, stream_batches
@@ -84,72 +82,6 @@ def test_batches_are_made_ahead_and_closing_ends_the_thread(dataset: Dataset) ->
         assert [len(batch.noise_BV) for batch in step.batches] == [3, 3] or len(step.batches) > 2
         assert CopyStream(CPU).send(step.batches) == step.batches
     assert threading.active_count() == before
-
-
-class _Log:
-    """What a card is asked to do, in order."""
-
-    def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        self.said: list[tuple[str, Any]] = []
-        self.pinned: list[Tensor] = []
-        log = self
-
-        class Stream:
-            def __init__(self, device: torch.device | None = None) -> None:
-                self.number = 0
-
-            def record_event(self) -> int:
-                self.number += 1
-                log.said.append(("event", self.number))
-                return self.number
-
-            def wait_event(self, event: int) -> None:
-                log.said.append(("wait", event))
-
-        def pin(tensor: Tensor) -> Tensor:
-            found = tensor.clone()
-            log.pinned.append(found)
-            return found
-
-        plain = Tensor.to
-
-        def to(tensor: Tensor, device: torch.device, *, non_blocking: bool = False) -> Tensor:
-            is_pinned = any(tensor is each for each in log.pinned)
-            log.said.append(("copy" if is_pinned and non_blocking else "slow copy", None))
-            return plain(tensor, device)
-
-        patch.setattr(torch.backends.cuda, "is_built", lambda: True)
-        patch.setattr(torch.cuda, "Stream", Stream)
-        patch.setattr(torch.cuda, "stream", lambda _: contextlib.nullcontext())
-        patch.setattr(torch.cuda, "current_stream", lambda _: Stream())
-        patch.setattr(Tensor, "pin_memory", pin)
-        patch.setattr(Tensor, "to", to)
-        patch.setattr(
-            Tensor, "record_stream", lambda tensor, _: log.said.append(("kept", tensor.device.type))
-        )
-
-
-def test_a_card_gets_copies_beside_its_kernels(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """From pinned memory, all queued at once, each waited for alone, kept until it is used."""
-    assert looks_up_itself(CARD)
-    log = _Log(monkeypatch)
-    with steps(dataset, CARD, looked_up=False) as found:
-        step = next(found)
-    with fake_card():
-        sent = CopyStream(CARD).send(step.batches)
-        assert len(sent) > 1
-        queued, log.said = log.said, []
-        arrived = [batch.to(CARD) for batch in sent]
-    kinds = [kind for kind, _ in queued]
-    assert "slow copy" not in kinds and "wait" not in kinds
-    assert [number for kind, number in queued if kind == "event"] == [*range(1, len(sent) + 1)]
-    assert [number for kind, number in log.said if kind == "wait"] == [*range(1, len(sent) + 1)]
-    assert {kind for kind, _ in log.said} == {"wait", "kept"}, "nothing is copied twice"
-    assert log.said.count(("kept", "cuda")) == kinds.count("copy")
-    for batch in arrived:
-        assert batch.target_BVRR3.device == CARD and batch.target_BVRR3.dtype == torch.float32
 
 
 def test_rows_of_targets_cover_all_that_a_picture_may_hold() -> None:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.bench.sides.blender_environment import installed_python
-from infra.bench.sides.shots import fixed_samples, shots
+from infra.bench.workloads.blender_environment import installed_python
+from infra.bench.workloads.shots import fixed_samples, shots
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.renders.variant import activate, choose_variant
 from storage.records.scene import Scene

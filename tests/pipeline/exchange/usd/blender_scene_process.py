@@ -2,7 +2,7 @@
 
     python -I blender_scene_process.py FOLDER
 
-FOLDER/request.json holds what infra.bench.sides.blender_process takes. Receives scene.usdc and,
+FOLDER/request.json holds what infra.bench.workloads.blender_process takes. Receives scene.usdc and,
 with instances instead of copies, instances.usdc; their textures; and picture.npy.
 
 The scene is what Blender's users make: a grid of quads with a picture on it, a cylinder of n-gons,
@@ -99,7 +99,7 @@ def make_scene(folder: Path) -> None:
 
 def main(folder: Path) -> None:
     request = json.loads((folder / "request.json").read_text())
-    cycles = module("infra/bench/sides/blender_process.py")
+    cycles = module("infra/bench/workloads/blender_process.py")
     bpy.ops.wm.read_factory_settings(use_empty=True)
     make_scene(folder)
     for name, instances in (("scene", False), ("instances", True)):

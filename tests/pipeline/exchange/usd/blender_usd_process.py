@@ -2,8 +2,8 @@
 
     python -I blender_usd_process.py FOLDER
 
-FOLDER/request.json: `usd`, `exact` (whether infra/blender restores the materials), `export` (a USD
-file to write from the imported scene, or null), and what infra.bench.sides.blender_process takes.
+FOLDER/request.json: `usd`, `exact` (whether infra/blender restores the materials), `export` (a
+USD file to write from the imported scene, or null), and what blender_process.py takes.
 Receives facts.json and picture.npy.
 """
 
@@ -60,7 +60,7 @@ def facts() -> dict[str, Any]:
 
 def main(folder: Path) -> None:
     request = json.loads((folder / "request.json").read_text())
-    cycles = module("infra/bench/sides/blender_process.py")
+    cycles = module("infra/bench/workloads/blender_process.py")
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.usd_import(filepath=request["usd"], attr_import_mode="ALL")
     (folder / "facts.json").write_text(json.dumps(facts()))

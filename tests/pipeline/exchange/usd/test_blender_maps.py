@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.bench.sides.blender_environment import installed_python
-from infra.bench.sides.cycles import Request, cycles_of_usd
+from infra.bench.workloads.blender_environment import installed_python
+from infra.bench.workloads.cycles import CyclesOptions, cycles_of_usd
 from pipeline.exchange.usd.write import write_usd
 from scene_templates.rotations import uniform_rotation
 from storage.metrics import psnr_linear_db
@@ -51,7 +51,7 @@ def test_textures_and_sky_are_where_we_show_them(tmp_path: Path, record_property
         pytest.skip("Blender is not installed: run `trilight bench cycles` once")
     scene = _scene()
     write_usd(tmp_path / "a.usdc", scene)
-    request = Request(resolution=RESOLUTION, spp=SPP, denoise=False, threads=2)
+    request = CyclesOptions(resolution=RESOLUTION, spp=SPP, denoise=False, threads=2)
     (theirs,) = cycles_of_usd(tmp_path / "a.usdc", request, (0,)).pictures_rgb
     assert scene.uv is not None
     mirrored = scene.uv * np.array([-1, 1], np.float32)

@@ -1,0 +1,130 @@
+"""Shared means of an experiment: children, scenes, objects, folders.
+
+Everything is made when it is first asked for, so that an experiment costs no more than it needs.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from infra.bench.experiment import BenchScale
+from infra.bench.workloads.named_scenes import first_sample, given_scenes, sampled_scene
+from infra.bench_options import BenchOptions
+from infra.rendering.held_out_scenes import composing_child
+from pipeline.builds.settings import BuildSettings
+from pipeline.builds.training import smoke
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from pipeline.making.prepare_isolated import preload_mesh_libraries
+from storage.errors import Rejected
+from storage.records.sample import Sample, encode_sample
+from storage.records.scene import Scene
+from storage.settings.changes import changed
+
+Result = TypeVar("Result")
+
+_SAMPLES = 2
+"""Rendered scenes that are packed and read."""
+
+
+def _do_nothing() -> None:
+    """Set up a child whose fork server has imported everything already."""
+
+
+class BenchContext:
+    """Makes and holds what an experiment's trials share, until `close`."""
+
+    def __init__(self, scale: BenchScale, options: BenchOptions) -> None:
+        # before any child: pymeshlab takes a second to import, and would be counted as work
+        preload_mesh_libraries()
+        self.scale, self.options = scale, options
+        self.notes: list[str] = []
+        """Notes that belong to the result."""
+        self.cores = os.cpu_count() or 1
+        self._stack = contextlib.ExitStack()
+        self._kept: dict[Any, Any] = {}
+
+    def close(self) -> None:
+        """End the children, delete their folders."""
+        self._stack.close()
+
+    def kept(self, key: Any, make: Callable[[], Result]) -> Result:
+        """Return what was made under a key, made now if it was not."""
+        if key not in self._kept:
+            self._kept[key] = make()
+        found: Result = self._kept[key]
+        return found
+
+    def note(self, text: str) -> None:
+        """Keep a sentence with the result; once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def folder(self) -> Path:
+        """Return an empty folder that is deleted in the end."""
+        return Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
+
+    def render_child(
+        self, build: BuildSettings, objects: str, threads: int | None = None
+    ) -> IsolatedChild:
+        """Return a child that composes scenes of a preset and renders them, until `close`."""
+        allowed = dataclasses.replace(build, allowed_licences=self.options.allowed_licences)
+        child = composing_child(allowed, objects, self.folder(), threads)
+        return self._stack.enter_context(contextlib.closing(child))
+
+    @functools.cached_property
+    def child(self) -> IsolatedChild:
+        """A render child of the preset `smoke` with procedural objects, on all cores."""
+        return self.render_child(smoke(), "builtin:")
+
+    @functools.cached_property
+    def mesh_child(self) -> IsolatedChild:
+        """A child for mesh libraries, one thread, with a limit on its processor time."""
+        limits = ChildLimits(memory_bytes=8 << 30, wall_s=600, cpu_s=240, calls_per_child=10_000)
+        child = IsolatedChild(limits=limits, setup=_do_nothing)
+        return self._stack.enter_context(contextlib.closing(child))
+
+    @functools.cached_property
+    def mesh_files(self) -> tuple[tuple[Path, int], ...]:
+        """Files of usable objects with their triangles after cleaning, the largest first.
+
+        Raises:
+            TrilightError: as `find_objects`.
+        """
+        from infra.bench.workloads.remeshing import count_faces
+        from pipeline.objects.sources import find_objects
+        from storage.cache import cache_folder
+
+        found = find_objects(
+            self.options.objects,
+            work_dir=cache_folder("objects"),
+            allowed_licences=self.options.allowed_licences,
+        )
+        sizes = {}
+        for record in found.records:
+            with contextlib.suppress(Rejected, ChildFailed):
+                sizes[Path(record.path)] = self.mesh_child.call(count_faces, Path(record.path))
+        return tuple(sorted(sizes.items(), key=lambda item: (-item[1], str(item[0]))))
+
+    def scene(self, trial: str) -> Scene:
+        """Return the scene of the trial `sampled N`, or the one of the user's of that name."""
+        given = given_scenes(self.options.scenes)
+        if trial in given:
+            return given[trial](self.child)
+        scene: Scene = self.child.call(sampled_scene, int(trial.split()[-1]))
+        return scene
+
+    @functools.cached_property
+    def samples(self) -> list[Sample]:
+        """Scenes of the preset `smoke` as a dataset has them, at the scale's width."""
+        build = changed(smoke(), {"renders.resolution": self.scale.picture_px})
+        child = self.render_child(build, "builtin:")
+        return [child.call(first_sample, index) for index in range(_SAMPLES)]
+
+    def members(self) -> list[dict[str, bytes]]:
+        """Return the files of those samples in a shard."""
+        return [dict(encode_sample(sample, "compact")) for sample in self.samples]

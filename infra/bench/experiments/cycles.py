@@ -1,0 +1,171 @@
+"""Plain, textured and sky-lit scenes: our pictures compared with raw ones of Blender's Cycles."""
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.bench.context import BenchContext
+from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
+from infra.bench.experiments.frontier import adaptive
+from infra.bench.workloads.cycles import CyclesOptions, CyclesSamples, cycles_of_usd, cycles_picture
+from infra.bench.workloads.judged_pictures import difference_db, shrunk
+from infra.bench.workloads.mapped_scenes import SKIES, mapped_scene
+from infra.bench.workloads.named_scenes import given_scenes
+from infra.bench.workloads.shots import shots
+from infra.bench_options import BenchOptions
+from infra.rendering.raw_references import RawReference, first_camera, raw_reference, true_error_db
+from pipeline.exchange.usd.write import write_usd
+from pipeline.renders.noise_floor import clamped_radiance
+from pipeline.renders.results import RenderedView
+from pipeline.renders.settings import USUAL_FLOOR_DB
+from storage.conventions import log10_radiance
+from storage.metrics import psnr_linear_db
+from storage.records.scene import Scene
+
+PLAIN, TEXTURED, SKY, GIVEN = "plain", "textured", "sky", "given"
+RESOLUTION = 64
+OUR_SHARE = 4
+"""Samples of ours, in two halves, for each sample of one picture of Cycles: they cost less."""
+
+EXPOSED = 0.5
+"""Radiance that nine tenths of the pixels do not exceed where pictures are compared."""
+
+AIM_DB = 36.0
+"""Agreement by pixel that is aimed at, or Cycles' with itself less 1 dB where that is lower."""
+
+_BLOCK_PX = 8
+_MOST_SCENES = 10
+
+
+def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
+    kinds = [PLAIN, TEXTURED, SKY, *([GIVEN] if options.scenes else [])]
+    return [Point(name=kind, kind=kind, judged=False) for kind in kinds]
+
+
+def _scene(context: BenchContext, kind: str, index: int) -> Scene:
+    if kind == PLAIN:
+        return context.scene(f"sampled {index}")
+    if kind == GIVEN:
+        names = list(given_scenes(context.options.scenes))
+        return context.scene(names[index % len(names)])
+    name = f"surfaces {index}" if kind == TEXTURED else f"sky {SKIES[index % len(SKIES)]}"
+    scene: Scene = context.child.call(mapped_scene, name)
+    return scene
+
+
+def _measure(
+    context: BenchContext, points: Sequence[Point], trial: str
+) -> Iterator[tuple[str, Figures]]:
+    spp = context.scale.max_spp
+    for point in points:
+        scene = _scene(context, point.name, int(trial.split()[-1]))
+        camera = first_camera(scene, RESOLUTION)
+        ours = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp)
+        settings = adaptive(USUAL_FLOOR_DB, RESOLUTION, spp)
+        shot = context.child.call(shots, scene, {"stated": settings})["stated"]
+        theirs = _cycles_samples(scene, spp, context.folder(), is_plain=point.name == PLAIN)
+        yield (
+            point.name,
+            {
+                "core_s": theirs.core_s,
+                **agreement_figures(ours, theirs),
+                **_stated_figures(shot.view, ours, theirs),
+            },
+        )
+
+
+def _cycles_samples(scene: Scene, spp: int, folder: Path, *, is_plain: bool) -> CyclesSamples:
+    """Return two raw pictures of Cycles: of the arrays of a plain scene, else of our USD."""
+    options = CyclesOptions(
+        resolution=RESOLUTION, spp=spp, denoise=False, threads=os.cpu_count() or 1
+    )
+    if not is_plain:
+        usd = folder / "scene.usdc"
+        write_usd(usd, scene)
+        return cycles_of_usd(usd, options, (0, 1))
+    pictures = [cycles_picture(scene, 0, options.with_seed(seed)) for seed in (0, 1)]
+    return CyclesSamples(
+        pictures_rgb=tuple(each.radiance_rgb for each in pictures),
+        core_s=sum(each.core_s for each in pictures),
+    )
+
+
+def agreement_figures(ours: RawReference, theirs: CyclesSamples) -> dict[str, float]:
+    """Return how well ours agree with a picture of theirs, in dB, and what of it is not noise.
+
+    All pictures are exposed alike, so that nine tenths of the pixels are below EXPOSED: what is
+    brighter than 1 counts as 1.
+    """
+    one, other = (picture.astype(np.float64) for picture in theirs.pictures_rgb)
+    level = float(np.quantile((one + other).mean(axis=-1) / 2, 0.9))
+    exposure = EXPOSED / level if level > 0 else 1.0
+    one, other = one * exposure, other * exposure
+    ours = RawReference(a_rgb=ours.a_rgb * exposure, b_rgb=ours.b_rgb * exposure)
+    their_halves = RawReference(a_rgb=one, b_rgb=other)
+    pixels_db = _linear_db(0.5 * (ours.a_rgb + ours.b_rgb), one)
+    seeds_db = _linear_db(one, other)
+    blocks = len(ours.a_rgb) // _BLOCK_PX
+    coarse = shrunk(ours, blocks), shrunk(their_halves, blocks)
+    return {
+        "pixels_db": pixels_db,
+        "seeds_db": seeds_db,
+        "margin_db": pixels_db - min(AIM_DB, seeds_db - 1),
+        "blocks_db": _linear_db(*(0.5 * (half.a_rgb + half.b_rgb) for half in coarse)),
+        "noiseless_db": difference_db(ours, their_halves, clamped_radiance),
+        "brightness": 100 * float((ours.a_rgb + ours.b_rgb).mean() / (one + other).mean() - 1),
+    }
+
+
+def _linear_db(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    return float(psnr_linear_db(one.astype(np.float32), other.astype(np.float32)))
+
+
+def _stated_figures(
+    view: RenderedView, ours: RawReference, theirs: CyclesSamples
+) -> dict[str, float]:
+    """Return a denoised picture's stated error, and its true one to our and to their samples."""
+    one, other = (picture.astype(np.float64) for picture in theirs.pictures_rgb)
+    references = {"ours": ours, "theirs": RawReference(a_rgb=one, b_rgb=other)}
+    everywhere = np.ones_like(view.hits)
+    found = {"stated_db": view.noise_floor_db}
+    for name, reference in references.items():
+        error_db, _ = true_error_db(view.radiance_rgb, reference, log10_radiance, everywhere)
+        found[f"to_{name}_db"] = error_db
+    return found
+
+
+EXPERIMENT = Experiment(
+    name="cycles",
+    title="Plain, textured and sky-lit scenes compared with Blender's Cycles",
+    about="Raw samples of ours and a denoised picture against raw samples of Cycles, of sampled "
+    "scenes, of scenes with procedural surfaces, of scenes below skies, and of those in "
+    "`--scenes`; the first run installs Blender (GPL-3, 380 MB) in its own environment.",
+    cost=Column(name="core-seconds of Cycles", figure="core_s"),
+    error=Column(name="agreement without noise, linear dB", figure="noiseless_db"),
+    better="higher",
+    columns=(
+        Column(name="by pixel, linear dB", figure="pixels_db"),
+        Column(name="at least, dB", figure="pixels_db", over="least"),
+        Column(name="Cycles with itself, dB", figure="seeds_db"),
+        Column(name="over the aim, least dB", figure="margin_db", over="least"),
+        Column(name="means of 8 x 8, dB", figure="blocks_db"),
+        Column(name="ours brighter by, median %", figure="brightness"),
+        Column(name="at most, %", figure="brightness", over="most"),
+        Column(name="at least, %", figure="brightness", over="least"),
+        Column(name="stated psnr_log_db", figure="stated_db"),
+        Column(name="to our samples, dB", figure="to_ours_db"),
+        Column(name="to Cycles' samples, dB", figure="to_theirs_db"),
+    ),
+    because="A sky a quarter turn off, a mirrored texture or colors decoded twice would each cost "
+    "ten decibels and more. Where a picture is as far from Cycles' samples as from our own, its "
+    "own noise is all that is left between it and either truth.",
+    points=_points,
+    trials=lambda scale, options: [
+        f"scene {index}" for index in range(min(_MOST_SCENES, scale.scenes))
+    ],
+    measure=_measure,
+    needs=("blender",),
+)

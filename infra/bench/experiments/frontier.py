@@ -1,0 +1,193 @@
+"""Our renderer compared with plain Mitsuba at equal true error, and its stated errors judged.
+
+Errors are true ones, to raw samples of our own tracer in two halves, which no denoiser has seen:
+their noise cancels. The renderers are measured in turn on every scene.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from infra.bench.context import BenchContext
+from infra.bench.experiment import (
+    BenchScale,
+    Column,
+    Experiment,
+    Figures,
+    Over,
+    Point,
+    percent,
+)
+from infra.bench.workloads.judged_pictures import figures, shrunk
+from infra.bench.workloads.kept_references import kept_reference
+from infra.bench.workloads.named_scenes import given_scenes, sampled_trials
+from infra.bench.workloads.plain_mitsuba import PlainPicture, render_levels
+from infra.bench.workloads.shots import SEED, shots
+from infra.bench_options import BenchOptions
+from infra.rendering.raw_references import RawReference, first_camera, true_error_db
+from pipeline.builds.training import pretrain_256
+from pipeline.renders.noise_floor import clamped_radiance
+from pipeline.renders.settings import USUAL_FLOOR_DB, RenderSettings
+from storage.conventions import log10_radiance
+
+TARGETS_DB = (38.0, 42.0, 46.0, 50.0)
+STATED_PX = (64, 256)
+"""Further widths at which stated errors are judged."""
+REFERENCE_PX = 256
+"""Width of the references in pixels, the largest that is judged."""
+
+OURS, STATED, PLAIN = "Trilight, stated errors", "Trilight, other widths", "plain Mitsuba"
+
+
+def adaptive(target_db: float, resolution: int, max_spp: int) -> RenderSettings:
+    """Return the settings of `pretrain-256` with another target, width and cap."""
+    return dataclasses.replace(
+        pretrain_256().renders,
+        resolution=resolution,
+        noise_floor_db=target_db,
+        max_spp=max_spp,
+        min_mean_radiance=0.0,
+    )
+
+
+def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
+    ours = [
+        Point(
+            name=f"trilight {target_db:.0f} dB",
+            settings=adaptive(target_db, scale.resolution, scale.max_spp),
+            default=target_db == pretrain_256().renders.noise_floor_db,
+            kind=OURS,
+        )
+        for target_db in TARGETS_DB
+    ]
+    stated = [
+        Point(
+            name=f"trilight {USUAL_FLOOR_DB:.0f} dB, {px} px",
+            settings=adaptive(USUAL_FLOOR_DB, px, scale.max_spp),
+            judged=False,
+            kind=STATED,
+        )
+        for px in STATED_PX
+        if px != scale.resolution
+    ]
+    # fixed numbers of samples up to four times our cap
+    doublings = range((4 * scale.max_spp // 64).bit_length())
+    plain = [
+        Point(name=f"mitsuba {64 << step}", settings=64 << step, kind=PLAIN) for step in doublings
+    ]
+    return [*ours, *stated, *plain]
+
+
+def _trials(scale: BenchScale, options: BenchOptions) -> list[str]:
+    return [*given_scenes(options.scenes), *sampled_trials(scale.scenes)]
+
+
+def _measure(
+    context: BenchContext, points: Sequence[Point], trial: str
+) -> list[tuple[str, Figures]]:
+    scale, scene = context.scale, context.scene(trial)
+    camera = first_camera(scene, REFERENCE_PX)
+    whole = kept_reference(context.child, scene, camera, scale.reference_spp)
+    reference = shrunk(whole, scale.resolution)
+    ours = {p.name: p.settings for p in points if isinstance(p.settings, RenderSettings)}
+    plain = [point for point in points if point.name not in ours]
+    taken = context.child.call(shots, scene, ours)
+    spps = tuple(point.settings for point in plain)
+    levels = context.child.call(render_levels, scene, scale.resolution, spps, SEED)
+    errors = [plain_figures(level, reference) for level in levels]
+    found: dict[str, Figures] = {
+        point.name: each for point, each in zip(plain, errors, strict=True)
+    }
+    steps = [(each["spp"], each["core_s"], each["db"]) for each in errors]
+    for name, shot in taken.items():
+        judged = figures(shot.view, shrunk(whole, ours[name].resolution))
+        own = {"core_s": shot.core_s, "db": judged["log_true_db"], **judged}
+        if ours[name].resolution == scale.resolution:
+            core_s, is_reached = cost_at_error(steps, own["db"])
+            own |= {"times": core_s / shot.core_s, "bound": float(not is_reached)}
+        found[name] = own
+    return [(point.name, found[point.name]) for point in points]
+
+
+def plain_figures(level: PlainPicture, reference: RawReference) -> dict[str, float]:
+    """Return cost and true errors of a picture of plain Mitsuba."""
+    everywhere = np.ones(level.radiance_rgb.shape[:2], np.bool_)
+    db, open_db = true_error_db(level.radiance_rgb, reference, log10_radiance, everywhere)
+    linear_db, _ = true_error_db(level.radiance_rgb, reference, clamped_radiance, everywhere)
+    return {
+        "core_s": level.core_s,
+        "spp": float(level.spp),
+        "db": db,
+        "linear_true_db": linear_db,
+        "log_open_db": open_db,
+    }
+
+
+def cost_at_error(levels: Sequence[tuple[float, float, float]], db: float) -> tuple[float, bool]:
+    """Return the core-seconds at which a path tracer first has an error, and whether it has it.
+
+    Between two levels dB are taken linear in log2 of the samples, and core-seconds linear in the
+    samples. Outside of what was measured the nearest level counts: its cost is a lower bound where
+    no level is good enough, and an upper one where all are better.
+
+    Args:
+        levels: samples per pixel, core-seconds and psnr_log_db, rising in samples; one at least.
+        db: psnr_log_db that is asked for, to the same reference.
+    """
+    row = next((row for row, (_, _, level_db) in enumerate(levels) if level_db >= db), None)
+    if row is None:
+        return levels[-1][1], False
+    spp_above, core_s_above, db_above = levels[row]
+    if row == 0:
+        return core_s_above, db_above == db
+    spp_below, core_s_below, db_below = levels[row - 1]
+    fraction = (db - db_below) / (db_above - db_below)
+    spp = spp_below * 2 ** (fraction * math.log2(spp_above / spp_below))
+    slope = (core_s_above - core_s_below) / (spp_above - spp_below)
+    return core_s_below + slope * (spp - spp_below), True
+
+
+_STATED: tuple[tuple[str, str, Over, Callable[[float], float] | None], ...] = (
+    ("over 1 dB worse than stated, %", "over_1", "mean", percent),
+    ("95 % interval from, %", "over_1", "low", percent),
+    ("to, %", "over_1", "high", percent),
+    ("over 3 dB, %", "over_3", "mean", percent),
+    ("caution, median dB", "caution_db", "median", None),
+    ("worst dB", "caution_db", "least", None),
+)
+
+_WRONG = tuple(
+    Column(name=f"{metric}: {words}", figure=f"{name}_{figure}", over=over, then=then)
+    for name, metric in (("log", "log"), ("linear", "linear"), ("object", "objects"))
+    for words, figure, over, then in (_STATED if name == "log" else _STATED[:1])
+)
+
+EXPERIMENT = Experiment(
+    name="frontier",
+    title="Cost at equal error compared with plain Mitsuba, and stated errors",
+    about="Our stated errors and Mitsuba's `path` integrator with one OIDN and our guide pictures, "
+    "scene by scene, held against raw samples in two halves.",
+    cost=Column(name="core-seconds a view", figure="core_s", over="mean"),
+    error=Column(name="psnr_log_db, dB", figure="db"),
+    better="higher",
+    columns=(
+        Column(name="samples", figure="spp", over="mean"),
+        Column(name="5th percentile, dB", figure="db", over="p5"),
+        Column(name="linear, dB", figure="linear_true_db"),
+        Column(name="Mitsuba's cost at equal error, times", figure="times"),
+        Column(name="least times", figure="times", over="least"),
+        Column(name="of them bounds, %", figure="bound", over="mean", then=percent),
+        *_WRONG,
+        Column(name="hit the sample limit, %", figure="at_cap", over="mean", then=percent),
+        Column(name="what the reference leaves open, median dB", figure="log_open_db"),
+    ),
+    because="Mitsuba's cost at equal error is the median over the scenes of its core-seconds, "
+    "interpolated between its numbers of samples, divided by ours; where it cannot be interpolated "
+    "it is a bound. A stated error is wrong where the true one is more than 1 dB (3 dB) worse; "
+    "intervals are over scenes. Caution is by how much a picture is better than stated.",
+    points=_points,
+    trials=_trials,
+    measure=_measure,
+)

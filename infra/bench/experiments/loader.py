@@ -1,0 +1,116 @@
+"""The loader: samples a second and bytes a sample, compared with the published layout.
+
+On rendered scenes of `smoke`, each under many keys so that there are enough bytes, or on `--data`.
+"""
+
+import itertools
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+
+from infra.bench.context import BenchContext
+from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, rounds
+from infra.bench.workloads.manifests import write_copies
+from infra.bench.workloads.packed_samples import LAYOUTS, unpacking_figures
+from infra.bench_options import BenchOptions
+from storage.dataset.settings import StorageSettings
+from storage.dataset.training_data import TrainingData, open_training_data
+
+UNPACK, TRAIN = "unpacking, one thread", "batches as training reads them"
+THREADS = (0, 1, 2, 4)
+"""Decoding threads; with 0 the thread that asks decodes."""
+BATCH, RESOLUTION = 4, 64
+"""Scenes of a batch, and width of its pictures in pixels, which are reduced from the stored one."""
+_VIEWS = 4
+"""Most views of a scene that are drawn."""
+_SAMPLES = 32
+"""Least samples of a pass over the training data."""
+
+
+def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
+    unpacked = [
+        Point(
+            name=f"unpack, {layout}",
+            settings=layout,
+            default=layout == StorageSettings.profile,
+            group=UNPACK,
+        )
+        for layout in LAYOUTS
+    ]
+    read = [
+        Point(name=f"batches, {threads} threads", settings=threads, group=TRAIN)
+        for threads in THREADS
+    ]
+    return [*unpacked, *read]
+
+
+def _measure(
+    context: BenchContext, points: Sequence[Point], trial: str
+) -> Iterator[tuple[str, Figures]]:
+    data, count = context.kept("data", lambda: _training_data(context))
+    for point in points:
+        if point.group == UNPACK:
+            found = unpacking_figures(context.samples, point.settings, context.folder())
+        else:
+            found = read_figures(data, count, point.settings)
+        yield point.name, found
+
+
+def _training_data(context: BenchContext) -> tuple[TrainingData, int]:
+    """Return the data that is read, and how many of its samples."""
+    if context.options.data:
+        data = open_training_data([context.options.data])
+        shards = data.split("train")
+        held = sum(shards.num_samples(number) for number in range(len(shards.names)))
+        return data, max(BATCH, min(_SAMPLES * context.scale.repeats, held))
+    root = context.folder()
+    count = write_copies(root, context.members())
+    return open_training_data([str(root)]), count
+
+
+def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
+    """Read samples as training does, but for the network."""
+    from train.data.order import RankShare
+    from train.data.stream import StreamSettings, stream_batches
+    from train.data.unusable import Unusable
+
+    settings = StreamSettings(
+        seed=0,
+        window=2,
+        batch_size=BATCH,
+        resolution=RESOLUTION,
+        views_per_scene=min(_VIEWS, data.num_views or _VIEWS),
+    )
+    began, core_began = time.perf_counter(), time.process_time()
+    stream = stream_batches(
+        data.split("train"), settings, 0, share=RankShare(), workers=threads, unusable=Unusable(0)
+    )
+    with closing(stream) as batches:
+        for _ in itertools.islice(batches, count // BATCH):
+            pass
+    return {
+        "sample_ms": 1000 * (time.perf_counter() - began) / count,
+        "core_ms": 1000 * (time.process_time() - core_began) / count,
+    }
+
+
+EXPERIMENT = Experiment(
+    name="loader",
+    title="Samples a second and bytes a sample",
+    about="Whole samples of `smoke`, four views each, unpacked from our profiles and from the "
+    "published HDF5 layout, and shards that become batches of 64 pixels by threads.",
+    cost=Column(name="ms a sample", figure="sample_ms"),
+    columns=(
+        Column(name="samples a second", figure="sample_ms", then=lambda ms: 1000 / ms),
+        Column(name="kB a sample", figure="bytes", then=lambda size: size / 1000),
+        Column(name="in memory, kB", figure="memory_bytes", then=lambda size: size / 1000),
+        Column(name="core-ms a sample", figure="core_ms"),
+    ),
+    because="Unpacking is timed by the processor in memory, batches by the clock; HDF5 files are "
+    "those of our exporter, read without any check.",
+    points=_points,
+    trials=rounds,
+    measure=_measure,
+    warm_up=True,
+    needs=("torch",),
+)

@@ -1,0 +1,154 @@
+"""All methods to a picture, from pure networks to the path tracer: cost against true error."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from infra.bench.context import BenchContext
+from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
+from infra.bench.workloads.kept_references import kept_reference
+from infra.bench_options import BenchOptions
+from infra.rendering.held_out_scenes import TRIANGLES, held_out_build, held_out_scene
+from infra.rendering.methods import (
+    BUILTIN_NETWORKS,
+    DIRECT_LIGHT,
+    SAMPLES,
+    TRACED_LIGHT,
+    Method,
+    direct_light_method,
+    kind_of,
+    network_labels,
+    network_method,
+    network_name,
+    sampled_method,
+    samples_name,
+    timed_method,
+    traced_network,
+    warm_up_denoiser,
+)
+from infra.rendering.raw_references import RawReference, first_camera, true_error_db
+from infra.timed_views import TimedViews
+from pipeline.isolation import IsolatedChild
+from pipeline.objects.generated import BENCHMARK
+from pipeline.renders.noise_floor import clamped_radiance
+from storage.conventions import log10_radiance
+from storage.records.first_hits import first_hits
+from storage.records.scene import Scene
+
+WIDTHS = (64, 256)
+
+
+def row_name(px: int, name: str) -> str:
+    """Return the name of a method's row at a width."""
+    return f"{px} px, {name}"
+
+
+def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
+    labels = network_labels(options.checkpoint)
+    networks = [*BUILTIN_NETWORKS, *(one for one in labels if one not in BUILTIN_NETWORKS)]
+    names = [
+        *map(network_name, networks), DIRECT_LIGHT, TRACED_LIGHT, *map(samples_name, SAMPLES)
+    ]  # fmt: skip
+    first = network_name(labels[0])
+    return [
+        Point(
+            name=row_name(px, name),
+            group=f"{px} px",
+            kind=kind_of(name),
+            rival=None if name == first else row_name(px, first),
+        )
+        for px in WIDTHS
+        for name in names
+    ]
+
+
+def _measure(
+    context: BenchContext, points: Sequence[Point], trial: str
+) -> Iterator[tuple[str, Figures]]:
+    methods, child = context.kept("methods", lambda: _set_up(context))
+    scene = child.call(held_out_scene, int(trial.split()[-1]))
+    for px in WIDTHS:
+        camera = first_camera(scene, px)
+        reference = kept_reference(child, scene, camera, 2 * context.scale.max_spp)
+        for name, method in methods[px].items():
+            figures = judged_figures(timed_method(method, scene), scene, reference)
+            yield row_name(px, name), figures
+        for level, picture in zip(SAMPLES, child.call(timed_samples, scene, px), strict=True):
+            yield row_name(px, samples_name(level)), judged_figures(picture, scene, reference)
+
+
+def _set_up(context: BenchContext) -> tuple[Mapping[int, Mapping[str, Method]], IsolatedChild]:
+    """Return the methods that need no render child, and a child for the others."""
+    import torch
+
+    from model.neural_renderer import NeuralRenderer
+    from train.loop.checkpoints import network_of_run
+
+    torch.set_num_threads(1)  # core-seconds of waiting threads are not the network's
+    paths = context.options.checkpoint
+    given = dict(zip(network_labels(paths), paths, strict=True))
+    renderers = {}
+    for label, path in (dict(zip(BUILTIN_NETWORKS, BUILTIN_NETWORKS, strict=True)) | given).items():
+        renderer = NeuralRenderer.load(path, device="cpu", finders=[network_of_run])
+        renderers[network_name(label)] = renderer
+        context.note(f"{network_name(label)} is {renderer.digest[:8]}")
+    context.note(f"differences are to {network_name(network_labels(paths)[0])}")
+    renderers[TRACED_LIGHT] = traced_network()
+    methods = {
+        px: {
+            **{name: network_method(renderer, px) for name, renderer in renderers.items()},
+            DIRECT_LIGHT: direct_light_method(px),
+        }
+        for px in WIDTHS
+    }
+    return methods, context.render_child(held_out_build(), BENCHMARK, threads=1)
+
+
+def timed_samples(scene: Scene, px: int) -> list[TimedViews]:
+    """Return the first view by each level of SAMPLES; runs in a render child."""
+    warm_up_denoiser(px)
+    return [timed_method(sampled_method(px, *level), scene) for level in SAMPLES]
+
+
+def judged_figures(picture: TimedViews, scene: Scene, reference: RawReference) -> Figures:
+    """Return the figures of a picture; references' noise is in none of the decibels."""
+    from train.evaluation.metrics import picture_scores
+
+    shown = picture.radiance_rgb
+    hits = first_hits(scene, resolution=len(shown)).met
+    everywhere = np.ones_like(hits)
+    mean = 0.5 * (reference.a_rgb + reference.b_rgb)
+    return {
+        "core_s": picture.first_s,
+        "view_s": picture.further_s,
+        "db": true_error_db(shown, reference, log10_radiance, everywhere)[0],
+        "object_db": true_error_db(shown, reference, log10_radiance, hits)[0],
+        "linear_db": true_error_db(shown, reference, clamped_radiance, everywhere)[0],
+        "ssim": float(picture_scores(shown, mean.astype(np.float32), hits, None)["ssim"] or 0.0),
+    }
+
+
+EXPERIMENT = Experiment(
+    name="methods",
+    title="Methods to a picture: what is traced and what is learned",
+    about=f"One view each of scenes of `{BENCHMARK}`, which no network was trained on, of at most "
+    f"{TRIANGLES} triangles, at 64 and 256 pixels; one thread, everything warm.",
+    cost=Column(name="a scene's first view, core-s", figure="core_s"),
+    error=Column(name="psnr_log_db, dB", figure="db"),
+    better="higher",
+    columns=(
+        Column(name="a further view, core-s", figure="view_s"),
+        Column(name="5th percentile, dB", figure="db", over="p5"),
+        Column(name="more than the first network, dB", figure="db", over="pair"),
+        Column(name="object, dB", figure="object_db"),
+        Column(name="linear, dB", figure="linear_db"),
+        Column(name="SSIM", figure="ssim"),
+    ),
+    also_cost=("a further view, core-s",),
+    because="Errors are to raw samples in two halves: neither their noise nor a denoiser is in "
+    "them. Differences are view by view, with the 95 % interval of their mean over scenes.",
+    points=_points,
+    trials=lambda scale, options: [f"held-out {index}" for index in range(scale.scenes)],
+    measure=_measure,
+    needs=("torch",),
+)

@@ -1,0 +1,123 @@
+"""Two trainings that differ in any settings, with equal seeds, judged on the same scenes."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from infra.bench.context import BenchContext
+from infra.bench.experiment import (
+    BenchScale,
+    Column,
+    Experiment,
+    Figures,
+    Point,
+    device_of,
+)
+from infra.bench_options import BenchOptions
+from storage.errors import Rejected, TrilightError
+
+if TYPE_CHECKING:
+    from infra.bench.workloads.trainings import TrainingScenes
+    from train.settings import TrainSettings
+
+SIDE_A, SIDE_B = "a", "b"
+PRESET = "smoke"
+
+
+def settings_of(side: str, seed: int, scale: BenchScale, options: BenchOptions) -> "TrainSettings":
+    """Return the settings of one side's training.
+
+    Raises:
+        TrilightError: several presets are named, or a change is none of their settings.
+    """
+    from train.runs import changed_run
+
+    if len(options.run) > 1:
+        raise TrilightError(
+            f"bench paired-training: --run names {len(options.run)} presets; expected one. Say "
+            "what differs by --set-a and --set-b."
+        )
+    own = options.set_a if side == SIDE_A else options.set_b
+    changes = {"seed": seed, **options.changes, **own}
+    steps = changes.pop("num_steps", scale.steps)  # warm-up and decay are in proportion
+    return changed_run((options.run or (PRESET,))[0], changes, steps=steps)
+
+
+def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
+    return [
+        Point(name=SIDE_A, kind=SIDE_A, default=True),
+        Point(name=SIDE_B, kind=SIDE_B, rival=SIDE_A),
+    ]
+
+
+def _trials(scale: BenchScale, options: BenchOptions) -> list[str]:
+    return [
+        f"seed {seed}, scene {scene}"
+        for seed in range(options.seeds)
+        for scene in range(scale.held_out)
+    ]
+
+
+def scene_of(trial: str) -> str:
+    """Return the scene of a trial: its errors with all seeds are one cluster."""
+    return trial.partition(", ")[2]
+
+
+def _measure(
+    context: BenchContext, points: Sequence[Point], trial: str
+) -> Iterator[tuple[str, Figures]]:
+    seed, scene = (int(part.split()[1]) for part in trial.split(", "))
+    for point in points:
+        key = (point.name, seed)
+        found = context.kept(key, lambda key=key: _train(context, *key))  # type: ignore[misc]
+        if scene >= len(found):
+            raise Rejected("no_scene", f"the validation split has {len(found)} scenes")
+        yield point.name, found[scene]
+
+
+def _train(context: BenchContext, side: str, seed: int) -> Sequence[Mapping[str, float]]:
+    import torch
+
+    from infra.bench.workloads.trainings import training_figures
+    from train.loop.crew import choose_device
+
+    options = context.options
+    settings = settings_of(side, seed, context.scale, options)
+    scenes = context.kept(("scenes", settings.resolution), lambda: _scenes(context, settings))
+    context.note(scenes.about)
+    own = options.set_a if side == SIDE_A else options.set_b
+    changed = ", ".join(f"{name}={value}" for name, value in own.items()) or "as it is"
+    context.note(f"{side}: {settings.run}, {settings.num_steps} steps, {changed}")
+    if device_of(options) == "cpu":
+        torch.set_num_threads(context.cores)
+    return training_figures(scenes, settings, choose_device(device_of(options)))
+
+
+def _scenes(context: BenchContext, settings: "TrainSettings") -> "TrainingScenes":
+    from infra.bench.workloads.trainings import scenes_of
+
+    return scenes_of(context.options.data or "", context.scale.held_out, settings.resolution)
+
+
+EXPERIMENT = Experiment(
+    name="paired-training",
+    title="Two trainings, side by side",
+    about="A training preset with the changes of --set-a and with those of --set-b, from the same "
+    "seeds, judged on scenes of the validation split of `--data`.",
+    cost=Column(name="seconds of a training", figure="seconds", over="mean"),
+    error=Column(
+        name="held-out log L1, thousandths", figure="log_l1", over="mean", then=lambda l1: 1000 * l1
+    ),
+    columns=(
+        Column(name="a step, s", figure="step_s", over="mean"),
+        Column(name="psnr_log_db, dB", figure="db", over="mean"),
+        Column(name="more error than a, %", figure="percent", over="pair"),
+        Column(name="more than a, dB", figure="db", over="pair"),
+    ),
+    because="Differences are of pairs of one seed and scene, with the 95 % interval of their mean, "
+    "bootstrapped over scenes: it says nothing of other seeds where there are few.",
+    points=_points,
+    trials=_trials,
+    measure=_measure,
+    cluster=scene_of,
+    needs=("torch", "data"),
+)

@@ -1,0 +1,90 @@
+"""What a device is, and what it reaches: products by type, copies within it and to it."""
+
+import shutil
+import subprocess
+import time
+from collections.abc import Callable
+
+import torch
+
+from model.precision import quick_products
+
+_ANSWER_S = 60
+REPEATS = 5
+
+
+def device_facts(device: torch.device) -> str:
+    """Return a sentence on a device: memory, libraries, driver; no serial number."""
+    if device.type != "cuda":
+        return f"no GPU: torch {torch.__version__} with {torch.get_num_threads()} threads"
+    found = torch.cuda.get_device_properties(device)
+    return (
+        f"{found.name}, {found.total_memory / 2**30:.0f} GiB, torch {torch.__version__}, CUDA "
+        f"{torch.version.cuda}, driver {_driver(device.index or 0)}"
+    )
+
+
+def _driver(index: int) -> str:
+    smi = shutil.which("nvidia-smi")
+    if smi is None:
+        return "unknown"
+    command = [smi, f"--id={index}", "--query-gpu=driver_version", "--format=csv,noheader"]
+    try:
+        return subprocess.run(
+            command, capture_output=True, text=True, timeout=_ANSWER_S, check=True
+        ).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+
+
+def product_figures(device: torch.device, kind: str, width: int) -> dict[str, float]:
+    """Return the time and FLOPs a second of a large square product: the best of five.
+
+    Args:
+        device: where.
+        kind: float32, tf32, bfloat16 or float16.
+        width: of the matrix.
+    """
+    dtype = torch.float32 if kind == "tf32" else getattr(torch, kind)
+    matrix = torch.randn(width, width, device=device).to(dtype)
+    with quick_products(device, wanted=kind == "tf32"):
+        seconds = best_s(lambda: matrix @ matrix, device)
+    return {"ms": 1e3 * seconds, "teraflop_per_s": 2 * width**3 / seconds / 1e12}
+
+
+def copy_figures(device: torch.device, kind: str, size: int) -> dict[str, float]:
+    """Return the time and bytes a second of a copy.
+
+    Args:
+        device: where.
+        kind: within (what is read and written counts), to_pageable or to_pinned.
+        size: bytes that are copied.
+    """
+    target = torch.zeros(size, dtype=torch.uint8, device=device)
+    if kind == "within":
+        source = torch.zeros(size, dtype=torch.uint8, device=device)
+    else:
+        source = torch.zeros(size, dtype=torch.uint8)
+        source = source.pin_memory() if kind == "to_pinned" else source
+    seconds = best_s(lambda: target.copy_(source, non_blocking=kind == "to_pinned"), device)
+    moved = 2 * size if kind == "within" else size
+    return {"ms": 1e3 * seconds, "gigabyte_per_s": moved / seconds / 1e9}
+
+
+def best_s(work: Callable[[], object], device: torch.device, repeats: int = REPEATS) -> float:
+    """Return the seconds of the quickest of some calls, after one that is not counted."""
+    work()
+    wait_for(device)
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        work()
+        wait_for(device)
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+def wait_for(device: torch.device) -> None:
+    """Wait until a device has done all that it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

@@ -1,0 +1,170 @@
+"""The points of a run as rows of a table: columns, intervals, and whether on the front."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from infra.bench.experiment import Column, Experiment, Point, columns_of
+from infra.bench.store import Run
+from infra.cost_tables import number_text, on_front
+from storage.errors import TrilightError
+from storage.intervals import mean_interval
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One point beside the others."""
+
+    point: Point
+    """The point's declaration, without its settings."""
+    values: Mapping[str, float]
+    """Value of each measured column, by name."""
+    intervals: Mapping[str, tuple[float, float]]
+    """The 95 % interval of each column over `pair`, by name."""
+    cost_range: tuple[float, float] | None
+    """Smallest and largest cost over the trials; None where there was one trial."""
+    on_front: bool | None
+    """Whether no other point of its group dominates it; None without an error, and for what is no
+    choice."""
+
+
+def rows_of(experiment: Experiment, run: Run) -> list[Row]:
+    """Return the points of a run in their declared order, without those it did not measure.
+
+    Raises:
+        TrilightError: the run is of another experiment, or nothing was measured.
+    """
+    if run.plan["experiment"] != experiment.name:
+        raise TrilightError(
+            f"bench {experiment.name}: the file holds results of {run.plan['experiment']!r}; "
+            "expected one experiment a file. Name another one by --out."
+        )
+    points = [Point(**record) for record in run.plan["points"]]
+    values = {point.name: _values(experiment, run, point) for point in points}
+    known = [point for point in points if values[point.name].get(experiment.cost.name, 0) > 0]
+    if not known:
+        raise TrilightError(f"bench {experiment.name}: no point was measured; run it again.")
+    front = _front(experiment, known, values)
+    return [
+        Row(
+            point=point,
+            values=values[point.name],
+            intervals=_intervals(experiment, run, point),
+            cost_range=_cost_range(experiment, run, point.name),
+            on_front=front.get(point.name),
+        )
+        for point in known
+    ]
+
+
+def table_of(experiment: Experiment, run: Run) -> Iterator[list[str]]:
+    """Yield the headings, and the cells of every point with the range of its cost."""
+    rows, columns = rows_of(experiment, run), columns_of(experiment)
+    has_front = experiment.error is not None and any(row.on_front is not None for row in rows)
+    yield ["setting", *(column.name for column in columns), *(["front"] if has_front else [])]
+    for row in rows:
+        name = f"{row.point.name} *" if row.point.default else row.point.name
+        front = {True: "yes", False: "no", None: "n/a"}[row.on_front]
+        cells = [_cell(column, row) for column in columns]
+        if row.cost_range:
+            cells[0] += f" ({' to '.join(map(number_text, row.cost_range))})"
+        yield [name, *cells, *([front] if has_front else [])]
+
+
+def _cell(column: Column, row: Row) -> str:
+    """Return one cell: decibels with one digit behind the point, n/a for what is not known."""
+    value = row.values.get(column.name)
+    if value is None:
+        return "" if column.over == "pair" else "n/a"
+    if column.name in row.intervals:
+        low, high = row.intervals[column.name]
+        return f"{value:+.1f} ({low:.1f} to {high:.1f})"
+    return f"{value:.1f}" if "dB" in column.name else number_text(value)
+
+
+_OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {
+    "median": np.median,
+    "mean": np.mean,
+    "pair": np.mean,
+    "least": np.min,
+    "most": np.max,
+    "p5": lambda values: np.percentile(values, 5),
+    "p95": lambda values: np.percentile(values, 95),
+}
+
+
+def _values(experiment: Experiment, run: Run, point: Point) -> dict[str, float]:
+    whole, found = run.whole_trials(), {}
+    for column in columns_of(experiment):
+        if column.over == "pair":
+            figures, trials = _differences(column, run, point)
+        else:
+            trials = [t for t in whole if column.figure in run.trials[t][point.name]]
+            figures = [run.trials[t][point.name][column.figure] for t in trials]
+        if figures:
+            value = _over(column, figures, [experiment.cluster(trial) for trial in trials])
+            found[column.name] = column.then(value) if column.then else value
+    return found
+
+
+def _over(column: Column, figures: Sequence[float], clusters: Sequence[str]) -> float:
+    if column.over in ("low", "high"):
+        return mean_interval(figures, clusters)[column.over == "high"]
+    return float(_OVER[column.over](figures))
+
+
+def _differences(column: Column, run: Run, point: Point) -> tuple[list[float], list[str]]:
+    """Return a point's figures less its rival's, with the trials that have both."""
+    if point.rival is None:
+        return [], []
+    name = column.figure
+    pairs = {
+        trial: (run.trials[trial][point.name], run.trials[trial][point.rival])
+        for trial in run.whole_trials()
+    }
+    both = {trial: pair for trial, pair in pairs.items() if all(name in one for one in pair)}
+    return [mine[name] - theirs[name] for mine, theirs in both.values()], list(both)
+
+
+def _intervals(experiment: Experiment, run: Run, point: Point) -> dict[str, tuple[float, float]]:
+    found = {}
+    for column in columns_of(experiment):
+        if column.over == "pair":
+            differences, trials = _differences(column, run, point)
+            if differences:
+                clusters = [experiment.cluster(trial) for trial in trials]
+                found[column.name] = mean_interval(differences, clusters)
+    return found
+
+
+def _cost_range(experiment: Experiment, run: Run, point: str) -> tuple[float, float] | None:
+    column = experiment.cost
+    trials = [run.trials[trial][point] for trial in run.whole_trials()]
+    costs = [trial[column.figure] for trial in trials if column.figure in trial]
+    if len(costs) < 2:
+        return None
+    least, most = sorted(column.then(c) if column.then else c for c in (min(costs), max(costs)))
+    return least, most
+
+
+def _front(
+    experiment: Experiment, known: Sequence[Point], values: Mapping[str, Mapping[str, float]]
+) -> dict[str, bool]:
+    """Return which points of each group are on its front, by name."""
+    if experiment.error is None:
+        return {}
+    error, sign = experiment.error.name, -1 if experiment.better == "higher" else 1
+    costs, found = (experiment.cost.name, *experiment.also_cost), dict[str, bool]()
+    for group in dict.fromkeys(point.group for point in known):
+        names = [
+            point.name
+            for point in known
+            if point.group == group and point.judged and error in values[point.name]
+        ]
+        figures = [
+            (sign * values[name][error], [values[name][cost] for cost in costs]) for name in names
+        ]
+        found |= dict(zip(names, on_front(figures), strict=True))
+    return found

@@ -1,0 +1,84 @@
+"""Blender as a Python module, in an environment of its own.
+
+Blender is under the GPL, large, and exists for one version of Python. So it is never a dependency:
+it is installed from the package index into the user's cache when a comparison asks for it, and only
+a process of its own imports it (infra.bench.workloads.blender_process).
+"""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from storage.cache import cache_folder
+from storage.errors import TrilightError
+
+BLENDER = "4.5.15"
+"""The version of Blender, and of its wheel; the reference pictures were made with it."""
+
+PYTHON = "3.11"
+"""The one version of Python that this wheel exists for."""
+
+_INSTALL_S = 1800
+_PROBE = f"import bpy; assert bpy.app.version_string.startswith({BLENDER!r})"
+_READY = "ready"
+
+
+def installed_python() -> Path | None:
+    """Return the Python that can import Blender, or None where it has not been set up."""
+    folder = _folder()
+    return _python_of(folder) if (folder / _READY).is_file() else None
+
+
+def blender_python() -> Path:
+    """Return the Python that can import Blender, after installing it (380 MB) where need be.
+
+    Raises:
+        TrilightError: there is no Python of that version, the package index does not give the
+            wheel, or what it gave cannot be loaded here.
+    """
+    found = installed_python()
+    if found:
+        return found
+    folder = _folder()
+    _run("make its environment", [_base_python(), "-m", "venv", "--clear", str(folder)])
+    python = _python_of(folder)
+    pip = [str(python), "-m", "pip", "install", "--quiet", "--only-binary", ":all:"]
+    _run("install it from the package index", [*pip, f"bpy=={BLENDER}"])
+    _run("load it", [str(python), "-I", "-c", _PROBE])
+    (folder / _READY).touch()  # last: an interrupted installation begins anew
+    return python
+
+
+def _folder() -> Path:
+    return cache_folder("cycles") / f"bpy-{BLENDER}"
+
+
+def _python_of(folder: Path) -> Path:
+    return folder / "bin" / "python"
+
+
+def _base_python() -> str:
+    """Return a Python of the wheel's version: this one, or one on the path."""
+    if f"{sys.version_info.major}.{sys.version_info.minor}" == PYTHON:
+        return sys.executable
+    found = shutil.which(f"python{PYTHON}")
+    if found is None:
+        raise _unavailable(f"python{PYTHON} is not on the path; install that version of Python")
+    return found
+
+
+def _run(step: str, command: list[str]) -> None:
+    try:
+        result = subprocess.run(
+            command, capture_output=True, text=True, timeout=_INSTALL_S, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise _unavailable(f"could not {step} ({type(error).__name__})") from error
+    if result.returncode:
+        said = (result.stderr or result.stdout).strip().splitlines()
+        raise _unavailable(f"could not {step}: {said[-1] if said else 'no message'}")
+
+
+def _unavailable(why: str) -> TrilightError:
+    return TrilightError(f"Blender {BLENDER}: {why}.")

@@ -1,0 +1,142 @@
+"""A view of a `Scene` as Blender's Cycles renders it, from its arrays or our USD; with its cost."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.bench.workloads.blender_environment import blender_python
+from storage.errors import TrilightError
+from storage.records.scene import ARRAY_FIELDS, Scene
+
+_SCRIPT = Path(__file__).with_name("blender_process.py")
+_USD_SCRIPT = Path(__file__).with_name("usd_process.py")
+_TIMEOUT_S = 4 * 3600
+
+
+@dataclass(frozen=True, kw_only=True)
+class CyclesOptions:
+    """How Cycles shall render a view."""
+
+    resolution: int
+    """Width and height in pixels."""
+    spp: int
+    """Samples per pixel; adaptive sampling is off."""
+    denoise: bool
+    """Whether Open Image Denoise cleans the picture, with Cycles' own albedo and normals."""
+    bounces: int = 8
+    """Most bounces, of each kind and in sum: 8 is Mitsuba's max_depth 10, 0 is direct light."""
+    seed: int = 0
+    """Seed of the samples."""
+    threads: int = 1
+    """Threads of Cycles; the denoiser takes all that the process may use."""
+
+    def with_seed(self, seed: int) -> "CyclesOptions":
+        """Return the same with another seed."""
+        return dataclasses.replace(self, seed=seed)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CyclesPicture:
+    """One finished picture and its cost."""
+
+    radiance_rgb: NDArray[np.float32]
+    """[R, R, 3] linear radiance."""
+    render_s: float
+    """What Cycles itself states, to 10 ms: sampling and denoising, on the clock. Starting Blender,
+    reading the scene and building its tree of triangles came before."""
+    core_s: float
+    """Core-seconds of that call, with what little Blender does around it; other work on the
+    machine moves them less than the clock."""
+    prepare_s: float
+    """Wall time before that: filling Blender's scene, and a picture of one sample."""
+
+
+def cycles_picture(scene: Scene, view: int, options: CyclesOptions) -> CyclesPicture:
+    """Render one view in a process of its own.
+
+    Args:
+        scene: that passes `Scene.check`.
+        view: row of its cameras.
+        options: how.
+
+    Raises:
+        TrilightError: Blender cannot be had (blender_environment), or it failed.
+    """
+    python = blender_python()
+    camera = {"c2w": scene.c2w[view].tolist(), "fov_deg": float(scene.fov_deg[view])}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        np.savez(folder / "scene.npz", **{field: getattr(scene, field) for field in ARRAY_FIELDS})
+        asked = {**dataclasses.asdict(options), **camera}
+        (folder / "request.json").write_text(json.dumps(asked))
+        _run_blender(_SCRIPT, folder, python)
+        timing = json.loads((folder / "timing.json").read_text())
+        return CyclesPicture(
+            radiance_rgb=np.load(folder / "picture.npy", allow_pickle=False),
+            render_s=timing["render_s"],
+            core_s=timing["core_s"],
+            prepare_s=timing["prepare_s"],
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CyclesSamples:
+    """Pictures of one view that share no samples, and their cost."""
+
+    pictures_rgb: tuple[NDArray[np.float32], ...]
+    """[R, R, 3] linear radiance, a picture a seed."""
+    core_s: float
+    """Core-seconds of all renders; reading the file came before."""
+
+
+def cycles_of_usd(usd: Path, options: CyclesOptions, seeds: Sequence[int]) -> CyclesSamples:
+    """Render the first view of a USD file of ours as Blender shows it after our script.
+
+    Args:
+        usd: the file, with what it names beside it.
+        options: how; its seed counts for nothing.
+        seeds: of the samples of each picture.
+
+    Raises:
+        TrilightError: as `cycles_picture`.
+    """
+    python = blender_python()
+    asked = {**dataclasses.asdict(options), "usd": str(usd.resolve()), "seeds": list(seeds)}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "request.json").write_text(json.dumps(asked))
+        _run_blender(_USD_SCRIPT, folder, python)
+        found = [folder / f"picture{number}.npy" for number in range(len(seeds))]
+        return CyclesSamples(
+            pictures_rgb=tuple(np.load(path, allow_pickle=False) for path in found),
+            core_s=json.loads((folder / "timing.json").read_text())["core_s"],
+        )
+
+
+def _run_blender(script: Path, folder: Path, python: Path) -> None:
+    """Run the script; what Blender writes of its own accord stays in the folder."""
+    surroundings = {**os.environ, "HOME": str(folder), "BLENDER_USER_RESOURCES": str(folder)}
+    try:
+        result = subprocess.run(
+            [str(python), "-I", str(script), str(folder)],
+            env=surroundings,
+            capture_output=True,
+            text=True,
+            timeout=_TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise TrilightError(f"Cycles: no picture within {_TIMEOUT_S} s.") from error
+    if result.returncode or not (folder / "timing.json").is_file():
+        said = (result.stderr or result.stdout).strip().splitlines()
+        raise TrilightError(
+            f"Cycles: exit status {result.returncode}: {said[-1] if said else 'no message'}."
+        )

@@ -1,0 +1,131 @@
+"""Plain Mitsuba's pictures of a view at rising numbers of samples, with their price.
+
+This is what a user of plain Mitsuba would run: stock `path` with its defaults and the
+`independent` sampler, and Open Image Denoise once. Material and emitters are those of
+tests/oracle/plugin_scene.py, which a checkout alone has: without its one texture rough metals would
+lose light, and no number of samples would give the right picture. Its emitters are chosen by their
+power, which is more than a user gets without asking, and the denoiser reads our own guide pictures:
+both favour this side.
+"""
+
+import importlib
+import sys
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.rendering.methods import warm_up_denoiser
+from infra.rendering.raw_references import first_camera
+from pipeline.renders.camera import Camera
+from pipeline.renders.denoiser import denoise
+from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.settings import RenderSettings
+from pipeline.renders.tracer import Features
+from storage.errors import TrilightError
+from storage.installation import IMPORT_ROOT
+from storage.records.scene import Scene
+from storage.seeds import seed_for
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlainPicture:
+    """One view with a fixed number of samples."""
+
+    spp: int
+    """Samples per pixel."""
+    radiance_rgb: NDArray[np.float32]
+    """[R, R, 3] linear radiance."""
+    core_s: float
+    """Core-seconds of this picture alone, kernels warm and scene loaded."""
+
+
+_RR_DEPTH = 5
+"""Mitsuba's default."""
+
+
+def render_levels(
+    scene: Scene, resolution: int, levels_spp: tuple[int, ...], seed: int
+) -> list[PlainPicture]:
+    """Render a scene's first view with each number of samples; no sample is traced twice.
+
+    Core-seconds are those of the samples, the guide pictures, and one denoise.
+
+    Args:
+        scene: that passes `Scene.check`.
+        resolution: pixels each way.
+        levels_spp: rising. Mitsuba is called once for what each adds to the one before, in steps
+            as large as a user's, since few samples a call cost it up to a tenth.
+        seed: of the view.
+    """
+    camera = first_camera(scene, resolution)
+    _Plain(scene).radiance(camera, seed_for(seed, "plain warm-up"), levels_spp[0])
+    warm_up_denoiser(resolution)
+    plain = _Plain(scene)
+    features, core_s = _features(scene, camera)
+    total, before, levels = np.zeros((resolution, resolution, 3)), 0, []
+    for spp in levels_spp:
+        started = time.process_time()
+        total += (spp - before) * plain.radiance(camera, seed_for(seed, "plain", spp), spp - before)
+        core_s += time.process_time() - started
+        started = time.process_time()
+        picture = denoise((total / spp).astype(np.float32), features, "high")
+        finished_core_s = core_s + time.process_time() - started
+        levels.append(PlainPicture(spp=spp, radiance_rgb=picture, core_s=finished_core_s))
+        before = spp
+    return levels
+
+
+def _features(scene: Scene, camera: Camera) -> tuple[Features, float]:
+    tracer = load_tracer(scene, max_depth=RenderSettings.max_depth, rr_depth=_RR_DEPTH)
+    aux_spp = RenderSettings.aux_spp
+    tracer.features(camera, spp=aux_spp)  # compiles
+    started = time.process_time()
+    features = tracer.features(camera, spp=aux_spp)
+    return features, time.process_time() - started
+
+
+def _oracle(name: str) -> Any:
+    """Return a module of the tests' oracle; raises TrilightError outside a checkout."""
+    sys.path.append(str(IMPORT_ROOT))
+    try:
+        return importlib.import_module(f"tests.oracle.{name}")
+    except ModuleNotFoundError as error:
+        raise TrilightError(
+            f"plain Mitsuba: no tests/oracle/{name}.py below {IMPORT_ROOT}; expected a checkout. "
+            "Run the experiment from one."
+        ) from error
+    finally:
+        sys.path.remove(str(IMPORT_ROOT))
+
+
+class _Plain:
+    """A scene with its integrator."""
+
+    def __init__(self, scene: Scene) -> None:
+        import mitsuba  # not before `activate`, which says where compiled kernels are kept
+
+        self._mi = mitsuba
+        self._scene = _oracle("plugin_scene").plugin_scene(scene)
+        self._sensor = _oracle("plugin_tracer").stock_sensor
+        self._path = mitsuba.load_dict(
+            {
+                "type": "path",
+                "max_depth": RenderSettings.max_depth,
+                "rr_depth": _RR_DEPTH,
+                "hide_emitters": True,
+            }
+        )
+
+    def radiance(self, camera: Camera, seed: int, spp: int) -> NDArray[np.float64]:
+        """Return the mean of `spp` samples, [R, R, 3]."""
+        picture = self._mi.render(
+            self._scene,
+            sensor=self._sensor(camera, {"type": "independent", "sample_count": spp}),
+            integrator=self._path,
+            seed=self._mi.UInt32(seed),
+            spp=spp,
+        )
+        return np.array(picture, np.float64)

@@ -1,0 +1,66 @@
+"""One view by the product's renderer under several settings, each with its price.
+
+Core-seconds are those of the process: sampling, guide pictures, measuring the stated error, and the
+one denoise that makes the picture. Loading the scene is not counted; kernels are warm.
+"""
+
+import dataclasses
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from infra.rendering.methods import warm_up_denoiser
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
+from pipeline.renders.settings import RenderSettings
+from storage.metrics import MAX_DB
+from storage.records.scene import Scene
+
+SEED = 20_261_122
+"""Seed of these pictures; no dataset preset and no run uses it."""
+
+_SMALL = 32
+"""Width of what only compiles, in pixels."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shot:
+    """One view under one setting."""
+
+    view: RenderedView
+    """The picture with its stated errors and its samples."""
+    core_s: float
+    """Core-seconds without loading the scene."""
+
+
+def fixed_samples(resolution: int, spp: int) -> RenderSettings:
+    """Return settings that no stated error stops early.
+
+    Args:
+        resolution: pixels each way.
+        spp: samples per pixel; a multiple of 128 for the best sampling.
+    """
+    return RenderSettings(
+        resolution=resolution,
+        noise_floor_db=MAX_DB - 1,
+        min_spp=spp,
+        max_spp=spp,
+        min_mean_radiance=0.0,
+    )
+
+
+def shots(scene: Scene, variants: Mapping[str, RenderSettings]) -> dict[str, Shot]:
+    """Return a scene's first view under each setting, with equal seeds; runs in a render child."""
+    return {name: _shot(scene, settings) for name, settings in variants.items()}
+
+
+def _shot(scene: Scene, settings: RenderSettings) -> Shot:
+    small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
+    pose, fov_deg = scene.c2w[0], float(scene.fov_deg[0])
+    SceneRenderer(scene, small).render_view(pose, fov_deg, seed=0)  # compiles
+    if settings.denoiser != "off":
+        warm_up_denoiser(settings.resolution, settings.denoiser)
+    renderer = SceneRenderer(scene, settings)
+    began = time.process_time()
+    view = renderer.render_view(pose, fov_deg, SEED)
+    return Shot(view=view, core_s=time.process_time() - began)

@@ -1,0 +1,103 @@
+"""Short trainings of any settings, judged scene by scene on what no network has seen."""
+
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from model.costs import Workload, training_flops
+from model.renderformer import RenderFormer
+from storage.dataset.shard_set import ShardSet
+from storage.dataset.training_data import open_training_data
+from storage.errors import TrilightError
+from train.data.buckets import bucket_scenes
+from train.data.stream import stream_batches
+from train.data.unusable import Unusable, first_samples
+from train.evaluation.judge import Judge
+from train.loop.crew import Crew
+from train.loop.muon import fitting_precision
+from train.loop.schedule import learning_rate
+from train.loop.state import new_state
+from train.loop.step import Stepper
+from train.loss.objective import Objective
+from train.run import stream_settings
+from train.settings import TrainSettings
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrainingScenes:
+    """The scenes of all trainings of an experiment: those they see, and those they do not."""
+
+    train: ShardSet
+    judge: Judge
+    about: str
+    """Numbers of scenes and digest of the data, for the result's notes."""
+
+
+def scenes_of(data: str, held_out: int, resolution: int) -> TrainingScenes:
+    """Return the scenes of a dataset, judged on the first ones of its validation split.
+
+    Raises:
+        TrilightError: the validation split is empty.
+    """
+    opened = open_training_data([data])
+    samples = list(first_samples(opened.split("validation"), held_out, Unusable(0)))
+    if not samples:
+        raise TrilightError(
+            f"--data {opened.shown}: its validation split is empty; expected scenes to judge on."
+        )
+    train = opened.split("train")
+    count = sum(train.num_samples(number) for number in range(len(train.names)))
+    return TrainingScenes(
+        train=train,
+        judge=Judge(samples, resolution, np.zeros((resolution, resolution, 3))),
+        about=f"{count} scenes seen, {len(samples)} judged on, data {opened.digest[:8]}",
+    )
+
+
+def training_figures(
+    scenes: TrainingScenes, settings: TrainSettings, device: torch.device
+) -> Sequence[Mapping[str, float]]:
+    """Train a network from the start and return the figures of each judged scene.
+
+    `percent` is 100 times the logarithm of the error, so that differences are per cent of it.
+    """
+    began = time.perf_counter()
+    model = _trained_network(scenes.train, settings, device)
+    seconds = time.perf_counter() - began
+    views, found = iter(scenes.judge.judge(model).views), []
+    for judged in scenes.judge.scenes:
+        mine = [next(views) for _ in judged.target_VRR3]
+        l1 = float(np.mean([view.log_l1 for view in mine]))
+        figures = {"seconds": seconds, "step_s": seconds / settings.num_steps}
+        if np.isfinite(l1) and l1 > 0:
+            db = float(np.mean([view.psnr_log_db for view in mine]))
+            figures |= {"log_l1": l1, "percent": 100 * float(np.log(l1)), "db": db}
+        found.append(figures)
+    return found
+
+
+def _trained_network(
+    shards: ShardSet, settings: TrainSettings, device: torch.device
+) -> RenderFormer:
+    crew = Crew(device=device)
+    state = new_state(settings, device, muon_precision=fitting_precision(crew))
+    stepper = Stepper(state, settings, Objective(settings.loss, None), crew)
+
+    def flops(triangles: int) -> int:
+        views, resolution = settings.views_per_scene, settings.resolution
+        workload = Workload(triangles=triangles, views=views, resolution=resolution)
+        return training_flops(settings.model, workload)
+
+    stream = stream_batches(
+        shards, stream_settings(settings), 0, share=crew.share, workers=1, unusable=state.unusable
+    )
+    with closing(stream) as batches:
+        for step in range(settings.num_steps):
+            buckets = bucket_scenes(next(batches), flops, settings.scenes_per_pass)
+            stepper.take(buckets, learning_rate(step, settings))  # no step waits for its figures
+            state.step += 1
+    return state.model.eval()

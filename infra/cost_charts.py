@@ -1,0 +1,158 @@
+"""Charts of errors against costs: each cost a mark, each kind of point a color, names beside them.
+
+A point stands at its first cost and at each further one, both at its error, with a line between.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+_COLORS = ("#c0392b", "#2e7d32", "#1f5fa8", "#7d5a00", "#6a3d9a")
+"""Of kinds, in the order in which they come; dark enough for small marks on white."""
+
+_FONT = 9
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeriesPoint:
+    """One point with several costs."""
+
+    name: str
+    """Written beside it."""
+    kind: str
+    """What it is one of: its color."""
+    costs: Sequence[float]
+    """Above 0, one for each series."""
+    error: float
+    """Its height."""
+
+
+def colors_of(points: Sequence[SeriesPoint]) -> dict[str, str]:
+    """Return the color of each kind, in the order in which they come."""
+    kinds = list(dict.fromkeys(one.kind for one in points))
+    return {name: _COLORS[row % len(_COLORS)] for row, name in enumerate(kinds)}
+
+
+def draw_points(axes: Any, points: Sequence[SeriesPoint], colors: Mapping[str, str]) -> None:
+    """Draw each point at each of its costs, on a logarithmic axis."""
+    axes.grid(alpha=0.25)
+    axes.set_xscale("log")
+    axes.margins(x=0.14, y=0.12)
+    axes.tick_params(labelsize=_FONT)
+    for one in points:
+        color = colors[one.kind]
+        heights = [one.error] * len(one.costs)
+        axes.plot(one.costs, heights, "-", color=color, linewidth=1, alpha=0.5)
+        for row, cost in enumerate(one.costs):
+            face = color if row == 0 else "white"
+            axes.plot(cost, one.error, "o", color=color, markerfacecolor=face, markersize=6)
+    plain_log(axes.xaxis)
+
+
+def name_points(axes: Any, points: Sequence[SeriesPoint]) -> None:
+    """Write each name beside the point's first cost; the figure was drawn once."""
+    names = [(one.name, (one.costs[0], one.error)) for one in points]
+    others = [(cost, one.error) for one in points for cost in one.costs[1:]]
+    _place_labels(axes, names, others)
+
+
+def draw_legend(figure: Any, costs: Sequence[str], colors: Mapping[str, str]) -> None:
+    """Say below the axes which mark is which cost, and which color which kind."""
+    from matplotlib.lines import Line2D
+
+    grey = [
+        Line2D([], [], linestyle="", marker="o", color="0.35", label=cost,
+               markerfacecolor="0.35" if row == 0 else "white")
+        for row, cost in enumerate(costs)
+    ]  # fmt: skip
+    kinds = [Line2D([], [], linewidth=4, color=color, label=name) for name, color in colors.items()]
+    figure.legend(
+        handles=[*kinds, *(grey if len(costs) > 1 else ())],
+        loc="outside lower center", ncols=3, fontsize=_FONT, frameon=False,
+    )  # fmt: skip
+
+
+_PLACES = (
+    (8, 5, "left", "bottom"),
+    (8, -5, "left", "top"),
+    (-8, 5, "right", "bottom"),
+    (-8, -5, "right", "top"),
+    (0, 9, "center", "bottom"),
+    (0, -9, "center", "top"),
+    (9, 0, "left", "center"),
+    (-9, 0, "right", "center"),
+    (0, 9, "left", "bottom"),
+    (0, -9, "left", "top"),
+)
+"""Offsets in printer's points, with the alignment of the name; the first free one is taken."""
+_CLEAR_PX = 7
+"""Kept free around each point, so that no name covers it or its ring."""
+
+
+def _place_labels(
+    axes: Any,
+    names: Sequence[tuple[str, tuple[float, float]]],
+    also_clear: Sequence[tuple[float, float]],
+) -> None:
+    """Write names beside their points, where they cover neither a point nor a name.
+
+    A name also stands clear of lines where possible, and is left out where there is no room.
+
+    Args:
+        axes: of matplotlib, drawn once, so that places are known.
+        names: with the point of each, in the order in which they matter.
+        also_clear: other points that no name covers.
+    """
+    from matplotlib.transforms import Bbox
+
+    lines = [axes.transData.transform_path(line.get_path()) for line in axes.lines]
+    centres = [axes.transData.transform(at) for at in (*(at for _, at in names), *also_clear)]
+    taken = [
+        Bbox.from_extents(x - _CLEAR_PX, y - _CLEAR_PX, x + _CLEAR_PX, y + _CLEAR_PX)
+        for x, y in centres
+    ]
+    for name, at in names:
+        labels = [_label(axes, name, at, place) for place in _PLACES]
+        boxes = [label.get_window_extent().padded(2) for label in labels]
+        free = [row for row, box in enumerate(boxes) if _is_free(axes, box, taken)]
+        clear = [
+            row
+            for row in free
+            if not any(line.intersects_bbox(boxes[row], filled=False) for line in lines)
+        ]
+        chosen = next(iter([*clear, *free]), None)
+        for row, label in enumerate(labels):
+            if row == chosen:
+                taken.append(boxes[row])
+            else:
+                label.remove()
+
+
+def _label(
+    axes: Any,
+    name: str,
+    at: tuple[float, float],
+    place: tuple[int, int, str, str],
+) -> Any:
+    right, up, across, along = place
+    label = axes.annotate(
+        name, at, xytext=(right, up), textcoords="offset points", fontsize=_FONT,
+        horizontalalignment=across, verticalalignment=along,
+    )  # fmt: skip
+    label.set_in_layout(False)  # else the axes would make room for it, and places would move
+    return label
+
+
+def _is_free(axes: Any, box: Any, taken: Sequence[Any]) -> bool:
+    frame = axes.get_window_extent()
+    inside = frame.x0 <= box.x0 and frame.y0 <= box.y0 and box.x1 <= frame.x1 and box.y1 <= frame.y1
+    return inside and not any(box.overlaps(other) for other in taken)
+
+
+def plain_log(axis: Any) -> None:
+    """Label a logarithmic axis with 0.3, 20 and 5000 instead of powers of ten."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1, 3)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
+    axis.set_minor_formatter(NullFormatter())

@@ -1,0 +1,97 @@
+"""Scenes that no network learned from, composed in a render child.
+
+`builtin:benchmark-v1` has no object in common with any other source, and no preset to train on
+draws from it. Previews are judged and timed on these scenes, and so are methods.
+"""
+
+import contextlib
+import dataclasses
+import os
+from pathlib import Path
+
+from pipeline.builds.settings import BuildSettings
+from pipeline.builds.training import smoke
+from pipeline.isolation import ChildLimits, IsolatedChild
+from pipeline.making.accept_objects import accept_objects
+from pipeline.making.asked_objects import AskedObjects
+from pipeline.making.attempt_scene import MAX_ATTEMPTS, SceneRecipe, assets_of, set_up_child
+from pipeline.making.begin_publication import begin
+from pipeline.making.environment import environment
+from pipeline.renders.variant import choose_variant
+from pipeline.scenes.compose import compose_scene
+from scene_templates.settings import SceneSettings
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.splits import JUDGED_SPLIT
+from storage.errors import Rejected
+from storage.records.scene import Scene
+from storage.settings.changes import changed
+
+TRIANGLES = 768
+"""Maximum number of triangles of a scene: what the built-in networks are trained on."""
+
+_SEED = 20_261_122
+"""Seed of the scenes; no dataset preset and no run uses it."""
+
+_LEAST_LEVEL = 24
+_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=4 * 3600, calls_per_child=10_000)
+
+
+def composing_child(
+    build: BuildSettings, objects: str, folder: Path, threads: int | None = None
+) -> IsolatedChild:
+    """Return a child that composes the scenes of a preset and renders them; close it in the end.
+
+    Args:
+        build: the preset's settings.
+        objects: source of the objects.
+        folder: empty; it keeps the record of the objects.
+        threads: of Mitsuba and the denoiser, if fewer than there are cores.
+    """
+    variant, workers = choose_variant(), threads or os.cpu_count() or 1
+    publication = begin(
+        DatasetFolder(folder), build, environment(variant), 1, accept_environment=False
+    )
+    asked = AskedObjects(
+        source=objects, licence=None, settings=build, publication=publication, workers=workers
+    )
+    accepted = accept_objects(asked)
+    recipe = SceneRecipe(settings=build, variant=variant, threads=workers, pool=accepted.pool)
+    return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(recipe,))
+
+
+def held_out_build() -> BuildSettings:
+    """Return `smoke` for scenes of at most TRIANGLES triangles, its objects as much coarser.
+
+    All of its objects are to judge by, as those of `builtin:benchmark-v1` are.
+    """
+    build = changed(smoke(), {"splits.one_split": True})
+    most = build.scenes.max_triangles
+    budgets = [max(_LEAST_LEVEL, b * TRIANGLES // most) for b in build.assets.budgets]
+    levels = sorted(set(budgets), reverse=True)
+    return changed(build, {"scenes.max_triangles": TRIANGLES, "assets.budgets": levels})
+
+
+def held_out_scene(index: int) -> Scene:
+    """Return a scene of `held_out_build` with one camera; runs in a child of that build.
+
+    Raises:
+        Rejected: every attempt at it was rejected.
+    """
+    settings = dataclasses.replace(held_out_build().scenes, num_views=1)
+    scene = first_composed(settings, index, seed=_SEED, split=JUDGED_SPLIT)
+    if scene is None:
+        raise Rejected("no_scene", f"scene {index}: every attempt at it was rejected")
+    return scene
+
+
+def first_composed(
+    settings: SceneSettings, scene_index: int, *, seed: int = 0, split: str = "train"
+) -> Scene | None:
+    """Return a scene's first attempt that passes, or None; runs in a render child."""
+    pool = assets_of(split)
+    for attempt in range(MAX_ATTEMPTS):
+        with contextlib.suppress(Rejected):
+            return compose_scene(
+                settings, pool, seed=seed, scene_index=scene_index, attempt=attempt
+            )
+    return None

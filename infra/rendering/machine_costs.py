@@ -1,0 +1,143 @@
+"""Times the parts of previews on this machine, for the choices of `trilight render`.
+
+Two of the scenes of the shipped table are made again and timed, on one thread and on all. How much
+quicker or slower each part is here than where the table was measured is what counts: times of a
+sample differ by a factor of two between scenes, and two scenes are not the table's twelve.
+"""
+
+import contextlib
+import importlib.util
+import os
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from infra.rendering.held_out_scenes import composing_child, held_out_build, held_out_scene
+from infra.rendering.way_table import (
+    NETWORK_SCENE,
+    NETWORK_VIEW,
+    PartCost,
+    PictureCosts,
+    WayTable,
+    machine_name,
+)
+from pipeline.objects.generated import BENCHMARK
+from pipeline.renders.preview_parts import timed_parts
+from pipeline.renders.renderer import set_threads
+from pipeline.renders.variant import choose_variant
+from storage.records.scene import Scene
+
+PROBES = (1, 2)
+"""Numbers of the held-out scenes whose parts every machine times."""
+
+PROBED_PX = (64, 256)
+"""Widths that are timed; between and beyond them machines differ by what they differ there."""
+
+Timed = dict[tuple[int, int], Mapping[str, float]]
+"""Seconds of the parts by width and threads."""
+
+
+def measured_costs(table: WayTable) -> PictureCosts:
+    """Return what the parts take here, in well under a minute on an idle machine."""
+    cores = os.cpu_count() or 1
+    with tempfile.TemporaryDirectory() as name:
+        child = composing_child(held_out_build(), BENCHMARK, Path(name))
+        with contextlib.closing(child):
+            scenes = [child.call(held_out_scene, index) for index in PROBES]
+            timed = [_timed(child, scene, cores) for scene in scenes]
+    mean: Timed = {
+        key: {part: float(np.mean([one[key][part] for one in timed])) for part in timed[0][key]}
+        for key in timed[0]
+    }
+    return costs_of(table, mean, cores, machine_name(choose_variant()))
+
+
+def costs_of(table: WayTable, timed: Timed, cores: int, machine: str) -> PictureCosts:
+    """Return the shipped costs times what the probes take here by what they took there.
+
+    Args:
+        table: with the core-seconds of the probes.
+        timed: mean seconds of the probes' parts, on one thread and on `cores`; a part that was not
+            timed costs what is shipped.
+        cores: threads at most.
+        machine: its name.
+    """
+    then = {(row.part, row.width): row.serial_s + row.parallel_s for row in table.probe.rows}
+    rows = []
+    for row in table.costs.rows:
+        shares = [
+            _serial_and_parallel(timed[px, 1][row.part], timed[px, cores][row.part], cores)
+            / max(then[row.part, px], 1e-9)
+            for px in PROBED_PX
+            if row.part in timed[px, 1]
+        ]
+        if not shares:
+            rows.append(row)
+            continue
+        at = np.interp(np.log2(row.width), np.log2(PROBED_PX), range(len(PROBED_PX)))
+        serial, parallel = (1 - at) * shares[0] + at * shares[-1]
+        core_s = row.serial_s + row.parallel_s
+        rows.append(
+            PartCost(
+                part=row.part,
+                width=row.width,
+                serial_s=float(f"{core_s * serial:.4g}"),
+                parallel_s=float(f"{core_s * parallel:.4g}"),
+            )
+        )
+    return PictureCosts(machine=machine, rows=tuple(rows))
+
+
+def _serial_and_parallel(one_s: float, all_s: float, cores: int) -> Any:
+    """Return [serial, parallel] seconds s and p with s + p = `one_s` and s + p / cores = `all_s`.
+
+    Where that would make one of them negative, it is 0 and the other is what one thread took.
+    """
+    if cores == 1:
+        return np.array([0.0, one_s])
+    parallel = float(np.clip((one_s - all_s) * cores / (cores - 1), 0.0, one_s))
+    return np.array([one_s - parallel, parallel])
+
+
+def _timed(child: Any, scene: Scene, cores: int) -> Timed:
+    found: Timed = {}
+    for threads in {1, cores}:
+        networks = _network_parts(scene, threads)
+        for px in PROBED_PX:
+            parts = child.call(parts_with_threads, scene, px, threads)
+            found[px, threads] = {**parts, **networks.get(px, {})}
+    return found
+
+
+def parts_with_threads(scene: Scene, resolution: int, threads: int) -> dict[str, float]:
+    """Return `timed_parts` with so many threads; runs in a render child."""
+    set_threads(threads)
+    return timed_parts(scene, resolution)
+
+
+def _network_parts(scene: Scene, threads: int) -> dict[int, dict[str, float]]:
+    """Return seconds of the network's parts by width; none where torch is not installed."""
+    if importlib.util.find_spec("torch") is None:
+        return {}
+    import torch
+
+    from model.neural_renderer import NeuralRenderer
+
+    torch.set_num_threads(threads)
+    renderer, found = NeuralRenderer.load("builtin:tokens"), {}
+    for px in PROBED_PX:
+        spent = []
+        for _ in range(4):
+            marks = [time.perf_counter()]
+            prepared = renderer.prepare(scene)
+            marks.append(time.perf_counter())
+            renderer.view(prepared, scene.c2w[0], float(scene.fov_deg[0]), px)
+            marks.append(time.perf_counter())
+            spent.append(np.diff(marks))
+        encoding_s, view_s = np.median(spent[1:], axis=0)  # memory and threads are new to the first
+        found[px] = {NETWORK_SCENE: float(encoding_s), NETWORK_VIEW: float(view_s)}
+    return found

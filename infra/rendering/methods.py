@@ -1,0 +1,184 @@
+"""Methods that make a picture: networks, traced light without a network, the path tracer.
+
+A method loads a scene and then shows any camera. The benchmark and the leaderboard compare them.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.timed_views import Show, TimedViews, timed_views
+from pipeline.renders.denoiser import Quality, denoise
+from pipeline.renders.preview import PreviewRenderer, PreviewSettings
+from pipeline.renders.renderer import finished
+from pipeline.renders.settings import Filtered
+from pipeline.renders.tracer import Features
+from storage.records.scene import Scene
+
+if TYPE_CHECKING:
+    from model.config import ModelConfig
+    from model.neural_renderer import NeuralRenderer
+
+View = Callable[[NDArray[np.float32], float], NDArray[np.float32]]
+"""Makes the picture [R, R, 3] of a camera to world [4, 4] and its full field of view in degrees."""
+
+Method = Callable[[Scene], View]
+"""Loads a scene, and returns its view; all pictures are of one width."""
+
+DIRECT_LIGHT, TRACED_LIGHT = "direct light, no network", "all traced light, no network"
+BUILTIN_NETWORKS = ("builtin:", "builtin:tokens")
+"""Networks of every comparison: the better one, and the one that traces nothing."""
+
+SAMPLES: tuple[tuple[int, Filtered], ...] = (
+    (1, "fast"),
+    (1, "high"),
+    (4, "fast"),
+    (4, "high"),
+    (16, "fast"),
+    (16, "high"),
+)
+"""Samples a pixel, and the filter of Open Image Denoise."""
+
+KINDS = ("network", "traced light, no network", "path tracer, denoised")
+
+SAMPLE_SEED = 20_261_122
+"""Seed of the path tracer's samples; no dataset preset and no run uses it."""
+
+_WEIGHTS = "model.safetensors"
+"""File of weights in the folder of a run."""
+
+
+def network_name(label: str) -> str:
+    """Return the name of a network's row."""
+    return f"network {label}"
+
+
+def network_labels(paths: Sequence[str]) -> tuple[str, ...]:
+    """Return short names of networks: the folder of a run, and no path of this machine."""
+    named = [Path(path) for path in paths]
+    return tuple(path.parent.name if path.name == _WEIGHTS else path.name for path in named)
+
+
+def samples_name(level: tuple[int, Filtered]) -> str:
+    """Return the name of the row of so many samples with a filter."""
+    return f"{level[0]} sample{'s' if level[0] > 1 else ''}, {level[1]}"
+
+
+def kind_of(name: str) -> str:
+    """Return the kind, one of KINDS, of a row's name."""
+    if name.startswith("network"):
+        return KINDS[0]
+    return KINDS[1] if name in (DIRECT_LIGHT, TRACED_LIGHT) else KINDS[2]
+
+
+def warm_up_denoiser(resolution: int, quality: Quality = "high") -> None:
+    """Let this process make its filter for pictures of a size."""
+    black = np.zeros((resolution, resolution, 3), np.float32)
+    denoise(black, Features(albedo=black, normal=black), quality)
+
+
+def sampled_method(resolution: int, spp: int, denoiser: Filtered) -> Method:
+    """Return the path tracer with so many samples a pixel and one denoise.
+
+    It works in a render child alone. Samples have the same seed in every view, as those of
+    `trilight render --orbit`.
+    """
+    settings = PreviewSettings(resolution=resolution, spp=spp, denoiser=denoiser)
+
+    def load(scene: Scene) -> View:
+        renderer = PreviewRenderer(scene, settings)
+        return lambda c2w, fov_deg: (
+            finished(renderer.view_steps(c2w, fov_deg, SAMPLE_SEED)).radiance_rgb
+        )
+
+    return load
+
+
+def network_method(renderer: "NeuralRenderer", resolution: int) -> Method:
+    """Return the method that shows a network's pictures."""
+
+    def load(scene: Scene) -> View:
+        prepared = renderer.prepare(scene)
+        return lambda c2w, fov_deg: renderer.view(prepared, c2w, fov_deg, resolution)
+
+    return load
+
+
+def direct_light_method(resolution: int) -> Method:
+    """Return the method that shows the lamps' light without a bounce, as the stage `hits` has it.
+
+    Nothing is gathered or mirrored and no network runs. Smooth surfaces show lamps by points drawn
+    on the lamps alone, so that sharp reflections of lamps are noisy.
+    """
+    from model.config import hits_smoke
+    from model.hits.lit_scene import LitScene
+    from model.hits.radiosity import SceneLight
+    from model.hits.view_inputs import Channel, view_inputs
+    from storage.records.material import PUBLISHED_COLUMNS, chosen_columns
+
+    def load(scene: Scene) -> View:
+        rows = chosen_columns(scene.materials, PUBLISHED_COLUMNS)[scene.material_index]
+        corners, normals = (
+            part[scene.faces] for part in (scene.vertex_positions, scene.vertex_normals)
+        )
+        lit = LitScene(corners, normals, rows)
+        dark = np.zeros((2, lit.num_triangles, 3), np.float32)
+        light = SceneLight(direct_2T3=dark, indirect_2T3=dark, mean_3=np.ones(3, np.float32))
+
+        def view(c2w: NDArray[np.float32], fov_deg: float) -> NDArray[np.float32]:
+            found = view_inputs(
+                lit, light, c2w, fov_deg, resolution,
+                rays_a_side=hits_smoke().hit_rays, anchors_a_side=1, gather_rays=0,
+            )  # fmt: skip
+            of_lamps = found.pixels[..., Channel.SHOWN_DIFFUSE]
+            return of_lamps + found.pixels[..., Channel.DIRECT_SPECULAR]
+
+        return view
+
+    return load
+
+
+def traced_network() -> "NeuralRenderer":
+    """Return a network that shows the traced light of the view stage `hits`, without training.
+
+    Every gain is 1, nothing is added or filtered, and gathered light is mixed by how near anchors
+    are. Layers are as small as they can be: what is timed is the tracing.
+    """
+    import dataclasses
+
+    from model.config import VERTEX_COORDINATES, hits_smoke
+
+    smallest = dataclasses.replace(
+        hits_smoke(), width=2 * VERTEX_COORDINATES, num_heads=1, rope_num_freqs=1,
+        encoder_layers=1, decoder_layers=1, hidden_width=1, num_registers=0, pixel_width=1,
+        filter_width=0, scene_tokens=False,
+    )  # fmt: skip
+    return untrained_network(smallest)
+
+
+def untrained_network(config: "ModelConfig") -> "NeuralRenderer":
+    """Return a network of hits of any size that shows the traced light, and nothing else."""
+    import torch
+
+    from model.neural_renderer import NeuralRenderer
+    from model.renderformer import RenderFormer
+
+    model = RenderFormer(config)
+    model.initialise(torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        model.decoder.head.query.weight.zero_()
+        model.decoder.head.last.bias[-6:] = -30.0  # softplus of what would be learned: nothing
+    return NeuralRenderer(model)
+
+
+def timed_method(method: Method, scene: Scene) -> TimedViews:
+    """Return a scene's first view with its times."""
+
+    def load() -> Show:
+        view = method(scene)
+        return lambda: view(scene.c2w[0], float(scene.fov_deg[0]))
+
+    return timed_views(load)

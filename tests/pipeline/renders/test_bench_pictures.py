@@ -1,0 +1,45 @@
+"""Our side and plain Mitsuba's, as experiments render them: the product's own pictures."""
+
+import numpy as np
+import pytest
+
+from infra.bench.workloads.judged_pictures import shrunk
+from infra.bench.workloads.plain_mitsuba import render_levels
+from infra.bench.workloads.shots import fixed_samples, shots
+from infra.rendering.raw_references import raw_reference
+from pipeline.renders.load_tracer import load_tracer
+from storage.metrics import psnr_log_db
+from tests.pipeline.renders.sampling import camera_of
+from tests.pipeline.renders.scene_kit import sampled_like_scene
+from tests.scenes_by_hand import tiny_scene
+
+
+@pytest.mark.usefixtures("llvm")
+def test_a_small_reference_is_that_of_its_own_width() -> None:
+    """A box of pixels is a pixel of a smaller picture: block means of one are samples of it."""
+    scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
+    large = raw_reference(scene, camera_of(scene, 64), 128, 1)
+    assert not np.array_equal(large.a_rgb, large.b_rgb)
+    small = shrunk(large, 32)
+    tracer = load_tracer(scene, max_depth=10, rr_depth=2)
+    direct = tracer.radiance(camera_of(scene, 32), seed=4, spp=256)
+    # Both have 256 samples a pixel, of which single ones are bright: compare calm pixels.
+    mean = 0.5 * (small.a_rgb + small.b_rgb)
+    ratio = mean[direct > 0.1] / direct[direct > 0.1]
+    assert np.median(np.abs(ratio - 1)) < 0.15
+    assert np.median(ratio) == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.slow("references")
+@pytest.mark.usefixtures("llvm")
+def test_plain_mitsuba_comes_to_the_same_picture() -> None:
+    """With other samples of another sampler: its error falls with samples, towards our picture."""
+    scene = tiny_scene()
+    ours = shots(scene, {"ours": fixed_samples(32, 2048)})["ours"].view.radiance_rgb
+    levels = render_levels(scene, 32, (16, 64, 1024), 5)
+    assert [level.spp for level in levels] == [16, 64, 1024]
+    assert levels[0].core_s > 0
+    errors = [psnr_log_db(level.radiance_rgb, ours) for level in levels]
+    # With three seeds 57 to 59, 60 to 62, and 68 to 69 dB; light off by half a percent is at 60.
+    assert errors[0] < errors[2]
+    assert errors[0] > 50 and errors[1] > 53 and errors[2] > 62
