@@ -16,18 +16,15 @@ from storage.dataset.splits import split_of_object, split_of_shard
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 from storage.settings.described import from_record
+from tests.for_each import for_each
 from tests.scene_templates.published import STAGE_1, STAGE_2
 
 RENDERFORMER = [name for name in BUILDS if name.startswith("renderformer-v1")]
 JUDGED = ["out-of-range", "out-of-range-2", "benchmark-v1", "benchmark-v1-mini"]
 
 
-def test_settings_survive_the_manifest() -> None:
-    for name in BUILDS:
-        _check_settings_survive_the_manifest(name)
-
-
-def _check_settings_survive_the_manifest(name: str) -> None:
+@for_each("name", BUILDS)
+def test_settings_survive_the_manifest(name: str) -> None:
     build = named_build(name)
     stored = json.loads(json.dumps(build.as_json()))
     assert stored == build.as_json()
@@ -75,12 +72,8 @@ def test_builds_differ_from_each_other() -> None:
     assert len(set(digests.values())) == len(digests)
 
 
-def test_what_is_named_changes_and_nothing_else() -> None:
-    for name in BUILDS:
-        _check_what_is_named_changes_and_nothing_else(name)
-
-
-def _check_what_is_named_changes_and_nothing_else(name: str) -> None:
+@for_each("name", BUILDS)
+def test_what_is_named_changes_and_nothing_else(name: str) -> None:
     before = named_build(name)
     after = named_build(
         name, seed=7, resolution=64, noise_floor_db=33.0, changes={"scenes.num_views": 3}
@@ -117,13 +110,9 @@ def test_mistakes_are_named() -> None:
         named_build("smoke", seed=-1)
 
 
-def test_renderformer_builds_keep_the_published_numbers() -> None:
+@for_each("name", RENDERFORMER)
+def test_renderformer_builds_keep_the_published_numbers(name: str) -> None:
     """Section by section of the published recipes: A.1, A.4 to A.8."""
-    for name in RENDERFORMER:
-        _check_renderformer_builds_keep_the_published_numbers(name)
-
-
-def _check_renderformer_builds_keep_the_published_numbers(name: str) -> None:
     build = named_build(name)
     first = "256" in name
     scenes = build.scenes
@@ -179,12 +168,8 @@ def test_the_original_policy_differs_in_the_background_alone() -> None:
         assert old.scenes != new.scenes
 
 
-def test_all_that_is_judged_is_of_the_test_split() -> None:
-    for name in JUDGED:
-        _check_all_that_is_judged_is_of_the_test_split(name)
-
-
-def _check_all_that_is_judged_is_of_the_test_split(name: str) -> None:
+@for_each("name", JUDGED)
+def test_all_that_is_judged_is_of_the_test_split(name: str) -> None:
     splits = named_build(name).splits
     assert {split_of_shard(shard, splits) for shard in range(50)} == {"test"}
     assert {split_of_object(f"{number:064x}", splits) for number in range(50)} == {"test"}
@@ -212,13 +197,9 @@ def test_a_turn_of_the_test_sets_is_whole() -> None:
     assert named_build("benchmark-v1-mini") == named_build("benchmark-v1")
 
 
-def test_the_simplest_objects_always_fit() -> None:
+@for_each("name", BUILDS)
+def test_the_simplest_objects_always_fit(name: str) -> None:
     """The coarsest budget of the asset stage, as often as a family has objects, fits its scene."""
-    for name in BUILDS:
-        _check_the_simplest_objects_always_fit(name)
-
-
-def _check_the_simplest_objects_always_fit(name: str) -> None:
     build = named_build(name)
     for family in build.scenes.families:
         objects = family.num_objects[1]

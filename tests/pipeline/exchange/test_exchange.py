@@ -8,7 +8,7 @@ from pipeline.scenes.pool import PooledAsset
 from scene_templates.layout_rand import scene_plan
 from scene_templates.settings import SceneSettings
 from storage.records.scene import Scene
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.pipeline.exchange.exchange_kit import (
     assert_h5_keeps_light,
     assert_json_keeps_light,
@@ -50,12 +50,8 @@ def _of_each(
     return found
 
 
-def test_published_scenes_come_back(shared: Path, tmp_path: Path) -> None:
-    for folder, name in with_folders(tmp_path, list(EXAMPLES)):
-        _check_published_scenes_come_back(shared, folder, name)
-
-
-def _check_published_scenes_come_back(shared: Path, tmp_path: Path, name: str) -> None:
+@for_each("name", EXAMPLES)
+def test_published_scenes_come_back(shared: Path, tmp_path: Path, name: str) -> None:
     scene = example_scene(shared, name)
     assert_usd_keeps_all(scene, tmp_path, ".usdc")
     if scene.num_triangles < 1000:  # textures of 53 kB a triangle are slow to pack

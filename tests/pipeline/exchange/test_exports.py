@@ -16,6 +16,7 @@ from storage.dataset.dataset import open_dataset
 from storage.errors import TrilightError
 from storage.records.sample import PartFloor, Sample
 from tests.command_line import trilight
+from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
 
 SIZE = 16
@@ -184,12 +185,8 @@ def test_hypersim_needs_the_lobes_apart(tmp_path: Path) -> None:
     assert "--set renders.split_lobes=true" in refused
 
 
-def test_the_same_dataset_gives_the_same_bytes(dataset: Path) -> None:
-    for form in FORMS:
-        _check_the_same_dataset_gives_the_same_bytes(dataset, form)
-
-
-def _check_the_same_dataset_gives_the_same_bytes(dataset: Path, form: str) -> None:
+@for_each("form", FORMS)
+def test_the_same_dataset_gives_the_same_bytes(dataset: Path, form: str) -> None:
     first = _files(exported(dataset, form, "--split", "test"))
     (dataset.parent / form).rename(dataset.parent / f"first {form}")
     assert _files(exported(dataset, form, "--split", "test")) == first

@@ -19,6 +19,7 @@ from pipeline.exchange.renderformer_json import read_description
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
+from tests.for_each import for_each
 from tests.pipeline.scenes.example_scenes import (
     EXAMPLES,
     PlainObj,
@@ -65,14 +66,8 @@ def _slowly(point: Point, obj: PlainObj, transform: dict[str, Any]) -> Point:
     return x * sx + tx, y * sy + ty, z * sz + tz
 
 
+@for_each("name", EXAMPLES)
 def test_examples_have_the_triangles_of_their_files(
-    examples: dict[str, Scene], shared: Path
-) -> None:
-    for name in EXAMPLES:
-        _check_examples_have_the_triangles_of_their_files(examples, shared, name)
-
-
-def _check_examples_have_the_triangles_of_their_files(
     examples: dict[str, Scene], shared: Path, name: str
 ) -> None:
     scene = examples[name]
@@ -82,14 +77,8 @@ def _check_examples_have_the_triangles_of_their_files(
         assert (scene.object_index == row).sum() == len(obj.triangles)
 
 
+@for_each("name", EXAMPLES)
 def test_every_corner_of_the_examples_is_where_a_slow_twin_puts_it(
-    examples: dict[str, Scene], shared: Path
-) -> None:
-    for name in EXAMPLES:
-        _check_every_corner_of_the_examples_is_where_a_slow_twin_puts_it(examples, shared, name)
-
-
-def _check_every_corner_of_the_examples_is_where_a_slow_twin_puts_it(
     examples: dict[str, Scene], shared: Path, name: str
 ) -> None:
     for row, stated in enumerate(_json(shared, name).values()):
@@ -122,24 +111,14 @@ BOUNDS = {
 }
 
 
-def test_examples_are_as_large_as_they_should_be(examples: dict[str, Scene]) -> None:
-    for name in BOUNDS:
-        _check_examples_are_as_large_as_they_should_be(examples, name)
-
-
-def _check_examples_are_as_large_as_they_should_be(examples: dict[str, Scene], name: str) -> None:
+@for_each("name", BOUNDS)
+def test_examples_are_as_large_as_they_should_be(examples: dict[str, Scene], name: str) -> None:
     points = examples[name].vertex_positions
     np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], BOUNDS[name], atol=1e-6)
 
 
+@for_each("name", EXAMPLES)
 def test_examples_have_the_materials_and_kinds_of_their_files(
-    examples: dict[str, Scene], shared: Path
-) -> None:
-    for name in EXAMPLES:
-        _check_examples_have_the_materials_and_kinds_of_their_files(examples, shared, name)
-
-
-def _check_examples_have_the_materials_and_kinds_of_their_files(
     examples: dict[str, Scene], shared: Path, name: str
 ) -> None:
     scene = examples[name]
@@ -249,12 +228,8 @@ REFUSED: list[tuple[tuple[str | int, ...], dict[str, Any], str]] = [
 ]
 
 
-def test_what_means_nothing_is_refused_by_name() -> None:
-    for case in REFUSED:
-        _check_what_means_nothing_is_refused_by_name(*case)
-
-
-def _check_what_means_nothing_is_refused_by_name(
+@for_each("path, change, message", REFUSED)
+def test_what_means_nothing_is_refused_by_name(
     path: tuple[str | int, ...], change: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(TrilightError) as caught:

@@ -18,7 +18,7 @@ from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.renderformer_json import described_files
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.pipeline.scenes.example_scenes import EXAMPLES, example_scene
 from tests.scenes_by_hand import LIGHT, tiny_scene
 
@@ -77,14 +77,8 @@ def assert_usable(described: dict[str, Any], scene: Scene, folder: Path) -> None
     assert len(found) == len(want)
 
 
+@for_each("name", EXAMPLES)
 def test_published_scenes_are_written_as_the_published_converter_reads(
-    shared: Path, tmp_path: Path
-) -> None:
-    for folder, name in with_folders(tmp_path, list(EXAMPLES)):
-        _check_published_scenes_are_written_as_the_published_converter_reads(shared, folder, name)
-
-
-def _check_published_scenes_are_written_as_the_published_converter_reads(
     shared: Path, tmp_path: Path, name: str
 ) -> None:
     scene = example_scene(shared, name)

@@ -18,7 +18,7 @@ from pipeline.exchange.renderformer_h5 import (
 from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.pipeline.scenes.example_scenes import example_scene
 from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
 
@@ -88,14 +88,8 @@ def test_mvp_projects_what_the_camera_looks_at(tmp_path: Path) -> None:
             assert clip[:3] / clip[3] == pytest.approx([1, 1, depth], abs=1e-4)
 
 
-def test_scene_to_file_to_scene_to_file(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path, itertools.product(TYPES, [tiny_scene(), awkward_scene()])
-    ):
-        _check_scene_to_file_to_scene_to_file(folder, *case)
-
-
-def _check_scene_to_file_to_scene_to_file(
+@for_each("texture_type, scene", itertools.product(TYPES, [tiny_scene(), awkward_scene()]))
+def test_scene_to_file_to_scene_to_file(
     tmp_path: Path, texture_type: TextureType, scene: Scene
 ) -> None:
     first, again = tmp_path / "first.h5", tmp_path / "again.h5"

@@ -13,18 +13,15 @@ import pytest
 from pipeline.exchange.renderformer_json import MAX_BYTES, described_files, read_description
 from storage.errors import TrilightError
 from storage.records.scene import SceneObject
+from tests.for_each import for_each
 from tests.pipeline.exchange.exchange_kit import assert_json_keeps_light, json_and_back
 from tests.pipeline.scenes.example_scenes import EXAMPLES
 from tests.pipeline.scenes.one_box import BOX, CAMERA, MATERIAL, OBJECT, SCENE, TRANSFORM, changed
 from tests.scenes_by_hand import LIGHT, tiny_scene
 
 
-def test_the_example_scenes_hold_no_unknown_field(shared: Path) -> None:
-    for name in EXAMPLES:
-        _check_the_example_scenes_hold_no_unknown_field(shared, name)
-
-
-def _check_the_example_scenes_hold_no_unknown_field(shared: Path, name: str) -> None:
+@for_each("name", EXAMPLES)
+def test_the_example_scenes_hold_no_unknown_field(shared: Path, name: str) -> None:
     data = (shared / "renderformer_scenes" / f"{name}.json").read_bytes()
     described = read_description(data, name)
     assert described.unknown_fields == ()
@@ -121,12 +118,8 @@ REFUSED = [
 ]
 
 
-def test_what_is_wrong_is_named() -> None:
-    for case in REFUSED:
-        _check_what_is_wrong_is_named(*case)
-
-
-def _check_what_is_wrong_is_named(data: bytes, message: str) -> None:
+@for_each("data, message", REFUSED)
+def test_what_is_wrong_is_named(data: bytes, message: str) -> None:
     with pytest.raises(TrilightError) as caught:
         read_description(data, "a.json")
     assert message in str(caught.value)

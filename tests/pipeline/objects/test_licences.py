@@ -1,6 +1,5 @@
 """Licences: who is let in, what is stated from outside, and the form of an identifier."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ from pipeline.objects.licences import DEFAULT_ALLOWED, USER_PROVIDED, refuse_lic
 from pipeline.objects.sources import find_objects
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
+from tests.for_each import for_each
 
 
 def record(uid: str, licence: str) -> ObjectRecord:
@@ -51,14 +51,9 @@ def test_compound_expressions_are_allowed_as_they_stand() -> None:
     assert refuse_licences([one], ["mit or apache-2.0"]) == ([one], [])
 
 
-def test_what_is_no_identifier_is_to_be_mended() -> None:
+@for_each("licence", ["", "CC BY 4.0", "x" * 65, "Größe"])
+def test_what_is_no_identifier_is_to_be_mended(licence: str) -> None:
     """No allow-list can name it, so the message must not say so."""
-    cases: Iterable[Any] = ["", "CC BY 4.0", "x" * 65, "Größe"]
-    for licence in cases:
-        _check_what_is_no_identifier_is_to_be_mended(licence)
-
-
-def _check_what_is_no_identifier_is_to_be_mended(licence: str) -> None:
     _, (failure,) = refuse_licences([record("a", licence)], DEFAULT_ALLOWED)
     assert "--allow-licence" not in failure.message
     assert "expected an SPDX identifier" in failure.message

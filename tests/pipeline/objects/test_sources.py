@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from pipeline.objects.sources import FoundObjects, find_objects
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
 from storage.remote.safe_url import printable
-from tests.for_each import with_folders
+from tests.for_each import for_each
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -65,13 +65,8 @@ def test_names_of_any_bytes_become_printable_uids(tmp_path: Path) -> None:
         assert Path(record.path).read_text() == "v 0 0 0"
 
 
-def test_printable_text_stays() -> None:
-    cases: Iterable[Any] = ["plain", "größe", "a b", "日本"]
-    for text in cases:
-        _check_printable_text_stays(text)
-
-
-def _check_printable_text_stays(text: str) -> None:
+@for_each("text", ["plain", "größe", "a b", "日本"])
+def test_printable_text_stays(text: str) -> None:
     assert printable(text) == text
 
 
@@ -138,21 +133,17 @@ def test_a_url_of_this_machine_is_its_folder(tmp_path: Path) -> None:
     assert find(f"file://{tmp_path}/my%20objects") == find(tmp_path / "my objects")
 
 
-def test_folders_without_objects(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path,
-        [
-            (lambda path: None, "does not exist"),
-            (lambda path: path.write_text(""), "is not a folder"),
-            (lambda path: path.mkdir(), "holds no object"),
-            (lambda path: touch(path, "readme.txt", "sub/a.jpg"), "holds no object"),
-            (lambda path: touch(path, "objects.jsonl"), "not JSON"),
-        ],
-    ):
-        _check_folders_without_objects(folder, *case)
-
-
-def _check_folders_without_objects(
+@for_each(
+    "make, message",
+    [
+        (lambda path: None, "does not exist"),
+        (lambda path: path.write_text(""), "is not a folder"),
+        (lambda path: path.mkdir(), "holds no object"),
+        (lambda path: touch(path, "readme.txt", "sub/a.jpg"), "holds no object"),
+        (lambda path: touch(path, "objects.jsonl"), "not JSON"),
+    ],
+)
+def test_folders_without_objects(
     tmp_path: Path, make: Callable[[Path], object], message: str
 ) -> None:
     make(tmp_path / "objects")
@@ -184,14 +175,8 @@ def test_builtin_objects_are_mended_and_otherwise_left_alone(tmp_path: Path) -> 
     assert [path.stat().st_mtime_ns for path in paths[1:]] == times[1:]
 
 
-def test_counts_without_meaning(tmp_path: Path) -> None:
-    for folder, source in with_folders(
-        tmp_path, ["builtin:0", "builtin:-3", "builtin:x", "builtin:1e3", "builtin:9999999999"]
-    ):
-        _check_counts_without_meaning(folder, source)
-
-
-def _check_counts_without_meaning(tmp_path: Path, source: str) -> None:
+@for_each("source", ["builtin:0", "builtin:-3", "builtin:x", "builtin:1e3", "builtin:9999999999"])
+def test_counts_without_meaning(tmp_path: Path, source: str) -> None:
     with pytest.raises(TrilightError, match=r"builtin:N with N from 1"):
         find(source, work_dir=tmp_path)
 

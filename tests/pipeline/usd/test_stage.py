@@ -15,7 +15,7 @@ from pipeline.usd import stage as opening
 from pipeline.usd.stage import OpenedUsd, quietly
 from pipeline.usd.texture_nodes import asset_bytes
 from storage.errors import TrilightError
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_scene
 
 HEAD = "#usda 1.0\n"
@@ -32,28 +32,24 @@ VARIANT = (
 CLIPS = 'def "A" (clips = {dictionary default = {asset[] assetPaths = [@/x.usda@]}}) {}'
 
 
-def test_refused_in_one_line(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path,
-        [
-            ('def "A" (references = @https://x.y/z.usda@</A>) {}', "nothing is fetched"),
-            ('def "A" (references = @s3://x/z.usda@</A>) {}', "nothing is fetched"),
-            ('def "A" (references = @/etc/x.usda@</A>) {}', "outside of its folder"),
-            ('def "A" (payload = @../x.usda@</A>) {}', "outside of its folder"),
-            ('def "A" (references = @./a/../../x.usda@</A>) {}', "outside of its folder"),
-            (VARIANT, "outside of its folder"),
-            ('def "A" (references = </B>) {}\ndef "B" (references = </A>) {}', "in a circle"),
-            ('def "A" (references = @./file.usda@</A>) {}', "in a circle"),
-            ('def "A" {\ndef "B" (inherits = </A>) {}\n}', "in a circle"),
-            (CLIPS, "value clips"),
-            ('def "A" {', "not readable as USD"),
-            ("\0\1\2", "not readable as USD"),
-        ],
-    ):
-        _check_refused_in_one_line(folder, *case)
-
-
-def _check_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+@for_each(
+    "text, message",
+    [
+        ('def "A" (references = @https://x.y/z.usda@</A>) {}', "nothing is fetched"),
+        ('def "A" (references = @s3://x/z.usda@</A>) {}', "nothing is fetched"),
+        ('def "A" (references = @/etc/x.usda@</A>) {}', "outside of its folder"),
+        ('def "A" (payload = @../x.usda@</A>) {}', "outside of its folder"),
+        ('def "A" (references = @./a/../../x.usda@</A>) {}', "outside of its folder"),
+        (VARIANT, "outside of its folder"),
+        ('def "A" (references = </B>) {}\ndef "B" (references = </A>) {}', "in a circle"),
+        ('def "A" (references = @./file.usda@</A>) {}', "in a circle"),
+        ('def "A" {\ndef "B" (inherits = </A>) {}\n}', "in a circle"),
+        (CLIPS, "value clips"),
+        ('def "A" {', "not readable as USD"),
+        ("\0\1\2", "not readable as USD"),
+    ],
+)
+def test_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "x.usda").write_text(HEAD)  # it is there, and must not be read
     folder = tmp_path / "inner"
     folder.mkdir()
@@ -80,15 +76,11 @@ OPENERS = {
 """Every way in which a layer names a file for composition; F is the file."""
 
 
-def test_no_way_leads_out(tmp_path: Path) -> None:
+@for_each(
+    "way, place", itertools.product(OPENERS, ["root", "sublayer", "referenced by an ancestor"])
+)
+def test_no_way_leads_out(tmp_path: Path, way: str, place: str) -> None:
     """In the root layer, or in a layer of which only the child of a prim is referenced."""
-    for folder, case in with_folders(
-        tmp_path, itertools.product(OPENERS, ["root", "sublayer", "referenced by an ancestor"])
-    ):
-        _check_no_way_leads_out(folder, *case)
-
-
-def _check_no_way_leads_out(tmp_path: Path, way: str, place: str) -> None:
     (tmp_path / "secret.usda").write_text(f'{HEAD}def "A" {{\ndef "C" {{}}\n}}')
     folder = tmp_path / "inner"
     folder.mkdir()

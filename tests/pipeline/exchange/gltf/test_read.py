@@ -13,7 +13,7 @@ from pipeline.exchange.gltf.read import GltfScene, read_gltf
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.pipeline.exchange.exchange_kit import row_at
 from tests.pipeline.exchange.gltf_kit import BLUE, GREEN, GREY, PICTURE, RED, UV, png, quad
 from tests.pipeline.exchange.gltf_kit import write_gltf as written
@@ -209,12 +209,8 @@ def test_one_texel_is_a_constant(tmp_path: Path) -> None:
     assert found.scene.materials[0, :3] == pytest.approx(diffuse_of(GREEN), abs=1e-6)
 
 
-def test_factors_that_are_no_albedo(tmp_path: Path) -> None:
-    for folder, value in with_folders(tmp_path, [float("nan"), "red", -1, 2]):
-        _check_factors_that_are_no_albedo(folder, value)
-
-
-def _check_factors_that_are_no_albedo(tmp_path: Path, value: Any) -> None:
+@for_each("value", [float("nan"), "red", -1, 2])
+def test_factors_that_are_no_albedo(tmp_path: Path, value: Any) -> None:
     surface = {"metallicFactor": value, "baseColorFactor": [0.5, 0.5, 0.5, 1]}
     found = read(tmp_path, material={"pbrMetallicRoughness": surface})
     assert any("metallicFactor" in text for text in found.lost)
@@ -227,20 +223,16 @@ def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:
         read(tmp_path, uv=broken)
 
 
-def test_a_broken_tree_is_one_sentence(tmp_path: Path) -> None:
-    for folder, damage in with_folders(
-        tmp_path,
-        [
-            {"textures": []},
-            {"materials": [[]]},
-            {"accessors": []},
-            {"meshes": [{}]},
-            {"bufferViews": [{"buffer": 0, "byteLength": 10**9}] * 3},
-        ],
-    ):
-        _check_a_broken_tree_is_one_sentence(folder, damage)
-
-
-def _check_a_broken_tree_is_one_sentence(tmp_path: Path, damage: dict[str, Any]) -> None:
+@for_each(
+    "damage",
+    [
+        {"textures": []},
+        {"materials": [[]]},
+        {"accessors": []},
+        {"meshes": [{}]},
+        {"bufferViews": [{"buffer": 0, "byteLength": 10**9}] * 3},
+    ],
+)
+def test_a_broken_tree_is_one_sentence(tmp_path: Path, damage: dict[str, Any]) -> None:
     with pytest.raises(TrilightError, match=r"^a\.gltf: "):
         read(tmp_path, **damage)

@@ -1,7 +1,6 @@
 """What other programs write in USD, as a scene: places, areas, colours, radiance, and losses."""
 
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
+from tests.for_each import for_each
 from tests.pipeline.exchange.strangers_stage import L_SHAPE, mesh, write_stage
 from tests.scenes_by_hand import tiny_scene
 
@@ -51,18 +51,16 @@ def test_units_and_axes(stage: UsdScene) -> None:
     assert stage.scene.fov_deg[0] == pytest.approx(2 * math.degrees(math.atan(18 / 50)), rel=1e-6)
 
 
-def test_lights_have_their_area_and_radiance(stage: UsdScene) -> None:
-    cases: Iterable[Any] = [
+@for_each(
+    "name, area_vector, radiance",
+    [
         ("rect", [0, 0, -0.1], [20, 20, 20]),
         ("disk", [0, math.pi * 0.04, 0], [1, 0.5, 0.25]),
         ("lamp", [0, 0, 0.005], [7, 7, 7]),
         ("sphere", [0, 0, 0], [3 / (4 * math.pi * 0.01)] * 3),
-    ]
-    for case in cases:
-        _check_lights_have_their_area_and_radiance(stage, *case)
-
-
-def _check_lights_have_their_area_and_radiance(
+    ],
+)
+def test_lights_have_their_area_and_radiance(
     stage: UsdScene, name: str, area_vector: list[float], radiance: list[float]
 ) -> None:
     corners, rows = object_of(stage.scene, name)

@@ -1,7 +1,6 @@
 """Built-in families that are one grid of vertices, with volumes that are known on paper."""
 
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from pipeline.objects.builtin.grids import Mesh
 from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
 from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
 from pipeline.objects.builtin.vase import VaseParams, vase
+from tests.for_each import for_each
 from tests.pipeline.objects.builtin.test_builtin import volume
 
 
@@ -73,13 +73,8 @@ def test_the_unknot_is_a_torus_of_known_volume() -> None:
     assert volume((positions, faces)) == pytest.approx(expected, rel=0.005)
 
 
-def test_strands_of_a_knot_do_not_meet() -> None:
-    cases: Iterable[Any] = [(2, 3), (3, 2), (2, 5), (3, 4), (1, 5), (4, 3), (5, 2)]
-    for windings in cases:
-        _check_strands_of_a_knot_do_not_meet(windings)
-
-
-def _check_strands_of_a_knot_do_not_meet(windings: tuple[int, int]) -> None:
+@for_each("windings", [(2, 3), (3, 2), (2, 5), (3, 4), (1, 5), (4, 3), (5, 2)])
+def test_strands_of_a_knot_do_not_meet(windings: tuple[int, int]) -> None:
     params = _ring(windings, segments=240, sides=8)
     positions, _ = torus_knot(params)
     rings = positions.reshape(240, 8, 3)

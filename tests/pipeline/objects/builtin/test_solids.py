@@ -1,8 +1,6 @@
 """Parts of built-in objects, and those put together from them: furniture, trees, plants."""
 
-from collections.abc import Iterable
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +11,7 @@ from pipeline.objects.builtin.grids import Mesh
 from pipeline.objects.builtin.plant import LeafParams, leaf_sheet
 from pipeline.objects.builtin.solids import beam, box, icosphere, join, lathe, moved, tube
 from pipeline.objects.builtin.tree import TreeParams, tree
+from tests.for_each import for_each
 from tests.pipeline.objects.builtin.test_builtin import is_closed, made, parts_of, volume
 
 
@@ -21,13 +20,8 @@ def polygon(sides: int) -> float:
     return 0.5 * sides * float(np.sin(2 * np.pi / sides))
 
 
-def test_an_icosphere_is_an_even_ball() -> None:
-    cases: Iterable[Any] = [1, 2, 3, 7, 12]
-    for frequency in cases:
-        _check_an_icosphere_is_an_even_ball(frequency)
-
-
-def _check_an_icosphere_is_an_even_ball(frequency: int) -> None:
+@for_each("frequency", [1, 2, 3, 7, 12])
+def test_an_icosphere_is_an_even_ball(frequency: int) -> None:
     positions, faces = icosphere(frequency)
     assert len(faces) == 20 * frequency**2
     assert len(positions) == 10 * frequency**2 + 2
@@ -120,8 +114,9 @@ def _furniture(**changes: object) -> FurnitureParams:
     return FurnitureParams(**(shape | changes))  # type: ignore[arg-type]
 
 
-def test_furniture_has_its_parts() -> None:
-    cases: Iterable[Any] = [
+@for_each(
+    "changes, parts",
+    [
         # A seat, four legs, four aprons, four stretchers, two posts, a rail and four slats.
         ({}, 1 + 4 + 4 + 4 + 2 + 1 + 4),
         ({"level_slats": True}, 1 + 4 + 4 + 4 + 2 + 4),
@@ -129,12 +124,9 @@ def test_furniture_has_its_parts() -> None:
         ({"kind": "table", "slats": 5}, 5 + 2 + 4 + 4 + 4),
         ({"kind": "round"}, 1 + 4 + 4 + 4),
         ({"kind": "shelf", "books": ((0.05, 0.8),) * 3}, 2 + 5 + 3),
-    ]
-    for case in cases:
-        _check_furniture_has_its_parts(*case)
-
-
-def _check_furniture_has_its_parts(changes: dict[str, object], parts: int) -> None:
+    ],
+)
+def test_furniture_has_its_parts(changes: dict[str, object], parts: int) -> None:
     assert len(parts_of(furniture(_furniture(**changes)))) == parts
 
 
@@ -207,18 +199,16 @@ def _tree(**changes: object) -> Mesh:
     return tree(TreeParams(**(shape | changes)))  # type: ignore[arg-type]
 
 
-def test_trees_have_their_parts() -> None:
-    cases: Iterable[Any] = [
+@for_each(
+    "changes, parts",
+    [
         ({}, 1 + 4 + 12),
         ({"children": (2, 2, 2)}, 1 + 2 + 4 + 8),
         ({"crown": "masses"}, 1 + 4 + 12 + 12),
         ({"crown": "tiers"}, 1 + 4),
-    ]
-    for case in cases:
-        _check_trees_have_their_parts(*case)
-
-
-def _check_trees_have_their_parts(changes: dict[str, object], parts: int) -> None:
+    ],
+)
+def test_trees_have_their_parts(changes: dict[str, object], parts: int) -> None:
     assert len(parts_of(_tree(**changes))) == parts
 
 

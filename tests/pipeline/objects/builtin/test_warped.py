@@ -1,8 +1,6 @@
 """Rocks, shells and lattices: what is known of them on paper."""
 
 import itertools
-from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +9,7 @@ from pipeline.objects.builtin.grids import Mesh
 from pipeline.objects.builtin.lattice import LatticeParams, lattice
 from pipeline.objects.builtin.rock import RockParams, rock
 from pipeline.objects.builtin.shell import ShellParams, shell
+from tests.for_each import for_each
 from tests.pipeline.objects.builtin.test_builtin import is_closed, parts_of, volume
 
 CUBE = tuple(
@@ -114,15 +113,11 @@ def _graph(x: int, y: int, z: int) -> tuple[int, int]:
     return (x + 1) * (y + 1) * (z + 1), bars
 
 
-def test_a_lattice_has_the_genus_of_its_graph() -> None:
-    cases: Iterable[Any] = itertools.product(
-        [(1, 1, 1), (2, 1, 3), (3, 3, 2), (4, 0, 3), (1, 0, 1)], [1, 3]
-    )
-    for case in cases:
-        _check_a_lattice_has_the_genus_of_its_graph(*case)
-
-
-def _check_a_lattice_has_the_genus_of_its_graph(cells: tuple[int, int, int], splits: int) -> None:
+@for_each(
+    "cells, splits",
+    itertools.product([(1, 1, 1), (2, 1, 3), (3, 3, 2), (4, 0, 3), (1, 0, 1)], [1, 3]),
+)
+def test_a_lattice_has_the_genus_of_its_graph(cells: tuple[int, int, int], splits: int) -> None:
     mesh = _lattice(cells, splits=splits)
     crossings, bars = _graph(*cells)
     assert is_closed(mesh) and len(parts_of(mesh)) == 1

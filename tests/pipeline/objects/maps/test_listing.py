@@ -1,8 +1,6 @@
 """Folders of textures and maps: sets by their names, licences as objects have them."""
 
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +10,7 @@ from pipeline.objects.maps.listing import FoundMaps, find_maps
 from pipeline.objects.maps.names import named_part
 from storage.errors import TrilightError
 from storage.records.objects import SKY, TEXTURE
+from tests.for_each import for_each
 from tests.pipeline.objects.maps.map_files import exr, noise, png
 
 
@@ -19,8 +18,9 @@ def _find(folder: Path, kind: str = TEXTURE, licence: str | None = None) -> Foun
     return find_maps(kind, str(folder), licence=licence, allowed_licences=DEFAULT_ALLOWED)
 
 
-def test_the_last_word_of_a_name_is_its_part() -> None:
-    cases: Iterable[Any] = [
+@for_each(
+    "stem, part",
+    [
         ("wood_floor_diff_4k", ("wood_floor_4k", "base")),
         ("Bricks076_1K_Color", ("Bricks076_1K", "base")),
         ("a/oak-baseColor", ("a/oak", "base")),
@@ -29,12 +29,9 @@ def test_the_last_word_of_a_name_is_its_part() -> None:
         ("oak_metalness", ("oak", "metallic")),
         ("oak", ("oak", "base")),
         ("color", ("color", "base")),
-    ]
-    for case in cases:
-        _check_the_last_word_of_a_name_is_its_part(*case)
-
-
-def _check_the_last_word_of_a_name_is_its_part(stem: str, part: tuple[str, str]) -> None:
+    ],
+)
+def test_the_last_word_of_a_name_is_its_part(stem: str, part: tuple[str, str]) -> None:
     assert named_part(stem) == part
 
 

@@ -1,24 +1,17 @@
 """Maps from outside: no light is lost by resampling, and what is wrong says so."""
 
-from collections.abc import Iterable
-from typing import Any
-
 import numpy as np
 import pytest
 
 from pipeline.objects.maps.radiance import usable_map
 from pipeline.objects.maps.resample import area_means, flux, solid_angle_means
 from storage.errors import Rejected
+from tests.for_each import for_each
 from tests.pipeline.objects.maps.map_files import sun_map
 
 
-def test_a_sun_of_a_million_keeps_its_energy() -> None:
-    cases: Iterable[Any] = [1, 5, 13, 32, 48]
-    for height in cases:
-        _check_a_sun_of_a_million_keeps_its_energy(height)
-
-
-def _check_a_sun_of_a_million_keeps_its_energy(height: int) -> None:
+@for_each("height", [1, 5, 13, 32, 48])
+def test_a_sun_of_a_million_keeps_its_energy(height: int) -> None:
     radiance = sun_map(rows=48)
     found = solid_angle_means(radiance, height)
     assert found.shape == (height, 2 * height, 3)

@@ -1,14 +1,13 @@
 """Radiance pictures: what they say, and every way in which one can be wrong."""
 
 import itertools
-from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import pytest
 
 from pipeline.objects.maps.rgbe import rgbe_radiance
 from storage.errors import Rejected
+from tests.for_each import for_each
 from tests.pipeline.objects.maps.map_files import hdr
 
 
@@ -20,13 +19,8 @@ def _texels(rows: int, columns: int) -> np.ndarray:
     return texels
 
 
-def test_values_are_mantissa_times_a_power_of_two() -> None:
-    cases: Iterable[Any] = itertools.product([True, False], [8, 300])
-    for case in cases:
-        _check_values_are_mantissa_times_a_power_of_two(*case)
-
-
-def _check_values_are_mantissa_times_a_power_of_two(runs: bool, columns: int) -> None:
+@for_each("runs, columns", itertools.product([True, False], [8, 300]))
+def test_values_are_mantissa_times_a_power_of_two(runs: bool, columns: int) -> None:
     texels = _texels(3, columns)
     found = rgbe_radiance(hdr(texels, runs=runs), 200)
     expected = texels[..., :3] / 256 * 2.0 ** (texels[..., 3:].astype(int) - 128)
