@@ -1,10 +1,11 @@
-"""What arcs multiply: prims are counted as they are composed, and left when they are too many."""
+"""What arcs and instances multiply is counted as it is composed, and left when it is too much."""
 
 from pathlib import Path
 
 import pytest
+from pxr import Usd, UsdGeom
 
-from pipeline.usd import composition
+from pipeline.usd import composition, placed
 from storage.errors import TrilightError
 from tests.pipeline.usd.test_stage import HEAD, prims_of
 
@@ -106,3 +107,35 @@ def test_depth(tmp_path: Path) -> None:
     (tmp_path / "deep.usda").write_text(HEAD + 'def "a" {\n' * levels + "}\n" * levels)
     with pytest.raises(TrilightError, match="nested more than 150 deep"):
         prims_of(tmp_path / "deep.usda")
+
+
+def stage_of(prototype: str, count: int) -> Usd.Stage:
+    """Return a stage with one instancer."""
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    instancer = UsdGeom.PointInstancer.Define(stage, "/many")
+    UsdGeom.Mesh.Define(stage, "/many/mesh")
+    instancer.CreatePrototypesRel().AddTarget(prototype)
+    instancer.CreateProtoIndicesAttr([0] * count)
+    instancer.CreatePositionsAttr([(index, 0, 0) for index in range(count)])
+    return stage
+
+
+def test_instances_stand_in_their_order() -> None:
+    lost: list[str] = []
+    found = placed.placed_prims(stage_of("/many/mesh", 3), Usd.TimeCode.Default(), lost)
+    assert [each.to_world[0, 3] for each in found] == [0, 1, 2]
+
+
+def test_too_many_instances_are_refused_before_their_places_are_computed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(placed, "MAX_PLACED", 4)
+    with pytest.raises(TrilightError, match="/many: 5 instances; expected at most 4"):
+        placed.placed_prims(stage_of("/many/mesh", 5), Usd.TimeCode.Default(), [])
+
+
+def test_an_instancer_within_itself_is_refused() -> None:
+    """Every level would hold the places of its instances."""
+    with pytest.raises(TrilightError, match="/many: nested more than 150 deep"):
+        placed.placed_prims(stage_of("/many", 2), Usd.TimeCode.Default(), [])

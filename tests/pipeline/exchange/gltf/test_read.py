@@ -1,5 +1,7 @@
 """glTF as a scene: places, colours at corners, the rule for Fresnel, and what is lost."""
 
+import base64
+import io
 import json
 import struct
 from pathlib import Path
@@ -7,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from PIL import Image
 
 from pipeline.exchange.convert import convert_scene
 from pipeline.exchange.gltf.read import GltfScene, read_gltf
@@ -15,15 +19,73 @@ from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.pipeline.exchange.exchange_kit import row_at
-from tests.pipeline.exchange.gltf_kit import BLUE, GREEN, GREY, PICTURE, RED, UV, png, quad
-from tests.pipeline.exchange.gltf_kit import write_gltf as written
+
+POSITIONS = np.array([[-1, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]], np.float32)
+"""A floor in glTF's axes: +Y up. In ours, the corners are (-1, -1), (1, -1), (1, 1), (-1, 1)."""
+
+UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
+"""v goes down: the first corner is the lower left one of the picture."""
+
+RED, GREEN, BLUE, GREY = (255, 0, 0), (0, 255, 0), (0, 0, 255), (128, 128, 128)
+PICTURE = np.array([[RED, GREEN], [BLUE, GREY]], np.uint8)
+"""The top row first: red is the upper left corner, at (-1, 1)."""
+
+
+def png(pixels: NDArray[np.uint8]) -> str:
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "PNG")
+    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode()
+
+
+def quad(**changes: Any) -> dict[str, Any]:
+    """Return the tree of a textured quad; `uv`, `pictures`, `material` and `node` may be others."""
+    uv = changes.pop("uv", UV)
+    arrays: list[NDArray[Any]] = [POSITIONS, np.array([0, 1, 2, 0, 2, 3], np.uint16)]
+    arrays += [] if uv is None else [uv]
+    data = b"".join(array.tobytes() for array in arrays)
+    ends = np.cumsum([array.nbytes for array in arrays])
+    attributes = {"POSITION": 0} | ({} if uv is None else {"TEXCOORD_0": 2})
+    kinds = [(5126, "VEC3"), (5123, "SCALAR"), (5126, "VEC2")]
+    pictures = changes.pop("pictures", [png(PICTURE)])
+    material = changes.pop("material", {})
+    surface = {"metallicFactor": 0, "roughnessFactor": 0.5, "baseColorTexture": {"index": 0}}
+    return {
+        "asset": {"version": "2.0", "copyright": "A. Maker"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "floor", **changes.pop("node", {})}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 1, "material": 0}]}],
+        "materials": [{"name": "m", "pbrMetallicRoughness": surface, **material}],
+        "textures": [{"source": row, "sampler": 0} for row in range(len(pictures))],
+        "samplers": [changes.pop("sampler", {})],
+        "images": [{"uri": uri} for uri in pictures],
+        "buffers": [
+            {"byteLength": len(data), "uri": "data:;base64," + base64.b64encode(data).decode()}
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": int(end - array.nbytes), "byteLength": array.nbytes}
+            for array, end in zip(arrays, ends, strict=True)
+        ],
+        "accessors": [
+            {"bufferView": row, "componentType": kinds[row][0], "type": kinds[row][1],
+             "count": array.size if kinds[row][1] == "SCALAR" else len(array)}
+            for row, array in enumerate(arrays)
+        ],
+        **changes,
+    }  # fmt: skip
+
+
+def write_gltf(folder: Path, tree: dict[str, Any], name: str = "a.gltf") -> Path:
+    (folder / name).write_text(json.dumps(tree))
+    return folder / name
+
 
 F = 0.04 + 0.96 / 21
 """What a dielectric of index 1.5 reflects: F0, and the mean of Schlick's rise to 1."""
 
 
 def read(folder: Path, **changes: Any) -> GltfScene:
-    return read_gltf(written(folder, quad(**changes)), "CC0-1.0")
+    return read_gltf(write_gltf(folder, quad(**changes)), "CC0-1.0")
 
 
 def diffuse_of(srgb: tuple[int, int, int]) -> np.ndarray:
@@ -124,7 +186,7 @@ def test_cameras_lights_and_emission(tmp_path: Path) -> None:
         },
     ]
     tree["scenes"][0]["nodes"] = [0, 1, 2]
-    found = read_gltf(written(tmp_path, tree), "CC0-1.0")
+    found = read_gltf(write_gltf(tmp_path, tree), "CC0-1.0")
     scene = found.scene
     assert scene.environment is None
     assert scene.c2w[0, :3, 3] == pytest.approx([0, -5, 2], abs=1e-6)

@@ -20,7 +20,7 @@ from storage.errors import TrilightError
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene
 from tests.for_each import for_each
-from tests.pipeline.exchange.usd.usd_validators import errors_of
+from tests.pipeline.exchange.exchange_kit import errors_of
 from tests.scenes_by_hand import LIGHT, tiny_scene
 
 OPENPBR_INPUTS = {
