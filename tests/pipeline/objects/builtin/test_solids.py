@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.objects.builtin.furniture import FurnitureParams, furniture
 from pipeline.objects.builtin.grids import Mesh
-from pipeline.objects.builtin.plant import LeafParams, leaf_sheet
-from pipeline.objects.builtin.solids import beam, box, icosphere, join, lathe, moved, tube
+from pipeline.objects.builtin.solids import beam, box, icosphere, lathe, tube
 from pipeline.objects.builtin.tree import TreeParams, tree
 from tests.for_each import for_each
 from tests.pipeline.objects.builtin.test_builtin import is_closed, made, parts_of, volume
@@ -89,20 +88,6 @@ def test_a_beam_runs_from_point_to_point() -> None:
         expected = 0.1 * 0.04 * float(np.linalg.norm(end))
         assert volume(mesh) == pytest.approx(expected, rel=0.03)
         assert is_closed(mesh)
-
-
-def test_a_tapered_beam_is_thinner_at_its_end() -> None:
-    positions, _ = beam([0, 0, 1], [0, 0, 0], (0.1, 0.1), 0.01, taper=0.5)
-    top, foot = positions[positions[:, 2] > 0.5], positions[positions[:, 2] < 0.5]
-    assert np.abs(foot[:, :2]).max() == pytest.approx(0.5 * np.abs(top[:, :2]).max(), rel=0.03)
-
-
-def test_joined_parts_keep_their_faces() -> None:
-    ball, bar = icosphere(2), moved(lathe([(1.0, 0.0), (1.0, 1.0)], 6), [5, 0, 0], 0.5)
-    both = join([ball, bar, ball])
-    assert len(both[0]) == 2 * len(ball[0]) + len(bar[0])
-    assert volume(both) == pytest.approx(2 * volume(ball) + volume(bar), rel=1e-12)
-    np.testing.assert_array_equal(both[0][both[1][-80:]], ball[0][ball[1]])
 
 
 def _furniture(**changes: object) -> FurnitureParams:
@@ -186,11 +171,6 @@ def test_no_two_boards_share_a_plane_where_they_meet() -> None:
         assert _shared_planes(made("furniture", number)) == 0, number
 
 
-def test_boards_that_share_a_plane_are_found() -> None:
-    first, second = box([0, 0, 0], [1, 1, 1], 0.1), box([0.5, 0, 0], [1, 0.8, 1], 0.1)
-    assert _shared_planes(join([first, second])) > 0
-
-
 def _tree(**changes: object) -> Mesh:
     shape = {
         "crown": "bare", "children": (4, 3), "spread_rad": 0.7, "shrink": 0.6, "thickness": 0.07,
@@ -210,52 +190,6 @@ def _tree(**changes: object) -> Mesh:
 )
 def test_trees_have_their_parts(changes: dict[str, object], parts: int) -> None:
     assert len(parts_of(_tree(**changes))) == parts
-
-
-def test_variants_are_trees_of_one_kind() -> None:
-    first, other = _tree(), _tree(variant=1)
-    assert np.array_equal(first[1], other[1])
-    assert not np.allclose(first[0], other[0], atol=0.01)
-
-
-def _leaf(**changes: float) -> Mesh:
-    shape = {
-        "length": 2.0, "width": 0.3, "widest": 0.5, "base": 0.2, "arch_rad": 0.0, "fold_rad": 0.0,
-        "teeth": 0, "tooth_depth": 0.5, "rows": 10,
-    }  # fmt: skip
-    return leaf_sheet(LeafParams(**(shape | changes)), 0.0)  # type: ignore[arg-type]
-
-
-def test_a_flat_leaf_lies_level_and_looks_up() -> None:
-    positions, faces = _leaf()
-    np.testing.assert_allclose(np.ptp(positions, axis=0), [2.0, 0.6, 0.0], atol=1e-12)
-    a, b, c = positions[faces].transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
-    assert (normal[:, 2] > 0).all()
-    assert not is_closed((positions, faces))
-
-
-def test_a_leaf_has_one_border() -> None:
-    faces = _leaf()[1]
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).tolist()
-    back = {(b, a) for a, b in edges}
-    follow = {a: b for a, b in edges if (a, b) not in back}
-    start = place = next(iter(follow))
-    length = 0
-    while length == 0 or place != start:
-        place, length = follow[place], length + 1
-    # Four edges at the base, and ten to the tip on either side.
-    assert length == len(follow) == 4 + 2 * 10
-
-
-def test_leaves_arch_fold_and_have_teeth() -> None:
-    plain = _leaf()
-    arched, folded, toothed = _leaf(arch_rad=1.0), _leaf(fold_rad=0.5), _leaf(teeth=4)
-    assert arched[0][-1, 2] < -0.5 and np.ptp(arched[0][:, 0]) < 2.0
-    assert folded[0][:, 2].max() > 0.1 and np.ptp(folded[0][:, 1]) < 0.6
-    width = np.ptp(toothed[0][:-1].reshape(10, 5, 3)[..., 1], axis=1)
-    full = np.ptp(plain[0][:-1].reshape(10, 5, 3)[..., 1], axis=1)
-    np.testing.assert_allclose(width / full, [1.0, 0.5] * 5)
 
 
 def test_plants_have_a_closed_pot_below_open_leaves() -> None:
