@@ -99,23 +99,6 @@ def test_every_corner_of_the_examples_is_where_a_slow_twin_puts_it(
             np.testing.assert_allclose(found, expected, atol=3e-7)
 
 
-BOUNDS = {
-    # the shells are halved cubes of side 2; the light's lowest and highest corner are at
-    # 2.1 -+ 2.5 * 0.025
-    "cbox": ((-0.5, -0.5, -0.5), (0.5, 0.5, 2.1625)),
-    "cbox-bunny": ((-0.5, -0.5, -0.5), (0.5, 0.5, 2.1625)),
-    "init-template": ((-0.5, -0.5, -0.5), (0.5, 0.5, 2.1625)),
-    # the light is at 1.47 +- 0.0625; the lowest vertex is one of purple.obj
-    "crystals": ((-0.5, -0.5, -0.540819), (1.5325, 0.5, 1.5325)),
-}
-
-
-@for_each("name", BOUNDS)
-def test_examples_are_as_large_as_they_should_be(examples: dict[str, Scene], name: str) -> None:
-    points = examples[name].vertex_positions
-    np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], BOUNDS[name], atol=1e-6)
-
-
 @for_each("name", EXAMPLES)
 def test_examples_have_the_materials_and_kinds_of_their_files(
     examples: dict[str, Scene], shared: Path, name: str
