@@ -34,7 +34,6 @@ from storage.records.sample import Sample
 from storage.records.scene import Scene
 from tests.command_line import trilight
 from tests.pipeline.documents.dataset_by_hand import SETTINGS, furnished, sample, write_dataset
-from tests.pipeline.documents.pages_read import read
 from tests.scenes_by_hand import tiny_scene
 
 WORDS = ("depth", "shading normal", "object ids", "diffuse albedo", "roughness")
@@ -114,13 +113,6 @@ def test_a_view_of_nothing_is_black() -> None:
         picture, caption = shown[f"view 1, {word}"]
         assert not picture.any() and caption == f"view 1, {word}: nothing is met"
         assert shown[f"view 0, {word}"][0].any()
-
-
-def test_a_page_is_whole_and_loads_nothing() -> None:
-    tags = read(page_of(sample(0, looking_away())).encode())
-    loaded = [link for link in tags.links if not link.endswith("report.html")]
-    assert len(loaded) == 2 + 2 * len(WORDS)
-    assert all(link.startswith("data:image/png;base64,") for link in loaded)
 
 
 @pytest.mark.usefixtures("bare_reports")

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 import trimesh
@@ -172,19 +171,6 @@ def test_light_beyond_half_floats_is_said_to_be_cut_off() -> None:
     scene = tiny_scene()
     scene.materials[LIGHT, 7:] = 65505
     assert any("cuts off" in text for text in described_files(scene, "a").lost)
-
-
-def test_our_hdf5_has_what_the_published_program_takes(shared: Path, tmp_path: Path) -> None:
-    """Every array that it loads, of one number of triangles and of views, finite in half floats."""
-    scene = example_scene(shared, "init-template")
-    with h5py.File(converted(scene, tmp_path, "a.h5")) as file:
-        found = {name: np.array(file[name]).astype(np.float32) for name in file}
-    count, views = scene.num_triangles, scene.num_views
-    assert {name: array.shape for name, array in found.items()} == {
-        "triangles": (count, 3, 3), "vn": (count, 3, 3), "texture": (count, 13, 32, 32),
-        "c2w": (views, 4, 4), "fov": (views,),
-    }  # fmt: skip
-    assert all(np.isfinite(array.astype(np.float16)).all() for array in found.values())
 
 
 WARM, SCENES = 100, 400

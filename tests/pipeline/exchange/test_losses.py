@@ -154,14 +154,6 @@ def test_textures_and_a_sky_are_said_to_be_lost_where_they_are(tmp_path: Path, f
     assert np.allclose(row[[0, 1, 2, 6]], np.concatenate(means), atol=1e-3)  # H5 holds halves
 
 
-@for_each("form", ["safetensors", "usda", "usdc", "usdz"])
-def test_these_carry_textures_and_a_sky(tmp_path: Path, form: str) -> None:
-    path, scene = tmp_path / f"a.{form}", textured_scene(environment=sky())
-    assert write_scene(path, scene) == ()
-    back = load_source(scene_source(str(path)))
-    assert back.notes == () and back.scene.textures[0].sha256 == scene.textures[0].sha256
-
-
 @pytest.mark.parametrize("form", ["json", "h5"])
 def test_a_scene_that_only_its_sky_lights_is_not_written_dark(tmp_path: Path, form: str) -> None:
     plain = tiny_scene()

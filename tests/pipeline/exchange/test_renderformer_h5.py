@@ -25,7 +25,6 @@ from storage.records.scene import Scene
 from storage.records.texture import Texture
 from tests.for_each import for_each
 from tests.pipeline.exchange.exchange_kit import row_at
-from tests.pipeline.scenes.example_scenes import example_scene
 from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
 from tests.sky_maps import COLOURS, POLES, six_poles
 from tests.textured_by_hand import number_texture, textured_scene
@@ -227,18 +226,6 @@ def test_other_packings_are_read(tmp_path: Path, packing: dict[str, object]) -> 
             file.create_dataset(name, data=wide, **packing)
     write_renderformer_h5(tmp_path / "c.h5", read_renderformer_h5(other).scene, sample.radiance_rgb)
     assert (tmp_path / "c.h5").read_bytes() == plain.read_bytes()
-
-
-def test_an_example_scene_goes_through_it(shared: Path, tmp_path: Path) -> None:
-    """Real meshes, smooth shading and colours per triangle."""
-    scene = example_scene(shared, "crystals")
-    first, again = tmp_path / "first.h5", tmp_path / "again.h5"
-    write_renderformer_h5(first, scene, texture_type="float16")
-    read = read_renderformer_h5(first)
-    write_renderformer_h5(again, read.scene, texture_type="float16")
-    assert again.read_bytes() == first.read_bytes()
-    assert read.lost == ()
-    assert read.scene.num_triangles == scene.num_triangles
 
 
 def _smooth_scene() -> Scene:

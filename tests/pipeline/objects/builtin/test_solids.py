@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.furniture import FurnitureParams, furniture
 from pipeline.objects.builtin.grids import Mesh
-from pipeline.objects.builtin.solids import beam, box, icosphere, lathe, tube
-from pipeline.objects.builtin.tree import TreeParams, tree
+from pipeline.objects.builtin.solids import box, icosphere, lathe, tube
 from tests.for_each import for_each
 from tests.pipeline.objects.builtin.test_builtin import is_closed, made, parts_of, volume
 
@@ -55,16 +53,6 @@ def test_a_straight_tube_is_a_prism_in_any_direction() -> None:
         assert is_closed(bar)
 
 
-def test_a_bent_tube_keeps_its_thickness_and_does_not_turn() -> None:
-    turn = np.linspace(0, np.pi, 65)
-    path = np.stack([np.cos(turn), np.zeros(65), np.sin(turn)], axis=1)
-    positions, _ = tube(path, np.full(65, 0.2), 8)
-    ring = positions[:-2].reshape(65, 8, 3)
-    np.testing.assert_allclose(np.linalg.norm(ring - path[:, None], axis=2), 0.2, rtol=1e-12)
-    # In a flat bend every vertex stays at its own distance from the plane.
-    np.testing.assert_allclose(np.ptp(ring[..., 1], axis=0), 0, atol=1e-12)
-
-
 def test_a_box_is_cut_at_its_edges_only() -> None:
     half, cut = np.array([0.5, 0.3, 0.2]), 0.05
     positions, faces = box([1.0, 2.0, 3.0], half, cut)
@@ -76,53 +64,6 @@ def test_a_box_is_cut_at_its_edges_only() -> None:
     prisms = 4 * cut**2 / 2 * float((2 * half).sum())
     assert volume((positions, faces)) == pytest.approx(0.24 - prisms, abs=8 * cut**3)
     assert volume((positions, faces)) > 0.24 - prisms
-
-
-def test_a_beam_runs_from_point_to_point() -> None:
-    for end in np.array([[1.0, 0, 0], [0, 0, 1], [0.1, 0.05, -0.7], [0.5, 0.5, 0.1]]):
-        start = np.array([0.2, 0.3, 0.4])
-        mesh = beam(start, start + end, (0.05, 0.02), 0.001)
-        along = (mesh[0] - start) @ end / (end @ end)
-        assert (along.min(), along.max()) == pytest.approx((0, 1), abs=1e-9)
-        # Bevels of a thousandth take less than 3 % of a section of 0.1 x 0.04.
-        expected = 0.1 * 0.04 * float(np.linalg.norm(end))
-        assert volume(mesh) == pytest.approx(expected, rel=0.03)
-        assert is_closed(mesh)
-
-
-def _furniture(**changes: object) -> FurnitureParams:
-    shape = {
-        "kind": "chair", "width": 0.5, "depth": 0.4, "height": 0.45, "board": 0.04, "leg": 0.02,
-        "leg_style": "square", "splay": 0.0, "stretchers": True, "back": 0.5, "slats": 4,
-        "level_slats": False, "boards": 3, "books": (),
-    }  # fmt: skip
-    return FurnitureParams(**(shape | changes))  # type: ignore[arg-type]
-
-
-@for_each(
-    "changes, parts",
-    [
-        # A seat, four legs, four aprons, four stretchers, two posts, a rail and four slats.
-        ({}, 1 + 4 + 4 + 4 + 2 + 1 + 4),
-        ({"level_slats": True}, 1 + 4 + 4 + 4 + 2 + 4),
-        ({"kind": "table", "slats": 1, "stretchers": False}, 1 + 4 + 4),
-        ({"kind": "table", "slats": 5}, 5 + 2 + 4 + 4 + 4),
-        ({"kind": "round"}, 1 + 4 + 4 + 4),
-        ({"kind": "shelf", "books": ((0.05, 0.8),) * 3}, 2 + 5 + 3),
-    ],
-)
-def test_furniture_has_its_parts(changes: dict[str, object], parts: int) -> None:
-    assert len(parts_of(furniture(_furniture(**changes)))) == parts
-
-
-def test_a_shelf_holds_no_more_books_than_fit() -> None:
-    books = ((0.05, 0.8),) * 500
-    shelf = furniture(_furniture(kind="shelf", books=books))
-    low, high = shelf[0].min(axis=0), shelf[0].max(axis=0)
-    empty = furniture(_furniture(kind="shelf"))
-    np.testing.assert_allclose([low, high], [empty[0].min(axis=0), empty[0].max(axis=0)])
-    # Four bays of 0.44 in steps of 0.053.
-    assert len(parts_of(shelf)) - len(parts_of(empty)) == 4 * 8
 
 
 def _overlap(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
@@ -169,33 +110,3 @@ def _shared_planes(mesh: Mesh) -> int:
 def test_no_two_boards_share_a_plane_where_they_meet() -> None:
     for number in range(16):
         assert _shared_planes(made("furniture", number)) == 0, number
-
-
-def _tree(**changes: object) -> Mesh:
-    shape = {
-        "crown": "bare", "children": (4, 3), "spread_rad": 0.7, "shrink": 0.6, "thickness": 0.07,
-        "rise": 0.3, "mass": 0.25, "tiers": 4, "folds": 6, "variant": 0,
-    }  # fmt: skip
-    return tree(TreeParams(**(shape | changes)))  # type: ignore[arg-type]
-
-
-@for_each(
-    "changes, parts",
-    [
-        ({}, 1 + 4 + 12),
-        ({"children": (2, 2, 2)}, 1 + 2 + 4 + 8),
-        ({"crown": "masses"}, 1 + 4 + 12 + 12),
-        ({"crown": "tiers"}, 1 + 4),
-    ],
-)
-def test_trees_have_their_parts(changes: dict[str, object], parts: int) -> None:
-    assert len(parts_of(_tree(**changes))) == parts
-
-
-def test_plants_have_a_closed_pot_below_open_leaves() -> None:
-    for number in range(6):
-        parts = parts_of(made("plant", number))
-        assert is_closed(parts[0]) and parts[0][0][:, 2].min() == 0.0, number
-        leaves = [part for part in parts if not is_closed(part)]
-        assert len(leaves) >= 7, number
-        assert all(leaf[0][:, 2].max() > parts[0][0][:, 2].max() for leaf in leaves), number

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,8 +18,6 @@ from tests.http_server import Fault, Site, serve
 from tests.pipeline.objects.find_kit import find, reasons
 
 pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
-
-ADDRESS = re.compile(r"http://127\.0\.0\.1:\d+")
 
 
 def gltf(*uris: str) -> str:
@@ -229,21 +226,6 @@ def test_a_licence_beside_a_catalogue_is_refused(site: Site) -> None:
         find(site.url, licence="MIT")
 
 
-def test_real_objects_over_http(site: Site, shared: Path) -> None:
-    folder = shared / "objects"
-    rows = (folder / "objects.jsonl").read_text().splitlines()[:12]
-    site.put("objects.jsonl", "\n".join(rows))
-    for row in map(json.loads, rows):
-        site.put(row["path"], (folder / row["path"]).read_bytes())
-    found = find(site.url)
-    assert len(found.records) == 12
-    for record, row in zip(
-        found.records, sorted(map(json.loads, rows), key=lambda r: r["uid"]), strict=True
-    ):
-        assert Path(record.path).read_bytes() == (folder / row["path"]).read_bytes()
-    assert not ADDRESS.search(repr([record.source_url for record in found.records]))
-
-
 pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
 
 
@@ -368,11 +350,6 @@ def test_what_killed_runs_left_is_cleared_after_a_day(site: Site) -> None:
         os.utime(folder / name, (when, when))
     find(site.url)
     assert sorted(path.name for path in folder.iterdir()) == ["a.obj", "young.obj.7.part"]
-
-
-def test_a_server_that_is_not_there(site: Site) -> None:
-    with pytest.raises(TrilightError, match="cannot be read .*Connect"):
-        find("http://127.0.0.1:1/x")
 
 
 def test_a_listing_without_end_is_left(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
