@@ -1,6 +1,5 @@
 """Every named build is complete, and is stored as it is; its numbers stand by their digests."""
 
-import dataclasses
 import json
 from typing import Any
 
@@ -23,15 +22,8 @@ def test_settings_survive_the_manifest(name: str) -> None:
     build = named_build(name)
     stored = json.loads(json.dumps(build.as_json()))
     assert stored == build.as_json()
-    assert list(differences(build.as_json(), stored)) == []
-    assert named_build(name).digest == build.digest
     assert from_record(BuildSettings, stored) == build
     assert build.build == ("benchmark-v1" if name == "benchmark-v1-mini" else name)
-
-
-def test_builds_differ_from_each_other() -> None:
-    digests = {name: named_build(name).digest for name in BUILDS if name != "benchmark-v1-mini"}
-    assert len(set(digests.values())) == len(digests)
 
 
 @for_each("name", BUILDS)
@@ -72,20 +64,6 @@ def test_mistakes_are_named() -> None:
         named_build("smoke", seed=-1)
 
 
-def test_the_original_policy_differs_in_the_background_alone() -> None:
-    for size in ("256", "512"):
-        new = named_build(f"renderformer-v1-{size}")
-        old = named_build(f"renderformer-v1-{size}-original")
-        assert new.build != old.build
-        families = tuple(
-            dataclasses.replace(was, shell=now.shell)
-            for was, now in zip(old.scenes.families, new.scenes.families, strict=True)
-        )
-        scenes = dataclasses.replace(old.scenes, families=families)
-        assert dataclasses.replace(old, build=new.build, scenes=scenes) == new
-        assert old.scenes != new.scenes
-
-
 @for_each("name", JUDGED)
 def test_all_that_is_judged_is_of_the_test_split(name: str) -> None:
     splits = named_build(name).splits
@@ -99,19 +77,15 @@ def test_all_that_is_judged_is_of_the_test_split(name: str) -> None:
 def test_a_turn_of_the_test_sets_is_whole() -> None:
     """Every excursion meets every layout once, and every layout has its share of the benchmark."""
     strange = named_build("out-of-range").scenes
-    assert len(strange.excursions) == 37
     assert len({(one.axis, one.value) for one in strange.excursions}) == 37
-    assert len({one.axis for one in strange.excursions}) == 9
     assert BUILDS["out-of-range"].num_scenes == 37 * len(strange.families)
     again = named_build("out-of-range-2").scenes
     assert again.excursions[:37] == strange.excursions
     assert len({(one.axis, one.value) for one in again.excursions}) == 49
-    assert len({one.axis for one in again.excursions}) == 14
     assert BUILDS["out-of-range-2"].num_scenes == 49 * len(again.families)
     bench = named_build("benchmark-v1").scenes
     assert bench.families_in_turn
     assert BUILDS["benchmark-v1"].num_scenes == 50 * len(bench.families)
-    assert len({family.template for family in bench.families}) == 4
     assert named_build("benchmark-v1-mini") == named_build("benchmark-v1")
 
 

@@ -15,12 +15,9 @@ from PIL import Image
 
 from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.pass_colours import (
-    albedo_colours,
     depth_greys,
     finite_range,
     id_colours,
-    normal_colours,
-    share_greys,
 )
 from pipeline.documents.report import write_report
 from pipeline.documents.scene_page import Neighbours, encode_scene_page
@@ -165,24 +162,6 @@ def test_near_is_bright_in_proportion() -> None:
     assert np.array_equal(depth_greys(depth_m * 1000), depth_greys(depth_m))
     assert depth_greys(np.array([[3.0, np.inf]])).tolist() == [[255, 0]]
     assert depth_greys(np.full((2, 2), np.inf)).tolist() == [[0, 0], [0, 0]]
-
-
-def test_shares_are_told_from_nothing() -> None:
-    assert share_greys(np.array([[0, 0.5, 1, np.nan]])).tolist() == [[40, 148, 255, 0]]
-
-
-def test_a_normal_can_be_read_back() -> None:
-    for axis, along in enumerate(np.eye(3)):
-        colour = normal_colours(np.array([[along, -along]]))[0].astype(float)
-        assert colour[0, axis] == 255 and colour[1, axis] == 0
-        assert np.abs(colour / 127.5 - 1 - [along, -along]).max() <= 0.5 / 127.5
-    assert normal_colours(np.full((1, 1, 3), np.nan)).tolist() == [[[0, 0, 0]]]
-
-
-def test_albedos_are_as_a_screen_shows_them() -> None:
-    # linear 0.6 is 0.7977 in sRGB, 203 of 255
-    assert albedo_colours(np.array([[[0.6, 0, 1]]])).tolist() == [[[203, 0, 255]]]
-    assert albedo_colours(np.full((1, 1, 3), np.nan)).tolist() == [[[0, 0, 0]]]
 
 
 def test_every_id_has_its_own_colour() -> None:

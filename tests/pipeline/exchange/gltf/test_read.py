@@ -243,20 +243,6 @@ def test_pictures_elsewhere_are_refused(tmp_path: Path, uri: str) -> None:
         read(tmp_path, pictures=[uri])
 
 
-def test_a_huge_picture_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
-    """A header that claims 9000 x 9000 pixels."""
-    import base64
-    import zlib
-
-    head = struct.pack(">IIBBBBB", 9000, 9000, 8, 2, 0, 0, 0)
-    chunk = b"IHDR" + head
-    data = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk
-    data += struct.pack(">I", zlib.crc32(chunk)) + struct.pack(">I", 0) + b"IDAT" + b"\0" * 8
-    uri = "data:image/png;base64," + base64.b64encode(data).decode()
-    with pytest.raises(TrilightError, match="9000 x 9000 pixels; expected at most"):
-        read(tmp_path, pictures=[uri])
-
-
 def test_a_mesh_without_coordinates_takes_the_mean(tmp_path: Path) -> None:
     found = read(tmp_path, uv=None)
     assert any("without texture coordinates" in text for text in found.lost)

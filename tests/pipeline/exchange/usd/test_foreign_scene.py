@@ -334,32 +334,25 @@ def test_damage_ends_in_one_line(
 
 
 ODD: list[tuple[str, str, Any]] = [
-    ("/W/Grid.points", "string", "x"),
     ("/W/Grid.points", "double[]", [1.0, 2.0]),
     ("/W/Grid.faceVertexCounts", "token[]", ["a"]),
     ("/W/Grid.faceVertexIndices", "float[]", [float("nan")]),
     ("/W/Grid.normals", "string[]", ["a"]),
     ("/W/Grid.primvars:st", "int", 3),
     ("/W/mat/preview.inputs:roughness", "string", "smooth"),
-    ("/W/mat/texture.inputs:scale", "token", "x"),
-    ("/W/rect.inputs:width", "string", "wide"),
     ("/W/rect.inputs:intensity", "float[]", [1.0, 2.0]),
     ("/W/rect.inputs:exposure", "float", 1e9),
-    ("/W/cam.focalLength", "string", "long"),
     ("/W/cam.focalLength", "float", float("nan")),
     ("/W/many.protoIndices", "string[]", ["a"]),
     ("/W/many.positions", "point3f[]", [(0, 0, 0)]),
 ]
 
 
-def test_values_of_another_kind_are_refused_or_noted(tmp_path: Path) -> None:
+@for_each("path, kind, value", ODD)
+def test_values_of_another_kind_are_refused_or_noted(
+    tmp_path: Path, path: str, kind: str, value: Any
+) -> None:
     """A layer may call an attribute of a schema by any type; so may one that a person wrote."""
-    for number, (path, kind, value) in enumerate(ODD):
-        (tmp_path / str(number)).mkdir()
-        _require_refused_or_lawful(tmp_path / str(number), path, kind, value)
-
-
-def _require_refused_or_lawful(tmp_path: Path, path: str, kind: str, value: Any) -> None:
     stage = Usd.Stage.Open(str(write_stage(tmp_path)))
     prim_path, name = path.split(".")
     prim = stage.GetPrimAtPath(prim_path)

@@ -81,7 +81,7 @@ def test_objects_stay_what_they_are() -> None:
     found = {}
     for family in FAMILIES:
         meshes = [made(family, number) for number in range(2 * SAMPLES)]
-        # to a cell of the mesh stage: exp, sin and cos differ between processors in their sixteenth digit
+        # to a cell of the mesh stage: processors differ in the sixteenth digit of exp and sin
         cells = [np.rint(positions * 2**20).astype(np.int64) for positions, _ in meshes]
         faces = [faces.astype(np.int64) for _, faces in meshes]
         found[family] = sha256_hex(np.concatenate([*cells, *faces]).tobytes())[:16]

@@ -1,20 +1,64 @@
-"""Built-in families of one surface, with volumes that are known on paper."""
+"""Built-in families and their parts, with volumes that are known on paper."""
 
 import itertools
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from pipeline.objects.builtin.gear import GearParams, gear
 from pipeline.objects.builtin.grids import Mesh
 from pipeline.objects.builtin.lattice import LatticeParams, lattice
-from pipeline.objects.builtin.rock import RockParams, rock
 from pipeline.objects.builtin.shell import ShellParams, shell
 from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
 from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
-from pipeline.objects.builtin.vase import VaseParams, vase
 from tests.for_each import for_each
-from tests.pipeline.objects.builtin.test_builtin import is_closed, parts_of, volume
+from tests.pipeline.objects.builtin.test_builtin import is_closed, made, parts_of, volume
+
+
+def _overlap(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
+    """Whether two triangles [3, 2] share area: no edge of either separates them."""
+    for one, other in ((first, second), (second, first)):
+        edge = np.roll(one, -1, axis=0) - one
+        normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        inner, outer = one @ normal.T, other @ normal.T
+        gap = np.maximum(
+            outer.min(axis=0) - inner.max(axis=0), inner.min(axis=0) - outer.max(axis=0)
+        )
+        # A hundredth of a millimetre of furniture: rounding is far below.
+        if (gap > -1e-5).any():
+            return False
+    return True
+
+
+def _shared_planes(mesh: Mesh) -> int:
+    """Pairs of faces of different parts that look the same way from the same place."""
+    parts = parts_of(mesh)
+    corners = np.concatenate([positions[faces] for positions, faces in parts])
+    owner = np.repeat(np.arange(len(parts)), [len(faces) for _, faces in parts])
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    offset = np.einsum("ij,ij->i", normal, corners[:, 0])
+    _, plane = np.unique(
+        np.rint(np.column_stack([normal, offset]) * 1e5), axis=0, return_inverse=True
+    )
+    count = 0
+    for number in np.flatnonzero(np.bincount(plane.reshape(-1)) > 1):
+        members = np.flatnonzero(plane.reshape(-1) == number)
+        axes = np.delete(np.arange(3), np.abs(normal[members[0]]).argmax())
+        flat = corners[members][..., axes]
+        count += sum(
+            _overlap(flat[i], flat[j])
+            for i in range(len(members))
+            for j in range(i)
+            if owner[members[i]] != owner[members[j]]
+        )
+    return count
+
+
+def test_no_two_boards_share_a_plane_where_they_meet() -> None:
+    for number in range(16):
+        assert _shared_planes(made("furniture", number)) == 0, number
 
 
 def _superquadric(profile: float, plan: float, **changes: float) -> Mesh:
@@ -83,76 +127,6 @@ def test_strands_of_a_knot_do_not_meet(windings: tuple[int, int]) -> None:
     step = np.linalg.norm(centre - np.roll(centre, 1, axis=0), axis=1).min()
     far_along = apart * step > np.pi * tube
     assert distance[far_along].min() > 2 * tube * 0.99
-
-
-def _gear(**changes: float) -> Mesh:
-    shape = {
-        "teeth": 12, "tooth_depth": 0.2, "half_thickness": 0.2, "chamfer": 0.0, "bore": 0.2,
-        "hub_width": 0.1, "hub_height": 1.0, "rim_width": 0.15, "web_height": 1.0,
-        "helix_rad": 0.0, "cone": 0.0,
-    }  # fmt: skip
-    return gear(GearParams(**(shape | changes)))  # type: ignore[arg-type]
-
-
-def test_a_plain_gear_is_its_outline_times_its_thickness() -> None:
-    mesh = _gear()
-    tip = mesh[0].reshape(72, -1, 3)[:, 0, :2]
-    x, y = tip.T
-    outline = 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
-    # The bore is a regular polygon of 72 corners.
-    bore = 0.5 * 72 * 0.2**2 * np.sin(2 * np.pi / 72)
-    assert volume(mesh) == pytest.approx(0.4 * (outline - bore), rel=1e-9)
-
-
-def test_the_wall_of_a_vase_is_even() -> None:
-    params = VaseParams(
-        height=1.0, radii=(0.3, 0.5, 0.2, 0.4), wall=0.05, flutes=0, flute_depth=0.0,
-        swirl_rad=0.0, rings=200, columns=8,
-    )  # fmt: skip
-    rings = vase(params)[0][:-2].reshape(400, 8, 3)
-    radius, height = np.linalg.norm(rings[:, 0, :2], axis=1), rings[:, 0, 2]
-    inner = slice(399, 199, -1)
-    outside = np.interp(height[inner], height[:200], radius[:200])
-    # Linear interpolation between 200 rings of a curve of unit height: 1e-4.
-    np.testing.assert_allclose(outside - radius[inner], 0.05, atol=1e-4)
-
-
-def test_a_straight_vase_is_a_cup_of_known_volume() -> None:
-    params = VaseParams(
-        height=1.0,
-        radii=(0.5, 0.5, 0.5, 0.5),
-        wall=0.05,
-        flutes=0,
-        flute_depth=0.3,
-        swirl_rad=0.4,
-        rings=16,
-        columns=96,
-    )
-    polygon = 0.5 * 96 * np.sin(2 * np.pi / 96)
-    expected = polygon * (0.5**2 * 1.0 - 0.45**2 * 0.95)
-    assert volume(vase(params)) == pytest.approx(expected, rel=1e-9)
-
-
-CUBE = tuple(
-    (*(float(sign * (axis == other)) for other in range(3)), 0.5)
-    for axis in range(3)
-    for sign in (-1, 1)
-)
-
-
-def _rock(**changes: object) -> Mesh:
-    shape = {
-        "cuts": CUBE, "sharpness": 200.0, "bumps": (), "bump_height": 0.2, "layers": 0.0,
-        "layer_depth": 0.1, "half_sizes": (1.0, 1.0, 1.0), "frequency": 24,
-    }  # fmt: skip
-    return rock(RockParams(**(shape | changes)))  # type: ignore[arg-type]
-
-
-def test_six_cuts_make_a_cube() -> None:
-    mesh = _rock()
-    # Faces of a 24th of a side cut across edges, and these are rounded by a two hundredth.
-    assert volume(mesh) == pytest.approx(1.0, rel=0.03)
-    np.testing.assert_allclose(np.ptp(mesh[0], axis=0), 1.0, rtol=0.01)
 
 
 def _shell(**changes: float) -> Mesh:
