@@ -15,10 +15,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.assets.prepare import prepare_asset
+from pipeline.assets.reading.load import load_mesh
+from pipeline.assets.reading.source_file import read_source
+from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.exchange.open_scene import load_source, scene_source, source_keys
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
+from tests.for_each import with_folders
 from tests.hostile import array_cases, json_cases, tar_cases, usd_cases
 from tests.scenes_by_hand import tiny_scene
 
@@ -117,12 +122,59 @@ def read(child: IsolatedChild, folder: Path, make: usd_cases.Make) -> tuple[str,
 
 @pytest.mark.parametrize("form", CASES)
 def test_every_file_ends_well(tmp_path: Path, child: IsolatedChild, form: str) -> None:
-    for number, (name, make, expected) in enumerate(CASES[form]()):
-        folder = tmp_path / str(number)
-        folder.mkdir()
+    for folder, (name, make, expected) in with_folders(tmp_path, CASES[form]()):
         kind, found = read(child, folder, make)
         assert "LEAK" not in found.names and found.farthest != 778.0, name
         outside = str(folder / "outside")  # which some of the files name themselves
         said = found.said.replace(outside, "")
         assert found.said.isprintable() and str(tmp_path) not in said, (name, found)
         assert kind in (("read", "refused") if expected == "any" else (expected,)), (name, found)
+
+
+SETTINGS = AssetSettings(
+    max_instances=1000, own_materials=OwnMaterialSettings(keep=True, texels=8, max_pixels=1 << 16)
+)
+HARMLESS = ("place NaN", "intensity", "radius", "time codes", "place 1e300")
+"""What is wrong with a lamp is nothing to an object."""
+
+
+def object_outcome(path: str) -> tuple[float, str]:
+    """Return the farthest coordinate of an object and all that a user would read."""
+    source = read_source(Path(path), SETTINGS)
+    farthest = float(np.abs(load_mesh(source).positions).max())
+    attempt = prepare_asset(Path(path), SETTINGS, "meshoptimizer")
+    materials = attempt.asset.materials
+    assert materials is not None
+    return farthest, f"{materials.reason} {materials.message} {list(attempt.missed.values())}"
+
+
+@pytest.mark.slow("hostile")
+def test_every_object_ends_well(tmp_path: Path, child: IsolatedChild) -> None:
+    """The cases are those of scenes; there a missing part is noted, here it refuses the object."""
+    for folder, (name, make, expected) in with_folders(tmp_path, usd_cases.cases()):
+        _require_good_end(folder, child, name, make, expected)
+
+
+def _require_good_end(
+    folder: Path, child: IsolatedChild, name: str, make: usd_cases.Make, expected: str
+) -> None:
+    inner = lay_out(folder)
+    make(inner)
+    (path,) = (inner / each for each in FILES if (inner / each).exists())
+    farthest, ended = 0.0, "refused"
+    try:
+        farthest, said = child.call(object_outcome, str(path))
+        ended = "read"
+    except Rejected as why:
+        said = f"{why.reason} {why.message}"
+    except ChildFailed as failure:
+        assert failure.reason != "exception", failure.message
+        said, ended = failure.message, "ended"
+    outside = str(folder / "outside")  # which some of the files name themselves
+    assert said.isprintable() and str(folder) not in said.replace(outside, ""), (name, said)
+    assert farthest < 700, (name, said)
+    if name.startswith("texture ") and expected == "refused":
+        assert ended == "read" and said.startswith("texture_"), (name, said)
+    elif expected == "refused" and not any(word in name for word in HARMLESS):
+        assert ended == "refused", (name, said)
+    assert (ended == "ended") == (expected == "ended"), (name, said)

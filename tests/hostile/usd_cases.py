@@ -112,6 +112,10 @@ def leaks() -> Iterator[tuple[str, Make, str]]:
         "reference": 'def "x" (references = @N@</B>) {}',
         "payload": 'def "x" (payload = @N@</B>) {}',
         "prepended": 'def "x" (prepend references = @N@</B>) {}',
+        "appended": 'def "x" (append references = @N@</B>) {}',
+        "added": 'def "x" (add references = @N@</B>) {}',
+        "of an over": 'over "x" (references = @N@</B>) {}',
+        "inactive": 'def "x" (active = false\nreferences = @N@</B>) {}',
         "in a variant": 'def "x" (variants = {string v = "a"}\nvariantSets = "v") {\n'
         'variantSet "v" = {\n"a" (references = @N@</B>) {}\n}\n}',
         "of an ancestor": 'def "Y" (references = @N@</A>) {}\ndef "x" (references = </Y/LEAK>) {}',
@@ -147,6 +151,9 @@ def leaks() -> Iterator[tuple[str, Make, str]]:
     yield "value clips", text(clip), "refused"
 
 
+LIBRARY = f'{HEAD}def "L" (references = @OUT@</B>) {{}}'
+
+
 def packages() -> Iterator[tuple[str, Make, str]]:
     def package(members: dict[str, str], **options: int) -> Make:
         def make(folder: Path) -> None:
@@ -161,13 +168,18 @@ def packages() -> Iterator[tuple[str, Make, str]]:
     arcs = {
         "absolute": f'{root}def "x" (references = @OUT@</B>) {{}}',
         "upwards": f'{root}def "x" (references = @../outside/secret.usda@</B>) {{}}',
+        "of another layer": f'{root}def "x" (references = @./lib.usda@</L>) {{}}',
         "ancestral": f'{root}def "Y" (references = @OUT@</A>) {{}}\n'
         'def "x" (references = </Y/LEAK>) {}',
         "texture": root + MATERIAL.replace("FILE", "../outside/secret.png"),
     }
     for kind, content in arcs.items():
         within = kind in ("upwards", "texture")  # what leads out of an archive is not in it
-        yield f"usdz {kind}", package({"s.usda": content}), "read" if within else "refused"
+        yield (
+            f"usdz {kind}",
+            package({"s.usda": content, "lib.usda": LIBRARY}),
+            "read" if within else "refused",
+        )
     yield (
         "usdz compressed",
         package({"s.usda": root * 99}, compress_type=zipfile.ZIP_DEFLATED),

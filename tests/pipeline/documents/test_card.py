@@ -1,31 +1,216 @@
-"""The card of a dataset: what hubs read, what people read, and nothing that runs or leaks."""
+"""The numbers of a dataset against those counted by hand, and the card that states them."""
 
 import contextlib
+import dataclasses
 import io
+import json
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 from pipeline.documents.card import _size_category, encode_card
 from pipeline.documents.dataset_documents import write_documents
-from pipeline.documents.distributions import dataset_distributions
+from pipeline.documents.distributions import Distributions, dataset_distributions
 from pipeline.documents.markdown import code, front_matter, plain, text
 from pipeline.documents.rights import encode_licences, rights_of
 from storage.dataset.dataset import Dataset, open_dataset
+from storage.errors import TrilightError
 from storage.records.objects import read_objects_lock, write_objects_lock
 from storage.records.profiles import Profile
+from storage.records.quantities import QUANTITIES, STATISTICS, summary
+from tests.for_each import with_folders
 from tests.pipeline.documents.dataset_by_hand import (
     edit_manifest,
     five_scenes,
     furnished,
     locked,
     sample,
+    write_dataset,
 )
 from tests.pipeline.making.derive_kit import finished
+from tests.scenes_by_hand import tiny_scene
+from tests.textured_by_hand import sky, textured_scene
+
+FLOAT32 = 1e-6
+"""Values are kept as float32: relative rounding of 6e-8, a few times over."""
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> Distributions:
+    return dataset_distributions(five_scenes(tmp_path_factory.mktemp("five")))
+
+
+def test_scenes_by_template_and_split(found: Distributions) -> None:
+    assert found.scenes == {("plane", "train"): 3, ("wall", "train"): 1, ("wall", "test"): 1}
+    assert found.splits == ["train", "test"]
+    assert found.templates == ["plane", "wall"]
+
+
+def test_uses_of_objects(found: Distributions) -> None:
+    assert found.placements == {"a": 4, "b": 1, "c": 1}
+    assert found.uses_per_object() == [4, 1, 1, 0]
+    assert found.licences == {"CC-BY-4.0": (1, 1, 1), "CC0-1.0": (3, 2, 5)}
+
+
+VALUES: list[tuple[str, Sequence[float]]] = [
+    ("objects_per_scene", [1, 2, 0, 2, 1]),
+    ("triangles_per_scene", [5, 7, 3, 7, 5]),
+    ("triangles_per_object", [2] * 6),
+    # five floors, six objects whose triangles are half red and half green
+    ("diffuse", [0.5] * 5 + [(0.6 + 0.4) / 2] * 6),
+    ("specular", [0.2] * 5 + [0.1] * 6),
+    ("albedo_sum", [0.7] * 5 + [(0.7 + 0.5) / 2] * 6),
+    ("roughness", [0.5] * 5 + [0.3] * 6),
+    ("textures_per_scene", [0] * 5),
+    ("texture_width", []),
+    ("skies_per_scene", [0] * 5),
+    ("sky_radiance", []),
+    ("sky_peak", []),
+    ("sky_half_light_deg", []),
+    ("lights_per_scene", [1] * 5),
+    ("total_emission", [100] * 5),
+    # the middle of the light is (0, -1/30, 2), and half of 0.2 x 0.2 its area
+    ("light_distance", [(4 + 1 / 900) ** 0.5] * 5),
+    ("light_size", [0.02**0.5] * 5),
+    ("camera_distance", [5**0.5] * 10),
+    ("elevation_deg", [np.degrees(np.arctan(0.5))] * 10),
+    ("azimuth_deg", [0, 90] * 5),
+    ("fov_deg", [45, 40] * 5),
+    ("noise_floor_db", [38, 38, 42, 42, 41.5, 41.5, 41.5, 41.5, 44, 44]),
+    ("noise_floor_linear_db", [33.25] * 10),
+    ("object_noise_floor_db", [40.5] * 10),
+    ("coverage", [0.25] * 8 + [0.5] * 2),
+    ("spp", [256, 256] + [128] * 8),
+    ("camera_attempt", [0] * 4 + [0, 0, 2, 2] + [0] * 2),
+]
+
+
+def test_values(found: Distributions) -> None:
+    for name, values in VALUES:
+        assert np.sort(found.all(name)) == pytest.approx(np.sort(values), rel=FLOAT32), name
+    assert {name for name, _ in VALUES} == set(QUANTITIES)
+
+
+def test_values_belong_to_their_split(found: Distributions) -> None:
+    assert found.values["test"]["noise_floor_db"].tolist() == [44, 44]
+    assert found.views_at_cap == {"train": 2, "test": 0}
+
+
+def test_surfaces(found: Distributions) -> None:
+    """The floor's triangles share two vertices; an object's have three each and two colours."""
+    assert found.as_json()["surfaces"] == {
+        "shell": {"all": 5, "smooth": 5, "many_colours": 0, "textured": 0},
+        "object": {"all": 6, "smooth": 0, "many_colours": 6, "textured": 0},
+    }
+
+
+def test_textures_and_skies(tmp_path: Path) -> None:
+    """Two scenes of one look, one with a sky alone, and a plain one."""
+    scenes = [
+        textured_scene(),
+        textured_scene(),
+        tiny_scene(environment=sky(radiance_rgb=np.full((2, 4, 3), 0.5, np.float32))),
+        tiny_scene(),
+    ]
+    shards = {"train-000000.tar": [sample(key, scene) for key, scene in enumerate(scenes)]}
+    maps = dataset_distributions(write_dataset(tmp_path, shards))
+    assert maps.all("textures_per_scene").tolist() == [2, 2, 0, 0]
+    assert maps.all("texture_width").tolist() == [6, 2, 6, 2]
+    assert maps.all("skies_per_scene").tolist() == [0, 0, 1, 0]
+    assert maps.all("sky_radiance") == pytest.approx([0.5])
+    assert maps.all("sky_half_light_deg") == pytest.approx([180], abs=0.01)
+    assert maps.maps == {
+        ("texture", "colours 0"): 2,
+        ("texture", "roughness"): 2,
+        ("sky", "sky 0"): 1,
+    }
+    assert maps.surfaces["shell", "textured"] == 2
+    assert {"kind": "sky", "family": "sky 0", "scenes": 1} in maps.as_json()["maps"]
+
+
+def test_rejections_by_stage_reason_and_attempt(found: Distributions) -> None:
+    assert list(found.rejections.items()) == [
+        (("scenes", "no_room"), {0: 1, 1: 1}),
+        (("objects", "no_faces"), {0: 1}),
+        (("renders", "black_view"), {0: 1}),
+    ]
+
+
+def test_targets_are_those_of_the_settings(found: Distributions) -> None:
+    floors = {"noise_floor_db": 40.0, "noise_floor_linear_db": None, "noise_floor_objects_db": None}
+    assert found.targets == {"max_triangles": 9, **floors, "min_spp": 64, "max_spp": 256}
+
+
+def test_a_view_has_reached_its_targets_when_it_has_reached_all(found: Distributions) -> None:
+    def reached(**targets: float) -> list[bool]:
+        asked = dataclasses.replace(found, targets={**found.targets, **targets})
+        each = asked.reached("train")
+        assert each is not None
+        return [bool(view) for view in each]
+
+    assert reached() == [False] * 2 + [True] * 6  # the first scene states 38 dB
+    assert reached(noise_floor_linear_db=33.0) == reached()
+    assert reached(noise_floor_linear_db=33.5) == [False] * 8
+    assert reached(noise_floor_objects_db=41.0) == [False] * 8
+    nothing = dataclasses.replace(found, targets=dict.fromkeys(found.targets))
+    assert nothing.reached("train") is None
+
+
+def test_json_holds_all_of_it(found: Distributions) -> None:
+    read = json.loads(json.dumps(found.as_json(), allow_nan=False, sort_keys=True))
+    assert set(read["quantities"]) == set(QUANTITIES)
+    assert read["quantities"]["triangles_per_scene"] == {
+        "count": 5, "min": 3, "p5": 3.4, "median": 5, "mean": 5.4, "p95": 7, "max": 7,
+    }  # fmt: skip
+    assert read["object_uses"]["max"] == 4
+    assert read["scenes"][0] == {"template": "plane", "split": "train", "count": 3}
+
+
+def test_a_dataset_without_shards(tmp_path: Path) -> None:
+    found = dataset_distributions(write_dataset(tmp_path, {}))
+    assert (found.splits, found.licences, found.rejections) == ([], {}, {})
+    assert found.as_json()["quantities"]["spp"] == {"count": 0}
+
+
+def test_each_shard_is_reported(tmp_path: Path) -> None:
+    names: list[str] = []
+    dataset_distributions(five_scenes(tmp_path), shard_done=names.append)
+    assert names == ["test-000005.tar", "train-000000.tar", "train-000001.tar"]
+
+
+def test_a_bad_sample_is_one_clear_line(tmp_path: Path) -> None:
+    plain, scene = sample(7, furnished([])), furnished(["a"])
+    bad = [
+        sample(7, furnished([]).with_provenance({})),
+        sample(7, furnished([]), noise_floor_db="quiet"),
+        sample(7, dataclasses.replace(scene, faces=scene.faces + np.uint32(50))),
+        dataclasses.replace(plain, views=plain.views[:1], radiance_rgb=plain.radiance_rgb[:1]),
+    ]
+    for folder, made in with_folders(tmp_path, bad):
+        dataset = write_dataset(folder, {"train-000000.tar": [made]})
+        with pytest.raises(TrilightError, match="sample 000000007: .*trilight verify"):
+            dataset_distributions(dataset)
+
+
+def test_bad_failures_are_one_clear_line(tmp_path: Path) -> None:
+    five_scenes(tmp_path).folder.failures.write_bytes(b'{"stage": "objects"}\n')
+    with pytest.raises(TrilightError, match="failures"):
+        dataset_distributions(open_dataset(str(tmp_path)))
+
+
+def test_summary_leaves_out_what_is_not_finite() -> None:
+    assert summary([1, np.nan, 3, np.inf]) == {
+        "count": 2, "min": 1, "p5": 1.1, "median": 2, "mean": 2, "p95": 2.9, "max": 3,
+    }  # fmt: skip
+    assert set(summary([1])) == set(STATISTICS)
+    assert summary([]) == {"count": 0}
+
 
 DOCUMENTS = (
     "README.md", "LICENSE.md", "croissant.json", "attribution.csv", "contact_sheet.png",

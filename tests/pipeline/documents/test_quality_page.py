@@ -1,12 +1,46 @@
-"""`quality.html` shows what there is, and nothing that comes from outside is markup."""
+"""The page of assets, filters of a gallery, figures, HTML: no markup from outside."""
 
+import base64
+import dataclasses
+import io
+import json
 import re
+import shlex
 
+import matplotlib
 import numpy as np
+from PIL import Image
 
+from pipeline.documents.figures import (
+    drawing,
+    encoded,
+    histogram,
+    panels,
+    rose,
+    short_label,
+    stacked_bars,
+)
+from pipeline.documents.gallery_controls import (
+    CardFacts,
+    card_attributes,
+    card_facts,
+    gallery_controls,
+)
+from pipeline.documents.html import (
+    Markup,
+    element,
+    escape,
+    image,
+    joined,
+    outside_link,
+    page,
+    png_uri,
+    table,
+)
 from pipeline.documents.quality_page import Pair, encode_quality_page
 from storage.records.asset import AssetRow
 from storage.records.objects import Failure
+from tests.pipeline.documents.dataset_by_hand import furnished, sample
 from tests.pipeline.documents.pages_read import HARM, Tags, read, text_of
 from tests.pipeline.documents.rows_by_hand import row
 
@@ -20,7 +54,9 @@ def pairs(entry: AssetRow) -> dict[str, list[Pair]]:
     return {"Worst": [Pair(row=entry, source=picture, result=picture)], "Best": []}
 
 
-def page(rows: list[AssetRow], failures: list[Failure], **more: dict[str, list[Pair]]) -> Tags:
+def quality_page(
+    rows: list[AssetRow], failures: list[Failure], **more: dict[str, list[Pair]]
+) -> Tags:
     shown = more.get("pairs", {})
     return read(encode_quality_page(rows, failures, shown, budget=1400, target="faithful"))
 
@@ -30,7 +66,7 @@ HARMFUL = row(HARM, title=HARM, method="pymeshlab_collapse", **RIGHTS)
 
 
 def test_text_from_outside_stays_text() -> None:
-    tags = page([HARMFUL], [failure(HARM, HARM)], pairs=pairs(HARMFUL))
+    tags = quality_page([HARMFUL], [failure(HARM, HARM)], pairs=pairs(HARMFUL))
     assert not {"script", "iframe", "link", "a", "object"} & set(tags.tags)
     assert not any(name.startswith("on") for name in tags.names)
     # uid in picture and table, licence in summary and table, item and message of the failure
@@ -47,7 +83,7 @@ def test_nothing_is_loaded_from_elsewhere() -> None:
 
 
 def test_counts_are_those_of_the_rows() -> None:
-    tags = page([row("a"), row("b")], [failure()])
+    tags = quality_page([row("a"), row("b")], [failure()])
     text = text_of(tags)
     assert "2 objects accepted, 0 of them repaired" in text
     assert "2 watertight; 1 rejected" in text
@@ -57,7 +93,7 @@ def test_counts_are_those_of_the_rows() -> None:
 
 def test_a_page_without_objects() -> None:
     for failures in ([], [failure("bad0"), failure("bad1")]):
-        tags = page([], failures)
+        tags = quality_page([], failures)
         text = text_of(tags)
         assert "0 objects accepted, 0 of them repaired" in text
         assert f"0 watertight; {len(failures)} rejected" in text
@@ -67,7 +103,7 @@ def test_a_page_without_objects() -> None:
 
 
 def test_a_page_without_failures_and_with_decimated_objects_only() -> None:
-    tags = page([row(str(k), method="meshoptimizer") for k in range(3)], [])
+    tags = quality_page([row(str(k), method="meshoptimizer") for k in range(3)], [])
     assert tags.tags.count("img") == 1
     assert "Rejected" not in " ".join(tags.text)
 
@@ -75,3 +111,214 @@ def test_a_page_without_failures_and_with_decimated_objects_only() -> None:
 def test_equal_rows_give_equal_pages() -> None:
     twice = [encode_quality_page([row()], [], {}, budget=9, target="x") for _ in range(2)]
     assert twice[0] == twice[1]
+
+
+def card(
+    split: str, layout: str, *, views: str = "within the target", floor: float = 40
+) -> CardFacts:
+    choices = {"split": split, "layout": layout, "views": views}
+    return CardFacts(choices=choices, orders={"least floor": floor, "few": -floor})
+
+
+CARDS = [
+    card("train", "plane", floor=44),
+    card("train", "room", views="at the cap", floor=38),
+    card("test", "plane", floor=41),
+]
+
+
+def buttons(markup: str) -> list[tuple[str, str, str]]:
+    """Return name, value and option of each radio button."""
+    return re.findall(r'name="([^"]*)" value="([^"]*)" data-words="([^"]*)"', markup)
+
+
+def test_each_choice_has_a_button_and_what_selects_it() -> None:
+    words = {value: words for _, value, words in buttons(gallery_controls(CARDS)) if words}
+    assert words == {
+        "train": "--split train",
+        "test": "--split test",
+        "plane": "--template plane",
+        "room": "--template room",
+        "within the target": "--where &#x27;not any(at_cap)&#x27;",
+        "at the cap": "--where &#x27;any(at_cap)&#x27;",
+    }
+    values = [value for name, value, _ in buttons(gallery_controls(CARDS)) if name == "order"]
+    assert values == ["", "0", "1"]
+
+
+def test_each_card_bears_its_choices_and_ranks_and_equals_stay() -> None:
+    attributes = card_attributes(CARDS)
+    assert [each["data-layout"] for each in attributes] == ["plane", "room", "plane"]
+    assert [json.loads(each["data-ranks"]) for each in attributes] == [[2, 0], [0, 2], [1, 1]]
+    same = card_attributes([card("train", "plane", floor=float("inf"))] * 3)
+    assert [json.loads(each["data-ranks"])[0] for each in same] == [0, 1, 2]
+
+
+def test_scenes_of_no_layout_are_no_choice() -> None:
+    """Such as those of scene files: no command selects them, and none claims to."""
+    markup = gallery_controls([card("train", name) for name in ("", "plane", "room")])
+    layouts = [value for name, value, _ in buttons(markup) if name == "layout"]
+    assert layouts == ["", "plane", "room"]
+
+
+def test_no_choice_no_button() -> None:
+    for cards in ([], [card("train", "plane")]):
+        assert buttons(gallery_controls(cards)) == []
+        assert len(card_attributes(cards)) == len(cards)
+
+
+def test_names_from_outside_stay_text() -> None:
+    tags = read(gallery_controls([card("train", HARM), card("train", "a 'b'")]).encode())
+    assert "script" not in tags.tags and "onerror" not in tags.names
+    assert HARM in "".join(tags.text)
+    quoted = [words for _, _, words in buttons(gallery_controls([card("train", HARM), *CARDS]))]
+    assert f"--template {shlex.quote(HARM)}" in [html_text(words) for words in quoted]
+
+
+def html_text(escaped: str) -> str:
+    return "".join(read(f"<p>{escaped}</p>".encode()).text)
+
+
+def test_what_a_card_knows() -> None:
+    made = sample(3, furnished(["a", "b"]))
+    facts = card_facts(made, "test")
+    assert facts.choices == {
+        "split": "test",
+        "layout": made.scene.provenance["template"],
+        "views": "within the target",
+    }
+    assert facts.orders["fewest triangles"] == made.scene.num_triangles
+    capped = [dataclasses.replace(view, at_cap=True) for view in made.views]
+    made = dataclasses.replace(made, views=tuple(capped))
+    assert card_facts(made, "test").choices["views"] == "at the cap"
+
+
+def test_text_is_escaped_once() -> None:
+    assert escape("<&'\">") == "&lt;&amp;&#x27;&quot;&gt;"
+    assert escape(escape("<")) == "&lt;"
+    assert joined(["<", Markup("<br>")]) == "&lt;\n<br>"
+
+
+def test_attributes_cannot_be_left() -> None:
+    tags = read(element("p", HARM, id=HARM, class_="a").encode())
+    assert (tags.tags, tags.names, tags.ids) == (["p"], {"id", "class"}, {HARM})
+    assert read(image("data:,", HARM).encode()).tags == ["img"]
+
+
+def test_cells_and_titles_are_text() -> None:
+    tags = read(page(HARM, table((HARM, "n"), [(HARM, 1), ("b", 2)], numbers=1)))
+    assert tags.tags.count("td") == 4
+    assert "".join(tags.text).count(HARM) == 3
+    assert not {"script", "iframe"} & set(tags.tags)
+
+
+def test_only_the_script_of_a_page_runs() -> None:
+    text = page("x", "y", script="show()").decode()
+    assert "<script>show()</script>" in text
+    # sha256 of "show()", as openssl dgst -binary | base64 gives it
+    assert "script-src 'sha256-bZcXq6A55386WOhnm+CkmXOdvD/gkjsQT5fkz6gxfg8='\"" in text
+
+
+def test_only_the_last_columns_are_numbers() -> None:
+    assert str(table(("a", "b"), [("x", 1)], numbers=1)).count('class="n"') == 2
+    assert "class" not in table((), [("x", "y")])
+    assert "<th>" not in table((), [("x", "y")])
+    assert table((), []) == "<table></table>"
+
+
+def test_addresses_become_links() -> None:
+    for url in ["https://example.org/a?b=c&d", "http://localhost:80/x", "HTTPS://E.org"]:
+        tags = read(outside_link(url).encode())
+        assert (tags.tags, tags.links, "".join(tags.text)) == (["a"], [url], url)
+
+
+def test_other_addresses_stay_text() -> None:
+    for url in [
+        "",
+        "javascript:alert(1)",
+        " https://example.org",
+        "java\nscript:alert(1)",
+        "data:text/html,x",
+        "//example.org",
+        "https://",
+        "https://me:secret@example.org",
+        "https://[broken",
+        "https://e.org/\u202egro",
+        HARM,
+    ]:
+        tags = read(outside_link(url).encode())
+        assert (tags.tags, "".join(tags.text)) == ([], url)
+
+
+def test_a_lone_surrogate_is_no_error() -> None:
+    assert b"?" in page("x", "\ud800")
+
+
+def test_equal_pictures_give_equal_addresses() -> None:
+    picture = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    assert png_uri(picture) == png_uri(picture.copy())
+    assert png_uri(picture).startswith("data:image/png;base64,")
+
+
+def picture(markup: Markup) -> Image.Image:
+    data = str(markup).split("base64,")[1].split('"')[0]
+    return Image.open(io.BytesIO(base64.b64decode(data)))
+
+
+VALUES: dict[str, list[float]] = {
+    "none": [],
+    "one": [3.5],
+    "equal": [2.5] * 9,
+    "whole": [1, 2, 2, 5],
+    "wide": [1e-9, 1e30],
+    "not finite": [np.nan, np.inf, 1.0],
+    "all not finite": [np.nan],
+    "many": list(np.linspace(0, 1, 1000)),
+}
+
+
+def test_any_values_can_be_drawn() -> None:
+    marks = {"a": 3.0, "b": None, "c": np.nan}
+    with drawing():
+        figure, axes = panels(len(VALUES) + 4, polar=(0, 1, 2, 3))
+        for axis, name in zip(axes, ("none", "equal", "wide", "not finite"), strict=False):
+            rose(axis, VALUES[name], "directions")
+        for axis, (name, values) in zip(axes[4:], VALUES.items(), strict=True):
+            histogram(axis, values, name, ylabel="y", marks=marks)
+        drawn = picture(encoded(figure, "alt"))
+    assert drawn.size[0] > 800
+    assert len(drawn.getcolors(1 << 24) or []) > 20
+
+
+def test_bars_hold_every_value() -> None:
+    """Heights of the bars add up to the values, and whole numbers have a bar each."""
+    with drawing():
+        _, (axes, other) = panels(2)
+        histogram(axes, [1, 2, 2, 5], "x")
+        histogram(other, np.linspace(0, 1, 1000), "x")
+    heights = [patch.get_height() for patch in axes.patches]  # type: ignore[attr-defined]
+    assert heights == [1, 2, 0, 0, 1]
+    total = sum(patch.get_height() for patch in other.patches)  # type: ignore[attr-defined]
+    assert total == 1000
+
+
+def test_names_from_outside_are_labels() -> None:
+    assert short_label("a\n b\x07\u202e") == "a b"
+    assert len(short_label("x" * 99)) == 26
+    names = ["$\\frac{$", "高 \ud800", "", "x" * 99]
+    with drawing():
+        figure, _ = stacked_bars(names, {name: [1, 2, 3, 4] for name in names}, xlabel="n")
+        assert picture(encoded(figure, "alt")).size[0] > 800
+
+
+def test_the_readers_settings_do_not_matter() -> None:
+    def drawn() -> str:
+        with drawing():
+            figure, (axes,) = panels(1)
+            histogram(axes, [1.5, 2.5], "x")
+            return encoded(figure, "alt")
+
+    plain = drawn()
+    with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "black"}):
+        assert drawn() == plain
+        assert matplotlib.rcParams["font.size"] == 30

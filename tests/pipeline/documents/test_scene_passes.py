@@ -15,12 +15,9 @@ from PIL import Image
 
 from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.pass_colours import (
-    albedo_colours,
     depth_greys,
     finite_range,
     id_colours,
-    normal_colours,
-    share_greys,
 )
 from pipeline.documents.report import write_report
 from pipeline.documents.scene_page import Neighbours, encode_scene_page
@@ -34,7 +31,6 @@ from storage.records.sample import Sample
 from storage.records.scene import Scene
 from tests.command_line import trilight
 from tests.pipeline.documents.dataset_by_hand import SETTINGS, furnished, sample, write_dataset
-from tests.pipeline.documents.pages_read import read
 from tests.scenes_by_hand import tiny_scene
 
 WORDS = ("depth", "shading normal", "object ids", "diffuse albedo", "roughness")
@@ -65,13 +61,6 @@ def looking_away() -> Scene:
     away = look_at_c2w(eye=[3, 0, 1], target=[4, 0, 2], up=[0, 0, 1])
     scene = tiny_scene()
     return tiny_scene(c2w=np.stack([scene.c2w[0], away]).astype(np.float32))
-
-
-def test_every_view_has_every_pass() -> None:
-    shown = figures(page_of(sample(0, furnished(["a"]))))
-    passes = {f"view {view}, {word}" for view in range(2) for word in WORDS}
-    assert passes < set(shown)
-    assert {shown[name][0].shape[:2] for name in passes} == {(SIZE, SIZE)}
 
 
 def test_colours_belong_to_the_values() -> None:
@@ -123,13 +112,6 @@ def test_a_view_of_nothing_is_black() -> None:
         assert shown[f"view 0, {word}"][0].any()
 
 
-def test_a_page_is_whole_and_loads_nothing() -> None:
-    tags = read(page_of(sample(0, looking_away())).encode())
-    loaded = [link for link in tags.links if not link.endswith("report.html")]
-    assert len(loaded) == 2 + 2 * len(WORDS)
-    assert all(link.startswith("data:image/png;base64,") for link in loaded)
-
-
 @pytest.mark.usefixtures("bare_reports")
 def test_the_commands_run_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shards = {"train-000000.tar": [sample(index, furnished(["a"])) for index in (3, 4)]}
@@ -178,29 +160,8 @@ def test_near_is_bright_in_proportion() -> None:
     assert depth_greys(depth_m).tolist() == [[255, 148], [40, 0]]
     # metres do not matter, only the range
     assert np.array_equal(depth_greys(depth_m * 1000), depth_greys(depth_m))
-
-
-def test_one_depth_is_bright_and_no_depth_is_black() -> None:
     assert depth_greys(np.array([[3.0, np.inf]])).tolist() == [[255, 0]]
     assert depth_greys(np.full((2, 2), np.inf)).tolist() == [[0, 0], [0, 0]]
-
-
-def test_shares_are_told_from_nothing() -> None:
-    assert share_greys(np.array([[0, 0.5, 1, np.nan]])).tolist() == [[40, 148, 255, 0]]
-
-
-def test_a_normal_can_be_read_back() -> None:
-    for axis, along in enumerate(np.eye(3)):
-        colour = normal_colours(np.array([[along, -along]]))[0].astype(float)
-        assert colour[0, axis] == 255 and colour[1, axis] == 0
-        assert np.abs(colour / 127.5 - 1 - [along, -along]).max() <= 0.5 / 127.5
-    assert normal_colours(np.full((1, 1, 3), np.nan)).tolist() == [[[0, 0, 0]]]
-
-
-def test_albedos_are_as_a_screen_shows_them() -> None:
-    # linear 0.6 is 0.7977 in sRGB, 203 of 255
-    assert albedo_colours(np.array([[[0.6, 0, 1]]])).tolist() == [[[203, 0, 255]]]
-    assert albedo_colours(np.full((1, 1, 3), np.nan)).tolist() == [[[0, 0, 0]]]
 
 
 def test_every_id_has_its_own_colour() -> None:

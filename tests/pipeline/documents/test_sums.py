@@ -1,14 +1,27 @@
-"""SHA256SUMS: of what is published, renewed with the documents, and never of a damaged shard."""
+"""Beside a dataset: sums of what is published, who made its objects, and which scenes are shown."""
 
+import csv
+import dataclasses
+import io
+import itertools
 import subprocess
+from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
+from typing import cast
 
 import pytest
 
+from pipeline.documents.attribution import encode_attribution
+from pipeline.documents.chosen import Chosen, choose_scenes
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sums import SUMS, published_files, renew_sums, stale_sums, write_sums
+from storage.dataset.dataset import Dataset
+from storage.dataset.manifest import ShardEntry
 from storage.errors import TrilightError
+from storage.records.objects import LockedObject
 from tests.pipeline.documents.dataset_by_hand import five_scenes
+from tests.pipeline.documents.rows_by_hand import row
 
 SHARD = "train-000000.tar"
 
@@ -60,3 +73,122 @@ def test_what_is_no_sum_is_one_sentence(tmp_path: Path) -> None:
     for use in (renew_sums, stale_sums):
         with pytest.raises(TrilightError, match="nothing is no sum"):
             use(tmp_path)
+
+
+def cells(data: bytes) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(data.decode(), newline="")))
+
+
+def test_rows_are_sorted_and_complete() -> None:
+    read = cells(encode_attribution([row("b"), row("a", attribution="somebody, and others")]))
+    assert [entry["uid"] for entry in read] == ["a", "b"]
+    assert read[0] == {
+        "uid": "a",
+        "title": "Ball",
+        "licence": "CC0-1.0",
+        "licence_source": "tests",
+        "attribution": "somebody, and others",
+        "source_url": "https://example.org/ball",
+        "changes": "cleaned, remeshed and given new materials",
+    }
+
+
+def test_formulas_are_made_inert() -> None:
+    fields = ["uid", "title", "licence", "attribution", "source_url"]
+    for field, start in itertools.product(fields, ["=", "+", "-", "@", "\t", "\r"]):
+        formula = f'{start}HYPERLINK("https://example.org/?"&A1)'
+        (read,) = cells(encode_attribution([row(**{field: formula})]))
+        assert read[field] == "'" + formula
+
+
+def test_other_text_comes_back_as_it_was() -> None:
+    for text in ['a "quoted" name', "a;b,c", "line\nbreak", "élan 高", "a=1", ""]:
+        (read,) = cells(encode_attribution([row(title=text)]))
+        assert read["title"] == text
+
+
+def test_no_objects_give_the_heading_alone() -> None:
+    assert encode_attribution([]).count(b"\n") == 1
+
+
+def test_the_source_of_a_licence_is_published() -> None:
+    entry = LockedObject(
+        uid="a",
+        asset_sha256="0" * 64,
+        split="train",
+        licence="CC-BY-4.0",
+        licence_source="=Objaverse 1.0, published 2019-05-03",
+        title="A",
+        attribution="Ada",
+        source_url="https://v/a",
+    )
+    (row,) = csv.DictReader(io.StringIO(encode_attribution([entry]).decode()))
+    assert list(row)[:4] == ["uid", "title", "licence", "licence_source"]
+    # the quote keeps a spreadsheet from taking it for a formula
+    assert row["licence_source"] == "'=Objaverse 1.0, published 2019-05-03"
+    assert (row["licence"], row["attribution"]) == ("CC-BY-4.0", "Ada")
+
+
+@dataclasses.dataclass
+class Listed:
+    """What is chosen from: shards of four scenes, keys numbered through; no file is there."""
+
+    counts: Mapping[str, int]
+    opened: list[str] = dataclasses.field(default_factory=list)
+
+    def shards_of(self, split: str) -> list[ShardEntry]:
+        return [shard for shard in self._keys if shard.split == split]
+
+    def keys(self, shard: ShardEntry) -> list[str]:
+        self.opened.append(shard.name)
+        return self._keys[shard]
+
+    @cached_property
+    def _keys(self) -> dict[ShardEntry, list[str]]:
+        keys: dict[ShardEntry, list[str]] = {}
+        key = itertools.count()
+        for split, count in self.counts.items():
+            for first in range(0, count, 4):
+                held = [f"{next(key):09d}" for _ in range(min(4, count - first))]
+                shard = ShardEntry(
+                    name=f"{split}-{len(keys):06d}.tar",
+                    split=split,
+                    num_samples=len(held),
+                    num_bytes=0,
+                    sha256="",
+                )
+                keys[shard] = held
+        return keys
+
+
+def chosen_of(max_scenes: int, **counts: int) -> list[Chosen]:
+    return choose_scenes(cast(Dataset, Listed(counts)), max_scenes)
+
+
+def test_all_where_there_are_few() -> None:
+    chosen = chosen_of(48, test=3, train=5)
+    assert [entry.split for entry in chosen] == ["train"] * 5 + ["test"] * 3
+    assert [int(entry.key) for entry in chosen] == [3, 4, 5, 6, 7, 0, 1, 2]
+
+
+def test_small_splits_are_seen() -> None:
+    chosen = chosen_of(48, train=4000, validation=20, test=3)
+    splits = [entry.split for entry in chosen]
+    assert (splits.count("validation"), splits.count("test")) == (6, 3)
+    assert len(set(entry.key for entry in chosen)) == len(chosen) == 48
+    train = [int(entry.key) for entry in chosen if entry.split == "train"]
+    gaps = [after - before for before, after in itertools.pairwise(train)]
+    assert (train[0], train[-1]) == (0, 3999)
+    assert max(gaps) - min(gaps) <= 1
+
+
+def test_exactly_as_many_as_asked_for() -> None:
+    for count in range(12):
+        keys = [entry.key for entry in chosen_of(count, train=4, validation=4, test=4)]
+        assert len(keys) == len(set(keys)) == count
+
+
+def test_only_shards_of_chosen_scenes_are_opened() -> None:
+    listed = Listed({"train": 4000, "test": 40})
+    chosen = choose_scenes(cast(Dataset, listed), 10)
+    assert sorted(listed.opened) == sorted({entry.shard.name for entry in chosen})

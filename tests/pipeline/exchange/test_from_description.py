@@ -1,11 +1,9 @@
-"""From scene files to scenes: places against a slow twin, materials, kinds, colours, refusals.
-
-Random colours are those of the published stream where its order is known.
-"""
+"""From scene files to scenes: places against a slow twin, materials, kinds, colours, refusals."""
 
 import dataclasses
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +13,12 @@ import trimesh
 
 from pipeline.exchange.description import DescribedObject
 from pipeline.exchange.from_description import placed, scene_from_description
+from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_json import read_description
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
+from tests.for_each import for_each
 from tests.pipeline.scenes.example_scenes import (
     EXAMPLES,
     PlainObj,
@@ -65,35 +65,14 @@ def _slowly(point: Point, obj: PlainObj, transform: dict[str, Any]) -> Point:
     return x * sx + tx, y * sy + ty, z * sz + tz
 
 
-def test_examples_have_the_triangles_of_their_files(
-    examples: dict[str, Scene], shared: Path
-) -> None:
-    for name in EXAMPLES:
-        _check_examples_have_the_triangles_of_their_files(examples, shared, name)
-
-
-def _check_examples_have_the_triangles_of_their_files(
-    examples: dict[str, Scene], shared: Path, name: str
-) -> None:
-    scene = examples[name]
-    assert scene.num_triangles == EXAMPLES[name]
-    for row, stated in enumerate(_json(shared, name).values()):
-        obj = plain_obj(shared / "renderformer_scenes" / stated["mesh_path"])
-        assert (scene.object_index == row).sum() == len(obj.triangles)
-
-
+@for_each("name", EXAMPLES)
 def test_every_corner_of_the_examples_is_where_a_slow_twin_puts_it(
-    examples: dict[str, Scene], shared: Path
-) -> None:
-    for name in EXAMPLES:
-        _check_every_corner_of_the_examples_is_where_a_slow_twin_puts_it(examples, shared, name)
-
-
-def _check_every_corner_of_the_examples_is_where_a_slow_twin_puts_it(
     examples: dict[str, Scene], shared: Path, name: str
 ) -> None:
+    assert examples[name].num_triangles == EXAMPLES[name]
     for row, stated in enumerate(_json(shared, name).values()):
         obj = plain_obj(shared / "renderformer_scenes" / stated["mesh_path"])
+        assert (examples[name].object_index == row).sum() == len(obj.triangles)
         step = max(1, len(obj.triangles) // 100)  # the twin needs all vertices for each point
         expected = [
             [_slowly(point, obj, stated["transform"]) for point in triangle]
@@ -111,35 +90,8 @@ def _check_every_corner_of_the_examples_is_where_a_slow_twin_puts_it(
             np.testing.assert_allclose(found, expected, atol=3e-7)
 
 
-BOUNDS = {
-    # the shells are halved cubes of side 2; the light's lowest and highest corner are at
-    # 2.1 -+ 2.5 * 0.025
-    "cbox": ((-0.5, -0.5, -0.5), (0.5, 0.5, 2.1625)),
-    "cbox-bunny": ((-0.5, -0.5, -0.5), (0.5, 0.5, 2.1625)),
-    "init-template": ((-0.5, -0.5, -0.5), (0.5, 0.5, 2.1625)),
-    # the light is at 1.47 +- 0.0625; the lowest vertex is one of purple.obj
-    "crystals": ((-0.5, -0.5, -0.540819), (1.5325, 0.5, 1.5325)),
-}
-
-
-def test_examples_are_as_large_as_they_should_be(examples: dict[str, Scene]) -> None:
-    for name in BOUNDS:
-        _check_examples_are_as_large_as_they_should_be(examples, name)
-
-
-def _check_examples_are_as_large_as_they_should_be(examples: dict[str, Scene], name: str) -> None:
-    points = examples[name].vertex_positions
-    np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], BOUNDS[name], atol=1e-6)
-
-
+@for_each("name", EXAMPLES)
 def test_examples_have_the_materials_and_kinds_of_their_files(
-    examples: dict[str, Scene], shared: Path
-) -> None:
-    for name in EXAMPLES:
-        _check_examples_have_the_materials_and_kinds_of_their_files(examples, shared, name)
-
-
-def _check_examples_have_the_materials_and_kinds_of_their_files(
     examples: dict[str, Scene], shared: Path, name: str
 ) -> None:
     scene = examples[name]
@@ -249,12 +201,8 @@ REFUSED: list[tuple[tuple[str | int, ...], dict[str, Any], str]] = [
 ]
 
 
-def test_what_means_nothing_is_refused_by_name() -> None:
-    for case in REFUSED:
-        _check_what_means_nothing_is_refused_by_name(*case)
-
-
-def _check_what_means_nothing_is_refused_by_name(
+@for_each("path, change, message", REFUSED)
+def test_what_means_nothing_is_refused_by_name(
     path: tuple[str | int, ...], change: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(TrilightError) as caught:
@@ -356,3 +304,30 @@ def test_random_colours_of_a_smooth_mesh(kind: str, count: int) -> None:
         ).materials,
         scene.materials,
     )
+
+
+def test_albedos_beyond_one_are_scaled_with_a_note_or_refused(shared: Path, tmp_path: Path) -> None:
+    """1.1 as the background of one published scene has it: one factor for both and all channels."""
+    source = shared / "renderformer_scenes"
+    for name in ("objects", "templates"):
+        shutil.copytree(source / name, tmp_path / name)
+    described = json.loads((source / "crystals.json").read_text())
+    (tmp_path / "lawful.json").write_text(json.dumps(described))
+    change = {"rand_tri_diffuse_seed": None, "diffuse": [0.6, 0.3, 0.0], "specular": [0.5] * 3}
+    described["objects"]["background_0"]["material"] |= change
+    path = tmp_path / "bright.json"
+    path.write_text(json.dumps(described))
+    loaded = load_source(scene_source(str(path)))
+    scene = loaded.scene
+    (place,) = [at for at, entry in enumerate(scene.objects) if entry.name == "background_0"]
+    row = scene.materials[scene.material_index[scene.object_index == place][0]]
+    expected = [0.6 / 1.1, 0.3 / 1.1, 0.0, 0.5 / 1.1, 0.5 / 1.1, 0.5 / 1.1]
+    assert row[:6] == pytest.approx(expected, rel=1e-6)  # the rounding of float32
+    assert scene.provenance["albedo_scale"] == {"background_0": round(1 / 1.1, 6)}
+    lawful = load_source(scene_source(str(tmp_path / "lawful.json")))
+    assert "albedo_scale" not in lawful.scene.provenance
+    assert lawful.notes == ()
+    assert any("diffuse + specular is 1.1000" in note for note in loaded.notes)
+    refusing = scene_source(str(path), albedo_over_one="refuse")
+    with pytest.raises(TrilightError, match="diffuse \\+ specular is 1.1000; expected at most 1"):
+        load_source(refusing)

@@ -15,7 +15,7 @@ from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, columns_in_use, laid_out
 from storage.records.scene import Scene, SceneObject
 from tests.columns_kit import COAT, TINT, WAVES, declared
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import sky, textured_scene
 
@@ -52,18 +52,17 @@ def test_a_column_that_a_form_does_not_know_is_said_to_be_lost(tmp_path: Path, f
 @pytest.mark.usefixtures("more_columns")
 def test_what_carries_everything_carries_new_columns(tmp_path: Path, form: str) -> None:
     path = tmp_path / f"a.{form}"
-    assert write_scene(path, coated(0.3)) == ()
+    scene = dataclasses.replace(coated(0.3), objects=ATTRIBUTED)
+    assert write_scene(path, scene) == ()
     back = load_source(scene_source(str(path)))
     assert back.notes == ()
-    assert np.array_equal(back.scene.materials, coated(0.3).materials)
+    assert np.array_equal(back.scene.materials, scene.materials)
+    assert lost_members(back.scene, ()) == lost_members(scene, ())
+    assert lost_members(back.scene, {field.name for field in dataclasses.fields(Scene)}) == ()
 
 
-def test_a_column_at_its_default_changes_no_byte(tmp_path: Path) -> None:
-    for folder, form in with_folders(tmp_path, EXACT):
-        _check_a_column_at_its_default_changes_no_byte(folder, form)
-
-
-def _check_a_column_at_its_default_changes_no_byte(tmp_path: Path, form: str) -> None:
+@for_each("form", EXACT)
+def test_a_column_at_its_default_changes_no_byte(tmp_path: Path, form: str) -> None:
     before, after = tmp_path / f"a.{form}", tmp_path / f"b.{form}"
     write_scene(before, tiny_scene())
     with declared(COAT, WAVES):
@@ -72,14 +71,8 @@ def _check_a_column_at_its_default_changes_no_byte(tmp_path: Path, form: str) ->
     assert after.read_bytes() == before.read_bytes()
 
 
-def test_a_column_that_is_not_declared_is_an_error_that_names_it(tmp_path: Path) -> None:
-    for folder, form in with_folders(tmp_path, EXACT):
-        _check_a_column_that_is_not_declared_is_an_error_that_names_it(folder, form)
-
-
-def _check_a_column_that_is_not_declared_is_an_error_that_names_it(
-    tmp_path: Path, form: str
-) -> None:
+@for_each("form", EXACT)
+def test_a_column_that_is_not_declared_is_an_error_that_names_it(tmp_path: Path, form: str) -> None:
     path = tmp_path / f"a.{form}"
     with declared(COAT):
         write_scene(path, tiny_coated := coated(0.3))
@@ -104,21 +97,6 @@ def test_a_usd_file_that_somebody_changed_keeps_the_columns(tmp_path: Path) -> N
     loaded = load_source(scene_source(str(path)))
     assert columns_in_use(loaded.scene.materials) == (*PUBLISHED_COLUMNS, "tint", "waves")
     assert any("coat: expected 1 numbers from 0 to 1" in note for note in loaded.notes)
-
-
-def test_what_carries_everything_says_nothing(tmp_path: Path) -> None:
-    for folder, form in with_folders(tmp_path, EXACT):
-        _check_what_carries_everything_says_nothing(folder, form)
-
-
-def _check_what_carries_everything_says_nothing(tmp_path: Path, form: str) -> None:
-    path = tmp_path / f"a.{form}"
-    scene = dataclasses.replace(tiny_scene(), objects=ATTRIBUTED)
-    assert write_scene(path, scene) == ()
-    back = load_source(scene_source(str(path))).scene
-    every_member = {field.name for field in dataclasses.fields(Scene)}
-    assert lost_members(back, ()) == lost_members(scene, ())
-    assert lost_members(back, every_member) == ()
 
 
 ATTRIBUTED = (
@@ -166,18 +144,6 @@ def test_textures_and_a_sky_are_said_to_be_lost_where_they_are(tmp_path: Path, f
     means = [texture.mean for texture in scene.textures]
     row = back.materials[back.material_index[0]]
     assert np.allclose(row[[0, 1, 2, 6]], np.concatenate(means), atol=1e-3)  # H5 holds halves
-
-
-def test_these_carry_textures_and_a_sky(tmp_path: Path) -> None:
-    for folder, form in with_folders(tmp_path, ["safetensors", "usda", "usdc", "usdz"]):
-        _check_these_carry_textures_and_a_sky(folder, form)
-
-
-def _check_these_carry_textures_and_a_sky(tmp_path: Path, form: str) -> None:
-    path, scene = tmp_path / f"a.{form}", textured_scene(environment=sky())
-    assert write_scene(path, scene) == ()
-    back = load_source(scene_source(str(path)))
-    assert back.notes == () and back.scene.textures[0].sha256 == scene.textures[0].sha256
 
 
 @pytest.mark.parametrize("form", ["json", "h5"])

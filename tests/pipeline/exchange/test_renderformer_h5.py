@@ -1,13 +1,16 @@
-"""The published HDF5 layout: what is written, what comes back, and that it comes back for good."""
+"""The published HDF5 layouts: what is written and comes back, textures as cells, version 2."""
 
 import dataclasses
 import itertools
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
+from pipeline.exchange.convert import write_scene
+from pipeline.exchange.renderformer_cells import CELLS, cells_of, filled_cells
 from pipeline.exchange.renderformer_h5 import (
     FAR,
     NEAR,
@@ -16,11 +19,15 @@ from pipeline.exchange.renderformer_h5 import (
     write_renderformer_h5,
 )
 from storage.errors import TrilightError
+from storage.records.lookup import environment_values, textured_rows
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
-from tests.for_each import with_folders
-from tests.pipeline.scenes.example_scenes import example_scene
+from storage.records.texture import Texture
+from tests.for_each import for_each
+from tests.pipeline.exchange.exchange_kit import row_at
 from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
+from tests.sky_maps import COLOURS, POLES, six_poles
+from tests.textured_by_hand import number_texture, textured_scene
 
 TYPES: tuple[TextureType, ...] = ("float16", "float32")
 
@@ -88,14 +95,8 @@ def test_mvp_projects_what_the_camera_looks_at(tmp_path: Path) -> None:
             assert clip[:3] / clip[3] == pytest.approx([1, 1, depth], abs=1e-4)
 
 
-def test_scene_to_file_to_scene_to_file(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path, itertools.product(TYPES, [tiny_scene(), awkward_scene()])
-    ):
-        _check_scene_to_file_to_scene_to_file(folder, *case)
-
-
-def _check_scene_to_file_to_scene_to_file(
+@for_each("texture_type, scene", itertools.product(TYPES, [tiny_scene(), awkward_scene()]))
+def test_scene_to_file_to_scene_to_file(
     tmp_path: Path, texture_type: TextureType, scene: Scene
 ) -> None:
     first, again = tmp_path / "first.h5", tmp_path / "again.h5"
@@ -227,13 +228,143 @@ def test_other_packings_are_read(tmp_path: Path, packing: dict[str, object]) -> 
     assert (tmp_path / "c.h5").read_bytes() == plain.read_bytes()
 
 
-def test_an_example_scene_goes_through_it(shared: Path, tmp_path: Path) -> None:
-    """Real meshes, smooth shading and colours per triangle."""
-    scene = example_scene(shared, "crystals")
-    first, again = tmp_path / "first.h5", tmp_path / "again.h5"
-    write_renderformer_h5(first, scene, texture_type="float16")
-    read = read_renderformer_h5(first)
-    write_renderformer_h5(again, read.scene, texture_type="float16")
-    assert again.read_bytes() == first.read_bytes()
-    assert read.lost == ()
-    assert read.scene.num_triangles == scene.num_triangles
+def _smooth_scene() -> Scene:
+    """The floor with a texture that changes slowly, looked up from (-0.5, -0.5) to (0.5, 0.5)."""
+    at = (np.arange(64) + 0.5) / 64
+    wave = 0.4 + 0.3 * np.cos(2 * np.pi * at)
+    colour = np.stack(np.broadcast_arrays(wave[None], wave[:, None], np.float64(0.2)), axis=-1)
+    rough = Texture(texels=(0.5 + 0.4 * np.sin(2 * np.pi * at))[:, None, None].astype(np.float32))
+    scene = textured_scene(0, Texture(texels=colour.astype(np.float32)), rough)
+    uv = 0.5 * scene.vertex_positions[scene.faces.ravel(), :2]
+    return dataclasses.replace(scene, uv=uv.astype(np.float32))
+
+
+def test_a_ramp_has_the_means_of_its_cells(tmp_path: Path) -> None:
+    """u is the weight of the first vertex and v that of the second: cell (x, y) is their middle."""
+    ramp = (np.arange(256, dtype=np.float32) + 0.5) / 256 / 2
+    along = np.broadcast_to(ramp[None, :, None], (256, 256, 3)).astype(np.float32)
+    rough = np.broadcast_to(ramp[:, None, None], (256, 256, 1)).astype(np.float32)
+    scene = textured_scene(0, Texture(texels=along), Texture(texels=np.ascontiguousarray(rough)))
+    corners = np.array([[0.98, 0.01], [0.01, 0.98], [0.01, 0.01]], np.float32)  # away from the seam
+    scene = dataclasses.replace(scene, uv=np.tile(corners, (3, 1)))
+    (_, diffuse), (_, roughness) = cells_of(scene, 0)
+    x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
+    whole = filled_cells() & (x + y < CELLS - 1)  # others lie partly beyond the triangle
+    for found, place in ((diffuse[0], x), (roughness[0], y)):
+        middle = (0.01 + 0.97 * (place + 0.5) / CELLS) / 2
+        assert found[whole] == pytest.approx(middle[whole], abs=1e-4)
+    assert (diffuse[:, ~filled_cells()] == 0).all()
+
+
+def test_a_fine_checker_is_grey_in_every_cell() -> None:
+    """A mean over the area: samples at the middle would be black or white."""
+    checker = (np.indices((64, 64)).sum(axis=0) % 2).astype(np.float32)
+    texels = np.repeat(0.8 * checker[..., None], 3, axis=-1)
+    scene = textured_scene(0, Texture(texels=texels), number_texture())
+    corners = np.array([[4, 0], [0, 4], [0, 0]], np.float32)  # 8 texels a cell
+    scene = dataclasses.replace(scene, uv=np.tile(corners, (3, 1)))
+    x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
+    assert cells_of(scene, 0)[0][1][0][x + y < CELLS - 1] == pytest.approx(0.4, abs=0.01)
+
+
+def test_a_smooth_texture_comes_back_as_an_atlas(tmp_path: Path) -> None:
+    """Half a cell at the greatest slope, where look-ups are clamped, and 8 bits: 0.03 + 0.005."""
+    scene = _smooth_scene()
+    notes = write_scene(tmp_path / "a.h5", scene)
+    assert any("2 textured triangles than the means of 32 x 32" in note for note in notes)
+    found = read_renderformer_h5(tmp_path / "a.h5")
+    assert not any("mean was taken" in text for text in found.lost)
+    back = found.scene
+    rng = np.random.default_rng(3)
+    for x, y in rng.uniform(-0.99, 0.99, (60, 2)):
+        assert row_at(back, x, y)[:7] == pytest.approx(row_at(scene, x, y)[:7], abs=0.035)
+    lit = back.materials[back.material_index][:, EMISSION]
+    assert np.array_equal(lit, scene.materials[scene.material_index][:, EMISSION])
+
+
+def test_corners_have_the_colours_of_their_cells(tmp_path: Path) -> None:
+    """No look-up meets the square of another triangle, not even at its own edges."""
+    path = tmp_path / "a.h5"
+    write_renderformer_h5(path, textured_scene())
+    with h5py.File(path, "r+") as file:
+        texture = file["texture"]
+        for triangle, level in ((0, 0.25), (1, 0.75)):
+            cells = np.where(filled_cells(), np.float32(level), np.float32(0))
+            cells[0, 0] = level - 0.125  # so that it varies
+            texture[triangle, :3] = cells
+            texture[triangle, 3:6] = 0
+    scene = read_renderformer_h5(path).scene
+    assert scene.uv is not None
+    uv = scene.uv.reshape(-1, 3, 2).astype(np.float64)
+    for triangle, level in ((0, 0.25), (1, 0.75)):
+        for weights in ([1, 0, 0], [0, 1, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]):
+            at = np.array(weights) @ uv[triangle]
+            row = textured_rows(scene, scene.material_index[[triangle]], at[None])[0]
+            assert row[:3] == pytest.approx([level] * 3, abs=0.005)  # 8 bits
+
+
+def test_plain_scenes_are_written_as_before(tmp_path: Path) -> None:
+    scene = textured_scene()
+    plain = dataclasses.replace(scene, uv=None, textures=(), material_textures=None)
+    write_renderformer_h5(tmp_path / "a.h5", plain)
+    assert not read_renderformer_h5(tmp_path / "a.h5").scene.textures
+
+
+def write_v2(path: Path, lit: bool = True, **more: Any) -> None:
+    scene = tiny_scene()
+    light = np.zeros((3, 3), np.float16)
+    light[2] = 100 if lit else 0
+    arrays = {
+        "triangles": scene.vertex_positions[scene.faces],
+        "vn": scene.vertex_normals[scene.faces],
+        "texture": np.random.default_rng(0).random((3, 80, 4, 4)).astype(np.float16),
+        "light_strength": light,
+        "c2w": scene.c2w,
+        "fov": scene.fov_deg,
+        **more,
+    }
+    with h5py.File(path, "w") as file:
+        for name, values in arrays.items():
+            file[name] = values
+
+
+def test_geometry_lights_and_cameras_are_read_and_the_code_is_not(tmp_path: Path) -> None:
+    write_v2(tmp_path / "a.h5")
+    found = read_renderformer_h5(tmp_path / "a.h5")
+    scene, ours = found.scene, tiny_scene()
+    assert np.array_equal(scene.vertex_positions[scene.faces], ours.vertex_positions[ours.faces])
+    rows = scene.materials[scene.material_index]
+    assert rows[0, :7].tolist() == [0.5, 0.5, 0.5, 0, 0, 0, 1]
+    assert rows[2, 7:10].tolist() == ours.materials[LIGHT, 7:10].tolist()
+    assert scene.environment is None
+    (note,) = found.lost
+    assert "learned code" in note and "grey of 0.5" in note
+
+
+@pytest.mark.parametrize("processed", [True, False])
+def test_its_environment_has_our_axes(tmp_path: Path, processed: bool) -> None:
+    """Raw ones are scaled by their strength; either may be the only light."""
+    radiance = six_poles().radiance_rgb
+    more: dict[str, Any] = {"env_map": np.moveaxis(radiance, -1, 0) if processed else radiance / 2}
+    if not processed:
+        more |= {"env_map_strength": np.array(2, np.float32), "env_map_rotation": np.zeros(3, "f4")}
+    write_v2(tmp_path / "a.h5", lit=False, **more)
+    sky = read_renderformer_h5(tmp_path / "a.h5").scene.environment
+    assert sky is not None and not sky.is_seen
+    for name, direction in POLES.items():
+        assert environment_values(sky, direction) == pytest.approx(COLOURS[name]), name
+
+
+def test_a_turned_environment_is_said(tmp_path: Path) -> None:
+    more: dict[str, Any] = {
+        "env_map": six_poles().radiance_rgb,
+        "env_map_rotation": np.array([0, 0, 90], "f4"),
+    }
+    write_v2(tmp_path / "a.h5", **more)
+    assert any("rotation of the" in text for text in read_renderformer_h5(tmp_path / "a.h5").lost)
+
+
+def test_a_map_of_another_shape_is_refused(tmp_path: Path) -> None:
+    write_v2(tmp_path / "a.h5", env_map=np.ones((4, 8), np.float32))
+    with pytest.raises(TrilightError, match=r"env_map: has shape \[4, 8\]; expected"):
+        read_renderformer_h5(tmp_path / "a.h5")

@@ -3,7 +3,6 @@ scene written and read again: the same triangles in the same light."""
 
 import dataclasses
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +12,15 @@ import pytest
 from pipeline.exchange.renderformer_json import MAX_BYTES, described_files, read_description
 from storage.errors import TrilightError
 from storage.records.scene import SceneObject
+from tests.for_each import for_each
 from tests.pipeline.exchange.exchange_kit import assert_json_keeps_light, json_and_back
 from tests.pipeline.scenes.example_scenes import EXAMPLES
 from tests.pipeline.scenes.one_box import BOX, CAMERA, MATERIAL, OBJECT, SCENE, TRANSFORM, changed
 from tests.scenes_by_hand import LIGHT, tiny_scene
 
 
-def test_the_example_scenes_hold_no_unknown_field(shared: Path) -> None:
-    for name in EXAMPLES:
-        _check_the_example_scenes_hold_no_unknown_field(shared, name)
-
-
-def _check_the_example_scenes_hold_no_unknown_field(shared: Path, name: str) -> None:
+@for_each("name", EXAMPLES)
+def test_the_example_scenes_hold_no_unknown_field(shared: Path, name: str) -> None:
     data = (shared / "renderformer_scenes" / f"{name}.json").read_bytes()
     described = read_description(data, name)
     assert described.unknown_fields == ()
@@ -55,9 +51,6 @@ def test_what_may_be_missing_has_the_published_default() -> None:
     assert box.material.random_diffuse_max == 1
     assert box.material.random_diffuse_type == "per-shading-group"
     assert (box.remesh, box.remesh_target_face_num) == (False, 2048)
-
-
-def test_seed_zero_is_a_seed() -> None:
     (box,) = read_description(changed(*MATERIAL, rand_tri_diffuse_seed=0), "a.json").objects
     assert box.material.rand_tri_diffuse_seed == 0
 
@@ -82,36 +75,24 @@ def test_unknown_fields_are_named_and_harmless() -> None:
 
 REFUSED = [
     (changed(version="2.0"), "version is '2.0'; expected '1.0'"),
-    (changed(objects=[]), "objects is []; expected a JSON object"),
-    (changed(objects={}), "0 objects; expected 1 to 8192"),
     (changed(objects={str(i): 1 for i in range(8193)}), "8193 objects; expected 1 to 8192"),
     (changed(objects={"a\nb": OBJECT}), "expected a printable name"),
     (changed(cameras=[]), "cameras is []; expected a list of 1 to 1000"),
     (changed(cameras=[1]), "cameras[0] is 1; expected a JSON object"),
     (changed(scene_name=...), "scene_name is missing"),
-    (changed(*BOX, mesh_path=...), "objects.box.mesh_path is missing"),
     (changed(*BOX, mesh_path="a\0b"), "objects.box.mesh_path is 'a\\x00b'; expected printable"),
-    (changed(*BOX, remesh=1), "objects.box.remesh is 1; expected true or false"),
     (changed(*BOX, remesh_target_face_num=2), "is 2; expected a whole number from 4"),
+    (changed(*TRANSFORM, normalize="yes"), "transform.normalize is yes; expected true or false"),
     (changed(*TRANSFORM, scale=2), "objects.box.transform.scale is 2; expected a list of three"),
-    (changed(*TRANSFORM, scale=[1, 1]), "expected a list of three numbers"),
     (changed(*TRANSFORM, rotation=[0, "90", 0]), "transform.rotation[1] is 90; expected a number"),
     (changed(*TRANSFORM, translation=[1e9, 0, 0]), "translation[0] is 1000000000.0; expected a nu"),
     (changed(*TRANSFORM, translation=[10**400, 0, 0]), "translation[0] is 1000000"),
-    (changed(*TRANSFORM, normalize="yes"), "transform.normalize is yes; expected true or false"),
     (changed(*MATERIAL, diffuse=[0.5, 0.5, 1.5]), "diffuse[2] is 1.5; expected a number from 0 to"),
     (changed(*MATERIAL, diffuse=[True, 0, 0]), "diffuse[0] is True; expected a number"),
-    (changed(*MATERIAL, emissive=[-1, 0, 0]), "emissive[0] is -1; expected a number from 0"),
-    (changed(*MATERIAL, roughness=None), "roughness is None; expected a number"),
-    (changed(*MATERIAL, smooth_shading=...), "objects.box.material.smooth_shading is missing"),
     (changed(*MATERIAL, random_diffuse_type="x"), "is x; expected one of per-triangle, per-shadi"),
-    (changed(*MATERIAL, random_diffuse_type=[]), "is []; expected one of per-triangle"),
-    (changed(*MATERIAL, rand_tri_diffuse_seed=-1), "is -1; expected a whole number from 0"),
     (changed(*MATERIAL, rand_tri_diffuse_seed=1.5), "is 1.5; expected a whole number"),
-    (changed(*CAMERA, fov=180), "cameras[0].fov is 180; expected a number from 0.001 to 179"),
     (changed().replace(b"40", b"1e999"), "cameras[0].fov is inf; expected a number"),
     (b"", "not readable as JSON"),
-    (b"\xff\xfe", "not readable as JSON"),
     (b"[" * 100_000, "a.json: "),
     (b"[]", "the file is []; expected a JSON object"),
     (b'{"a": NaN}', "NaN is no JSON number"),
@@ -121,12 +102,8 @@ REFUSED = [
 ]
 
 
-def test_what_is_wrong_is_named() -> None:
-    for case in REFUSED:
-        _check_what_is_wrong_is_named(*case)
-
-
-def _check_what_is_wrong_is_named(data: bytes, message: str) -> None:
+@for_each("data, message", REFUSED)
+def test_what_is_wrong_is_named(data: bytes, message: str) -> None:
     with pytest.raises(TrilightError) as caught:
         read_description(data, "a.json")
     assert message in str(caught.value)
@@ -153,9 +130,8 @@ def test_every_field_is_looked_at() -> None:
 
 
 def _expect_refusal(data: bytes) -> None:
-    read: Callable[[], Any] = lambda: read_description(data, "a.json")  # noqa: E731
     with pytest.raises(TrilightError):
-        read()
+        read_description(data, "a.json")
 
 
 def test_a_scene_by_hand(tmp_path: Path) -> None:

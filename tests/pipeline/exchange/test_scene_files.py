@@ -124,27 +124,31 @@ def test_a_scene_says_where_it_comes_from(folder: Path) -> None:
     assert str(folder) not in json.dumps(dict(scene.provenance))
 
 
-def test_a_mesh_outside_of_the_folder_is_refused(folder: Path) -> None:
+def test_links_are_followed_within_the_folder_alone(folder: Path) -> None:
     shutil.copy(folder / "meshes/green.obj", folder.parent / "out.obj")
     (folder / "link.obj").symlink_to(folder.parent / "out.obj")
-    for path in ("../out.obj", "/etc/passwd", "meshes/../../out.obj", ".", "link.obj"):
+    for path in ("../out.obj", "link.obj"):  # tests/hostile has more ways
         _change(folder, "a.json", mesh_path=path)
         with pytest.raises(TrilightError, match="a.json: objects.green.mesh_path is .*leads out"):
             _build(folder)
-
-
-def test_a_link_that_stays_inside_is_followed(folder: Path) -> None:
-    (folder / "link.obj").symlink_to("meshes/green.obj")
-    _change(folder, "a.json", mesh_path="./meshes/../link.obj")
+    (folder / "within.obj").symlink_to("meshes/green.obj")
+    _change(folder, "a.json", mesh_path="./meshes/../within.obj")
     assert _build(folder).objects[0].uid == "meshes/green.obj"
-
-
-def test_links_in_a_circle_are_refused(folder: Path) -> None:
     (folder / "x.obj").symlink_to("y.obj")
     (folder / "y.obj").symlink_to("x.obj")
     _change(folder, "a.json", mesh_path="x.obj")
     with pytest.raises(TrilightError, match="objects.green.mesh_path is x.obj"):
         _build(folder)
+
+
+def test_folders_that_give_nothing(tmp_path: Path) -> None:
+    with pytest.raises(TrilightError, match="no such folder"):
+        find_scene_files(str(tmp_path / "nowhere"))
+    with pytest.raises(TrilightError, match=r"0 files \*.json"):
+        find_scene_files(str(tmp_path))
+    (tmp_path / "a.json").write_text("{")
+    with pytest.raises(TrilightError, match="none of the 1 scene files is usable; the first: a.js"):
+        find_scene_files(str(tmp_path))
 
 
 def test_a_scene_file_that_links_out_is_refused(folder: Path) -> None:
@@ -189,31 +193,25 @@ def test_remesh_keeps_the_place_and_the_number(folder: Path) -> None:
         assert abs(found - wanted).max() < 0.05  # of an object that is 0.3 high
 
 
+def test_all_scenes_are_for_testing_and_the_last_shard_may_be_small(folder: Path) -> None:
+    splits = dataclasses.replace(_settings(folder).splits, listed_scenes=6)
+    names = [shard_name(index, splits) for index in (0, 1)]
+    assert names == ["test-000000.tar", "test-000001.tar"]
+    assert [list(scenes_of_shard(index, splits)) for index in (0, 1)] == [[0, 1, 2, 3], [4, 5]]
+
+
 def test_without_wish_there_are_as_many_views_as_every_file_has(folder: Path) -> None:
     assert _settings(folder).scenes.num_views == 1
     found = find_scene_files(str(folder))
     assert found.notes(1) == ("b.json: 1 of 2 cameras not used, from cameras[1] on",)
+    _change(folder, "a.json", colour="red")
+    assert find_scene_files(str(folder)).notes(1)[0] == "a.json: unknown field objects.green.colour"
     with pytest.raises(TrilightError, match="--views is 2; expected 1 to 1.*in a.json"):
         _settings(folder, views=2)
     with pytest.raises(TrilightError, match="--views is 0"):
         _settings(folder, views=0)
     with pytest.raises(TrilightError, match="only with --scenes-from"):
         DatasetOrder(views=1)
-
-
-def test_unknown_fields_become_notes(folder: Path) -> None:
-    _change(folder, "a.json", colour="red")
-    assert find_scene_files(str(folder)).notes(1)[0] == "a.json: unknown field objects.green.colour"
-
-
-def test_all_scenes_are_for_testing_and_the_last_shard_may_be_small(folder: Path) -> None:
-    settings = _settings(folder)
-    splits = dataclasses.replace(settings.splits, listed_scenes=6)
-    assert [shard_name(index, splits) for index in (0, 1)] == [
-        "test-000000.tar",
-        "test-000001.tar",
-    ]
-    assert [list(scenes_of_shard(index, splits)) for index in (0, 1)] == [[0, 1, 2, 3], [4, 5]]
 
 
 @pytest.mark.usefixtures("no_child")
@@ -309,13 +307,6 @@ def test_the_licence_is_the_users_word(folder: Path, tmp_path: Path) -> None:
         _accept(folder, tmp_path / "theirs", "CC-BY-NC-4.0")
 
 
-def test_a_folder_without_scenes_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(TrilightError, match="no such folder"):
-        find_scene_files(str(tmp_path / "nowhere"))
-    with pytest.raises(TrilightError, match=r"0 files \*.json"):
-        find_scene_files(str(tmp_path))
-
-
 def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Path) -> None:
     """One that is no scene, and one whose mesh is broken; scene k stays the k-th file."""
     (folder / "aa.json").write_text("{")
@@ -338,9 +329,3 @@ def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Pa
     assert any("c.json is left out: c.json: objects.green" in note for note in files.notes), (
         files.notes
     )
-
-
-def test_only_bad_files_are_refused_with_the_reason_of_the_first(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text("{")
-    with pytest.raises(TrilightError, match="none of the 1 scene files is usable; the first: a.js"):
-        find_scene_files(str(tmp_path))

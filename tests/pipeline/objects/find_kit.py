@@ -7,9 +7,16 @@ from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.sources import FoundObjects, find_objects
 
 
-def find(url: str, **options: Any) -> FoundObjects:
-    options = {"allowed_licences": DEFAULT_ALLOWED, **options}
-    return find_objects(url, work_dir=Path("unused"), **options)
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("v 0 0 0")
+
+
+def find(source: Path | str, **options: Any) -> FoundObjects:
+    options = {"allowed_licences": DEFAULT_ALLOWED, "work_dir": Path("unused"), **options}
+    return find_objects(str(source), **options)
 
 
 def reasons(found: FoundObjects) -> dict[str, str]:

@@ -1,8 +1,8 @@
-"""Folders and built-in objects: what is found, under which names, and every mistake in a folder."""
+"""Folders, built-in objects, variables, licences: what is found, and every mistake in one."""
 
 import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,25 +10,15 @@ import pytest
 
 from pipeline.assets.reading.source_file import SUFFIXES as READABLE
 from pipeline.objects.generated import FAMILIES
-from pipeline.objects.licences import DEFAULT_ALLOWED, USER_PROVIDED
+from pipeline.objects.licences import DEFAULT_ALLOWED, USER_PROVIDED, refuse_licences
 from pipeline.objects.listing import SUFFIXES
-from pipeline.objects.sources import FoundObjects, find_objects
+from pipeline.objects.sources import find_objects
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
+from storage.remote import tries
 from storage.remote.safe_url import printable
-from tests.for_each import with_folders
-
-
-def touch(folder: Path, *names: str) -> None:
-    for name in names:
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("v 0 0 0")
-
-
-def find(source: Path | str, **options: Any) -> FoundObjects:
-    options = {"allowed_licences": DEFAULT_ALLOWED, "work_dir": Path("unused"), **options}
-    return find_objects(str(source), **options)
+from tests.for_each import for_each
+from tests.pipeline.objects.find_kit import find, touch
 
 
 def listed(folder: Path) -> list[ObjectRecord]:
@@ -65,13 +55,8 @@ def test_names_of_any_bytes_become_printable_uids(tmp_path: Path) -> None:
         assert Path(record.path).read_text() == "v 0 0 0"
 
 
-def test_printable_text_stays() -> None:
-    cases: Iterable[Any] = ["plain", "größe", "a b", "日本"]
-    for text in cases:
-        _check_printable_text_stays(text)
-
-
-def _check_printable_text_stays(text: str) -> None:
+@for_each("text", ["plain", "größe", "a b", "日本"])
+def test_printable_text_stays(text: str) -> None:
     assert printable(text) == text
 
 
@@ -138,21 +123,17 @@ def test_a_url_of_this_machine_is_its_folder(tmp_path: Path) -> None:
     assert find(f"file://{tmp_path}/my%20objects") == find(tmp_path / "my objects")
 
 
-def test_folders_without_objects(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path,
-        [
-            (lambda path: None, "does not exist"),
-            (lambda path: path.write_text(""), "is not a folder"),
-            (lambda path: path.mkdir(), "holds no object"),
-            (lambda path: touch(path, "readme.txt", "sub/a.jpg"), "holds no object"),
-            (lambda path: touch(path, "objects.jsonl"), "not JSON"),
-        ],
-    ):
-        _check_folders_without_objects(folder, *case)
-
-
-def _check_folders_without_objects(
+@for_each(
+    "make, message",
+    [
+        (lambda path: None, "does not exist"),
+        (lambda path: path.write_text(""), "is not a folder"),
+        (lambda path: path.mkdir(), "holds no object"),
+        (lambda path: touch(path, "readme.txt", "sub/a.jpg"), "holds no object"),
+        (lambda path: touch(path, "objects.jsonl"), "not JSON"),
+    ],
+)
+def test_folders_without_objects(
     tmp_path: Path, make: Callable[[Path], object], message: str
 ) -> None:
     make(tmp_path / "objects")
@@ -184,14 +165,8 @@ def test_builtin_objects_are_mended_and_otherwise_left_alone(tmp_path: Path) -> 
     assert [path.stat().st_mtime_ns for path in paths[1:]] == times[1:]
 
 
-def test_counts_without_meaning(tmp_path: Path) -> None:
-    for folder, source in with_folders(
-        tmp_path, ["builtin:0", "builtin:-3", "builtin:x", "builtin:1e3", "builtin:9999999999"]
-    ):
-        _check_counts_without_meaning(folder, source)
-
-
-def _check_counts_without_meaning(tmp_path: Path, source: str) -> None:
+@for_each("source", ["builtin:0", "builtin:-3", "builtin:x", "builtin:1e3", "builtin:9999999999"])
+def test_counts_without_meaning(tmp_path: Path, source: str) -> None:
     with pytest.raises(TrilightError, match=r"builtin:N with N from 1"):
         find(source, work_dir=tmp_path)
 
@@ -209,3 +184,150 @@ def test_real_objects_are_found_and_five_refused(shared: Path) -> None:
     assert [one.uid for one in found.records] == sorted(one.uid for one in found.records)
     assert [one.item for one in found.failures] == sorted(one.item for one in found.failures)
     assert {record.licence_source for record in found.records} == {"objects.jsonl"}
+
+
+CANARY = "hunter2-secret-value"
+
+
+@pytest.mark.parametrize("name", ["PATH", "AWS_SECRET_ACCESS_KEY", "TRILIGHT_CACHE", "", "A\nB"])
+def test_only_variables_of_sources_are_read(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    if name.isidentifier():
+        monkeypatch.setenv(name, CANARY)
+    with pytest.raises(TrilightError, match="begins with TRILIGHT_SOURCE_") as caught:
+        find(f"env:{name}")
+    assert CANARY not in str(caught.value)
+
+
+def test_the_source_that_it_says_is_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("v 0 0 0")
+    monkeypatch.setenv("TRILIGHT_SOURCE_MINE", str(tmp_path))
+    assert [record.uid for record in find("env:TRILIGHT_SOURCE_MINE").records] == ["a"]
+
+
+VALUES = (
+    CANARY,
+    f"/no/{CANARY}'quoted\nand more",
+    f"https://me:{CANARY}@127.0.0.1:9/{CANARY}?key={CANARY}",
+    f"ftp://{CANARY}/x",
+    f"s3://me:{CANARY}@bucket/x",
+    f"pipe:cat {CANARY}",
+    f"builtin:{CANARY}",
+    f"objaverse:{CANARY}",
+)
+
+
+def test_no_message_shows_what_it_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tries, "PAUSE_S", 0.0)
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    for value in VALUES:
+        monkeypatch.setenv("TRILIGHT_SOURCE_MINE", value)
+        with pytest.raises(TrilightError) as caught:
+            find("env:TRILIGHT_SOURCE_MINE")
+        message = str(caught.value)
+        assert "env:TRILIGHT_SOURCE_MINE" in message, value
+        assert "does not exist" in message or value != CANARY
+        for part in ("hunter2", "127.0.0.1", "bucket", "quoted"):
+            assert part not in message, value
+        assert caught.value.__cause__ is None and caught.value.__suppress_context__, value
+
+
+def test_an_empty_folder_is_named_by_its_variable(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / CANARY).mkdir()
+    monkeypatch.setenv("TRILIGHT_SOURCE_MINE", str(tmp_path / CANARY))
+    with pytest.raises(TrilightError, match="^objects 'env:TRILIGHT_SOURCE_MINE'") as caught:
+        find("env:TRILIGHT_SOURCE_MINE")
+    assert CANARY not in str(caught.value)
+
+
+def record(uid: str, licence: str) -> ObjectRecord:
+    return ObjectRecord(
+        uid=uid,
+        path="",
+        title="",
+        licence=licence,
+        licence_source="tests",
+        attribution="",
+        source_url="",
+    )
+
+
+def test_the_default_refuses_what_is_unknown_or_restricted() -> None:
+    allowed = ["CC0-1.0", "cc-by-4.0", "MIT", USER_PROVIDED]
+    refused = ["LicenseRef-unknown", "CC-BY-NC-4.0", "CC-BY-ND-4.0", "CC-BY-NC-SA-4.0", "", "GPL"]
+    records = [record(licence, licence) for licence in allowed + refused]
+    kept, failures = refuse_licences(records, DEFAULT_ALLOWED)
+    assert [one.uid for one in kept] == allowed
+    assert [failure.item for failure in failures] == refused
+    assert {(failure.stage, failure.reason) for failure in failures} == {
+        ("objects", "licence_refused")
+    }
+    assert not any(mark in name for name in DEFAULT_ALLOWED for mark in ("NC", "ND", "unknown"))
+
+
+def test_a_refusal_says_how_to_allow() -> None:
+    one = record("a", "CC-BY-NC-4.0")
+    _, (failure,) = refuse_licences([one], DEFAULT_ALLOWED)
+    assert "--allow-licence 'CC-BY-NC-4.0'" in failure.message
+    assert refuse_licences([one], (*DEFAULT_ALLOWED, "CC-BY-NC-4.0")) == ([one], [])
+    one = record("a", "MIT OR Apache-2.0")
+    _, (failure,) = refuse_licences([one], DEFAULT_ALLOWED)
+    assert "--allow-licence 'MIT OR Apache-2.0'" in failure.message
+    assert refuse_licences([one], ["mit or apache-2.0"]) == ([one], [])
+
+
+@for_each("licence", ["", "CC BY 4.0", "x" * 65, "Größe"])
+def test_what_is_no_identifier_is_to_be_mended(licence: str) -> None:
+    """No allow-list can name it, so the message must not say so."""
+    _, (failure,) = refuse_licences([record("a", licence)], DEFAULT_ALLOWED)
+    assert "--allow-licence" not in failure.message
+    assert "expected an SPDX identifier" in failure.message
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "a.obj").write_text("v 0 0 0")
+    return tmp_path
+
+
+def test_a_stated_licence_is_that_of_silent_files(folder: Path) -> None:
+    found = find_objects(
+        str(folder), work_dir=folder, allowed_licences=["CC-BY-4.0"], licence="cc-by-4.0"
+    )
+    (one,) = found.records
+    assert (one.licence, one.licence_source) == ("cc-by-4.0", "stated by the user (--licence)")
+    found = find(folder, licence="CC-BY-NC-4.0")
+    assert not found.records
+    assert [failure.reason for failure in found.failures] == ["licence_refused"]
+
+
+@pytest.mark.parametrize("name", ["objects.jsonl", "objects.csv", "builtin:", "objaverse:"])
+def test_sources_that_state_their_own(folder: Path, name: str) -> None:
+    source = name if name.endswith(":") else str(folder)
+    if source != name:
+        (folder / name).write_text("")
+    with pytest.raises(TrilightError, match=f"--licence is 'MIT', but {name} states"):
+        find_objects(source, work_dir=folder, allowed_licences=["MIT"], licence="MIT")
+
+
+BAD = ["", " ", "CC BY", "CC-BY-4.0\n", "a/b", "x" * 65, "LicenseRef-größe", "a:b", "(MIT)"]
+
+
+def test_malformed_identifiers(folder: Path) -> None:
+    stated: list[dict[str, Any]] = [{"allowed_licences": ["MIT"], "licence": one} for one in BAD]
+    for options in (*stated, *({"allowed_licences": [one]} for one in BAD)):
+        with pytest.raises(TrilightError, match="expected an SPDX identifier") as caught:
+            find_objects(str(folder), work_dir=folder, **options)
+        assert "\n" not in str(caught.value), options
+
+
+@pytest.mark.parametrize(
+    "licence", ["MIT", "CC-BY-SA-4.0", "GPL-2.0+", "LicenseRef-My.Shop-1", "x" * 64]
+)
+def test_well_formed_identifiers(folder: Path, licence: str) -> None:
+    (one,) = find_objects(
+        str(folder), work_dir=folder, allowed_licences=[licence], licence=licence
+    ).records
+    assert one.licence == licence

@@ -18,7 +18,7 @@ from storage.errors import TrilightError
 from storage.records.lookup import texture_values
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, tiny_scene
 from tests.textured_by_hand import colour_texture, corner_uv, number_texture, sky, textured_scene
 
@@ -28,14 +28,8 @@ def there_and_back(folder: Path, scene: Scene) -> Scene:
     return read_gltf(folder / "a.glb", "CC0-1.0").scene
 
 
-def test_a_scene_comes_back(tmp_path: Path) -> None:
-    for folder, specular in with_folders(
-        tmp_path, [(0.2, 0.2, 0.2), (0, 0, 0), (0.4, 0.1, 0.3), (0.9, 0.5, 0.1)]
-    ):
-        _check_a_scene_comes_back(folder, specular)
-
-
-def _check_a_scene_comes_back(tmp_path: Path, specular: tuple[float, float, float]) -> None:
+@for_each("specular", [(0.2, 0.2, 0.2), (0, 0, 0), (0.4, 0.1, 0.3), (0.9, 0.5, 0.1)])
+def test_a_scene_comes_back(tmp_path: Path, specular: tuple[float, float, float]) -> None:
     materials = tiny_scene().materials.copy()
     materials[FLOOR, DIFFUSE], materials[FLOOR, SPECULAR] = (0.1, 0.05, 0.3), specular
     scene = tiny_scene(materials=materials)

@@ -14,7 +14,7 @@ from pipeline.exchange.usd.write import write_usd
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
 from storage.records.exr import encode_channels
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.pipeline.exchange.exchange_kit import row_at
 from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.textured_by_hand import textured_scene
@@ -105,15 +105,11 @@ def test_a_transform_scales_then_turns_then_moves(tmp_path: Path) -> None:
     assert row_at(scene, 0, 0)[:3] == pytest.approx(linear(GREY), abs=1e-6)  # at (0.75, 0.25)
 
 
-def test_coordinates_beyond_the_picture(tmp_path: Path) -> None:
+@for_each(
+    "mode, colour", [("repeat", RED), ("clamp", GREEN), ("mirror", GREEN), ("black", (0, 0, 0))]
+)
+def test_coordinates_beyond_the_picture(tmp_path: Path, mode: str, colour: Any) -> None:
     """u from 0 to 2: at x = 0.25 it is 1.25, in the row of red and green."""
-    for folder, case in with_folders(
-        tmp_path, [("repeat", RED), ("clamp", GREEN), ("mirror", GREEN), ("black", (0, 0, 0))]
-    ):
-        _check_coordinates_beyond_the_picture(folder, *case)
-
-
-def _check_coordinates_beyond_the_picture(tmp_path: Path, mode: str, colour: Any) -> None:
 
     def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
         token("wrapS", mode)(stage, preview, texture)

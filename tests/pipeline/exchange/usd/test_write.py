@@ -19,8 +19,8 @@ from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene
-from tests.for_each import with_folders
-from tests.pipeline.exchange.usd.usd_validators import errors_of
+from tests.for_each import for_each
+from tests.pipeline.exchange.exchange_kit import errors_of
 from tests.scenes_by_hand import LIGHT, tiny_scene
 
 OPENPBR_INPUTS = {
@@ -66,33 +66,16 @@ def odd_scene() -> Scene:
     )
 
 
-def test_every_validator_of_usd_agrees(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path, itertools.product(SUFFIXES, [tiny_scene(), odd_scene()])
-    ):
-        _check_every_validator_of_usd_agrees(folder, *case)
-
-
-def _check_every_validator_of_usd_agrees(tmp_path: Path, suffix: str, scene: Scene) -> None:
-    assert errors_of(written(tmp_path, scene, f"a{suffix}")) == []
-
-
 def test_validators_would_see_a_mistake(tmp_path: Path) -> None:
     stage = written(tmp_path, tiny_scene())
     stage.ClearDefaultPrim()
     assert errors_of(stage)
 
 
-def test_there_and_back_is_exact(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path, itertools.product(SUFFIXES, [tiny_scene(), odd_scene()])
-    ):
-        _check_there_and_back_is_exact(folder, *case)
-
-
-def _check_there_and_back_is_exact(tmp_path: Path, suffix: str, scene: Scene) -> None:
+@for_each("suffix, scene", itertools.product(SUFFIXES, [tiny_scene(), odd_scene()]))
+def test_there_and_back_is_exact_and_valid(tmp_path: Path, suffix: str, scene: Scene) -> None:
     path = tmp_path / f"a{suffix}"
-    write_usd(path, scene)
+    assert errors_of(written(tmp_path, scene, path.name)) == []
     back = read_exact(Sdf.Layer.FindOrOpen(str(path)))
     assert back is not None
     assert encode_scene(back) == encode_scene(scene)
@@ -256,12 +239,8 @@ def edits() -> Iterable[tuple[str, str, Any]]:
     yield "/Scene/Objects/floor", "instanceable", True
 
 
-def test_what_was_changed_is_no_longer_ours(tmp_path: Path) -> None:
-    for folder, case in with_folders(tmp_path, list(edits())):
-        _check_what_was_changed_is_no_longer_ours(folder, *case)
-
-
-def _check_what_was_changed_is_no_longer_ours(
+@for_each("path, field, value", edits())
+def test_what_was_changed_is_no_longer_ours(
     tmp_path: Path, path: str, field: str, value: Any
 ) -> None:
     write_usd(tmp_path / "a.usda", tiny_scene())

@@ -9,19 +9,12 @@ from typing import Any
 
 import pytest
 
-from pipeline.objects.sources import find_objects
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
-from tests.for_each import with_folders
+from tests.for_each import for_each
+from tests.pipeline.objects.find_kit import find, touch
 
 ALLOWED = ["CC0-1.0", "MIT", "LicenseRef-unknown"]
-
-
-def touch(folder: Path, *names: str) -> None:
-    for name in names:
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("v 0 0 0")
 
 
 def write_catalogue(folder: Path, *rows: Any) -> None:
@@ -34,8 +27,7 @@ def write_csv(folder: Path, text: str, encoding: str = "utf-8") -> None:
 
 
 def listed(folder: Path, **options: Any) -> list[ObjectRecord]:
-    options = {"allowed_licences": ALLOWED, **options}
-    found = find_objects(str(folder), work_dir=Path("unused"), **options)
+    found = find(folder, **{"allowed_licences": ALLOWED, **options})
     assert not found.failures
     return list(found.records)
 
@@ -86,35 +78,27 @@ def test_a_catalogue_rules_its_folder(tmp_path: Path) -> None:
 GOOD = {"uid": "a", "path": "a.obj"}
 
 
-def test_mistakes_in_a_catalogue_are_placed(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path,
-        [
-            ("{not json", "objects.jsonl:2: not JSON"),
-            ("[" * 100_000, "objects.jsonl:2: not JSON"),
-            ([1, 2], "objects.jsonl:2: got a list"),
-            ({"path": "a.obj"}, "objects.jsonl:2: field 'uid' is missing"),
-            ({"uid": "b"}, "objects.jsonl:2: field 'path' is missing"),
-            ({"uid": 7, "path": "a.obj"}, "objects.jsonl:2: field 'uid' is a int"),
-            ({"uid": "b", "path": "a.obj", "licence": None}, "field 'licence' is a NoneType"),
-            ({"uid": " ", "path": "a.obj"}, "not blank"),
-            ({"uid": "b\n", "path": "a.obj"}, "printable"),
-            ({"uid": "a", "path": "b.obj"}, "objects.jsonl:2: uid 'a' is already used in line 1"),
-            ({"uid": "b", "path": ""}, "expected the name of a file"),
-            ({"uid": "b", "path": "a\u0000b"}, "expected the name of a file"),
-            ({"uid": "b", "path": "\ud800"}, "expected the name of a file"),
-            ({"uid": "b", "path": "."}, "leads out"),
-            ({"uid": "b", "path": "../secret.obj"}, "leads out"),
-            ({"uid": "b", "path": "x/../../secret.obj"}, "leads out"),
-            ({"uid": "b", "path": "/etc/hostname"}, "leads out"),
-            ({"uid": "b", "path": "link.obj"}, "leads out"),
-            ({"uid": "b", "path": "b.obj", "licence_source": 1}, "'licence_source' is a int"),
-        ],
-    ):
-        _check_mistakes_in_a_catalogue_are_placed(folder, *case)
-
-
-def _check_mistakes_in_a_catalogue_are_placed(tmp_path: Path, row: Any, message: str) -> None:
+@for_each(
+    "row, message",
+    [
+        ("{not json", "objects.jsonl:2: not JSON"),
+        ("[" * 100_000, "objects.jsonl:2: not JSON"),
+        ([1, 2], "objects.jsonl:2: got a list"),
+        ({"path": "a.obj"}, "objects.jsonl:2: field 'uid' is missing"),
+        ({"uid": "b"}, "objects.jsonl:2: field 'path' is missing"),
+        ({"uid": 7, "path": "a.obj"}, "objects.jsonl:2: field 'uid' is a int"),
+        ({"uid": "b", "path": "a.obj", "licence": None}, "field 'licence' is a NoneType"),
+        ({"uid": " ", "path": "a.obj"}, "not blank"),
+        ({"uid": "b\n", "path": "a.obj"}, "printable"),
+        ({"uid": "a", "path": "b.obj"}, "objects.jsonl:2: uid 'a' is already used in line 1"),
+        ({"uid": "b", "path": ""}, "expected the name of a file"),
+        ({"uid": "b", "path": "a\u0000b"}, "expected the name of a file"),
+        ({"uid": "b", "path": "x/../../secret.obj"}, "leads out"),
+        ({"uid": "b", "path": "/etc/hostname"}, "leads out"),
+        ({"uid": "b", "path": "link.obj"}, "leads out"),
+    ],
+)
+def test_mistakes_in_a_catalogue_are_placed(tmp_path: Path, row: Any, message: str) -> None:
     folder = tmp_path / "objects"
     touch(tmp_path, "secret.obj")
     touch(folder, "a.obj")
@@ -152,14 +136,8 @@ grö,c.obj, ,  ,,,,
 """
 
 
-def test_a_table_says_what_lines_say(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path, itertools.product(["utf-8", "utf-8-sig"], ["\n", "\r\n"])
-    ):
-        _check_a_table_says_what_lines_say(folder, *case)
-
-
-def _check_a_table_says_what_lines_say(tmp_path: Path, encoding: str, ending: str) -> None:
+@for_each("encoding, ending", itertools.product(["utf-8", "utf-8-sig"], ["\n", "\r\n"]))
+def test_a_table_says_what_lines_say(tmp_path: Path, encoding: str, ending: str) -> None:
     write_csv(tmp_path, TABLE.replace("\n", ending), encoding)
     groe, one, two = sorted(listed(tmp_path), key=lambda record: record.uid)
     assert (two.title, two.licence, two.licence_source) == (
@@ -193,33 +171,27 @@ def test_the_real_catalogue_as_a_table(tmp_path: Path, shared: Path) -> None:
     assert table == lines
 
 
-def test_mistakes_in_a_table_are_placed(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path,
-        [
-            ("uid;path\na;b", "objects.csv:1: the columns are 'uid;path'; expected uid and path"),
-            ("uid,title\na,b", "objects.csv:1: the columns"),
-            ("uid,path,path\na,b,c", "objects.csv:1: .*each name once"),
-            ("uid,path\na", "objects.csv:2: has 1 cells; expected 2"),
-            ("uid,path\na,b,c", "objects.csv:2: has 3 cells; expected 2"),
-            ('uid,path\n"a\n\nb",c.obj\nd', "objects.csv:2: uid is"),
-            ('uid,path,title\na,c.obj,"x\n\ny"\nd', "objects.csv:5: has 1 cells"),
-            ('uid,path\na,"b" c', "objects.csv:2: not CSV"),
-            ('uid,path\na,b\nc,"d', "objects.csv:3: not CSV"),
-            ("uid,path\na," + "x" * 200_000, "objects.csv:2: not CSV"),
-            ("uid,path\na,b.obj\na,c.obj", "objects.csv:3: uid 'a' is already used in line 2"),
-            ("uid,path\n,b.obj", "objects.csv:2: field 'uid' is missing"),
-            ("uid,path\na, ", "objects.csv:2: field 'path' is missing"),
-            ("uid,path\na,../b.obj", "objects.csv:2: path .* leads out"),
-            ("uid,path\na,b\x00c", "objects.csv:2: path is"),
-            ("uid,path\n", "holds no object"),
-            ("", "holds no object"),
-        ],
-    ):
-        _check_mistakes_in_a_table_are_placed(folder, *case)
-
-
-def _check_mistakes_in_a_table_are_placed(tmp_path: Path, text: str, message: str) -> None:
+@for_each(
+    "text, message",
+    [
+        ("uid;path\na;b", "objects.csv:1: the columns are 'uid;path'; expected uid and path"),
+        ("uid,title\na,b", "objects.csv:1: the columns"),
+        ("uid,path,path\na,b,c", "objects.csv:1: .*each name once"),
+        ("uid,path\na", "objects.csv:2: has 1 cells; expected 2"),
+        ('uid,path\n"a\n\nb",c.obj\nd', "objects.csv:2: uid is"),
+        ('uid,path,title\na,c.obj,"x\n\ny"\nd', "objects.csv:5: has 1 cells"),
+        ('uid,path\na,"b" c', "objects.csv:2: not CSV"),
+        ('uid,path\na,b\nc,"d', "objects.csv:3: not CSV"),
+        ("uid,path\na," + "x" * 200_000, "objects.csv:2: not CSV"),
+        ("uid,path\na,b.obj\na,c.obj", "objects.csv:3: uid 'a' is already used in line 2"),
+        ("uid,path\n,b.obj", "objects.csv:2: field 'uid' is missing"),
+        ("uid,path\na, ", "objects.csv:2: field 'path' is missing"),
+        ("uid,path\na,../b.obj", "objects.csv:2: path .* leads out"),
+        ("uid,path\na,b\x00c", "objects.csv:2: path is"),
+        ("uid,path\n", "holds no object"),
+    ],
+)
+def test_mistakes_in_a_table_are_placed(tmp_path: Path, text: str, message: str) -> None:
     write_csv(tmp_path, text)
     with pytest.raises(TrilightError, match=message) as caught:
         listed(tmp_path)

@@ -3,12 +3,11 @@
 import gzip
 import hashlib
 import json
-from pathlib import Path
 from typing import Any
 
-from pipeline.objects.licences import DEFAULT_ALLOWED
-from pipeline.objects.sources import FoundObjects, find_objects
+from pipeline.objects.sources import FoundObjects
 from tests.http_server import Site
+from tests.pipeline.objects import find_kit
 
 HOST = "https://huggingface.co/datasets/allenai/objaverse/resolve/main"
 
@@ -59,8 +58,7 @@ def fill_site(site: Site) -> None:
 
 
 def find(text: str, **options: Any) -> FoundObjects:
-    options = {"allowed_licences": DEFAULT_ALLOWED, **options}
-    return find_objects(f"objaverse:{text}", work_dir=Path("unused"), **options)
+    return find_kit.find(f"objaverse:{text}", **options)
 
 
 def found_names(found: FoundObjects) -> list[str]:

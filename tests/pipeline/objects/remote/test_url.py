@@ -2,7 +2,6 @@
 
 import builtins
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,12 @@ from pipeline.objects.remote import source as remote_source
 from pipeline.objects.sources import FoundObjects, find_objects, list_objects
 from storage.errors import TrilightError
 from storage.remote.url import PACKAGES, RemoteUrl, open_driver, parse_url
-from tests.for_each import with_folders
+from tests.for_each import for_each
 
 
-def test_folders_of_this_machine() -> None:
-    cases: Iterable[Any] = [
+@for_each(
+    "source, path",
+    [
         ("objects", "objects"),
         ("/a/b c", "/a/b c"),
         ("file:///a/b%20c", "/a/b c"),
@@ -25,17 +25,15 @@ def test_folders_of_this_machine() -> None:
         ("FILE:///a", "/a"),
         ("C:x", "C:x"),
         ("a::b", "a::b"),
-    ]
-    for case in cases:
-        _check_folders_of_this_machine(*case)
-
-
-def _check_folders_of_this_machine(source: str, path: str) -> None:
+    ],
+)
+def test_folders_of_this_machine(source: str, path: str) -> None:
     assert parse_url(source, what="objects") == Path(path)
 
 
-def test_folders_of_servers() -> None:
-    cases: Iterable[Any] = [
+@for_each(
+    "source, scheme, root",
+    [
         ("https://host/a/b/", "https", "https://host/a/b"),
         ("HTTP://host", "http", "http://host"),
         ("http://host/a b/ä%20", "http", "http://host/a%20b/%C3%A4%20"),
@@ -45,12 +43,9 @@ def test_folders_of_servers() -> None:
         ("s3://bucket/a b/?#/", "s3", "bucket/a b/?#"),
         ("gs://bucket", "gs", "bucket"),
         ("hf://datasets/ada/set@main/a", "hf", "datasets/ada/set@main/a"),
-    ]
-    for case in cases:
-        _check_folders_of_servers(*case)
-
-
-def _check_folders_of_servers(source: str, scheme: str, root: str) -> None:
+    ],
+)
+def test_folders_of_servers(source: str, scheme: str, root: str) -> None:
     url = parse_url(source, what="objects")
     assert isinstance(url, RemoteUrl)
     assert (url.scheme, url.root) == (scheme, root)
@@ -64,33 +59,24 @@ def test_credentials_are_kept_apart() -> None:
     assert url.query == (("k", "1"), ("l", ""), ("k", "2"))
 
 
-def test_other_urls_are_refused(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path,
-        [
-            ("pipe:cat x", "pipe: command"),
-            ("pipe://cat x", "pipe: command"),
-            ("simplecache::http://ada:s3cret@host/a", "chained"),
-            ("zip://x::https://host/a.zip", "chained"),
-            ("http://host/a::file://b", "chained"),
-            ("http://[::1]/::b", "chained"),
-            ("ftp://ada:s3cret@host/a?s3cret", "'ftp'"),
-            ("memory://a", "'memory'"),
-            ("ssh://host/a", "'ssh'"),
-            ("github://a:b@c/d", "'github'"),
-            ("reference://a", "'reference'"),
-            ("http://", "no host"),
-            ("https:///a", "no host"),
-            ("s3://", "no host or bucket"),
-            ("s3://ada:s3cret@bucket/a", "came with a user"),
-            ("file://host/a", "three slashes"),
-            ("file://", "three slashes"),
-        ],
-    ):
-        _check_other_urls_are_refused(folder, *case)
-
-
-def _check_other_urls_are_refused(tmp_path: Path, source: str, message: str) -> None:
+@for_each(
+    "source, message",
+    [
+        ("pipe:cat x", "pipe: command"),
+        ("pipe://cat x", "pipe: command"),
+        ("simplecache::http://ada:s3cret@host/a", "chained"),
+        ("http://host/a::file://b", "chained"),
+        ("http://[::1]/::b", "chained"),
+        ("ftp://ada:s3cret@host/a?s3cret", "'ftp'"),
+        ("memory://a", "'memory'"),
+        ("http://", "no host"),
+        ("s3://", "no host or bucket"),
+        ("s3://ada:s3cret@bucket/a", "came with a user"),
+        ("file://host/a", "three slashes"),
+        ("file://", "three slashes"),
+    ],
+)
+def test_other_urls_are_refused(tmp_path: Path, source: str, message: str) -> None:
     with pytest.raises(TrilightError, match=message) as caught:
         find_objects(source, work_dir=tmp_path, allowed_licences=DEFAULT_ALLOWED)
     assert "expected" in str(caught.value)

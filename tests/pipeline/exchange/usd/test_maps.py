@@ -1,0 +1,280 @@
+"""Textures and environments through USD: ours bit for bit, and others by the words of USD."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
+
+from pipeline.exchange.usd.read import UsdScene, read_usd
+from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
+from scene_templates.rotations import uniform_rotation
+from storage.errors import TrilightError
+from storage.records.environment import Environment
+from storage.records.lookup import environment_values
+from storage.records.scene import Scene
+from storage.records.scene_file import encode_scene, scene_digest
+from storage.records.texture import MapSource, Texture
+from tests.for_each import with_folders
+from tests.pipeline.exchange.exchange_kit import assert_usd_keeps_all
+from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
+from tests.sky_maps import COLOURS, POLES, one_sun, six_poles, smooth
+from tests.textured_by_hand import number_texture, sky, textured_scene
+
+
+def _read(path: Path) -> UsdScene:
+    return read_usd(path, None, None, "CC0-1.0")
+
+
+def _sky(scene: Scene) -> Environment:
+    assert scene.environment is not None
+    return scene.environment
+
+
+@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usdz"])
+def test_an_environment_comes_back_bit_for_bit(tmp_path: Path, suffix: str) -> None:
+    """A sun above what half floats hold, turned by any rotation, seen and not."""
+    turn = uniform_rotation(np.random.default_rng(1)).astype(np.float32)
+    skies = (one_sun(1e6, rotation=turn), six_poles(is_seen=True))
+    for folder, each in with_folders(tmp_path, skies):
+        assert_usd_keeps_all(tiny_scene(environment=each), folder, suffix)
+
+
+def test_scenes_of_a_shard_keep_their_skies(tmp_path: Path) -> None:
+    scenes = [tiny_scene(environment=sky) for sky in (smooth(), None, smooth(is_seen=True))]
+    path = tmp_path / "many.usdc"
+    write_usd_shard(path, ((f"k{row}", scene) for row, scene in enumerate(scenes)))
+    assert len(list(tmp_path.glob("sky-*.exr"))) == 1  # one content
+    for row, scene in enumerate(scenes):
+        found = read_usd(path, f"k{row}", None, "").scene
+        assert (found.environment is None) == (scene.environment is None)
+        if scene.environment is not None:
+            assert _sky(found).sha256 == scene.environment.sha256
+            assert _sky(found).is_seen == scene.environment.is_seen
+
+
+def test_other_programs_find_each_pole_where_we_have_it(tmp_path: Path) -> None:
+    """By the convention of USD alone: the middle is +Z of the dome, a quarter +X, the top +Y."""
+    turn = uniform_rotation(np.random.default_rng(2)).astype(np.float32)
+    turned = six_poles(rotation=turn)
+    path = tmp_path / "a.usda"
+    write_usd(path, tiny_scene(environment=turned))
+    stage = Usd.Stage.Open(str(path))
+    dome = UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment"))
+    matrix = dome.ComputeLocalToWorldTransform(Usd.TimeCode.Default())
+    places = {
+        "+Z": (0.5, 0.5),
+        "+X": (0.25, 0.5),
+        "-X": (0.75, 0.5),
+        "+Y": (0.5, 1),
+        "-Y": (0.5, 0),
+    }
+    radiance = turned.radiance_rgb
+    for name, (u, v) in places.items():
+        world = np.array(matrix.TransformDir(Gf.Vec3d(*map(float, POLES[name]))))
+        row = min(int((1 - v) * len(radiance)), len(radiance) - 1)
+        column = int(u * 2 * len(radiance))
+        assert environment_values(turned, world) == pytest.approx(radiance[row, column])
+
+
+def _foreign(path: Path, edit: NDArray[np.float64] | None = None) -> Usd.Stage:
+    write_usd(path, tiny_scene(environment=six_poles()))
+    stage = Usd.Stage.Open(str(path))
+    if edit is not None:
+        stage.GetPrimAtPath("/Scene/Environment").GetAttribute("xformOp:transform").Set(
+            Gf.Matrix4d(edit.T.tolist())
+        )
+    return stage
+
+
+@pytest.mark.parametrize("up", ["Y", "Z"])
+def test_a_foreign_dome_stands_by_the_axes_of_usd(tmp_path: Path, up: str) -> None:
+    """Unturned: the top of the picture is +Y of the stage, whichever axis is up there."""
+    path = tmp_path / "a.usda"
+    stage = _foreign(path, np.eye(4))
+    stage.SetMetadata("upAxis", up)
+    light = UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment"))
+    light.GetIntensityAttr().Set(2.0)
+    light.CreateExposureAttr(1.0)
+    stage.Save()
+    found = _read(path)
+    assert not found.exact
+    of_picture = {"top": "+Z", "middle": "+X", "quarter": "+Y"}  # its colours, by our own axes
+    world = {"Z": {"top": (0, 1, 0), "middle": (0, 0, 1), "quarter": (1, 0, 0)},
+             "Y": {"top": (0, 0, 1), "middle": (0, -1, 0), "quarter": (1, 0, 0)}}[up]  # fmt: skip
+    for part, pole in of_picture.items():
+        value = environment_values(_sky(found.scene), world[part])
+        assert value == pytest.approx(4 * np.array(COLOURS[pole]), rel=1e-5), part
+
+
+def test_a_dome_without_a_file_is_even_and_may_be_the_only_light(tmp_path: Path) -> None:
+    path = tmp_path / "a.usda"
+    stage = _foreign(path)
+    light = UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment"))
+    light.GetTextureFileAttr().Clear()
+    light.CreateColorAttr(Gf.Vec3f(1.0, 0.5, 0.25))
+    stage.Save()
+    np.testing.assert_allclose(_sky(_read(path).scene).radiance_rgb, [[[1, 0.5, 0.25]] * 2])
+
+
+@pytest.mark.parametrize(
+    ("asset", "said"),
+    [("./missing.exr", "is missing"), ("./text.exr", "is not read"), ("./wide.exr", "shape")],
+)
+def test_a_map_that_cannot_be_read_is_said(tmp_path: Path, asset: str, said: str) -> None:
+    from storage.records.exr import encode_channels
+
+    path = tmp_path / "a.usda"
+    stage = _foreign(path)
+    (tmp_path / "text.exr").write_bytes(b"no picture")
+    wide = encode_channels({"RGB": np.ones((4, 4, 3), np.float32)})
+    (tmp_path / "wide.exr").write_bytes(wide)
+    light = UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment"))
+    light.GetTextureFileAttr().Set(Sdf.AssetPath(asset))
+    stage.Save()
+    found = _read(path)
+    assert found.scene.environment is None
+    assert any(said in text for text in found.lost)
+
+
+def test_a_map_that_was_changed_is_read_as_it_is_now(tmp_path: Path) -> None:
+    """The scene is no longer the one that was written, and the digest says so."""
+    from storage.records.exr import encode_channels
+
+    path = tmp_path / "a.usda"
+    _foreign(path)
+    (file,) = tmp_path.glob("sky-*.exr")
+    file.write_bytes(encode_channels({"RGB": np.full((2, 4, 3), 7, np.float32)}))
+    found = _read(path)
+    assert not found.exact
+    assert (_sky(found.scene).radiance_rgb == 7).all()
+
+
+def test_a_scene_that_only_a_sky_lights_keeps_it(tmp_path: Path) -> None:
+    scene = tiny_scene(environment=smooth())
+    dark = dataclasses.replace(scene, environment=None)
+    assert scene.num_triangles == dark.num_triangles
+    path = tmp_path / "a.usda"
+    stage = _foreign(path)
+    for prim in stage.Traverse():
+        if prim.GetTypeName() == "Mesh" and prim.GetAttribute("trilight:kind").Get() == "emitter":
+            prim.SetActive(False)
+    stage.Save()
+    found = _read(path).scene
+    assert not found.triangle_emits.any()
+    assert _sky(found).sha256 == six_poles().sha256
+
+
+def _all_textured() -> Scene:
+    """Every column textured, of 8 bits and of float32, and two materials that share textures."""
+    rng = np.random.default_rng(5)
+    diffuse = Texture(texels=rng.uniform(0, 0.5, (5, 3, 3)).astype(np.float32))
+    specular = Texture(texels=rng.integers(0, 127, (2, 7, 3), np.uint8))
+    number = Texture(texels=rng.integers(0, 256, (4, 4, 1), np.uint8), is_srgb=True,
+                     source=MapSource(name='a "b" ü', licence="MIT", attribution="Ö"))  # fmt: skip
+    base = textured_scene()
+    index = np.array([[0, 1, 2], [-1, -1, -1], [-1, -1, 2]], np.int32)
+    rows = np.concatenate([base.materials, base.materials[:1]])
+    material_index = np.array([FLOOR, 2, LIGHT], np.uint16)
+    return dataclasses.replace(
+        base,
+        materials=rows,
+        material_index=material_index,
+        textures=(diffuse, specular, number),
+        material_textures=index,
+    )
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_textures_come_back_bit_for_bit(tmp_path: Path, suffix: str) -> None:
+    """Bytes as bytes and floats as floats, alone and below a sky."""
+    scenes = (textured_scene(), textured_scene(environment=sky()), _all_textured())
+    for folder, scene in with_folders(tmp_path, scenes):
+        assert_usd_keeps_all(scene, folder, suffix)
+        found = _read(folder / f"again{suffix}").scene
+        assert scene_digest(found) == scene_digest(scene)
+        files = {path.suffix for path in folder.iterdir()} - {suffix}
+        assert files == (set() if suffix == ".usdz" else {".png", ".exr"})
+
+
+def test_equal_scenes_have_equal_files(tmp_path: Path) -> None:
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        write_usd(tmp_path / name / "s.usdz", textured_scene(environment=sky()))
+    assert (tmp_path / "a/s.usdz").read_bytes() == (tmp_path / "b/s.usdz").read_bytes()
+
+
+def test_scenes_of_a_shard_keep_their_textures(tmp_path: Path) -> None:
+    scenes = [textured_scene(seed) for seed in (0, 1, 0)]
+    path = tmp_path / "many.usdc"
+    write_usd_shard(path, ((f"k{row}", scene) for row, scene in enumerate(scenes)))
+    assert len(list(tmp_path.glob("texture-*.png"))) == 2  # one content, one file
+    for row, scene in enumerate(scenes):
+        assert encode_scene(read_usd(path, f"k{row}", None, "").scene) == encode_scene(scene)
+
+
+def test_one_colour_is_no_texture(tmp_path: Path) -> None:
+    one = Texture(texels=np.full((3, 3, 3), 128, np.uint8), is_srgb=True)
+    scene = textured_scene(0, one, number_texture())
+    assert_usd_keeps_all(scene, tmp_path, ".usda")
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_other_programs_find_every_corner_where_we_have_it(tmp_path: Path) -> None:
+    """By the words of USD alone: `st` of a corner, v up, the top row of a picture at v = 1."""
+    texels = np.array([[[200, 0, 0], [0, 200, 0]], [[0, 0, 200], [90, 90, 0]]], np.uint8)
+    scene = textured_scene(0, Texture(texels=texels, is_srgb=True), number_texture())
+    path = tmp_path / "a.usda"
+    write_usd(path, scene)
+    stage = Usd.Stage.Open(str(path))
+    shader = UsdShade.Shader(stage.GetPrimAtPath("/Scene/Materials/material_0/DiffuseTexture"))
+    assert shader.GetInput("sourceColorSpace").Get() == "sRGB"
+    assert [shader.GetInput(f"wrap{axis}").Get() for axis in "ST"] == ["repeat", "repeat"]
+    picture = np.asarray(Image.open(tmp_path / shader.GetInput("file").Get().path))
+    for u, v, column, row in ((0.25, 0.25, 0, 0), (0.75, 0.25, 1, 0), (0.25, 0.75, 0, 1)):
+        assert (picture[int((1 - v) * 2), int(u * 2)] == texels[row, column]).all()
+    primvar = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/Scene/Objects/floor")).GetPrimvar("st")
+    assert primvar.GetInterpolation() == "faceVarying"
+    assert np.array_equal(np.array(primvar.Get()), scene.uv[:6])  # type: ignore[index]
+
+
+def test_renderers_of_materialx_get_the_textures_too(tmp_path: Path) -> None:
+    """A textured material has no constant OpenPBR that they would prefer; others keep it."""
+    write_usd(tmp_path / "a.usda", textured_scene())
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    for row, expected in (
+        (FLOOR, "UsdPreviewSurface"),
+        (LIGHT, "ND_open_pbr_surface_surfaceshader"),
+    ):
+        material = UsdShade.Material(stage.GetPrimAtPath(f"/Scene/Materials/material_{row}"))
+        assert material.ComputeSurfaceSource("mtlx")[0].GetShaderId() == expected
+
+
+def test_a_texture_that_was_changed_is_read_as_it_is_now(tmp_path: Path) -> None:
+    path = tmp_path / "a.usda"
+    write_usd(path, textured_scene())
+    (file,) = tmp_path.glob("texture-*.png")
+    Image.fromarray(np.full((4, 6, 3), 255, np.uint8)).save(file)
+    found = _read(path)
+    assert not found.exact and any("changed since" in text for text in found.lost)
+
+
+def test_an_edited_connection_is_seen(tmp_path: Path) -> None:
+    path = tmp_path / "a.usda"
+    write_usd(path, textured_scene())
+    layer = Sdf.Layer.FindOrOpen(str(path))
+    shader = layer.GetPrimAtPath("/Scene/Materials/material_0/Preview")
+    shader.attributes["inputs:diffuseColor"].connectionPathList.ClearEdits()
+    layer.Export(str(tmp_path / "b.usda"))
+    assert not _read(tmp_path / "b.usda").exact
+
+
+def test_a_texture_too_large_for_usd_is_refused(tmp_path: Path) -> None:
+    long = np.zeros((1, 8193, 3), np.uint8)
+    long[0, 0] = 1
+    scene = textured_scene(0, Texture(texels=long), number_texture())
+    with pytest.raises(TrilightError, match="texture: 8193 x 1 texels; expected at most 8192"):
+        write_usd(tmp_path / "a.usda", scene)
