@@ -1,15 +1,25 @@
-"""A precision rounds what it says, keeps what it must, and is refused where it has no path."""
+"""What is rounded, recomputed or packed gives what it gave, as near as is said."""
 
 import copy
+import dataclasses
 
+import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
+from model import encoded_scene, rounding
+from model.packing import pack_lengths, packed
 from model.precision import rounded_parts, set_precision, tf32
-from model.scene_tensors import converted
+from model.renderformer import RenderFormer
+from model.scene_tensors import SceneBatch, batch_scenes, converted, scene_tensors, tensors_of
 from storage.errors import TrilightError
+from storage.records.environment import Environment
+from storage.records.material import EMISSION, material_width
+from storage.records.scene import ARRAY_FIELDS
 from tests.for_each import for_each
-from tests.model.kit import FAMILIES, awake, random_scene, render, tiny_config
+from tests.model.kit import FAMILIES, RESOLUTION, awake, random_scene, render, tiny_config
+from tests.train.toy import toy_scene
 
 
 @for_each("family", FAMILIES)
@@ -68,3 +78,190 @@ def test_tf32_is_set_for_a_while_only() -> None:
         with tf32(allowed):
             assert torch.backends.cuda.matmul.fp32_precision == expected
         assert torch.backends.cuda.matmul.fp32_precision == before
+
+
+@for_each("family", FAMILIES)
+def test_gradients_are_the_same_bit_by_bit(family: str) -> None:
+    model = awake(tiny_config(family))
+    batch = batch_scenes([random_scene(3, seed=1), random_scene(5, seed=2)])
+    results = []
+    for wanted in (False, True):
+        model.recompute_activations(wanted)
+        model.zero_grad()
+        picture = model(batch, RESOLUTION)
+        picture.square().sum().backward()
+        gradients = {name: weight.grad for name, weight in model.named_parameters()}
+        results.append((picture.detach(), gradients))
+    (picture, gradients), (again, gradients_again) = results
+    assert torch.equal(picture, again)
+    for name, gradient in gradients.items():
+        again = gradients_again[name]
+        assert gradient is not None and again is not None, name
+        assert torch.equal(gradient, again), name
+
+
+def test_less_is_kept_for_the_way_back() -> None:
+    model = awake(tiny_config())
+    batch = batch_scenes([random_scene(40)])
+    kept = []
+    for wanted in (False, True):
+        model.recompute_activations(wanted)
+        sizes: list[int] = []
+
+        def keep(tensor: torch.Tensor, sizes: list[int] = sizes) -> torch.Tensor:
+            sizes.append(tensor.numel())
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+            model(batch, RESOLUTION)
+        kept.append(sum(sizes))
+    assert kept[1] < 0.5 * kept[0]
+
+
+@for_each("recompute", [False, True])
+@for_each("family", ["linear", "dpt"])
+def test_rounding_together_changes_no_bit(
+    family: str, recompute: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = awake(tiny_config(family), dtype=torch.float32)
+    model.recompute_activations(recompute)
+    scenes = [random_scene(n, seed=n, dtype=torch.float32) for n in (3, 5)]
+    rounded: list[int] = []
+
+    def results() -> dict[str, Tensor]:
+        model.zero_grad()
+        with torch.autocast("cpu", torch.bfloat16):
+            picture = model(batch_scenes(scenes), RESOLUTION)
+        picture.square().sum().backward()
+        grads = {name: weight.grad for name, weight in model.named_parameters()}
+        return {"picture": picture.detach(), **{k: v for k, v in grads.items() if v is not None}}
+
+    together = rounding._copies
+
+    def counted(tensors: tuple[Tensor, ...], to: torch.dtype) -> tuple[Tensor, ...]:
+        rounded.append(len(tensors))
+        return together(tensors, to)
+
+    monkeypatch.setattr(rounding, "_copies", counted)
+    found = results()
+    layers = len(model.encoder.layers) + len(model.decoder.layers) + (family == "dpt")
+    assert len(rounded) == 2 * layers, "once forth and once back for each layer, and the head"
+    monkeypatch.setattr(rounding, "_rounded", lambda *_: {})
+    alone = results()
+    assert found.keys() == alone.keys()
+    for name, value in found.items():
+        assert torch.equal(value, alone[name]), name
+
+
+def test_without_autocast_nothing_is_rounded() -> None:
+    layer = torch.nn.Linear(3, 3)
+    assert rounding.rounded_weights(layer, torch.device("cpu")) == {}
+    assert rounding.rounded_weights(layer, torch.device("meta")) == {}
+
+
+def test_every_triangle_carries_its_own_vertices_normals_and_material() -> None:
+    scene = toy_scene(0)
+    tensors = scene_tensors(scene)
+    assert tensors.num_triangles == scene.num_triangles
+    assert tensors.num_views == scene.num_views
+    for row in range(scene.num_triangles):
+        corners = scene.faces[row]
+        material = scene.materials[scene.material_index[row]]
+        np.testing.assert_array_equal(tensors.triangles_T33[row], scene.vertex_positions[corners])
+        np.testing.assert_array_equal(tensors.normals_T33[row], scene.vertex_normals[corners])
+        np.testing.assert_array_equal(tensors.material_TM[row, :7], material[:7])
+        emission = 10.0 ** tensors.material_TM[row, 7:].double().numpy() - 1
+        # emission of 20 through a float32 logarithm
+        np.testing.assert_allclose(emission, material[EMISSION], atol=1e-4)
+    assert tensors.material_TM.shape[1] == material_width()
+    assert all(value.dtype == torch.float32 for value in tensors_of(tensors).values())
+
+
+def test_the_scene_stays_as_it_was_and_shares_no_memory() -> None:
+    scene = toy_scene(1)
+    before = {name: getattr(scene, name).copy() for name in ARRAY_FIELDS}
+    tensors = scene_tensors(scene)
+    for value in tensors_of(tensors).values():
+        value.fill_(-1)
+    for name, array in before.items():
+        np.testing.assert_array_equal(getattr(scene, name), array, err_msg=name)
+
+
+def test_batches_are_padded_with_zeros_to_the_longest_and_no_further() -> None:
+    scenes = [random_scene(3, seed=1), random_scene(7, seed=2), random_scene(5, seed=3)]
+    batch = batch_scenes(scenes)
+    assert batch.triangles_BT33.shape[1] == 7
+    assert batch.is_triangle_BT is not None
+    assert batch.is_triangle_BT.sum(1).tolist() == [3, 7, 5]
+    for row, scene in enumerate(scenes):
+        length = scene.num_triangles
+        for name in ("triangles", "normals", "material"):
+            suffix = "M" if name == "material" else "33"
+            padded = getattr(batch, f"{name}_BT{suffix}")[row]
+            assert torch.equal(padded[:length], getattr(scene, f"{name}_T{suffix}"))
+            assert torch.all(padded[length:] == 0)
+
+
+def test_equal_lengths_need_no_mask() -> None:
+    batch = batch_scenes([random_scene(4, seed=1), random_scene(4, seed=2)])
+    assert batch.is_triangle_BT is None
+
+
+def test_a_black_sky_is_none() -> None:
+    for height, radiance, is_there in ((2, 1.0, True), (2, 0.0, False), (1, 0.0, False)):
+        texels = np.full((height, 2 * height, 3), radiance, np.float32)
+        scene = dataclasses.replace(toy_scene(0), environment=Environment(radiance_rgb=texels))
+        batch = batch_scenes([scene_tensors(scene)])
+        assert (batch.skies is not None) == is_there
+
+
+LENGTHS = (5, 9, 1)
+
+
+def _batch() -> SceneBatch:
+    return batch_scenes([random_scene(length, seed=length) for length in LENGTHS])
+
+
+def _results(model: RenderFormer, batch: SceneBatch) -> dict[str, Tensor]:
+    model.zero_grad()
+    picture = model(batch, RESOLUTION)
+    picture.square().sum().backward()
+    weights = {name: weight.grad for name, weight in model.named_parameters()}
+    return {"picture": picture.detach(), **{k: v for k, v in weights.items() if v is not None}}
+
+
+@for_each("family", FAMILIES)
+def test_a_packed_batch_is_the_padded_one(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, batch = awake(tiny_config(family)), _batch()
+    padded = _results(model, batch)
+    monkeypatch.setattr(encoded_scene, "takes_packed", lambda *_: True)
+    monkeypatch.setattr("model.attention.scaled_dot_product_attention", _forbid_masks)
+    for name, found in _results(model, batch).items():
+        wanted = padded[name]
+        assert (found - wanted).abs().max() <= 1e-11 * wanted.abs().max().clamp(min=1), name
+
+
+def _forbid_masks(q: Tensor, k: Tensor, v: Tensor, attn_mask: Tensor | None) -> Tensor:
+    assert attn_mask is None, "nothing that is padded is attended with a mask"
+    return torch.nn.functional.scaled_dot_product_attention(q, k, v)
+
+
+def test_packing_keeps_what_exists_and_gradients_go_back_there() -> None:
+    packing = pack_lengths(LENGTHS, 9, torch.device("cpu"))
+    x = torch.arange(27.0).reshape(3, 9, 1).requires_grad_()
+    exists = torch.arange(9) < torch.tensor(LENGTHS)[:, None]
+    there = packed(x, packing)
+    assert torch.equal(there.detach(), x.detach()[exists])
+    starts_S1, longest = packing.sequences
+    assert starts_S1.tolist() == [0, 5, 14, 15] and longest >= 9
+    assert packing.of_views(2).starts_S1.tolist() == [0, 5, 14, 15, 20, 29, 30]
+    (there * there.detach()).sum().backward()
+    assert x.grad is not None
+    assert torch.equal(x.grad[..., 0], x.detach()[..., 0] * exists)
+
+
+def test_where_a_mask_says_more_than_lengths_there_is_a_mask() -> None:
+    batch = _batch()
+    assert batch.num_triangles == LENGTHS
+    alone = batch_scenes([random_scene(5), random_scene(5)])
+    assert alone.num_triangles is None and alone.is_triangle_BT is None

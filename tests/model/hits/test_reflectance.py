@@ -1,13 +1,19 @@
-"""The specular lobe in numpy: its samples and its density are of one lobe, and it loses nothing."""
+"""Reflected and gathered light: lobes, anchors and triangles beside closed forms."""
 
 import numpy as np
 import pytest
 
+from model.hits.anchors import anchor_pixels
 from model.hits.lit_scene import LitScene, Points
+from model.hits.radiosity import BOUNCES, scene_light
 from model.hits.reflectance import drawn, gloss_at, lobe
 from model.hits.vectors import dot, unit
+from model.hits.view_inputs import Channel
 from storage.records.multiscatter import directional_albedo
 from tests.for_each import for_each
+from tests.model.hits.kit import FLOOR, LAMP, corner, lit_scene, traced
+from tests.pipeline.renders.closed_forms import lambert_irradiance
+from tests.pipeline.renders.scene_kit import box, join, light, material, quad
 
 COUNT = 20_000
 
@@ -95,3 +101,80 @@ def test_from_behind_and_below_nothing_is_reflected() -> None:
     below = np.array([[0.6, 0.0], [0.0, 0.8], [-0.8, -0.6]], np.float32)
     value, _ = lobe(gloss_at(scene, points), points, below, below[2])
     assert not value.any()
+
+
+def test_each_part_has_its_own_anchor_and_prefers_what_is_met() -> None:
+    coverage = np.zeros((8, 8), np.float32)
+    coverage[0, 3] = 0.25  # in the part at the top left, far from its middle
+    pixels = anchor_pixels(coverage, 2)
+    rows, columns = pixels // 8, pixels % 8
+    assert list(zip(rows // 4, columns // 4, strict=True)) == [(0, 0), (0, 1), (1, 0), (1, 1)]
+    assert (rows[0], columns[0]) == (0, 3)
+    assert abs(rows[1] - 1.5) < 1, "where nothing tells them apart, the most central"
+
+
+def test_an_anchor_for_each_pixel() -> None:
+    assert np.array_equal(anchor_pixels(np.ones((4, 4), np.float32), 4), np.arange(16))
+
+
+def test_light_gathered_beside_a_bright_wall_is_that_of_its_view() -> None:
+    """A floor beside a white wall that a far lamp lights evenly: Lambert's formula, twice."""
+    wall = np.array([[-3, 1, 0.0], [3, 1, 0], [3, 1, 6], [-3, 1, 6]])
+    lamp = np.array([[-1, -40, 3.0], [1, -40, 3], [0, -40, 5]])
+    parts = [quad(FLOOR, material()), quad(wall, material(diffuse=1.0)), light(lamp, 4000.0)]
+    scene = join(parts, eye=(0, -1, 2), target=(0, 0, 0), fov_deg=2.0)
+    inputs = traced(scene, 8, anchors_a_side=4, gather_rays=256)
+    middle = wall.mean(axis=0, keepdims=True)
+    radiance = lambert_irradiance(middle, np.array([0, -1.0, 0]), lamp, 4000.0) / np.pi
+    seen = lambert_irradiance(np.zeros((1, 3)), np.array([0, 0, 1.0]), wall, float(radiance[0]))
+    # the lamp lights the rim of the wall 2 % less; the black floor takes nothing part in it
+    assert inputs.gathered.mean() == pytest.approx(float(seen[0]) / np.pi, rel=0.03)
+
+
+def test_more_rays_less_noise_the_same_mean() -> None:
+    few = [traced(corner(), gather_rays=8, seed=seed).gathered for seed in range(12)]
+    many = [traced(corner(), gather_rays=128, seed=seed).gathered for seed in range(4)]
+    error = np.std([x.mean() for x in few], ddof=1) / np.sqrt(len(few))
+    assert abs(np.mean(few) - np.mean(many)) < 5 * error + 1e-3 * np.mean(many)
+    assert np.std(many, axis=0).mean() < 0.6 * np.std(few, axis=0).mean()
+
+
+def test_where_nothing_is_met_nothing_is_gathered() -> None:
+    inputs = traced(corner(), 32)
+    met = inputs.pixels.reshape(-1, inputs.pixels.shape[-1])[inputs.anchor, Channel.COVERAGE]
+    assert not inputs.gathered[met[:, 0] == 0].any()
+    assert inputs.gathered[met[:, 0] > 0].any()
+
+
+def test_direct_light_is_that_of_lamberts_formula() -> None:
+    plate = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]])
+    scene = join([quad(plate, material(diffuse=0.5)), light(LAMP, 7.0)])
+    got = scene_light(lit_scene(scene)).direct_2T3
+    wanted = lambert_irradiance(np.zeros((1, 3)), np.array([0, 0, 1.0]), np.array(LAMP), 7.0)
+    # four points of a lamp that is seen under a few degrees
+    assert got[0, :2].mean() == pytest.approx(float(wanted[0]) / np.pi, rel=0.05)
+    assert not got[1, :2].any(), "the back of the plate is dark"
+
+
+def test_a_closed_room_reflects_as_often_as_is_added_up() -> None:
+    """Whatever leaves a wall arrives at another: with albedo a, sum of a^k for the bounces."""
+    albedo = 0.5
+    lamp = [[-0.2, -0.2, 0.1], [0.2, -0.2, 0.1], [0, 0.2, 0.1]]
+    scene = lit_scene(join([box([0, 0, 0], 2.0, material(diffuse=albedo)), light(lamp, 10.0)]))
+    found = scene_light(scene)
+    inner = 1  # corners run counter-clockwise seen from outside
+    walls = scene.area[:12, None]
+    direct = (found.direct_2T3[inner, :12] * walls).sum()
+    indirect = (found.indirect_2T3[inner, :12] * walls).sum()
+    wanted = sum(albedo**k for k in range(1, BOUNCES + 1))
+    # 12 triangles with 32 rays each, and a lamp that stands in the way of 2 % of them
+    assert indirect / direct == pytest.approx(wanted, rel=0.1)
+    assert not found.direct_2T3[0, :12].any(), "outside it is dark"
+
+
+def test_the_unit_is_the_mean_light_and_never_zero() -> None:
+    lamps = [light(LAMP, [8.0, 1e-3, 2.0])]
+    parts = [quad(FLOOR, material(diffuse=0.5)), *lamps]
+    unit = scene_light(lit_scene(join(parts))).mean_3
+    assert unit[0] > unit[2] > unit[1] > 0
+    assert unit[1] == pytest.approx(0.03 * unit[0])

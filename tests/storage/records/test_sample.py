@@ -1,18 +1,41 @@
-"""A sample comes back from its members exactly, and damaged members are named."""
+"""A sample comes back from its members in every profile, and damaged members are named."""
 
+import dataclasses
+import gzip
 import io
 import json
+import zlib
+from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
+from numpy.typing import NDArray
 
 from storage.conventions import SCHEMA_VERSION
+from storage.dataset.dataset import open_dataset
+from storage.dataset.manifest import index_shard, write_manifest
+from storage.dataset.settings import StorageSettings
+from storage.dataset.shard import write_shard
+from storage.dataset.statistics import dataset_statistics
 from storage.errors import TrilightError
-from storage.records.exr import decode_exr, encode_exr
+from storage.metrics import psnr_log_db
+from storage.records.exr import ExrCodec, decode_exr, encode_exr
+from storage.records.profiles import (
+    DWA_LEVELS,
+    LAW_DB,
+    MAX_ARRAY_BYTES,
+    PROFILES,
+    Profile,
+    keeps_law,
+    pack_arrays,
+    pack_picture,
+    unpack_arrays,
+)
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import ARRAY_FIELDS
 from tests.for_each import for_each
+from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
 from tests.scenes_by_hand import tiny_sample
 
 
@@ -116,3 +139,138 @@ def test_an_enormous_window_is_refused_before_it_is_allocated() -> None:
     data[at + 8 : at + 16] = (1_000_000).to_bytes(4, "little") * 2
     with pytest.raises(TrilightError, match="data window spans|not a readable"):
         decode_exr(bytes(data))
+
+
+def noisy_picture(noise_db: float, resolution: int = 64) -> NDArray[np.float32]:
+    """Return a bright disc on black, with noise of that floor where it is not black."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:resolution, :resolution] / resolution - 0.5
+    disc = ((x**2 + y**2) < 0.16)[..., None]
+    clean = (3 + 2 * x + np.sin(9 * y))[..., None] * np.array([1.0, 0.8, 0.5])
+    rms = 10 ** (-noise_db / 20) / np.sqrt(disc.mean())
+    noisy = 10 ** (np.log10(1 + clean) + rms * rng.standard_normal(clean.shape)) - 1
+    return np.where(disc, np.maximum(noisy, 0), 0).astype(np.float32)
+
+
+@for_each("profile", PROFILES)
+def test_arrays_come_back_exactly(profile: Profile) -> None:
+    sample = tiny_sample()
+    back = decode_sample(sample.key, encode_sample(sample, profile))
+    for name in ARRAY_FIELDS:
+        assert np.array_equal(getattr(back.scene, name), getattr(sample.scene, name))
+    assert encode_sample(sample, profile) == encode_sample(tiny_sample(), profile)
+
+
+@for_each(
+    ("floor_db", "level"),
+    [(20.0, 200), (40.0, 100), (45.0, None), (50.0, None), (60.0, None), (85.0, None)],
+)
+def test_the_law_of_the_tenth(floor_db: float, level: float | None) -> None:
+    """The coarsest level that keeps it, where that is smaller; otherwise nothing is lost."""
+    picture = noisy_picture(floor_db)
+    data = pack_picture(picture, floor_db, "compact")
+    exact = encode_exr(picture)
+    if level is None:
+        assert data == exact
+        return
+    back = decode_exr(data)
+    assert psnr_log_db(picture, back) >= floor_db + LAW_DB
+    assert (back >= 0).all()
+    assert data == encode_exr(picture, ExrCodec(compression="DWAB", dwa_level=level))
+    assert len(data) < len(exact)
+    for coarser in [tried for tried in DWA_LEVELS if tried > level]:
+        stored = encode_exr(picture, ExrCodec(compression="DWAB", dwa_level=coarser))
+        assert not keeps_law(picture, decode_exr(stored), floor_db)
+
+
+def test_the_law_means_a_tenth_of_the_mean_square() -> None:
+    """0.41 dB is what a tenth more noise costs: 10 log10 1.1."""
+    picture = np.full((16, 16, 3), 9.0, np.float32)  # log10(1 + 9) = 1
+    for excess_db, kept in ((9.9, False), (10.1, True)):
+        rms = 10 ** (-(40 + excess_db) / 20)
+        assert keeps_law(picture, (10 ** (1 + rms) - 1) * np.ones_like(picture), 40.0) == kept
+
+
+@for_each("wrong", [np.nan, np.inf])
+def test_what_is_not_finite_never_keeps_the_law(wrong: float) -> None:
+    picture = np.ones((8, 8, 3), np.float32)
+    stored = picture.copy()
+    stored[0, 0, 0] = wrong
+    assert not keeps_law(picture, stored, 1.0)
+
+
+@for_each("floor_db", [91.0, 100.0, np.nan, np.inf])
+def test_a_floor_that_nothing_can_beat_is_packed_without_loss(floor_db: float) -> None:
+    picture = noisy_picture(30.0)
+    assert pack_picture(picture, floor_db, "compact") == encode_exr(picture)
+
+
+def test_each_view_has_its_own_floor() -> None:
+    sample = tiny_sample(resolution=64)
+    views = tuple(
+        dataclasses.replace(view, noise_floor_db=floor)
+        for view, floor in zip(sample.views, (20.0, 95.0), strict=True)
+    )
+    back = decode_sample("0", encode_sample(dataclasses.replace(sample, views=views), "compact"))
+    assert not np.array_equal(back.radiance_rgb[0], sample.radiance_rgb[0])
+    assert np.array_equal(back.radiance_rgb[1], sample.radiance_rgb[1])
+
+
+def test_an_unknown_profile_is_named() -> None:
+    with pytest.raises(TrilightError, match="'tiny'; expected lossless or compact"):
+        StorageSettings(profile="tiny")  # type: ignore[arg-type]
+
+
+def test_the_digest_of_scenes_does_not_know_the_profile(tmp_path: Path) -> None:
+    dataset = five_scenes(tmp_path)
+    before = dataset_statistics(dataset)
+    shards = []
+    for shard in dataset.manifest.shards:
+        samples = list(dataset.read_shard(shard))
+        path = dataset.folder.shard(shard.name)
+        path.unlink()  # a shard is never written over
+        write_shard(path, [(sample.key, encode_sample(sample, "compact")) for sample in samples])
+        shards.append(index_shard(path))
+    write_manifest(
+        dataset.folder.manifest, dataclasses.replace(dataset.manifest, shards=tuple(shards))
+    )
+    after = open_dataset(str(edit_manifest(dataset)))
+    assert dataset_statistics(after).scene_digest == before.scene_digest
+    assert after.manifest.dataset_digest != dataset.manifest.dataset_digest
+    (first, *_) = after.manifest.shards
+    assert len(list(after.read_scenes(first))) == first.num_samples
+
+
+PLAIN = b"the arrays of a scene" * 100
+HOSTILE = {
+    "missing": ({}, "is missing"),
+    "there twice": (
+        {"scene.safetensors": PLAIN, **pack_arrays(PLAIN, "compact")},
+        "there in two forms",
+    ),
+    "no gzip": ({"scene.safetensors.gz": PLAIN}, "damaged"),
+    "zlib without its gzip header": ({"scene.safetensors.gz": zlib.compress(PLAIN)}, "damaged"),
+    "cut short": ({"scene.safetensors.gz": gzip.compress(PLAIN)[:-9]}, "cut short"),
+    "wrong checksum": (
+        {"scene.safetensors.gz": gzip.compress(PLAIN)[:-8] + b"\0" * 8},
+        "damaged",
+    ),
+    "more after the end": ({"scene.safetensors.gz": gzip.compress(PLAIN) * 2}, "after its end"),
+}
+
+
+@for_each(("members", "message"), HOSTILE.values())
+def test_hostile_arrays_are_refused(members: dict[str, bytes], message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        unpack_arrays(members)
+
+
+def test_a_bomb_is_refused_before_it_goes_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a member that inflates beyond the limit nothing more than the limit is unpacked."""
+    monkeypatch.setattr("storage.records.profiles.MAX_ARRAY_BYTES", 1 << 20)
+    bomb = gzip.compress(bytes((1 << 20) + 1))
+    assert len(bomb) < 2000
+    with pytest.raises(TrilightError, match="holds more than 1048576"):
+        unpack_arrays({"scene.safetensors.gz": bomb})
+    assert len(unpack_arrays({"scene.safetensors.gz": gzip.compress(bytes(1 << 20))})) == 1 << 20
+    assert MAX_ARRAY_BYTES == 1 << 28

@@ -4,15 +4,22 @@ import dataclasses
 import json
 from collections.abc import Callable
 from dataclasses import field
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
+from typing_extensions import TypeAliasType
 
+from storage import array_hints
+from storage.array_hints import array_scalar
 from storage.errors import TrilightError
 from storage.settings.changes import changed
-from storage.settings.described import checked
+from storage.settings.described import checked, described
+from storage.settings.execution import EXECUTION
+from storage.settings.ranges import Within
 from tests.for_each import for_each
 
 
@@ -269,3 +276,55 @@ def test_a_group_with_presets_may_be_named_and_then_changed(backwards: bool) -> 
 def test_a_wrong_preset_or_name_is_asked_back(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
         changed(Car(), changes)
+
+
+Count = Annotated[int, Within(1, 9)]
+
+
+@checked("group")
+class Group:
+    """One of each."""
+
+    plain: int
+    """Meaning."""
+    ranged: Count = 1
+    """Meaning, with a range."""
+    marked: Annotated[int, Within(1, 9), EXECUTION] = 1
+    """Marked after its range."""
+    alias: Annotated[Count, EXECUTION] = 1
+    """Marked around an alias."""
+    switch: Annotated[bool, EXECUTION] = False
+    """Marked alone."""
+
+
+def test_what_is_marked_is_described_so() -> None:
+    marked = {field.name for field in described(Group) if field.is_execution}
+    assert marked == {"marked", "alias", "switch"}
+
+
+def test_a_mark_changes_no_range() -> None:
+    by_name = {field.name: field for field in described(Group)}
+    assert by_name["marked"].expected == by_name["ranged"].expected
+    assert by_name["switch"].expected == "true or false"
+    with pytest.raises(TrilightError, match="marked is 10; expected a whole number from 1 to 9"):
+        Group(plain=0, marked=10)
+    with pytest.raises(TrilightError, match="switch is 1; expected true or false"):
+        Group(plain=0, switch=1)  # type: ignore[arg-type]
+
+
+_Kept = TypeVar("_Kept", bound=np.generic)
+AliasOfLater = TypeAliasType(  # what numpy 2.5 has in the place of NDArray
+    "AliasOfLater", np.ndarray[Any, np.dtype[_Kept]], type_params=(_Kept,)
+)
+
+
+@for_each("scalar", [np.float32, np.int64, np.floating[Any]])
+def test_the_scalar_is_read_of_either(scalar: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert array_scalar(NDArray[scalar]) == scalar
+    monkeypatch.setattr(array_hints, "NDArray", AliasOfLater)
+    assert array_scalar(AliasOfLater[scalar]) == scalar
+
+
+def test_what_is_no_array_has_none() -> None:
+    assert array_scalar(tuple[int, int]) is None
+    assert array_scalar(int) is None
