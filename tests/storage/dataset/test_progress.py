@@ -28,14 +28,11 @@ from storage.errors import TrilightError
 from tests.pipeline.making.test_publication import begin_tiny, make_tiny_shard
 
 
-def test_an_empty_folder_has_no_progress(tmp_path: Path) -> None:
-    now = read_progress(DatasetFolder(tmp_path))
+def test_downloads_and_objects_are_counted_from_the_start_of_each_run(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path)
+    now = read_progress(folder)
     assert (now.downloads_planned, now.objects_planned, now.scenes_planned) == (0, 0, 0)
     assert (now.downloads_done, now.objects_done, now.scenes_done) == (0, 0, 0)
-
-
-def test_downloads_and_objects_are_counted(tmp_path: Path) -> None:
-    folder = DatasetFolder(tmp_path)
     announce_downloads(folder, 2, 5)
     announce_objects(folder, 4)
     for _ in range(3):
@@ -45,12 +42,6 @@ def test_downloads_and_objects_are_counted(tmp_path: Path) -> None:
     assert (now.objects_done, now.objects_planned) == (3, 4)
     count_object(folder, 4)  # another maker found them done
     assert read_progress(folder).objects_done == 4
-
-
-def test_a_new_run_counts_from_the_start(tmp_path: Path) -> None:
-    folder = DatasetFolder(tmp_path)
-    announce_objects(folder, 4)
-    count_object(folder)
     announce_objects(folder, 7)
     now = read_progress(folder)
     assert (now.objects_done, now.objects_planned) == (0, 7)
@@ -106,6 +97,7 @@ def test_shards_scenes_and_what_to_do_next(tmp_path: Path) -> None:
     publication = begin_tiny(tmp_path, 12)
     make_tiny_shard(publication, 1)
     found = read_status(str(tmp_path))
+    assert list(read_scene_logs(publication.folder)) == [] and found.views_per_hour is None
     assert (found.shards_done, found.shards_planned) == (1, 3)
     assert (found.scenes_done, found.scenes_planned) == (4, 12)
     assert not found.finished
@@ -137,12 +129,6 @@ def test_rate_and_cost_are_those_of_the_logs(tmp_path: Path) -> None:
     assert found.remaining_s == 12 / (4 / 20)
     assert found.core_hours == 4 * 10 * 2 / 3600
     assert found.last_scene_unix_s == 1010.0
-
-
-def test_logs_without_rows_say_nothing(tmp_path: Path) -> None:
-    begin_tiny(tmp_path, 4)
-    assert list(read_scene_logs(DatasetFolder(tmp_path))) == []
-    assert read_status(str(tmp_path)).views_per_hour is None
 
 
 def test_a_manifest_that_does_not_say_how_it_is_divided_is_a_mistake_in_words(
