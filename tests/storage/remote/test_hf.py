@@ -22,6 +22,7 @@ from storage.dataset.dataset import Dataset
 from storage.digests import sha256_hex
 from storage.records.sample import encode_sample
 from tests.conftest import ROOT
+from tests.storage.remote.conftest import SHARD, with_changed_byte
 
 REPOSITORY = "ada/set"
 
@@ -87,7 +88,6 @@ def serve_hub(root: Path) -> Iterator[str]:
 
 pytest.importorskip("huggingface_hub", reason="hf:// needs the package huggingface_hub")
 
-SHARD = "train-000000.tar"
 DATASET = f"hf://datasets/{REPOSITORY}"
 
 READ = """
@@ -155,9 +155,8 @@ def test_a_repository_holds_the_same_dataset(hub: str, cache: Path, local: Datas
 
 
 def test_missing_and_changed_shards_are_named(hub: str, cache: Path, local: Dataset) -> None:
-    content = bytearray((local.folder.root / SHARD).read_bytes())
-    content[-700] ^= 1
-    (local.folder.root / SHARD).write_bytes(content)
+    path = local.folder.root / SHARD
+    path.write_bytes(with_changed_byte(path))
     (local.folder.root / "test-000005.tar").unlink()
     (fast, full), said, _ = run(hub, cache)
     assert (fast, set(full)) == (["test-000005.tar"], {"test-000005.tar", SHARD})

@@ -9,22 +9,10 @@ import pytest
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.shard_places import listed_shards
 from storage.errors import TrilightError
-from storage.records.sample import Sample, encode_sample
 from storage.remote import tries
 from storage.remote.tries import TRIES, Pace, Patience, TransferFailed
 from tests.http_server import Fault, Site
-
-SHARD = "train-000000.tar"
-PATH = f"/{SHARD}"
-
-
-def read(url: str) -> list[Sample]:
-    dataset = open_dataset(url)
-    return list(dataset.read_shard(dataset.shards_of("train")[0]))
-
-
-def expected(local: Dataset) -> list[dict[str, bytes]]:
-    return [encode_sample(sample) for sample in local.read_shard(local.shards_of("train")[0])]
+from tests.storage.remote.conftest import PATH, SHARD, expected, read
 
 
 def test_a_dataset_is_the_same_through_a_server(server: Site, local: Dataset) -> None:
@@ -32,32 +20,23 @@ def test_a_dataset_is_the_same_through_a_server(server: Site, local: Dataset) ->
     assert remote.manifest == local.manifest
     assert remote.objects_lock() == local.objects_lock()
     assert remote.failures() == local.failures()
-    assert [encode_sample(sample) for sample in read(server.url)] == expected(local)
+    assert read(server.url) == expected(local)
     with pytest.raises(TrilightError, match="is on a server; expected a local folder"):
         _ = remote.folder
 
 
-@pytest.mark.parametrize(
-    "faults",
-    [
-        [Fault(status=500), Fault(status=503), Fault(status=429)],
-        [Fault(cut_after=0), Fault(cut_after=5000), Fault(cut_after=1)],
-        [Fault(stall_after=3000)],
-        [Fault(flip=True)],
-        [Fault(cut_after=4000), Fault(other_part=True)],
-        [Fault(cut_after=100)] * 12,
-        [Fault(cut_after=4000, no_length=True), Fault(no_length=True)],
-    ],
-    ids=[
-        "statuses",
-        "cut",
-        "stalled",
-        "changed bytes",
-        "another part",
-        "cut often",
-        "lengths unsaid",
-    ],
-)
+OUTLIVED = {
+    "statuses": [Fault(status=500), Fault(status=503), Fault(status=429)],
+    "cut": [Fault(cut_after=0), Fault(cut_after=5000), Fault(cut_after=1)],
+    "stalled": [Fault(stall_after=3000)],
+    "changed bytes": [Fault(flip=True)],
+    "another part": [Fault(cut_after=4000), Fault(other_part=True)],
+    "cut often": [Fault(cut_after=100)] * 12,
+    "lengths unsaid": [Fault(cut_after=4000, no_length=True), Fault(no_length=True)],
+}
+
+
+@pytest.mark.parametrize("faults", OUTLIVED.values(), ids=OUTLIVED)
 @pytest.mark.parametrize("ranges", [True, False])
 def test_what_passes_by_itself_is_outlived(
     server: Site,
@@ -71,7 +50,7 @@ def test_what_passes_by_itself_is_outlived(
         pytest.skip("without ranges, a line that always breaks gets nowhere")
     monkeypatch.setattr(tries, "PATIENCE", Patience(least_bytes_per_s=0.0))  # of a busy machine
     server.faults[PATH], server.ranges = list(faults), ranges
-    assert [encode_sample(sample) for sample in read(server.url)] == expected(local)
+    assert read(server.url) == expected(local)
     assert not server.faults[PATH]
     (kept,) = cache.iterdir()
     assert kept.read_bytes() == (local.folder.root / SHARD).read_bytes()
@@ -158,17 +137,8 @@ def test_a_cache_that_cannot_be_written_is_named(
         read(server.url)
 
 
-SHARD = "train-000000.tar"
-PATH = f"/{SHARD}"
-
-
 def patience(monkeypatch: pytest.MonkeyPatch, **limits: float) -> None:
     monkeypatch.setattr(tries, "PATIENCE", Patience(**limits))
-
-
-def count_read(url: str) -> int:
-    dataset = open_dataset(url)
-    return len(list(dataset.read_shard(dataset.shards_of("train")[0])))
 
 
 def test_a_server_that_trickles_is_left(
@@ -179,7 +149,7 @@ def test_a_server_that_trickles_is_left(
     server.always[PATH] = Fault(trickle=(1, 0.02))
     begun_s = time.monotonic()
     with pytest.raises(TrilightError, match=r"too slow, \d+ bytes in .* at least 1000 a second"):
-        count_read(server.url)
+        read(server.url)
     assert time.monotonic() - begun_s < 30, "of a file that would take minutes"
     assert server.gets()[PATH] == 1
     assert not list(cache.iterdir())
@@ -191,8 +161,8 @@ def test_a_server_that_stalls_after_a_few_bytes_is_left(
     """Each answer moves on by 100 bytes: that is no reason to count the tries anew."""
     server.always[PATH] = Fault(stall_after=100)
     assert local.shards_of("train")[0].num_bytes > 100 * TRIES
-    with pytest.raises(TrilightError, match=r"cannot be count_read \(no answer in time\)"):
-        count_read(server.url)
+    with pytest.raises(TrilightError, match=r"cannot be read \(no answer in time\)"):
+        read(server.url)
     assert server.gets()[PATH] == TRIES
 
 
@@ -202,7 +172,7 @@ def test_a_file_that_takes_too_long_altogether_is_left(
     patience(monkeypatch, file_s=0.5, least_bytes_per_s=1.0)
     server.always[PATH] = Fault(trickle=(10, 0.02))
     with pytest.raises(TrilightError, match="it did not come within 0 s"):
-        count_read(server.url)
+        read(server.url)
 
 
 def test_a_slow_steady_link_is_waited_for(
@@ -214,7 +184,7 @@ def test_a_slow_steady_link_is_waited_for(
     step = size // 40
     server.faults[PATH] = [Fault(cut_after=step, trickle=(step // 4, 0.02))] * (2 * TRIES)
     server.faults[PATH] += [Fault(trickle=(step, 0.02))]
-    assert count_read(server.url) > 0
+    assert read(server.url)
     assert server.gets()[PATH] == 2 * TRIES + 1
 
 

@@ -12,16 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.dataset import Dataset
 from storage.dataset.shard import scan_members
 from storage.dataset.verify import verify_dataset
-from storage.records.sample import encode_sample
 from storage.remote import tries
 from storage.remote import url as remote_url
-from tests.storage.remote.waiting import until
+from tests.storage.remote.conftest import SHARD, expected, read, until
 
 NGINX = shutil.which("nginx", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin")
-SHARD = "train-000000.tar"
 
 CONFIG = """
 daemon off; master_process off; pid {here}/pid; error_log {here}/error.log;
@@ -88,26 +86,9 @@ def nginx(
 
 def start_reading(url: str) -> tuple[threading.Thread, list[dict[str, bytes]]]:
     found: list[dict[str, bytes]] = []
-
-    def read() -> None:
-        dataset = open_dataset(url)
-        found.extend(
-            encode_sample(sample) for sample in dataset.read_shard(dataset.shards_of("train")[0])
-        )
-
-    thread = threading.Thread(target=read)
+    thread = threading.Thread(target=lambda: found.extend(read(url)))
     thread.start()
     return thread, found
-
-
-def expected(local: Dataset) -> list[dict[str, bytes]]:
-    return [encode_sample(sample) for sample in local.read_shard(local.shards_of("train")[0])]
-
-
-def test_it_serves_a_dataset_as_it_is(nginx: Nginx, local: Dataset) -> None:
-    thread, found = start_reading(nginx.url)
-    thread.join()
-    assert found == expected(local)
 
 
 def test_errors_are_outlived(nginx: Nginx, local: Dataset) -> None:
@@ -138,10 +119,11 @@ def test_a_server_that_dies_and_comes_back_goes_on_where_it_was(
 def test_changed_and_missing_shards_are_named(nginx: Nginx, local: Dataset) -> None:
     assert verify_dataset(nginx.url, fast=True).problems == []
     assert verify_dataset(nginx.url).problems == []
-    content = bytearray((local.folder.root / SHARD).read_bytes())
+    path = local.folder.root / SHARD
+    content = bytearray(path.read_bytes())
     first = next(scan_members(io.BytesIO(content), SHARD))
     content[first.offset + first.num_bytes // 2] ^= 1
-    (local.folder.root / SHARD).write_bytes(content)
+    path.write_bytes(content)
     (local.folder.root / "test-000005.tar").unlink()
     assert verify_dataset(nginx.url, fast=True).bad_shards == ["test-000005.tar"]
     found = verify_dataset(nginx.url)
