@@ -15,7 +15,7 @@ import OpenEXR
 import pytest
 
 from storage.errors import TrilightError
-from storage.records.exr import encode_channels
+from storage.records.exr import decode_exr, encode_channels, encode_exr
 from storage.records.lights import MAX_LIGHTS, decode_lights_exr, encode_lights_exr
 from tests.conftest import ROOT
 
@@ -47,12 +47,8 @@ def _planes(names: list[str]) -> dict[str, np.ndarray]:
     return dict.fromkeys(names, np.zeros((_SIZE, _SIZE), np.float16))
 
 
-def _more_channels() -> bytes:
-    return encode_channels(_planes(["R", "G", "B", *(f"more{i}" for i in range(13))]))
-
-
-def _many_channels() -> bytes:
-    return encode_channels(_planes([f"c{i}" for i in range(16)]))
+def _halves(*names: str) -> bytes:
+    return encode_channels(_planes(list(names)))
 
 
 def _second_part() -> bytes:
@@ -78,10 +74,11 @@ def _deep_pixels() -> bytes:
     return stream.getvalue()
 
 
+MANY = [f"c{i}" for i in range(16)]
 HOSTILE: list[tuple[Callable[[], bytes], str, str]] = [
-    (_more_channels, "picture", "expected B, G, R."),
-    (_many_channels, "picture", "channels are c0, c1, c10, c11, c12, c13 and 10 more"),
-    (_many_channels, "lights", "expected light0.B"),
+    (lambda: _halves(*"RGB", *MANY[3:]), "picture", "expected B, G, R."),
+    (lambda: _halves(*MANY), "picture", "channels are c0, c1, c10, c11, c12, c13 and 10 more"),
+    (lambda: _halves(*MANY), "lights", "expected light0.B"),
     (_second_part, "picture", "the file has 2 parts; expected one"),
     (_deep_pixels, "picture", "deepscanline; expected lines or tiles"),
 ]
@@ -111,7 +108,7 @@ def _with_window(data: bytes, height: int, width: int) -> bytes:
     return data[:at] + struct.pack("<4i", 0, 0, width - 1, height - 1) + data[at + 16 :]
 
 
-def test_bytes_are_bounded_where_each_light_is_expected() -> None:
+def test_bytes_are_bounded_by_what_is_expected() -> None:
     lights = encode_lights_exr(np.zeros((MAX_LIGHTS, 8, 8, 3), np.float32))
     with pytest.raises(
         TrilightError, match=r"192 channels of \[4096, 4096\] pixels may take 128849"
@@ -120,3 +117,8 @@ def test_bytes_are_bounded_where_each_light_is_expected() -> None:
     # What the renderer writes at most is not refused for its size, but for its missing pixels.
     with pytest.raises(TrilightError, match="not a readable OpenEXR file|a channel is no"):
         decode_lights_exr(_with_window(lights, 2048, 2048), (MAX_LIGHTS, 2048, 2048))
+    with pytest.raises(TrilightError, match=r"^lights: \[1000001, 1000001\] pixels"):
+        decode_lights_exr(_with_window(lights, 1_000_001, 1_000_001), (MAX_LIGHTS, 8, 8))
+    picture = encode_exr(np.zeros((16, 16, 3), np.float32))
+    with pytest.raises(TrilightError, match="data window spans|not a readable"):
+        decode_exr(_with_window(picture, 1_000_001, 1_000_001))

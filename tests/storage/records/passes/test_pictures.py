@@ -231,11 +231,9 @@ def test_a_single_pixel_and_a_place_far_away() -> None:
     [
         ({"view": 2}, "view is 2; expected 0 to 1"),
         ({"resolution": 0}, "resolution is 0; expected a whole number from 1 to 65536"),
-        ({"resolution": 2.5}, "resolution is 2.5; expected a whole number"),
         ({"rays_a_side": 65}, "rays_a_side is 65; expected a whole number from 1 to 64"),
         ({"names": ["depth"]}, "there is no pass 'depth'; expected of triangle, object"),
         ({"names": ["motion_px"]}, "motion_px: no other moment is given; expected `then`"),
-        ({"then_view": 2}, "then_view is 2; expected 0 to 1"),
     ],
 )
 def test_mistakes_are_named(arguments: dict, complaint: str) -> None:
@@ -306,18 +304,14 @@ def test_what_is_behind_the_other_camera_does_not_move() -> None:
 
 def test_other_triangles_are_refused() -> None:
     scene = tiny_scene()
+    fewer = dataclasses.replace(
+        scene,
+        faces=scene.faces[:2],
+        material_index=scene.material_index[:2],
+        object_index=scene.object_index[:2],
+    )
     with pytest.raises(TrilightError, match=r"2 triangles; expected the 3 of this one"):
-        view_passes(scene, then=_first_triangles(2))
+        view_passes(scene, then=fewer)
     turned = dataclasses.replace(scene, faces=scene.faces[:, [1, 2, 0]])
     with pytest.raises(TrilightError, match=r"faces\[0\] .* \[1, 2, 0\]; expected \[0, 1, 2\]"):
         view_passes(scene, then=turned)
-
-
-def _first_triangles(count: int) -> Scene:
-    scene = tiny_scene()
-    return dataclasses.replace(
-        scene,
-        faces=scene.faces[:count],
-        material_index=scene.material_index[:count],
-        object_index=scene.object_index[:count],
-    )

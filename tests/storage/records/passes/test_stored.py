@@ -7,9 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from storage.dataset.manifest import Manifest
 from storage.dataset.settings import StorageSettings
-from storage.dataset.verify import check_sample
 from storage.errors import TrilightError
 from storage.records.exr import channel_names, decode_channels, encode_channels
 from storage.records.first_hits import first_hits
@@ -26,7 +24,8 @@ from storage.records.passes.stored import (
 from storage.records.sample import Sample, decode_sample, encode_sample
 from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, tiny_sample, tiny_scene
-from tests.storage.records.passes.view_kit import room
+from tests.storage.records.passes.test_pictures import room
+from tests.storage.records.test_parts import faults
 from tests.textured_by_hand import sky, textured_scene
 
 ALL = tuple(each.name for each in declared_passes() if each.name != MOTION)
@@ -66,6 +65,10 @@ def test_a_sample_gives_the_same_numbers_stored_or_not() -> None:
         for name in names:
             assert there[name].dtype == computed[name].dtype
             np.testing.assert_array_equal(there[name], computed[name])
+    members = encode_sample(sample)
+    del members["1.passes.exr"]
+    with pytest.raises(TrilightError, match="1.passes.exr.*missing"):
+        decode_sample(sample.key, members)
 
 
 def test_stored_passes_are_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,12 +83,8 @@ def test_the_names_and_values_that_other_programs_read() -> None:
     data = passes_exr(room(0), names, view=1, resolution=32)
     file = OpenEXR.File(io.BytesIO(data), separate_channels=True)
     channels = {name: channel.pixels for name, channel in file.channels().items()}
-    letters = ["diffuse.B", "diffuse.G", "diffuse.R"]
-    assert sorted(channels) == [
-        *["A", "N.X", "N.Y", "N.Z", "Z"],
-        *(f"material_{letter}" for letter in letters),
-        "triangle.V",
-    ]
+    colours = [f"material_diffuse.{letter}" for letter in "BGR"]
+    assert sorted(channels) == ["A", "N.X", "N.Y", "N.Z", "Z", *colours, "triangle.V"]
     assert {channel.dtype for channel in channels.values()} == {np.dtype(np.float32)}
     missed = channels["A"] == 0
     assert missed.any()
@@ -135,19 +134,6 @@ def test_other_files_are_refused(channels: dict[str, int], resolution: int, mess
         decode_passes_exr(encode_channels(planes)[:100], resolution)
 
 
-def faults(sample: Sample, *names: str) -> list[str]:
-    manifest = Manifest(
-        build="x",
-        settings={"renders": {"resolution": 16}, "storage": {"passes": list(names)}},
-        environment={},
-        num_scenes=1,
-        num_views=2,
-        objects_lock_sha256="",
-        shards=(),
-    )
-    return list(check_sample(sample, "train", manifest, {}))
-
-
 def test_verify_compares_with_the_scene() -> None:
     sample = with_passes(("object", "depth_axis_m"))
     assert faults(sample, "object", "depth_axis_m") == []
@@ -157,18 +143,10 @@ def test_verify_compares_with_the_scene() -> None:
     assert sample.passes_exr is not None
     first, second = sample.passes_exr
     swapped = dataclasses.replace(sample, passes_exr=(second, first))
-    assert "pass depth_axis_m is not what the scene says" in " ".join(
-        faults(swapped, "object", "depth_axis_m")
-    )
+    said = " ".join(faults(swapped, "object", "depth_axis_m"))
+    assert "pass depth_axis_m is not what the scene says" in said
     cut = dataclasses.replace(sample, passes_exr=(first[:-200], second))
     assert "not a readable OpenEXR" in faults(cut, "object", "depth_axis_m")[0]
-
-
-def test_a_lacking_member_is_named() -> None:
-    members = encode_sample(with_passes(("object",)))
-    del members["1.passes.exr"]
-    with pytest.raises(TrilightError, match="1.passes.exr.*missing"):
-        decode_sample("000000000", members)
 
 
 def test_wrong_views_and_names_are_named() -> None:
@@ -176,11 +154,6 @@ def test_wrong_views_and_names_are_named() -> None:
         tiny_sample().view_passes(["object"], view=2)
     with pytest.raises(TrilightError, match="sample 000000000: view 0: there is no pass 'x'"):
         tiny_sample().view_passes(["x"])
-
-
-def test_computed_passes_need_no_file() -> None:
-    found = picture_passes(room(0), ["hit"], view=0, resolution=8)
-    assert found["hit"].dtype == np.bool_
 
 
 RESOLUTION = 24
@@ -230,17 +203,15 @@ def test_one_pixel_is_that_of_the_picture_and_changes_no_table() -> None:
     assert (scene.materials == before).all()
 
 
-def test_a_scene_without_textures_has_no_coordinates() -> None:
-    for scene in (tiny_scene(), tiny_scene(environment=sky())):
-        assert "uv" not in view_passes(scene, resolution=RESOLUTION)
-        assert np.isnan(view_passes(scene, ["uv"], resolution=RESOLUTION)["uv"]).all()
-
-
-def test_a_sky_changes_no_pass() -> None:
-    plain = view_passes(tiny_scene(), resolution=RESOLUTION)
-    lit = view_passes(tiny_scene(environment=sky(is_seen=True)), resolution=RESOLUTION)
+def test_a_scene_without_textures_has_no_coordinates_and_a_sky_changes_no_pass() -> None:
+    plain, lit = (
+        view_passes(scene, resolution=RESOLUTION)
+        for scene in (tiny_scene(), tiny_scene(environment=sky(is_seen=True)))
+    )
+    assert "uv" not in plain and plain.keys() == lit.keys()
     for name, values in plain.items():
         np.testing.assert_array_equal(lit[name], values)
+    assert np.isnan(view_passes(tiny_scene(), ["uv"], resolution=RESOLUTION)["uv"]).all()
 
 
 def test_coordinates_go_through_a_file() -> None:
