@@ -11,15 +11,27 @@ from torch import Tensor
 from model import encoded_scene, rounding
 from model.packing import pack_lengths, packed
 from model.precision import rounded_parts, set_precision, tf32
-from model.renderformer import RenderFormer
 from model.scene_tensors import SceneBatch, batch_scenes, converted, scene_tensors, tensors_of
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import EMISSION, material_width
 from storage.records.scene import ARRAY_FIELDS
 from tests.for_each import for_each
-from tests.model.kit import FAMILIES, RESOLUTION, awake, random_scene, render, tiny_config
+from tests.model.kit import (
+    FAMILIES,
+    RESOLUTION,
+    awake,
+    picture_and_gradients,
+    random_scene,
+    render,
+    tiny_config,
+)
 from tests.train.toy import toy_scene
+
+
+def batch_of(*lengths: int, dtype: torch.dtype = torch.float64) -> SceneBatch:
+    """Return a batch of scenes of so many triangles, each a scene of its own."""
+    return batch_scenes([random_scene(n, seed=row, dtype=dtype) for row, n in enumerate(lengths)])
 
 
 @for_each("family", FAMILIES)
@@ -29,9 +41,8 @@ def test_bfloat16_rounds_the_layers_and_keeps_what_makes_tokens(family: str) -> 
     for name, weight in model.named_parameters():
         assert weight.dtype == (torch.bfloat16 if id(weight) in rounded else torch.float32), name
     exact = {name for name, weight in model.named_parameters() if id(weight) not in rounded}
-    for name in ("encoder.tokens.material.weight", "decoder.rays.weight", "encoder.registers_NW"):
-        assert name in exact
-    assert "decoder.head.last.weight" in exact
+    tokens = {"encoder.tokens.material.weight", "decoder.rays.weight", "encoder.registers_NW"}
+    assert exact > tokens | {"decoder.head.last.weight"}
     assert "decoder.layers.0.ffn.up.weight" not in exact
     assert model.encoder.rotary.freqs_F.dtype == torch.float32
 
@@ -61,15 +72,17 @@ def test_positions_are_never_rounded() -> None:
     assert (pictures[0] - pictures[1]).abs().max() < 0.1 * pictures[0].std()
 
 
-@for_each("name", ["tf32", "float16"])
-def test_what_a_cpu_has_no_path_for_is_refused(name: str) -> None:
-    with pytest.raises(TrilightError, match=f"precision {name}: the network is on cpu"):
+@for_each(
+    ("name", "message"),
+    [
+        ("tf32", "precision tf32: the network is on cpu"),
+        ("float16", "precision float16: the network is on cpu"),
+        ("float8", "float8.*expected one of float32, bfloat16"),
+    ],
+)
+def test_what_a_cpu_has_no_path_for_is_refused(name: str, message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
         set_precision(awake(tiny_config(), torch.float32), name)
-
-
-def test_an_unknown_precision_is_refused() -> None:
-    with pytest.raises(TrilightError, match="float8.*expected one of float32, bfloat16"):
-        set_precision(awake(tiny_config(), torch.float32), "float8")
 
 
 def test_tf32_is_set_for_a_while_only() -> None:
@@ -81,40 +94,28 @@ def test_tf32_is_set_for_a_while_only() -> None:
 
 
 @for_each("family", FAMILIES)
-def test_gradients_are_the_same_bit_by_bit(family: str) -> None:
-    model = awake(tiny_config(family))
-    batch = batch_scenes([random_scene(3, seed=1), random_scene(5, seed=2)])
-    results = []
-    for wanted in (False, True):
-        model.recompute_activations(wanted)
-        model.zero_grad()
-        picture = model(batch, RESOLUTION)
-        picture.square().sum().backward()
-        gradients = {name: weight.grad for name, weight in model.named_parameters()}
-        results.append((picture.detach(), gradients))
-    (picture, gradients), (again, gradients_again) = results
-    assert torch.equal(picture, again)
-    for name, gradient in gradients.items():
-        again = gradients_again[name]
-        assert gradient is not None and again is not None, name
-        assert torch.equal(gradient, again), name
+def test_recomputed_gradients_are_the_same_bit_by_bit(family: str) -> None:
+    model, batch = awake(tiny_config(family)), batch_of(3, 5)
+    model.recompute_activations(False)
+    kept = picture_and_gradients(model, batch)
+    model.recompute_activations(True)
+    again = picture_and_gradients(model, batch)
+    assert kept.keys() == again.keys() == {"picture", *dict(model.named_parameters())}
+    for name, value in kept.items():
+        assert torch.equal(value, again[name]), name
 
 
 def test_less_is_kept_for_the_way_back() -> None:
-    model = awake(tiny_config())
-    batch = batch_scenes([random_scene(40)])
-    kept = []
+    model, batch, kept = awake(tiny_config()), batch_of(40), [0, 0]
     for wanted in (False, True):
         model.recompute_activations(wanted)
-        sizes: list[int] = []
 
-        def keep(tensor: torch.Tensor, sizes: list[int] = sizes) -> torch.Tensor:
-            sizes.append(tensor.numel())
+        def keep(tensor: Tensor, wanted: bool = wanted) -> Tensor:
+            kept[wanted] += tensor.numel()
             return tensor
 
         with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
             model(batch, RESOLUTION)
-        kept.append(sum(sizes))
     assert kept[1] < 0.5 * kept[0]
 
 
@@ -125,22 +126,17 @@ def test_rounding_together_changes_no_bit(
 ) -> None:
     model = awake(tiny_config(family), dtype=torch.float32)
     model.recompute_activations(recompute)
-    scenes = [random_scene(n, seed=n, dtype=torch.float32) for n in (3, 5)]
+    batch = batch_of(3, 5, dtype=torch.float32)
     rounded: list[int] = []
-
-    def results() -> dict[str, Tensor]:
-        model.zero_grad()
-        with torch.autocast("cpu", torch.bfloat16):
-            picture = model(batch_scenes(scenes), RESOLUTION)
-        picture.square().sum().backward()
-        grads = {name: weight.grad for name, weight in model.named_parameters()}
-        return {"picture": picture.detach(), **{k: v for k, v in grads.items() if v is not None}}
-
     together = rounding._copies
 
     def counted(tensors: tuple[Tensor, ...], to: torch.dtype) -> tuple[Tensor, ...]:
         rounded.append(len(tensors))
         return together(tensors, to)
+
+    @torch.autocast("cpu", torch.bfloat16)
+    def results() -> dict[str, Tensor]:
+        return picture_and_gradients(model, batch)
 
     monkeypatch.setattr(rounding, "_copies", counted)
     found = results()
@@ -190,6 +186,7 @@ def test_the_scene_stays_as_it_was_and_shares_no_memory() -> None:
 def test_batches_are_padded_with_zeros_to_the_longest_and_no_further() -> None:
     scenes = [random_scene(3, seed=1), random_scene(7, seed=2), random_scene(5, seed=3)]
     batch = batch_scenes(scenes)
+    assert batch.num_triangles == (3, 7, 5)
     assert batch.triangles_BT33.shape[1] == 7
     assert batch.is_triangle_BT is not None
     assert batch.is_triangle_BT.sum(1).tolist() == [3, 7, 5]
@@ -200,11 +197,8 @@ def test_batches_are_padded_with_zeros_to_the_longest_and_no_further() -> None:
             padded = getattr(batch, f"{name}_BT{suffix}")[row]
             assert torch.equal(padded[:length], getattr(scene, f"{name}_T{suffix}"))
             assert torch.all(padded[length:] == 0)
-
-
-def test_equal_lengths_need_no_mask() -> None:
-    batch = batch_scenes([random_scene(4, seed=1), random_scene(4, seed=2)])
-    assert batch.is_triangle_BT is None
+    equal = batch_of(4, 4)
+    assert equal.is_triangle_BT is None and equal.num_triangles is None, "no mask is needed"
 
 
 def test_a_black_sky_is_none() -> None:
@@ -218,25 +212,14 @@ def test_a_black_sky_is_none() -> None:
 LENGTHS = (5, 9, 1)
 
 
-def _batch() -> SceneBatch:
-    return batch_scenes([random_scene(length, seed=length) for length in LENGTHS])
-
-
-def _results(model: RenderFormer, batch: SceneBatch) -> dict[str, Tensor]:
-    model.zero_grad()
-    picture = model(batch, RESOLUTION)
-    picture.square().sum().backward()
-    weights = {name: weight.grad for name, weight in model.named_parameters()}
-    return {"picture": picture.detach(), **{k: v for k, v in weights.items() if v is not None}}
-
-
 @for_each("family", FAMILIES)
 def test_a_packed_batch_is_the_padded_one(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, batch = awake(tiny_config(family)), _batch()
-    padded = _results(model, batch)
+    """On a card the kernel is torch's; here its slow twin, sequence after sequence."""
+    model, batch = awake(tiny_config(family)), batch_of(*LENGTHS)
+    padded = picture_and_gradients(model, batch)
     monkeypatch.setattr(encoded_scene, "takes_packed", lambda *_: True)
     monkeypatch.setattr("model.attention.scaled_dot_product_attention", _forbid_masks)
-    for name, found in _results(model, batch).items():
+    for name, found in picture_and_gradients(model, batch).items():
         wanted = padded[name]
         assert (found - wanted).abs().max() <= 1e-11 * wanted.abs().max().clamp(min=1), name
 
@@ -258,10 +241,3 @@ def test_packing_keeps_what_exists_and_gradients_go_back_there() -> None:
     (there * there.detach()).sum().backward()
     assert x.grad is not None
     assert torch.equal(x.grad[..., 0], x.detach()[..., 0] * exists)
-
-
-def test_where_a_mask_says_more_than_lengths_there_is_a_mask() -> None:
-    batch = _batch()
-    assert batch.num_triangles == LENGTHS
-    alone = batch_scenes([random_scene(5), random_scene(5)])
-    assert alone.num_triangles is None and alone.is_triangle_BT is None

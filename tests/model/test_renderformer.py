@@ -14,7 +14,7 @@ from torch.func import functional_call
 from model.layers import CrossAttention, merge_heads, split_heads
 from model.positions import Rotation, camera_rotation, rotate, token_places, world_rotation
 from model.renderformer import RenderFormer, radiance
-from model.scene_tensors import Cameras, SceneTensors, batch_scenes, converted
+from model.scene_tensors import SceneTensors, batch_scenes, converted
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.model.attention_reference import attend_reference
@@ -22,11 +22,11 @@ from tests.model.kit import (
     FAMILIES,
     RESOLUTION,
     awake,
+    one_view,
     random_pose,
     random_scene,
     render,
     tiny_config,
-    with_fields,
 )
 
 TIGHT = 1e-11
@@ -56,7 +56,7 @@ def test_finite_garbage_in_the_padding_changes_nothing(family: str) -> None:
     batch = batch_scenes([random_scene(3, seed=1), random_scene(6, seed=2)])
     triangles, normals = batch.triangles_BT33.clone(), batch.normals_BT33.clone()
     triangles[0, 3:], normals[0, 3:] = 1e3, 7.0
-    dirty = with_fields(batch, triangles_BT33=triangles, normals_BT33=normals)
+    dirty = dataclasses.replace(batch, triangles_BT33=triangles, normals_BT33=normals)
     with torch.no_grad():
         close(model(dirty, RESOLUTION), model(batch, RESOLUTION))
 
@@ -101,18 +101,6 @@ def translated(scene: SceneTensors, offset: Tensor) -> SceneTensors:
     return dataclasses.replace(scene, triangles_T33=scene.triangles_T33 + offset, c2w_V44=poses)
 
 
-@for_each("family", FAMILIES)
-def test_views_one_by_one_or_together(family: str) -> None:
-    model = model_for(family)
-    scene = random_scene(8, num_views=3)
-    together = render(model, scene)[0]
-    for view in range(3):
-        alone = dataclasses.replace(
-            scene, c2w_V44=scene.c2w_V44[[view]], fov_deg_V=scene.fov_deg_V[[view]]
-        )
-        close(render(model, alone)[0, 0], together[view])
-
-
 def test_float32_stays_near_float64() -> None:
     scene = random_scene(9)
     precise = render(awake(tiny_config(), torch.float64), scene)
@@ -129,7 +117,9 @@ def test_gradients_are_those_of_finite_differences() -> None:
     weights = dict(model.named_parameters())
 
     def picture(triangles: Tensor, normals: Tensor, c2w: Tensor, *changed: Tensor) -> Tensor:
-        scene = with_fields(batch, triangles_BT33=triangles, normals_BT33=normals, c2w_BV44=c2w)
+        scene = dataclasses.replace(
+            batch, triangles_BT33=triangles, normals_BT33=normals, c2w_BV44=c2w
+        )
         replaced = dict(zip(names, changed, strict=True))
         return functional_call(model, replaced, (scene, 8))[..., ::5, ::5, :]
 
@@ -168,27 +158,15 @@ def test_a_fresh_network_is_black_and_learns_from_every_picture() -> None:
     assert bias.grad.abs().sum() > 0.9
 
 
-def test_initial_weights_depend_on_the_generator_alone() -> None:
-    first, second = (awake(tiny_config("dpt"), seed=4) for _ in range(2))
-    for (name, a), b in zip(first.named_parameters(), second.parameters(), strict=True):
-        assert torch.equal(a, b), name
-
-
 def test_norms_have_the_published_epsilons() -> None:
     """By attribute: the picture cannot tell 1e-6 from 1e-5 (1e-7 of it)."""
-    token_norms = {
-        "encoder.tokens.material_norm",
-        "encoder.tokens.normal_norm",
-        "decoder.rays_norm",
-    }
-    norms = {
-        name: module.eps
-        for name, module in model_for("linear").named_modules()
-        if isinstance(module, nn.RMSNorm)
-    }
-    assert token_norms < set(norms)
+    tokens = {f"encoder.tokens.{name}_norm" for name in ("material", "normal")}
+    tokens.add("decoder.rays_norm")
+    modules = dict(model_for("linear").named_modules())
+    norms = {name: each.eps for name, each in modules.items() if isinstance(each, nn.RMSNorm)}
+    assert tokens < set(norms)
     for name, eps in norms.items():
-        assert eps == (1.1920929e-07 if name in token_norms else 1e-6), name
+        assert eps == (1.1920929e-07 if name in tokens else 1e-6), name
 
 
 def test_radiance_undoes_the_logarithm_and_bounds_the_dark() -> None:
@@ -235,36 +213,33 @@ def test_rotation_and_vertex_order_do_change_the_picture(family: str) -> None:
     assert (render(model, relabelled) - before).abs().max() > 1e-4
 
 
-def view(cameras: Cameras, index: int) -> Cameras:
-    return Cameras(c2w_BV44=cameras.c2w_BV44[:, [index]], fov_deg_BV=cameras.fov_deg_BV[:, [index]])
-
-
 @for_each("family", FAMILIES)
 def test_one_encoding_serves_every_camera_in_any_order(family: str) -> None:
-    model = awake(tiny_config(family))
+    """Views one by one, together, and through what is kept of a scene."""
+    model = model_for(family)
     scene = random_scene(7, num_views=3)
     batch = batch_scenes([scene])
+    together = render(model, scene)[0]
     with torch.no_grad():
         encoded = model.encode(batch)
         for index in (2, 0, 1, 0):
-            alone = dataclasses.replace(
-                scene, c2w_V44=scene.c2w_V44[[index]], fov_deg_V=scene.fov_deg_V[[index]]
-            )
-            got = model.decode(encoded, view(batch.cameras, index), RESOLUTION)
+            alone = one_view(scene, index)
+            got = model.decode(encoded, batch_scenes([alone]).cameras, RESOLUTION)
             close(got[0], render(model, alone)[0])
+            close(got[0, 0], together[index])
 
 
 def test_encoding_looks_at_no_camera() -> None:
+    """Keys must be kept before their rotation: two cameras would otherwise disagree."""
     model = awake(tiny_config())
     batch = batch_scenes([random_scene(5)])
     blind = dataclasses.replace(
         batch, c2w_BV44=batch.c2w_BV44 * torch.nan, fov_deg_BV=batch.fov_deg_BV * torch.nan
     )
     with torch.no_grad():
-        for seen, unseen in zip(
-            model.encode(batch).keys_values, model.encode(blind).keys_values, strict=True
-        ):
-            assert torch.equal(seen[0], unseen[0]) and torch.equal(seen[1], unseen[1])
+        kept = [model.encode(each).keys_values for each in (batch, blind)]
+    for seen, unseen in zip(*kept, strict=True):
+        assert torch.equal(seen[0], unseen[0]) and torch.equal(seen[1], unseen[1])
 
 
 def test_cached_cross_attention_is_the_uncached_one() -> None:

@@ -1,5 +1,7 @@
 """Attention, whole and in windows, is its slow twin, in value and gradient."""
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -8,6 +10,7 @@ from model.layers import SelfAttention
 from model.windows import attend_in_windows, cut_windows
 from tests.for_each import for_each
 from tests.model.attention_reference import attend_reference
+from tests.model.kit import value_and_gradients
 
 SHAPES = [(1, 1, 1, 1, 2), (2, 2, 5, 7, 6), (3, 1, 17, 33, 8), (1, 4, 64, 130, 16)]
 """(B, H, Q, N, D): one token, odd sizes, and more keys than a kernel's block."""
@@ -46,12 +49,10 @@ def test_fast_attention_equals_its_slow_twin(
     sizes = [(scenes, heads, length, width) for length in (queries, keys, keys, queries)]
     q, k, v, upstream = (torch.randn(s, generator=generator, dtype=dtype) for s in sizes)
     mask = make_mask(kind, scenes, keys)
-    results = []
-    for function in (attend, attend_reference):
-        inputs = [x.clone().requires_grad_() for x in (q, k, v)]
-        output = function(inputs[0], inputs[1], inputs[2], mask)
-        gradients = torch.autograd.grad(output, inputs, upstream)
-        results.append([output.detach(), *gradients])
+    results = (
+        value_and_gradients(function, (q, k, v), upstream, mask)
+        for function in (attend, attend_reference)
+    )
     for fast, slow in zip(*results, strict=True):
         torch.testing.assert_close(fast, slow, rtol=0, atol=tolerance)
 
@@ -109,14 +110,8 @@ def test_windows_are_those_of_the_roll(side: int, width: int, shifted: bool) -> 
         q, k, v = (x[:, :, windows.order_Q] for x in (q, k, v))
         return attend_in_windows(q, k, v, windows)[:, :, windows.back_Q]
 
-    def theirs(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        return rolled_and_masked(q, k, v, width, shifted)
-
-    results = []
-    for function in (ours, theirs):
-        inputs = [x.clone().requires_grad_() for x in (q, k, v)]
-        output = function(inputs[0], inputs[1], inputs[2])
-        results.append([output, *torch.autograd.grad(output, inputs, upstream)])
+    theirs = partial(rolled_and_masked, width=width, shifted=shifted)
+    results = (value_and_gradients(each, (q, k, v), upstream) for each in (ours, theirs))
     for got, expected in zip(*results, strict=True):
         # float64 softmax over at most 64 keys
         torch.testing.assert_close(got, expected, rtol=0, atol=1e-13)
