@@ -111,9 +111,6 @@ def test_each_part_has_its_own_anchor_and_prefers_what_is_met() -> None:
     assert list(zip(rows // 4, columns // 4, strict=True)) == [(0, 0), (0, 1), (1, 0), (1, 1)]
     assert (rows[0], columns[0]) == (0, 3)
     assert abs(rows[1] - 1.5) < 1, "where nothing tells them apart, the most central"
-
-
-def test_an_anchor_for_each_pixel() -> None:
     assert np.array_equal(anchor_pixels(np.ones((4, 4), np.float32), 4), np.arange(16))
 
 

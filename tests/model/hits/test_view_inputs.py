@@ -8,18 +8,18 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from model.hits.lit_scene import LitScene
-from model.hits.radiosity import scene_light
 from model.hits.textures import surface_textures
 from model.hits.tracing import TracedScene, traced_batch
-from model.hits.view_inputs import NUM_CHANNELS, Channel, ViewInputs, view_inputs
+from model.hits.view_inputs import NUM_CHANNELS, Channel, view_inputs
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from storage.conventions import pixel_places
 from storage.records.first_hits import first_hits
 from storage.records.material import EMISSION
+from storage.records.retextured import with_textures
 from storage.records.scene import Scene
+from storage.records.texture import Texture
 from tests.for_each import for_each
-from tests.model.hits.kit import FLOOR, LAMP, corner, direct, textured, traced
+from tests.model.hits.kit import FLOOR, LAMP, corner, direct, traced
 from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
 from tests.rigid_motion import moved
 from train.data.augment import mirrored, with_channels, with_vertices_turned
@@ -163,59 +163,49 @@ EXTREMES = {
 
 @for_each("name", EXTREMES)
 def test_extremes_are_finite_and_not_negative(name: str) -> None:
-    scene = join(EXTREMES[name], eye=(1.0, -3.0, 1.4), target=(0, 0, 0.2), fov_deg=40.0)
-    inputs = traced(scene, 16)
-    assert np.isfinite(inputs.pixels).all()
-    assert np.isfinite(inputs.gathered).all()
-    assert (inputs.pixels[..., LIGHTS] >= 0).all()
-    assert (inputs.gathered >= 0).all()
+    """Seen from above, and by a camera that grazes the floor."""
+    for eye, target, fov_deg in (((1, -3, 1.4), (0, 0, 0.2), 40), ((0, -1.9, 1e-4), (0, 2, 0), 60)):
+        inputs = traced(join(EXTREMES[name], eye=eye, target=target, fov_deg=fov_deg), 16)
+        for values in (inputs.pixels, inputs.gathered):
+            assert np.isfinite(values).all()
+        assert (inputs.pixels[..., LIGHTS] >= 0).all()
+        assert (inputs.gathered >= 0).all()
 
 
 def test_no_light_at_all_is_black() -> None:
     """A scene has an emitter, but a group of its lights may have none (model.light_groups)."""
-    dark = _relit(corner(), 0.0)
-    inputs = traced(dark)
-    assert not inputs.pixels[..., LIGHTS].any()
-    assert not inputs.gathered.any()
-
-
-def test_a_lamp_without_area_gives_nothing() -> None:
     scene = corner()
     positions = scene.vertex_positions.copy()
     positions[-3:] = positions[-1]
-    inputs = traced(dataclasses.replace(scene, vertex_positions=positions))
-    assert np.isfinite(inputs.pixels).all()
-    assert not inputs.pixels[..., LIGHTS].any()
+    without_area = dataclasses.replace(scene, vertex_positions=positions)
+    for dark in (_relit(scene, 0.0), without_area):
+        inputs = traced(dark)
+        assert np.isfinite(inputs.pixels).all()
+        assert not inputs.pixels[..., LIGHTS].any()
+        assert not inputs.gathered.any()
 
 
-def test_a_grazing_mirror_is_finite() -> None:
-    scene = join(EXTREMES["mirror"], eye=(0, -1.9, 1e-4), target=(0, 2, 0), fov_deg=60.0)
-    assert np.isfinite(traced(scene, 16).pixels).all()
-
-
-def _traced(scene: Scene, rays_a_side: int = 2) -> ViewInputs:
-    lit = LitScene(
-        scene.vertex_positions[scene.faces],
-        scene.vertex_normals[scene.faces],
-        scene.materials[scene.material_index],
-        surface_textures(scene),
-    )
-    return view_inputs(
-        lit,
-        scene_light(lit),
-        scene.c2w[0],
-        float(scene.fov_deg[0]),
-        32,
-        rays_a_side=rays_a_side,
-        anchors_a_side=8,
-        gather_rays=16,
-    )
+def textured(*, roughness: bool = True) -> Scene:
+    """Return the corner with a coloured floor, and a ball of which the gloss is textured."""
+    scene = corner()
+    rng = np.random.default_rng(0)
+    colours = Texture(texels=rng.integers(0, 200, (8, 8, 3), np.uint8), is_srgb=True)
+    rough = Texture(texels=rng.uniform(0.2, 0.9, (4, 4, 1)).astype(np.float32))
+    index = np.full((len(scene.materials), 3), -1, np.int32)
+    index[0, 0] = 0
+    if roughness:
+        index[3, 2] = 1
+    uv = 1.3 * scene.vertex_positions[scene.faces.ravel(), :2] - 0.4
+    textures = (colours, rough)[: 1 + roughness]
+    found = with_textures(scene, uv.astype(np.float32), textures, index)
+    found.check()
+    return found
 
 
 def test_a_pixel_has_the_material_at_its_hit() -> None:
     scene = textured()
     hits = first_hits(scene, resolution=32)
-    pixels = _traced(scene, rays_a_side=1).pixels
+    pixels = traced(scene, rays_a_side=1).pixels
     met = hits.met
     same = met & (pixels[..., 0] > 0)
     assert same.sum() > 0.99 * met.sum()
@@ -232,7 +222,7 @@ def test_every_ray_of_a_textured_pixel_counts() -> None:
     scene = textured(roughness=False)
     fine = first_hits(scene, resolution=64).material[..., 0:3]
     means = np.asarray(fine).reshape(32, 2, 32, 2, 3).mean(axis=(1, 3))
-    found = _traced(scene).pixels
+    found = traced(scene).pixels
     whole = np.isfinite(means).all(axis=-1) & (found[..., 0] == 1)
     apart = np.abs(found[..., Channel.DIFFUSE] - means).max(axis=-1)[whole]
     assert np.median(apart) < 1e-4 and np.mean(apart > 0.02) < 0.05  # rims: other rays meet
@@ -241,7 +231,7 @@ def test_every_ray_of_a_textured_pixel_counts() -> None:
 def test_plain_triangles_of_a_textured_scene_and_plain_scenes_stay() -> None:
     plain, scene = corner(), textured()
     assert surface_textures(plain) is None
-    without, there = traced(plain).pixels, _traced(scene).pixels
+    without, there = traced(plain).pixels, traced(scene).pixels
     wall = first_hits(scene, resolution=32).material[..., 6] == 1.0
     for channel in (Channel.DIFFUSE, Channel.NORMAL, Channel.POSITION):
         apart = np.abs(without[..., channel] - there[..., channel]).max(axis=-1)[wall]

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from model.config import ModelConfig
 from model.neural_renderer import NeuralRenderer
-from model.renderformer import RenderFormer, radiance
-from model.scene_tensors import SceneTensors, scene_tensors
+from model.renderformer import radiance
+from model.scene_tensors import scene_tensors
 from model.sky.drawn import DrawnSky
 from model.sky.symmetries import behind_mirror, scaled, turned, with_channels
 from scene_templates.rotations import uniform_rotation
@@ -120,58 +119,43 @@ def test_light_comes_from_where_a_symmetry_puts_it() -> None:
     mirrored = behind_mirror(SKY, sides)
     mirrored.check()
     assert np.abs(environment_values(mirrored, DIRECTIONS * sides) - HERE).max() < 3e-6
+    twice = behind_mirror(mirrored, sides)
+    assert np.array_equal(twice.radiance_rgb, SKY.radiance_rgb)
+    assert np.array_equal(twice.rotation, SKY.rotation)
     order = np.array([1, 2, 0])
     assert np.array_equal(environment_values(with_channels(SKY, order), DIRECTIONS), HERE[:, order])
     assert np.abs(environment_values(scaled(SKY, 3.0), DIRECTIONS) - 3 * HERE).max() < 1e-6
 
 
-def test_two_mirrors_are_none() -> None:
-    sides = np.array([-1, 1, 1], np.float32)
-    twice = behind_mirror(behind_mirror(SKY, sides), sides)
-    assert np.array_equal(twice.radiance_rgb, SKY.radiance_rgb)
-    assert np.array_equal(twice.rotation, SKY.rotation)
-
-
-def _below(sky: Environment | None, radiance: float = 30.0) -> SceneTensors:
-    return scene_tensors(corner(radiance=radiance, sky=sky))
-
-
-def _network() -> RenderFormer:
-    return awake(hits_config(sky_rays=2), torch.float32)
-
-
 @for_each("config", [tiny_config(), hits_config()])
 def test_networks_that_know_no_sky_refuse_it_and_say_so_when_rendering(config: ModelConfig) -> None:
-    network = awake(config, torch.float32)
+    network, below = awake(config, torch.float32), corner(sky=smooth())
     with pytest.raises(TrilightError, match=r"does not know its light.*sky_rays=16.*share=0"):
-        render(network, _below(smooth()))
-    below = corner(sky=smooth())
+        render(network, scene_tensors(below))
     with pytest.warns(UserWarning, match="does not know: it is missing here"):
         shown = NeuralRenderer(network).render(below, 32)
     assert np.array_equal(shown, NeuralRenderer(network).render(corner(), 32))
 
 
 def test_a_sky_that_cameras_see_is_refused_and_left_black() -> None:
-    network = _network()
+    network = awake(hits_config(sky_rays=2), torch.float32)
     seen = corner(sky=smooth(is_seen=True))
     with pytest.raises(TrilightError, match=r"cameras see its environment.*seen_share=0"):
         render(network, scene_tensors(seen))
     with pytest.warns(UserWarning, match="networks leave it black"):
         shown = NeuralRenderer(network).render(seen, 32)
-    hidden = corner(sky=smooth())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert np.array_equal(shown, NeuralRenderer(network).render(hidden, 32))
-
-
-def _linear(log10: Tensor) -> Tensor:
-    return radiance(log10.double())
+        hidden = NeuralRenderer(network).render(corner(sky=smooth()), 32)
+    assert np.array_equal(shown, hidden)
 
 
 def test_hits_scale_with_all_light_exactly() -> None:
     """The sky is in the scene's unit, as lamps are: ten times the light, ten times the picture."""
-    network = _network()
-    once = _linear(render(network, _below(constant(0.4), 20.0)))
-    tenfold = _linear(render(network, _below(constant(4.0), 200.0)))
+    network = awake(hits_config(sky_rays=2), torch.float32)
+    once, tenfold = (
+        radiance(render(network, scene_tensors(corner(radiance=lamp, sky=constant(sky)))).double())
+        for lamp, sky in ((20.0, 0.4), (200.0, 4.0))
+    )
     # float32 throughout; log10(1 + x) of the darkest pixels has the fewest digits
     assert ((tenfold - 10 * once).abs() < 2e-4 * tenfold + 2e-5).all()
