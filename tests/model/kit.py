@@ -1,6 +1,7 @@
 """Tiny networks with awake heads, and random scenes for them."""
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -82,5 +83,26 @@ def render(model: RenderFormer, *scenes: SceneTensors, resolution: int = RESOLUT
     return pictures
 
 
-def with_fields(batch: SceneBatch, **fields: Any) -> SceneBatch:
-    return dataclasses.replace(batch, **fields)
+def one_view(scene: SceneTensors, index: int) -> SceneTensors:
+    return dataclasses.replace(
+        scene, c2w_V44=scene.c2w_V44[[index]], fov_deg_V=scene.fov_deg_V[[index]]
+    )
+
+
+def picture_and_gradients(
+    model: RenderFormer, batch: SceneBatch, resolution: int = RESOLUTION
+) -> dict[str, Tensor]:
+    """Return a picture, and what its square teaches each weight that it reaches."""
+    model.zero_grad()
+    picture = model(batch, resolution)
+    picture.square().sum().backward()
+    weights = {name: weight.grad for name, weight in model.named_parameters()}
+    return {"picture": picture.detach(), **{k: v for k, v in weights.items() if v is not None}}
+
+
+def value_and_gradients(
+    function: Callable[..., Tensor], inputs: Sequence[Tensor], upstream: Tensor, *rest: Any
+) -> list[Tensor]:
+    fresh = [each.clone().requires_grad_() for each in inputs]
+    value = function(*fresh, *rest)
+    return [value.detach(), *torch.autograd.grad(value, fresh, upstream)]

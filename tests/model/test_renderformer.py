@@ -1,7 +1,7 @@
 """Laws of the whole network, in float64 on tiny sizes, for every family.
 
 Tolerance 1e-11: pictures of size 1 after some twenty layers of float64 sums; a broken law changes
-them by 1e-3 and more, as the two guards at the end show.
+them by 1e-3 and more, as the two guards show.
 """
 
 import dataclasses
@@ -11,19 +11,22 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from model.layers import CrossAttention, merge_heads, split_heads
+from model.positions import Rotation, camera_rotation, rotate, token_places, world_rotation
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes, converted
 from storage.errors import TrilightError
 from tests.for_each import for_each
+from tests.model.attention_reference import attend_reference
 from tests.model.kit import (
     FAMILIES,
     RESOLUTION,
     awake,
+    one_view,
     random_pose,
     random_scene,
     render,
     tiny_config,
-    with_fields,
 )
 
 TIGHT = 1e-11
@@ -53,7 +56,7 @@ def test_finite_garbage_in_the_padding_changes_nothing(family: str) -> None:
     batch = batch_scenes([random_scene(3, seed=1), random_scene(6, seed=2)])
     triangles, normals = batch.triangles_BT33.clone(), batch.normals_BT33.clone()
     triangles[0, 3:], normals[0, 3:] = 1e3, 7.0
-    dirty = with_fields(batch, triangles_BT33=triangles, normals_BT33=normals)
+    dirty = dataclasses.replace(batch, triangles_BT33=triangles, normals_BT33=normals)
     with torch.no_grad():
         close(model(dirty, RESOLUTION), model(batch, RESOLUTION))
 
@@ -98,18 +101,6 @@ def translated(scene: SceneTensors, offset: Tensor) -> SceneTensors:
     return dataclasses.replace(scene, triangles_T33=scene.triangles_T33 + offset, c2w_V44=poses)
 
 
-@for_each("family", FAMILIES)
-def test_views_one_by_one_or_together(family: str) -> None:
-    model = model_for(family)
-    scene = random_scene(8, num_views=3)
-    together = render(model, scene)[0]
-    for view in range(3):
-        alone = dataclasses.replace(
-            scene, c2w_V44=scene.c2w_V44[[view]], fov_deg_V=scene.fov_deg_V[[view]]
-        )
-        close(render(model, alone)[0, 0], together[view])
-
-
 def test_float32_stays_near_float64() -> None:
     scene = random_scene(9)
     precise = render(awake(tiny_config(), torch.float64), scene)
@@ -126,7 +117,9 @@ def test_gradients_are_those_of_finite_differences() -> None:
     weights = dict(model.named_parameters())
 
     def picture(triangles: Tensor, normals: Tensor, c2w: Tensor, *changed: Tensor) -> Tensor:
-        scene = with_fields(batch, triangles_BT33=triangles, normals_BT33=normals, c2w_BV44=c2w)
+        scene = dataclasses.replace(
+            batch, triangles_BT33=triangles, normals_BT33=normals, c2w_BV44=c2w
+        )
         replaced = dict(zip(names, changed, strict=True))
         return functional_call(model, replaced, (scene, 8))[..., ::5, ::5, :]
 
@@ -165,27 +158,15 @@ def test_a_fresh_network_is_black_and_learns_from_every_picture() -> None:
     assert bias.grad.abs().sum() > 0.9
 
 
-def test_initial_weights_depend_on_the_generator_alone() -> None:
-    first, second = (awake(tiny_config("dpt"), seed=4) for _ in range(2))
-    for (name, a), b in zip(first.named_parameters(), second.parameters(), strict=True):
-        assert torch.equal(a, b), name
-
-
 def test_norms_have_the_published_epsilons() -> None:
     """By attribute: the picture cannot tell 1e-6 from 1e-5 (1e-7 of it)."""
-    token_norms = {
-        "encoder.tokens.material_norm",
-        "encoder.tokens.normal_norm",
-        "decoder.rays_norm",
-    }
-    norms = {
-        name: module.eps
-        for name, module in model_for("linear").named_modules()
-        if isinstance(module, nn.RMSNorm)
-    }
-    assert token_norms < set(norms)
+    tokens = {f"encoder.tokens.{name}_norm" for name in ("material", "normal")}
+    tokens.add("decoder.rays_norm")
+    modules = dict(model_for("linear").named_modules())
+    norms = {name: each.eps for name, each in modules.items() if isinstance(each, nn.RMSNorm)}
+    assert tokens < set(norms)
     for name, eps in norms.items():
-        assert eps == (1.1920929e-07 if name in token_norms else 1e-6), name
+        assert eps == (1.1920929e-07 if name in tokens else 1e-6), name
 
 
 def test_radiance_undoes_the_logarithm_and_bounds_the_dark() -> None:
@@ -230,3 +211,84 @@ def test_rotation_and_vertex_order_do_change_the_picture(family: str) -> None:
     before = render(model, scene)
     assert (render(model, turned) - before).abs().max() > 1e-4
     assert (render(model, relabelled) - before).abs().max() > 1e-4
+
+
+@for_each("family", FAMILIES)
+def test_one_encoding_serves_every_camera_in_any_order(family: str) -> None:
+    """Views one by one, together, and through what is kept of a scene."""
+    model = model_for(family)
+    scene = random_scene(7, num_views=3)
+    batch = batch_scenes([scene])
+    together = render(model, scene)[0]
+    with torch.no_grad():
+        encoded = model.encode(batch)
+        for index in (2, 0, 1, 0):
+            alone = one_view(scene, index)
+            got = model.decode(encoded, batch_scenes([alone]).cameras, RESOLUTION)
+            close(got[0], render(model, alone)[0])
+            close(got[0, 0], together[index])
+
+
+def test_encoding_looks_at_no_camera() -> None:
+    """Keys must be kept before their rotation: two cameras would otherwise disagree."""
+    model = awake(tiny_config())
+    batch = batch_scenes([random_scene(5)])
+    blind = dataclasses.replace(
+        batch, c2w_BV44=batch.c2w_BV44 * torch.nan, fov_deg_BV=batch.fov_deg_BV * torch.nan
+    )
+    with torch.no_grad():
+        kept = [model.encode(each).keys_values for each in (batch, blind)]
+    for seen, unseen in zip(*kept, strict=True):
+        assert torch.equal(seen[0], unseen[0]) and torch.equal(seen[1], unseen[1])
+
+
+def test_cached_cross_attention_is_the_uncached_one() -> None:
+    """Against the published order: project, norm, split, rotate for this view, attend."""
+    layer = CrossAttention(48, 2).double()
+    generator = torch.Generator().manual_seed(0)
+    context = torch.randn(2, 9, 48, generator=generator, dtype=torch.float64)
+    bundles = torch.randn(2, 3, 5, 48, generator=generator, dtype=torch.float64)
+    angles = torch.randn(2, 3, 9, 12, generator=generator, dtype=torch.float64)
+    is_key = torch.arange(9) < torch.tensor([[9], [4]])
+    with torch.no_grad():
+        got = layer(bundles, layer.keys_values(context), (angles.cos(), angles.sin()), is_key)
+        for index in range(3):
+            rotation = (angles[:, index].cos(), angles[:, index].sin())
+            close(got[:, index], uncached(layer, bundles[:, index], context, rotation, is_key))
+
+
+def uncached(
+    layer: CrossAttention, x: Tensor, context: Tensor, rotation: Rotation, is_key: Tensor
+) -> Tensor:
+    normed = layer.context_norm(context)
+    q = split_heads(layer.q_norm(layer.q(x)), layer.num_heads)
+    k = rotate(split_heads(layer.k_norm(layer.k(normed)), layer.num_heads), *rotation)
+    v = split_heads(layer.v(normed), layer.num_heads)
+    return layer.out(merge_heads(attend_reference(q, k, v, is_key)))
+
+
+@for_each("eps", [0.0, 1e-5])
+def test_registers_stand_where_the_published_divisor_puts_them(eps: float) -> None:
+    """In the world and again in the camera: sum / (T + eps) in each frame, by hand."""
+    triangles = torch.randn(
+        1, 2, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    padded = torch.cat([triangles, torch.full_like(triangles, 1e3)], dim=1)
+    mask = torch.tensor([[True, True, False, False]])
+    c2w = torch.eye(4, dtype=torch.float64)[None, None].clone()
+    c2w[..., :3, 3] = torch.tensor([3.0, -2.0, 5.0])
+    places = token_places(padded, mask, num_registers=2, eps=eps)
+    expected_world = triangles.mean(dim=2).sum(dim=1) / (2 + eps)
+    expected_camera = (triangles.mean(dim=2) - c2w[0, 0, :3, 3]).sum(dim=1) / (2 + eps)
+    seen: list[Tensor] = []
+
+    def keep(positions: Tensor) -> Rotation:
+        seen.append(positions)
+        return positions, positions
+
+    world_rotation(keep, places)  # type: ignore[arg-type]
+    camera_rotation(keep, places, c2w)  # type: ignore[arg-type]
+    for positions, expected in zip(seen, (expected_world, expected_camera), strict=True):
+        registers = positions.reshape(-1, 3, 3)[:2]
+        # float64 means of six vertices of size 5; eps moves them by 5e-6 of that
+        torch.testing.assert_close(registers, expected.expand(2, 3, 3), rtol=0, atol=1e-14)

@@ -1,15 +1,72 @@
-"""Windows cut without a roll see exactly what the published rolled and masked ones see.
+"""Attention, whole and in windows, is its slow twin, in value and gradient."""
 
-In value and gradient.
-"""
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from model.attention import attend
 from model.layers import SelfAttention
 from model.windows import attend_in_windows, cut_windows
 from tests.for_each import for_each
 from tests.model.attention_reference import attend_reference
+from tests.model.kit import value_and_gradients
+
+SHAPES = [(1, 1, 1, 1, 2), (2, 2, 5, 7, 6), (3, 1, 17, 33, 8), (1, 4, 64, 130, 16)]
+"""(B, H, Q, N, D): one token, odd sizes, and more keys than a kernel's block."""
+
+MASKS = ["none", "all", "first only", "random", "ragged"]
+
+
+def make_mask(kind: str, scenes: int, keys: int) -> Tensor | None:
+    generator = torch.Generator().manual_seed(3)
+    mask = torch.ones(scenes, keys, dtype=torch.bool)
+    if kind == "none":
+        return None
+    if kind == "first only":
+        mask[:, 1:] = False
+    if kind == "random":
+        mask = torch.rand(scenes, keys, generator=generator) < 0.5
+        mask[:, -1] = True
+    if kind == "ragged":
+        mask = torch.arange(keys) < torch.arange(1, scenes + 1)[:, None] * keys / scenes
+        mask[:, 0] = True
+    return mask
+
+
+@for_each("kind", MASKS)
+@for_each("shape", SHAPES)
+@for_each(
+    ("dtype", "tolerance"),
+    # Sums of up to 130 products: rounding of the dtype (1e-16, 6e-8) times their number.
+    [(torch.float64, 1e-13), (torch.float32, 1e-5)],
+)
+def test_fast_attention_equals_its_slow_twin(
+    shape: tuple[int, ...], kind: str, dtype: torch.dtype, tolerance: float
+) -> None:
+    scenes, heads, queries, keys, width = shape
+    generator = torch.Generator().manual_seed(1)
+    sizes = [(scenes, heads, length, width) for length in (queries, keys, keys, queries)]
+    q, k, v, upstream = (torch.randn(s, generator=generator, dtype=dtype) for s in sizes)
+    mask = make_mask(kind, scenes, keys)
+    results = (
+        value_and_gradients(function, (q, k, v), upstream, mask)
+        for function in (attend, attend_reference)
+    )
+    for fast, slow in zip(*results, strict=True):
+        torch.testing.assert_close(fast, slow, rtol=0, atol=tolerance)
+
+
+def test_a_masked_key_has_neither_influence_nor_gradient() -> None:
+    generator = torch.Generator().manual_seed(2)
+    q, k, v = (torch.randn(1, 2, 4, 6, generator=generator) for _ in range(3))
+    k.requires_grad_()
+    mask = torch.tensor([[True, True, False, True]])
+    attend(q, k, v, mask).sum().backward()
+    assert k.grad is not None
+    assert torch.all(k.grad[:, :, 2] == 0)
+    assert torch.any(k.grad[:, :, 1] != 0)
+
 
 CPU = torch.device("cpu")
 
@@ -53,14 +110,8 @@ def test_windows_are_those_of_the_roll(side: int, width: int, shifted: bool) -> 
         q, k, v = (x[:, :, windows.order_Q] for x in (q, k, v))
         return attend_in_windows(q, k, v, windows)[:, :, windows.back_Q]
 
-    def theirs(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        return rolled_and_masked(q, k, v, width, shifted)
-
-    results = []
-    for function in (ours, theirs):
-        inputs = [x.clone().requires_grad_() for x in (q, k, v)]
-        output = function(inputs[0], inputs[1], inputs[2])
-        results.append([output, *torch.autograd.grad(output, inputs, upstream)])
+    theirs = partial(rolled_and_masked, width=width, shifted=shifted)
+    results = (value_and_gradients(each, (q, k, v), upstream) for each in (ours, theirs))
     for got, expected in zip(*results, strict=True):
         # float64 softmax over at most 64 keys
         torch.testing.assert_close(got, expected, rtol=0, atol=1e-13)

@@ -98,13 +98,19 @@ def test_leftovers_are_cleared_only_where_nobody_works(tmp_path: Path) -> None:
 
 
 @for_each(
-    ("number", "passes"),
-    [(errno.ENOSPC, True), (errno.EDQUOT, True), (errno.EIO, True), (errno.EACCES, False)],
+    ("number", "passes", "message"),
+    [
+        (errno.ENOSPC, True, "a: the disk is full. What was finished is safe"),
+        (errno.EDQUOT, True, "a: the disk is full"),
+        (errno.EIO, True, "a: cannot write b"),
+        (errno.EACCES, False, "a: cannot write b"),
+    ],
 )
-def test_what_may_pass_is_told_from_what_will_not(number: int, passes: bool) -> None:
+def test_what_may_pass_is_told_from_what_will_not(number: int, passes: bool, message: str) -> None:
     """A scheduler tries the first kind again."""
     error = write_error(Path("a/b"), OSError(number, os.strerror(number)))
     assert isinstance(error, EnvironmentFailure) == passes
+    assert str(error).startswith(message)
 
 
 def test_a_folder_that_can_never_be_made_is_said_at_once() -> None:

@@ -1,30 +1,101 @@
-"""Metrics against values known on paper."""
+"""Frames, units, metrics and intervals, against what is known on paper."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from storage.conventions import (
+    camera_rays,
+    focal_px,
+    in_camera,
+    log10_radiance,
+    look_at_c2w,
+    pixel_places,
+    preview_srgb8,
+    radiance_from_log10,
+    srgb8,
+)
+from storage.intervals import mean_interval
 from storage.metrics import MAX_DB, object_psnr_log_db, psnr_linear_db, psnr_log_db
 
+angles = st.floats(1, 170)
 
-def test_a_decade_apart_is_zero_db() -> None:
+
+def test_a_camera_looks_along_minus_z_with_y_up() -> None:
+    c2w = look_at_c2w(eye=[0, -3, 0], target=[0, 0, 0], up=[0, 0, 1])
+    assert np.allclose(c2w @ [0, 0, -1, 0], [0, 1, 0, 0])
+    assert np.allclose(c2w @ [0, 1, 0, 0], [0, 0, 1, 0])
+    assert np.allclose(c2w @ [1, 0, 0, 0], [1, 0, 0, 0])
+
+
+@given(fov_deg=angles, resolution=st.integers(2, 64))
+def test_the_outer_pixel_edges_span_the_field_of_view(fov_deg: float, resolution: int) -> None:
+    half_width = 0.5 * resolution / focal_px(fov_deg, resolution)
+    assert np.isclose(2 * np.degrees(np.arctan(half_width)), fov_deg)
+
+
+@given(fov_deg=angles)
+def test_rays_are_unit_and_turn_with_the_picture(fov_deg: float) -> None:
+    c2w = look_at_c2w(eye=[1, 2, 3], target=[0, 0, 0], up=[0, 0, 1])
+    origin, directions = camera_rays(c2w, fov_deg, 8)
+    assert np.allclose(origin, [1, 2, 3])
+    assert np.allclose(np.linalg.norm(directions, axis=-1), 1)
+    up, right = c2w[:3, 1], c2w[:3, 0]
+    assert (np.diff(directions @ up, axis=0) < 0).all()  # row 0 is the top
+    assert (np.diff(directions @ right, axis=1) > 0).all()
+    middle = directions[3:5, 3:5].mean(axis=(0, 1))
+    assert np.allclose(middle / np.linalg.norm(middle), -c2w[:3, 2])
+    _, rows = camera_rays(c2w, fov_deg, 8, slice(2, 5))
+    assert np.allclose(rows, directions[2:5], rtol=0, atol=1e-15)
+
+
+@given(angles)
+def test_places_in_the_picture_invert_the_rays(fov_deg: float) -> None:
+    c2w = look_at_c2w(eye=[1, 2, 3], target=[0, 0.5, 0], up=[0, 0, 1])
+    c2w[:3, :3] *= 1 + 1e-5  # as far from a rotation as float32 poses that passed through files
+    origin, rays = camera_rays(c2w, fov_deg, 7)
+    row, column = np.indices((7, 7))
+    centres = np.stack([column, row], axis=-1) + 0.5
+    for distance in (0.1, 30):
+        points = origin + distance * rays
+        assert np.allclose(pixel_places(points, c2w, fov_deg, 7), centres, atol=1e-9)
+        assert (in_camera(points, c2w)[..., 2] < 0).all()
+    assert np.isnan(pixel_places(origin - rays, c2w, fov_deg, 7)).all()
+    assert np.isnan(pixel_places(origin, c2w, fov_deg, 7)).all()
+
+
+@given(st.floats(0, 6e4))
+def test_the_output_space_is_inverted(radiance: float) -> None:
+    # float64 rounding grows with the exponent: relative 1e-12 plus what 1 + L loses near 0
+    assert np.isclose(radiance_from_log10(log10_radiance(radiance)), radiance, 1e-12, 1e-15)
+
+
+def test_a_preview_is_monotone_and_ends_at_white() -> None:
+    ramp = np.linspace(0, 2, 200)[:, None, None]
+    preview = preview_srgb8(ramp).astype(int).ravel()
+    assert preview[0] == 0
+    assert (np.diff(preview) >= 0).all()
+    assert (preview[100:] == 255).all()  # radiance 1 and above
+
+
+def test_srgb_of_known_values() -> None:
+    # 0.2140 is what IEC 61966-2-1 gives for code 127.5 of 255; the first piece ends at 0.0031308
+    assert srgb8([-1, 0, 0.003, 0.2140, 1, 7]).tolist() == [0, 0, 10, 127, 255, 255]
+
+
+def test_a_decade_is_zero_db_a_tenth_twenty_and_equal_pictures_are_capped() -> None:
     assert psnr_log_db(np.full((4, 4, 3), 9.0), np.full((4, 4, 3), 99.0)) == pytest.approx(0)
-
-
-def test_a_tenth_of_a_decade_is_twenty_db() -> None:
     picture = np.random.default_rng(0).random((8, 8, 3)) * 10
     brighter = (1 + picture) * 10**0.1 - 1
     assert psnr_log_db(picture, brighter) == pytest.approx(20)
+    assert psnr_log_db(picture, picture) == MAX_DB
 
 
 def test_linear_sees_nothing_above_one() -> None:
     # Twelve and seven: one side clamped elsewhere would still pass with a value of 1 on the other.
     assert psnr_linear_db(np.full(9, 12.0), np.full(9, 7.0)) == MAX_DB
     assert psnr_linear_db(np.full(9, 0.5), np.full(9, 0.6)) == pytest.approx(20)
-
-
-def test_equal_pictures_are_capped() -> None:
-    picture = np.ones((2, 2, 3))
-    assert psnr_log_db(picture, picture) == MAX_DB
 
 
 def test_background_earns_nothing() -> None:
@@ -41,3 +112,14 @@ def test_symmetry() -> None:
     a, b = rng.random((2, 6, 6, 3)) * 100
     assert psnr_log_db(a, b) == psnr_log_db(b, a)
     assert psnr_linear_db(a, b) == psnr_linear_db(b, a)
+
+
+def test_the_interval_of_a_mean_goes_by_clusters() -> None:
+    """Ten scenes of which each has the same figure 8 times know no more than ten figures."""
+    figures = [float(scene < 3) for scene in range(10) for _ in range(8)]
+    clusters = [f"scene {scene}" for scene in range(10) for _ in range(8)]
+    low, high = mean_interval(figures, clusters)
+    alone_low, alone_high = mean_interval(figures, [str(n) for n in range(80)])
+    assert low < alone_low < 0.3 < alone_high < high
+    assert low == pytest.approx(0.3 - 1.96 * np.sqrt(0.3 * 0.7 / 10), abs=0.06)
+    assert mean_interval([0.5] * 4, ["a", "a", "b", "b"]) == (0.5, 0.5)

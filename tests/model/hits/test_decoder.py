@@ -152,6 +152,8 @@ def test_what_comes_traced_is_what_the_network_traces_itself() -> None:
     shown = renderer.render(scene, PX)[0]
     expected = radiance(picture(model, plain)[0, 0]).numpy()
     np.testing.assert_allclose(shown, expected, rtol=1e-4, atol=1e-6)
+    with pytest.raises(TrilightError, match="multiple of 8"):
+        renderer.render(scene, 30)
 
 
 def test_each_input_is_read_and_can_be_withheld() -> None:
@@ -167,23 +169,20 @@ def test_each_input_is_read_and_can_be_withheld() -> None:
         assert (shown - whole).abs().max() > 1e-4, name
 
 
-def test_without_tokens_there_is_no_scene_stage() -> None:
-    model = network(scene_tokens=False)
-    assert not [name for name, _ in model.named_parameters() if name.startswith("encoder")]
-    assert torch.isfinite(picture(model, tensors(corner()))).all()
-
-
 @for_each("tokens", [True, False])
 def test_every_weight_has_a_gradient_and_comes_back_from_its_file(tokens: bool) -> None:
     model = network(scene_tokens=tokens)
+    assert tokens == any(name.startswith("encoder") for name, _ in model.named_parameters())
     model(batch_scenes([tensors(corner())]), PX).square().sum().backward()
     for name, weight in model.named_parameters():
         assert weight.grad is not None, name
         assert weight.grad.abs().max() > 0, name
     again = decode_weights(encode_weights(model))
     assert again.config == model.config
+    assert any(isinstance(each, nn.RMSNorm) for each in again.decoder.modules()), "for training"
     scene = tensors(corner())
-    assert torch.equal(picture(again, scene), picture(model.eval(), scene))
+    shown = picture(again, scene)
+    assert torch.equal(shown, picture(model.eval(), scene)) and torch.isfinite(shown).all()
 
 
 def test_gradients_are_those_of_differences() -> None:
@@ -213,11 +212,6 @@ def test_gradients_are_those_of_differences() -> None:
         assert float((above - below) / (2 * step)) == pytest.approx(float(grad[at]), rel=1e-4)
 
 
-def test_pictures_need_the_width_that_is_a_multiple_of_eight() -> None:
-    with pytest.raises(TrilightError, match="multiple of 8"):
-        NeuralRenderer(network()).render(corner(), 30)
-
-
 @for_each(
     ("changes", "message"),
     [
@@ -242,8 +236,3 @@ def test_it_takes_bfloat16_for_what_is_rounded() -> None:
     assert rounded.dtype == torch.float32
     # 8 bits of mantissa in anchors alone, whose numbers gain at most twice what was traced
     assert (rounded - exact).abs().mean() < 0.03 * exact.abs().mean()
-
-
-def test_norms_are_those_of_layers() -> None:
-    """So that training's rule for norms finds them."""
-    assert any(isinstance(module, nn.RMSNorm) for module in network().decoder.modules())

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from model.hits.direct_light import no_light
+from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import scene_light
 from model.hits.reflectance import drawn, gloss_at
 from model.hits.sky_light import add_sky_light, escaped_light, sees_sky
@@ -64,6 +65,18 @@ def test_a_white_ball_in_a_white_sky_is_white(roughness: float) -> None:
     assert picture[full].mean() == pytest.approx(1.0, abs=0.02)
 
 
+EYE = np.array([1.0, -3.0, 1.4], np.float32)
+
+
+def _seen(lit: LitScene, targets: list[list[float]]) -> Points:
+    """Return what rays from the eye meet first on their way to these places."""
+    toward = np.array(targets, np.float32) - EYE
+    rays = (toward / np.linalg.norm(toward, axis=1)[:, None]).T
+    points, met = lit.first_points(EYE, rays.astype(np.float32))
+    assert len(met) == len(targets)
+    return points
+
+
 def _irradiance_twin(scene: Scene, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Return irradiance over pi: texel by texel, with one shadow ray each."""
     lit, sky = lit_scene(scene), scene.environment
@@ -89,11 +102,7 @@ def _irradiance_twin(scene: Scene, place: np.ndarray, normal: np.ndarray) -> np.
 def test_light_of_a_sky_is_that_of_all_its_texels_with_shadows(sky: Environment) -> None:
     scene = corner(sky=sky)
     lit = lit_scene(scene)
-    origin = np.array([1.0, -3.0, 1.4], np.float32)
-    targets = np.array([[0.9, -0.6, 0.0], [-0.9, 0.6, 0.0], [0.6, 1.5, 1.2]])
-    rays = ((targets - origin) / np.linalg.norm(targets - origin, axis=1)[:, None]).T
-    points, met = lit.first_points(origin, rays.astype(np.float32))
-    assert len(met) == 3
+    points = _seen(lit, [[0.9, -0.6, 0.0], [-0.9, 0.6, 0.0], [0.6, 1.5, 1.2]])
     found, count = np.zeros((3, 3)), 64
     rng = np.random.default_rng(0)
     for _ in range(count):
@@ -157,10 +166,7 @@ def test_the_lobe_ray_and_the_others_share_what_a_mirror_shows() -> None:
     """A ball in a smooth sky: with and without rays by the lobe the same light."""
     scene = corner(radiance=0.0, roughness=0.3, sky=smooth())
     lit = lit_scene(scene)
-    origin = np.array([1.0, -3.0, 1.4], np.float32)
-    ray = np.array([0.5, -0.2, 0.4]) - origin
-    ray = (ray / np.linalg.norm(ray)).astype(np.float32)[:, None]
-    points, _ = lit.first_points(origin, np.repeat(ray, 4_000, axis=1))
+    points = _seen(lit, [[0.5, -0.2, 0.4]] * 4_000)
     light, gloss = no_light(points), gloss_at(lit, points)
     shift = np.random.default_rng(0).random((2, 4_000), np.float32)
     add_sky_light(light, lit, points, gloss, shift, 0, rays=8, lobe_rays=0)

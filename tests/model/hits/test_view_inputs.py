@@ -1,20 +1,29 @@
-"""What is traced of a view: laws that hold for every scene, and the extremes."""
+"""What is traced of a view: laws that hold for every scene, its textures, and the extremes."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+import torch
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from model.hits.view_inputs import NUM_CHANNELS, Channel
+from model.hits.textures import surface_textures
+from model.hits.tracing import TracedScene, traced_batch
+from model.hits.view_inputs import NUM_CHANNELS, Channel, view_inputs
+from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from storage.conventions import pixel_places
 from storage.records.first_hits import first_hits
 from storage.records.material import EMISSION
+from storage.records.retextured import with_textures
 from storage.records.scene import Scene
+from storage.records.texture import Texture
 from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, LAMP, corner, direct, traced
 from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
 from tests.rigid_motion import moved
+from train.data.augment import mirrored, with_channels, with_vertices_turned
+from train.data.scenes import TrainingScene
 
 LIGHTS = slice(Channel.OPEN_DIFFUSE.start, Channel.MIRRORED.stop)
 
@@ -154,31 +163,120 @@ EXTREMES = {
 
 @for_each("name", EXTREMES)
 def test_extremes_are_finite_and_not_negative(name: str) -> None:
-    scene = join(EXTREMES[name], eye=(1.0, -3.0, 1.4), target=(0, 0, 0.2), fov_deg=40.0)
-    inputs = traced(scene, 16)
-    assert np.isfinite(inputs.pixels).all()
-    assert np.isfinite(inputs.gathered).all()
-    assert (inputs.pixels[..., LIGHTS] >= 0).all()
-    assert (inputs.gathered >= 0).all()
+    """Seen from above, and by a camera that grazes the floor."""
+    for eye, target, fov_deg in (((1, -3, 1.4), (0, 0, 0.2), 40), ((0, -1.9, 1e-4), (0, 2, 0), 60)):
+        inputs = traced(join(EXTREMES[name], eye=eye, target=target, fov_deg=fov_deg), 16)
+        for values in (inputs.pixels, inputs.gathered):
+            assert np.isfinite(values).all()
+        assert (inputs.pixels[..., LIGHTS] >= 0).all()
+        assert (inputs.gathered >= 0).all()
 
 
 def test_no_light_at_all_is_black() -> None:
     """A scene has an emitter, but a group of its lights may have none (model.light_groups)."""
-    dark = _relit(corner(), 0.0)
-    inputs = traced(dark)
-    assert not inputs.pixels[..., LIGHTS].any()
-    assert not inputs.gathered.any()
-
-
-def test_a_lamp_without_area_gives_nothing() -> None:
     scene = corner()
     positions = scene.vertex_positions.copy()
     positions[-3:] = positions[-1]
-    inputs = traced(dataclasses.replace(scene, vertex_positions=positions))
-    assert np.isfinite(inputs.pixels).all()
-    assert not inputs.pixels[..., LIGHTS].any()
+    without_area = dataclasses.replace(scene, vertex_positions=positions)
+    for dark in (_relit(scene, 0.0), without_area):
+        inputs = traced(dark)
+        assert np.isfinite(inputs.pixels).all()
+        assert not inputs.pixels[..., LIGHTS].any()
+        assert not inputs.gathered.any()
 
 
-def test_a_grazing_mirror_is_finite() -> None:
-    scene = join(EXTREMES["mirror"], eye=(0, -1.9, 1e-4), target=(0, 2, 0), fov_deg=60.0)
-    assert np.isfinite(traced(scene, 16).pixels).all()
+def textured(*, roughness: bool = True) -> Scene:
+    """Return the corner with a coloured floor, and a ball of which the gloss is textured."""
+    scene = corner()
+    rng = np.random.default_rng(0)
+    colours = Texture(texels=rng.integers(0, 200, (8, 8, 3), np.uint8), is_srgb=True)
+    rough = Texture(texels=rng.uniform(0.2, 0.9, (4, 4, 1)).astype(np.float32))
+    index = np.full((len(scene.materials), 3), -1, np.int32)
+    index[0, 0] = 0
+    if roughness:
+        index[3, 2] = 1
+    uv = 1.3 * scene.vertex_positions[scene.faces.ravel(), :2] - 0.4
+    textures = (colours, rough)[: 1 + roughness]
+    found = with_textures(scene, uv.astype(np.float32), textures, index)
+    found.check()
+    return found
+
+
+def test_a_pixel_has_the_material_at_its_hit() -> None:
+    scene = textured()
+    hits = first_hits(scene, resolution=32)
+    pixels = traced(scene, rays_a_side=1).pixels
+    met = hits.met
+    same = met & (pixels[..., 0] > 0)
+    assert same.sum() > 0.99 * met.sum()
+    # Places of hits are float32 here and float64 there: 1e-6 m is 1e-5 of a texel.
+    apart = np.abs(pixels[..., Channel.DIFFUSE] - hits.material[..., 0:3]).max(axis=-1)[same]
+    assert np.mean(apart > 1e-4) < 0.005
+    apart = np.abs(pixels[..., Channel.ROUGHNESS][..., 0] - hits.material[..., 6])[same]
+    assert np.mean(apart > 1e-4) < 0.005
+    assert hits.material[same][:, 0].std() > 0.1
+
+
+def test_every_ray_of_a_textured_pixel_counts() -> None:
+    """The albedo of a pixel is the mean over its rays, not that of one of them."""
+    scene = textured(roughness=False)
+    fine = first_hits(scene, resolution=64).material[..., 0:3]
+    means = np.asarray(fine).reshape(32, 2, 32, 2, 3).mean(axis=(1, 3))
+    found = traced(scene).pixels
+    whole = np.isfinite(means).all(axis=-1) & (found[..., 0] == 1)
+    apart = np.abs(found[..., Channel.DIFFUSE] - means).max(axis=-1)[whole]
+    assert np.median(apart) < 1e-4 and np.mean(apart > 0.02) < 0.05  # rims: other rays meet
+
+
+def test_plain_triangles_of_a_textured_scene_and_plain_scenes_stay() -> None:
+    plain, scene = corner(), textured()
+    assert surface_textures(plain) is None
+    without, there = traced(plain).pixels, traced(scene).pixels
+    wall = first_hits(scene, resolution=32).material[..., 6] == 1.0
+    for channel in (Channel.DIFFUSE, Channel.NORMAL, Channel.POSITION):
+        apart = np.abs(without[..., channel] - there[..., channel]).max(axis=-1)[wall]
+        assert np.mean(apart > 1e-5) < 0.05  # at rims, the other surface is textured
+
+
+@for_each("symmetry", ["turned", "mirrored", "channels"])
+def test_textures_go_through_the_symmetries_of_training(symmetry: str) -> None:
+    scene = textured()
+    tensors = scene_tensors(scene)
+    training = TrainingScene(
+        key="",
+        tensors=tensors,
+        target_VRR3=torch.zeros(1, 4, 4, 3),
+        noise_V=torch.zeros(1),
+        light_T=torch.zeros(tensors.num_triangles, dtype=torch.int64),
+    )
+    order = np.array([2, 0, 1])
+    if symmetry == "turned":
+        turn = np.random.default_rng(1).integers(0, 3, tensors.num_triangles)
+        changed = with_vertices_turned(training, turn)
+    elif symmetry == "mirrored":
+        changed = mirrored(training)
+    else:
+        changed = with_channels(training, order)
+    before, after = (
+        _albedo(traced_batch(batch_scenes([each]))[0], each) for each in (tensors, changed.tensors)
+    )
+    if symmetry == "mirrored":
+        after = after[:, ::-1]
+    elif symmetry == "channels":
+        before = before[..., order]
+    assert before.std() > 0.05
+    assert np.mean(np.abs(before - after).max(axis=-1) > 1e-3) < 0.01  # rims
+
+
+def _albedo(scene: TracedScene, tensors: SceneTensors) -> NDArray[np.float32]:
+    found = view_inputs(
+        scene.lit,
+        scene.light,
+        tensors.c2w_V44[0].numpy(),
+        float(tensors.fov_deg_V[0]),
+        32,
+        rays_a_side=1,
+        anchors_a_side=8,
+        gather_rays=0,
+    )
+    return np.asarray(found.pixels[..., Channel.DIFFUSE])

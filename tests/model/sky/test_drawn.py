@@ -1,17 +1,28 @@
-"""Directions drawn from a map: as often as there is light, with the density that is stated."""
+"""Skies: directions drawn as their density says, symmetries, and networks that know them."""
 
+import warnings
 from collections.abc import Callable
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
+from model.config import ModelConfig
+from model.neural_renderer import NeuralRenderer
+from model.renderformer import radiance
+from model.scene_tensors import scene_tensors
 from model.sky.drawn import DrawnSky
+from model.sky.symmetries import behind_mirror, scaled, turned, with_channels
 from scene_templates.rotations import uniform_rotation
+from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.lookup import environment_values
 from storage.records.sky_texels import row_solid_angles, texel_means
 from tests.for_each import for_each
+from tests.model.hits.kit import corner
+from tests.model.hits.test_decoder import hits_config
+from tests.model.kit import awake, render, tiny_config
 from tests.sky_maps import as_sky, constant, night, one_sun, six_poles, smooth
 
 TURN = uniform_rotation(np.random.default_rng(3)).astype(np.float32)
@@ -93,3 +104,58 @@ def test_scene_and_sky_turned_together_have_the_same_draws_elsewhere() -> None:
     u = np.random.default_rng(0).random((2, 500), np.float32)
     there = DrawnSky(smooth(rotation=TURN)).drawn(u)
     assert np.abs(TURN @ DrawnSky(smooth()).drawn(u) - there).max() < 1e-6
+
+
+SKY = smooth(rotation=uniform_rotation(np.random.default_rng(8)).astype(np.float32))
+DIRECTIONS = np.random.default_rng(0).normal(size=(500, 3))
+HERE = environment_values(SKY, DIRECTIONS)
+
+
+def test_light_comes_from_where_a_symmetry_puts_it() -> None:
+    """Rotations are kept in float32, by which this sky changes by less than 1e-6."""
+    rotation, sides = uniform_rotation(np.random.default_rng(9)), np.array([-1, 1, 1], np.float32)
+    there = environment_values(turned(SKY, rotation), DIRECTIONS @ rotation.T)
+    assert np.abs(there - HERE).max() < 3e-6
+    mirrored = behind_mirror(SKY, sides)
+    mirrored.check()
+    assert np.abs(environment_values(mirrored, DIRECTIONS * sides) - HERE).max() < 3e-6
+    twice = behind_mirror(mirrored, sides)
+    assert np.array_equal(twice.radiance_rgb, SKY.radiance_rgb)
+    assert np.array_equal(twice.rotation, SKY.rotation)
+    order = np.array([1, 2, 0])
+    assert np.array_equal(environment_values(with_channels(SKY, order), DIRECTIONS), HERE[:, order])
+    assert np.abs(environment_values(scaled(SKY, 3.0), DIRECTIONS) - 3 * HERE).max() < 1e-6
+
+
+@for_each("config", [tiny_config(), hits_config()])
+def test_networks_that_know_no_sky_refuse_it_and_say_so_when_rendering(config: ModelConfig) -> None:
+    network, below = awake(config, torch.float32), corner(sky=smooth())
+    with pytest.raises(TrilightError, match=r"does not know its light.*sky_rays=16.*share=0"):
+        render(network, scene_tensors(below))
+    with pytest.warns(UserWarning, match="does not know: it is missing here"):
+        shown = NeuralRenderer(network).render(below, 32)
+    assert np.array_equal(shown, NeuralRenderer(network).render(corner(), 32))
+
+
+def test_a_sky_that_cameras_see_is_refused_and_left_black() -> None:
+    network = awake(hits_config(sky_rays=2), torch.float32)
+    seen = corner(sky=smooth(is_seen=True))
+    with pytest.raises(TrilightError, match=r"cameras see its environment.*seen_share=0"):
+        render(network, scene_tensors(seen))
+    with pytest.warns(UserWarning, match="networks leave it black"):
+        shown = NeuralRenderer(network).render(seen, 32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hidden = NeuralRenderer(network).render(corner(sky=smooth()), 32)
+    assert np.array_equal(shown, hidden)
+
+
+def test_hits_scale_with_all_light_exactly() -> None:
+    """The sky is in the scene's unit, as lamps are: ten times the light, ten times the picture."""
+    network = awake(hits_config(sky_rays=2), torch.float32)
+    once, tenfold = (
+        radiance(render(network, scene_tensors(corner(radiance=lamp, sky=constant(sky)))).double())
+        for lamp, sky in ((20.0, 0.4), (200.0, 4.0))
+    )
+    # float32 throughout; log10(1 + x) of the darkest pixels has the fewest digits
+    assert ((tenfold - 10 * once).abs() < 2e-4 * tenfold + 2e-5).all()

@@ -1,6 +1,7 @@
-"""A manifest is read in pieces and kept small: the same for any cut, and few bytes a sample."""
+"""Manifests, splits and what is read through them: the same for any cut, and nothing moves."""
 
 import dataclasses
+import hashlib
 import io
 import json
 from pathlib import Path
@@ -10,10 +11,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from storage.conventions import SPLITS
 from storage.dataset import json_pieces
+from storage.dataset.dataset import open_dataset
 from storage.dataset.json_pieces import entries
 from storage.dataset.manifest import decode_head, read_head, read_manifest, write_manifest
+from storage.dataset.settings import SplitSettings
+from storage.dataset.splits import (
+    require_objects,
+    scenes_of_shard,
+    shard_name,
+    shards_for,
+    split_of_object,
+    split_of_shard,
+)
+from storage.errors import TrilightError
+from storage.seeds import rng_for, seed_for
 from tests.for_each import for_each
+from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
 from tests.storage.dataset.manifests_kit import (
     SAMPLES_PER_SHARD,
     memory_of_opening,
@@ -51,7 +66,7 @@ def test_entries_are_those_of_the_object(
 
 @for_each(
     "text",
-    ["", "[]", "3", "{", '{"a"', '{"a": 1', '{"a": 1,}', '{"a": [1,]}', '{"a": [1 2]}',
+    ["", "[]", "{", '{"a"', '{"a": 1', '{"a": 1,}', '{"a": [1,]}', '{"a": [1 2]}',
      '{"a" 1}', "{1: 2}", '{"a": 1} 2', '{"a": tru}', '{"a": [1}', '{"a": 1 "b": 2}'],
 )  # fmt: skip
 def test_what_is_no_object_is_refused(text: str) -> None:
@@ -92,3 +107,90 @@ def test_opening_a_large_dataset_takes_few_bytes_a_sample(tmp_path: Path) -> Non
     write_manifest_of(tmp_path, 100_000)
     taken = memory_of_opening(tmp_path)["peak_bytes"]
     assert taken < 100_000 * 40  # 390 shards; measured: 17, nearly all of it a piece of the text
+
+
+SETTINGS = SplitSettings(scenes_per_shard=4)
+
+
+def _geometry(number: int) -> str:
+    return hashlib.sha256(str(number).encode()).hexdigest()
+
+
+def test_shares_of_objects_are_as_stated() -> None:
+    splits = [split_of_object(_geometry(i), SETTINGS) for i in range(4000)]
+    for split, share in (("train", 0.75), ("validation", 0.125), ("test", 0.125)):
+        # 4000 draws: a standard error of at most 0.007, so 0.03 is over four of them
+        assert abs(splits.count(split) / 4000 - share) < 0.03
+
+
+@given(st.integers(1, 100_000), st.integers(1, 300))
+def test_whole_shards_hold_every_scene(num_scenes: int, scenes_per_shard: int) -> None:
+    settings = SplitSettings(scenes_per_shard=scenes_per_shard)
+    count = shards_for(num_scenes, settings)
+    assert (count - 1) * scenes_per_shard < num_scenes <= count * scenes_per_shard
+    here, following = (scenes_of_shard(index, settings) for index in (count, count + 1))
+    assert here.stop == following.start and len(here) == scenes_per_shard
+
+
+@given(st.integers(0, 1000))
+def test_every_cycle_has_each_split(cycle: int) -> None:
+    first = cycle * SETTINGS.shards_per_cycle
+    splits = [split_of_shard(first + i, SETTINGS) for i in range(SETTINGS.shards_per_cycle)]
+    assert set(splits) == set(SPLITS)
+    assert splits.count("validation") == splits.count("test") == 1
+
+
+def test_a_small_dataset_has_all_splits() -> None:
+    names = [shard_name(index, SETTINGS) for index in range(shards_for(24, SETTINGS))]
+    assert {name.split("-")[0] for name in names} == set(SPLITS)
+
+
+def test_a_split_without_objects_is_one_clear_line() -> None:
+    with pytest.raises(TrilightError, match="split 'validation': none of the 5"):
+        require_objects({"train": 5}, {"train", "validation"})
+    require_objects({"train": 5}, {"train"})
+
+
+@for_each("changes", [{"shards_per_cycle": 5}, {"held_out_objects": 0.5}])
+def test_settings_out_of_range_are_named(changes: dict[str, float]) -> None:
+    with pytest.raises(TrilightError, match=next(iter(changes))):
+        SplitSettings(**{"scenes_per_shard": 4, **changes})  # type: ignore[arg-type]
+
+
+def test_randomness_has_a_name() -> None:
+    first = rng_for(0, "scene", 7, 0).random(4)
+    assert (rng_for(0, "scene", 7, 0).random(4) == first).all()
+    others = [rng_for(0, "scene", 7, 1), rng_for(1, "scene", 7, 0), rng_for(0, "camera", 7, 0)]
+    assert all((other.random(4) != first).all() for other in others)
+    assert rng_for(0, "scene", 70).random() != rng_for(0, "scene", 7, 0).random()
+    assert 0 <= seed_for(0, "samples", 1) < 2**31
+
+
+def test_a_missing_and_a_short_shard_are_named(tmp_path: Path) -> None:
+    dataset = five_scenes(tmp_path)
+    shard = dataset.manifest.shards[0]
+    path = dataset.folder.shard(shard.name)
+    path.write_bytes(path.read_bytes()[:4096])
+    with pytest.raises(TrilightError, match=rf"{shard.name}.*cut short.*trilight verify"):
+        list(dataset.read_scenes(shard))
+    path.unlink()
+    with pytest.raises(TrilightError, match=rf"{shard.name}.*trilight generate"):
+        list(dataset.read_scenes(shard))
+
+
+def test_a_count_that_is_not_the_shard_s_is_named(tmp_path: Path) -> None:
+    dataset = five_scenes(tmp_path)
+    shards = json.loads(dataset.folder.manifest.read_text())["shards"]
+    shards[0]["num_samples"] = 9
+    found = open_dataset(str(edit_manifest(dataset, shards=shards)))
+    with pytest.raises(TrilightError, match=r"[12] samples; expected 9.*trilight verify"):
+        found.keys(found.manifest.shards[0])
+
+
+def test_manifests_of_version_2_are_read_and_others_refused(tmp_path: Path) -> None:
+    dataset = five_scenes(tmp_path)
+    older = open_dataset(str(edit_manifest(dataset, schema_version=2))).manifest
+    assert (older.num_samples, older.schema_version) == (5, 2)
+    edit_manifest(dataset, schema_version=1)
+    with pytest.raises(TrilightError, match=r"manifest.*version 1; .* reads 2, 3, 4 and 5"):
+        open_dataset(str(tmp_path))

@@ -3,11 +3,13 @@
 import dataclasses
 import json
 import os
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from storage.dataset import progress
+from storage.dataset import progress, scene_logs
 from storage.dataset.asked import write_asked
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, read_manifest, write_manifest
@@ -21,21 +23,18 @@ from storage.dataset.progress import (
     read_status,
     tell_views,
 )
-from storage.dataset.scene_logs import log_scene, read_scene_logs
+from storage.dataset.scene_logs import SceneLog, log_scene, look_at_logs, read_scene_logs
 from storage.dataset.shard_notes import note_of
 from storage.errors import TrilightError
 from tests.http_server import serve
 from tests.pipeline.making.test_publication import begin_tiny, make_tiny_shard
 
 
-def test_an_empty_folder_has_no_progress(tmp_path: Path) -> None:
-    now = read_progress(DatasetFolder(tmp_path))
+def test_downloads_and_objects_are_counted_from_the_start_of_each_run(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path)
+    now = read_progress(folder)
     assert (now.downloads_planned, now.objects_planned, now.scenes_planned) == (0, 0, 0)
     assert (now.downloads_done, now.objects_done, now.scenes_done) == (0, 0, 0)
-
-
-def test_downloads_and_objects_are_counted(tmp_path: Path) -> None:
-    folder = DatasetFolder(tmp_path)
     announce_downloads(folder, 2, 5)
     announce_objects(folder, 4)
     for _ in range(3):
@@ -45,12 +44,6 @@ def test_downloads_and_objects_are_counted(tmp_path: Path) -> None:
     assert (now.objects_done, now.objects_planned) == (3, 4)
     count_object(folder, 4)  # another maker found them done
     assert read_progress(folder).objects_done == 4
-
-
-def test_a_new_run_counts_from_the_start(tmp_path: Path) -> None:
-    folder = DatasetFolder(tmp_path)
-    announce_objects(folder, 4)
-    count_object(folder)
     announce_objects(folder, 7)
     now = read_progress(folder)
     assert (now.objects_done, now.objects_planned) == (0, 7)
@@ -106,6 +99,7 @@ def test_shards_scenes_and_what_to_do_next(tmp_path: Path) -> None:
     publication = begin_tiny(tmp_path, 12)
     make_tiny_shard(publication, 1)
     found = read_status(str(tmp_path))
+    assert list(read_scene_logs(publication.folder)) == [] and found.views_per_hour is None
     assert (found.shards_done, found.shards_planned) == (1, 3)
     assert (found.scenes_done, found.scenes_planned) == (4, 12)
     assert not found.finished
@@ -153,12 +147,6 @@ def test_rate_and_cost_are_those_of_the_logs(tmp_path: Path) -> None:
     assert found.last_scene_unix_s == 1010.0
 
 
-def test_logs_without_rows_say_nothing(tmp_path: Path) -> None:
-    begin_tiny(tmp_path, 4)
-    assert list(read_scene_logs(DatasetFolder(tmp_path))) == []
-    assert read_status(str(tmp_path)).views_per_hour is None
-
-
 def test_a_manifest_that_does_not_say_how_it_is_divided_is_a_mistake_in_words(
     tmp_path: Path,
 ) -> None:
@@ -169,3 +157,37 @@ def test_a_manifest_that_does_not_say_how_it_is_divided_is_a_mistake_in_words(
         write_manifest(path, dataclasses.replace(manifest, settings=settings))
         with pytest.raises(TrilightError):
             read_status(str(tmp_path))
+
+
+def _write_log(folder: DatasetFolder, number: int, *, end_s: float) -> None:
+    """Write a log of two scenes of 10 s on two cores, and of a row that a kill has cut."""
+    path = folder.logs / f"part-{number // 8:04d}" / f"train-{number:06d}.tar.jsonl"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = [{"seconds": 10.0, "cores": 2, "finished_unix_s": end_s + at} for at in (0.0, 5.0)]
+    path.write_text("".join(f"{json.dumps(row)}\n" for row in rows) + '{"seconds": 1')
+    os.utime(path, (end_s + 5.0, end_s + 5.0))
+
+
+def test_of_many_logs_few_are_read_and_the_last_scenes_are_all_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = DatasetFolder(tmp_path)
+    assert look_at_logs(folder).core_s is None
+    ends_s = [1000.0 + 7.0 * ((5 * number) % 24) for number in range(24)]  # in no order
+    for number, end_s in enumerate(ends_s):
+        _write_log(folder, number, end_s=end_s)
+    (folder.logs / "asked.json").write_text("[]")
+    every = look_at_logs(folder)
+    assert every.core_s == 24 * 2 * 10 * 2 and len(every.last) == 48
+    read, decode = Counter[str](), scene_logs.decode_scene_log
+
+    def counted(text: str) -> Iterator[SceneLog]:
+        read["logs"] += 1
+        return decode(text)
+
+    monkeypatch.setattr(scene_logs, "decode_scene_log", counted)
+    monkeypatch.setattr(scene_logs, "LAST_SCENES", 5)
+    monkeypatch.setattr(scene_logs, "MOST_LOGS", 6)
+    some = look_at_logs(folder)
+    assert read["logs"] == 5 + 6 and some.core_s == every.core_s
+    assert some.last == every.last[-5:]

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from storage.dataset.dataset import Dataset
 from storage.dataset.shard import write_shard
 from storage.dataset.shard_places import expanded, listed_shards
 from storage.dataset.training_data import open_training_data
@@ -39,12 +38,8 @@ def test_patterns(pattern: str, names: list[str]) -> None:
     ("patterns", "message"),
     [
         (["pipe:touch x; echo a.tar"], "pipe: command"),
-        (["{pipe,file}:a.tar"], "pipe: command"),
         (["http://h/a.tar::http://h/b.tar"], "chained"),
-        (["simplecache::s3://b/a.tar"], "chained"),
         (["http://h/{a,b::c}.tar"], "chained"),
-        (["ftp://h/a.tar"], "'ftp'"),
-        (["memory://a.tar"], "'memory'"),
         (["a-{1..3.tar"], "brace is not closed"),
         (["{a,{b,c}}.tar"], "within another"),
         (["{3..1}.tar"], "backwards"),
@@ -110,28 +105,10 @@ def _continued(path: Path) -> None:
     write_shard(path, [("000000001", {"1.exr": members["1.exr"]})])
 
 
-def _linked(path: Path) -> None:
-    with tarfile.open(path, "w") as archive:
-        link = tarfile.TarInfo("000000009.json")
-        link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
-        archive.addfile(link)
-
-
-def _above(path: Path) -> None:
-    with tarfile.open(path, "w") as archive:
-        archive.addfile(tarfile.TarInfo("../000000009.json"))
-
-
 def _extended(path: Path) -> None:
     """An extended header that claims a terabyte: nobody may take memory for it."""
     header = tarfile.TarInfo("000000009.json")
     header.type, header.size = tarfile.XHDTYPE, 1 << 40
-    path.write_bytes(header.tobuf(tarfile.GNU_FORMAT) + bytes(4096))
-
-
-def _huge(path: Path) -> None:
-    header = tarfile.TarInfo("000000009.json")
-    header.size = 1 << 40
     path.write_bytes(header.tobuf(tarfile.GNU_FORMAT) + bytes(4096))
 
 
@@ -147,10 +124,7 @@ HOSTILE = {
     "cut short": (_cut, "cut short"),
     "a key of another shard": (_same_key, "sample 000000000 is in another shard too"),
     "members of another shard's sample": (_continued, "000000001 is in another shard too"),
-    "a link": (_linked, "refused"),
-    "a path": (_above, "refused"),
     "an extended header": (_extended, "refused"),
-    "a huge member": (_huge, "claims 1099511627776 bytes"),
     "a pickle": (_pickled, "000000009.json is not JSON"),
 }
 
@@ -184,21 +158,19 @@ def test_hostile_shards_are_refused_and_run_nothing(
     spoil(tmp_path / "train-000002.tar")
     shards = open_training_data([f"{tmp_path}/train-{{000000,000002}}.tar"]).split("train")
     before = sorted(path.name for path in tmp_path.iterdir())
-    _read_all(tmp_path, 0)  # what is imported on the way compiles, so once before
-    with audited() as seen:
-        shards.open(0).close()
-        with pytest.raises(TrilightError, match=message), closing(shards.open(1)) as shard:
+
+    def read_all(number: int) -> None:
+        with closing(shards.open(number)) as shard:
             for row in range(len(shard.keys)):
                 shard.sample(row)
+
+    read_all(0)  # what is imported on the way compiles, so once before
+    with audited() as seen:
+        shards.open(0).close()
+        with pytest.raises(TrilightError, match=message):
+            read_all(1)
     assert not seen
     assert sorted(path.name for path in tmp_path.iterdir()) == before
-
-
-def _read_all(folder: Path, number: int) -> None:
-    shards = open_training_data([f"{folder}/train-00000{number}.tar"]).split("train")
-    with closing(shards.open(0)) as shard:
-        for row in range(len(shard.keys)):
-            shard.sample(row)
 
 
 def test_the_hook_would_notice(tmp_path: Path) -> None:
@@ -222,18 +194,15 @@ def test_an_unreadable_sample_is_named_with_its_shard(tmp_path: Path) -> None:
         shard.sample(0)
 
 
-def edited(dataset: Dataset, old: str, new: str) -> list[str]:
-    path = dataset.folder.manifest
-    path.write_text(path.read_text().replace(old, new))
-    return [str(dataset.folder.root)]
-
-
 def test_hostile_manifests_are_refused(tmp_path: Path) -> None:
-    for name in ("../train-000000.tar", "/etc/passwd", "pipe:train-000000.tar", "a/b.tar"):
-        dataset = five_scenes(tmp_path)
+    dataset = five_scenes(tmp_path)
+    path = dataset.folder.manifest
+    text = path.read_text()
+    for name in ("../train-000000.tar", "/etc/passwd", "pipe:train-000000.tar", "a/b.tar", "x"):
+        path.write_text(text.replace("train-000000.tar", name))
         with pytest.raises(TrilightError, match="not a readable manifest"):
-            open_training_data(edited(dataset, "train-000000.tar", name))
+            open_training_data([str(tmp_path)])
     for content in ("[" * 100_000, "[]", "{}", "3", '{"schema_version": 3}', "\\"):
-        dataset.folder.manifest.write_text(content)
+        path.write_text(content)
         with pytest.raises(TrilightError, match="manifest"):
             open_training_data([str(tmp_path)])

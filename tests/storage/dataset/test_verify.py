@@ -1,41 +1,58 @@
-"""Verifying: every bad shard and sample is named, and nothing that is whole."""
+"""Verifying: every bad shard, sample and map is named, and nothing that is whole."""
 
 import dataclasses
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.manifest import index_shard, write_manifest
 from storage.dataset.shard import write_shard
-from storage.dataset.verify import verify_dataset
+from storage.dataset.verify import Verification, verify_dataset
 from storage.digests import sha256_hex
-from storage.records.sample import encode_sample
-from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
+from storage.errors import TrilightError
+from storage.records.map_references import map_member
+from storage.records.packed_maps import pack_environment, pack_texture
+from storage.records.sample import encode_sample, sample_key
+from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes, write_dataset
+from tests.storage.dataset.test_shard import TRAIN, four_samples
+from tests.textured_by_hand import colour_texture, number_texture, sky, textured_sample
 
 
-@pytest.fixture
-def dataset(tmp_path: Path) -> Dataset:
-    made = five_scenes(tmp_path)
+def opened(made: Dataset) -> Dataset:
     digest = sha256_hex(made.folder.objects_lock.read_bytes())
     return open_dataset(str(edit_manifest(made, objects_lock_sha256=digest)))
 
 
-def rewrite(dataset: Dataset, name: str, change: Callable[[str, dict[str, bytes]], str]) -> None:
-    """Pack a shard anew with changed members, and have the manifest agree."""
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    return opened(five_scenes(tmp_path))
+
+
+def rewrite(
+    dataset: Dataset,
+    name: str,
+    change: Callable[[str, dict[str, bytes]], object],
+    key: Callable[[str], str] = str,
+) -> Verification:
+    """Pack a shard anew with changed members, have the manifest agree, and verify."""
     (entry,) = [shard for shard in dataset.manifest.shards if shard.name == name]
     samples = []
     for sample in dataset.read_shard(entry):
         members = encode_sample(sample)
-        samples.append((change(sample.key, members), members))
+        change(sample.key, members)
+        samples.append((key(sample.key), members))
     dataset.folder.shard(name).unlink()  # a shard is never written over
     write_shard(dataset.folder.shard(name), samples)
     shards = tuple(
         index_shard(dataset.folder.shard(shard.name)) for shard in dataset.manifest.shards
     )
     write_manifest(dataset.folder.manifest, dataclasses.replace(dataset.manifest, shards=shards))
+    return verify_dataset(dataset.folder.root)
 
 
 def test_a_whole_dataset_has_no_fault_and_every_shard_is_looked_at(dataset: Dataset) -> None:
@@ -47,14 +64,12 @@ def test_a_whole_dataset_has_no_fault_and_every_shard_is_looked_at(dataset: Data
 
 
 def test_every_bad_sample_of_every_bad_shard_is_named(dataset: Dataset) -> None:
-    def spoil(key: str, members: dict[str, bytes]) -> str:
+    def spoil(key: str, members: dict[str, bytes]) -> None:
         if key in ("000000000", "000000001", "000000003"):
             members["0.exr"] = b"no picture"
-        return key
 
     rewrite(dataset, "train-000000.tar", spoil)
-    rewrite(dataset, "train-000001.tar", spoil)
-    found = verify_dataset(dataset.folder.root)
+    found = rewrite(dataset, "train-000001.tar", spoil)
     assert found.bad_shards == ["train-000000.tar", "train-000001.tar"]
     named = [problem.split(":")[:2] for problem in found.problems]
     assert named == [
@@ -66,8 +81,7 @@ def test_every_bad_sample_of_every_bad_shard_is_named(dataset: Dataset) -> None:
 
 
 def test_a_key_in_two_shards_is_named(dataset: Dataset) -> None:
-    rewrite(dataset, "train-000001.tar", lambda key, _: key.replace("2", "0"))
-    found = verify_dataset(dataset.folder.root)
+    found = rewrite(dataset, "train-000001.tar", lambda *_: None, lambda key: key.replace("2", "0"))
     assert found.bad_shards == ["train-000001.tar"]
     assert "sample 000000000 occurs twice in the dataset, first in" in found.problems[0]
 
@@ -119,3 +133,80 @@ def test_a_manifest_that_does_not_say_what_its_pictures_are_is_a_fault(
     write_manifest(dataset.folder.manifest, manifest)
     problems = verify_dataset(dataset.folder.root).problems
     assert any("pictures (" in problem for problem in problems)
+
+
+SKY, COLOURS, ROUGHNESS = (
+    map_member(each.sha256) for each in (sky(), colour_texture(), number_texture())
+)
+Change = Callable[[str, dict[str, bytes]], object]
+
+
+@pytest.fixture
+def mapped(tmp_path: Path) -> Dataset:
+    made = write_dataset(
+        tmp_path, {TRAIN: four_samples(), "test-000001.tar": [textured_sample("000000004")]}
+    )
+    return opened(made)
+
+
+def _with_sky(value: float) -> Change:
+    """Return a change to a sky of one wrong value, named as its content is."""
+    other = sky(radiance_rgb=np.full((2, 4, 3), value, np.float32))
+
+    def change(_: str, members: dict[str, bytes]) -> None:
+        if members.pop(SKY, None) is not None:
+            members["json"] = members["json"].replace(sky().sha256.encode(), other.sha256.encode())
+            members[map_member(other.sha256)] = pack_environment(other)
+
+    return change
+
+
+def _with_bytes(name: str, damage: Callable[[bytes], bytes]) -> Change:
+    def change(_: str, members: dict[str, bytes]) -> None:
+        if name in members:
+            members[name] = damage(members[name])
+
+    return change
+
+
+DAMAGED: dict[str, tuple[Change, str, tuple[int, ...]]] = {
+    "missing": (
+        lambda _, members: members.pop(ROUGHNESS, None),
+        "is missing; expected a member __map-",
+        (1, 2, 3),
+    ),
+    "other colours": (
+        _with_bytes(COLOURS, lambda _: pack_texture(colour_texture(2))),
+        "has the content",
+        (1, 2),
+    ),
+    "cut": (_with_bytes(SKY, lambda data: data[:-10]), "cut short", (1, 2)),
+    "another sky": (
+        _with_bytes(SKY, lambda _: pack_environment(sky(1))),
+        "has the content",
+        (1, 2),
+    ),
+    "NaN": (_with_sky(np.nan), r"radiance_rgb\[0, 0, 0\] is nan; expected finite", (1, 2)),
+    "too bright": (_with_sky(1e10), "expected finite values from 0 to 1e", (1, 2)),
+}
+"""What is done to a map, what is said of it, and of which samples."""
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_wrong_map_is_a_finding_of_each_sample_that_has_it(mapped: Dataset, name: str) -> None:
+    """Of those that read for people too: `inspect` ends with one line that names the sample."""
+    assert verify_dataset(mapped.folder.root).problems == []
+    change, message, rows = DAMAGED[name]
+    problems = rewrite(mapped, TRAIN, change).problems
+    assert [line.split(": ")[1] for line in problems] == [f"sample {sample_key(k)}" for k in rows]
+    assert all(re.search(message, line) for line in problems), problems
+    with pytest.raises(TrilightError, match="trilight verify") as caught:
+        list(open_dataset(str(mapped.folder.root)).scenes())
+    assert re.search(message, str(caught.value)) and sample_key(1) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_map_that_nobody_uses_is_a_finding(mapped: Dataset) -> None:
+    unused = map_member("0" * 64)
+    found = rewrite(mapped, TRAIN, lambda _, members: members.update({unused: b"x"}))
+    assert found.problems == [f"{TRAIN}: map {unused} is used by no sample"]

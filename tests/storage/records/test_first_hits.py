@@ -1,4 +1,4 @@
-"""What pixels see: against a search through all triangles, and in closed form."""
+"""What rays and pixels see: against a search through all triangles, and in closed form."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,9 @@ from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import TrilightError
 from storage.records.first_hits import FirstHits, SeenFrom, first_hits
 from storage.records.scene import Scene
-from storage.records.surfaces import MISS
+from storage.records.surfaces import MISS, Surfaces
 from tests.for_each import for_each
+from tests.pipeline.renders.scene_kit import join, light
 from tests.scenes_by_hand import tiny_scene
 
 RESOLUTION = 24
@@ -181,3 +182,45 @@ def test_what_is_not_there_is_named() -> None:
         first_hits(tiny_scene(), view=2)
     with pytest.raises(TrilightError, match="pixel column is 8; expected 0 to 7"):
         first_hits(tiny_scene(), resolution=8, pixel=(0, 8))
+
+
+DOWN = np.array([[0, 0, -1]], np.float32)
+
+
+def test_rays_from_both_sides_and_past_the_floor() -> None:
+    origins = np.array([[0.5, -0.2, 3], [0.5, -0.2, -3], [5, 0, 3]], np.float32)
+    met = Surfaces(tiny_scene()).met(origins, np.array([[0, 0, -2], [0, 0, 1], [0, 0, -1]], "f4"))
+    assert met.triangle.tolist() == [0, 0, MISS]
+    # in lengths of the direction; processors of other vector widths round the last bits otherwise
+    np.testing.assert_allclose(met.distance_m[:2], [1.5, 3], rtol=4 * 2**-23)
+    assert (met.normal[:2, 2] > 0).all() and not met.normal[:2, :2].any()
+
+
+def test_rows_are_those_of_the_scene_where_lights_stand_first() -> None:
+    scene = tiny_scene()
+    order = [2, 0, 1]
+    moved = tiny_scene(
+        faces=scene.faces[order],
+        material_index=scene.material_index[order],
+        object_index=scene.object_index[order],
+    )
+    above = np.array([[0, 0, 3], [0.5, -0.2, 3], [-0.5, 0.2, 3]], np.float32)
+    met = Surfaces(moved).met(above, np.repeat(DOWN, 3, axis=0))
+    assert met.triangle[1:].tolist() == [1, 2]
+    assert met.triangle[0] in (1, 2), "the lamp lets rays pass"
+
+
+def test_what_is_free() -> None:
+    origins = np.repeat(np.array([[0.5, -0.2, 3]], np.float32), 3, axis=0)
+    free = Surfaces(tiny_scene()).is_free(
+        origins, np.repeat(DOWN, 3, axis=0), np.array([2.9, 3.1, 1e9], np.float32)
+    )
+    assert free.tolist() == [True, False, False]
+
+
+def test_lights_alone() -> None:
+    surfaces = Surfaces(join([light([[-1, 0, -1], [1, 0, -1], [0, 0, 1]], 1.0)]))
+    origin = np.array([[0, 1, 0]], np.float32)
+    toward = np.array([[0, -1, 0]], np.float32)
+    assert surfaces.met(origin, toward).triangle.tolist() == [MISS]
+    assert surfaces.is_free(origin, toward, np.array([9], np.float32)).all()

@@ -1,4 +1,4 @@
-"""Look-ups against obvious twins: loops over texels, and the six directions of a map."""
+"""Look-ups and facts of maps against obvious twins: loops over texels, and closed forms."""
 
 import math
 
@@ -8,10 +8,11 @@ import pytest
 from storage.conventions import latlong_direction, latlong_uv, srgb8
 from storage.records.environment import Environment
 from storage.records.lookup import environment_values, texture_values, textured_rows
+from storage.records.map_facts import SkyFacts, sky_facts, texture_families, textured_objects
 from storage.records.material import DIFFUSE, ROUGHNESS
-from storage.records.texture import Texture
+from storage.records.texture import MapSource, Texture
 from tests.for_each import for_each
-from tests.scenes_by_hand import FLOOR, LIGHT
+from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import colour_texture, number_texture, sky, textured_scene
 
 SIX = {"+X": (1, 0, 0), "-X": (-1, 0, 0), "+Y": (0, 1, 0), "-Y": (0, -1, 0), "+Z": (0, 0, 1),
@@ -146,3 +147,47 @@ def test_far_coordinates_lose_no_digits() -> None:
     far = texture_values(colour_texture(), np.array([1023.125, -1023.875], np.float32))
     assert (far == texture_values(colour_texture(), (0.125, 0.125))).all()
     assert math.isfinite(far.sum())
+
+
+HEIGHT = 90
+
+
+def facts(radiance: np.ndarray) -> SkyFacts:
+    return sky_facts(Environment(radiance_rgb=radiance.astype(np.float32)))
+
+
+def test_a_constant_sky_has_half_of_its_light_in_half_of_the_sphere() -> None:
+    found = facts(np.full((HEIGHT, 2 * HEIGHT, 3), 0.7))
+    assert found.mean_radiance == pytest.approx(0.7, rel=1e-6)
+    assert found.peak == pytest.approx(1, rel=1e-6)
+    # half of the sphere is the cone of 180 degrees across; 1e-4 is the rounding of float32 radiance
+    assert found.half_light_deg == pytest.approx(180, abs=1e-3)
+
+
+def test_half_of_a_sphere_and_one_texel() -> None:
+    """A lit upper half has half of its light in 2 pi / 2 steradians: 120 degrees across."""
+    half = np.zeros((HEIGHT, 2 * HEIGHT, 3))
+    half[: HEIGHT // 2] = [3, 2, 1]
+    found = facts(half)
+    assert (found.mean_radiance, found.peak) == (pytest.approx(1), pytest.approx(2))
+    assert found.half_light_deg == pytest.approx(120, abs=1e-3)
+    sun = np.zeros((HEIGHT, 2 * HEIGHT, 3))
+    sun[HEIGHT // 2, 17] = 1e6
+    texel = np.sin(np.pi / HEIGHT) * np.pi / HEIGHT  # steradians, from the equator down
+    found = facts(sun)
+    assert found.mean_radiance == pytest.approx(1e6 * texel / (4 * np.pi), rel=1e-6)
+    across = np.degrees(2 * np.arccos(1 - texel / 2 / (2 * np.pi)))
+    assert found.half_light_deg == pytest.approx(across, rel=1e-6)
+    assert facts(np.zeros((2, 4, 3))) == SkyFacts(mean_radiance=0, peak=0, half_light_deg=0)
+
+
+def test_what_textures_are_called_and_where_they_are() -> None:
+    named = Texture(texels=colour_texture().texels, source=MapSource(name="fine planks diffuse"))
+    other = Texture(texels=np.zeros((1, 2, 1), np.uint8), source=MapSource(name="worn by hand"))
+    scene = textured_scene(0, named, other)
+    assert texture_families(scene) == {"fine planks", "worn by hand"}
+    assert textured_objects(scene) == set(
+        np.unique(scene.object_index[scene.material_index == FLOOR])
+    )
+    plain = tiny_scene(environment=sky())
+    assert texture_families(plain) == textured_objects(plain) == set()

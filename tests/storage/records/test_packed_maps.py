@@ -1,10 +1,12 @@
-"""Maps as bytes: the same again, once each, and nothing that a hostile file claims is believed."""
+"""Maps as bytes: the same again, held once each, and nothing that a hostile file claims."""
 
 import dataclasses
 import gzip
 import json
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -13,13 +15,16 @@ from safetensors.numpy import load, save
 
 from storage.conventions import MAPS_VERSION, SCHEMA_VERSION
 from storage.errors import TrilightError
-from storage.records.map_references import MAP_NAME, map_member
+from storage.records import packed_maps
+from storage.records.environment import Environment
+from storage.records.held_maps import HeldMaps, with_same_content
+from storage.records.map_references import map_member
 from storage.records.packed_maps import pack_environment, pack_texture
 from storage.records.profiles import PROFILES, Profile
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import decode_scene_file, encode_scene
-from storage.records.texture import MAX_MAPS_BYTES, Texture
+from storage.records.texture import MAX_MAPS_BYTES, MapSource, Texture
 from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 from tests.textured_by_hand import (
@@ -51,20 +56,23 @@ def require_same(found: Scene, scene: Scene) -> None:
         assert (one.is_seen, one.source) == (other.is_seen, other.source)
 
 
+HALVES = Texture(texels=np.array([[[0.5]], [[0.25]]], np.float32))
 SCENES = {
     "textured": textured_scene(),
     "sky": tiny_scene(environment=sky(is_seen=True)),
     "both": textured_scene(environment=sky()),
-    "halves": textured_scene(
-        0, colour_texture(), Texture(texels=np.array([[[0.5]], [[0.25]]], np.float32))
-    ),
-}  # fmt: skip
+    "halves": textured_scene(0, colour_texture(), HALVES),
+}
 
 
 @for_each("profile", PROFILES)
 @for_each("name", SCENES)
-def test_a_sample_comes_back(name: str, profile: Profile) -> None:
+def test_a_sample_and_a_scene_file_come_back(name: str, profile: Profile) -> None:
     sample = dataclasses.replace(tiny_sample(), scene=SCENES[name])
+    data = encode_scene(sample.scene)
+    found = decode_scene_file(data, "a.safetensors")
+    require_same(found, sample.scene)
+    assert encode_scene(found) == data
     members = encode_sample(sample, profile)
     assert members == encode_sample(sample, profile)
     assert json.loads(members["json"])["schema_version"] == MAPS_VERSION == 4
@@ -74,14 +82,6 @@ def test_a_sample_comes_back(name: str, profile: Profile) -> None:
     assert encode_sample(dataclasses.replace(back, kept_members={}), "lossless") == encode_sample(
         dataclasses.replace(back, scene=sample.scene), "lossless"
     )
-
-
-@for_each("name", SCENES)
-def test_a_scene_file_comes_back(name: str) -> None:
-    data = encode_scene(SCENES[name])
-    back = decode_scene_file(data, "a.safetensors")
-    require_same(back, SCENES[name])
-    assert encode_scene(back) == data
 
 
 def test_scenes_without_maps_are_what_they_were() -> None:
@@ -109,16 +109,11 @@ def test_floats_are_stored_in_halves_only_where_nothing_is_lost() -> None:
     def dtype(data: bytes) -> str:
         return str(load(gzip.decompress(data))["values"].dtype)
 
-    halves = np.array([[[0.5], [0.25]]], np.float32)
-    assert dtype(pack_texture(Texture(texels=halves))) == "float16"
+    assert dtype(pack_texture(HALVES)) == "float16"
     assert dtype(pack_texture(number_texture())) == "float32"
     assert dtype(pack_environment(sky())) == "float32"  # its sun of 1e6 is beyond half floats
     dim = sky(radiance_rgb=np.full((1, 2, 3), 7, np.float32))
     assert dtype(pack_environment(dim)) == "float16"
-
-
-def _names(members: Members) -> list[str]:
-    return [name for name in members if MAP_NAME.fullmatch(name)]
 
 
 def _record(change: Callable[[dict[str, Any]], None]) -> Callable[[Members], None]:
@@ -128,6 +123,15 @@ def _record(change: Callable[[dict[str, Any]], None]) -> Callable[[Members], Non
         members["json"] = json.dumps(record).encode()
 
     return changed
+
+
+def _entry(kind: str, **fields: Any) -> Callable[[Members], None]:
+    """Change what the record says of the first texture, or of the environment."""
+
+    def change(maps: dict[str, Any]) -> None:
+        (maps["environment"] if kind == "environment" else maps["textures"][0]).update(fields)
+
+    return _record(change)
 
 
 def _texture_bytes(change: Callable[[bytes], bytes]) -> Callable[[Members], None]:
@@ -162,71 +166,57 @@ def _drop_maps(members: Members) -> None:
     members["json"] = json.dumps(record).encode()
 
 
-HOSTILE: dict[str, tuple[Callable[[Members], object], str]] = {
-    "missing": (lambda m: m.pop(_names(m)[0]), "is missing; expected a member __map-"),
-    "of other content": (_texture_bytes(_other_values), "has the content"),
-    "noise": (_texture_bytes(lambda _: b"noise"), "damaged"),
-    "empty": (_texture_bytes(lambda _: b""), "no safetensors file"),
-    "cut short": (_texture_bytes(lambda data: data[:-9]), "cut short"),
-    "with more behind": (_texture_bytes(lambda data: data + b"x"), "goes on"),
-    "huge": (_texture_bytes(_claiming([16384, 16384, 3])), f"at most {MAX_MAPS_BYTES}"),
-    "huger": (_texture_bytes(_claiming([2**40, 2**40, 3])), "a picture of 8 bits or floats"),
-    "negative": (_texture_bytes(_claiming([-1, -1, 3])), "a picture"),
-    "flat": (_texture_bytes(_claiming([4, 6])), "a picture"),
-    "lying": (_texture_bytes(_claiming([4, 6, 3])), "unreadable"),
-    "in doubles": (_texture_bytes(_claiming([4, 6, 3], "F64")), "a picture"),
-    "a texture as a sky": (
-        _record(lambda maps: maps["environment"].update(sha256=colour_texture().sha256)),
-        "expected an environment map",
-    ),
-    "a sky as a texture": (
-        _record(lambda maps: maps["textures"][0].update(sha256=sky().sha256)),
-        "expected a texture",
-    ),
-    "a path as a name": (
-        _record(lambda maps: maps["textures"][0].update(sha256="../" * 20)), "64 hexadecimal"
-    ),
-    "no name": (_record(lambda maps: maps["textures"][0].pop("sha256")), "exactly the fields"),
-    "a number as a name": (
-        _record(lambda maps: maps["textures"][0].update(name=3)), "expected text"
-    ),
-    "textures of another kind": (_record(lambda maps: maps.update(textures=3)), "a list"),
-    "an entry more": (_record(lambda maps: maps.update(more=1)), "textures, environment, or both"),
-    "a rotation of words": (
-        _record(lambda maps: maps["environment"].update(rotation=[["a"] * 3] * 3)), "three rows"
-    ),
-    "half a rotation": (
-        _record(lambda maps: maps["environment"].update(rotation=[[1, 0, 0]])), "three rows"
-    ),
-    "a number as truth": (
-        _record(lambda maps: maps["environment"].update(is_seen=1)), "true or false"
-    ),
-    "another rotation than that of the arrays": (
-        _record(lambda maps: maps["environment"].update(rotation=np.eye(3).tolist())),
-        "do not speak of the same",
-    ),
-    "no maps in the record": (_drop_maps, "do not speak of the same"),
-    "maps of version 3": (
+HOSTILE: list[tuple[Callable[[Members], object], str]] = [
+    (lambda m: m.pop(map_member(sky().sha256)), "is missing; expected a member __map-"),
+    (_texture_bytes(_other_values), "has the content"),
+    (_texture_bytes(lambda _: b"noise"), "damaged"),
+    (_texture_bytes(lambda _: b""), "no safetensors file"),
+    (_texture_bytes(lambda data: data[:-9]), "cut short"),
+    (_texture_bytes(lambda data: data[:60] + b"\xff" + data[61:]), "damaged"),
+    (_texture_bytes(lambda data: data + b"x"), "goes on"),
+    (_texture_bytes(_claiming([16384, 16384, 3])), f"at most {MAX_MAPS_BYTES}"),
+    (_texture_bytes(_claiming([2**40, 2**40, 3])), "a picture of 8 bits or floats"),
+    (_texture_bytes(_claiming([-1, -1, 3])), "a picture"),
+    (_texture_bytes(_claiming([4, 6])), "a picture"),
+    (_texture_bytes(_claiming([4, 6, 3])), "unreadable"),
+    (_texture_bytes(_claiming([4, 6, 3], "F64")), "a picture"),
+    (_entry("environment", sha256=colour_texture().sha256), "expected an environment map"),
+    (_entry("texture", sha256=sky().sha256), "expected a texture"),
+    (_entry("texture", sha256="../" * 20), "64 hexadecimal"),
+    (_record(lambda maps: maps["textures"][0].pop("sha256")), "exactly the fields"),
+    (_entry("texture", name=3), "expected text"),
+    (_record(lambda maps: maps.update(textures=3)), "a list"),
+    (_record(lambda maps: maps.update(more=1)), "textures, environment, or both"),
+    (_entry("environment", rotation=[["a"] * 3] * 3), "three rows"),
+    (_entry("environment", rotation=[[1, 0, 0]]), "three rows"),
+    (_entry("environment", is_seen=1), "true or false"),
+    (_entry("environment", rotation=np.eye(3).tolist()), "do not speak of the same"),
+    (_drop_maps, "do not speak of the same"),
+    (
         lambda m: m.update(json=m["json"].replace(b'"schema_version":4', b'"schema_version":3')),
         "expected 4 exactly where there are any",
     ),
-}  # fmt: skip
+]
 
 
-@for_each("name", HOSTILE)
-def test_a_hostile_sample_is_one_line(name: str) -> None:
-    change, message = HOSTILE[name]
-    members = encode_sample(textured_sample())
-    change(members)
+@contextmanager
+def little_memory() -> Iterator[None]:
+    """A few buffers; the textures here are of 72 bytes."""
     tracemalloc.start()
     try:
-        with pytest.raises(TrilightError, match=message) as caught:
-            decode_sample(KEY, members)
-        _, peak = tracemalloc.get_traced_memory()
+        yield
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
     finally:
         tracemalloc.stop()
+
+
+@for_each(("change", "message"), HOSTILE)
+def test_a_hostile_sample_is_one_line(change: Callable[[Members], object], message: str) -> None:
+    members = encode_sample(textured_sample())
+    change(members)
+    with little_memory(), pytest.raises(TrilightError, match=message) as caught:
+        decode_sample(KEY, members)
     assert str(caught.value).startswith("sample 000000000: ") and "\n" not in str(caught.value)
-    assert peak < 8 << 20  # a few buffers; the texture is of 72 bytes
 
 
 def test_maps_are_counted_before_they_are_unpacked() -> None:
@@ -240,46 +230,34 @@ def test_maps_are_counted_before_they_are_unpacked() -> None:
     record["maps"] = {"textures": [{"sha256": digit * 64, **rights} for digit in "01"]}
     members |= {map_member(digit * 64): packed for digit in "01"}
     members["json"] = json.dumps(record).encode()
-    tracemalloc.start()
-    try:
-        with pytest.raises(TrilightError, match=f"expected at most {MAX_MAPS_BYTES}"):
-            decode_sample(KEY, members)
-        assert tracemalloc.get_traced_memory()[1] < 8 << 20
-    finally:
-        tracemalloc.stop()
+    expected = f"expected at most {MAX_MAPS_BYTES}"
+    with little_memory(), pytest.raises(TrilightError, match=expected):
+        decode_sample(KEY, members)
 
 
-SCENE_FILES: dict[str, tuple[Callable[[dict[str, Any], dict[str, Any]], object], str]] = {
-    "an array less": (lambda arrays, _: arrays.pop("texture.1"), "texture.1 is missing"),
-    "an array more": (
-        lambda arrays, _: arrays.update({"texture": np.zeros(1, np.uint8)}), "expected: 'texture'"
-    ),
-    "texels in doubles": (
-        lambda arrays, _: arrays.update({"texture.0": np.zeros((1, 1, 3))}), "expected U8 or F16"
-    ),
-    "other texels": (
-        lambda arrays, _: arrays.update({"texture.0": arrays["texture.0"] ^ 1}), "has the content"
-    ),
-    "radiance of NaN": (
-        lambda arrays, _: arrays.update(
-            environment=np.full((1, 2, 3), np.nan, np.float32)
-        ),
-        "is nan",
-    ),
-    "sRGB said of one alone": (
-        lambda _, record: record.update(is_srgb=[True]), "for each texture"
-    ),
-    "no word of maps": (lambda _, record: record.pop("maps"), "exactly where there are any"),
-    "no word of maps, and an older version": (
+def _arrays(**changed: Any) -> Callable[[dict[str, Any], dict[str, Any]], None]:
+    return lambda arrays, _: arrays.update(changed)
+
+
+SCENE_FILES: list[tuple[Callable[[dict[str, Any], dict[str, Any]], object], str]] = [
+    (lambda arrays, _: arrays.pop("texture.1"), "texture.1 is missing"),
+    (_arrays(texture=np.zeros(1, np.uint8)), "expected: 'texture'"),
+    (_arrays(**{"texture.0": np.zeros((1, 1, 3))}), "expected U8 or F16"),
+    (_arrays(**{"texture.0": colour_texture(1).texels}), "has the content"),
+    (_arrays(environment=np.full((1, 2, 3), np.nan, np.float32)), "is nan"),
+    (lambda _, record: record.update(is_srgb=[True]), "for each texture"),
+    (lambda _, record: record.pop("maps"), "exactly where there are any"),
+    (
         lambda _, record: (record.pop("maps"), record.update(schema_version=3)),
         "textures is missing",
     ),
-}  # fmt: skip
+]
 
 
-@for_each("name", SCENE_FILES)
-def test_a_hostile_scene_file_is_one_line(name: str) -> None:
-    change, message = SCENE_FILES[name]
+@for_each(("change", "message"), SCENE_FILES)
+def test_a_hostile_scene_file_is_one_line(
+    change: Callable[[dict[str, Any], dict[str, Any]], object], message: str
+) -> None:
     data = encode_scene(textured_scene(environment=sky()))
     length = int.from_bytes(data[:8], "little")
     record = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["trilight_scene"])
@@ -289,3 +267,91 @@ def test_a_hostile_scene_file_is_one_line(name: str) -> None:
     with pytest.raises(TrilightError, match=message) as caught:
         decode_scene_file(changed, "a.safetensors")
     assert str(caught.value).startswith("a.safetensors: ") and "\n" not in str(caught.value)
+
+
+def test_equal_members_give_equal_samples_with_and_without_what_is_held() -> None:
+    """Another name and another turn of the same maps: both are the entry's, not the held one's."""
+    turned = sky(rotation=np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32), is_seen=True)
+    renamed = dataclasses.replace(turned, source=MapSource(name="dusk", licence="CC-BY-4.0"))
+    first = encode_sample(textured_sample(KEY))
+    scene = textured_scene(environment=renamed)
+    second = encode_sample(dataclasses.replace(textured_sample(KEY), scene=scene))
+    held = HeldMaps()
+    for members in (first, second, first):
+        found, plain = decode_sample(KEY, members, held), decode_sample(KEY, members)
+        found.check()
+        assert encode_sample(found) == encode_sample(plain) == members
+        assert found.scene.environment is not None and plain.scene.environment is not None
+        assert found.scene.environment.source == plain.scene.environment.source
+        assert found.scene.environment.is_seen == plain.scene.environment.is_seen
+
+
+def test_a_map_is_unpacked_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    members, unpacked = encode_sample(textured_sample(KEY)), list[str]()
+    values = packed_maps._Packed.values
+
+    def counted(packed: packed_maps._Packed) -> np.ndarray:
+        unpacked.append(packed.name)
+        return values(packed)
+
+    monkeypatch.setattr(packed_maps._Packed, "values", counted)
+    held = HeldMaps()
+    scenes = [decode_sample(KEY, members, held).scene for _ in range(3)]
+    assert len(unpacked) == len(set(unpacked)) == 3
+    one, other = scenes[0].textures[0], scenes[2].textures[0]
+    assert one.texels is other.texels
+    with pytest.raises(ValueError, match="read-only"):
+        one.texels[0] = 0
+
+
+def test_memory_is_bounded_and_the_oldest_goes() -> None:
+    held, made = HeldMaps(most_bytes=1000), list[int]()
+
+    def asked(number: int, side: int = 10) -> Texture:
+        def unpack() -> Texture:
+            made.append(number)
+            return Texture(texels=np.full((side, side, 3), number, np.uint8))
+
+        return held.found(Texture, f"{number:064x}", b"%d" % number, unpack)
+
+    for number in (1, 2, 3, 1, 4, 1, 2):  # 300 bytes each: 4 takes the place of 2
+        assert asked(number).texels[0, 0, 0] == number
+        assert held.num_bytes <= 1000
+    assert made == [1, 2, 3, 4, 2]
+    asked(9, side=20)
+    asked(9, side=20)  # larger than all that may be held
+    assert made[-2:] == [9, 9] and held.num_bytes <= 1000
+
+
+def test_what_is_refused_stays_refused() -> None:
+    """A damaged copy of a held map, a held map under another name, and one of another kind."""
+    held = HeldMaps()
+    members = encode_sample(textured_sample(KEY))
+    decode_sample(KEY, members, held)
+    name, other = map_member(colour_texture().sha256), map_member(sky().sha256)
+    for wrong in (members[name][:-9], members[other], encode_sample(textured_sample(KEY, 1))):
+        swapped = wrong if isinstance(wrong, bytes) else wrong[map_member(colour_texture(1).sha256)]
+        for _ in range(2):
+            with pytest.raises(TrilightError):
+                decode_sample(KEY, {**members, name: swapped}, held)
+    decode_sample(KEY, members, held)
+
+
+def test_threads_share_it() -> None:
+    members, held = encode_sample(textured_sample(KEY)), HeldMaps()
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: decode_sample(KEY, members, held), range(16)))
+    assert all(encode_sample(each) == members for each in found)
+    assert held.num_bytes == sum(
+        each.nbytes for each in (*(t.texels for t in found[0].scene.textures), sky().radiance_rgb)
+    )
+
+
+def test_what_is_known_of_a_content_stays_known() -> None:
+    one = colour_texture()
+    digest, mean = one.sha256, one.mean
+    other = with_same_content(one, source=MapSource(name="another"))
+    assert vars(other)["sha256"] == digest and vars(other)["mean"] is mean
+    assert other.source.name == "another" and one.source.name != "another"
+    turned = with_same_content(sky(), is_seen=True)
+    assert isinstance(turned, Environment) and turned.is_seen

@@ -1,8 +1,9 @@
-"""Pictures by part: they come back exactly, and their sum is the picture, as verify demands."""
+"""Pictures by light and by part: they come back exactly, and their sum is the picture."""
 
 import dataclasses
 import io
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,19 @@ import OpenEXR
 import pytest
 from numpy.typing import NDArray
 
+from storage.conventions import HALF_FLOAT_MAX
 from storage.dataset.manifest import Manifest
+from storage.dataset.shard import write_shard
 from storage.dataset.verify import check_sample
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_exr
-from storage.records.lights import MAX_LIGHTS, rounded_to_half, sum_of_lights
+from storage.records.lights import (
+    MAX_LIGHTS,
+    decode_lights_exr,
+    encode_lights_exr,
+    rounded_to_half,
+    sum_of_lights,
+)
 from storage.records.parts import (
     KNOWN_PARTS,
     decode_parts_exr,
@@ -23,10 +32,96 @@ from storage.records.parts import (
     sum_of_parts,
 )
 from storage.records.sample import PartFloor, Sample, decode_sample, decode_scene, encode_sample
+from storage.records.scene import SceneObject
 from tests.for_each import for_each
-from tests.scenes_by_hand import tiny_sample
+from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 SIZE = (16, 16)
+
+
+def _noise(*shape: int, seed: Any = 0) -> NDArray[np.float32]:
+    """Return light [..., 3] in half floats, of any size."""
+    rng = np.random.default_rng(seed)
+    radiance = rng.exponential(size=(*shape, 3)) * 10.0 ** rng.uniform(-4, 3)
+    return rounded_to_half(radiance.astype(np.float32))
+
+
+def _lit_sample(**changes: Any) -> Sample:
+    """Return the tiny sample with two lights, the second without a triangle of its own."""
+    made = tiny_sample()
+    objects = (*made.scene.objects, SceneObject(name="light 2", kind="emitter"))
+    lights = np.stack([_noise(2, *SIZE, seed=view) for view in range(2)])
+    fields: dict[str, Any] = {
+        "scene": tiny_scene(objects=objects),
+        "lights_rgb": lights,
+        "radiance_rgb": np.stack([sum_of_lights(view) for view in lights]),
+    }
+    return dataclasses.replace(made, **fields | changes)
+
+
+@for_each("count", [1, 2, 12, MAX_LIGHTS])
+def test_lights_come_back_exactly_and_in_order(count: int) -> None:
+    lights = _noise(count, *SIZE)
+    data = encode_lights_exr(lights)
+    back = decode_lights_exr(data, (count, 16, 16))
+    assert back.dtype == np.float32
+    np.testing.assert_array_equal(back, lights)
+    assert encode_lights_exr(back) == data
+    channels = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()
+    assert set(channels) == {f"light{i}.{name}" for i in range(count) for name in "RGB"}
+    last = channels[f"light{count - 1}.G"].pixels
+    np.testing.assert_array_equal(last, lights[-1, ..., 1])
+
+
+def test_a_sum_beyond_half_floats_is_seen() -> None:
+    lights = np.full((2, 8, 8, 3), HALF_FLOAT_MAX * 0.6, np.float32)
+    assert np.isinf(sum_of_lights(rounded_to_half(lights))).all()
+
+
+@for_each("shape", [(3, 16, 16), (2, 8, 16), (2, 16, 24), (MAX_LIGHTS + 1, 16, 16)])
+def test_another_shape_is_refused(shape: tuple[int, int, int]) -> None:
+    data = encode_lights_exr(_noise(2, *SIZE))
+    with pytest.raises(TrilightError, match="lights: |channels are light0.B, .*; expected light0"):
+        decode_lights_exr(data, shape)
+
+
+def test_a_sample_with_lights_comes_back() -> None:
+    sample = _lit_sample()
+    members = encode_sample(sample)
+    assert {"0.lights.exr", "1.lights.exr"} <= set(members)
+    back = decode_sample(sample.key, members)
+    assert back.lights_rgb is not None
+    np.testing.assert_array_equal(back.lights_rgb, sample.lights_rgb)
+    assert back.lights_rgb.shape == (2, 2, 16, 16, 3)
+    del members["1.lights.exr"]
+    with pytest.raises(TrilightError, match="1.lights.exr.*missing"):
+        decode_sample(sample.key, members)
+    assert decode_sample("000000000", encode_sample(tiny_sample())).lights_rgb is None
+
+
+def test_stock_webdataset_reads_the_names(tmp_path: Path) -> None:
+    import webdataset
+
+    sample = _lit_sample()
+    write_shard(tmp_path / "train-000000.tar", [(sample.key, encode_sample(sample))])
+    (read,) = webdataset.WebDataset(str(tmp_path / "train-000000.tar"), shardshuffle=False)
+    assert read["__key__"] == sample.key
+    assert {"0.exr", "0.lights.exr", "1.exr", "1.lights.exr"} <= set(read)
+
+
+def test_verify_demands_the_sum_of_lights() -> None:
+    sample = _lit_sample()
+    assert faults(sample, per_light=True) == []
+    assert faults(tiny_sample()) == []  # a manifest from before there was the setting
+    assert "has pictures by light" in faults(sample, per_light=False)[0]
+    without = _lit_sample(lights_rgb=None)
+    assert "lacks pictures by light" in faults(without, per_light=True)[0]
+    pictures = sample.radiance_rgb.copy()
+    pictures[1, 3, 5, 2] = np.nextafter(np.float16(pictures[1, 3, 5, 2]), np.float16(np.inf))
+    (fault,) = faults(_lit_sample(radiance_rgb=pictures), per_light=True)
+    assert "view 1 is not the sum of its lights in 1 pixels, first in (3, 5)" in fault
+
+
 FLOOR = PartFloor(noise_floor_db=40.5, noise_floor_linear_db=30.25, object_noise_floor_db=39.0)
 RENDERS = {
     ("direct", "indirect"): {"split": True},
@@ -41,13 +136,7 @@ RENDERS = {
 def _parts(
     names: tuple[str, ...], shape: tuple[int, ...], seed: int = 0
 ) -> dict[str, NDArray[np.float32]]:
-    rng = np.random.default_rng(seed)
-    return {
-        name: rounded_to_half(
-            (rng.exponential(size=(*shape, 3)) * 10.0 ** rng.uniform(-4, 3)).astype(np.float32)
-        )
-        for name in names
-    }
+    return {name: _noise(*shape, seed=(seed, row)) for row, name in enumerate(names)}
 
 
 def _sample(names: tuple[str, ...] = KNOWN_PARTS[0], *, lights: bool = False) -> Sample:
@@ -66,10 +155,12 @@ def _sample(names: tuple[str, ...] = KNOWN_PARTS[0], *, lights: bool = False) ->
     )
 
 
-def _faults(sample: Sample, **renders: Any) -> list[str]:
+def faults(sample: Sample, *passes: str, **renders: Any) -> list[str]:
+    """Return what is wrong with a sample of a dataset with these settings."""
+    storage = {"storage": {"passes": list(passes)}} if passes else {}
     manifest = Manifest(
         build="x",
-        settings={"renders": {"resolution": 16, **renders}},
+        settings={"renders": {"resolution": 16, **renders}, **storage},
         environment={},
         num_scenes=1,
         num_views=2,
@@ -105,15 +196,21 @@ def test_parts_come_back_exactly(names: tuple[str, ...], lights: int | None) -> 
 
 @for_each("names", KNOWN_PARTS)
 def test_the_stored_sum_is_exact(names: tuple[str, ...]) -> None:
-    """Parts and picture, each through its own file: the sum of the one is the other, bitwise."""
+    """Parts or lights and picture, each through its own file: the sum of the one is the other."""
     for seed in range(5):
-        parts = _parts(names, SIZE, seed)
-        picture = decode_exr(encode_exr(sum_of_parts(parts)))
-        back = decode_parts_exr(encode_parts_exr(parts), names, SIZE, None)
-        np.testing.assert_array_equal(sum_of_parts(back), picture)
-        # one rounding to half floats of the exact sum, and four to float32
-        exact = np.sum([part.astype(np.float64) for part in parts.values()], axis=0)
-        np.testing.assert_allclose(picture, exact, rtol=2**-11 + 4 * 2**-24, atol=6e-8)
+        parts, lights = _parts(names, SIZE, seed), _noise(7, *SIZE, seed=seed)
+        parts_back = decode_parts_exr(encode_parts_exr(parts), names, SIZE, None)
+        lights_back = decode_lights_exr(encode_lights_exr(lights), (7, *SIZE))
+        for stored, back, each in (
+            (sum_of_parts(parts), sum_of_parts(parts_back), list(parts.values())),
+            (sum_of_lights(lights), sum_of_lights(lights_back), list(lights)),
+        ):
+            picture = decode_exr(encode_exr(stored))
+            np.testing.assert_array_equal(back, picture)
+            # one rounding to half floats of the exact sum, and one a picture to float32
+            exact = np.sum(each, axis=0, dtype=np.float64)
+            tolerance = 2**-11 + len(each) * 2**-24
+            np.testing.assert_allclose(picture, exact, rtol=tolerance, atol=6e-8)
 
 
 @for_each(
@@ -147,7 +244,7 @@ def test_a_sample_with_parts_comes_back_and_verify_accepts_it(
     for name in names:
         np.testing.assert_array_equal(back.parts_rgb[name], sample.parts_rgb[name])
     assert [view.parts for view in back.views] == [dict.fromkeys(names, FLOOR)] * 2
-    assert _faults(back, per_light=lights, **RENDERS[names]) == []
+    assert faults(back, per_light=lights, **RENDERS[names]) == []
     del members["1.parts.exr"]
     with pytest.raises(TrilightError, match="1.parts.exr.*missing"):
         decode_sample(sample.key, members)
@@ -164,7 +261,6 @@ def test_a_sample_without_parts_is_written_as_ever() -> None:
 @for_each(
     "parts",
     [{}, 3, {"direct": {}}, {"direct": vars(FLOOR), "glossy": vars(FLOOR)},
-     {"direct": vars(FLOOR), "indirect": {**vars(FLOOR), "noise_floor_db": True}},
      {"direct": vars(FLOOR), "indirect": {**vars(FLOOR), "noise_floor_db": 1e9}},
      {"direct": vars(FLOOR), "indirect": {**vars(FLOOR), "more": 1.0}}],
 )  # fmt: skip
@@ -176,23 +272,23 @@ def test_a_record_of_no_parts_is_refused(parts: Any) -> None:
         decode_scene("000000000", {**members, "json": json.dumps(record).encode()})
 
 
-def test_verify_demands_the_sum() -> None:
+def test_verify_demands_the_sum_of_parts() -> None:
     sample = _sample()
-    assert "parts are direct, indirect; the settings" in _faults(sample)[0]
-    assert "every view expect diffuse, specular" in _faults(sample, split_lobes=True)[0]
-    assert "parts are none" in _faults(tiny_sample(), split=True)[0]
+    assert "parts are direct, indirect; the settings" in faults(sample)[0]
+    assert "every view expect diffuse, specular" in faults(sample, split_lobes=True)[0]
+    assert "parts are none" in faults(tiny_sample(), split=True)[0]
     views = (sample.views[0], dataclasses.replace(sample.views[1], parts=None))
-    assert _faults(dataclasses.replace(sample, views=views), split=True)
+    assert faults(dataclasses.replace(sample, views=views), split=True)
     pictures = sample.radiance_rgb.copy()
     pictures[1, 3, 5, 2] = np.nextafter(np.float16(pictures[1, 3, 5, 2]), np.float16(np.inf))
-    (fault,) = _faults(dataclasses.replace(sample, radiance_rgb=pictures), split=True)
+    (fault,) = faults(dataclasses.replace(sample, radiance_rgb=pictures), split=True)
     assert "view 1 has a picture that is not the sum of its parts in 1 pixels" in fault
     assert fault.endswith("first in (3, 5)")
     both = _sample(lights=True)
     assert both.parts_rgb is not None
     wrong = {name: 2 * part for name, part in both.parts_rgb.items()}
-    faults = _faults(dataclasses.replace(both, parts_rgb=wrong), split=True, per_light=True)
-    assert len(faults) == 2 and "a light that is not the sum" in faults[0]
+    found = faults(dataclasses.replace(both, parts_rgb=wrong), split=True, per_light=True)
+    assert len(found) == 2 and "a light that is not the sum" in found[0]
 
 
 def test_light_that_is_not_finite_is_refused() -> None:

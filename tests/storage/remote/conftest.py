@@ -1,12 +1,17 @@
-"""A small dataset behind a server, a cache of its own, and no pauses between tries."""
+"""A small dataset behind a server, a cache of its own, and no pauses between tries.
 
-from collections.abc import Iterator
+Functions beside the fixtures read the first shard of it.
+"""
+
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
+from storage.records.sample import encode_sample
 from storage.remote import tries, url
 from tests.http_server import Site, serve
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
@@ -45,3 +50,28 @@ def server(cache: Path, local: Dataset, monkeypatch: pytest.MonkeyPatch) -> Iter
     with serve(local.folder.root) as running:
         yield running
     url._driver_of.cache_clear()
+
+
+SHARD = "train-000000.tar"
+PATH = f"/{SHARD}"
+
+
+def read(url: str) -> list[dict[str, bytes]]:
+    return expected(open_dataset(url))
+
+
+def expected(dataset: Dataset) -> list[dict[str, bytes]]:
+    return [encode_sample(each) for each in dataset.read_shard(dataset.shards_of("train")[0])]
+
+
+def with_changed_byte(path: Path) -> bytes:
+    """Return the content of a shard with another bit near its end."""
+    content = bytearray(path.read_bytes())
+    content[-700] ^= 1
+    return bytes(content)
+
+
+def until(happened: Callable[[], object]) -> None:
+    """Return when something has happened; the test's own time limit ends it otherwise."""
+    while not happened():
+        time.sleep(0.02)

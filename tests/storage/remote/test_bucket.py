@@ -1,59 +1,195 @@
-"""Writing to a bucket: whole, only once where that is asked for, and only where that can be."""
+"""Buckets of S3 and Google: the same dataset again, written whole and once, mistakes named."""
 
 import errno
+import os
+import shutil
 from collections.abc import Iterator
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from pipeline.making.bucket_publication import begin_dataset, joined
 from pipeline.making.dataset_order import DatasetOrder
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.layout import dataset_folder
+from storage.dataset.training_data import open_training_data
+from storage.dataset.verify import verify_dataset
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.remote import bucket as remote_bucket
+from storage.remote import fetch
+from storage.remote import url as remote_url
+from storage.remote.bucket import Bucket
 from storage.remote.tries import with_tries
 from storage.remote.url import RemoteUrl
 from tests.for_each import for_each
 from tests.pipeline.making.bucket_kit import empty_bucket
+from tests.pipeline.making.test_publication import ENVIRONMENT, _build
+from tests.s3_server import Line, control
+from tests.storage.remote.conftest import SHARD, expected, read, with_changed_byte
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
 pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
 
 
+pytest.importorskip("gcsfs", reason="gs:// needs the package gcsfs")
+emulator: Any = pytest.importorskip(
+    "gcp_storage_emulator.server", reason="needs the package gcp-storage-emulator"
+)
+
+
+pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
+pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
+
+
+def place(text: str) -> RemoteUrl:
+    url = remote_url.parse_url(text, what="out")
+    assert isinstance(url, RemoteUrl)
+    return url
+
+
+def fill(driver: Any, local: Dataset) -> None:
+    for path in local.folder.root.iterdir():
+        driver.pipe_file(f"shards/set/{path.name}", path.read_bytes())
+
+
 @pytest.fixture
-def bucket(moto: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def s3(moto: int, local: Dataset, cache: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Line]:
+    """Put the small dataset into a bucket of S3; returns the line to it."""
+    line = Line(moto)
+    monkeypatch.setattr(fetch, "PIECE_BYTES", 4096)
     with empty_bucket(moto, monkeypatch) as driver:
-        yield driver
+        fill(driver, local)
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{line.port}")
+        remote_url._driver_of.cache_clear()
+        yield line
+    line.listener.close()
 
 
-def test_large_files_come_in_parts_and_only_once(
-    bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def gs(local: Dataset, cache: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Put the small dataset into a bucket of Google's emulator; returns the driver of it."""
+    server = emulator.create_server("127.0.0.1", 0, in_memory=True, default_bucket="shards")
+    server.start()
+    port = server._api._httpd.server_address[1]
+    monkeypatch.setenv("STORAGE_EMULATOR_HOST", f"http://127.0.0.1:{port}")
+    monkeypatch.setattr(fetch, "PIECE_BYTES", 4096)
+    remote_url._driver_of.cache_clear()
+    driver = remote_url.open_driver(place("gs://shards"))
+    fill(driver, local)
+    yield driver
+    remote_url._driver_of.cache_clear()
+    server.stop()
+
+
+@pytest.fixture
+def conditional(gs: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Teach the emulator, which ignores it, what Google's server does with ifGenerationMatch=0."""
+    upload = emulator.objects.upload_partial
+    handlers = next(row[-1] for row in emulator.HANDLERS if upload in row[-1].values())
+
+    def looking(handler: Any) -> Any:
+        def handle(request: Any, response: Any, storage: Any, *more: Any, **options: Any) -> None:
+            query, data = request.query, request.data
+            if query.get("ifGenerationMatch") == ["0"]:
+                name = query["name"][0] if "name" in query else data["meta"]["name"]
+                if name in storage.objects.get(request.params["bucket_name"], ()):
+                    response.status = HTTPStatus.PRECONDITION_FAILED
+                    response.json({"error": {"code": 412, "message": "conditionNotMet"}})
+                    return
+            handler(request, response, storage, *more, **options)
+
+        return handle
+
+    for method, handler in list(handlers.items()):
+        monkeypatch.setitem(handlers, method, looking(handler))
+
+
+@pytest.mark.parametrize("scheme", ["s3", "gs"])
+def test_a_bucket_holds_the_same_dataset(
+    scheme: str, local: Dataset, request: pytest.FixtureRequest
 ) -> None:
+    """And what is missing or changed in it later is named."""
+    request.getfixturevalue(scheme)
+    url = f"{scheme}://shards/set"
+    assert open_dataset(url).manifest == local.manifest
+    assert read(url) == expected(local)
+    assert verify_dataset(url).problems == []
+    shards = open_training_data([f"{url}/train-{{000000..000001}}.tar"]).split("train")
+    assert [shards.num_samples(number) for number in range(2)] == [2, 2]
+    shutil.rmtree(os.environ["TRILIGHT_CACHE"])
+    driver = remote_url.open_driver(place(f"{scheme}://shards"))
+    driver.pipe_file(f"shards/set/{SHARD}", with_changed_byte(local.folder.root / SHARD))
+    driver.rm_file("shards/set/test-000005.tar")
+    assert verify_dataset(url, fast=True).bad_shards == ["test-000005.tar"]
+    assert set(verify_dataset(url).bad_shards) == {"test-000005.tar", SHARD}
+    with pytest.raises(TrilightError, match="sha256 differs, 2 times"):
+        read(url)
+    for elsewhere in ("shards/elsewhere", "no-such-bucket/set"):
+        with pytest.raises(TrilightError, match=r"no manifest\.json here"):
+            read(f"{scheme}://{elsewhere}")
+
+
+def test_interrupted_reads_go_on(s3: Line, local: Dataset) -> None:
+    dataset = open_dataset("s3://shards/set")
+    s3.cuts = [2000, 500, 3000]
+    assert expected(dataset) == expected(local)
+    assert not s3.cuts
+
+
+def test_wrong_access_is_named_without_secrets(s3: Line, moto: int) -> None:
+    dataset = open_dataset("s3://shards/set")
+    control(moto, "reset-auth", b"0")
+    try:
+        with pytest.raises(TrilightError) as caught:
+            expected(dataset)
+        with pytest.raises(TrilightError, match="manifest.*cannot be read"):
+            open_dataset("s3://shards/set")
+    finally:
+        control(moto, "reset-auth", b"inf")
+    text = str(caught.value)
+    assert "cannot be read" in text and "Check the URL and your access" in text
+    assert "s3cret" not in text and os.environ["AWS_SECRET_ACCESS_KEY"] not in text
+
+
+def create_once(driver: Any, made: Bucket, folder: Path) -> None:
+    """In one request and, from 5 MiB on, in several; what is written otherwise replaces it."""
+    content, root = bytes(range(256)) * (11 << 12), made.url.root
+    (folder / "large").write_bytes(content)
+    for name, first in (("small", b"small"), ("part-0001/large", folder / "large")):
+        assert made.create(name, first), name
+        assert not made.create(name, b"second"), name
+        assert not made.create(name, folder / "large"), name
+    assert driver.cat_file(f"{root}/small") == b"small"
+    assert driver.cat_file(f"{root}/part-0001/large") == content
+    made.write("small", b"third")
+    assert driver.cat_file(f"{root}/small") == b"third"
+    assert made.names() == {"small", "part-0001/large"}
+    made.require_create()
+    made.require_create()  # what is left of the first time says nothing
+
+
+def test_a_file_is_created_once(moto: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote_bucket, "_PART_BYTES", 5 << 20)  # no server takes smaller parts
-    place = remote_bucket.Bucket(RemoteUrl(what="out", scheme="s3", root="shards/set"))
-    content = bytes(range(256)) * (11 << 12)
-    (tmp_path / "large").write_bytes(content)
-    assert place.create("part-0001/large", tmp_path / "large")
-    (tmp_path / "large").write_bytes(content[::-1])
-    assert not place.create("part-0001/large", tmp_path / "large")
-    assert not place.create("part-0001/large", b"small")
-    assert bucket.cat_file("shards/set/part-0001/large") == content
-    assert place.names() == {"part-0001/large"}
+    with empty_bucket(moto, monkeypatch) as driver:
+        create_once(driver, Bucket(place("s3://shards/set")), tmp_path)
 
 
-def test_a_server_that_ignores_conditions_is_refused(
-    bucket: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place = remote_bucket.Bucket(RemoteUrl(what="out", scheme="s3", root="shards/set"))
-    place.require_create()
-    place.require_create()  # what is left of the first time says nothing
-    put = remote_bucket.Bucket._put
-    monkeypatch.setattr(
-        remote_bucket.Bucket,
-        "_put",
-        lambda self, name, content, mode: put(self, name, content, mode="overwrite"),
-    )
-    with pytest.raises(TrilightError, match="^out 's3://shards/set': .* conditional writes"):
-        place.require_create()
+def test_a_file_is_created_once_at_google(gs: Any, conditional: None, tmp_path: Path) -> None:
+    create_once(gs, Bucket(place("gs://shards/made")), tmp_path)
+
+
+def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun(gs: Any) -> None:
+    """The emulator as it is; two makers could each replace what the other has put there."""
+    folder = dataset_folder("gs://shards/made")
+    with (
+        pytest.raises(TrilightError, match="^out 'gs://shards/made': .*conditional writes"),
+        joined(folder),
+    ):
+        begin_dataset(folder, _build(), ENVIRONMENT, 8, accept_environment=False)
+    assert Bucket(place("gs://shards/made")).names() == {".staging/once"}
+    assert not folder.manifest.exists()
 
 
 @for_each(
@@ -64,7 +200,6 @@ def test_a_server_that_ignores_conditions_is_refused(
         ("https://ada:hunter2@host/set", "out 'https://host/set' has the scheme 'https'; expected"),
         ("hf://datasets/ada/set", "has the scheme 'hf'; expected a folder, or a URL of s3 or gs"),
         ("s3://", "names no host or bucket"),
-        ("ftp://host/set", "has the scheme 'ftp'"),
         ("pipe:cat", "is a pipe: command"),
     ],
 )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from storage.conventions import in_camera, pixel_places
+from storage.conventions import camera_rays, in_camera, look_at_c2w, pixel_places
 from storage.errors import TrilightError
 from storage.records.material import default_rows
 from storage.records.passes import pictures
@@ -15,11 +15,27 @@ from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
 from tests.columns_kit import COAT, WAVES, declared
 from tests.for_each import for_each
-from tests.pipeline.renders.scene_kit import join, light, material, quad
-from tests.pipeline.scenes.slow_rays import first_hits as slow_first_hits
+from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene
 from tests.scenes_by_hand import tiny_scene
-from tests.storage.records.passes.view_kit import from_above, rays_of, room
 from tests.textured_by_hand import textured_scene
+
+
+def rays_of(
+    scene: Scene, resolution: int, view: int = 0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return camera_rays(scene.c2w[view], float(scene.fov_deg[view]), resolution)
+
+
+def room(seed: int = 0, num_views: int = 2) -> Scene:
+    """Return shell, objects with curved and flat faces, and lights, in a view with empty pixels."""
+    return sampled_like_scene(np.random.default_rng(seed), num_views=num_views)
+
+
+def from_above(height: float = 1.0, fov_deg: float = 90.0) -> Scene:
+    """Return the floor of the tiny scene, seen straight from above, +Y at the picture's top."""
+    pose = look_at_c2w(eye=[0, 0, height], target=[0, 0, 0], up=[0, 1, 0])[None]
+    return tiny_scene(c2w=pose.astype(np.float32), fov_deg=np.array([fov_deg], np.float32))
+
 
 EXACT = 1e-9
 """Double precision on corners within some metres, with grazing triangles costing some digits."""
@@ -79,21 +95,6 @@ def test_the_axes_of_the_camera() -> None:
     np.testing.assert_allclose(seen["shading_normal_camera"][1, 1], [0.6, 0, 0.8], atol=1e-6)
     np.testing.assert_allclose(seen["geometric_normal_camera"][1, 1], [0, 0, 1], atol=1e-6)
     assert seen["depth_axis_m"][0, 0] == pytest.approx(2, abs=1e-12)
-
-
-def test_a_search_through_all_triangles_sees_the_same() -> None:
-    scene, resolution = room(1), 20
-    seen = view_passes(scene, resolution=resolution)
-    origin, rays = rays_of(scene, resolution)
-    solid = np.flatnonzero(~scene.triangle_emits)
-    corners = scene.vertex_positions[scene.faces[solid]].astype(np.float64)
-    face, distance = slow_first_hits(origin, rays.reshape(-1, 3), corners)
-    triangle = np.where(face >= 0, solid[face], -1).reshape(resolution, resolution)
-    same = seen["triangle"] == triangle
-    # a float32 ray may pass a shared edge on its other side; the depth there is the same
-    assert same.mean() > 0.99
-    depth = distance.reshape(resolution, resolution)
-    np.testing.assert_allclose(seen["depth_ray_m"][same], depth[same], rtol=EXACT)
 
 
 def test_a_mirrored_scene_has_mirrored_passes() -> None:
@@ -193,19 +194,6 @@ def test_nothing_is_seen() -> None:
         assert np.isinf(seen["depth_ray_m"]).all() and (seen["triangle"] == -1).all()
 
 
-def test_a_scene_of_lights_alone_shows_nothing() -> None:
-    scene = join([light([[-1, 0, -1], [1, 0, -1], [0, 0, 1]], 1.0)])
-    seen = view_passes(scene, resolution=4)
-    assert not seen["hit"].any() and seen["coverage"].max() == 0
-
-
-def test_emitters_are_hidden() -> None:
-    """The lamp of the tiny scene hangs between this camera and the floor."""
-    seen = view_passes(from_above(height=4, fov_deg=20), resolution=9)
-    assert seen["hit"].all() and seen["material_emission"].max() == 0
-    np.testing.assert_allclose(seen["depth_axis_m"], 4, rtol=1e-12)
-
-
 def test_a_camera_inside_an_object_sees_its_back() -> None:
     walls = [
         quad(
@@ -221,33 +209,6 @@ def test_a_camera_inside_an_object_sees_its_back() -> None:
     assert seen["depth_ray_m"].min() > 0.5
     behind = np.sum(seen["geometric_normal"] * rays_of(scene, 16)[1], axis=-1) > 0
     assert 0 < behind.sum() < behind.size, "normals are those of the triangles, not turned"
-
-
-def test_degenerate_triangles_are_never_seen() -> None:
-    scene = from_above()
-    flat = np.array([[0, 0, 0], [0, 0, 1], [1, 1, 1], [0, 2, 0]], np.uint32)
-    more = dataclasses.replace(
-        scene,
-        faces=np.concatenate([flat, scene.faces]),
-        material_index=np.append(np.zeros(4, np.uint16), scene.material_index),
-        object_index=np.append(np.zeros(4, np.uint16), scene.object_index),
-    )
-    # the fourth is the half of the floor turned over, in its place; it may win
-    seen, plain = (view_passes(each, resolution=8) for each in (more, scene))
-    assert not np.isin(seen["triangle"], [0, 1, 2]).any()
-    for name in ("depth_ray_m", "position_m", "material_diffuse", "hit"):
-        np.testing.assert_allclose(seen[name], plain[name], atol=1e-12)
-
-
-def test_a_camera_in_the_plane_of_the_floor_sees_finite_numbers() -> None:
-    pose = np.eye(4, dtype=np.float32)
-    pose[:3, :3] = np.transpose([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
-    pose[:3, 3] = [0.05, -3, 0]
-    scene = tiny_scene()
-    seen = view_passes(scene.with_cameras(pose[None], scene.fov_deg[:1]), resolution=9)
-    for name in ("barycentric", "position_m", "depth_ray_m", "shading_normal"):
-        assert np.isfinite(seen[name][seen["hit"]]).all(), name
-    assert not seen["hit"][[0, 1, 7, 8]].any()
 
 
 def test_a_single_pixel_and_a_place_far_away() -> None:
@@ -270,11 +231,9 @@ def test_a_single_pixel_and_a_place_far_away() -> None:
     [
         ({"view": 2}, "view is 2; expected 0 to 1"),
         ({"resolution": 0}, "resolution is 0; expected a whole number from 1 to 65536"),
-        ({"resolution": 2.5}, "resolution is 2.5; expected a whole number"),
         ({"rays_a_side": 65}, "rays_a_side is 65; expected a whole number from 1 to 64"),
         ({"names": ["depth"]}, "there is no pass 'depth'; expected of triangle, object"),
         ({"names": ["motion_px"]}, "motion_px: no other moment is given; expected `then`"),
-        ({"then_view": 2}, "then_view is 2; expected 0 to 1"),
     ],
 )
 def test_mistakes_are_named(arguments: dict, complaint: str) -> None:
@@ -294,3 +253,65 @@ def test_a_column_of_ones_own_is_a_pass() -> None:
         assert next(each for each in declared_passes() if each.name == "material_waves").channels
     np.testing.assert_array_equal(seen["material_coat"], np.full((4, 4), 0.25))
     np.testing.assert_array_equal(seen["material_waves"], np.full((4, 4, 5), 0.5))
+
+
+def test_nothing_moves_where_nothing_changes() -> None:
+    scene = room(0)
+    seen = view_passes(scene, resolution=16, then=scene)
+    np.testing.assert_allclose(seen["motion_px"][seen["hit"]], 0, atol=1e-9)
+    assert np.isnan(seen["motion_px"][~seen["hit"]]).all()
+
+
+def test_a_camera_that_steps_aside_in_closed_form() -> None:
+    """At fov 90 and 1 m, 16 pixels are 2 m: a step of 0.25 m to the right moves all left by 2."""
+    scene = from_above(height=1, fov_deg=90)
+    poses = np.concatenate([scene.c2w, scene.c2w])
+    poses[1, :3, 3] += [0.25, 0.125, 0]  # right and up in the picture
+    both = scene.with_cameras(poses, np.array([90, 90], np.float32))
+    for a_side in (1, 2):
+        motion = view_passes(both, ["motion_px"], resolution=16, rays_a_side=a_side, then_view=1)
+        expected = np.broadcast_to([-2.0, 1.0], (16, 16, 2))
+        np.testing.assert_allclose(motion["motion_px"], expected, atol=1e-6)
+
+
+def test_it_is_the_difference_of_projections() -> None:
+    scene = room(1)
+    seen = view_passes(scene, resolution=24, view=0, then_view=1)
+    now, then = (
+        pixel_places(seen["position_m"], scene.c2w[view], float(scene.fov_deg[view]), 24)
+        for view in (0, 1)
+    )
+    np.testing.assert_allclose(seen["motion_px"], then - now, atol=1e-6)
+
+
+def test_points_are_followed_by_their_triangles() -> None:
+    """The floor slides by 0.5 m to the right, which is 4 of 16 pixels."""
+    scene = from_above(height=1, fov_deg=90)
+    moved = scene.vertex_positions.copy()
+    moved[:4, 0] += 0.5
+    later = dataclasses.replace(scene, vertex_positions=moved)
+    motion = view_passes(scene, ["motion_px"], resolution=16, then=later)["motion_px"]
+    np.testing.assert_allclose(motion, np.broadcast_to([4.0, 0.0], (16, 16, 2)), atol=1e-6)
+
+
+def test_what_is_behind_the_other_camera_does_not_move() -> None:
+    scene = from_above()
+    up = look_at_c2w(eye=[0, 0, 1], target=[0, 0, 2], up=[0, 1, 0])[None].astype(np.float32)
+    later = scene.with_cameras(up, scene.fov_deg)
+    seen = view_passes(scene, resolution=4, rays_a_side=2, then=later)
+    assert seen["hit"].all() and np.isnan(seen["motion_px"]).all()
+
+
+def test_other_triangles_are_refused() -> None:
+    scene = tiny_scene()
+    fewer = dataclasses.replace(
+        scene,
+        faces=scene.faces[:2],
+        material_index=scene.material_index[:2],
+        object_index=scene.object_index[:2],
+    )
+    with pytest.raises(TrilightError, match=r"2 triangles; expected the 3 of this one"):
+        view_passes(scene, then=fewer)
+    turned = dataclasses.replace(scene, faces=scene.faces[:, [1, 2, 0]])
+    with pytest.raises(TrilightError, match=r"faces\[0\] .* \[1, 2, 0\]; expected \[0, 1, 2\]"):
+        view_passes(scene, then=turned)
