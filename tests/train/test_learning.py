@@ -1,6 +1,7 @@
 """That learning happens: one picture to the last detail, unseen scenes better than any stored one.
 
-Slow: minutes of training on a busy machine.
+And of networks that are told hits, skies and textures: from shards to weights, to the bit after a
+stop, and traced alike by any crew. What is slow takes minutes on a busy machine.
 """
 
 import dataclasses
@@ -12,10 +13,19 @@ import torch
 
 from model.config import ModelConfig
 from model.config import smoke as smoke_model
+from model.hits.traced import INPUTS
 from model.open import open_network
+from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import open_training_data
+from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
-from tests.train.kit import tiny_run, trained
+from storage.records.retextured import with_textures
+from storage.records.scene import Scene
+from storage.records.texture import Texture
+from tests.model.hits.test_decoder import hits_config
+from tests.model.kit import tiny_config
+from tests.sky_maps import smooth
+from tests.train.kit import stepper, take, tiny_run, trained
 from tests.train.toy import toy_picture, toy_sample, toy_scene, write_toy_dataset
 from train.data.augment import with_views
 from train.data.buckets import make_batch
@@ -24,12 +34,10 @@ from train.evaluation.evaluate import Contest, judged_views, make_rivals
 from train.evaluation.judge import predict
 from train.evaluation.judged_view import NETWORK, summary
 from train.evaluation.rivals import MEDIAN, NEAREST
-from train.loop.checkpoints import network_of_run
-from train.loop.crew import Crew
+from train.loop.checkpoints import network_of_run, path_of_step
 from train.loop.schedule import learning_rate
 from train.loop.state import TrainState, new_state
-from train.loop.step import Stepper
-from train.loss.objective import Objective
+from train.run import stream_settings
 from train.settings import AugmentationSettings, TrainSettings
 
 SMALL = dataclasses.replace(
@@ -38,19 +46,7 @@ SMALL = dataclasses.replace(
 
 
 def memorised(scenes: list[TrainingScene], model: ModelConfig, steps: int) -> TrainState:
-    settings = memorising(model, scenes, steps)
-    state = new_state(settings)
-    crew = Crew(device=torch.device("cpu"))
-    stepper = Stepper(state, settings, Objective(settings.loss, None), crew)
-    batches = [make_batch([scene]) for scene in scenes]
-    for step in range(steps):
-        stepper.step(batches, learning_rate(step, settings))
-        state.step += 1
-    return state
-
-
-def memorising(model: ModelConfig, scenes: list[TrainingScene], steps: int) -> TrainSettings:
-    return tiny_run(
+    settings = tiny_run(
         model=model,
         resolution=scenes[0].target_VRR3.shape[1],
         num_steps=steps,
@@ -59,6 +55,13 @@ def memorising(model: ModelConfig, scenes: list[TrainingScene], steps: int) -> T
         final_rate_share=0.01,
         augmentation=AugmentationSettings(),
     )
+    state = new_state(settings)
+    memorising = stepper(state, settings)
+    batches = [make_batch([scene]) for scene in scenes]
+    for step in range(steps):
+        memorising.step(batches, learning_rate(step, settings))
+        state.step += 1
+    return state
 
 
 def score(state: TrainState, scene: TrainingScene, target: TrainingScene) -> float:
@@ -125,3 +128,100 @@ def test_unseen_scenes_look_better_than_any_stored_picture(tmp_path: Path) -> No
     # measured: 0.0292 against 0.0395 and 0.0313
     assert means[NETWORK] < 0.9 * means[MEDIAN]
     assert means[NETWORK] < means[NEAREST]
+
+
+HITS_AUGMENTATION = AugmentationSettings(
+    rotation="uniform", mirror=True, channels=True, vertex_order=True, withheld_inputs=0.3
+)
+
+
+def hits_run(**changes: object) -> TrainSettings:
+    run = tiny_run(model=hits_config(), run="tiny-hits", augmentation=HITS_AUGMENTATION)
+    return dataclasses.replace(run, **changes)  # type: ignore[arg-type]
+
+
+def test_what_is_traced_depends_on_no_thread_and_no_rank(dataset: Dataset) -> None:
+    alone = {
+        scene.key: scene.tensors.traced
+        for scene in take(dataset, stream_settings(hits_run()), 1, first=3)[0]
+    }
+    for rank in range(3):
+        part = {"workers": 3, "rank": rank, "world_size": 3}
+        ((other,),) = take(dataset, stream_settings(hits_run()), 1, first=3, **part)  # type: ignore[arg-type]
+        a, b = alone.pop(other.key), other.tensors.traced
+        assert a is not None
+        assert b is not None
+        for name, value in vars(a).items():
+            assert torch.equal(value, getattr(b, name)), name
+
+
+def test_views_are_traced_after_the_symmetries_and_lack_inputs_by_chance(dataset: Dataset) -> None:
+    scenes = take(dataset, stream_settings(hits_run()), 1, first=3)[0]
+    given = torch.cat([s.tensors.traced.given_VI for s in scenes if s.tensors.traced])
+    assert given.shape == (6, len(INPUTS))
+    assert 0 < given.mean() < 1
+    for scene in scenes:
+        traced = scene.tensors.traced
+        assert traced is not None
+        # each pixel that is lit in the picture, mirrored as it is, is one that meets something
+        lit = scene.target_VRR3.amax(dim=-1) > 0.01
+        assert (traced.pixels_VRRC[..., 0] > 0)[lit].float().mean() > 0.95
+
+
+MAPS_AUGMENTATION = AugmentationSettings(
+    rotation="uniform", mirror=True, channels=True, vertex_order=True, light_scale=2.0
+)
+
+
+def _scene_of_maps(index: int) -> Scene:
+    """Return a toy scene: two in three below a sky, two in three with a texture."""
+    scene = toy_scene(index)
+    if index % 3 != 1:
+        scene = dataclasses.replace(scene, environment=smooth(8))
+    if index % 3:
+        rng = np.random.default_rng(index)
+        texture = Texture(texels=rng.integers(0, 90, (8, 8, 3), np.uint8))
+        rows = np.full((len(scene.materials), 3), -1, np.int32)
+        rows[scene.material_index[~scene.triangle_emits][0], 0] = 0
+        uv = scene.vertex_positions[scene.faces.ravel(), :2].astype(np.float32)
+        scene = with_textures(scene, uv, (texture,), rows)
+    return scene
+
+
+def maps_run() -> TrainSettings:
+    run = tiny_run(model=hits_config(sky_rays=2), run="tiny-maps", augmentation=MAPS_AUGMENTATION)
+    return dataclasses.replace(run, num_steps=4, validate_every=4, checkpoint_every=2)
+
+
+@pytest.fixture(scope="module")
+def with_maps(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """With steps in which no scene has a sky, or a texture."""
+    folder = tmp_path_factory.mktemp("maps")
+    return write_toy_dataset(folder, train=6, validation=2, per_shard=3, scene_of=_scene_of_maps)
+
+
+def require_resumed_to_the_bit(run: TrainSettings, data: Dataset, out: Path) -> None:
+    folder = trained(run, data, out).folder
+    weights = folder.weights.read_bytes()
+    path_of_step(folder.checkpoints, run.num_steps).unlink()
+    folder.weights.unlink()
+    assert trained(run, data, out, resume=True).folder.weights.read_bytes() == weights
+
+
+def test_a_run_that_is_told_hits_resumes_to_the_bit(dataset: Dataset, tmp_path: Path) -> None:
+    run = hits_run(num_steps=3, validate_every=4, checkpoint_every=2)
+    require_resumed_to_the_bit(run, dataset, tmp_path)
+
+
+@pytest.mark.slow("training")
+def test_a_run_below_skies_resumes_to_the_bit(with_maps: Dataset, tmp_path: Path) -> None:
+    require_resumed_to_the_bit(maps_run(), with_maps, tmp_path)
+
+
+def test_a_run_that_knows_no_sky_is_refused_before_its_first_step(
+    with_maps: Dataset, tmp_path: Path
+) -> None:
+    run = dataclasses.replace(maps_run(), model=tiny_config())
+    with pytest.raises(TrilightError, match=r"does not know its light.*model.sky_rays=16"):
+        trained(run, with_maps, tmp_path / "run")
+    assert not list((tmp_path / "run").glob("checkpoints/*"))

@@ -8,7 +8,6 @@ import pytest
 from model.base_widths import BaseWidths
 from model.config import SIZES, large
 from storage.errors import TrilightError
-from storage.settings.changes import changed
 from storage.settings.described import settings_record
 from tests.for_each import for_each
 from tests.train.kit import tiny_run
@@ -25,9 +24,8 @@ def test_named_runs_carry_their_name_and_survive_json(name: str) -> None:
 
 
 def test_an_unknown_run_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(
-        TrilightError, match="'smoek': no such run; did you mean smoke.* builtin, fine"
-    ):
+    message = "'smoek': no such run; did you mean smoke.* builtin, fine"
+    with pytest.raises(TrilightError, match=message):
         named_run("smoek")
 
 
@@ -61,33 +59,18 @@ def test_what_is_stated_is_not_brought_along() -> None:
         changed_run("smoke", {"warmup_steps": 50}, steps=24)
     with pytest.raises(TrilightError, match="num_steps'? is 0; expected a whole number from 1"):
         changed_run("smoke", {}, steps=0)
-    for name in ("log_every", "validate_every", "checkpoint_every"):
-        with pytest.raises(TrilightError, match=f"{name}.? is 0; expected a whole number from 1"):
-            changed_run("pretrain", {name: 0}, steps=24)
-    with pytest.raises(TrilightError, match="'log_every' is 'often'"):
-        changed_run("pretrain", {"log_every": "often"}, steps=24)
+    for value, message in ((0, "is 0; expected a whole number from 1"), ("often", "is 'often'")):
+        with pytest.raises(TrilightError, match=f"log_every'? {message}"):
+            changed_run("pretrain", {"log_every": value}, steps=24)
 
 
 @for_each(
     ("changes", "message"),
     [
         ({"resolution": 20}, "resolution is 20; expected a multiple of 8"),
-        ({"resolution": 0}, "resolution is 0"),
-        ({"num_steps": 0}, "num_steps'? is 0; expected a whole number from 1"),
-        ({"views_per_scene": 0}, "views_per_scene is 0"),
         ({"warmup_steps": 12}, "warmup_steps is 12; expected 0 to 11"),
-        ({"learning_rate": 0.0}, "learning_rate is 0.0; expected a number above 0, up to 1"),
-        ({"learning_rate": float("nan")}, "learning_rate is nan"),
-        ({"grad_clip": -1.0}, "grad_clip is -1.0"),
-        ({"weight_decay": -0.1}, "weight_decay is -0.1"),
         ({"validate_every": 5}, "validate_every is 5; expected a multiple of log_every, 2"),
         ({"checkpoint_every": 3}, "checkpoint_every is 3"),
-        ({"checkpoints_kept": 0}, "checkpoints_kept is 0"),
-        ({"scenes_per_pass": 0}, "scenes_per_pass is 0"),
-        ({"keep_every": -1}, "keep_every is -1"),
-        ({"ema_decay": 1.5}, "ema_decay is 1.5; expected a number from 0 to below 1"),
-        ({"ema_decay": float("nan")}, "ema_decay is nan"),
-        ({"betas": (0.9, 1.0)}, "betas is .*expected two numbers from 0 to below 1"),
         ({"precision": "float16"}, "precision is 'float16'; expected float32 or bfloat16"),
     ],
 )
@@ -138,29 +121,3 @@ def test_every_size_can_be_asked_for_by_name() -> None:
         changed_run("smoke", {"model": "larg"})
     with pytest.raises(TrilightError, match="resolution is 72; expected a multiple of 64"):
         changed_run("smoke", {"model": "large", "resolution": 72})
-
-
-def test_any_field_can_be_replaced_by_name() -> None:
-    changes = {
-        "loss.perceptual": "none",
-        "augmentation.rotation": "uniform",
-        "model.hidden_width": 72,
-        "betas": [0.9, 0.95],
-        "ema_decay": 0.5,
-    }
-    settings = changed(named_run("smoke"), changes)
-    assert settings.loss.perceptual == "none" and settings.augmentation.rotation == "uniform"
-    assert (settings.model.hidden_width, settings.betas, settings.ema_decay) == (
-        72,
-        (0.9, 0.95),
-        0.5,
-    )
-    for name, value, message in (
-        ("loss.perceptual", "vgg", "expected lpips, ms_ssim or none"),
-        ("augmentation.rotation", "full", "expected none, recipe or uniform"),
-        ("augmentation.light_mix", 0.5, "light_mix' is 0.5; expected a number from 1"),
-        ("augmentation.translation", -1.0, "translation' is -1.0"),
-        ("lossy", 1, "setting 'lossy' does not exist"),
-    ):
-        with pytest.raises(TrilightError, match=message):
-            changed(named_run("smoke"), {name: value})

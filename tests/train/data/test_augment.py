@@ -1,7 +1,8 @@
 """Law of every symmetry: rendering the transformed scene gives the transformed picture.
 
-The renderer is the toy one, which knows nothing of symmetries. Pixels on an edge may fall on
-either side of it by rounding: at most 1 % of them may differ.
+First by the toy's renderer, which knows nothing of symmetries: pixels on an edge may fall on either
+side of it by rounding, so at most 1 % of them may differ. Then by Mitsuba, in independent passes
+that each go through the symmetry as training would send them. Then below a sky.
 """
 
 import dataclasses
@@ -10,11 +11,29 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
-from model.scene_tensors import tensors_of
+from model.hits.radiosity import scene_light
+from model.hits.tracing import lit_scene_of
+from model.hits.view_inputs import Channel, view_inputs
+from model.scene_tensors import SceneTensors, scene_tensors, tensors_of
+from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.renderer import set_threads
+from pipeline.renders.variant import activate, choose_variant
+from storage.conventions import radiance_from_log10
+from storage.errors import TrilightError
+from storage.records.lights import light_rows
+from storage.records.sample import encode_sample
 from storage.records.scene import Scene
+from storage.records.stored_sample import StoredSample, stored_sample
 from storage.seeds import rng_for
 from tests.for_each import for_each
+from tests.model.hits.kit import corner
+from tests.model.hits.test_decoder import hits_config
+from tests.model.kit import tiny_config
+from tests.pipeline.renders.sampling import Estimate, assert_agree, camera_of, render_blocks
+from tests.pipeline.renders.scene_kit import sampled_like_scene
+from tests.sky_maps import smooth
 from tests.train.toy import toy_picture, toy_sample
 from train.data.augment import (
     augmented,
@@ -27,6 +46,8 @@ from train.data.augment import (
     with_views,
 )
 from train.data.scenes import TrainingScene, training_scene
+from train.data.stream import StreamSettings, _SceneMaker
+from train.data.unusable import Unusable
 from train.settings import AugmentationSettings
 
 RESOLUTION = 32
@@ -150,3 +171,166 @@ def test_what_is_left_out_changes_nothing() -> None:
     scene = training_scene(toy_sample(2), 16)
     same = augmented(scene, AugmentationSettings(), rng_for(1, "augment"))
     assert same is scene
+
+
+BLOCK, PASSES, SPP = 4, 16, 64
+
+TRACED = {
+    "mirror": AugmentationSettings(mirror=True),
+    "channels": AugmentationSettings(channels=True),
+    "vertex order": AugmentationSettings(vertex_order=True),
+    "rotation of the recipe": AugmentationSettings(rotation="recipe", translation=0.25),
+    "any rotation": AugmentationSettings(rotation="uniform"),
+    "light scale": AugmentationSettings(light_scale=4.0),
+    "light mix": AugmentationSettings(light_mix=8.0),
+    "all at once": dataclasses.replace(EVERYTHING, light_scale=2.0, light_mix=4.0),
+}
+
+
+@pytest.fixture(scope="module")
+def mitsuba() -> None:
+    activate(choose_variant())
+    set_threads(2)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """Glossy, coloured, with lights of different colours, so that every symmetry shows."""
+    for index in range(100):
+        scene = sampled_like_scene(rng_for(index, "symmetry"), num_views=1)
+        if len(light_rows(scene)) == 3:
+            break
+    rows = light_rows(scene)
+    materials = scene.materials.copy()
+    colours = rng_for(3, "colours").uniform(0.3, 1, (len(rows), 3))
+    for row, colour in zip(rows, colours, strict=True):
+        of_light = scene.material_index[scene.object_index == row]
+        materials[of_light[0], 7:] *= colour
+    return dataclasses.replace(scene, materials=materials.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def passes(scene: Scene, mitsuba: None) -> NDArray[np.float32]:
+    """[PASSES, L, R, R, 3]: independent pictures of each light alone."""
+    tracer = load_tracer(scene, max_depth=10, rr_depth=5)
+    camera = camera_of(scene, RESOLUTION)
+    lights = [tracer.only_light(row) for row in light_rows(scene)]
+    return np.stack(
+        [
+            np.stack([light.radiance(camera, seed=1000 + k, spp=SPP) for light in lights])
+            for k in range(PASSES)
+        ]
+    )
+
+
+def transformed(
+    scene: Scene, lights_LRR3: NDArray[np.float32], symmetry: Callable[..., TrainingScene]
+) -> TrainingScene:
+    sample = dataclasses.replace(
+        toy_sample(0, views=1),
+        scene=scene,
+        radiance_rgb=lights_LRR3.sum(axis=0)[None],
+        lights_rgb=lights_LRR3[None],
+    )
+    return symmetry(training_scene(sample, RESOLUTION, lights_apart=True))
+
+
+@pytest.mark.slow("statistics")
+@for_each("name", sorted(TRACED))
+def test_the_path_traced_picture_is_the_transformed_one(
+    name: str, scene: Scene, passes: NDArray[np.float32]
+) -> None:
+    seed = next(s for s in range(9) if rng_for(s, "draw").random() < 0.5)  # a visit that mirrors
+
+    def symmetry(training: TrainingScene) -> TrainingScene:
+        return augmented(training, TRACED[name], rng_for(seed, "draw"))
+
+    visits = [transformed(scene, lights, symmetry) for lights in passes]
+    pictures = np.array([radiance_from_log10(v.target_VRR3[0].double()) for v in visits])
+    count = RESOLUTION // BLOCK
+    blocks = pictures.reshape(PASSES, count, BLOCK, count, BLOCK, 3).mean(axis=(2, 4))
+    expected = Estimate(
+        mean=blocks.mean(axis=0), error=blocks.std(axis=0, ddof=1) / np.sqrt(PASSES)
+    )
+    other = scene_behind(visits[0], scene)
+    other.check()
+    estimate = render_blocks(other, resolution=RESOLUTION, block=BLOCK, passes=PASSES)
+    # float32 positions and log10(1 + x): relative 1e-4 covers both
+    assert_agree(estimate, expected, slack=1e-4)
+    if name not in ("vertex order", "rotation of the recipe", "any rotation"):
+        untouched = render_blocks(scene, resolution=RESOLUTION, block=BLOCK, passes=PASSES)
+        with pytest.raises(AssertionError, match="of what is allowed"):
+            assert_agree(estimate, untouched)
+    assert torch.isfinite(visits[0].target_VRR3).all()
+
+
+ORDER = np.array([2, 0, 1])
+
+
+def _direct(tensors: SceneTensors) -> NDArray:
+    """Return the mean of the direct light of several noises, at four pixels by four."""
+    lit = lit_scene_of(tensors)
+    light = scene_light(lit)
+    total = np.zeros((32, 32, 3), np.float32)
+    for seed in range(6):
+        found = view_inputs(
+            lit, light, tensors.c2w_V44[0].numpy(), float(tensors.fov_deg_V[0]), 32,
+            rays_a_side=2, anchors_a_side=8, gather_rays=0, sky_rays=8, seed=seed,
+        ).pixels  # fmt: skip
+        total += found[..., Channel.SHOWN_DIFFUSE] / 6
+    return total.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3))
+
+
+@for_each("symmetry", ["moved", "mirrored", "channels", "scaled"])
+def test_a_sky_goes_through_the_symmetries_of_training(symmetry: str) -> None:
+    tensors = scene_tensors(corner(sky=smooth(), radiance=0.0))
+    training = TrainingScene(
+        key="",
+        tensors=tensors,
+        target_VRR3=torch.zeros(1, 4, 4, 3),
+        noise_V=torch.zeros(1),
+        light_T=torch.zeros(tensors.num_triangles, dtype=torch.int64),
+    )
+    before = _direct(tensors)
+    if symmetry == "moved":
+        rotation = rotation_rand("uniform", np.random.default_rng(0))
+        after = _direct(moved(training, rotation, torch.tensor([0.4, -0.1, 0.2])).tensors)
+    elif symmetry == "mirrored":
+        after = _direct(mirrored(training).tensors)[:, ::-1]
+    elif symmetry == "channels":
+        after = _direct(with_channels(training, ORDER).tensors)
+        before = before[..., ORDER]
+    else:
+        after = _direct(with_light_scaled(training, 3.0).tensors) / np.float32(3)
+    # The noise goes along, but behind a mirror: there 48 rays and more of 16 pixels differ by 3 %.
+    most = 0.06 if symmetry == "mirrored" else 0.005
+    assert before.std() > 0.05
+    assert np.median(np.abs(after / np.maximum(before, 1e-3) - 1)[before > 0.05]) < most
+    assert after.mean() == pytest.approx(before.mean(), rel=most / 4)
+
+
+def _below_a_sky() -> StoredSample:
+    sample = toy_sample(0)
+    below = dataclasses.replace(sample.scene, environment=smooth())
+    return stored_sample("0", encode_sample(dataclasses.replace(sample, scene=below)))
+
+
+@for_each(
+    ("config", "is_known"),
+    [
+        (tiny_config(), False),
+        (hits_config(), False),
+        (hits_config(sky_rays=2), True),
+    ],
+)
+def test_training_takes_skies_that_its_network_knows(config: object, is_known: bool) -> None:
+    settings = StreamSettings(
+        seed=0, window=1, batch_size=1, resolution=16, views_per_scene=1, network=config  # type: ignore[arg-type]
+    )  # fmt: skip
+    rng = np.random.default_rng(0)
+    maker = _SceneMaker(None, None, settings, Unusable(0))  # type: ignore[arg-type]
+    if is_known:
+        assert maker._drawn(_below_a_sky(), rng).tensors.sky is not None
+        return
+    with pytest.raises(TrilightError, match="this network does not know its light"):
+        maker._drawn(_below_a_sky(), rng)

@@ -1,11 +1,8 @@
 """Laws of the stream: batch i is the same scenes for ever, and errors arrive where they belong."""
 
 import dataclasses
-import itertools
 import threading
 from collections.abc import Iterator
-from contextlib import closing
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,15 +10,14 @@ import torch
 from model.demodulated import with_albedo
 from model.scene_tensors import tensors_of
 from storage.dataset.dataset import Dataset
-from storage.dataset.training_data import TrainingData, open_training_data
+from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.model.kit import tiny_config
+from tests.train.kit import take
 from tests.train.toy import write_toy_dataset
-from train.data.order import RankShare
 from train.data.scenes import TrainingScene
-from train.data.stream import StreamSettings, prefetched, stream_batches
-from train.data.unusable import Unusable, first_samples
+from train.data.stream import StreamSettings, prefetched
 from train.settings import AugmentationSettings
 
 SETTINGS = StreamSettings(
@@ -35,36 +31,9 @@ SETTINGS = StreamSettings(
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("toy")
     return write_toy_dataset(folder, train=14, validation=2, per_shard=3, resolution=16)
-
-
-@pytest.fixture(scope="module")
-def data(dataset: Dataset) -> TrainingData:
-    return open_training_data([str(dataset.folder.root)])
-
-
-def take(
-    data: TrainingData,
-    first: int,
-    count: int,
-    *,
-    rank: int = 0,
-    world_size: int = 1,
-    workers: int = 1,
-    settings: StreamSettings = SETTINGS,
-) -> list[list[TrainingScene]]:
-    batches = stream_batches(
-        data.split("train"),
-        settings,
-        first,
-        share=RankShare(rank=rank, world_size=world_size),
-        workers=workers,
-        unusable=Unusable(0),
-    )
-    with closing(batches):
-        return list(itertools.islice(batches, count))
 
 
 def same(a: TrainingScene, b: TrainingScene) -> bool:
@@ -102,25 +71,33 @@ WHOLE = 8
 
 
 @pytest.fixture(scope="module")
-def whole(data: TrainingData) -> list[list[TrainingScene]]:
+def whole(data: Dataset) -> list[list[TrainingScene]]:
     """Batches of more than three epochs, uninterrupted."""
-    return take(data, 0, WHOLE)
+    return take(data, SETTINGS, WHOLE)
 
 
 @for_each("first", range(WHOLE))
 def test_resuming_after_every_batch_is_uninterrupted(
-    data: TrainingData, whole: list[list[TrainingScene]], first: int
+    data: Dataset, whole: list[list[TrainingScene]], first: int
 ) -> None:
-    assert same_batches(whole[first:], take(data, first, WHOLE - first))
+    assert same_batches(whole[first:], take(data, SETTINGS, WHOLE - first, first=first))
 
 
 @for_each("world_size", [2, 3, 6])
 @for_each("first", range(0, WHOLE, 3))
 def test_any_number_of_ranks_may_go_on(
-    data: TrainingData, whole: list[list[TrainingScene]], first: int, world_size: int
+    data: Dataset, whole: list[list[TrainingScene]], first: int, world_size: int
 ) -> None:
     shares = [
-        take(data, first, WHOLE - first, rank=rank, world_size=world_size, workers=1 + rank % 2)
+        take(
+            data,
+            SETTINGS,
+            WHOLE - first,
+            first=first,
+            rank=rank,
+            world_size=world_size,
+            workers=1 + rank % 2,
+        )
         for rank in range(world_size)
     ]
     assert {len(batch) for share in shares for batch in share} == {6 // world_size}
@@ -134,20 +111,20 @@ def test_any_number_of_ranks_may_go_on(
 
 @for_each("workers", [0, 2, 5])
 def test_the_number_of_threads_changes_nothing(
-    data: TrainingData, whole: list[list[TrainingScene]], workers: int
+    data: Dataset, whole: list[list[TrainingScene]], workers: int
 ) -> None:
     before = threading.active_count()
-    assert same_batches(take(data, 0, WHOLE, workers=workers), whole)
+    assert same_batches(take(data, SETTINGS, WHOLE, workers=workers), whole)
     assert threading.active_count() == before, "closing the stream ends its threads"
 
 
 def test_a_list_of_the_same_shards_gives_the_same_batches(
-    dataset: Dataset, whole: list[list[TrainingScene]]
+    data: Dataset, whole: list[list[TrainingScene]]
 ) -> None:
-    listed = open_training_data([f"{dataset.folder.root}/train-{{000000..000004}}.tar"])
+    listed = open_training_data([f"{data.folder.root}/train-{{000000..000004}}.tar"])
     assert "without a manifest" in listed.notes[0]
-    assert same_batches(take(listed, 0, 4), whole[:4])
-    assert same_batches(take(listed, 3, 2), whole[3:5])
+    assert same_batches(take(listed, SETTINGS, 4), whole[:4])
+    assert same_batches(take(listed, SETTINGS, 2, first=3), whole[3:5])
 
 
 def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) -> None:
@@ -160,9 +137,9 @@ def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) ->
     assert not same(visits[0], visits[1]), "every visit draws its own views and symmetries"
 
 
-def test_ranks_that_cannot_share_equally_are_refused(data: TrainingData) -> None:
+def test_ranks_that_cannot_share_equally_are_refused(data: Dataset) -> None:
     with pytest.raises(TrilightError, match="not divisible by 4 ranks"):
-        take(data, 0, 1, world_size=4)
+        take(data, SETTINGS, 1, world_size=4)
 
 
 def test_a_bug_in_the_thread_is_not_swallowed() -> None:
@@ -176,45 +153,24 @@ def test_a_bug_in_the_thread_is_not_swallowed() -> None:
         next(items)
 
 
-def test_first_samples_are_the_first(data: TrainingData) -> None:
-    keys = [sample.key for sample in first_samples(data.split("train"), 5, Unusable(0))]
-    assert keys == [f"{index:09d}" for index in range(5)]
-    assert len(list(first_samples(data.split("validation"), 99, Unusable(0)))) == 2
-    with pytest.raises(TrilightError, match="the test split holds no scene"):
-        data.split("test")
-
-
-def test_views_are_drawn_without_repetition(data: TrainingData) -> None:
+def test_views_are_drawn_without_repetition(data: Dataset) -> None:
     settings = StreamSettings(seed=0, window=1, batch_size=7, resolution=8, views_per_scene=2)
-    for scene in take(data, 0, 1, settings=settings)[0]:
+    for scene in take(data, settings, 1)[0]:
         poses = scene.tensors.c2w_V44.numpy()
         assert poses.shape[0] == 2
         assert abs(poses[0] - poses[1]).max() > 0
 
 
-def test_albedo_is_that_of_the_scene_after_its_symmetries(data: TrainingData) -> None:
+def test_albedo_is_that_of_the_scene_after_its_symmetries(data: Dataset) -> None:
     """Mirrored, turned and recoloured, as the network would ask for it itself."""
     augmentation = AugmentationSettings(rotation="uniform", mirror=True, channels=True)
     network = tiny_config(demodulated=True, hit_rays=2)
     settings = dataclasses.replace(SETTINGS, augmentation=augmentation, network=network)
     plain = dataclasses.replace(settings, network=tiny_config())
-    pairs = zip(
-        take(data, 0, 1, settings=settings)[0], take(data, 0, 1, settings=plain)[0], strict=True
-    )
+    pairs = zip(take(data, settings, 1)[0], take(data, plain, 1)[0], strict=True)
     for scene, other in pairs:
         expected = with_albedo(other.tensors, 16, 2).albedo_VRR6
         assert expected is not None and scene.tensors.albedo_VRR6 is not None
         assert torch.equal(scene.tensors.albedo_VRR6, expected) and expected.max() > 0
         assert same(other, dataclasses.replace(scene, tensors=other.tensors))
         assert other.tensors.albedo_VRR6 is None
-
-
-def test_a_damaged_shard_is_named_when_it_is_reached(tmp_path: Path) -> None:
-    write_toy_dataset(tmp_path, train=6, validation=1, per_shard=2, resolution=8)
-    shard = tmp_path / "train-000001.tar"
-    content = bytearray(shard.read_bytes())
-    content[len(content) // 2] ^= 1
-    shard.write_bytes(content)
-    settings = StreamSettings(seed=0, window=1, batch_size=1, resolution=8, views_per_scene=1)
-    with pytest.raises(TrilightError, match=r"train-000001.tar.*sha256"):
-        take(open_training_data([str(tmp_path)]), 0, 6, settings=settings)

@@ -12,6 +12,7 @@ from PIL import Image
 from infra.judging import plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
+from pipeline.builds.judging import JUDGING_BUILDS
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
@@ -21,7 +22,7 @@ from storage.records.scene import Scene
 from storage.seeds import rng_for
 from tests.command_line import trilight
 from tests.train.kit import tiny_run
-from tests.train.loss.test_lpips import small_weights
+from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
 from train.evaluation.evaluate import (
@@ -36,6 +37,7 @@ from train.evaluation.evaluate import (
 from train.evaluation.judge import judged_scene, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, by_group, facts_of, summary
 from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
+from train.evaluation.published import BENCHMARK
 from train.evaluation.report import markdown, record
 from train.evaluation.rivals import MEDIAN, NEAREST, Rivals, median_picture
 from train.evaluation.same_time import TRACER
@@ -320,3 +322,11 @@ def test_the_command_shows_the_path_tracer_in_the_networks_time(
     assert found["path tracer"]["network_further_s"] > 0 and "and the path tracer" in told
     with Image.open(out / "worst.png") as sheet:
         assert sheet.width > 1500, "five pictures a view, two views a line"
+
+
+def test_the_benchmark_stands_beside_the_paper() -> None:
+    assert record([row(0)], {"build": "smoke"})["published"] is None
+    page = markdown(record([row(0)], {"build": BENCHMARK}))
+    assert BENCHMARK in JUDGING_BUILDS
+    assert "| psnr_linear_db | 29.77 | 30.00 |" in page and "| lpips | 0.0551 | n/a |" in page
+    assert "400 scenes" in page and "256 x 256" in page
