@@ -3,9 +3,7 @@
 The laws between fields are why: an end is reached by changing its neighbours too.
 """
 
-import contextlib
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -169,16 +167,6 @@ def at_end(settings: type, field: Declared, end: End, number: float) -> Any:
     example = EXAMPLES[settings]
     changes = {field.name: with_number(example, field, end, number)}
     return dataclasses.replace(example, **(BESIDE.get((settings, field.name, end), {}) | changes))
-
-
-@contextlib.contextmanager
-def naming(*parts: str) -> Iterator[None]:
-    """Have what fails inside name the field."""
-    try:
-        yield
-    except BaseException as failure:  # also what pytest.raises raises
-        failure.add_note(" ".join(parts))
-        raise
 
 
 SCENE_REASONS = ("no_room", "over_budget", "no_faces", "no_camera", "emitter_inside")

@@ -1,4 +1,4 @@
-"""How work is divided, at its ends: one shard, one range, too many workers, millions of scenes."""
+"""How work is divided, at its ends: one range, too many workers, empty and broken ranges."""
 
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -6,19 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.flows.dataset_flows import generate_scenes
-from pipeline.flows.orders import dataset_order
 from pipeline.making.pipeline import make_dataset
 from pipeline.making.run import ShardJob, TaskOutcome
 from pipeline.making.runner import in_window
-from pipeline.making.tasks import MOST_TASKS, Piece, TaskSizes, cut_tasks
+from pipeline.making.tasks import Piece
 from storage.dataset.dataset import open_dataset
-from storage.dataset.settings import MOST_SCENES, SplitSettings
-from storage.dataset.splits import shards_for
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from tests.extremes.range_examples import naming
-from tests.pipeline.flows.test_forms import _defaults
+from tests.for_each import case
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
@@ -26,21 +21,6 @@ from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, with
 def scenes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
     """Split and number of each scene that is made, without objects and pictures."""
     return without_rendering(monkeypatch)
-
-
-def test_a_set_of_one_shard_is_the_beginning_of_a_larger_one(
-    tmp_path: Path, scenes: list[tuple[str, int]]
-) -> None:
-    for name, number in (("one", 1), ("three", 9)):  # rounded up to shards of four
-        runner = Undocumented()
-        make_dataset(tiny_order(out=str(tmp_path / name), scenes=number), runner)
-        assert runner.finished == 1
-        assert verify_dataset(tmp_path / name).problems == []
-    assert [scene for _, scene in scenes] == [*range(4), *range(12)]
-    (only,), all_three = (
-        open_dataset(str(tmp_path / name)).manifest.shards for name in ("one", "three")
-    )
-    assert only == all_three[0] and len(all_three) == 3
 
 
 def test_ranges_of_one_shard_in_any_order_are_the_whole(
@@ -105,26 +85,6 @@ def test_as_many_makers_at_once_as_there_are_scenes(
     assert verify_dataset(tmp_path / "set").problems == []
 
 
-@pytest.mark.parametrize(
-    ("per_shard", "seconds"),
-    [(256, 0.0), (256, 240.0), (100_000, 1e6), (1_000_000, 0.001)],
-)
-def test_ten_million_scenes_are_at_most_a_thousand_tasks(per_shard: int, seconds: float) -> None:
-    """However fast or slow, cut when asked for: the first is there before the second exists."""
-    splits, sizes = SplitSettings(scenes_per_shard=per_shard), TaskSizes()
-    shards = range(shards_for(10_000_000, splits))
-    tasks = cut_tasks(shards, splits, sizes)
-    made, first = 0, next(tasks)
-    assert len(first) >= 1
-    sizes.measured(1, seconds)
-    number = 1
-    for task in (first, *tasks):
-        made += sum(piece.last - piece.first for piece in task)
-        number += task is not first
-    assert number <= MOST_TASKS
-    assert made == len(shards) * per_shard >= 10_000_000
-
-
 def test_a_window_is_never_exceeded_and_needs_no_more_tasks_than_there_are() -> None:
     for window, number in ((1, 5), (5, 1), (1000, 3), (3, 0)):
         held: list[int] = []
@@ -149,7 +109,7 @@ def test_a_window_is_never_exceeded_and_needs_no_more_tasks_than_there_are() -> 
 
 def test_empty_and_broken_ranges_are_refused_by_name() -> None:
     for shards in ("0:0", "3:3", "5:2", "-1:2", "0", ":", "0:1:2", "a:b", " 0:1"):
-        with naming(shards), pytest.raises(TrilightError) as caught:
+        with case(shards), pytest.raises(TrilightError) as caught:
             tiny_order(shards=shards)
         assert str(caught.value).startswith(f"shards is {shards!r}; expected a range such as 0:8")
         assert "\n" not in str(caught.value)
@@ -159,29 +119,14 @@ def test_a_range_beyond_the_end_is_refused_and_one_that_reaches_beyond_makes_wha
     tmp_path: Path, scenes: list[tuple[str, int]]
 ) -> None:
     for shards in ("2:3", "99999999999999999999:100000000000000000000"):
-        with pytest.raises(TrilightError) as caught:
-            make_dataset(
-                tiny_order(out=str(tmp_path / "set"), scenes=8, shards=shards), Undocumented()
-            )
+        order = tiny_order(out=str(tmp_path / "set"), scenes=8, shards=shards)
         expected = (
-            f"shards is {shards!r}; expected one that begins below 2, the shards of 8 scenes."
+            f"^shards is '{shards}'; expected one that begins below 2, the shards of 8 scenes"
         )
-        assert str(caught.value) == expected
+        with pytest.raises(TrilightError, match=expected):
+            make_dataset(order, Undocumented())
     assert scenes == []
-    outcome = make_dataset(
-        tiny_order(out=str(tmp_path / "set"), scenes=8, shards="1:10000"), Undocumented()
-    )
+    order = tiny_order(out=str(tmp_path / "set"), scenes=8, shards="1:10000")
+    outcome = make_dataset(order, Undocumented())
     assert (outcome.num_shards, outcome.num_shards_planned) == (1, 2)
     assert [scene for _, scene in scenes] == [4, 5, 6, 7]
-
-
-def test_a_flow_takes_scenes_at_both_ends_of_their_range() -> None:
-    """A flow makes its order first, before anything is begun."""
-    for number in (1, MOST_SCENES):
-        assert generate_scenes.validate_parameters({"scenes": number})["scenes"] == number
-        assert dataset_order(_defaults(scenes=number)).scenes == number
-    for number in (0, -1, MOST_SCENES + 1):
-        with pytest.raises(
-            TrilightError, match=f"^scenes is {number}; expected a whole number from"
-        ):
-            dataset_order(_defaults(scenes=number))

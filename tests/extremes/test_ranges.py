@@ -19,7 +19,8 @@ from storage.records.texture import CONSTANT
 from storage.settings.described import checked, described
 from storage.settings.ranges import Columns, Declared, Within, declared_ranges
 from tests.conftest import ROOT
-from tests.extremes.range_examples import EXAMPLES, FIELDS, End, at_end, naming
+from tests.extremes.range_examples import EXAMPLES, FIELDS, End, at_end
+from tests.for_each import case
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import textured_scene
 
@@ -51,7 +52,7 @@ def first_outside(field: Declared, end: End) -> float:
 @every_end
 def test_an_end_of_each_field_is_accepted(end: End) -> None:
     for settings, field in FIELDS:
-        with naming(settings.__name__, field.name):
+        with case((settings.__name__, field.name)):
             at_end(settings, field, end, last_inside(field, end))
 
 
@@ -60,7 +61,7 @@ def test_one_step_outside_is_refused_by_name(end: End) -> None:
     for settings, field in FIELDS:
         number = first_outside(field, end)
         option = re.sub("_(db|deg|ev)$", "", field.name).replace("_", "-")
-        with naming(settings.__name__, field.name):
+        with case((settings.__name__, field.name)):
             with pytest.raises(TrilightError) as caught:
                 at_end(settings, field, end, number)
             message = str(caught.value)
@@ -72,7 +73,7 @@ def test_one_step_outside_is_refused_by_name(end: End) -> None:
 
 def test_other_kinds_of_values_are_refused() -> None:
     for settings, field in FIELDS:
-        with naming(settings.__name__, field.name):
+        with case((settings.__name__, field.name)):
             _require_refusals(settings, field)
 
 
@@ -206,7 +207,7 @@ def _place(field: Declared) -> Any:
 @every_end
 def test_an_array_of_a_scene_may_reach_the_end(end: End) -> None:
     for field in ARRAYS:
-        with naming(_array_name(field)):
+        with case(_array_name(field)):
             _require_end(field, end)
 
 
@@ -248,5 +249,5 @@ def test_an_array_of_a_scene_beyond_the_end_is_refused(end: End) -> None:
         place = _place(field)
         index = ", ".join(str(at) for at in (place if isinstance(place, tuple) else (place,)))
         message = rf"{field.name}\[{index}\] is .*; expected"
-        with naming(_array_name(field)), pytest.raises(TrilightError, match=message):
+        with case(_array_name(field)), pytest.raises(TrilightError, match=message):
             _with(field, number).check()

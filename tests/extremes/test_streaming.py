@@ -1,7 +1,6 @@
 """The smallest and largest things that a training run may be made to read, or is refused."""
 
 import itertools
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -18,37 +17,23 @@ from storage.dataset.training_data import open_training_data
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from tests.pipeline.making.derive_kit import finished, scenes
+from tests.train.kit import keys_of, take
 from tests.train.toy import write_toy_dataset
-from train.data.order import OrderSettings, RankShare, batches_from, windows_from
-from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import Unusable
+from train.data.order import OrderSettings, batches_from, windows_from
+from train.data.stream import StreamSettings
 
 
 def keys(
     root: Path, batch_size: int, count: int, *, first: int = 0, window: int = 4, ranks: int = 1
 ) -> list[list[str]]:
-    """Return the keys of the batches first, first + 1, ... of a dataset."""
+    """Return the keys of the batches first, first + 1, ... of a dataset, sorted."""
     settings = StreamSettings(
         seed=0, window=window, batch_size=batch_size, resolution=8, views_per_scene=1
     )
-    shares = [_keys(root, settings, first, count, RankShare(rank=r, world_size=ranks))
-              for r in range(ranks)]  # fmt: skip
-    return [sorted(itertools.chain(*parts)) for parts in zip(*shares, strict=True)]
-
-
-def _keys(
-    root: Path, settings: StreamSettings, first: int, count: int, share: RankShare
-) -> list[list[str]]:
-    batches = stream_batches(
-        open_training_data([str(root)]).split("train"),
-        settings,
-        first,
-        share=share,
-        workers=1,
-        unusable=Unusable(0),
-    )
-    with closing(batches):
-        return [[scene.key for scene in batch] for batch in itertools.islice(batches, count)]
+    data = open_training_data([str(root)])
+    shares = [take(data, settings, count, first=first, rank=rank, world_size=ranks)
+              for rank in range(ranks)]  # fmt: skip
+    return [sorted(itertools.chain(*keys_of(parts))) for parts in zip(*shares, strict=True)]
 
 
 def every(train: int) -> list[str]:
@@ -91,13 +76,6 @@ def test_a_batch_in_a_distant_epoch_is_had_at_once(tmp_path: Path) -> None:
     assert [place.position for place in batch] == list(range(3 * first, 3 * first + 64))
 
 
-def test_pixels_that_do_not_divide_the_data_s_are_refused(tmp_path: Path) -> None:
-    write_toy_dataset(tmp_path, train=1, validation=1, per_shard=1, resolution=8, views=1)
-    settings = StreamSettings(seed=0, window=1, batch_size=1, resolution=3, views_per_scene=1)
-    with pytest.raises(TrilightError, match="resolution 3: expected a divisor of 8"):
-        _keys(tmp_path, settings, 0, 1, RankShare())
-
-
 @pytest.mark.parametrize("num_samples", [0, 1, SAMPLES_PER_SHARD + 1, 20_000])
 def test_an_index_of_any_length_comes_back(tmp_path: Path, num_samples: int) -> None:
     write_manifest_of(tmp_path, num_samples)
@@ -113,32 +91,13 @@ def test_an_index_of_any_length_comes_back(tmp_path: Path, num_samples: int) -> 
             data.split("train")
 
 
-def _derived(source: Path, out: Path, derive: Derive) -> list[tuple[str, int]]:
-    """Return split and size of the shards that are made of a dataset of 4 and 2 scenes."""
-    derive_shards([open_finished(str(source))], derive, DatasetFolder(out))
-    assert verify_dataset(out).problems == []
-    return [(shard.split, shard.num_samples) for shard in open_dataset(str(out)).manifest.shards]
-
-
-@pytest.mark.parametrize(
-    ("size", "made"),
-    [
-        (1, [("train", 1)] * 4 + [("test", 1)] * 2),
-        (10**9, [("train", 4), ("test", 2)]),
-    ],
-)
-def test_shards_of_one_scene_and_one_shard_of_all(
-    tmp_path: Path, size: int, made: list[tuple[str, int]]
-) -> None:
-    source = finished(tmp_path / "a", scenes(0))
-    derive = Derive(operation="reshard", scenes_per_shard=size)
-    assert sorted(_derived(source, tmp_path / "b", derive)) == sorted(made)
-
-
 def test_a_selection_of_one_scene_is_a_dataset_and_of_none_is_refused(tmp_path: Path) -> None:
     source = finished(tmp_path / "a", scenes(0))  # the best floor is 41 dB, of scene 5
     one = Derive(operation="select", selection=Selection(min_noise_floor_db=40.9))
-    assert _derived(source, tmp_path / "one", one) == [("test", 1)]
+    derive_shards([open_finished(str(source))], one, DatasetFolder(tmp_path / "one"))
+    assert verify_dataset(tmp_path / "one").problems == []
+    (shard,) = open_dataset(str(tmp_path / "one")).manifest.shards
+    assert (shard.split, shard.num_samples) == ("test", 1)
     none = Derive(operation="select", selection=Selection(min_noise_floor_db=41.1))
     with pytest.raises(TrilightError, match="none of the 6 scenes"):
         derive_dataset([str(source)], none, tmp_path / "none")

@@ -30,15 +30,10 @@ BAD_KEY = "000000002"
 
 
 def keys(
-    data: TrainingData | Dataset,
-    unusable: Unusable,
-    settings: StreamSettings = SETTINGS,
-    count: int = 4,
-    rank: int = 0,
-    world_size: int = 1,
+    data: TrainingData | Dataset, unusable: Unusable, *, count: int = 4, **ranks: int
 ) -> list[list[str]]:
-    ranks: dict[str, Any] = {"rank": rank, "world_size": world_size}
-    return keys_of(take(data, settings, count, workers=2, unusable=unusable, **ranks))
+    part: dict[str, Any] = ranks
+    return keys_of(take(data, SETTINGS, count, workers=2, unusable=unusable, **part))
 
 
 @pytest.fixture
@@ -219,8 +214,8 @@ def write_shards(folder: Path, spoil: Callable[[Members], object], bad_samples: 
 
 
 def spoilt_keys(paths: list[str], unusable: Unusable, count: int = 5) -> set[str]:
-    found = keys(open_training_data(paths), unusable, BOTH_VIEWS, count)
-    return set(itertools.chain(*found))
+    found = take(open_training_data(paths), BOTH_VIEWS, count, unusable=unusable)
+    return set(itertools.chain(*keys_of(found)))
 
 
 @for_each("case", CASES)

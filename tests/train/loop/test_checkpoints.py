@@ -40,6 +40,7 @@ from train.loop.crew import Crew
 from train.loop.recorder import MetricsLog
 from train.loop.state import TrainState, new_state
 from train.settings import TrainSettings
+from train.stored_settings import known_settings
 from train.watching.rows import read_rows
 
 CASES = [("fsync", "before"), ("replace", "before"), ("replace", "after"), ("unlink", "before")]
@@ -52,6 +53,7 @@ from storage.settings.described import from_record
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.state import new_state
 from train.settings import TrainSettings
+from train.stored_settings import known_settings
 
 settings = from_record(TrainSettings, json.loads(sys.argv[2]))
 state = new_state(settings)
@@ -243,7 +245,7 @@ def save(path: Path, state: TrainState, settings: TrainSettings | None = None) -
 
 def load(path: Path) -> TrainState:
     checkpoint = read_checkpoint(path)
-    typed = from_record(TrainSettings, checkpoint.header["settings"])
+    typed = from_record(TrainSettings, known_settings(checkpoint.header["settings"], "resume"))
     return resumed_state(checkpoint, going_on(checkpoint.header, typed, DIGEST, {}))
 
 
