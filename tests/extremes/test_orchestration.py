@@ -1,20 +1,32 @@
-"""How work is divided, at its ends: one range, too many workers, empty and broken ranges."""
+"""How work is divided, at its ends: one range, too many workers, empty and broken ranges.
 
+And the smallest and largest things that a training run may be made to read.
+"""
+
+import itertools
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from infra.bench.subjects.manifests import SAMPLES_PER_SHARD, write_manifest_of
 from pipeline.making.pipeline import make_dataset
 from pipeline.making.run import ShardJob, TaskOutcome
 from pipeline.making.runner import in_window
 from pipeline.making.tasks import Piece
 from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import read_manifest, write_manifest
+from storage.dataset.training_data import open_training_data
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from tests.for_each import case
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
+from tests.train.kit import keys_of, take
+from tests.train.toy import write_toy_dataset
+from train.data.order import OrderSettings, batches_from, windows_from
+from train.data.stream import StreamSettings
 
 
 @pytest.fixture
@@ -130,3 +142,71 @@ def test_a_range_beyond_the_end_is_refused_and_one_that_reaches_beyond_makes_wha
     outcome = make_dataset(order, Undocumented())
     assert (outcome.num_shards, outcome.num_shards_planned) == (1, 2)
     assert [scene for _, scene in scenes] == [4, 5, 6, 7]
+
+
+def keys(
+    root: Path, batch_size: int, count: int, *, first: int = 0, window: int = 4, ranks: int = 1
+) -> list[list[str]]:
+    """Return the keys of the batches first, first + 1, ... of a dataset, sorted."""
+    settings = StreamSettings(
+        seed=0, window=window, batch_size=batch_size, resolution=8, views_per_scene=1
+    )
+    data = open_training_data([str(root)])
+    shares = [take(data, settings, count, first=first, rank=rank, world_size=ranks)
+              for rank in range(ranks)]  # fmt: skip
+    return [sorted(itertools.chain(*keys_of(parts))) for parts in zip(*shares, strict=True)]
+
+
+def every(train: int) -> list[str]:
+    return [f"{index:09d}" for index in range(train)]
+
+
+@pytest.mark.parametrize(
+    ("train", "per_shard", "views"),
+    [(1, 1, 1), (5, 1, 1), (5, 99, 2)],
+    ids=["one sample of one view", "one sample a shard", "one shard"],
+)
+def test_small_splits_are_shown_whole_in_every_epoch(
+    tmp_path: Path, train: int, per_shard: int, views: int
+) -> None:
+    write_toy_dataset(
+        tmp_path, train=train, validation=1, per_shard=per_shard, resolution=8, views=views
+    )
+    for window in (1, 1000):
+        assert keys(tmp_path, train, 3, window=window) == [every(train)] * 3, window
+
+
+def test_a_batch_may_be_larger_than_the_split(tmp_path: Path) -> None:
+    """It then holds scenes of several epochs, each as often as there are epochs, one more or less;
+    and a rank for every scene of it changes nothing."""
+    write_toy_dataset(tmp_path, train=3, validation=1, per_shard=2, resolution=8)
+    (batch, other) = keys(tmp_path, 8, 2)
+    assert len(batch) == len(other) == 8
+    counts = [(batch + other).count(key) for key in every(3)]
+    assert sorted(counts) == [5, 5, 6]
+    assert keys(tmp_path, 8, 2, ranks=8) == [batch, other]
+
+
+def test_a_batch_in_a_distant_epoch_is_had_at_once(tmp_path: Path) -> None:
+    write_toy_dataset(tmp_path, train=5, validation=1, per_shard=2, resolution=8)
+    first = 10**12
+    assert keys(tmp_path, 5, 2, first=first) == [every(5)] * 2  # 5 x 10^12 begins an epoch
+    order = OrderSettings(seed=2**63, window=2)
+    windows = windows_from(3, lambda shard: 7, order, 3 * first)
+    batch = next(batches_from(windows, 3 * first, 64))
+    assert [place.position for place in batch] == list(range(3 * first, 3 * first + 64))
+
+
+@pytest.mark.parametrize("num_samples", [0, 1, SAMPLES_PER_SHARD + 1, 20_000])
+def test_an_index_of_any_length_comes_back(tmp_path: Path, num_samples: int) -> None:
+    write_manifest_of(tmp_path, num_samples)
+    path = DatasetFolder(tmp_path).manifest
+    manifest, text = read_manifest(path), path.read_bytes()
+    assert manifest.num_samples == num_samples
+    write_manifest(path, manifest)
+    assert path.read_bytes() == text
+    data = open_training_data([str(tmp_path)])
+    assert len(data.splits) == min(num_samples, 1)
+    if not num_samples:
+        with pytest.raises(TrilightError, match="the train split holds no scene"):
+            data.split("train")

@@ -231,18 +231,6 @@ def test_a_list_gives_the_same_weights_and_says_what_it_lacks(
         trained(RUN, dataset, tmp_path / "out", resume=True)
 
 
-def test_damaged_data_is_left_out_when_it_is_allowed(dataset: Dataset, tmp_path: Path) -> None:
-    root = tmp_path / "damaged"
-    copied = write_toy_dataset(root, train=7, validation=2, per_shard=3)
-    flip_a_bit(copied.folder.shard("train-000002.tar"))
-    with pytest.raises(TrilightError, match=r"train-000002\.tar.*sha256"):
-        trained(RUN, [str(root)], tmp_path / "a")
-    result = trained(dataclasses.replace(RUN, most_unusable=1), [str(root)], tmp_path / "b")
-    (message,) = result.unusable
-    assert "train-000002.tar" in message
-    assert message in result.folder.summary.read_text().replace("\\n", "\n")
-
-
 def test_the_budget_of_damage_is_the_run_s_and_not_the_process_s(
     dataset: Dataset, tmp_path: Path
 ) -> None:

@@ -195,6 +195,7 @@ def test_a_bad_sample_is_left_out_by_its_key(
     result = run(allowed, data, tmp_path / "out", resume=True, progress=notes)
     assert sum(text.startswith("left out: ") and BAD_KEY in text for text in notes.notes) == 1
     assert BAD_KEY in result.unusable[0] and result.num_steps == 8
+    assert BAD_KEY in result.folder.summary.read_text()
     (event,) = result.history
     assert (event.step, event.name, event.after) == (stopped_at, "most_unusable", 1)
 

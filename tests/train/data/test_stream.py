@@ -1,9 +1,13 @@
-"""Laws of the stream: batch i is the same scenes for ever, and errors arrive where they belong."""
+"""Laws of the stream: batch i is the same scenes for ever, and errors arrive where they belong.
+
+Laws of targets: block means are measurements, and bad values never reach the weights.
+"""
 
 import dataclasses
 import threading
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,11 +16,19 @@ from model.scene_tensors import tensors_of
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
+from storage.records.exr import encode_channels
+from storage.records.profiles import PROFILES, Profile
+from storage.records.sample import decode_sample, encode_sample
+from storage.records.stored_sample import stored_sample
+from storage.seeds import rng_for
 from tests.for_each import for_each
 from tests.model.kit import tiny_config
 from tests.train.kit import take
-from tests.train.toy import write_toy_dataset
-from train.data.scenes import TrainingScene
+from tests.train.toy import toy_sample, write_toy_dataset
+from train.data.augment import augmented, with_views
+from train.data.buckets import MOST_WASTE, bucket_scenes
+from train.data.resolution import block_mean
+from train.data.scenes import TrainingScene, drawn_scene, training_scene, with_target
 from train.data.stream import StreamSettings, prefetched
 from train.settings import AugmentationSettings
 
@@ -174,3 +186,134 @@ def test_albedo_is_that_of_the_scene_after_its_symmetries(data: Dataset) -> None
         assert torch.equal(scene.tensors.albedo_VRR6, expected) and expected.max() > 0
         assert same(other, dataclasses.replace(scene, tensors=other.tensors))
         assert other.tensors.albedo_VRR6 is None
+
+
+def test_a_smaller_picture_is_the_mean_of_its_blocks() -> None:
+    pictures = rng_for(0, "pictures").uniform(0, 9, (2, 12, 12, 3)).astype(np.float32)
+    small = block_mean(pictures, 4)
+    assert small.shape == (2, 4, 4, 3) and small.dtype == np.float32
+    for row in range(4):
+        for column in range(4):
+            block = pictures[:, 3 * row : 3 * row + 3, 3 * column : 3 * column + 3]
+            # float32 mean of nine numbers below 9
+            expected = block.mean(axis=(1, 2), dtype=np.float64)
+            np.testing.assert_allclose(small[:, row, column], expected, rtol=1e-6)
+
+
+def test_halving_twice_is_quartering_and_light_is_kept() -> None:
+    pictures = rng_for(1, "pictures").uniform(0, 9, (1, 16, 16, 3)).astype(np.float32)
+    twice = block_mean(block_mean(pictures, 8), 4)
+    np.testing.assert_allclose(twice, block_mean(pictures, 4), rtol=1e-6)  # float32 means
+    np.testing.assert_allclose(twice.mean(), pictures.mean(), rtol=1e-6)
+    assert block_mean(pictures, 16) is pictures
+
+
+@for_each("bad", [np.nan, np.inf, -np.inf, -1e-3])
+def test_a_bad_target_is_refused_by_name(bad: float) -> None:
+    sample = toy_sample(4, resolution=16)
+    radiance = sample.radiance_rgb.copy()
+    radiance[1, 2, 3, 0] = bad
+    with pytest.raises(TrilightError, match=r"sample 000000004: view 1 .* at pixel \(2, 3\)"):
+        dataclasses.replace(sample, radiance_rgb=radiance).check()
+    lights = np.stack([sample.radiance_rgb, radiance], axis=1)
+    with pytest.raises(TrilightError, match=r"view 1 light 1 has .* at pixel \(2, 3\)"):
+        dataclasses.replace(sample, lights_rgb=lights).check()
+
+
+def test_targets_are_log10_of_one_plus_radiance() -> None:
+    sample = toy_sample(4, resolution=16)
+    target = training_scene(sample, 16).target_VRR3.numpy()
+    np.testing.assert_allclose(10.0**target - 1, sample.radiance_rgb, atol=1e-6)  # float32 log
+
+
+def cost(num_triangles: int) -> float:
+    """Mostly what the pictures cost, as in a small network."""
+    return 300.0 + num_triangles
+
+
+@for_each("most", [2, 16])
+def test_buckets_hold_each_scene_once_and_waste_little(most: int) -> None:
+    scenes = [training_scene(toy_sample(index), 8) for index in range(12)]
+    batches = bucket_scenes(scenes, cost, most)
+    lengths: list[int] = []
+    for batch in batches:
+        longest = batch.scenes.triangles_BT33.shape[1]
+        mask = batch.scenes.is_triangle_BT
+        own = mask.sum(1).tolist() if mask is not None else [longest] * len(batch.target_BVRR3)
+        assert longest == max(own)
+        assert len(own) * cost(longest) <= (1 + MOST_WASTE) * sum(cost(one) for one in own)
+        assert len(batch.target_BVRR3) == len(batch.noise_BV) == len(own) <= most
+        lengths += own
+    assert sorted(lengths) == sorted(scene.tensors.num_triangles for scene in scenes)
+    assert 1 < len(batches) < len(scenes)
+
+
+def test_a_view_takes_its_target_and_its_noise_along() -> None:
+    sample = toy_sample(4, resolution=16)
+    floors = (dataclasses.replace(sample.views[0], noise_floor_db=40.0), sample.views[1])
+    scene = training_scene(dataclasses.replace(sample, views=floors), 16)
+    torch.testing.assert_close(scene.noise_V, torch.tensor([1e-2, 1e-5]))
+    assert with_views(scene, np.array([1])).noise_V.tolist() == scene.noise_V[1:].tolist()
+
+
+def test_what_a_run_does_not_take_is_refused() -> None:
+    sample = toy_sample(4, resolution=16)
+    most = sample.scene.num_triangles
+    assert training_scene(sample, 16, most_triangles=most).tensors.num_triangles == most
+    with pytest.raises(TrilightError, match=f"{most} triangles; the run takes at most {most - 1}"):
+        training_scene(sample, 16, most_triangles=most - 1)
+    with pytest.raises(TrilightError, match=r"not kept apart, which light_mix needs.*per_light"):
+        training_scene(sample, 16, lights_apart=True)
+
+
+@for_each("profile", PROFILES)
+@for_each("lights_apart", [False, True])
+def test_drawn_views_are_those_of_the_whole_sample_to_the_bit(
+    profile: Profile, lights_apart: bool
+) -> None:
+    """Looked up by bits, or computed for each pixel; after all symmetries, at both resolutions."""
+    sample = toy_sample(1, resolution=16, views=3)
+    noisy = tuple(dataclasses.replace(view, noise_floor_db=20.0) for view in sample.views)
+    sample = dataclasses.replace(sample, views=noisy)
+    if lights_apart:
+        exact = sample.radiance_rgb.astype(np.float16).astype(np.float32)
+        sample = dataclasses.replace(sample, radiance_rgb=exact, lights_rgb=exact[:, None])
+    members = encode_sample(sample, profile)
+    whole, stored = decode_sample("1", members), stored_sample("1", members)
+    settings = AugmentationSettings(
+        mirror=True,
+        channels=True,
+        vertex_order=True,
+        light_scale=3.0,
+        light_mix=2.0 if lights_apart else 1.0,
+        rotation="uniform",
+    )
+    rows_seen = 0
+    for seed, resolution in enumerate((16, 16, 8, 16)):
+        full = training_scene(whole, resolution, lights_apart=lights_apart)
+        drawn = drawn_scene(stored, [0, 2], resolution, lights_apart=lights_apart)
+        rows_seen += drawn.levels_L is not None
+        wanted = augmented(
+            with_views(full, np.array([0, 2])), settings, np.random.default_rng(seed)
+        )
+        got = with_target(augmented(drawn, settings, np.random.default_rng(seed)))
+        assert torch.equal(got.target_VRR3, wanted.target_VRR3) and got.levels_L is None
+        assert torch.equal(got.noise_V, wanted.noise_V)
+        for name, tensor in tensors_of(wanted.tensors).items():
+            assert torch.equal(getattr(got.tensors, name), tensor)
+    assert rows_seen == 3
+
+
+def test_what_is_no_half_float_is_no_row() -> None:
+    """Zeros with a sign are zeros; a picture of another tool's float32 is computed as it is."""
+    sample = toy_sample(1, resolution=8)
+    radiance = sample.radiance_rgb.copy()
+    radiance[0, 0, 0] = -0.0
+    members = encode_sample(dataclasses.replace(sample, radiance_rgb=radiance))
+    drawn = with_target(drawn_scene(stored_sample("1", members), [0], 8))
+    assert drawn.target_VRR3[0, 0, 0].tolist() == [0.0, 0.0, 0.0]
+    members["1.exr"] = encode_channels({"RGB": sample.radiance_rgb[1]})
+    mixed = drawn_scene(stored_sample("1", members), [0, 1], 8)
+    assert mixed.levels_L is None
+    wanted = torch.from_numpy(np.log10(1 + sample.radiance_rgb[1]).astype(np.float32))
+    assert torch.equal(mixed.target_VRR3[1], wanted)

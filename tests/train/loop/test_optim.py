@@ -103,32 +103,6 @@ def test_muon_moves_every_direction_of_a_matrix_about_as_far(
 
 
 @each_kind
-def test_without_a_gradient_every_weight_shrinks_by_its_rate(
-    muon_rate: float, precision: Precision
-) -> None:
-    model = with_gradients()
-    for weight in model.parameters():
-        weight.grad = torch.zeros_like(weight)
-    before = [weight.detach().clone() for weight in model.parameters()]
-    Updater(model, tiny_run(muon_rate=muon_rate, weight_decay=0.5), precision).step(RATE)
-    for ours, old in zip(model.parameters(), before, strict=True):
-        # float32 rounding of one product
-        rate = muon_rate * RATE if muon_rate and old.ndim == 2 else RATE
-        torch.testing.assert_close(ours.detach(), (1 - 0.5 * rate) * old, rtol=1e-6, atol=0)
-
-
-@for_each("precision", ["bfloat16", "float32"])
-def test_with_muon_vectors_are_moved_as_without(precision: Precision) -> None:
-    def moved_by(settings: TrainSettings) -> dict[str, torch.Tensor]:
-        model = with_gradients()
-        return moved(model, Updater(model, settings, precision))
-
-    with_muon, without = moved_by(tiny_run(muon_rate=3.0)), moved_by(tiny_run())
-    vectors = [name for name, step in without.items() if step.ndim == 1]
-    assert vectors and all(torch.equal(with_muon[name], without[name]) for name in vectors)
-
-
-@each_kind
 def test_what_is_remembered_can_be_taken_over(muon_rate: float, precision: Precision) -> None:
     settings = tiny_run(muon_rate=muon_rate)
     model = with_gradients()
