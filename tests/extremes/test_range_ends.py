@@ -34,7 +34,7 @@ from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
 from storage.errors import Rejected, TrilightError
 from storage.settings.changes import changed
 from storage.settings.ranges import Declared
-from tests.extremes.range_examples import FIELDS, SCENE_REASONS, SMOKE, End
+from tests.extremes.test_ranges import FIELDS, SMOKE, End
 from tests.for_each import case, for_each
 from tests.model.kit import awake, random_scene, tiny_config
 from tests.pipeline.renders.scene_kit import join, light, material, quad
@@ -129,6 +129,9 @@ def _require_scene_or_reason(pool: list[PooledAsset], name: str, field: Declared
             assert (name, end) not in NO_SCENE
             scene.check()
 
+
+SCENE_REASONS = ("no_room", "over_budget", "no_faces", "no_camera", "emitter_inside")
+"""Why a room may not be possible."""
 
 CHEAP = [
     name for name, _ in SCENE_FIELDS

@@ -83,8 +83,8 @@ def test_geometry_behind_the_camera_and_emitters_are_not_hit() -> None:
     assert not hit_masks(at_light, 8).any()
 
 
-def view_score(log_l1: float) -> ViewScore:
-    return ViewScore(log_l1=log_l1, psnr_log_db=0, psnr_linear_db=0, object_psnr_log_db=0)
+def view_score(log_l1: float, db: float = 0.0) -> ViewScore:
+    return ViewScore(log_l1=log_l1, psnr_log_db=db, psnr_linear_db=db, object_psnr_log_db=db)
 
 
 def test_a_lead_is_sure_where_scenes_agree_on_it() -> None:
@@ -115,18 +115,13 @@ def test_scores_are_those_of_storage() -> None:
 
 
 def test_a_summary_shows_the_bad_ones() -> None:
-    def view(value: float) -> ViewScore:
-        return ViewScore(
-            log_l1=value, psnr_log_db=value, psnr_linear_db=value, object_psnr_log_db=value
-        )
-
-    views = [view(float(value)) for value in range(101)]
+    views = [view_score(float(value), float(value)) for value in range(101)]
     summary = summarise(views)
     assert summary["log_l1"] == 50.0
     assert summary["psnr_log_db_median"] == 50.0
     assert summary["object_psnr_log_db_p5"] == pytest.approx(5.0)
     assert share_better(views, views) == 0
-    assert share_better(views, [view(25.5)] * 101) == pytest.approx(26 / 101)
+    assert share_better(views, [view_score(25.5, 25.5)] * 101) == pytest.approx(26 / 101)
 
 
 def test_no_fixed_picture_has_less_l1_error_than_the_median() -> None:
@@ -153,14 +148,13 @@ def test_the_error_picture_is_black_without_error_and_white_at_its_limit() -> No
     assert error_picture(np.full((2, 2, 3), wrong), target).min() == 255
 
 
+def sheet_view(target: NDArray, predicted: NDArray) -> SheetView:
+    return SheetView(name="", scores="", target_rgb=target, predicted_rgb=predicted, noise=0.01)
+
+
 def test_the_sheet_shows_every_view(tmp_path: Path) -> None:
     target = np.full((8, 8, 3), 0.2)
-    views = [
-        SheetView(
-            name=f"view {row}", scores="", target_rgb=target, predicted_rgb=target * row, noise=0.01
-        )
-        for row in range(3)
-    ]
+    views = [sheet_view(target, target * row) for row in range(3)]
     for name in ("a.png", "b.png"):
         write_picture(tmp_path / name, drawn_sheet(views, ("one line", "and another")))
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
@@ -174,10 +168,7 @@ def test_the_noise_picture_is_black_at_the_noise_and_white_at_its_limit() -> Non
     target = np.full((2, 2, 3), 0.5)
 
     def view(error: float) -> SheetView:
-        predicted = 1.5 * 10**error - 1
-        return SheetView(
-            name="", scores="", target_rgb=target, predicted_rgb=target * 0 + predicted, noise=0.01
-        )
+        return sheet_view(target, np.full_like(target, 1.5 * 10**error - 1))
 
     assert noise_picture(view(0.0099)).max() == 0
     assert 0 < noise_picture(view(0.02)).mean() < 255

@@ -106,7 +106,9 @@ def test_it_is_answered_while_the_main_thread_is_in_a_call_that_does_not_return(
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_second_signal_acts_as_it_did_before(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_signal_acts_as_it_did_before_but_not_what_torchrun_passes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(interrupts, "ONE_ASKING_S", 0.0)
     with pytest.raises(KeyboardInterrupt), deferred_interrupts(lambda times: None) as asked:
         signal.raise_signal(signal.SIGINT)
@@ -114,9 +116,7 @@ def test_a_second_signal_acts_as_it_did_before(monkeypatch: pytest.MonkeyPatch) 
         signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
-
-def test_what_torchrun_passes_on_is_no_second_signal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The terminal sends Ctrl-C to all processes, and torchrun sends it to its own once more."""
+    # the terminal sends Ctrl-C to all processes, and torchrun sends it to its own once more
     monkeypatch.setattr(interrupts, "ONE_ASKING_S", 3600.0)
     answers: list[int] = []
     with deferred_interrupts(answers.append) as asked:
@@ -150,7 +150,7 @@ def test_one_piece_of_work_after_another() -> None:
     assert done == ["first", "second"]
 
 
-def test_an_error_is_raised_at_the_next_call_or_at_the_end() -> None:
+def test_an_error_is_raised_at_the_next_call_or_at_the_end_and_hides_no_other() -> None:
     background = Background()
     background.begin(full)
     with pytest.raises(TrilightError, match="the disk is full"):
@@ -158,9 +158,6 @@ def test_an_error_is_raised_at_the_next_call_or_at_the_end() -> None:
     background.wait()
     with pytest.raises(TrilightError, match="the disk is full"), Background() as other:
         other.begin(full)
-
-
-def test_an_error_does_not_hide_another() -> None:
     with pytest.raises(TrilightError, match="a loss") as error, Background() as background:
         background.begin(full)
         raise TrilightError("a loss is not finite")

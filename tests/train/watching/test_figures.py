@@ -12,8 +12,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -196,63 +195,43 @@ def test_what_hardly_moves_does_not_spike_at_a_breath_and_what_is_not_finite_nev
     ]
 
 
-class StandIn(ModuleType):
-    """Has what is used of the package, and remembers it."""
-
-    def __init__(self) -> None:
-        super().__init__("wandb")
-        self.begun: dict[str, Any] = {}
-        self.logged: list[dict[str, Any]] = []
-        self.metrics: list[tuple[str, str]] = []
-        self.finished = 0
-        self.Image = lambda picture: ("picture", picture.size)
-
-    def init(self, **given: Any) -> "StandIn":
-        self.begun = given
-        return self
-
-    def define_metric(self, name: str, *, step_metric: str) -> None:
-        self.metrics.append((name, step_metric))
-
-    def log(self, row: dict[str, Any]) -> None:
-        self.logged.append(row)
-
-    def finish(self) -> None:
-        self.finished += 1
-
-
 @pytest.fixture
-def package(monkeypatch: pytest.MonkeyPatch) -> StandIn:
-    package = StandIn()
+def package(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
+    """Stands for wandb, and remembers what it was asked."""
+    package = MagicMock()
+    package.Image = lambda picture: ("picture", picture.size)
     monkeypatch.setitem(sys.modules, "wandb", package)
     return package
 
 
 def test_rows_and_sheets_of_a_run_are_logged_offline(
-    dataset: Dataset, package: StandIn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dataset: Dataset, package: MagicMock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("WANDB_MODE", raising=False)
     settings, out = tiny_run(num_steps=4), tmp_path / "mine"
     result = trained(settings, dataset, out, watched=WatchSettings(wandb="light"))
-    config = package.begun.pop("config")
+    begun, board = dict(package.init.call_args.kwargs), package.init.return_value
+    config = begun.pop("config")
     assert (config["num_steps"], config["model"]["width"]) == (4, 36)
-    assert package.begun == {
+    assert begun == {
         "project": "light", "group": "mine", "dir": str(out), "mode": "offline",
     }  # fmt: skip
     rows = [row for row in read_rows(result.folder.metrics) if "loss" in row]
-    losses = {row["step"]: row["train/loss"] for row in package.logged if "train/loss" in row}
+    logged = [call.args[0] for call in board.log.call_args_list]
+    losses = {row["step"]: row["train/loss"] for row in logged if "train/loss" in row}
     assert losses == {row["step"]: row["loss"] for row in rows}
-    assert any("validation/log_l1" in row and row["step"] == 4 for row in package.logged)
-    assert any(row.get("validation", "")[0:1] == ("picture",) for row in package.logged)
-    assert package.metrics == [("*", "step")] and package.finished == 1
+    assert any("validation/log_l1" in row and row["step"] == 4 for row in logged)
+    assert any(row.get("validation", "")[0:1] == ("picture",) for row in logged)
+    board.define_metric.assert_called_once_with("*", step_metric="step")
+    board.finish.assert_called_once_with()
 
 
 def test_a_mode_of_the_users_own_is_obeyed(
-    package: StandIn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    package: MagicMock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WANDB_MODE", "online")
     BiasesBoard("light", tmp_path, {})
-    assert package.begun["mode"] == "online"
+    assert package.init.call_args.kwargs["mode"] == "online"
 
 
 def test_where_it_is_missing_a_run_that_asks_for_it_does_not_begin(
