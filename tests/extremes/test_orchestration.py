@@ -10,14 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from infra.bench.subjects.manifests import SAMPLES_PER_SHARD, write_manifest_of
 from pipeline.making.pipeline import make_dataset
 from pipeline.making.run import ShardJob, TaskOutcome
-from pipeline.making.runner import in_window
 from pipeline.making.tasks import Piece
 from storage.dataset.dataset import open_dataset
-from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import read_manifest, write_manifest
 from storage.dataset.training_data import open_training_data
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
@@ -97,28 +93,6 @@ def test_as_many_makers_at_once_as_there_are_scenes(
     assert verify_dataset(tmp_path / "set").problems == []
 
 
-def test_a_window_is_never_exceeded_and_needs_no_more_tasks_than_there_are() -> None:
-    for window, number in ((1, 5), (5, 1), (1000, 3), (3, 0)):
-        held: list[int] = []
-        most = 0
-
-        def submit(task: int) -> int:
-            nonlocal most
-            held.append(task)  # noqa: B023
-            most = max(most, len(held))  # noqa: B023
-            return task
-
-        def result(task: int) -> int:
-            held.remove(task)  # noqa: B023
-            return task
-
-        results = in_window(
-            range(number), submit=submit, first_done=max, result=result, window=window
-        )
-        assert sorted(results) == list(range(number))
-        assert most == min(window, number)
-
-
 def test_empty_and_broken_ranges_are_refused_by_name() -> None:
     for shards in ("0:0", "3:3", "5:2", "-1:2", "0", ":", "0:1:2", "a:b", " 0:1"):
         with case(shards), pytest.raises(TrilightError) as caught:
@@ -195,18 +169,3 @@ def test_a_batch_in_a_distant_epoch_is_had_at_once(tmp_path: Path) -> None:
     windows = windows_from(3, lambda shard: 7, order, 3 * first)
     batch = next(batches_from(windows, 3 * first, 64))
     assert [place.position for place in batch] == list(range(3 * first, 3 * first + 64))
-
-
-@pytest.mark.parametrize("num_samples", [0, 1, SAMPLES_PER_SHARD + 1, 20_000])
-def test_an_index_of_any_length_comes_back(tmp_path: Path, num_samples: int) -> None:
-    write_manifest_of(tmp_path, num_samples)
-    path = DatasetFolder(tmp_path).manifest
-    manifest, text = read_manifest(path), path.read_bytes()
-    assert manifest.num_samples == num_samples
-    write_manifest(path, manifest)
-    assert path.read_bytes() == text
-    data = open_training_data([str(tmp_path)])
-    assert len(data.splits) == min(num_samples, 1)
-    if not num_samples:
-        with pytest.raises(TrilightError, match="the train split holds no scene"):
-            data.split("train")

@@ -39,7 +39,7 @@ from tests.for_each import case, for_each
 from tests.model.kit import awake, random_scene, tiny_config
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.train.kit import stepper, tiny_run
-from tests.train.toy import toy_sample, toy_scene
+from tests.train.toy import toy_sample
 from train.data.augment import augmented
 from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
@@ -345,18 +345,3 @@ def test_losses_and_their_gradients_are_finite_wherever_predictions_are(
     losses.total_BV.sum().backward()
     assert prediction.grad is not None and torch.isfinite(prediction.grad).all()
     assert losses.total_BV.item() >= 0
-
-
-def test_a_scene_of_its_light_alone_is_a_step() -> None:
-    whole = toy_sample(0)
-    scene = toy_scene(0, boxes=0)
-    alone = dataclasses.replace(
-        scene,
-        faces=scene.faces[-1:],
-        material_index=scene.material_index[-1:],
-        object_index=scene.object_index[-1:],
-    )
-    lonely = training_scene(dataclasses.replace(whole, scene=alone), 16)
-    run = tiny_run()
-    report = stepper(new_state(run), run).step([make_batch([lonely])], 1e-3)
-    assert report.applied

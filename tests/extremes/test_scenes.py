@@ -14,11 +14,9 @@ import pytest
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings
 from pipeline.builds.named import BUILDS, named_build
-from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
-from storage.errors import Rejected
 from storage.records.asset import Asset
 from storage.records.scene import Scene
 from storage.settings.changes import changed
@@ -157,19 +155,6 @@ def test_a_pool_of_one_object_fills_every_scene(pool: list[PooledAsset], build: 
             }
             names = [entry.name for entry in scene.objects]
             assert len(set(names)) == len(names)
-
-
-def test_a_pool_of_one_object_that_is_too_large_is_rejected_at_every_attempt(
-    pool: list[PooledAsset],
-) -> None:
-    """With reason and numbers, sixteen times over, instead of for ever."""
-    finest = dataclasses.replace(pool[0].asset, levels=pool[0].asset.levels[:1])
-    large = [dataclasses.replace(pool[0], asset=finest)]
-    settings = changed(SETTINGS, {"max_triangles": 1300})
-    for attempt in range(16):
-        with pytest.raises(Rejected, match="at least 1280 triangles") as caught:
-            compose_scene(settings, large, seed=0, scene_index=0, attempt=attempt)
-        assert caught.value.reason == "over_budget"
 
 
 def check(asset: Asset, settings: AssetSettings) -> None:

@@ -166,7 +166,10 @@ def test_a_finished_run_is_judged_again(
     same_as_uninterrupted(tmp_path, whole)
 
 
-def test_the_folder_holds_everything_and_agrees_with_the_result(whole: TrainResult) -> None:
+def test_the_folder_holds_everything_and_agrees_with_the_result(
+    whole: TrainResult, listener: Listener
+) -> None:
+    """And progress hears of every step."""
     folder = whole.folder
     summary = json.loads(folder.summary.read_text())
     assert summary["scores"] == whole.scores
@@ -188,8 +191,6 @@ def test_the_folder_holds_everything_and_agrees_with_the_result(whole: TrainResu
     model = decode_weights(weights)
     assert sum(weight.numel() for weight in model.parameters()) == whole.num_parameters
 
-
-def test_progress_hears_of_every_step(whole: TrainResult, listener: Listener) -> None:
     steps = [f"step {step}" for step in range(1, 13)]
     for step in (12, 8, 4):
         steps.insert(step, f"validated {step}")
@@ -197,16 +198,12 @@ def test_progress_hears_of_every_step(whole: TrainResult, listener: Listener) ->
 
 
 def test_mistakes_are_named(dataset: Dataset, whole: TrainResult, tmp_path: Path) -> None:
-    with pytest.raises(TrilightError, match=r"no manifest\.json here"):
-        trained(tiny_run(), [str(tmp_path / "nowhere")], tmp_path / "a")
     with pytest.raises(TrilightError, match="resolution 24: expected a divisor of 32"):
         trained(tiny_run(resolution=24), dataset, tmp_path / "b")
     with pytest.raises(TrilightError, match="views_per_scene is 3, .* have 2 views"):
         trained(tiny_run(views_per_scene=3), dataset, tmp_path / "c")
     with pytest.raises(TrilightError, match="holds a run already; add --resume"):
         trained(tiny_run(), dataset, whole.folder.root)
-    with pytest.raises(TrilightError, match="no checkpoint here to resume from"):
-        trained(tiny_run(), dataset, tmp_path / "d", resume=True)
 
 
 def test_data_without_a_validation_split_trains_and_says_so(

@@ -1,8 +1,7 @@
 """Law of every symmetry: rendering the transformed scene gives the transformed picture.
 
 First by the toy's renderer, which knows nothing of symmetries: pixels on an edge may fall on either
-side of it by rounding, so at most 1 % of them may differ. Then by Mitsuba, in independent passes
-that each go through the symmetry as training would send them. Then below a sky.
+side of it by rounding, so at most 1 % of them may differ. Then below a sky.
 """
 
 import dataclasses
@@ -17,12 +16,7 @@ from model.hits.radiosity import scene_light
 from model.hits.tracing import lit_scene_of
 from model.hits.view_inputs import Channel, view_inputs
 from model.scene_tensors import SceneTensors, scene_tensors, tensors_of
-from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.renderer import set_threads
-from pipeline.renders.variant import activate, choose_variant
-from storage.conventions import radiance_from_log10
 from storage.errors import TrilightError
-from storage.records.lights import light_rows
 from storage.records.sample import encode_sample
 from storage.records.scene import Scene
 from storage.records.stored_sample import StoredSample, stored_sample
@@ -31,8 +25,7 @@ from tests.for_each import for_each
 from tests.model.hits.kit import corner
 from tests.model.hits.test_decoder import hits_config
 from tests.model.kit import tiny_config
-from tests.pipeline.renders.sampling import Estimate, assert_agree, camera_of, render_blocks
-from tests.pipeline.renders.scene_kit import sampled_like_scene
+from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.sky_maps import smooth
 from tests.train.toy import toy_picture, toy_sample
 from train.data.augment import (
@@ -51,6 +44,7 @@ from train.data.unusable import Unusable
 from train.settings import AugmentationSettings
 
 RESOLUTION = 32
+FLOOR = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
 
 EVERYTHING = AugmentationSettings(
     rotation="uniform",
@@ -74,6 +68,9 @@ SYMMETRIES: dict[str, Symmetry] = {
         scene, rotation_rand("uniform", rng_for(0, "turn")), torch.tensor([3.0, -1.0, 0.5])
     ),
     "light": lambda scene: with_light_scaled(scene, 2.5),
+    "rotation of the recipe": lambda scene: augmented(
+        scene, AugmentationSettings(rotation="recipe", translation=0.25), rng_for(0, "augment")
+    ),
     "all at random": lambda scene: augmented(scene, EVERYTHING, rng_for(0, "augment")),
 }
 
@@ -133,6 +130,25 @@ def test_a_turned_vertex_takes_its_normal_along() -> None:
         assert torch.equal(turned.triangles_T33[row], numbered[row].roll(-(row % 3), dims=0))
 
 
+def test_mixed_lights_and_their_pictures_are_as_much_stronger() -> None:
+    """A picture is the sum of what each light gives alone, in proportion to its emission."""
+    lamps = [light([[x, 0, 2], [x + 1, 0, 2], [x, 1, 2]], 3.0 + x) for x in (0, 1)]
+    lit = join([quad(FLOOR, material(diffuse=0.5)), *lamps])
+    alone = rng_for(0, "lights").uniform(0, 9, (1, 2, 16, 16, 3)).astype(np.float32)
+    whole = {"scene": lit, "radiance_rgb": alone.sum(axis=1), "lights_rgb": alone}
+    sample = dataclasses.replace(toy_sample(0, views=1), **whole)
+    scene = training_scene(sample, 16, lights_apart=True)
+    mixed = augmented(scene, AugmentationSettings(light_mix=8.0), rng_for(0, "mix"))
+    before, after = (10 ** each.tensors.material_TM[:, 7:] - 1 for each in (scene, mixed))
+    assert not before[:2].any() and not after[:2].any(), "the floor stays dark"
+    factors = (after / before)[2:, 0].numpy()
+    assert factors.max() > 1.1 * factors.min()
+    expected = np.log10(1 + np.einsum("l,vlijc->vijc", factors, alone))
+    # float32 logarithms
+    np.testing.assert_allclose(mixed.target_VRR3, expected, rtol=1e-4)
+    np.testing.assert_allclose(after[2:], before[2:] * factors[:, None], rtol=1e-4)
+
+
 def test_mirroring_twice_is_nothing() -> None:
     scene = training_scene(toy_sample(2), 16)
     again = mirrored(mirrored(scene))
@@ -161,9 +177,10 @@ def test_uniform_rotations_favour_no_direction_and_the_recipe_favours_none_at_al
     assert abs(traces["uniform"].mean()) < 0.13
     assert abs(traces["uniform"].var() - 1) < 0.2  # fourth moment 3: 5 sqrt(2 / 1500) = 0.18
     assert traces["recipe"].mean() > 0.3
-    turned = rotation_rand("uniform", rng)
-    torch.testing.assert_close(turned @ turned.T, torch.eye(3).double())
-    assert turned.det().item() == pytest.approx(1)
+    for kind in ("uniform", "recipe"):
+        turned = rotation_rand(kind, rng)
+        torch.testing.assert_close(turned @ turned.T, torch.eye(3).double())
+        assert turned.det().item() == pytest.approx(1)
     assert torch.equal(rotation_rand("none", rng), torch.eye(3).double())
 
 
@@ -171,97 +188,6 @@ def test_what_is_left_out_changes_nothing() -> None:
     scene = training_scene(toy_sample(2), 16)
     same = augmented(scene, AugmentationSettings(), rng_for(1, "augment"))
     assert same is scene
-
-
-BLOCK, PASSES, SPP = 4, 16, 64
-
-TRACED = {
-    "mirror": AugmentationSettings(mirror=True),
-    "channels": AugmentationSettings(channels=True),
-    "vertex order": AugmentationSettings(vertex_order=True),
-    "rotation of the recipe": AugmentationSettings(rotation="recipe", translation=0.25),
-    "any rotation": AugmentationSettings(rotation="uniform"),
-    "light scale": AugmentationSettings(light_scale=4.0),
-    "light mix": AugmentationSettings(light_mix=8.0),
-    "all at once": dataclasses.replace(EVERYTHING, light_scale=2.0, light_mix=4.0),
-}
-
-
-@pytest.fixture(scope="module")
-def mitsuba() -> None:
-    activate(choose_variant())
-    set_threads(2)
-
-
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    """Glossy, coloured, with lights of different colours, so that every symmetry shows."""
-    for index in range(100):
-        scene = sampled_like_scene(rng_for(index, "symmetry"), num_views=1)
-        if len(light_rows(scene)) == 3:
-            break
-    rows = light_rows(scene)
-    materials = scene.materials.copy()
-    colours = rng_for(3, "colours").uniform(0.3, 1, (len(rows), 3))
-    for row, colour in zip(rows, colours, strict=True):
-        of_light = scene.material_index[scene.object_index == row]
-        materials[of_light[0], 7:] *= colour
-    return dataclasses.replace(scene, materials=materials.astype(np.float32))
-
-
-@pytest.fixture(scope="module")
-def passes(scene: Scene, mitsuba: None) -> NDArray[np.float32]:
-    """[PASSES, L, R, R, 3]: independent pictures of each light alone."""
-    tracer = load_tracer(scene, max_depth=10, rr_depth=5)
-    camera = camera_of(scene, RESOLUTION)
-    lights = [tracer.only_light(row) for row in light_rows(scene)]
-    return np.stack(
-        [
-            np.stack([light.radiance(camera, seed=1000 + k, spp=SPP) for light in lights])
-            for k in range(PASSES)
-        ]
-    )
-
-
-def transformed(
-    scene: Scene, lights_LRR3: NDArray[np.float32], symmetry: Callable[..., TrainingScene]
-) -> TrainingScene:
-    sample = dataclasses.replace(
-        toy_sample(0, views=1),
-        scene=scene,
-        radiance_rgb=lights_LRR3.sum(axis=0)[None],
-        lights_rgb=lights_LRR3[None],
-    )
-    return symmetry(training_scene(sample, RESOLUTION, lights_apart=True))
-
-
-@pytest.mark.slow("statistics")
-@for_each("name", sorted(TRACED))
-def test_the_path_traced_picture_is_the_transformed_one(
-    name: str, scene: Scene, passes: NDArray[np.float32]
-) -> None:
-    seed = next(s for s in range(9) if rng_for(s, "draw").random() < 0.5)  # a visit that mirrors
-
-    def symmetry(training: TrainingScene) -> TrainingScene:
-        return augmented(training, TRACED[name], rng_for(seed, "draw"))
-
-    visits = [transformed(scene, lights, symmetry) for lights in passes]
-    pictures = np.array([radiance_from_log10(v.target_VRR3[0].double()) for v in visits])
-    count = RESOLUTION // BLOCK
-    blocks = pictures.reshape(PASSES, count, BLOCK, count, BLOCK, 3).mean(axis=(2, 4))
-    expected = Estimate(
-        mean=blocks.mean(axis=0), error=blocks.std(axis=0, ddof=1) / np.sqrt(PASSES)
-    )
-    other = scene_behind(visits[0], scene)
-    other.check()
-    estimate = render_blocks(other, resolution=RESOLUTION, block=BLOCK, passes=PASSES)
-    # float32 positions and log10(1 + x): relative 1e-4 covers both
-    assert_agree(estimate, expected, slack=1e-4)
-    if name not in ("vertex order", "rotation of the recipe", "any rotation"):
-        untouched = render_blocks(scene, resolution=RESOLUTION, block=BLOCK, passes=PASSES)
-        with pytest.raises(AssertionError, match="of what is allowed"):
-            assert_agree(estimate, untouched)
-    assert torch.isfinite(visits[0].target_VRR3).all()
 
 
 ORDER = np.array([2, 0, 1])

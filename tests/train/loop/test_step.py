@@ -124,33 +124,16 @@ def test_the_mean_follows_the_weights_faster_at_first() -> None:
     assert new_state(tiny_run()).shown is not None and new_state(tiny_run()).mean_model is None
 
 
-def test_bfloat16_rounds_products_but_no_position() -> None:
-    """The published training rounds positions too, to a grid of up to 0.004 m."""
-    model = new_state(tiny_run()).model
-    batch = make_batch(scenes(2))
-    seen: dict[str, list[Tensor]] = {}
-
-    def note(precision: Precision) -> Tensor:
-        hook = model.encoder.rotary.register_forward_pre_hook(
-            lambda _, given: seen.setdefault(precision, []).append(given[0].clone())
-        )
-        with torch.no_grad():
-            model.decoder.head.last.weight.fill_(0.01)  # or all pictures are black alike
-            prediction = predicted(model, batch, RESOLUTION, precision)
-        hook.remove()
-        return prediction
-
-    exact, rounded = note("float32"), note("bfloat16")
-    assert rounded.dtype == torch.float32
-    assert 0 < (rounded - exact).abs().max() < 0.05
-    for ours, theirs in zip(seen["bfloat16"], seen["float32"], strict=True):
-        assert ours.dtype == torch.float32 and torch.equal(ours, theirs)
-
-
 @for_each("family", ["linear", "dpt"])
-def test_bfloat16_rounds_neither_rays_nor_materials_nor_the_last_layers(family: str) -> None:
-    """As model.precision says; norms keep the type that they get, and layers are rounded."""
+def test_bfloat16_rounds_no_position_ray_or_material_nor_the_last_layers(family: str) -> None:
+    """As model.precision says; norms keep the type that they get, and layers are rounded.
+
+    The published training rounds positions too, to a grid of up to 0.004 m.
+    """
     network, found = awake(tiny_config(family), torch.float32), dict[str, str]()
+    positions, batch = list[Tensor](), make_batch(scenes(2))
+    network.encoder.rotary.register_forward_pre_hook(lambda _, given: positions.append(given[0]))
+    exact_picture = predicted(network, batch, RESOLUTION, "float32")
 
     def note(name: str, module: nn.Module, given: tuple[Tensor, ...], output: Tensor) -> None:
         kept = isinstance(module, Norm) and output.dtype == given[0].dtype
@@ -159,7 +142,9 @@ def test_bfloat16_rounds_neither_rays_nor_materials_nor_the_last_layers(family: 
     for name, module in network.named_modules():
         if isinstance(module, Norm | nn.Linear | nn.Conv2d):
             module.register_forward_hook(functools.partial(note, name))
-    assert predicted(network, make_batch(scenes(2)), RESOLUTION, "bfloat16").dtype == torch.float32
+    rounded = predicted(network, batch, RESOLUTION, "bfloat16")
+    assert rounded.dtype == torch.float32 and not torch.equal(rounded, exact_picture)
+    assert positions[1].dtype == torch.float32 and torch.equal(*positions)
     exact = {"encoder.tokens.material", "encoder.tokens.normal", "decoder.rays"}
     exact |= {"decoder.head.last"} | ({"decoder.head.widen"} if family == "dpt" else set())
     assert {name: found[name] for name in exact} == dict.fromkeys(exact, "float32")

@@ -69,14 +69,6 @@ def test_a_loader_that_sleeps_is_named_with_its_stack(tmp_path: Path) -> None:
     assert text.count("process 0 of 1") == 2
 
 
-def test_a_slow_kind_has_its_own_usual_time_and_the_first_steps_have_more(tmp_path: Path) -> None:
-    settings = WatchSettings(hang_after_s=1.0, hang_factor=4)
-    dog = Watchdog(settings, Activity(), ALONE, tmp_path, noted=pytest.fail, hung=pytest.fail)
-    assert dog._limit_s(None) == 5.0
-    assert dog._limit_s(0.01) == 1.0
-    assert dog._limit_s(3.0) == 12.0
-
-
 def test_words_of_other_processes_are_passed_on_and_the_run_stops_if_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
