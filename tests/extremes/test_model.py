@@ -16,15 +16,12 @@ from model.layers import LAYER_NORM_EPS, Norm
 from model.open import BUILTIN_TOKENS, open_network
 from model.positions import TriangleRotary
 from model.scene_tensors import SceneBatch, batch_scenes, scene_tensors
+from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.scene import MAX_POSITION_M
 from tests.model.attention_reference import attend_reference
 from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
 from tests.train.toy import toy_scene
-
-HALF_MAX = 65504.0
-"""The largest float16."""
-
 
 EMISSIONS = [0.0, 1e-6, 1.0, 1e6]
 
@@ -63,7 +60,7 @@ def test_no_matrix_product_comes_near_the_end_of_float16(name: str) -> None:
         highest = max(peaks, key=lambda name: peaks[name])
         # norms keep every sum near its inputs' size; a hundredth of the range leaves room for
         # training
-        assert peaks[highest] < HALF_MAX / 100, (emission, highest)
+        assert peaks[highest] < HALF_FLOAT_MAX / 100, (emission, highest)
 
 
 @pytest.mark.parametrize("family", FAMILIES)

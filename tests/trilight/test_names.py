@@ -13,6 +13,7 @@ import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -23,25 +24,19 @@ from tests.for_each import for_each
 from trilight import extend
 
 
-def test_every_name_is_there() -> None:
-    for name in trilight.__all__:
-        assert getattr(trilight, name) is not None, name
+@for_each(("module", "missing"), [(trilight, "rendr"), (extend, "TEMPLATE")])
+def test_every_name_is_there(module: ModuleType, missing: str) -> None:
+    for name in module.__all__:
+        assert getattr(module, name) is not None, name
     assert trilight.__version__ == metadata.version("trilight")
-    with pytest.raises(AttributeError, match="no attribute 'rendr'"):
-        trilight.rendr  # noqa: B018
+    with pytest.raises(AttributeError, match=f"no attribute '{missing}'"):
+        getattr(module, missing)
 
 
 def test_no_name_is_one_that_a_wheel_needs() -> None:
     """There `trilight.train` is a package: importing it would replace a function of that name."""
     modules = {path.stem for path in (ROOT / "trilight").glob("*.py")}
     assert not {*trilight.__all__, *modules} & {*PACKAGES, "tests"}
-
-
-def test_extensions_have_one_place_to_import_from() -> None:
-    for name in extend.__all__:
-        assert getattr(extend, name) is not None, name
-    with pytest.raises(AttributeError, match="no attribute 'TEMPLATE'"):
-        extend.TEMPLATE  # noqa: B018
 
 
 @for_each("example", sorted((ROOT / "examples").glob("*.py")))

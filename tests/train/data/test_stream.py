@@ -199,8 +199,7 @@ def test_a_smaller_picture_is_the_mean_of_its_blocks() -> None:
             expected = block.mean(axis=(1, 2), dtype=np.float64)
             np.testing.assert_allclose(small[:, row, column], expected, rtol=1e-6)
 
-
-def test_halving_twice_is_quartering_and_light_is_kept() -> None:
+    # halving twice is quartering, and light is kept
     pictures = rng_for(1, "pictures").uniform(0, 9, (1, 16, 16, 3)).astype(np.float32)
     twice = block_mean(block_mean(pictures, 8), 4)
     np.testing.assert_allclose(twice, block_mean(pictures, 4), rtol=1e-6)  # float32 means

@@ -50,7 +50,6 @@ def system(root: Path, files: dict[str, str]) -> Path:
         ({}, 16.0, None),
         ({"proc/meminfo": "MemFree: 1 kB\nMemAvailable: 2097152 kB\n"}, 16.0, 2 * GIB),
         ({"sys/fs/cgroup/cpu.max": "350000 100000\n"}, 3.5, None),
-        ({"sys/fs/cgroup/cpu.max": "max 100000\n"}, 16.0, None),
         (
             {
                 "proc/self/cgroup": "0::/job/step\n",
@@ -95,7 +94,6 @@ def test_a_machine_is_what_its_files_say(
         (Machine(cores=2), False, 1, "1 thread decodes samples, by 2 cores"),
         (Machine(cores=8), True, 7, "7 threads decode samples, by 8 cores"),
         (Machine(cores=208, processes=8), True, MOST_THREADS, "by 208 cores for 8 processes"),
-        (Machine(cores=1, processes=4), False, 1, "1 thread"),
         (Machine(cores=64, free_bytes=GIB // 16), True, 5, "64 cores and 0.1 GiB of free memory"),
     ],
 )

@@ -140,19 +140,16 @@ def test_the_trace_holds_the_steps_and_the_note_says_how_to_open_it(tmp_path: Pa
     assert str(trace) in note and "chrome://tracing" in note and table in note
 
 
-def test_what_was_not_reached_is_told(tmp_path: Path) -> None:
-    said: list[str] = []
-    profiler = StepProfiler(2, CPU, tmp_path, said.append)
-    profiler.begins(1)
-    profiler.ends(1)
-    profiler.close(1)
-    assert said == ["nothing was profiled: the run ended before step 4 of this call"]
-    off = StepProfiler(0, CPU, tmp_path, said.append)
-    for step in range(1, 9):
-        off.begins(step)
-        off.ends(step)
-    off.close(8)
-    assert len(said) == 1 and list(tmp_path.iterdir()) == []
+@for_each(("asked", "said"), [(2, ["the run ended before step 4 of this call"]), (0, [])])
+def test_what_was_not_reached_is_told(tmp_path: Path, asked: int, said: list[str]) -> None:
+    told: list[str] = []
+    profiler = StepProfiler(asked, CPU, tmp_path, told.append)
+    for step in (1, 2):
+        profiler.begins(step)
+        profiler.ends(step)
+    profiler.close(2)
+    assert told == [f"nothing was profiled: {text}" for text in said]
+    assert list(tmp_path.iterdir()) == []
 
 
 REPORT = StepReport(loss=1.0, l1=1.0, brightness=1.0, grad_norm=0.1, applied=True)
