@@ -29,6 +29,7 @@ from storage.dataset.scene_logs import read_scene_logs
 from storage.dataset.training_data import open_training_data
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
+from storage.records.sample import sample_key
 from tests.for_each import case
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 from tests.train.kit import keys_of, take
@@ -143,10 +144,6 @@ def keys(
     return [sorted(itertools.chain(*keys_of(parts))) for parts in zip(*shares, strict=True)]
 
 
-def every(train: int) -> list[str]:
-    return [f"{index:09d}" for index in range(train)]
-
-
 @pytest.mark.parametrize(
     ("train", "per_shard", "views"),
     [(1, 1, 1), (5, 1, 1), (5, 99, 2)],
@@ -159,7 +156,9 @@ def test_small_splits_are_shown_whole_in_every_epoch(
         tmp_path, train=train, validation=1, per_shard=per_shard, resolution=8, views=views
     )
     for window in (1, 1000):
-        assert keys(tmp_path, train, 3, window=window) == [every(train)] * 3, window
+        assert keys(tmp_path, train, 3, window=window) == [[*map(sample_key, range(train))]] * 3, (
+            window
+        )
 
 
 def test_a_batch_may_be_larger_than_the_split(tmp_path: Path) -> None:
@@ -168,7 +167,7 @@ def test_a_batch_may_be_larger_than_the_split(tmp_path: Path) -> None:
     write_toy_dataset(tmp_path, train=3, validation=1, per_shard=2, resolution=8)
     (batch, other) = keys(tmp_path, 8, 2)
     assert len(batch) == len(other) == 8
-    counts = [(batch + other).count(key) for key in every(3)]
+    counts = [(batch + other).count(key) for key in map(sample_key, range(3))]
     assert sorted(counts) == [5, 5, 6]
     assert keys(tmp_path, 8, 2, ranks=8) == [batch, other]
 
@@ -176,7 +175,9 @@ def test_a_batch_may_be_larger_than_the_split(tmp_path: Path) -> None:
 def test_a_batch_in_a_distant_epoch_is_had_at_once(tmp_path: Path) -> None:
     write_toy_dataset(tmp_path, train=5, validation=1, per_shard=2, resolution=8)
     first = 10**12
-    assert keys(tmp_path, 5, 2, first=first) == [every(5)] * 2  # 5 x 10^12 begins an epoch
+    assert (
+        keys(tmp_path, 5, 2, first=first) == [[*map(sample_key, range(5))]] * 2
+    )  # 5 x 10^12 begins an epoch
     order = OrderSettings(seed=2**63, window=2)
     windows = windows_from(3, lambda shard: 7, order, 3 * first)
     batch = next(batches_from(windows, 3 * first, 64))
