@@ -62,15 +62,21 @@ def _results(model: RenderFormer, lengths: tuple[int, ...]) -> dict[str, Tensor]
     return {"picture": picture.detach(), **{k: v for k, v in grads.items() if v is not None}}
 
 
-def _check(
+@pytest.mark.slow("training")  # Dynamo traces every layer
+@pytest.mark.parametrize(
+    ("backend", "passes", "most_graphs"), [("eager", PASSES, 15), ("inductor", QUICK, 12)]
+)
+def test_compiled_layers_compute_the_same_and_three_kinds_of_pass_are_few_graphs(
     monkeypatch: pytest.MonkeyPatch,
     backend: str,
-    head: str,
     passes: tuple[tuple[int, ...], ...],
     most_graphs: int,
 ) -> None:
-    """Compile a network by a backend, and hold its results beside those without."""
-    model = awake(tiny_config(head), dtype=torch.float32)
+    """Layers of a stage share a graph for every length: four functions, two graphs more a kind.
+
+    Inductor guards on more than the lengths' being variables: its second pass has graphs too.
+    """
+    model = awake(tiny_config("linear"), dtype=torch.float32)
     plain = [_results(model, lengths) for lengths in passes]
     counter = CompileCounterWithBackend(backend)
     _compile_by(monkeypatch, counter)
@@ -87,20 +93,6 @@ def _check(
     before = counter.frame_count
     _results(model, (2, 10, 4))
     assert counter.frame_count == before, "another length is no other graph"
-
-
-@pytest.mark.slow("training")  # Dynamo traces every layer
-def test_three_kinds_of_pass_are_three_times_as_many_graphs(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Layers of a stage share a graph for every length: four functions, two graphs more a kind."""
-    _check(monkeypatch, "eager", "linear", PASSES, 15)
-
-
-@pytest.mark.slow("training")
-def test_inductor_computes_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It guards on more than the lengths' being variables, so the second pass has graphs too."""
-    _check(monkeypatch, "inductor", "linear", QUICK, 12)
 
 
 @pytest.mark.slow("training")
