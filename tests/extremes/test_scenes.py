@@ -51,7 +51,6 @@ EXTREMES: list[dict[str, Any]] = [
         "enough_error": 0.0,
     },
     {"families.num_objects": [8, 8], "placement.overlap_share": 1.0, "max_triangles": 4096},
-    {"families.num_objects": [0, 0]},
     {"families.object_scale": [0.01, 0.01], "views.min_coverage": 0.0},
     {"families.object_scale": [2.9, 2.9], "placement.inside": False, "views.min_depth": 0.0},
     {"families.shell.tilt_deg": 10.0, "families.shell.square_share": 0.0},
@@ -59,7 +58,6 @@ EXTREMES: list[dict[str, Any]] = [
     {"families.smooth_share": 1.0, "materials.smooth_angle_deg": 180.0},
     {"materials.coloured_specular_share": 1.0, "materials.specular_ratio": [1.0, 1.0]},
     {"materials.albedo_sum": [1.0, 1.0]},
-    {"num_views": 16, "views.coverage_grid": 5},
     {"fill_to": 1536, "enough_error": 1.0},
 ]
 
