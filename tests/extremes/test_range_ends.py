@@ -1,6 +1,10 @@
-"""What settings make at the ends of their ranges: something right, or a rejection with reason."""
+"""What settings make at the ends of their ranges: something right, or a rejection with reason.
+
+Training at the ends of targets, losses, weights and symmetries: finite, or a skipped step.
+"""
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -24,25 +28,25 @@ from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
 from scene_templates.settings import SceneSettings, ViewLaws
+from storage.conventions import HALF_FLOAT_MAX
 from storage.dataset.settings import MOST_SCENES, SplitSettings
 from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
 from storage.errors import Rejected, TrilightError
 from storage.settings.changes import changed
 from storage.settings.ranges import Declared
-from tests.extremes.range_examples import FIELDS, SCENE_REASONS, SMOKE, End, naming
+from tests.extremes.test_ranges import FIELDS, SMOKE, End
+from tests.for_each import case, for_each
 from tests.model.kit import awake, random_scene, tiny_config
 from tests.pipeline.renders.scene_kit import join, light, material, quad
-from tests.train.kit import tiny_run
+from tests.train.kit import stepper, tiny_run
 from tests.train.toy import toy_sample
 from train.data.augment import augmented
-from train.data.buckets import make_batch
+from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
-from train.loop.crew import Crew
 from train.loop.schedule import learning_rate
 from train.loop.state import new_state
-from train.loop.step import Stepper
 from train.loss.objective import Objective
-from train.settings import AugmentationSettings, LossSettings
+from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 GROUPS: dict[type, str] = {
     SceneSettings: "",
@@ -116,7 +120,7 @@ def _require_scene_or_reason(pool: list[PooledAsset], name: str, field: Declared
     blind = {} if name.startswith("views.") else BLIND
     beside = BESIDE.get((name, end), {})
     wanted = changed(ONE_FAMILY, {**blind, **beside, name: _value(field, end)})
-    with naming(name, end):
+    with case((name, end)):
         try:
             scene = compose_scene(wanted, pool, seed=0, scene_index=0, attempt=0)
         except Rejected as rejection:
@@ -125,6 +129,9 @@ def _require_scene_or_reason(pool: list[PooledAsset], name: str, field: Declared
             assert (name, end) not in NO_SCENE
             scene.check()
 
+
+SCENE_REASONS = ("no_room", "over_budget", "no_faces", "no_camera", "emitter_inside")
+"""Why a room may not be possible."""
 
 CHEAP = [
     name for name, _ in SCENE_FIELDS
@@ -184,11 +191,6 @@ def test_pictures_at_the_ends_of_samples_and_floors() -> None:
         view = _render(noise_floor_db=float(floor_db))
         assert (view.spp, view.at_cap) == (8, at_cap)
     _render(aux_spp=64)
-
-
-def test_no_picture_is_as_bright_as_the_brightest_bound() -> None:
-    with pytest.raises(Rejected, match="black_view"):
-        _render(min_mean_radiance=65504.0)
 
 
 LEAST = ModelConfig(
@@ -254,10 +256,9 @@ def test_weights_stay_finite_at_the_ends_of_training(changes: dict[str, Any]) ->
     run = tiny_run(**changes)
     state = new_state(run)
     before = [weight.detach().clone() for weight in state.model.parameters()]
-    stepper = Stepper(state, run, Objective(run.loss, None), Crew(device=torch.device("cpu")))
-    scenes = [training_scene(toy_sample(index), 16) for index in range(2)]
+    moving = stepper(state, run)
     for number in range(4):
-        report = stepper.step([make_batch(scenes)], learning_rate(number, run))
+        report = moving.step([batch()], learning_rate(number, run))
         assert report.applied
     after = list(state.model.parameters())
     assert all(torch.isfinite(weight).all() for weight in after)
@@ -291,3 +292,56 @@ def test_shards_at_the_ends_hold_every_scene_once(per_shard: int, per_cycle: int
     assert scenes_of_shard(count - 1, listed).stop == MOST_SCENES
     names = {shard_name(index, splits).split("-")[0] for index in range(6)}
     assert names == {"train", "validation", "test"}
+
+
+BRIGHTEST = math.log10(1 + HALF_FLOAT_MAX)
+"""The largest target: pictures are stored as half floats."""
+
+TERMS = [
+    LossSettings(perceptual="none"),
+    LossSettings(perceptual="ms_ssim"),
+    LossSettings(perceptual="none", noise_half=1e-6),
+    LossSettings(perceptual="none", noise_half=10.0),
+]
+
+
+def batch() -> TrainingBatch:
+    """Return two toy scenes."""
+    return make_batch([training_scene(toy_sample(index), 16) for index in range(2)])
+
+
+RUNS = [*(tiny_run(loss=terms) for terms in TERMS), tiny_run(precision="bfloat16")]
+
+
+@for_each("run", RUNS)
+def test_every_target_that_can_be_stored_gives_a_step(run: TrainSettings) -> None:
+    usual = batch()
+    for target, noise in ((0.0, 0.0), (0.0, 10.0), (1e-7, 1e-5), (BRIGHTEST, 0.0)):
+        ends = dataclasses.replace(
+            usual,
+            target_BVRR3=torch.full_like(usual.target_BVRR3, target),
+            noise_BV=torch.full_like(usual.noise_BV, noise),
+        )
+        state = new_state(run)
+        report = stepper(state, run).step([ends], 1e-3)
+        finite = math.isfinite(report.loss) and math.isfinite(report.grad_norm)
+        assert report.applied and finite, (target, noise)
+        assert all(torch.isfinite(weight).all() for weight in state.model.parameters())
+
+
+@given(
+    shown=st.floats(-40, 40, width=32),
+    wanted=st.floats(0, BRIGHTEST),
+    noise=st.floats(0, 100, width=32),
+    terms=st.sampled_from(TERMS),
+)
+@settings(max_examples=40, deadline=None)
+def test_losses_and_their_gradients_are_finite_wherever_predictions_are(
+    shown: float, wanted: float, noise: float, terms: LossSettings
+) -> None:
+    size = (1, 1, 32, 32, 3)
+    prediction = torch.full(size, shown, requires_grad=True)
+    losses = Objective(terms, None)(prediction, torch.full(size, wanted), torch.full((1, 1), noise))
+    losses.total_BV.sum().backward()
+    assert prediction.grad is not None and torch.isfinite(prediction.grad).all()
+    assert losses.total_BV.item() >= 0

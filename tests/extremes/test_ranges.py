@@ -1,17 +1,49 @@
-"""Every numeric field declares its range; both ends are accepted, and a step outside is refused."""
+"""Every numeric field declares its range; both ends are accepted, and a step outside is refused.
+
+Of every class there is an example, and what else must hold where a field stands at an end of its
+range: the laws between fields are why an end is reached by changing its neighbours too.
+"""
 
 import dataclasses
 import math
 import re
 import typing
 from collections.abc import Iterator
-from typing import Annotated, Any, get_args, get_origin
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from infra.leaderboard.order import LeaderboardOrder
+from infra.rendering.request import Asked
+from infra.serving.train_model import TrainOrder
 from infra.setup.settings_page import ROOTS, reachable
+from model.base_widths import BaseWidths
+from model.config import ModelConfig, smoke, tiny
+from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
+from pipeline.builds.named import named_build
+from pipeline.builds.revisit import GivenCamera, RevisitSettings
+from pipeline.builds.settings import BuildSettings
+from pipeline.flows.orders import DatasetInRuns
+from pipeline.making.price import CorePrice
+from pipeline.making.revisit_order import Revisit
+from pipeline.renders.settings import MAX_SPP, RenderSettings
+from scene_templates.cameras import CameraSettings
+from scene_templates.families import Family
+from scene_templates.frozen_v1 import ONE_FAMILY_EACH
+from scene_templates.lights import LightSettings
+from scene_templates.materials import MaterialSettings
+from scene_templates.placement import PlacementSettings
+from scene_templates.rooms import SharedRoom
+from scene_templates.separate_sides import SideRanges
+from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, ViewLaws
+from scene_templates.skies.draw import SkyMapSettings
+from scene_templates.skies.settings import SkySettings
+from scene_templates.surfaces.draw import SurfaceMapSettings
+from scene_templates.textures import TextureSettings
+from storage.dataset.settings import ListedShard, SplitSettings
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
@@ -19,12 +51,130 @@ from storage.records.texture import CONSTANT
 from storage.settings.described import checked, described
 from storage.settings.ranges import Columns, Declared, Within, declared_ranges
 from tests.conftest import ROOT
-from tests.extremes.range_examples import EXAMPLES, FIELDS, End, at_end, naming
+from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import textured_scene
+from train.evaluation.order import EvaluationOrder
+from train.runs import named_run
+from train.settings import AugmentationSettings, LossSettings, TrainSettings
+from train.watching.settings import WatchSettings
 
-ENDS: tuple[End, End] = ("low", "high")
-every_end = pytest.mark.parametrize("end", ENDS)
+End = Literal["low", "high"]
+
+ASKED = Asked(
+    source="a.json", out=Path("a.exr"), engine="mitsuba", checkpoint=None, resolution=64,
+    noise_floor_db=40.0, max_spp=64, view=0, orbit=None, arc_deg=360.0, cameras=None, fps=24,
+    tone_map="plain", exposure_ev=0.0, precision="float32", lights_per_pass=8,
+    seed=0, threads=None,
+)  # fmt: skip
+SMOKE = named_build("smoke")
+RUN = named_run("smoke")
+
+EXAMPLES: dict[type, Any] = {
+    DatasetInRuns: DatasetInRuns(),
+    BuildSettings: SMOKE,
+    AssetSettings: SMOKE.assets,
+    GateSettings: SMOKE.assets.gate,
+    OwnMaterialSettings: SMOKE.assets.own_materials,
+    SceneSettings: SMOKE.scenes,
+    Family: ONE_FAMILY_EACH[0],
+    SharedRoom: SharedRoom(),
+    SideRanges: SideRanges(),
+    PlacementSettings: SMOKE.scenes.placement,
+    MaterialSettings: SMOKE.scenes.materials,
+    LightSettings: SMOKE.scenes.lights,
+    CameraSettings: SMOKE.scenes.cameras,
+    ViewLaws: SMOKE.scenes.views,
+    TextureSettings: TextureSettings(),
+    SurfaceMapSettings: SurfaceMapSettings(),
+    SkySettings: SkySettings(),
+    SkyMapSettings: SkyMapSettings(),
+    Excursion: Excursion(axis="fov_deg", value=10.0, changes=()),
+    RenderSettings: SMOKE.renders,
+    SplitSettings: SMOKE.splits,
+    ListedShard: ListedShard(split="train", scenes=4),
+    Revisit: Revisit(dataset="a", out="b"),
+    RevisitSettings: RevisitSettings(source_digest="", kept_cameras=4, lights="new", num_lights=2),
+    GivenCamera: GivenCamera(c2w=(0.0,) * 16, fov_deg=40.0),
+    Asked: ASKED,
+    CorePrice: CorePrice(),
+    TrainOrder: TrainOrder(),
+    TrainSettings: RUN,
+    ModelConfig: tiny(),
+    LossSettings: RUN.loss,
+    AugmentationSettings: RUN.augmentation,
+    BaseWidths: RUN.base_widths,
+    EvaluationOrder: EvaluationOrder(checkpoint="a", data=("b",)),
+    LeaderboardOrder: LeaderboardOrder(source="a", width=(64,)),
+    WatchSettings: WatchSettings(),
+}  # fmt: skip
+"""A valid value of every class that declares a range, but for `Scene`."""
+
+_LINEAR = {"head": "linear", "dpt_features": 0, "dpt_channels": (), "dpt_taps": ()}
+_HITS = {"view_stage": "hits", "hit_rays": 1, "hit_anchors": 8, "pixel_width": 8}
+_PLANE = dataclasses.replace(ONE_FAMILY_EACH[0], num_objects=(0, 0), template="plane")
+_EVERY = 10**9
+
+BESIDE: dict[tuple[type, str, End], dict[str, Any]] = {
+    (DatasetInRuns, "views", "low"): {"scenes_from": "a"},
+    (DatasetInRuns, "views", "high"): {"scenes_from": "a"},
+    (AssetSettings, "epsilon", "high"): {"gate": GateSettings(max_error_p99=1.0)},
+    (SceneSettings, "max_triangles", "low"): {
+        "families": (_PLANE,), "lights": LightSettings(count=(1, 1)),
+    },
+    (SceneSettings, "fill_to", "high"): {"max_triangles": MAX_TRIANGLES},
+    (MaterialSettings, "roughness_log", "low"): {"roughness_bias": 0.0},
+    (MaterialSettings, "roughness_bias", "high"): {"roughness_log": (1.0, 2.0)},
+    (RevisitSettings, "kept_cameras", "low"): {"new_cameras": 1},
+    (RevisitSettings, "new_cameras", "high"): {"kept_cameras": 0},
+    **{(Asked, name, end): {"noise_floor_db": None}
+       for name in ("seconds", "error_db", "spp") for end in ("low", "high")},
+    (RenderSettings, "min_spp", "high"): {"max_spp": MAX_SPP},
+    (RenderSettings, "max_spp", "low"): {"min_spp": 8},
+    (TrainSettings, "resolution", "low"): {"model": dataclasses.replace(smoke(), patch_px=1)},
+    (TrainSettings, "num_steps", "low"): {"warmup_steps": 0},
+    (TrainSettings, "warmup_steps", "high"): {"num_steps": _EVERY},
+    (TrainSettings, "log_every", "high"): {"validate_every": _EVERY, "checkpoint_every": _EVERY},
+    (TrainSettings, "validate_every", "low"): {"log_every": 1},
+    (TrainSettings, "checkpoint_every", "low"): {"log_every": 1},
+    (ModelConfig, "width", "low"): {"num_heads": 1, "rope_num_freqs": 1},
+    (ModelConfig, "width", "high"): {"num_heads": 512, "rope_num_freqs": 1},
+    (ModelConfig, "num_heads", "high"): {"width": 512 * 18, "rope_num_freqs": 1},
+    (ModelConfig, "rope_num_freqs", "high"): {"width": 18 * 64, "num_heads": 1},
+    (ModelConfig, "decoder_layers", "low"): {"dpt_taps": (0, 0, 0, 0)},
+    (ModelConfig, "patch_px", "low"): _LINEAR,
+    (ModelConfig, "patch_px", "high"): _LINEAR,
+    (ModelConfig, "dpt_features", "low"): _LINEAR,
+    (ModelConfig, "dpt_taps", "high"): {"decoder_layers": 256},
+    **{(ModelConfig, name, "high"): _LINEAR | _HITS
+       for name in ("hit_rays", "hit_anchors", "gather_rays", "pixel_width", "filter_width",
+                    "sky_rays")},
+}  # fmt: skip
+"""What must stand beside an end."""
+
+FIELDS = [
+    (settings, field)
+    for settings in reachable(*(root for roots in ROOTS.values() for root in roots))
+    if settings is not Scene
+    for field in declared_ranges(settings)
+]
+"""Every declared range of settings."""
+
+
+def at_end(settings: type, field: Declared, end: End, number: Any) -> Any:
+    """Return valid settings with one number of a field replaced; raises what they raise."""
+    example, value = EXAMPLES[settings], number
+    old = getattr(example, field.name)
+    if field.shape == "pair":
+        value = (number, old[1]) if end == "low" else (old[0], number)
+    elif field.shape != "one":
+        value = (*old[:-1], number) if end == "low" else (number, *old[1:])
+    changes = {field.name: value}
+    return dataclasses.replace(example, **(BESIDE.get((settings, field.name, end), {}) | changes))
+
+
+every_end = pytest.mark.parametrize("end", ["low", "high"])
+every_field = for_each(("settings", "field"), FIELDS)
 
 
 def last_inside(field: Declared, end: End) -> float:
@@ -49,34 +199,27 @@ def first_outside(field: Declared, end: End) -> float:
 
 
 @every_end
-def test_an_end_of_each_field_is_accepted(end: End) -> None:
-    for settings, field in FIELDS:
-        with naming(settings.__name__, field.name):
-            at_end(settings, field, end, last_inside(field, end))
+@every_field
+def test_an_end_of_each_field_is_accepted(settings: type, field: Declared, end: End) -> None:
+    at_end(settings, field, end, last_inside(field, end))
 
 
 @every_end
-def test_one_step_outside_is_refused_by_name(end: End) -> None:
-    for settings, field in FIELDS:
-        number = first_outside(field, end)
-        option = re.sub("_(db|deg|ev)$", "", field.name).replace("_", "-")
-        with naming(settings.__name__, field.name):
-            with pytest.raises(TrilightError) as caught:
-                at_end(settings, field, end, number)
-            message = str(caught.value)
-            assert f"{field.name} is " in message or f"--{option} is " in message
-            assert f"expected {field.expected}." in message
-            assert repr(number) in message
-            assert "\n" not in message
+@every_field
+def test_one_step_outside_is_refused_by_name(settings: type, field: Declared, end: End) -> None:
+    number = first_outside(field, end)
+    option = re.sub("_(db|deg|ev)$", "", field.name).replace("_", "-")
+    with pytest.raises(TrilightError) as caught:
+        at_end(settings, field, end, number)
+    message = str(caught.value)
+    assert f"{field.name} is " in message or f"--{option} is " in message
+    assert f"expected {field.expected}." in message
+    assert repr(number) in message
+    assert "\n" not in message
 
 
-def test_other_kinds_of_values_are_refused() -> None:
-    for settings, field in FIELDS:
-        with naming(settings.__name__, field.name):
-            _require_refusals(settings, field)
-
-
-def _require_refusals(settings: type, field: Declared) -> None:
+@every_field
+def test_other_kinds_of_values_are_refused(settings: type, field: Declared) -> None:
     wrong: list[Any] = [math.nan, math.inf, -math.inf, True, "1", (1, 2, 3) * 3]
     if field.kind is int:
         wrong.append(last_inside(field, "low") + 0.5)
@@ -174,10 +317,6 @@ def test_what_is_checked_is_what_is_declared() -> None:
 ARRAYS = declared_ranges(Scene)
 
 
-def _array_name(field: Declared) -> str:
-    return field.name + (f"-{field.part.name}" if field.part else "")
-
-
 PLACES = {
     "vertex_positions": (1, 2), "vertex_normals": (0, 0), "faces": (1, 2), "material_index": 1,
     "object_index": 1, "c2w": (1, 0, 3), "fov_deg": 1,
@@ -204,13 +343,8 @@ def _place(field: Declared) -> Any:
 
 
 @every_end
-def test_an_array_of_a_scene_may_reach_the_end(end: End) -> None:
-    for field in ARRAYS:
-        with naming(_array_name(field)):
-            _require_end(field, end)
-
-
-def _require_end(field: Declared, end: End) -> None:
+@for_each("field", ARRAYS)
+def test_an_array_of_a_scene_may_reach_the_end(field: Declared, end: End) -> None:
     inwards = {"low": np.float32(np.inf), "high": np.float32(-np.inf)}[end]
     number: Any = getattr(field.within, end)
     if field.kind is float:
@@ -237,16 +371,15 @@ def _require_end(field: Declared, end: End) -> None:
 
 
 @every_end
-def test_an_array_of_a_scene_beyond_the_end_is_refused(end: End) -> None:
+@for_each("field", [field for field in ARRAYS if field.kind is float])
+def test_an_array_of_a_scene_beyond_the_end_is_refused(field: Declared, end: End) -> None:
     """But for integers, whose ranges are those of their types: nothing is beyond."""
     outwards = {"low": np.float32(-np.inf), "high": np.float32(np.inf)}[end]
-    for field in (field for field in ARRAYS if field.kind is float):
-        number = np.float32(getattr(field.within, end))
-        if not getattr(field.within, f"{end}_open"):
-            with np.errstate(over="ignore"):
-                number = np.nextafter(number, outwards)
-        place = _place(field)
-        index = ", ".join(str(at) for at in (place if isinstance(place, tuple) else (place,)))
-        message = rf"{field.name}\[{index}\] is .*; expected"
-        with naming(_array_name(field)), pytest.raises(TrilightError, match=message):
-            _with(field, number).check()
+    number = np.float32(getattr(field.within, end))
+    if not getattr(field.within, f"{end}_open"):
+        with np.errstate(over="ignore"):
+            number = np.nextafter(number, outwards)
+    place = _place(field)
+    index = ", ".join(str(at) for at in (place if isinstance(place, tuple) else (place,)))
+    with pytest.raises(TrilightError, match=rf"{field.name}\[{index}\] is .*; expected"):
+        _with(field, number).check()

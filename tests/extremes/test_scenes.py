@@ -1,34 +1,46 @@
-"""Far from the defaults: scenes still keep every law, or are rejected with a reason."""
+"""Far from the defaults: scenes still keep every law, or are rejected with a reason.
+
+And numerical extremes of their meshes: the size of the world, slivers, plates, edges of budgets.
+"""
 
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.settings import AssetSettings
 from pipeline.builds.named import BUILDS, named_build
-from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
-from storage.errors import Rejected
+from storage.records.asset import Asset
 from storage.records.scene import Scene
 from storage.settings.changes import changed
-from tests.extremes.range_examples import SCENE_REASONS, naming
+from tests.for_each import case
+from tests.pipeline.assets.meshes_by_hand import (
+    cube,
+    geometry,
+    knot,
+    moved,
+    prepare,
+    reason_of,
+    sphere,
+    write_obj,
+    write_off,
+)
 from tests.pipeline.scenes.scene_facts import counts_of, digest, rows_of
 from tests.pipeline.scenes.small_pool import first_scene
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
 
 EXTREMES: list[dict[str, Any]] = [
-    {"cameras.fov_deg": [100.0, 110.0]},
     {"cameras.fov_deg": [10.0, 12.0]},
-    {"cameras.distance": [1.0, 1.0]},
     {"cameras.distance": [4.0, 4.0], "views.min_coverage": 0.001},
     {"lights.count": [32, 32], "lights.spacing": 0.0},
-    {"lights.count": [1, 1]},
-    {"lights.scale": [0.01, 0.01]},
     {"lights.scale": [10.0, 10.0], "lights.total_emission": [1e-3, 1e-3]},
     {"lights.total_emission": [1e9, 1e9]},
     {"lights.coloured_share": 1.0, "lights.orientation": "euler"},
@@ -39,20 +51,13 @@ EXTREMES: list[dict[str, Any]] = [
         "enough_error": 0.0,
     },
     {"families.num_objects": [8, 8], "placement.overlap_share": 1.0, "max_triangles": 4096},
-    {"families.num_objects": [0, 0]},
     {"families.object_scale": [0.01, 0.01], "views.min_coverage": 0.0},
     {"families.object_scale": [2.9, 2.9], "placement.inside": False, "views.min_depth": 0.0},
     {"families.shell.tilt_deg": 10.0, "families.shell.square_share": 0.0},
-    {"families.shell.scale": [0.2, 0.2], "placement.inside": False},
-    {"families.shell.scale": [3.0, 3.0], "views.max_shell_back": 1.0},
     {"families.smooth_share": 1.0, "materials.coloured_share": 1.0},
     {"families.smooth_share": 1.0, "materials.smooth_angle_deg": 180.0},
-    {"families.smooth_share": 1.0, "materials.smooth_angle_deg": 0.0},
-    {"materials.roughness_log": [0.06, 0.06]},
     {"materials.coloured_specular_share": 1.0, "materials.specular_ratio": [1.0, 1.0]},
     {"materials.albedo_sum": [1.0, 1.0]},
-    {"materials.albedo_sum": [0.0, 0.0]},
-    {"num_views": 16, "views.coverage_grid": 5},
     {"fill_to": 1536, "enough_error": 1.0},
 ]
 
@@ -70,40 +75,9 @@ def test_extreme_settings_keep_the_laws(pool: list[PooledAsset]) -> None:
     for changes in EXTREMES:
         settings = changed(SETTINGS, changes)
         for index, seed in enumerate((0, 2**63)):
-            with naming(f"{changes}"):
+            with case(f"{changes}"):
                 scene = first_scene(settings, pool, seed=seed, scene_index=index)
                 _require_laws(scene, settings)
-
-
-BEYOND: list[dict[str, Any]] = [
-    {"families.object_scale": [1e-3, 1e-3], "views.min_coverage": 0.0},
-    {"families.object_scale": [1e-3, 1e-3], "placement.overlap_share": 1.0},
-    {"families.object_scale": [1e3, 1e3], "placement.inside": False},
-    {"families.shell.scale": [1e-3, 1e-3]},
-    {"families.shell.scale": [1e3, 1e3]},
-    {"lights.scale": [1e-3, 1e-3], "lights.distance": [1e3, 1e3]},
-    {"lights.scale": [1e3, 1e3]},
-    {"lights.distance": [1e-3, 1e-3], "lights.target_jitter": 0.0},
-    {"lights.total_emission": [1e-3, 1e-3], "lights.count": [64, 64], "lights.spacing": 0.0},
-    {"cameras.distance": [1e-3, 1e-3], "cameras.target_jitter": 0.0},
-    {"cameras.distance": [1e3, 1e3], "cameras.target_jitter": 1e3},
-    {"cameras.fov_deg": [170.0, 170.0]},
-    {"cameras.fov_deg": [1.0, 1.0], "cameras.up_jitter": 1.0},
-]
-"""Settings that are admitted, and of which few rooms can be (ends one by one: test_range_ends)."""
-
-
-def test_absurd_settings_give_scenes_or_reasons(pool: list[PooledAsset]) -> None:
-    for changes in BEYOND:
-        settings = changed(SETTINGS, changes)
-        for index in range(2):
-            with naming(f"{changes}"):
-                try:
-                    scene = compose_scene(settings, pool, seed=0, scene_index=index, attempt=0)
-                except Rejected as rejection:
-                    assert rejection.reason in SCENE_REASONS
-                else:
-                    _require_laws(scene, settings)
 
 
 LAST = 999_999_998
@@ -116,7 +90,7 @@ def test_far_seeds_and_indices_are_seeds_and_indices(pool: list[PooledAsset]) ->
     for number, build in enumerate(BUILDS):
         settings = named_build(build, changes={"scenes.num_views": 1}).scenes
         seed, index = FAR[number % len(FAR)]
-        with naming(build, f"{seed}", f"{index}"):
+        with case((build, f"{seed}", f"{index}")):
             scene = first_scene(settings, pool, seed=seed, scene_index=index)
             _require_laws(scene, settings.of_scene(index))
             assert scene.provenance["scene_index"] == index
@@ -181,17 +155,100 @@ def test_a_pool_of_one_object_fills_every_scene(pool: list[PooledAsset], build: 
             assert len(set(names)) == len(names)
 
 
-def test_a_pool_of_one_object_that_is_too_large_is_rejected_at_every_attempt(
-    pool: list[PooledAsset],
-) -> None:
-    """With reason and numbers, sixteen times over, instead of for ever."""
-    large = [dataclasses.replace(pool[0], asset=_finest_only(pool[0]))]
-    settings = changed(SETTINGS, {"max_triangles": 1300})
-    for attempt in range(16):
-        with pytest.raises(Rejected, match="at least 1280 triangles") as caught:
-            compose_scene(settings, large, seed=0, scene_index=0, attempt=attempt)
-        assert caught.value.reason == "over_budget"
+def check(asset: Asset, settings: AssetSettings) -> None:
+    for level in asset.levels:
+        assert 1 <= len(level.faces) <= level.record.budget
+        assert np.isfinite(level.positions).all()
+        assert level.record.quality.error_p99 <= settings.gate.max_error_p99
 
 
-def _finest_only(entry: PooledAsset) -> Any:
-    return dataclasses.replace(entry.asset, levels=entry.asset.levels[:1])
+def test_the_size_of_the_world_changes_nothing_up_to_its_limits(tmp_path: Path) -> None:
+    unit = moved(knot(), 1 / np.ptp(knot().positions, axis=0).max())
+    settings = AssetSettings(budgets=(500,))
+    plain = prepare(write_off(tmp_path / "b.off", unit), settings)
+    for extent in (1e-8, 1e8):
+        scaled = prepare(write_off(tmp_path / "a.off", moved(unit, extent)), settings)
+        assert geometry(scaled) == geometry(plain), extent
+    for extent in (0.9e-9, 1.1e9):
+        path = write_off(tmp_path / "a.off", moved(unit, extent))
+        assert reason_of(path) == "extent_range", extent
+
+
+@pytest.mark.parametrize("method", ["pymeshlab_collapse", "meshoptimizer"])
+def test_slivers_of_a_million_to_one(tmp_path: Path, method: str) -> None:
+    """A cylinder of 3000 strips as long as the box, each 1e-6 of it apart at the ends."""
+    turn = np.linspace(0, 2 * np.pi, 1501)[:-1]
+    rim = np.column_stack([np.cos(turn), np.sin(turn)]) * 2.4e-4
+    ends = [np.column_stack([rim, np.full(1500, z)]) for z in (-0.5, 0.5)]
+    here, there = np.arange(1500), (np.arange(1500) + 1) % 1500
+    lower = np.column_stack([here, there, here + 1500])
+    upper = np.column_stack([there, there + 1500, here + 1500])
+    faces = np.concatenate([lower, upper])
+    pole = TriangleMesh(positions=np.concatenate(ends), faces=faces)
+    settings = AssetSettings(budgets=(1400,))
+    asset = prepare(write_obj(tmp_path / "a.obj", pole), settings, method)
+    check(asset, settings)
+    assert asset.levels
+
+
+def test_a_plate_a_hundred_thousandth_thick(tmp_path: Path) -> None:
+    """Ten cells of the grid: its two sides stay apart, and each faces its own way."""
+    plate = moved(cube(10), [1.0, 1.0, 1e-5])
+    settings = AssetSettings(budgets=(1200, 500))
+    asset = prepare(write_obj(tmp_path / "a.obj", plate), settings)
+    check(asset, settings)
+    finest = asset.levels[0]
+    assert len(finest.faces) == 1200
+    assert asset.source.watertight
+    assert asset.source.front_share == 1.0
+    # Half of 1e-5 to either side, on a grid of 2^-20.
+    np.testing.assert_allclose(np.abs(finest.positions[:, 2]).max(), 5e-6, atol=2**-21)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_four_faces_are_enough(tmp_path: Path, flip: bool) -> None:
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    mesh = TriangleMesh(positions=corners, faces=faces[:, :: -1 if flip else 1])
+    asset = prepare(write_off(tmp_path / "a.off", mesh), AssetSettings(budgets=(4,)))
+    (level,) = asset.levels
+    corners = level.positions.astype(np.float64)[level.faces]
+    volume = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    assert (len(level.faces), asset.source.num_parts, asset.source.watertight) == (4, 1, True)
+    assert volume == pytest.approx(1 / 6, rel=1e-5)  # float32 positions
+
+
+def test_one_triangle_is_an_object(tmp_path: Path) -> None:
+    one = TriangleMesh(positions=np.eye(3), faces=np.array([[0, 1, 2]]))
+    settings = AssetSettings()
+    asset = prepare(write_off(tmp_path / "a.off", one), settings)
+    (level,) = asset.levels
+    assert (len(level.faces), level.record.method) == (1, "source")
+    assert asset.source.open_edges == 3
+
+
+@pytest.mark.parametrize(
+    ("method", "rings"),
+    [
+        pytest.param("pymeshlab_collapse", 251, marks=pytest.mark.slow("memory")),
+        ("meshoptimizer", 51),
+    ],
+)
+def test_as_many_faces_as_scans_have(tmp_path: Path, method: str, rings: int) -> None:
+    ball = sphere(rings=rings, columns=400)
+    assert len(ball.faces) == 800 * rings
+    settings = AssetSettings(budgets=(1400,))
+    asset = prepare(write_off(tmp_path / "a.off", ball), settings, method)
+    check(asset, settings)
+    # 1400 triangles of a ball leave chords of 0.1 % of its diagonal; five times that is a hole
+    assert asset.levels[0].record.quality.error_p99 < 0.005
+
+
+@pytest.mark.parametrize("spare", [0, -1, 1])
+def test_a_source_at_the_edge_of_its_budget(tmp_path: Path, spare: int) -> None:
+    mesh = cube(10)
+    budget = len(mesh.faces) + spare
+    asset = prepare(write_obj(tmp_path / "a.obj", mesh), AssetSettings(budgets=(budget,)))
+    (level,) = asset.levels
+    assert (level.record.method == "source") == (spare >= 0)
+    assert len(level.faces) == len(mesh.faces) if spare >= 0 else len(level.faces) <= budget

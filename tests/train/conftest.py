@@ -5,6 +5,9 @@ from collections.abc import Iterator
 import pytest
 import torch
 
+from storage.dataset.dataset import Dataset
+from tests.train.toy import write_toy_dataset
+
 
 @pytest.fixture(autouse=True, scope="session")
 def one_thread() -> Iterator[None]:
@@ -12,3 +15,9 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Nine scenes of two views; for reading only."""
+    return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=7, validation=2, per_shard=3)

@@ -1,15 +1,34 @@
-"""A run that takes seconds."""
+"""A run that takes seconds, its steps and its stream alone, and who listens to it."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from model.config import ModelConfig
+from storage.dataset.dataset import Dataset
+from storage.dataset.training_data import TrainingData, open_training_data
+from train.data.mixture import Mixture
+from train.data.order import RankShare
+from train.data.scenes import TrainingScene
+from train.data.stream import StreamSettings, stream_batches
+from train.data.unusable import Unusable
+from train.loop.crew import Crew
+from train.loop.state import TrainState
+from train.loop.step import Stepper
+from train.loss.objective import Objective
+from train.progress import TrainProgress
 from train.result import TrainResult
 from train.run import train_run
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
 from train.start import Start
+
+CPU = torch.device("cpu")
+ALONE = Crew(device=CPU)
 
 TINY_MODEL = ModelConfig(
     width=36,
@@ -43,10 +62,79 @@ def tiny_run(**changes: object) -> TrainSettings:
     return dataclasses.replace(settings, **changes)  # type: ignore[arg-type]
 
 
+class Killed(BaseException):
+    """Stands for a power cut: nothing is saved on the way out."""
+
+
+class Heard(TrainProgress):
+    """Keeps the notes of a run, and ends it at a step as a power cut would."""
+
+    def __init__(self, *, killed_at: int | None = None) -> None:
+        self.killed_at = killed_at
+        self.notes: list[str] = []
+
+    def noted(self, text: str) -> None:
+        self.notes.append(text)
+
+    def advance(self, *, step: int, **_: Any) -> None:
+        if step == self.killed_at:
+            raise Killed
+
+
 def trained(
-    settings: TrainSettings, data: Sequence[str], out: Path, *, resume: bool = False, **rest: Any
+    settings: TrainSettings,
+    data: Dataset | Sequence[str],
+    out: Path,
+    *,
+    resume: bool = False,
+    start: Start | None = None,
+    **rest: Any,
 ) -> TrainResult:
     """Run to the end in this process."""
-    result = train_run(settings, data=data, out=out, start=Start(resume=resume), **rest)
+    places = [str(data.folder.root)] if isinstance(data, Dataset) else data
+    begun = start or Start(resume=resume)
+    result = train_run(settings, data=places, out=out, start=begun, **rest)
     assert result is not None
     return result
+
+
+def stepper(state: TrainState, settings: TrainSettings) -> Stepper:
+    return Stepper(state, settings, Objective(settings.loss, None), ALONE)
+
+
+def take(
+    data: TrainingData | Dataset,
+    settings: StreamSettings,
+    count: int,
+    *,
+    first: int = 0,
+    rank: int = 0,
+    world_size: int = 1,
+    workers: int = 1,
+    unusable: Unusable | None = None,
+    mixture: Mixture | None = None,
+) -> list[list[TrainingScene]]:
+    """Return the batches first, first + 1, ... of the training split."""
+    opened = open_training_data([str(data.folder.root)]) if isinstance(data, Dataset) else data
+    batches = stream_batches(
+        opened.split("train"),
+        settings,
+        first,
+        share=RankShare(rank=rank, world_size=world_size),
+        workers=workers,
+        unusable=unusable or Unusable(0),
+        mixture=mixture,
+    )
+    with closing(batches):
+        return list(itertools.islice(batches, count))
+
+
+def keys_of(batches: Sequence[Sequence[TrainingScene]]) -> list[list[str]]:
+    return [[scene.key for scene in batch] for batch in batches]
+
+
+def flip_a_bit(path: Path) -> None:
+    """Damage a file in its middle."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)

@@ -1,4 +1,8 @@
-"""What a command that resumes may say: execution as it likes, meaning as it was, or a decision."""
+"""What a run is, and what a command that resumes it may say.
+
+Named runs exist, and contradictions are refused by field. Execution is as one likes, meaning as it
+was, or a decision.
+"""
 
 import dataclasses
 import json
@@ -6,12 +10,16 @@ from typing import Any
 
 import pytest
 
+from model.base_widths import BaseWidths
+from model.config import SIZES, large
+from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.removed import LAST_COMMIT
 from storage.settings.described import settings_record
 from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run
 from train.going_on import GoingOn, event_records, events_of, going_on
+from train.runs import RUNS, changed_run, in_proportion, named_run
 from train.settings import AugmentationSettings, TrainSettings
 from train.stored_settings import known_settings, stored_settings
 
@@ -102,7 +110,6 @@ def test_execution_is_free_and_noted() -> None:
         ),
         ({"num_steps": 20}, "num_steps is 20, but .* 12.* --set num_steps=12.*change num_steps=20"),
         ({"betas": (0.9, 0.95)}, r"--set betas=\[0.9,0.99\].* --change betas=\[0.9,0.95\]"),
-        ({"schedule": "wsd"}, "--set schedule=cosine, or decide on --change schedule=wsd"),
         (
             {"augmentation": AugmentationSettings(mirror=True)},
             "augmentation.channels is false, .* with true, and augmentation.vertex_order is "
@@ -112,7 +119,6 @@ def test_execution_is_free_and_noted() -> None:
             {"model": dataclasses.replace(TINY_MODEL, hidden_width=64)},
             "model.hidden_width is 64, but the checkpoint was made with 48.* another run in",
         ),
-        ({"run": "other"}, "run is other, but .* tiny.* --set run=tiny, or begin another run"),
     ],
 )
 def test_other_meaning_is_refused_with_both_values_and_both_ways(
@@ -155,13 +161,10 @@ def test_a_decision_holds_from_its_step_and_is_not_typed_again() -> None:
             "--change scenes_per_pass: it is execution.* --set scenes_per_pass",
         ),
         ({"model.hidden_width": 64}, "model.hidden_width: it is the run's for good.*--from"),
-        ({"from_weights": True}, "from_weights: it is the run's for good"),
         ({"base_widths.width": 64}, "base_widths.width: it is the run's for good"),
         ({"muon_rate": 3.0}, "muon_rate=3: the checkpoint lacks the memories"),
         ({"num_steps": 7}, "num_steps=7: 8 steps are done.*--branch"),
-        ({"lossy": 1}, "setting 'lossy' does not exist"),
         ({"learning_rate": 2}, "'learning_rate' is 2; expected a number above 0, up to 1"),
-        ({"warmup_steps": 12}, "warmup_steps is 12; expected 0 to 11"),
     ],
 )
 def test_what_cannot_be_decided_is_refused(decisions: dict[str, Any], message: str) -> None:
@@ -221,3 +224,123 @@ def test_a_rate_that_rises_again_is_said() -> None:
 def test_a_history_that_is_none_is_refused() -> None:
     with pytest.raises(TrilightError, match="history of the run is not readable"):
         events_of([{"when": 3}])
+
+
+def test_an_unknown_run_is_refused_with_the_known_ones() -> None:
+    message = "'smoek': no such run; did you mean smoke.* builtin, fine"
+    with pytest.raises(TrilightError, match=message):
+        named_run("smoek")
+
+
+@for_each("name", sorted(RUNS))
+def test_named_runs_survive_json_and_fewer_steps_bring_warm_up_and_intervals_along(
+    name: str,
+) -> None:
+    """So that any number of steps is a run that is logged, judged and saved as the whole one is."""
+    run = named_run(name)
+    record = settings_record(run)
+    assert run.run == name and json.loads(json.dumps(record)) == record
+    for steps in (1, 2, 7, 24, 331, run.num_steps // 2):
+        shorter = changed_run(name, {}, steps=steps)
+        assert shorter.num_steps == steps
+        share = steps / run.num_steps
+        # rounded to a whole number of rows, and never to none
+        assert abs(shorter.warmup_steps - run.warmup_steps * share) <= 0.5
+        assert abs(shorter.log_every - run.log_every * share) < 1
+        for field in ("validate_every", "checkpoint_every"):
+            assert abs(getattr(shorter, field) - getattr(run, field) * share) <= shorter.log_every
+        assert shorter.keep_every % shorter.checkpoint_every == 0
+        assert (shorter.keep_every > 0) == (run.keep_every > 0)
+    assert changed_run(name, {}, steps=run.num_steps) == run
+    longer = changed_run(name, {}, steps=3 * run.num_steps)
+    assert dataclasses.replace(longer, num_steps=run.num_steps) == run
+
+
+def test_what_is_stated_is_not_brought_along() -> None:
+    stated = {"warmup_steps": 5, "validate_every": 12, "checkpoint_every": 24}
+    found = changed_run("smoke", stated, steps=24)
+    assert {name: getattr(found, name) for name in stated} == stated
+    assert changed_run("smoke", {"checkpoint_every": 9}, steps=80).log_every in (1, 3)
+    assert not in_proportion(named_run("smoke"), 24, stated).keys() & stated.keys()
+    with pytest.raises(TrilightError, match="warmup_steps is 50; expected 0 to 23"):
+        changed_run("smoke", {"warmup_steps": 50}, steps=24)
+    with pytest.raises(TrilightError, match="num_steps'? is 0; expected a whole number from 1"):
+        changed_run("smoke", {}, steps=0)
+    for value, message in ((0, "is 0; expected a whole number from 1"), ("often", "is 'often'")):
+        with pytest.raises(TrilightError, match=f"log_every'? {message}"):
+            changed_run("pretrain", {"log_every": value}, steps=24)
+
+
+@for_each(
+    ("changes", "message"),
+    [
+        ({"resolution": 20}, "resolution is 20; expected a multiple of 8"),
+        ({"warmup_steps": 12}, "warmup_steps is 12; expected 0 to 11"),
+        ({"validate_every": 5}, "validate_every is 5; expected a multiple of log_every, 2"),
+        ({"checkpoint_every": 3}, "checkpoint_every is 3"),
+        ({"precision": "float16"}, "precision is 'float16'; expected float32 or bfloat16"),
+    ],
+)
+def test_contradictory_settings_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        tiny_run(**changes)
+
+
+def test_the_paper_runs_are_the_papers() -> None:
+    """Zeng et al. 2025, section 4, and the published configuration."""
+    first, second = named_run("paper-pretrain"), named_run("paper-finetune")
+    assert (first.resolution, first.most_triangles, first.num_steps) == (256, 1536, 500_000)
+    assert (first.scenes_per_step, first.views_per_scene) == (128, 2)
+    assert (first.warmup_steps, first.learning_rate) == (8_000, 1e-4)
+    assert (second.resolution, second.most_triangles, second.num_steps) == (512, 4096, 100_000)
+    for run in (first, second):
+        assert (run.loss.perceptual, run.loss.perceptual_weight) == ("lpips", 0.05)
+        assert (run.betas, run.weight_decay, run.grad_clip) == ((0.9, 0.999), 0.01, 1.0)
+        assert (run.augmentation.rotation, run.augmentation.translation) == ("recipe", 0.25)
+        assert run.ema_decay == run.muon_rate == 0 and not run.augmentation.mirror
+        assert run.base_widths == BaseWidths() and run.base_widths.width == 0
+    assert second.from_weights and not first.from_weights
+
+
+def test_the_large_runs_are_the_published_large_recipe() -> None:
+    """Of its training code: rates, warm-up and steps; 4 and 6 scenes on each of 8 cards."""
+    first, second = named_run("paper-pretrain-large"), named_run("paper-finetune-large")
+    for run, base in ((first, "paper-pretrain"), (second, "paper-finetune")):
+        small = named_run(base)
+        assert run.model == large()
+        for name in ("loss", "augmentation", "resolution", "most_triangles", "views_per_scene"):
+            assert getattr(run, name) == getattr(small, name), name
+        for name in ("betas", "weight_decay", "grad_clip", "final_rate_share", "precision"):
+            assert getattr(run, name) == getattr(small, name), name
+    assert (first.num_steps, first.warmup_steps, first.learning_rate) == (600_000, 8_000, 1e-4)
+    assert (second.num_steps, second.warmup_steps, second.learning_rate) == (50_000, 4_000, 5e-5)
+    assert (first.scenes_per_step, second.scenes_per_step) == (4 * 8, 6 * 8)
+    assert second.recompute_activations and not first.recompute_activations
+    assert second.from_weights and not first.from_weights
+
+
+def test_every_size_can_be_asked_for_by_name() -> None:
+    for name, make in SIZES.items():
+        assert changed_run("smoke", {"model": name}).model == make()
+    without = changed_run("pretrain", {"model.window_bundles": 0, "model": "large"})
+    assert without.model == dataclasses.replace(large(), window_bundles=0)
+    with pytest.raises(TrilightError, match="'model' is 'larg'; did you mean large"):
+        changed_run("smoke", {"model": "larg"})
+    with pytest.raises(TrilightError, match="resolution is 72; expected a multiple of 64"):
+        changed_run("smoke", {"model": "large", "resolution": 72})
+
+
+SHIPPED = {
+    "builtin": "f414db1e0417fdce",
+    "hits": "62ab9f9520cd9d79",
+    "hits-tokens": "ca39119c1c965aa5",
+}
+"""Of what a run states beside its name and the defaults. Another digest is another run, which takes
+another name."""
+
+
+def test_the_runs_of_the_shipped_networks_stay_what_they_are() -> None:
+    for name, digest in SHIPPED.items():
+        record = settings_record(named_run(name), stated=True)
+        del record["run"]
+        assert sha256_hex(canonical_json(record))[:16] == digest, name

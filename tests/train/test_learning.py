@@ -1,9 +1,19 @@
 """That learning happens: one picture to the last detail, unseen scenes better than any stored one.
 
-Slow: minutes of training on a busy machine.
+And of networks that are told hits, skies and textures: from shards to weights, to the bit after a
+stop, and traced alike by any crew. What is slow takes minutes on a busy machine.
+
+And a step of each kind of network on a graphics card that is not there (fake_card): on tensors
+without numbers, forward, loss with LPIPS, backward, clipping, Muon, running mean, validation,
+evaluation, checkpoint. A module that stayed behind shows here alone. Functions without `test_` run
+in a process of their own.
 """
 
 import dataclasses
+import json
+import re
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +22,24 @@ import torch
 
 from model.config import ModelConfig
 from model.config import smoke as smoke_model
+from model.hits.traced import INPUTS
+from model.neural_renderer import NeuralRenderer
 from model.open import open_network
+from model.renderformer import RenderFormer
+from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import open_training_data
+from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
-from tests.train.kit import tiny_run, trained
+from storage.records.retextured import with_textures
+from storage.records.scene import Scene
+from storage.records.texture import Texture
+from tests.for_each import for_each
+from tests.model.hits.test_decoder import hits_config
+from tests.model.kit import tiny_config
+from tests.sky_maps import smooth
+from tests.train.fake_card import CARD, card_process, fake_card
+from tests.train.kit import stepper, take, tiny_run, trained
+from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_picture, toy_sample, toy_scene, write_toy_dataset
 from train.data.augment import with_views
 from train.data.buckets import make_batch
@@ -24,13 +48,15 @@ from train.evaluation.evaluate import Contest, judged_views, make_rivals
 from train.evaluation.judge import predict
 from train.evaluation.judged_view import NETWORK, summary
 from train.evaluation.rivals import MEDIAN, NEAREST
-from train.loop.checkpoints import network_of_run
+from train.loop.checkpoints import network_of_run, path_of_step
 from train.loop.crew import Crew
 from train.loop.schedule import learning_rate
 from train.loop.state import TrainState, new_state
-from train.loop.step import Stepper
-from train.loss.objective import Objective
+from train.loss.lpips import LINEAR_FILE, VGG16_FILE, load_lpips
+from train.run import stream_settings, train_run
+from train.runs import changed_run
 from train.settings import AugmentationSettings, TrainSettings
+from train.start import Start
 
 SMALL = dataclasses.replace(
     smoke_model(), width=64, num_heads=1, hidden_width=192, encoder_layers=2, decoder_layers=2
@@ -38,19 +64,7 @@ SMALL = dataclasses.replace(
 
 
 def memorised(scenes: list[TrainingScene], model: ModelConfig, steps: int) -> TrainState:
-    settings = memorising(model, scenes, steps)
-    state = new_state(settings)
-    crew = Crew(device=torch.device("cpu"))
-    stepper = Stepper(state, settings, Objective(settings.loss, None), crew)
-    batches = [make_batch([scene]) for scene in scenes]
-    for step in range(steps):
-        stepper.step(batches, learning_rate(step, settings))
-        state.step += 1
-    return state
-
-
-def memorising(model: ModelConfig, scenes: list[TrainingScene], steps: int) -> TrainSettings:
-    return tiny_run(
+    settings = tiny_run(
         model=model,
         resolution=scenes[0].target_VRR3.shape[1],
         num_steps=steps,
@@ -59,6 +73,13 @@ def memorising(model: ModelConfig, scenes: list[TrainingScene], steps: int) -> T
         final_rate_share=0.01,
         augmentation=AugmentationSettings(),
     )
+    state = new_state(settings)
+    memorising = stepper(state, settings)
+    batches = [make_batch([scene]) for scene in scenes]
+    for step in range(steps):
+        memorising.step(batches, learning_rate(step, settings))
+        state.step += 1
+    return state
 
 
 def score(state: TrainState, scene: TrainingScene, target: TrainingScene) -> float:
@@ -125,3 +146,228 @@ def test_unseen_scenes_look_better_than_any_stored_picture(tmp_path: Path) -> No
     # measured: 0.0292 against 0.0395 and 0.0313
     assert means[NETWORK] < 0.9 * means[MEDIAN]
     assert means[NETWORK] < means[NEAREST]
+
+
+HITS_AUGMENTATION = AugmentationSettings(
+    rotation="uniform", mirror=True, channels=True, vertex_order=True, withheld_inputs=0.3
+)
+
+
+def hits_run(**changes: object) -> TrainSettings:
+    run = tiny_run(model=hits_config(), run="tiny-hits", augmentation=HITS_AUGMENTATION)
+    return dataclasses.replace(run, **changes)  # type: ignore[arg-type]
+
+
+def test_what_is_traced_depends_on_no_thread_and_no_rank(dataset: Dataset) -> None:
+    alone = {
+        scene.key: scene.tensors.traced
+        for scene in take(dataset, stream_settings(hits_run()), 1, first=3)[0]
+    }
+    for rank in range(3):
+        part = {"workers": 3, "rank": rank, "world_size": 3}
+        ((other,),) = take(dataset, stream_settings(hits_run()), 1, first=3, **part)  # type: ignore[arg-type]
+        a, b = alone.pop(other.key), other.tensors.traced
+        assert a is not None
+        assert b is not None
+        for name, value in vars(a).items():
+            assert torch.equal(value, getattr(b, name)), name
+
+
+def test_views_are_traced_after_the_symmetries_and_lack_inputs_by_chance(dataset: Dataset) -> None:
+    scenes = take(dataset, stream_settings(hits_run()), 1, first=3)[0]
+    given = torch.cat([s.tensors.traced.given_VI for s in scenes if s.tensors.traced])
+    assert given.shape == (6, len(INPUTS))
+    assert 0 < given.mean() < 1
+    for scene in scenes:
+        traced = scene.tensors.traced
+        assert traced is not None
+        # each pixel that is lit in the picture, mirrored as it is, is one that meets something
+        lit = scene.target_VRR3.amax(dim=-1) > 0.01
+        assert (traced.pixels_VRRC[..., 0] > 0)[lit].float().mean() > 0.95
+
+
+MAPS_AUGMENTATION = AugmentationSettings(
+    rotation="uniform", mirror=True, channels=True, vertex_order=True, light_scale=2.0
+)
+
+
+def _scene_of_maps(index: int) -> Scene:
+    """Return a toy scene: two in three below a sky, two in three with a texture."""
+    scene = toy_scene(index)
+    if index % 3 != 1:
+        scene = dataclasses.replace(scene, environment=smooth(8))
+    if index % 3:
+        rng = np.random.default_rng(index)
+        texture = Texture(texels=rng.integers(0, 90, (8, 8, 3), np.uint8))
+        rows = np.full((len(scene.materials), 3), -1, np.int32)
+        rows[scene.material_index[~scene.triangle_emits][0], 0] = 0
+        uv = scene.vertex_positions[scene.faces.ravel(), :2].astype(np.float32)
+        scene = with_textures(scene, uv, (texture,), rows)
+    return scene
+
+
+def maps_run() -> TrainSettings:
+    run = tiny_run(model=hits_config(sky_rays=2), run="tiny-maps", augmentation=MAPS_AUGMENTATION)
+    return dataclasses.replace(run, num_steps=4, validate_every=4, checkpoint_every=2)
+
+
+@pytest.fixture(scope="module")
+def with_maps(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """With steps in which no scene has a sky, or a texture."""
+    folder = tmp_path_factory.mktemp("maps")
+    return write_toy_dataset(folder, train=6, validation=2, per_shard=3, scene_of=_scene_of_maps)
+
+
+def require_resumed_to_the_bit(run: TrainSettings, data: Dataset, out: Path) -> None:
+    folder = trained(run, data, out).folder
+    weights = folder.weights.read_bytes()
+    path_of_step(folder.checkpoints, run.num_steps).unlink()
+    folder.weights.unlink()
+    assert trained(run, data, out, resume=True).folder.weights.read_bytes() == weights
+
+
+def test_a_run_that_is_told_hits_resumes_to_the_bit(dataset: Dataset, tmp_path: Path) -> None:
+    run = hits_run(num_steps=3, validate_every=4, checkpoint_every=2)
+    require_resumed_to_the_bit(run, dataset, tmp_path)
+
+
+@pytest.mark.slow("training")
+def test_a_run_below_skies_resumes_to_the_bit(with_maps: Dataset, tmp_path: Path) -> None:
+    require_resumed_to_the_bit(maps_run(), with_maps, tmp_path)
+
+
+def test_a_run_that_knows_no_sky_is_refused_before_its_first_step(
+    with_maps: Dataset, tmp_path: Path
+) -> None:
+    run = dataclasses.replace(maps_run(), model=tiny_config())
+    with pytest.raises(TrilightError, match=r"does not know its light.*model.sky_rays=16"):
+        trained(run, with_maps, tmp_path / "run")
+    assert not list((tmp_path / "run").glob("checkpoints/*"))
+
+
+@pytest.fixture(scope="module")
+def card(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProcessPoolExecutor]:
+    """A process with a card that is not there."""
+    with card_process(tmp_path_factory.mktemp("card")) as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("toy")
+    write_toy_dataset(folder, train=2, validation=2, resolution=RESOLUTION)
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def lpips(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A folder of files like the published ones, with few channels."""
+    folder = tmp_path_factory.mktemp("lpips")
+    for name, weights in zip((VGG16_FILE, LINEAR_FILE), small_weights(), strict=True):
+        torch.save(weights, folder / name)
+    return str(folder)
+
+
+@pytest.mark.slow("gpu")  # a process and a library of its own
+@for_each(("run", "size"), [("pretrain", "smoke"), ("hits", "hits-smoke")])
+def test_each_view_stage_takes_its_step_on_a_card(
+    run: str, size: str, card: ProcessPoolExecutor, data: str, lpips: str, tmp_path: Path
+) -> None:
+    card.submit(train_and_judge, run, size, data, lpips, tmp_path).result()
+
+
+@pytest.mark.slow("gpu")
+def test_a_run_goes_on_and_a_second_one_begins_on_a_card(
+    card: ProcessPoolExecutor, data: str, lpips: str, tmp_path: Path
+) -> None:
+    card.submit(resume, data, lpips, tmp_path).result()
+
+
+@pytest.mark.slow("gpu")
+def test_the_card_forgives_nothing(card: ProcessPoolExecutor) -> None:
+    for mistake, message in {
+        "processor": "Expected all tensors to be on the same device|two devices",
+        "numpy": "can't convert cuda:0",
+        "unique": "unique",
+    }.items():
+        error = card.submit(mixed_on_the_card, mistake).exception()
+        assert error is not None and re.search(message, str(error)), mistake
+
+
+RESOLUTION = 64
+"""One window of the large network's."""
+
+
+def one_step_of(run: str, size: str) -> TrainSettings:
+    """Return a named run at a named size, with one step of two scenes of the toy's."""
+    changes = {
+        "model": size,
+        "resolution": RESOLUTION,
+        "num_steps": 1,
+        "warmup_steps": 0,
+        "scenes_per_step": 2,
+        "scenes_per_pass": 2,
+        "views_per_scene": 1,
+        "log_every": 1,
+        "validate_every": 1,
+        "checkpoint_every": 1,
+        "validation_scenes": 1,
+        "from_weights": False,
+    }
+    return changed_run(run, changes)
+
+
+def train_and_judge(run: str, size: str, data: str, lpips: str, out: Path) -> None:
+    """Train by train_run, evaluate and render."""
+    settings = one_step_of(run, size)
+    with fake_card():
+        start, crew = Start(lpips=lpips), Crew(device=CARD)
+        result = train_run(settings, data=[data], out=out, start=start, crew=crew)
+        assert result is not None and result.skipped_steps == 0
+        network = RenderFormer(settings.model).to(CARD)
+        distance = load_lpips(lpips)
+        assert distance is not None
+        contest = Contest(
+            network=network,
+            shards=open_training_data([data]).split("validation"),
+            resolution=RESOLUTION,
+            rivals=None,
+            lpips=distance.to(CARD),
+            most_scenes=1,
+        )
+        (view, *_) = judged_views(contest, lambda: None)
+        assert view.scores["network"]["lpips"] is not None
+        assert NeuralRenderer(network).render(toy_scene(0), RESOLUTION).shape[1:] == (64, 64, 3)
+
+
+def resume(data: str, lpips: str, out: Path) -> None:
+    """Go on with a run on the card, and begin a second stage with it.
+
+    Muon is torch's own there, whatever the processor beside the card has.
+    """
+    first = dataclasses.replace(one_step_of("builtin", "smoke"), num_steps=2, warmup_steps=1)
+    second = dataclasses.replace(one_step_of("finetune", "smoke"), from_weights=True)
+    with pytest.MonkeyPatch.context() as patch, fake_card():
+        patch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
+        crew = Crew(device=CARD)
+        train_run(first, data=[data], out=out / "first", crew=crew)
+        checkpoint = out / "first" / "checkpoints" / "step-000000002.safetensors"
+        checkpoint.unlink()
+        train_run(first, data=[data], out=out / "first", start=Start(resume=True), crew=crew)
+        start = Start(begin_with=str(checkpoint), lpips=lpips)
+        train_run(second, data=[data], out=out / "second", start=start, crew=crew)
+    for name in ("first", "second"):
+        record = json.loads((out / name / "settings.json").read_text())
+        assert record["muon_precision"] == "bfloat16"
+
+
+def mixed_on_the_card(name: str) -> None:
+    """Make a mistake that a card would not forgive."""
+    with fake_card():
+        on_card = torch.zeros(4, 3, 16, 16, device=CARD)
+        mistakes = {
+            "processor": lambda: on_card + torch.zeros(4, 1, 1, 1),
+            "numpy": lambda: on_card.numpy(),
+            "unique": lambda: on_card.unique(),
+        }
+        mistakes[name]()

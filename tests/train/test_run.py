@@ -5,9 +5,9 @@ import os
 import re
 import shutil
 import signal
-from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -19,51 +19,34 @@ from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
 from storage.records.safe_read import safetensors_header
 from tests.command_line import trilight
-from tests.train.kit import tiny_run, trained
+from tests.train.kit import Heard, Killed, tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train.evaluation import judge
 from train.loop import trainer
 from train.loop.interrupts import Stopped
 from train.progress import TrainProgress
 from train.result import TrainResult
-from train.run import train_run
-from train.settings import TrainSettings
 from train.start import Start
 from train.watching.rows import read_rows
 
 TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share", "time_s", "memory_mb"}
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=7, validation=2, per_shard=3)
-
-
-class Listener(TrainProgress):
+class Listener(Heard):
     """Keeps what a run says of its progress."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.heard: list[str] = []
-        self.notes: list[str] = []
 
-    def begin(
-        self,
-        *,
-        step: int,
-        num_steps: int,
-        num_parameters: int,
-        median_scores: Mapping[str, float] | None,
-    ) -> None:
+    def begin(self, *, step: int, num_steps: int, **_: Any) -> None:
         self.heard.append(f"begin {step}/{num_steps}")
 
-    def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
+    def advance(self, *, step: int, **_: Any) -> None:
         self.heard.append(f"step {step}")
 
-    def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
+    def validated(self, *, step: int, **_: Any) -> None:
         self.heard.append(f"validated {step}")
-
-    def noted(self, text: str) -> None:
-        self.notes.append(text)
 
 
 @pytest.fixture(scope="module")
@@ -77,18 +60,7 @@ def whole(
     dataset: Dataset, listener: Listener, tmp_path_factory: pytest.TempPathFactory
 ) -> TrainResult:
     """The run that nothing interrupts."""
-    return run(tiny_run(), dataset, tmp_path_factory.mktemp("whole"), progress=listener)
-
-
-def run(
-    settings: TrainSettings,
-    dataset: Dataset,
-    out: Path,
-    *,
-    resume: bool = False,
-    progress: TrainProgress | None = None,
-) -> TrainResult:
-    return trained(settings, [str(dataset.folder.root)], out, resume=resume, progress=progress)
+    return trained(tiny_run(), dataset, tmp_path_factory.mktemp("whole"), progress=listener)
 
 
 class SignalAt(TrainProgress):
@@ -98,22 +70,9 @@ class SignalAt(TrainProgress):
         self.step = step
         self.number = number
 
-    def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
+    def advance(self, *, step: int, **_: Any) -> None:
         if step == self.step:
             os.kill(os.getpid(), self.number)
-
-
-class Killed(BaseException):
-    """Stands for a power cut: nothing is saved on the way out."""
-
-
-class KillAt(TrainProgress):
-    def __init__(self, step: int) -> None:
-        self.step = step
-
-    def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
-        if step == self.step:
-            raise Killed
 
 
 def same_as_uninterrupted(out: Path, whole: TrainResult) -> None:
@@ -134,9 +93,9 @@ def test_stopped_and_resumed_is_uninterrupted_to_the_bit(
     handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     for step, number in ((1, signal.SIGINT), (7, signal.SIGTERM), (11, signal.SIGUSR1)):
         with pytest.raises(TrilightError, match=f"stopped at step {step} .* --resume"):
-            run(tiny_run(), dataset, tmp_path, resume=step > 1, progress=SignalAt(step, number))
+            trained(tiny_run(), dataset, tmp_path, resume=step > 1, progress=SignalAt(step, number))
         assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
-    run(tiny_run(), dataset, tmp_path, resume=True)
+    trained(tiny_run(), dataset, tmp_path, resume=True)
     same_as_uninterrupted(tmp_path, whole)
     assert curve(tmp_path) == curve(whole.folder.root), "a row half full is filled"
 
@@ -172,12 +131,12 @@ def test_a_signal_in_a_validation_or_while_saving_loses_nothing(
         with monkeypatch.context() as patch:
             asked = SignalIn(patch, module, name, call)
             with pytest.raises(Stopped, match=f"stopped at step {step} by") as stopped:
-                run(tiny_run(), dataset, tmp_path, resume=number > 0)
+                trained(tiny_run(), dataset, tmp_path, resume=number > 0)
         assert (asked.calls, stopped.value.exit_status) == (call, 75), number
         rows = read_rows(tmp_path / "metrics.jsonl")
         left = [row["step"] for row in rows if "validation" in row]
         assert (step in left) == (name == "keep_checkpoint"), number
-    run(tiny_run(), dataset, tmp_path, resume=True)
+    trained(tiny_run(), dataset, tmp_path, resume=True)
     same_as_uninterrupted(tmp_path, whole)
     assert curve(tmp_path) == curve(whole.folder.root)
 
@@ -186,11 +145,11 @@ def test_the_same_command_begins_begins_again_and_goes_on(
     dataset: Dataset, whole: TrainResult, tmp_path: Path
 ) -> None:
     """As a scheduler starts it: killed before the first checkpoint, and after one."""
-    start, data = Start(restartable=True), [str(dataset.folder.root)]
+    start = Start(restartable=True)
     for step in (3, 7):
         with pytest.raises(Killed):
-            train_run(tiny_run(), data=data, out=tmp_path, start=start, progress=KillAt(step))
-    train_run(tiny_run(), data=data, out=tmp_path, start=start)
+            trained(tiny_run(), dataset, tmp_path, start=start, progress=Heard(killed_at=step))
+    trained(tiny_run(), dataset, tmp_path, start=start)
     same_as_uninterrupted(tmp_path, whole)
     assert curve(tmp_path) == curve(whole.folder.root)
     begun = [row["text"].split(" on ")[0] for row in read_rows(tmp_path / "notes.jsonl")]
@@ -202,12 +161,15 @@ def test_a_finished_run_is_judged_again(
 ) -> None:
     shutil.copytree(whole.folder.root, tmp_path, dirs_exist_ok=True)
     (tmp_path / "validation_sheet.png").unlink()
-    again = run(tiny_run(), dataset, tmp_path, resume=True)
+    again = trained(tiny_run(), dataset, tmp_path, resume=True)
     assert again.scores == whole.scores
     same_as_uninterrupted(tmp_path, whole)
 
 
-def test_the_folder_holds_everything_and_agrees_with_the_result(whole: TrainResult) -> None:
+def test_the_folder_holds_everything_and_agrees_with_the_result(
+    whole: TrainResult, listener: Listener
+) -> None:
+    """And progress hears of every step."""
     folder = whole.folder
     summary = json.loads(folder.summary.read_text())
     assert summary["scores"] == whole.scores
@@ -229,8 +191,6 @@ def test_the_folder_holds_everything_and_agrees_with_the_result(whole: TrainResu
     model = decode_weights(weights)
     assert sum(weight.numel() for weight in model.parameters()) == whole.num_parameters
 
-
-def test_progress_hears_of_every_step(whole: TrainResult, listener: Listener) -> None:
     steps = [f"step {step}" for step in range(1, 13)]
     for step in (12, 8, 4):
         steps.insert(step, f"validated {step}")
@@ -238,24 +198,12 @@ def test_progress_hears_of_every_step(whole: TrainResult, listener: Listener) ->
 
 
 def test_mistakes_are_named(dataset: Dataset, whole: TrainResult, tmp_path: Path) -> None:
-    with pytest.raises(TrilightError, match=r"no manifest\.json here"):
-        trained(tiny_run(), [str(tmp_path / "nowhere")], tmp_path / "a")
     with pytest.raises(TrilightError, match="resolution 24: expected a divisor of 32"):
-        run(tiny_run(resolution=24), dataset, tmp_path / "b")
+        trained(tiny_run(resolution=24), dataset, tmp_path / "b")
     with pytest.raises(TrilightError, match="views_per_scene is 3, .* have 2 views"):
-        run(tiny_run(views_per_scene=3), dataset, tmp_path / "c")
+        trained(tiny_run(views_per_scene=3), dataset, tmp_path / "c")
     with pytest.raises(TrilightError, match="holds a run already; add --resume"):
-        run(tiny_run(), dataset, whole.folder.root)
-    with pytest.raises(TrilightError, match="no checkpoint here to resume from"):
-        run(tiny_run(), dataset, tmp_path / "d", resume=True)
-    with pytest.raises(TrilightError, match="seed is 9, but .* with 0"):
-        run(tiny_run(seed=9), dataset, whole.folder.root, resume=True)
-
-
-def test_an_empty_training_split_is_named(tmp_path: Path) -> None:
-    dataset = write_toy_dataset(tmp_path / "data", resolution=8, train=0, validation=1)
-    with pytest.raises(TrilightError, match="the train split holds no scene"):
-        run(tiny_run(resolution=8), dataset, tmp_path / "out")
+        trained(tiny_run(), dataset, whole.folder.root)
 
 
 def test_data_without_a_validation_split_trains_and_says_so(
@@ -264,7 +212,7 @@ def test_data_without_a_validation_split_trains_and_says_so(
     """As the first eight scenes of a new user; the steps are those of any other run."""
     few = write_toy_dataset(tmp_path / "data", train=7, validation=0, per_shard=3)
     out, listener = tmp_path / "out", Listener()
-    result = run(tiny_run(), few, out, progress=listener)
+    result = trained(tiny_run(), few, out, progress=listener)
     note, workers = listener.notes
     assert "decode" in workers and "cores" in workers, "the default of --workers is said"
     assert "no validation split" in note and "more scenes" in note
@@ -276,7 +224,7 @@ def test_data_without_a_validation_split_trains_and_says_so(
     assert not [row for row in read_rows(result.folder.metrics) if "validation" in row]
     weights = whole.folder.weights.read_bytes()
     assert result.folder.weights.read_bytes() == weights
-    again = run(tiny_run(), few, out, resume=True)
+    again = trained(tiny_run(), few, out, resume=True)
     assert again.folder.weights.read_bytes() == weights
     data = ["--data", str(dataset.folder.root), "--split", "validation", "--most-scenes", "1"]
     data += ["--tracer-views", "0"]
@@ -284,13 +232,12 @@ def test_data_without_a_validation_split_trains_and_says_so(
     assert done.exit_code == 0, done.output
 
 
-class Poison(TrainProgress):
+class Poison(Heard):
     """Makes every norm return NaN in all steps after the first but those in `spared`."""
 
     def __init__(self, spared: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
-        self.spared = spared
-        self.poisoned = False
-        self.notes: list[str] = []
+        super().__init__()
+        self.spared, self.poisoned = spared, False
         original = Norm.forward
 
         def forward(module: Norm, x: torch.Tensor) -> torch.Tensor:
@@ -298,10 +245,7 @@ class Poison(TrainProgress):
 
         monkeypatch.setattr(Norm, "forward", forward)
 
-    def noted(self, text: str) -> None:
-        self.notes.append(text)
-
-    def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
+    def advance(self, *, step: int, **_: Any) -> None:
         self.poisoned = step + 1 not in self.spared
 
 
@@ -311,22 +255,9 @@ def test_a_run_that_recovers_goes_on_and_counts(
     """Nine steps fail, one is taken, nine fail; of ten in a row see test_ways_on."""
     poison = Poison({11, 21}, monkeypatch)
     settings = tiny_run(num_steps=21, validate_every=22, scenes_per_step=2)
-    result = run(settings, dataset, tmp_path, progress=poison)
+    result = trained(settings, dataset, tmp_path, progress=poison)
     assert result.skipped_steps == 18
     named = [re.search(r"step (\d+) was skipped.* scenes were 0+\d+, ", n) for n in poison.notes]
     assert [int(match[1]) for match in named if match] == [*range(2, 11), *range(12, 21)]
     losses = {row["step"]: row["loss"] for row in read_rows(result.folder.metrics) if "loss" in row}
     assert losses[4] is None and losses[12] > 0, "a row without a finite step has no loss"
-
-
-@pytest.mark.slow("training")
-def test_it_learns_scenes_that_it_has_never_seen(tmp_path: Path) -> None:
-    dataset = write_toy_dataset(tmp_path / "data", train=96, validation=12, per_shard=32)
-    settings = tiny_run(
-        num_steps=800, scenes_per_step=8, log_every=10, validate_every=100, checkpoint_every=400
-    )
-    result = run(settings, dataset, tmp_path / "out")
-    assert result.loss_at_end < 0.7 * result.loss_at_start
-    # measured: 0.90 of the median picture, 0.64 of the first loss
-    assert result.scores is not None and result.median_scores is not None
-    assert result.scores["log_l1"] < 0.95 * result.median_scores["log_l1"]

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import math
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.train.data.test_unusable import BAD_KEY, spoil_sample
-from tests.train.kit import tiny_run
+from tests.train.kit import Heard, Killed, tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train import run as run_module
 from train.data.buckets import TrainingBatch
@@ -28,36 +27,19 @@ from train.loop.recorder import read_rows
 from train.loop.step import Stepper, Unread
 from train.progress import TrainProgress
 from train.result import TrainResult
-from train.run import train_run
 from train.settings import TrainSettings
 from train.start import Start
 
 
-class Notes(TrainProgress):
-    def __init__(self) -> None:
-        self.texts: list[str] = []
-
-    def noted(self, text: str) -> None:
-        self.texts.append(text)
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=7, validation=1, per_shard=3)
-
-
 def run(
     settings: TrainSettings,
-    dataset: Dataset,
+    data: Dataset,
     out: Path,
     *,
     progress: TrainProgress | None = None,
     **start: Any,
 ) -> TrainResult:
-    data, begun = [str(dataset.folder.root)], Start(**start)
-    result = train_run(settings, data=data, out=out, start=begun, progress=progress)
-    assert result is not None
-    return result
+    return trained(settings, data, out, start=Start(**start), progress=progress)
 
 
 def wsd(**changes: Any) -> TrainSettings:
@@ -97,11 +79,6 @@ def short(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> RunFold
     return run(SHORT, dataset, tmp_path_factory.mktemp("short")).folder
 
 
-def copied(short: RunFolder, out: Path) -> Path:
-    shutil.copytree(short.root, out, dirs_exist_ok=True)
-    return out
-
-
 def test_an_extended_run_is_a_longer_one_to_the_bit(
     dataset: Dataset, short: RunFolder, tmp_path: Path
 ) -> None:
@@ -110,13 +87,8 @@ def test_an_extended_run_is_a_longer_one_to_the_bit(
     assert saved_steps(short.checkpoints) == [4, 5]
     begins = path_of_step(short.checkpoints, 4)
     whole = read_checkpoint(path_of_step(long.folder.checkpoints, 8)).arrays
-    extended = run(
-        SHORT,
-        dataset,
-        tmp_path / "extended",
-        branch=str(begins),
-        decisions={"num_steps": 10},
-    )
+    start: dict[str, Any] = {"branch": str(begins), "decisions": {"num_steps": 10}}
+    extended = run(SHORT, dataset, tmp_path / "extended", **start)
     ours = read_checkpoint(path_of_step(extended.folder.checkpoints, 8)).arrays
     assert ours.keys() == whole.keys()
     assert all((ours[name] == whole[name]).all() for name in whole), "weights, mean and memories"
@@ -141,13 +113,13 @@ def test_a_finished_run_made_longer_in_its_own_folder(
     dataset: Dataset, short: RunFolder, tmp_path: Path
 ) -> None:
     """Its rate rises again, which is said; the decision is on disk, in the summary, and stays."""
-    copied(short, tmp_path)
+    shutil.copytree(short.root, tmp_path, dirs_exist_ok=True)
     with pytest.raises(TrilightError, match="num_steps is 7, but the checkpoint was made with 5"):
         run(dataclasses.replace(SHORT, num_steps=7), dataset, tmp_path, resume=True)
-    notes = Notes()
+    notes = Heard()
     longer = run(SHORT, dataset, tmp_path, resume=True, decisions={"num_steps": 7}, progress=notes)
     assert longer.num_steps == 7
-    assert any("the rate had been falling since step 4" in text for text in notes.texts)
+    assert any("the rate had been falling since step 4" in text for text in notes.notes)
     recorded = {"step": 5, "kind": "meaning", "name": "num_steps", "before": 5, "after": 7}
     record = json.loads(longer.folder.settings.read_text())
     assert record["settings"]["num_steps"] == 7 and record["history"] == [recorded]
@@ -156,20 +128,18 @@ def test_a_finished_run_made_longer_in_its_own_folder(
     assert again.num_steps == 7, "the command that began it goes on with what was decided"
 
 
-class Killed(BaseException):
-    """Stands for a power cut."""
-
-
-class KilledAtOnce(Notes):
-    def advance(self, **_: Any) -> None:
-        raise Killed
-
-
 def test_a_kill_forgets_no_decision(dataset: Dataset, short: RunFolder, tmp_path: Path) -> None:
-    copied(short, tmp_path)
+    shutil.copytree(short.root, tmp_path, dirs_exist_ok=True)
     path_of_step(tmp_path / "checkpoints", 5).unlink()
     with pytest.raises(Killed):
-        run(SHORT, dataset, tmp_path, resume=True, decisions={"seed": 5}, progress=KilledAtOnce())
+        run(
+            SHORT,
+            dataset,
+            tmp_path,
+            resume=True,
+            decisions={"seed": 5},
+            progress=Heard(killed_at=5),
+        )
     again = run(SHORT, dataset, tmp_path, resume=True)
     assert [(event.step, event.name, event.after) for event in again.history] == [(4, "seed", 5)]
 
@@ -190,10 +160,10 @@ def test_too_little_memory_goes_on_with_fewer_scenes_a_pass(
     monkeypatch.setattr(step_module, "predicted", small_card)
     with pytest.raises(TrilightError, match=r"too little memory in step \d+.*scenes_per_pass=2"):
         run(settings, dataset, tmp_path / "small")
-    notes, step = Notes(), saved_steps(tmp_path / "small/checkpoints")[-1]
+    notes, step = Heard(), saved_steps(tmp_path / "small/checkpoints")[-1]
     one = dataclasses.replace(settings, scenes_per_pass=1)
     run(one, dataset, tmp_path / "small", resume=True, progress=notes)
-    assert any("scenes_per_pass is 1 instead of 16" in text for text in notes.texts)
+    assert any("scenes_per_pass is 1 instead of 16" in text for text in notes.notes)
     found, wanted = weights(tmp_path / "small"), weights(tmp_path / "whole")
     before = read_checkpoint(path_of_step(tmp_path / "small/checkpoints", step)).network()
     way = apart(wanted, before.state_dict())
@@ -220,25 +190,14 @@ def test_a_bad_sample_is_left_out_by_its_key(
         run(wsd(**each), data, tmp_path / "out")
     stopped_at = saved_steps(tmp_path / "out/checkpoints")[-1]
     assert 0 < stopped_at < 8
-    notes = Notes()
+    notes = Heard()
     allowed = wsd(**each, most_unusable=1)
     result = run(allowed, data, tmp_path / "out", resume=True, progress=notes)
-    assert sum(text.startswith("left out: ") and BAD_KEY in text for text in notes.texts) == 1
+    assert sum(text.startswith("left out: ") and BAD_KEY in text for text in notes.notes) == 1
     assert BAD_KEY in result.unusable[0] and result.num_steps == 8
+    assert BAD_KEY in result.folder.summary.read_text()
     (event,) = result.history
     assert (event.step, event.name, event.after) == (stopped_at, "most_unusable", 1)
-
-
-def failing(when: Callable[[TrainSettings, int], bool]) -> Callable[..., Unread]:
-    """Return a step that is not finite where `when` says so of the run's settings and step."""
-    original = Stepper.take
-
-    def taken(self: Stepper, *given: Any, **rest: Any) -> Unread:
-        if when(self._settings, self._state.step):
-            return torch.tensor([math.nan, math.nan, 0.0, 0.0, math.nan, 0.0, 0.0]).double()
-        return original(self, *given, **rest)
-
-    return taken
 
 
 def test_ten_skipped_steps_go_on_by_a_decision(
@@ -250,24 +209,24 @@ def test_ten_skipped_steps_go_on_by_a_decision(
     """
     settings = wsd(num_steps=16, keep_every=2, checkpoint_every=2)
 
-    def diverges(now: TrainSettings, step: int) -> bool:
-        return step >= 4 and (now.learning_rate, now.seed) == (2e-3, 0)
+    original = Stepper.take
 
-    monkeypatch.setattr(Stepper, "take", failing(diverges))
+    def diverging(self: Stepper, *given: Any, **rest: Any) -> Unread:
+        now = self._settings
+        if self._state.step >= 4 and (now.learning_rate, now.seed) == (2e-3, 0):
+            return torch.tensor([math.nan, math.nan, 0.0, 0.0, math.nan, 0.0, 0.0]).double()
+        return original(self, *given, **rest)
+
+    monkeypatch.setattr(Stepper, "take", diverging)
     ways = r"10 steps in a row up to step 14.*--change learning_rate=0\.001.*seed=1.*--branch"
     for again in (False, True):
         with pytest.raises(TrilightError, match=ways):
             run(settings, dataset, tmp_path / "run", resume=again)
-    slower: dict[str, Any] = {"decisions": {"learning_rate": 1e-3}}
-    in_place = run(settings, dataset, tmp_path / "run", resume=True, **slower)
+    slower = {"learning_rate": 1e-3}
+    in_place = run(settings, dataset, tmp_path / "run", resume=True, decisions=slower)
     assert in_place.num_steps == 16
-    rewound = run(
-        settings,
-        dataset,
-        tmp_path / "branch",
-        branch=str(path_of_step(tmp_path / "run/checkpoints", 2)),
-        decisions={"seed": 1},
-    )
+    early = str(path_of_step(tmp_path / "run/checkpoints", 2))
+    rewound = run(settings, dataset, tmp_path / "branch", branch=early, decisions={"seed": 1})
     assert rewound.skipped_steps == 0
     assert [event.step for event in rewound.history] == [2, 2]
 

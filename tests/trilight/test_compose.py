@@ -103,12 +103,9 @@ def _described(place: dict[str, object]) -> dict[str, object]:
     ("mistake", "message"),
     [
         (lambda: Material(diffuse=(0.5, 0.5)), "diffuse is .*expected three finite numbers"),
-        (lambda: Material(roughness=1.5), "roughness is 1.5; expected a number from 0 to 1"),
-        (lambda: Material(emission=(-1, 0, 0)), "emission is .*from 0"),
         (lambda: _lit().add_mesh("missing.glb"), "missing.glb: no such file"),
         (lambda: _lit().add_mesh(([[0, 0]], [[0, 0, 0]])), r"shape \(1, 2\); expected \[V, 3\]"),
         (lambda: _lit().add_mesh(([[0, 0, 0]], [[0, 0, 1]])), "vertices 0 to 1; expected 0 to 0"),
-        (lambda: _lit().add_mesh(([[0, 0, 0]], np.zeros((0, 3), int))), r"shape \(0, 3\)"),
         (lambda: _lit().add_mesh(TETRAHEDRON, size=0), "size is 0; expected metres above 0"),
         (lambda: _lit().add_mesh(TETRAHEDRON, size=np.inf), "size is inf; expected metres above"),
         (lambda: _lit().add_mesh(TETRAHEDRON, at=(0, 0)), "at is .*three finite numbers"),  # type: ignore[arg-type]
@@ -120,7 +117,6 @@ def _described(place: dict[str, object]) -> dict[str, object]:
         (lambda: _lit().add_mesh(TETRAHEDRON, name="a").add_mesh(TETRAHEDRON, name="a").scene(),
          "'a' twice"),
         (lambda: SceneBuilder().add_floor().add_camera(at=(0, -2, 1)).scene(), "emission"),
-        (lambda: SceneBuilder().add_floor().add_lamp(at=(0, 0, 2)).scene(), "c2w"),
         (lambda: _lit().add_floor().add_camera(at=(0, 0, 0)).scene(), r"cameras\[1\] looks"),
         (lambda: SceneBuilder("empty").scene(), "empty: holds no object"),
     ],

@@ -1,9 +1,19 @@
-"""What `import trilight` offers: the same names to programs, to type checkers, and in documents."""
+"""What `import trilight` offers: the same names to programs, to type checkers, and in documents.
+
+The code of docs/reference/python.md and the notebooks of examples/ run as somebody would run them.
+A notebook's code cells are run in order in one fresh interpreter. A kernel (nbclient, ipykernel,
+pyzmq) would add what no cell needs: the display of values.
+"""
 
 import ast
+import json
+import os
 import re
+import subprocess
+import sys
 from importlib import metadata
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -14,25 +24,19 @@ from tests.for_each import for_each
 from trilight import extend
 
 
-def test_every_name_is_there() -> None:
-    for name in trilight.__all__:
-        assert getattr(trilight, name) is not None, name
+@for_each(("module", "missing"), [(trilight, "rendr"), (extend, "TEMPLATE")])
+def test_every_name_is_there(module: ModuleType, missing: str) -> None:
+    for name in module.__all__:
+        assert getattr(module, name) is not None, name
     assert trilight.__version__ == metadata.version("trilight")
-    with pytest.raises(AttributeError, match="no attribute 'rendr'"):
-        trilight.rendr  # noqa: B018
+    with pytest.raises(AttributeError, match=f"no attribute '{missing}'"):
+        getattr(module, missing)
 
 
 def test_no_name_is_one_that_a_wheel_needs() -> None:
     """There `trilight.train` is a package: importing it would replace a function of that name."""
     modules = {path.stem for path in (ROOT / "trilight").glob("*.py")}
     assert not {*trilight.__all__, *modules} & {*PACKAGES, "tests"}
-
-
-def test_extensions_have_one_place_to_import_from() -> None:
-    for name in extend.__all__:
-        assert getattr(extend, name) is not None, name
-    with pytest.raises(AttributeError, match="no attribute 'TEMPLATE'"):
-        extend.TEMPLATE  # noqa: B018
 
 
 @for_each("example", sorted((ROOT / "examples").glob("*.py")))
@@ -54,3 +58,64 @@ def test_documents_name_what_is_there(page: str) -> None:
 
 def _code(text: str) -> list[str]:
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+def _require_runs(folder: Path, *words: str) -> None:
+    """Run a program as somebody would in a folder of theirs."""
+    ran = subprocess.run(
+        [sys.executable, *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+
+
+NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
+
+RUN_CELLS = """
+import json, sys
+cells = [cell for cell in json.load(open(sys.argv[1]))["cells"] if cell["cell_type"] == "code"]
+for number, cell in enumerate(cells):
+    exec(compile("".join(cell["source"]), f"code cell {number}", "exec"), globals())
+"""
+
+
+@for_each("notebook", NOTEBOOKS)
+def test_it_holds_code_and_no_outputs(notebook: Path) -> None:
+    assert len(NOTEBOOKS) >= 2
+    cells = [
+        cell for cell in json.loads(notebook.read_text())["cells"] if cell["cell_type"] == "code"
+    ]
+    assert len(cells) >= 5
+    for cell in cells:
+        assert (cell["outputs"], cell["execution_count"]) == ([], None)
+        code = "".join(cell["source"])
+        compile(code, notebook.name, "exec")
+        assert set(re.findall(r"\btrilight\.(\w+)", code)) <= set(trilight.__all__)
+
+
+@pytest.mark.slow("commands")
+@for_each("notebook", NOTEBOOKS)
+def test_it_runs(notebook: Path, tmp_path: Path) -> None:
+    _require_runs(tmp_path, "-c", RUN_CELLS, str(notebook))
+
+
+CODE = _code((ROOT / "docs/reference/python.md").read_text())
+
+
+def test_the_page_is_a_program() -> None:
+    assert len(CODE) == 4
+    compile("\n".join(CODE), "python.md", "exec")
+
+
+@pytest.mark.slow("commands")
+def test_the_page_runs(tmp_path: Path) -> None:
+    """As one program without `if __name__ == "__main__"`, in a folder of its own."""
+    program = tmp_path / "program.py"
+    program.write_text("\n".join(CODE))
+    _require_runs(tmp_path, str(program))
+    made = {path.name for path in tmp_path.iterdir()}
+    assert {"still.usdz", "still.exr", "network.png", "set", "run", "evaluation"} <= made

@@ -2,8 +2,8 @@
 
 import dataclasses
 import itertools
-from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,12 +13,11 @@ from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.train.data.test_stream import by_key, identity, same_batches
-from tests.train.kit import tiny_run, trained
+from tests.train.kit import keys_of, take, tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train.data.mixture import RECORD, Mixture, mixture_of
-from train.data.order import RankShare
 from train.data.scenes import TrainingScene
-from train.data.stream import StreamSettings, stream_batches
+from train.data.stream import StreamSettings
 from train.data.unusable import Unusable, first_samples
 from train.loop.checkpoints import path_of_step, read_checkpoint
 from train.run import train_run
@@ -53,29 +52,6 @@ def mixture(*weights: float, **changes: object) -> Mixture:
     return dataclasses.replace(few, **changes)  # type: ignore[arg-type]
 
 
-def take(
-    data: TrainingData,
-    mixed: Mixture | None,
-    first: int,
-    count: int,
-    *,
-    rank: int = 0,
-    world_size: int = 1,
-    workers: int = 1,
-) -> list[list[TrainingScene]]:
-    batches = stream_batches(
-        data.split("train"),
-        SETTINGS,
-        first,
-        share=RankShare(rank=rank, world_size=world_size),
-        workers=workers,
-        unusable=Unusable(0),
-        mixture=mixed,
-    )
-    with closing(batches):
-        return list(itertools.islice(batches, count))
-
-
 @for_each("weights", [(1.0,), (3.0, 1.0), (0.1, 0.2, 0.7), (1e-3, 5.0), (7.0, 3e5)])
 def test_every_stretch_has_its_shares_and_may_be_entered_anywhere(
     weights: tuple[float, ...],
@@ -99,7 +75,7 @@ WHOLE = 9
 
 @pytest.fixture(scope="module")
 def whole(data: TrainingData) -> list[list[TrainingScene]]:
-    return take(data, mixture(*WEIGHTS), 0, WHOLE)
+    return take(data, SETTINGS, WHOLE, mixture=mixture(*WEIGHTS))
 
 
 def test_each_dataset_keeps_the_order_that_it_has_alone(
@@ -109,7 +85,7 @@ def test_each_dataset_keeps_the_order_that_it_has_alone(
     turns = list(itertools.islice(mixture(*WEIGHTS).sources_from(0), len(scenes)))
     assert [turns.count(source) for source in (0, 1)] == [24, 12]
     for source, root in enumerate(roots):
-        alone = [s.key for batch in take(open_mixture([root]), None, 0, 6) for s in batch]
+        alone = list(itertools.chain(*keys_of(take(open_mixture([root]), SETTINGS, 6))))
         mine = [scene.key for scene, turn in zip(scenes, turns, strict=True) if turn == source]
         assert mine == alone[: len(mine)]
     smaller = [scene for scene, turn in zip(scenes, turns, strict=True) if turn == 1]
@@ -122,9 +98,10 @@ def test_each_dataset_keeps_the_order_that_it_has_alone(
 def test_it_goes_on_anywhere_with_any_ranks_and_threads(
     data: TrainingData, whole: list[list[TrainingScene]], first: int
 ) -> None:
-    mixed, count = mixture(*WEIGHTS), WHOLE - first
-    assert same_batches(take(data, mixed, first, count, workers=3), whole[first:])
-    shares = [take(data, mixed, first, count, rank=rank, world_size=2) for rank in (0, 1)]
+    part: dict[str, Any] = {"first": first, "mixture": mixture(*WEIGHTS)}
+    count = WHOLE - first
+    assert same_batches(take(data, SETTINGS, count, workers=3, **part), whole[first:])
+    shares = [take(data, SETTINGS, count, rank=rank, world_size=2, **part) for rank in (0, 1)]
     for wanted, *parts in zip(whole[first:], *shares, strict=True):
         got = by_key([scene for part in parts for scene in part])
         assert [*map(identity, got)] == [*map(identity, by_key(wanted))]
@@ -178,15 +155,11 @@ def test_a_damaged_shard_is_replaced_by_its_own_datasets(tmp_path: Path) -> None
     (tmp_path / "a" / "train-000001.tar").write_bytes(b"no shard")
     mixed, unusable = open_mixture([str(tmp_path / "a"), str(tmp_path / "b")]), Unusable(2)
     turns = list(itertools.islice(mixture(1.0, 1.0).sources_from(0), 16))
-    batches = stream_batches(
-        mixed.split("train"), SETTINGS, 0, share=RankShare(), workers=2, unusable=unusable,
-        mixture=mixture(1.0, 1.0),
-    )  # fmt: skip
-    with closing(batches):
-        scenes = [scene for batch in itertools.islice(batches, 4) for scene in batch]
+    found = take(mixed, SETTINGS, 4, workers=2, unusable=unusable, mixture=mixture(1.0, 1.0))
+    keys = itertools.chain(*keys_of(found))
     (message,) = unusable.messages
     assert "train-000001.tar" in message
-    of_first = {scene.key for scene, turn in zip(scenes, turns, strict=True) if turn == 0}
+    of_first = {key for key, turn in zip(keys, turns, strict=True) if turn == 0}
     assert of_first == {"000000000", "000000001"}
 
 

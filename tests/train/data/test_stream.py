@@ -1,27 +1,35 @@
-"""Laws of the stream: batch i is the same scenes for ever, and errors arrive where they belong."""
+"""Laws of the stream: batch i is the same scenes for ever, and errors arrive where they belong.
+
+Laws of targets: block means are measurements, and bad values never reach the weights.
+"""
 
 import dataclasses
-import itertools
 import threading
 from collections.abc import Iterator
-from contextlib import closing
-from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from model.demodulated import with_albedo
 from model.scene_tensors import tensors_of
 from storage.dataset.dataset import Dataset
-from storage.dataset.training_data import TrainingData, open_training_data
+from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
+from storage.records.exr import encode_channels
+from storage.records.profiles import PROFILES, Profile
+from storage.records.sample import decode_sample, encode_sample
+from storage.records.stored_sample import stored_sample
+from storage.seeds import rng_for
 from tests.for_each import for_each
 from tests.model.kit import tiny_config
-from tests.train.toy import write_toy_dataset
-from train.data.order import RankShare
-from train.data.scenes import TrainingScene
-from train.data.stream import StreamSettings, prefetched, stream_batches
-from train.data.unusable import Unusable, first_samples
+from tests.train.kit import take
+from tests.train.toy import toy_sample, write_toy_dataset
+from train.data.augment import augmented, with_views
+from train.data.buckets import MOST_WASTE, bucket_scenes
+from train.data.resolution import block_mean
+from train.data.scenes import TrainingScene, drawn_scene, training_scene, with_target
+from train.data.stream import StreamSettings, prefetched
 from train.settings import AugmentationSettings
 
 SETTINGS = StreamSettings(
@@ -35,36 +43,9 @@ SETTINGS = StreamSettings(
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("toy")
     return write_toy_dataset(folder, train=14, validation=2, per_shard=3, resolution=16)
-
-
-@pytest.fixture(scope="module")
-def data(dataset: Dataset) -> TrainingData:
-    return open_training_data([str(dataset.folder.root)])
-
-
-def take(
-    data: TrainingData,
-    first: int,
-    count: int,
-    *,
-    rank: int = 0,
-    world_size: int = 1,
-    workers: int = 1,
-    settings: StreamSettings = SETTINGS,
-) -> list[list[TrainingScene]]:
-    batches = stream_batches(
-        data.split("train"),
-        settings,
-        first,
-        share=RankShare(rank=rank, world_size=world_size),
-        workers=workers,
-        unusable=Unusable(0),
-    )
-    with closing(batches):
-        return list(itertools.islice(batches, count))
 
 
 def same(a: TrainingScene, b: TrainingScene) -> bool:
@@ -102,25 +83,33 @@ WHOLE = 8
 
 
 @pytest.fixture(scope="module")
-def whole(data: TrainingData) -> list[list[TrainingScene]]:
+def whole(data: Dataset) -> list[list[TrainingScene]]:
     """Batches of more than three epochs, uninterrupted."""
-    return take(data, 0, WHOLE)
+    return take(data, SETTINGS, WHOLE)
 
 
 @for_each("first", range(WHOLE))
 def test_resuming_after_every_batch_is_uninterrupted(
-    data: TrainingData, whole: list[list[TrainingScene]], first: int
+    data: Dataset, whole: list[list[TrainingScene]], first: int
 ) -> None:
-    assert same_batches(whole[first:], take(data, first, WHOLE - first))
+    assert same_batches(whole[first:], take(data, SETTINGS, WHOLE - first, first=first))
 
 
 @for_each("world_size", [2, 3, 6])
 @for_each("first", range(0, WHOLE, 3))
 def test_any_number_of_ranks_may_go_on(
-    data: TrainingData, whole: list[list[TrainingScene]], first: int, world_size: int
+    data: Dataset, whole: list[list[TrainingScene]], first: int, world_size: int
 ) -> None:
     shares = [
-        take(data, first, WHOLE - first, rank=rank, world_size=world_size, workers=1 + rank % 2)
+        take(
+            data,
+            SETTINGS,
+            WHOLE - first,
+            first=first,
+            rank=rank,
+            world_size=world_size,
+            workers=1 + rank % 2,
+        )
         for rank in range(world_size)
     ]
     assert {len(batch) for share in shares for batch in share} == {6 // world_size}
@@ -134,20 +123,20 @@ def test_any_number_of_ranks_may_go_on(
 
 @for_each("workers", [0, 2, 5])
 def test_the_number_of_threads_changes_nothing(
-    data: TrainingData, whole: list[list[TrainingScene]], workers: int
+    data: Dataset, whole: list[list[TrainingScene]], workers: int
 ) -> None:
     before = threading.active_count()
-    assert same_batches(take(data, 0, WHOLE, workers=workers), whole)
+    assert same_batches(take(data, SETTINGS, WHOLE, workers=workers), whole)
     assert threading.active_count() == before, "closing the stream ends its threads"
 
 
 def test_a_list_of_the_same_shards_gives_the_same_batches(
-    dataset: Dataset, whole: list[list[TrainingScene]]
+    data: Dataset, whole: list[list[TrainingScene]]
 ) -> None:
-    listed = open_training_data([f"{dataset.folder.root}/train-{{000000..000004}}.tar"])
+    listed = open_training_data([f"{data.folder.root}/train-{{000000..000004}}.tar"])
     assert "without a manifest" in listed.notes[0]
-    assert same_batches(take(listed, 0, 4), whole[:4])
-    assert same_batches(take(listed, 3, 2), whole[3:5])
+    assert same_batches(take(listed, SETTINGS, 4), whole[:4])
+    assert same_batches(take(listed, SETTINGS, 2, first=3), whole[3:5])
 
 
 def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) -> None:
@@ -160,9 +149,9 @@ def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) ->
     assert not same(visits[0], visits[1]), "every visit draws its own views and symmetries"
 
 
-def test_ranks_that_cannot_share_equally_are_refused(data: TrainingData) -> None:
+def test_ranks_that_cannot_share_equally_are_refused(data: Dataset) -> None:
     with pytest.raises(TrilightError, match="not divisible by 4 ranks"):
-        take(data, 0, 1, world_size=4)
+        take(data, SETTINGS, 1, world_size=4)
 
 
 def test_a_bug_in_the_thread_is_not_swallowed() -> None:
@@ -176,31 +165,21 @@ def test_a_bug_in_the_thread_is_not_swallowed() -> None:
         next(items)
 
 
-def test_first_samples_are_the_first(data: TrainingData) -> None:
-    keys = [sample.key for sample in first_samples(data.split("train"), 5, Unusable(0))]
-    assert keys == [f"{index:09d}" for index in range(5)]
-    assert len(list(first_samples(data.split("validation"), 99, Unusable(0)))) == 2
-    with pytest.raises(TrilightError, match="the test split holds no scene"):
-        data.split("test")
-
-
-def test_views_are_drawn_without_repetition(data: TrainingData) -> None:
+def test_views_are_drawn_without_repetition(data: Dataset) -> None:
     settings = StreamSettings(seed=0, window=1, batch_size=7, resolution=8, views_per_scene=2)
-    for scene in take(data, 0, 1, settings=settings)[0]:
+    for scene in take(data, settings, 1)[0]:
         poses = scene.tensors.c2w_V44.numpy()
         assert poses.shape[0] == 2
         assert abs(poses[0] - poses[1]).max() > 0
 
 
-def test_albedo_is_that_of_the_scene_after_its_symmetries(data: TrainingData) -> None:
+def test_albedo_is_that_of_the_scene_after_its_symmetries(data: Dataset) -> None:
     """Mirrored, turned and recoloured, as the network would ask for it itself."""
     augmentation = AugmentationSettings(rotation="uniform", mirror=True, channels=True)
     network = tiny_config(demodulated=True, hit_rays=2)
     settings = dataclasses.replace(SETTINGS, augmentation=augmentation, network=network)
     plain = dataclasses.replace(settings, network=tiny_config())
-    pairs = zip(
-        take(data, 0, 1, settings=settings)[0], take(data, 0, 1, settings=plain)[0], strict=True
-    )
+    pairs = zip(take(data, settings, 1)[0], take(data, plain, 1)[0], strict=True)
     for scene, other in pairs:
         expected = with_albedo(other.tensors, 16, 2).albedo_VRR6
         assert expected is not None and scene.tensors.albedo_VRR6 is not None
@@ -209,12 +188,131 @@ def test_albedo_is_that_of_the_scene_after_its_symmetries(data: TrainingData) ->
         assert other.tensors.albedo_VRR6 is None
 
 
-def test_a_damaged_shard_is_named_when_it_is_reached(tmp_path: Path) -> None:
-    write_toy_dataset(tmp_path, train=6, validation=1, per_shard=2, resolution=8)
-    shard = tmp_path / "train-000001.tar"
-    content = bytearray(shard.read_bytes())
-    content[len(content) // 2] ^= 1
-    shard.write_bytes(content)
-    settings = StreamSettings(seed=0, window=1, batch_size=1, resolution=8, views_per_scene=1)
-    with pytest.raises(TrilightError, match=r"train-000001.tar.*sha256"):
-        take(open_training_data([str(tmp_path)]), 0, 6, settings=settings)
+def test_a_smaller_picture_is_the_mean_of_its_blocks() -> None:
+    pictures = rng_for(0, "pictures").uniform(0, 9, (2, 12, 12, 3)).astype(np.float32)
+    small = block_mean(pictures, 4)
+    assert small.shape == (2, 4, 4, 3) and small.dtype == np.float32
+    for row in range(4):
+        for column in range(4):
+            block = pictures[:, 3 * row : 3 * row + 3, 3 * column : 3 * column + 3]
+            # float32 mean of nine numbers below 9
+            expected = block.mean(axis=(1, 2), dtype=np.float64)
+            np.testing.assert_allclose(small[:, row, column], expected, rtol=1e-6)
+
+    # halving twice is quartering, and light is kept
+    pictures = rng_for(1, "pictures").uniform(0, 9, (1, 16, 16, 3)).astype(np.float32)
+    twice = block_mean(block_mean(pictures, 8), 4)
+    np.testing.assert_allclose(twice, block_mean(pictures, 4), rtol=1e-6)  # float32 means
+    np.testing.assert_allclose(twice.mean(), pictures.mean(), rtol=1e-6)
+    assert block_mean(pictures, 16) is pictures
+
+
+@for_each("bad", [np.nan, np.inf, -np.inf, -1e-3])
+def test_a_bad_target_is_refused_by_name(bad: float) -> None:
+    sample = toy_sample(4, resolution=16)
+    radiance = sample.radiance_rgb.copy()
+    radiance[1, 2, 3, 0] = bad
+    with pytest.raises(TrilightError, match=r"sample 000000004: view 1 .* at pixel \(2, 3\)"):
+        dataclasses.replace(sample, radiance_rgb=radiance).check()
+    lights = np.stack([sample.radiance_rgb, radiance], axis=1)
+    with pytest.raises(TrilightError, match=r"view 1 light 1 has .* at pixel \(2, 3\)"):
+        dataclasses.replace(sample, lights_rgb=lights).check()
+
+
+def test_targets_are_log10_of_one_plus_radiance() -> None:
+    sample = toy_sample(4, resolution=16)
+    target = training_scene(sample, 16).target_VRR3.numpy()
+    np.testing.assert_allclose(10.0**target - 1, sample.radiance_rgb, atol=1e-6)  # float32 log
+
+
+def cost(num_triangles: int) -> float:
+    """Mostly what the pictures cost, as in a small network."""
+    return 300.0 + num_triangles
+
+
+@for_each("most", [2, 16])
+def test_buckets_hold_each_scene_once_and_waste_little(most: int) -> None:
+    scenes = [training_scene(toy_sample(index), 8) for index in range(12)]
+    batches = bucket_scenes(scenes, cost, most)
+    lengths: list[int] = []
+    for batch in batches:
+        longest = batch.scenes.triangles_BT33.shape[1]
+        mask = batch.scenes.is_triangle_BT
+        own = mask.sum(1).tolist() if mask is not None else [longest] * len(batch.target_BVRR3)
+        assert longest == max(own)
+        assert len(own) * cost(longest) <= (1 + MOST_WASTE) * sum(cost(one) for one in own)
+        assert len(batch.target_BVRR3) == len(batch.noise_BV) == len(own) <= most
+        lengths += own
+    assert sorted(lengths) == sorted(scene.tensors.num_triangles for scene in scenes)
+    assert 1 < len(batches) < len(scenes)
+
+
+def test_a_view_takes_its_target_and_its_noise_along() -> None:
+    sample = toy_sample(4, resolution=16)
+    floors = (dataclasses.replace(sample.views[0], noise_floor_db=40.0), sample.views[1])
+    scene = training_scene(dataclasses.replace(sample, views=floors), 16)
+    torch.testing.assert_close(scene.noise_V, torch.tensor([1e-2, 1e-5]))
+    assert with_views(scene, np.array([1])).noise_V.tolist() == scene.noise_V[1:].tolist()
+
+
+def test_what_a_run_does_not_take_is_refused() -> None:
+    sample = toy_sample(4, resolution=16)
+    most = sample.scene.num_triangles
+    assert training_scene(sample, 16, most_triangles=most).tensors.num_triangles == most
+    with pytest.raises(TrilightError, match=f"{most} triangles; the run takes at most {most - 1}"):
+        training_scene(sample, 16, most_triangles=most - 1)
+    with pytest.raises(TrilightError, match=r"not kept apart, which light_mix needs.*per_light"):
+        training_scene(sample, 16, lights_apart=True)
+
+
+@for_each("profile", PROFILES)
+@for_each("lights_apart", [False, True])
+def test_drawn_views_are_those_of_the_whole_sample_to_the_bit(
+    profile: Profile, lights_apart: bool
+) -> None:
+    """Looked up by bits, or computed for each pixel; after all symmetries, at both resolutions."""
+    sample = toy_sample(1, resolution=16, views=3)
+    noisy = tuple(dataclasses.replace(view, noise_floor_db=20.0) for view in sample.views)
+    sample = dataclasses.replace(sample, views=noisy)
+    if lights_apart:
+        exact = sample.radiance_rgb.astype(np.float16).astype(np.float32)
+        sample = dataclasses.replace(sample, radiance_rgb=exact, lights_rgb=exact[:, None])
+    members = encode_sample(sample, profile)
+    whole, stored = decode_sample("1", members), stored_sample("1", members)
+    settings = AugmentationSettings(
+        mirror=True,
+        channels=True,
+        vertex_order=True,
+        light_scale=3.0,
+        light_mix=2.0 if lights_apart else 1.0,
+        rotation="uniform",
+    )
+    rows_seen = 0
+    for seed, resolution in enumerate((16, 16, 8, 16)):
+        full = training_scene(whole, resolution, lights_apart=lights_apart)
+        drawn = drawn_scene(stored, [0, 2], resolution, lights_apart=lights_apart)
+        rows_seen += drawn.levels_L is not None
+        wanted = augmented(
+            with_views(full, np.array([0, 2])), settings, np.random.default_rng(seed)
+        )
+        got = with_target(augmented(drawn, settings, np.random.default_rng(seed)))
+        assert torch.equal(got.target_VRR3, wanted.target_VRR3) and got.levels_L is None
+        assert torch.equal(got.noise_V, wanted.noise_V)
+        for name, tensor in tensors_of(wanted.tensors).items():
+            assert torch.equal(getattr(got.tensors, name), tensor)
+    assert rows_seen == 3
+
+
+def test_what_is_no_half_float_is_no_row() -> None:
+    """Zeros with a sign are zeros; a picture of another tool's float32 is computed as it is."""
+    sample = toy_sample(1, resolution=8)
+    radiance = sample.radiance_rgb.copy()
+    radiance[0, 0, 0] = -0.0
+    members = encode_sample(dataclasses.replace(sample, radiance_rgb=radiance))
+    drawn = with_target(drawn_scene(stored_sample("1", members), [0], 8))
+    assert drawn.target_VRR3[0, 0, 0].tolist() == [0.0, 0.0, 0.0]
+    members["1.exr"] = encode_channels({"RGB": sample.radiance_rgb[1]})
+    mixed = drawn_scene(stored_sample("1", members), [0, 1], 8)
+    assert mixed.levels_L is None
+    wanted = torch.from_numpy(np.log10(1 + sample.radiance_rgb[1]).astype(np.float32))
+    assert torch.equal(mixed.target_VRR3[1], wanted)

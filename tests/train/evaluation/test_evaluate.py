@@ -12,16 +12,17 @@ from PIL import Image
 from infra.judging import _num_scenes, plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
+from pipeline.builds.judging import JUDGING_BUILDS
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.material import ROUGHNESS
-from storage.records.scene import Scene
 from storage.seeds import rng_for
 from tests.command_line import trilight
+from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.train.kit import tiny_run
-from tests.train.loss.test_lpips import small_weights
+from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
 from train.evaluation.evaluate import (
@@ -36,11 +37,19 @@ from train.evaluation.evaluate import (
 from train.evaluation.judge import judged_scene, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, by_group, facts_of, summary
 from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
+from train.evaluation.published import BENCHMARK
 from train.evaluation.report import markdown, record
 from train.evaluation.rivals import MEDIAN, NEAREST, Rivals, median_picture
 from train.evaluation.same_time import TRACER
 from train.loop.state import new_state
 from train.loss.lpips import Lpips
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("weights") / "model.safetensors"
+    path.write_bytes(encode_weights(new_state(tiny_run()).model))
+    return str(path)
 
 
 @pytest.fixture(scope="module")
@@ -114,27 +123,6 @@ def test_every_view_is_judged_beside_its_rivals(dataset: Dataset) -> None:
 
 
 SCORES = dict.fromkeys(METRICS, 31.0) | {"lpips": None, "log_l1": 0.1}
-
-
-def with_lights(scene: Scene, lights: int) -> Scene:
-    """Return the scene with its last triangle, which shines, so many times, a step apart."""
-    corners = scene.vertex_positions[scene.faces[-1]]
-    added = np.concatenate([corners + np.array([0, 0, 0.1 * step]) for step in range(1, lights)])
-    first = len(scene.vertex_positions)
-    return dataclasses.replace(
-        scene,
-        vertex_positions=np.concatenate([scene.vertex_positions, added.astype(np.float32)]),
-        vertex_normals=np.concatenate(
-            [scene.vertex_normals, np.tile(scene.vertex_normals[-3:], (lights - 1, 1))]
-        ),
-        faces=np.concatenate(
-            [scene.faces, np.arange(first, first + len(added), dtype=np.uint32).reshape(-1, 3)]
-        ),
-        material_index=np.append(
-            scene.material_index, np.repeat(scene.material_index[-1], lights - 1)
-        ),
-        object_index=np.append(scene.object_index, np.repeat(scene.object_index[-1], lights - 1)),
-    )
 
 
 def row(number: int, **changes: object) -> JudgedView:
@@ -239,7 +227,9 @@ def test_many_lights_are_judged_in_one_pass_and_in_groups(dataset: Dataset) -> N
     network = new_state(tiny_run()).model
     scene = toy_scene(0)
     assert grouped_pictures(network, scene, 16) is None, "one light is one group"
-    many = with_lights(scene, 20)
+    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.5))
+    lamps = [light([[x, 0, 2], [x + 0.05, 0, 2], [x, 0.05, 2]], 9.0) for x in np.arange(20) / 10]
+    many = join([floor, *lamps]).with_cameras(scene.c2w, scene.fov_deg)
     grouped = grouped_pictures(network, many, 16)
     assert grouped is not None and grouped.shape == (2, 16, 16, 3)
     # by hand: every group's picture times its share, the same sums in another order
@@ -278,11 +268,12 @@ def test_facts_come_from_the_scene() -> None:
     assert (facts["num_lights"], facts["roughness"]) == (1, min(surfaces))
 
 
-def test_the_command_writes_report_and_sheets(dataset: Dataset, tmp_path: Path) -> None:
-    weights, out = tmp_path / "model.safetensors", tmp_path / "out"
-    weights.write_bytes(encode_weights(new_state(tiny_run()).model))
+def test_the_command_writes_report_and_sheets(
+    dataset: Dataset, weights: str, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
     data = ["--data", str(dataset.folder.root)]
-    command = ["evaluate", str(weights), *data, "--split", "validation", "--out", str(out)]
+    command = ["evaluate", weights, *data, "--split", "validation", "--out", str(out)]
     command += ["--tracer-views", "0"]
     done = trilight([*command, "--json", "--resolution", "16"])
     assert done.exit_code == 0, done.output
@@ -299,32 +290,37 @@ def test_the_command_writes_report_and_sheets(dataset: Dataset, tmp_path: Path) 
     missing = trilight(["evaluate", str(tmp_path / "no"), *data])
     assert isinstance(missing.exception, TrilightError)
     assert "no such file or folder" in str(missing.exception)
-    empty = trilight(["evaluate", str(weights), *data])
+    empty = trilight(["evaluate", weights, *data])
     assert "the test split holds no scene" in str(empty.exception)
 
 
 def test_without_a_path_tracer_the_report_says_why(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dataset: Dataset, weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TRILIGHT_VARIANT", "none_such")
-    weights = tmp_path / "model.safetensors"
-    weights.write_bytes(encode_weights(new_state(tiny_run()).model))
     data = ["--data", str(dataset.folder.root), "--split", "validation", "--most-scenes", "1"]
-    told = trilight(["evaluate", str(weights), *data, "--out", str(tmp_path / "out")]).output
+    told = trilight(["evaluate", weights, *data, "--out", str(tmp_path / "out")]).output
     assert "The path tracer in that time is not shown: TRILIGHT_VARIANT is" in told
     assert "is not shown: TRILIGHT" in (tmp_path / "out" / "evaluation.md").read_text()
 
 
 @pytest.mark.slow("references")
 def test_the_command_shows_the_path_tracer_in_the_networks_time(
-    dataset: Dataset, tmp_path: Path
+    dataset: Dataset, weights: str, tmp_path: Path
 ) -> None:
-    weights, out = tmp_path / "model.safetensors", tmp_path / "out"
-    weights.write_bytes(encode_weights(new_state(tiny_run()).model))
+    out = tmp_path / "out"
     data = ["--data", str(dataset.folder.root), "--split", "validation"]
-    told = trilight(["evaluate", str(weights), *data, "--out", str(out)]).output
+    told = trilight(["evaluate", weights, *data, "--out", str(out)]).output
     found = json.loads((out / "evaluation.json").read_text())
     assert TRACER in found["contestants"] and found["path tracer"]["views"] == 6
     assert found["path tracer"]["network_further_s"] > 0 and "and the path tracer" in told
     with Image.open(out / "worst.png") as sheet:
         assert sheet.width > 1500, "five pictures a view, two views a line"
+
+
+def test_the_benchmark_stands_beside_the_paper() -> None:
+    assert record([row(0)], {"build": "smoke"})["published"] is None
+    page = markdown(record([row(0)], {"build": BENCHMARK}))
+    assert BENCHMARK in JUDGING_BUILDS
+    assert "| psnr_linear_db | 29.77 | 30.00 |" in page and "| lpips | 0.0551 | n/a |" in page
+    assert "400 scenes" in page and "256 x 256" in page

@@ -1,21 +1,35 @@
-"""Laws of judging: hits against a ray tracer, scores against storage, a rival that is a median."""
+"""Laws of judging: hits against a ray tracer, scores against storage, a rival that is a median.
 
+What noise alone would score; and the path tracer in the network's time, over views that have both.
+"""
+
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
-from storage.conventions import camera_rays, log10_radiance
+from storage.conventions import camera_rays, log10_radiance, radiance_from_log10
+from storage.dataset.training_data import open_training_data
 from storage.metrics import object_psnr_log_db, psnr_linear_db, psnr_log_db
+from storage.records.sample import Sample
 from storage.records.scene import Scene
 from storage.seeds import rng_for
 from tests.for_each import for_each
-from tests.train.toy import toy_sample, toy_scene
+from tests.train.kit import tiny_run
+from tests.train.loss.test_objective import small_weights
+from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
 from train.evaluation.error_colours import ERROR_WHITE, error_picture
+from train.evaluation.evaluate import Contest, judged_views, sheet_views
 from train.evaluation.judge import hit_masks
+from train.evaluation.judged_view import NETWORK, JudgedView
+from train.evaluation.metrics import METRICS, noise_floors, picture_scores
+from train.evaluation.report import markdown, record
 from train.evaluation.rivals import median_picture
+from train.evaluation.same_time import CAPTION, TRACER, Times, TracerTimes, same_time, sentences
 from train.evaluation.scores import ViewScore, lead, score_view, share_better, summarise
 from train.evaluation.sheet import (
     NOISE_WHITE,
@@ -24,6 +38,8 @@ from train.evaluation.sheet import (
     noise_picture,
     write_picture,
 )
+from train.loop.state import new_state
+from train.loss.lpips import Lpips
 
 
 def hits_one_by_one(scene: Scene, view: int, resolution: int) -> np.ndarray:
@@ -67,8 +83,8 @@ def test_geometry_behind_the_camera_and_emitters_are_not_hit() -> None:
     assert not hit_masks(at_light, 8).any()
 
 
-def view_score(log_l1: float) -> ViewScore:
-    return ViewScore(log_l1=log_l1, psnr_log_db=0, psnr_linear_db=0, object_psnr_log_db=0)
+def view_score(log_l1: float, db: float = 0.0) -> ViewScore:
+    return ViewScore(log_l1=log_l1, psnr_log_db=db, psnr_linear_db=db, object_psnr_log_db=db)
 
 
 def test_a_lead_is_sure_where_scenes_agree_on_it() -> None:
@@ -99,18 +115,13 @@ def test_scores_are_those_of_storage() -> None:
 
 
 def test_a_summary_shows_the_bad_ones() -> None:
-    def view(value: float) -> ViewScore:
-        return ViewScore(
-            log_l1=value, psnr_log_db=value, psnr_linear_db=value, object_psnr_log_db=value
-        )
-
-    views = [view(float(value)) for value in range(101)]
+    views = [view_score(float(value), float(value)) for value in range(101)]
     summary = summarise(views)
     assert summary["log_l1"] == 50.0
     assert summary["psnr_log_db_median"] == 50.0
     assert summary["object_psnr_log_db_p5"] == pytest.approx(5.0)
     assert share_better(views, views) == 0
-    assert share_better(views, [view(25.5)] * 101) == pytest.approx(26 / 101)
+    assert share_better(views, [view_score(25.5, 25.5)] * 101) == pytest.approx(26 / 101)
 
 
 def test_no_fixed_picture_has_less_l1_error_than_the_median() -> None:
@@ -137,14 +148,13 @@ def test_the_error_picture_is_black_without_error_and_white_at_its_limit() -> No
     assert error_picture(np.full((2, 2, 3), wrong), target).min() == 255
 
 
+def sheet_view(target: NDArray, predicted: NDArray) -> SheetView:
+    return SheetView(name="", scores="", target_rgb=target, predicted_rgb=predicted, noise=0.01)
+
+
 def test_the_sheet_shows_every_view(tmp_path: Path) -> None:
     target = np.full((8, 8, 3), 0.2)
-    views = [
-        SheetView(
-            name=f"view {row}", scores="", target_rgb=target, predicted_rgb=target * row, noise=0.01
-        )
-        for row in range(3)
-    ]
+    views = [sheet_view(target, target * row) for row in range(3)]
     for name in ("a.png", "b.png"):
         write_picture(tmp_path / name, drawn_sheet(views, ("one line", "and another")))
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
@@ -158,11 +168,114 @@ def test_the_noise_picture_is_black_at_the_noise_and_white_at_its_limit() -> Non
     target = np.full((2, 2, 3), 0.5)
 
     def view(error: float) -> SheetView:
-        predicted = 1.5 * 10**error - 1
-        return SheetView(
-            name="", scores="", target_rgb=target, predicted_rgb=target * 0 + predicted, noise=0.01
-        )
+        return sheet_view(target, np.full_like(target, 1.5 * 10**error - 1))
 
     assert noise_picture(view(0.0099)).max() == 0
     assert 0 < noise_picture(view(0.02)).mean() < 255
     assert noise_picture(view(0.0101 * NOISE_WHITE)).min() == 255
+
+
+def test_floors_of_metrics_without_a_measurement_are_of_drawn_noise() -> None:
+    sample = toy_sample(0, resolution=32)
+    target, hits = sample.radiance_rgb[0].astype(np.float64), np.ones((32, 32), bool)
+    found = {
+        floor_db: noise_floors(
+            dataclasses.replace(sample.views[0], noise_floor_db=floor_db),
+            target, hits, Lpips(*small_weights()), rng_for(0, "noise"),
+        )
+        for floor_db in (20.0, 40.0)
+    }  # fmt: skip
+    assert found[20.0]["ssim"] < found[40.0]["ssim"] < 1
+    for metric in ("lpips", "hdr_flip", "log_l1"):
+        assert found[20.0][metric] > found[40.0][metric] > 0
+    assert found[40.0]["psnr_log_db"] == 40.0 and found[40.0]["log_l1"] == pytest.approx(0.01)
+    # as large as stated, and less where it would make a pixel negative: there at most half is left
+    noisy = log10_radiance(target) + rng_for(0, "noise").normal(0, 0.01, target.shape)
+    twin = radiance_from_log10(np.maximum(noisy, 0))
+    assert 39.9 < psnr_log_db(twin, target) < 43.1  # 3072 draws are good to 0.1 dB
+    assert found[40.0]["ssim"] == picture_scores(twin, target, hits, None)["ssim"]
+    without = noise_floors(sample.views[0], target, hits, None, rng_for(0, "noise"))
+    assert set(METRICS) - set(without) == {"lpips"}
+
+
+TIMES = Times(
+    network_first_s=0.12,
+    network_further_s=0.06,
+    scenes=4,
+    preview=TracerTimes(samples=4, denoiser="fast", first_s=0.025, further_s=0.022, note=""),
+)
+
+
+class Target:
+    """Shows the stored pictures themselves, of the first view alone."""
+
+    def judged(self, sample: Sample, view: int) -> NDArray | None:
+        return self.shown(sample, view) if view == 0 else None
+
+    def shown(self, sample: Sample, view: int) -> NDArray:
+        return sample.radiance_rgb[view]
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def judging(tmp_path_factory: pytest.TempPathFactory) -> tuple[Contest, list[JudgedView]]:
+    dataset = write_toy_dataset(tmp_path_factory.mktemp("toy"), train=1, validation=3)
+    contest = Contest(
+        network=new_state(tiny_run()).model,
+        shards=open_training_data([str(dataset.folder.root)]).split("validation"),
+        resolution=32,
+        rivals=None,
+        lpips=None,
+        most_scenes=99,
+        traced=Target(),
+    )
+    return contest, judged_views(contest, lambda: None)
+
+
+def test_both_are_judged_on_the_same_views(judging: tuple[Contest, list[JudgedView]]) -> None:
+    _, views = judging
+    assert [TRACER in view.scores for view in views] == [True, False] * 3
+    found = same_time(views, TIMES, "the first view of each scene")
+    assert found["views"] == 3
+    assert found["tracer"]["psnr_log_db"]["median"] == 100.0, "it shows the target itself"
+    leads = [view.scores[NETWORK]["psnr_log_db"] - 100.0 for view in views[::2]]  # type: ignore[operator]
+    assert found["lead_db"]["mean"] == pytest.approx(np.mean(leads))
+    assert found["lead_db"]["low"] <= found["lead_db"]["mean"] <= found["lead_db"]["high"]
+    assert found["share_better"] == 0
+    page = markdown(record(views, {}, found))
+    assert "In the network's own time".lower() in page.lower()
+    assert "takes 0.022 (0.025) with 4 samples a pixel and its fast filter." in page
+    assert "takes the network 0.06 core-seconds, the first of a scene 0.12" in page
+    assert list(record(views, {}, found)["contestants"]) == [NETWORK], "a column is of all views"
+
+
+def test_what_takes_longer_and_what_is_missing_is_said(
+    judging: tuple[Contest, list[JudgedView]],
+) -> None:
+    _, views = judging
+    dearest = TracerTimes(samples=1, denoiser="fast", first_s=0.1, further_s=0.07, note="slow")
+    dear = dataclasses.replace(TIMES, preview=dearest)
+    told = " ".join(sentences(same_time(views, dear, "all")))
+    assert "1 sample a pixel" in told and "longer than the network" in told and "slow." in told
+    untraced = [dataclasses.replace(view, scores={NETWORK: view.scores[NETWORK]}) for view in views]
+    own, line = sentences(same_time(untraced, TIMES, "all"))
+    assert line.endswith("is not shown: none of the judged views could be traced.")
+    lacking = dataclasses.replace(TIMES, preview=None, missing="no tracer here")
+    page = markdown(record(views, {}, same_time(views, lacking, "all")))
+    assert own in page and "is not shown: no tracer here." in page
+    assert "own time" not in markdown(record(views, {}))
+
+
+def test_sheets_show_it_beside_the_prediction(
+    judging: tuple[Contest, list[JudgedView]], tmp_path: Path
+) -> None:
+    contest, views = judging
+    alone = drawn_sheet(sheet_views(dataclasses.replace(contest, traced=None), views), ("title",))
+    shown = sheet_views(contest, views)
+    # the target went through float32 logarithms
+    np.testing.assert_allclose(
+        shown[1].beside_rgb[CAPTION], shown[1].target_rgb, rtol=1e-5, atol=1e-6
+    )
+    assert drawn_sheet(shown, ("title",)).width > alone.width

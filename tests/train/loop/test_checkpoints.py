@@ -1,4 +1,4 @@
-"""Which checkpoints stay, and that a kill while one is saved leaves the one before it whole."""
+"""Checkpoints hold all that changes, a kill leaves the one before whole, and damage is refused."""
 
 import dataclasses
 import json
@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,34 +16,44 @@ from model.neural_renderer import NeuralRenderer
 from model.open import find_network, open_network
 from model.weights import encode_weights
 from storage.errors import TrilightError
-from storage.settings.described import settings_record
+from storage.settings.described import from_record, settings_record
 from tests.conftest import ROOT
+from tests.extensions_kit import EXAMPLES, loaded, written
 from tests.for_each import for_each
-from tests.train.kit import tiny_run
+from tests.train.kit import ALONE, TINY_MODEL, flip_a_bit, stepper, tiny_run
+from tests.train.toy import toy_sample
+from train.data.buckets import TrainingBatch, make_batch
+from train.data.scenes import training_scene
 from train.folder import RunFolder
 from train.going_on import going_on
 from train.loop.checkpoints import (
     keep_checkpoint,
     network_of_run,
     path_of_step,
+    read_checkpoint,
     resumed_checkpoint,
     resumed_state,
+    save_checkpoint,
     saved_steps,
 )
 from train.loop.crew import Crew
-from train.loop.state import new_state
-
-ALONE = Crew(device=torch.device("cpu"))
+from train.loop.recorder import MetricsLog
+from train.loop.state import TrainState, new_state
+from train.settings import TrainSettings
+from train.stored_settings import known_settings
+from train.watching.rows import read_rows
 
 CASES = [("fsync", "before"), ("replace", "before"), ("replace", "after"), ("unlink", "before")]
 
 CHILD = """
 import json, os, signal, sys
 from pathlib import Path
+from typing import Any
 from storage.settings.described import from_record
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.state import new_state
 from train.settings import TrainSettings
+from train.stored_settings import known_settings
 
 settings = from_record(TrainSettings, json.loads(sys.argv[2]))
 state = new_state(settings)
@@ -84,25 +95,14 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
-    settings = tiny_run(checkpoints_kept=2, keep_every=10)
-    state = new_state(settings)
-    for step in (4, 8, 10, 12, 16, 20, 24):
-        state.step = step
-        keep_checkpoint(tmp_path, state, settings, data_digest="d", world_size=1)
+    keep(tmp_path, 4, 8, 10, 12, 16, 20, 24, checkpoints_kept=2, keep_every=10)
     assert saved_steps(tmp_path) == [10, 20, 24]
     assert resumed_checkpoint(tmp_path, ALONE, pytest.fail).header["step"] == 24
     (tmp_path / "step-notes.safetensors").write_bytes(b"")
     assert saved_steps(tmp_path) == [10, 20, 24]
-
-
-def test_the_one_where_the_decay_begins_stays(tmp_path: Path) -> None:
-    """It is the last from which a longer run can go on as if it had been longer all along."""
-    settings = tiny_run(schedule="wsd", num_steps=25, checkpoints_kept=1)
-    state = new_state(settings)
-    for step in (16, 20, 24):
-        state.step = step
-        keep_checkpoint(tmp_path, state, settings, data_digest="d", world_size=1)
-    assert saved_steps(tmp_path) == [20, 24]
+    # where the decay begins a longer run can go on as if it had been longer all along
+    keep(tmp_path / "wsd", 16, 20, 24, schedule="wsd", num_steps=25, checkpoints_kept=1)
+    assert saved_steps(tmp_path / "wsd") == [20, 24]
 
 
 @for_each(("call", "when"), CASES)
@@ -111,17 +111,16 @@ def test_killed_while_saving_leaves_a_whole_one(killed: Path, call: str, when: s
     newest = resumed_checkpoint(folder, ALONE, pytest.fail)
     step = resumed_state(newest, going_on(newest.header, tiny_run(), "d", {})).step
     assert step == (1 if (call, when) in (("fsync", "before"), ("replace", "before")) else 2)
-    state = new_state(tiny_run())
-    state.step = state.skipped_steps = 3
-    keep_checkpoint(folder, state, tiny_run(), data_digest="d", world_size=1)
+    keep(folder, 3)
     assert not list(folder.glob("*.part")), "what the killed one left is cleared away"
 
 
-def keep(folder: Path, *steps: int, kept: int = 3) -> None:
-    state = new_state(tiny_run())
+def keep(folder: Path, *steps: int, **changes: Any) -> None:
+    """Save a run at steps that were all skipped."""
+    settings = tiny_run(**({"checkpoints_kept": 3} | changes))
+    state = new_state(settings)
     for step in steps:
         state.step = state.skipped_steps = step
-        settings = tiny_run(checkpoints_kept=kept)
         keep_checkpoint(folder, state, settings, data_digest="d", world_size=1)
 
 
@@ -129,18 +128,12 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1000])
 
 
-def flip(path: Path) -> None:
-    data = bytearray(path.read_bytes())
-    data[-1000] ^= 1
-    path.write_bytes(data)
-
-
 def lock(path: Path) -> None:
     path.unlink()
     path.mkdir()
 
 
-@for_each("damage", [cut, flip, lock])
+@for_each("damage", [cut, flip_a_bit, lock])
 def test_a_damaged_newest_one_is_named_and_the_one_before_it_is_used(
     damage: Callable[[Path], None], tmp_path: Path
 ) -> None:
@@ -163,8 +156,8 @@ def test_a_damaged_newest_one_is_named_and_the_one_before_it_is_used(
 
 def test_a_damaged_later_one_takes_nobodys_place(tmp_path: Path) -> None:
     keep(tmp_path, 4, 12)
-    flip(path_of_step(tmp_path, 12))
-    keep(tmp_path, 8, kept=1)
+    flip_a_bit(path_of_step(tmp_path, 12))
+    keep(tmp_path, 8, checkpoints_kept=1)
     assert resumed_checkpoint(tmp_path, ALONE, lambda _: None).header["step"] == 8
 
 
@@ -189,16 +182,14 @@ def test_processes_that_read_different_checkpoints_do_not_go_on(tmp_path: Path) 
 
 
 def test_a_full_disk_leaves_the_older_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings, state = tiny_run(checkpoints_kept=1), new_state(tiny_run())
-    keep_checkpoint(tmp_path, state, settings, data_digest="d", world_size=1)
+    keep(tmp_path, 0, checkpoints_kept=1)
 
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    state.step = 5
     with pytest.raises(TrilightError, match="the disk is full"):
-        keep_checkpoint(tmp_path, state, settings, data_digest="d", world_size=1)
+        keep(tmp_path, 5, checkpoints_kept=1)
     assert saved_steps(tmp_path) == [0]
 
 
@@ -222,3 +213,122 @@ def test_a_network_is_found_in_folder_checkpoint_and_file(tmp_path: Path) -> Non
         assert torch.equal(
             open_network(place, network_of_run).decoder.token_W, state.model.decoder.token_W
         )
+
+
+DIGEST = "d" * 64
+
+
+def stepped(steps: int = 3) -> TrainState:
+    state = new_state(tiny_run())
+    batch = make_batch([training_scene(toy_sample(0), 16)])
+    for _ in range(steps):
+        one_step(state, batch)
+    return state
+
+
+def one_step(state: TrainState, batch: TrainingBatch) -> None:
+    stepper(state, tiny_run()).step([batch], 1e-3)
+    state.step += 1
+
+
+def equal_weights(one: TrainState, other: TrainState) -> bool:
+    ours, theirs = one.model.state_dict(), other.model.state_dict()
+    return all(torch.equal(ours[key], theirs[key]) for key in ours)
+
+
+def save(path: Path, state: TrainState, settings: TrainSettings | None = None) -> None:
+    save_checkpoint(path, state, settings or tiny_run(), data_digest=DIGEST, world_size=1)
+
+
+def load(path: Path) -> TrainState:
+    checkpoint = read_checkpoint(path)
+    typed = from_record(TrainSettings, known_settings(checkpoint.header["settings"], "resume"))
+    return resumed_state(checkpoint, going_on(checkpoint.header, typed, DIGEST, {}))
+
+
+@for_each("steps", [0, 3])
+def test_a_loaded_state_goes_on_to_the_bit(tmp_path: Path, steps: int) -> None:
+    state = stepped(steps)
+    path = tmp_path / "checkpoint"
+    save(path, state)
+    loaded = load(path)
+    assert (loaded.step, loaded.skipped_steps) == (state.step, state.skipped_steps)
+    batch = make_batch([training_scene(toy_sample(1), 16)])
+    for each in (state, loaded):
+        one_step(each, batch)
+    assert equal_weights(state, loaded)
+
+
+def test_equal_states_give_equal_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        save(tmp_path / name, stepped())
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_skipped_steps_do_not_count_as_updates(tmp_path: Path) -> None:
+    state = stepped(2)
+    state.step, state.skipped_steps = 5, 3
+    save(tmp_path / "c", state)
+    loaded = load(tmp_path / "c")
+    batch = make_batch([training_scene(toy_sample(1), 16)])
+    one_step(loaded, batch)
+    one_step(state, batch)
+    # AdamW's steps are the longer the fewer it believes to have done
+    assert equal_weights(loaded, state)
+
+
+def test_a_missing_or_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TrilightError, match="no checkpoint here to resume from"):
+        resumed_checkpoint(tmp_path / "checkpoints", ALONE, print)
+    save(tmp_path / "c", new_state(tiny_run()))
+    data = (tmp_path / "c").read_bytes()
+    for damaged in (b"", data[:100], data[:-1], b"PK\x03\x04" + data):
+        (tmp_path / "c").write_bytes(damaged)
+        with pytest.raises(TrilightError, match=f"checkpoint {tmp_path / 'c'} is not readable"):
+            load(tmp_path / "c")
+
+
+def test_no_bit_may_flip(tmp_path: Path) -> None:
+    """In the header, its sha256, the weights, the last byte: each would still be a weight."""
+    path = tmp_path / "c"
+    save(path, stepped(1))
+    data = path.read_bytes()
+    end = 8 + int.from_bytes(data[:8], "little")
+    places = [0, 8, *range(9, end, end // 40), data.index(b"sha256") + 20]
+    for place in [*places, end, end + 4321, len(data) - 1]:
+        damaged = bytearray(data)
+        damaged[place] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        with pytest.raises(TrilightError, match="is not readable"):
+            read_checkpoint(path)
+    path.write_bytes(data)
+    assert load(path).step == 1
+
+
+def test_the_log_is_cut_back_to_the_checkpoint(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    log = MetricsLog(path, first_step=0)
+    for step in (2, 4, 6):
+        log.append({"step": step, "loss": 1.0 / step})
+    with path.open("a") as stream:
+        stream.write('{"step": 8, "lo')
+    MetricsLog(path, first_step=4)
+    assert [row["step"] for row in read_rows(path)] == [2, 4]
+
+
+def test_a_run_of_an_extension_is_resumed_with_the_same_one_only(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint"
+    size = EXAMPLES / "model_size.py"
+    with loaded(size) as extension:
+        save(path, stepped(0))
+        load(path)
+    assert read_checkpoint(path).header["extensions"] == {"model_size.py": extension.sha256}
+    assert read_checkpoint(path).network().config == TINY_MODEL  # the network asks for no file
+    with pytest.raises(TrilightError, match=r"begun with the extension model_size\.py, which is"):
+        load(path)
+    changed = written(tmp_path, size.read_text() + "# changed\n", "model_size.py")
+    with loaded(changed), pytest.raises(TrilightError, match=r"another extension model_size\.py"):
+        load(path)
+    with loaded(EXAMPLES / "metric.py"):  # judges, and decides no weight
+        save(path, stepped(0))
+    assert "extensions" not in read_checkpoint(path).header

@@ -1,7 +1,7 @@
 """Compiled layers compute what layers compute, from one graph for all of them and all lengths."""
 
-import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 import torch
@@ -14,19 +14,17 @@ from model.renderformer import RenderFormer
 from model.scene_tensors import batch_scenes
 from storage.errors import TrilightError
 from tests.model.kit import RESOLUTION, awake, random_scene, tiny_config
-from tests.train.kit import tiny_run
+from tests.train.kit import CPU, stepper, tiny_run
 from tests.train.toy import toy_sample
-from train.data.buckets import TrainingBatch, make_batch
+from train.data.buckets import make_batch
 from train.data.scenes import training_scene
 from train.loop import compiled
 from train.loop.compiled import compile_parts, compiled_parts, undo_compiling
-from train.loop.crew import Crew
 from train.loop.state import new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective
 from train.settings import Compile, LossSettings
 
-CPU = torch.device("cpu")
 QUICK = ((3, 5), (4, 9, 2))
 PASSES = (*QUICK, (6, 6), (7,), (11, 2), (8, 3, 5, 1))
 """Lengths of the scenes of passes: padded, of one length, and one alone."""
@@ -39,8 +37,20 @@ def forgets() -> Iterator[None]:
     torch._dynamo.reset()
 
 
-def _objective() -> Objective:
-    return Objective(LossSettings(perceptual="none"), None)
+OBJECTIVE = Objective(LossSettings(perceptual="none"), None)
+
+
+def _compile_by(patch: pytest.MonkeyPatch, backend: Callable[..., Any]) -> None:
+    """Have modules compile by a backend."""
+    real = torch.compile
+    patch.setattr(torch, "compile", lambda f, **_: real(f, backend=backend, dynamic=True))
+    patch.setattr(
+        torch.nn.Module,
+        "compile",
+        lambda module, **_: setattr(
+            module, "_compiled_call_impl", real(module._call_impl, backend=backend, dynamic=True)
+        ),
+    )
 
 
 def _results(model: RenderFormer, lengths: tuple[int, ...]) -> dict[str, Tensor]:
@@ -52,28 +62,26 @@ def _results(model: RenderFormer, lengths: tuple[int, ...]) -> dict[str, Tensor]
     return {"picture": picture.detach(), **{k: v for k, v in grads.items() if v is not None}}
 
 
-def _check(
+@pytest.mark.slow("training")  # Dynamo traces every layer
+@pytest.mark.parametrize(
+    ("backend", "passes", "most_graphs"), [("eager", PASSES, 15), ("inductor", QUICK, 12)]
+)
+def test_compiled_layers_compute_the_same_and_three_kinds_of_pass_are_few_graphs(
     monkeypatch: pytest.MonkeyPatch,
     backend: str,
-    head: str,
     passes: tuple[tuple[int, ...], ...],
     most_graphs: int,
 ) -> None:
-    """Compile a network by a backend, and hold its results beside those without."""
-    model = awake(tiny_config(head), dtype=torch.float32)
+    """Layers of a stage share a graph for every length: four functions, two graphs more a kind.
+
+    Inductor guards on more than the lengths' being variables: its second pass has graphs too.
+    """
+    model = awake(tiny_config("linear"), dtype=torch.float32)
     plain = [_results(model, lengths) for lengths in passes]
     counter = CompileCounterWithBackend(backend)
-    real = torch.compile
-    monkeypatch.setattr(torch, "compile", lambda f, **_: real(f, backend=counter, dynamic=True))
-    monkeypatch.setattr(
-        torch.nn.Module,
-        "compile",
-        lambda module, **_: setattr(
-            module, "_compiled_call_impl", real(module._call_impl, backend=counter, dynamic=True)
-        ),
-    )
+    _compile_by(monkeypatch, counter)
     names = [name for name, _ in model.named_parameters()]
-    assert compile_parts(model, _objective(), "yes", CPU)
+    assert compile_parts(model, OBJECTIVE, "yes", CPU)
     assert [name for name, _ in model.named_parameters()] == names, "checkpoints stay"
     for lengths, wanted in zip(passes, plain, strict=True):
         for name, found in _results(model, lengths).items():
@@ -85,20 +93,6 @@ def _check(
     before = counter.frame_count
     _results(model, (2, 10, 4))
     assert counter.frame_count == before, "another length is no other graph"
-
-
-@pytest.mark.slow("training")  # Dynamo traces every layer
-def test_three_kinds_of_pass_are_three_times_as_many_graphs(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Layers of a stage share a graph for every length: four functions, two graphs more a kind."""
-    _check(monkeypatch, "eager", "linear", PASSES, 15)
-
-
-@pytest.mark.slow("training")
-def test_inductor_computes_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It guards on more than the lengths' being variables, so the second pass has graphs too."""
-    _check(monkeypatch, "inductor", "linear", QUICK, 12)
 
 
 @pytest.mark.slow("training")
@@ -126,7 +120,7 @@ def test_a_part_is_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.amp, "is_autocast_available", cut)
     layers = {"encoder_layers": 1, "decoder_layers": 1}
     model = awake(tiny_config("linear", **layers), dtype=torch.float32)
-    for _, module, method in compiled_parts(model, _objective()):
+    for _, module, method in compiled_parts(model, OBJECTIVE):
         assert method in ("forward", "keys_values")
         whole = torch.compile(
             getattr(module, method), backend="eager", dynamic=True, fullgraph=True
@@ -136,7 +130,7 @@ def test_a_part_is_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_is_compiled_where(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, objective, card = awake(tiny_config()), _objective(), torch.device("cuda")
+    model, objective, card = awake(tiny_config()), OBJECTIVE, torch.device("cuda")
     layers = len(model.encoder.layers) + len(model.decoder.layers)
     assert len(list(compiled_parts(model, objective))) == layers + 2
     assert not compile_parts(model, objective, "auto", CPU)
@@ -149,46 +143,30 @@ def test_what_is_compiled_where(monkeypatch: pytest.MonkeyPatch) -> None:
     assert compile_parts(model, objective, "auto", card)
 
 
-def _batch() -> TrainingBatch:
-    resolution = tiny_run().resolution
-    return make_batch(
-        [training_scene(toy_sample(index, resolution=resolution), resolution) for index in (0, 1)]
-    )
-
-
 def _fails_to_compile(graph: object, inputs: object) -> object:
     raise AssertionError("no kernel for this")
 
 
 def _uncompilable(monkeypatch: pytest.MonkeyPatch, compile: Compile) -> Stepper:
     """Return a stepper on the processor whose compiler, as on some card, fails."""
-    real = torch.compile
     monkeypatch.setattr(compiled, "_worth_it", lambda _: True)
-    monkeypatch.setattr(
-        torch.nn.Module,
-        "compile",
-        lambda module, **_: setattr(
-            module,
-            "_compiled_call_impl",
-            real(module._call_impl, backend=_fails_to_compile, dynamic=True),
-        ),
-    )
-    run = dataclasses.replace(tiny_run(), compile=compile)
-    return Stepper(new_state(run), run, Objective(run.loss, None), Crew(device=CPU))
+    _compile_by(monkeypatch, _fails_to_compile)
+    run = tiny_run(compile=compile)
+    return stepper(new_state(run), run)
 
 
 def test_what_cannot_be_compiled_is_trained_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """On an H200 torch 2.11 failed to compile `smoke`, and the run ended before its first step."""
-    batch = _batch()
-    plain = Stepper(new_state(tiny_run()), tiny_run(), _objective(), Crew(device=CPU))
+    batch = make_batch([training_scene(toy_sample(index), 16) for index in (0, 1)])
+    plain = stepper(new_state(tiny_run()), tiny_run())
     wanted = plain.step([batch], 1e-3)
     with monkeypatch.context() as patch:
-        stepper = _uncompilable(patch, compile="auto")
-        assert stepper.step([batch], 1e-3) == wanted
-        (remark,) = stepper.remarks
-        assert "cannot compile" in remark and not stepper.is_compiled
-        assert stepper.step([batch], 1e-3) == plain.step([batch], 1e-3)
-        assert len(stepper.remarks) == 1
+        failing = _uncompilable(patch, compile="auto")
+        assert failing.step([batch], 1e-3) == wanted
+        (remark,) = failing.remarks
+        assert "cannot compile" in remark and not failing.is_compiled
+        assert failing.step([batch], 1e-3) == plain.step([batch], 1e-3)
+        assert len(failing.remarks) == 1
     torch._dynamo.reset()
     insisting = _uncompilable(monkeypatch, compile="yes")
     with pytest.raises(TrilightError, match="cannot compile the network.*--set compile=no"):
@@ -196,7 +174,7 @@ def test_what_cannot_be_compiled_is_trained_all_the_same(monkeypatch: pytest.Mon
 
 
 def test_compiling_is_undone() -> None:
-    model, objective = awake(tiny_config()), _objective()
+    model, objective = awake(tiny_config()), OBJECTIVE
     compile_parts(model, objective, "yes", CPU)
     undo_compiling(model, objective)
     for _, module, method in compiled_parts(model, objective):

@@ -245,17 +245,3 @@ def test_a_job_of_slurm_whose_time_is_up_goes_on_to_the_bit(
     assert job.returncode == 0, errors
     assert "by a signal, nothing is lost" in errors
     same_to_the_bit(tmp_path / "job", undisturbed(2))
-
-
-@pytest.mark.slow("training")
-def test_a_batch_that_cannot_be_shared_is_named(dataset: Dataset, tmp_path: Path) -> None:
-    done = subprocess.run(
-        command(dataset, tmp_path, 2, scenes_per_step=5),
-        cwd=ROOT,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode != 0
-    assert "a batch of 5 scenes is not divisible by 2 ranks" in done.stderr

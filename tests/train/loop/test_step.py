@@ -1,9 +1,14 @@
-"""Laws of one step: a mean over views, whatever the batches; what is not finite changes nothing."""
+"""Laws of one step: a mean over views, whatever the batches; what is not finite changes nothing.
+
+A decision that only kernels know does what one of the host does; here on a processor.
+"""
 
 import copy
 import functools
 import math
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,22 +16,25 @@ import torch
 from torch import Tensor, nn
 
 from model.layers import Norm
-from model.renderformer import count_parameters
 from tests.for_each import for_each
 from tests.model.kit import awake, tiny_config
-from tests.train.kit import tiny_run
-from tests.train.toy import toy_sample
+from tests.train.kit import stepper, tiny_run, trained
+from tests.train.loop.test_optim import with_gradients
+from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.buckets import TrainingBatch, bucket_scenes, make_batch
 from train.data.scenes import training_scene
-from train.loop.crew import Crew
-from train.loop.state import TrainState, new_state
+from train.folder import RunFolder
+from train.loop import muon, optim
+from train.loop import step as step_module
+from train.loop.checkpoints import path_of_step, read_checkpoint, saved_steps
+from train.loop.decision import Decision, move_along, move_towards
+from train.loop.optim import Updater
+from train.loop.state import TrainState, mean_share, new_state
 from train.loop.step import Stepper, StepReport, predicted
-from train.loss.objective import Objective, view_l1
-from train.runs import changed_run
-from train.settings import Precision, TrainSettings
+from train.settings import Precision
+from train.watching.rows import read_rows
 
 RESOLUTION = 16
-CPU = torch.device("cpu")
 
 
 def scenes(count: int = 5) -> list:
@@ -35,10 +43,6 @@ def scenes(count: int = 5) -> list:
 
 def cost(num_triangles: int) -> float:
     return 100.0 + num_triangles
-
-
-def stepper(state: TrainState, settings: TrainSettings) -> Stepper:
-    return Stepper(state, settings, Objective(settings.loss, None), Crew(device=CPU))
 
 
 def step(state: TrainState, batches: list[TrainingBatch], grad_clip: float = 1.0) -> StepReport:
@@ -64,14 +68,6 @@ def test_buckets_of_any_size_give_the_gradient_of_one_batch() -> None:
     assert loss == pytest.approx(whole_loss, rel=1e-5)
     for a, b in zip(cut, whole, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
-
-
-def test_the_loss_is_the_mean_absolute_error_of_each_view() -> None:
-    prediction = torch.full((1, 2, 4, 4, 3), -1.0)
-    target = torch.zeros(1, 2, 4, 4, 3)
-    target[0, 1] = 2.0
-    # negative predictions count in full: the ELU is not part of it
-    assert view_l1(prediction, target).tolist() == [[1.0, 3.0]]
 
 
 def ruin_target(state: TrainState, batch: TrainingBatch) -> None:
@@ -128,33 +124,16 @@ def test_the_mean_follows_the_weights_faster_at_first() -> None:
     assert new_state(tiny_run()).shown is not None and new_state(tiny_run()).mean_model is None
 
 
-def test_bfloat16_rounds_products_but_no_position() -> None:
-    """The published training rounds positions too, to a grid of up to 0.004 m."""
-    model = new_state(tiny_run()).model
-    batch = make_batch(scenes(2))
-    seen: dict[str, list[Tensor]] = {}
-
-    def note(precision: Precision) -> Tensor:
-        hook = model.encoder.rotary.register_forward_pre_hook(
-            lambda _, given: seen.setdefault(precision, []).append(given[0].clone())
-        )
-        with torch.no_grad():
-            model.decoder.head.last.weight.fill_(0.01)  # or all pictures are black alike
-            prediction = predicted(model, batch, RESOLUTION, precision)
-        hook.remove()
-        return prediction
-
-    exact, rounded = note("float32"), note("bfloat16")
-    assert rounded.dtype == torch.float32
-    assert 0 < (rounded - exact).abs().max() < 0.05
-    for ours, theirs in zip(seen["bfloat16"], seen["float32"], strict=True):
-        assert ours.dtype == torch.float32 and torch.equal(ours, theirs)
-
-
 @for_each("family", ["linear", "dpt"])
-def test_bfloat16_rounds_neither_rays_nor_materials_nor_the_last_layers(family: str) -> None:
-    """As model.precision says; norms keep the type that they get, and layers are rounded."""
+def test_bfloat16_rounds_no_position_ray_or_material_nor_the_last_layers(family: str) -> None:
+    """As model.precision says; norms keep the type that they get, and layers are rounded.
+
+    The published training rounds positions too, to a grid of up to 0.004 m.
+    """
     network, found = awake(tiny_config(family), torch.float32), dict[str, str]()
+    positions, batch = list[Tensor](), make_batch(scenes(2))
+    network.encoder.rotary.register_forward_pre_hook(lambda _, given: positions.append(given[0]))
+    exact_picture = predicted(network, batch, RESOLUTION, "float32")
 
     def note(name: str, module: nn.Module, given: tuple[Tensor, ...], output: Tensor) -> None:
         kept = isinstance(module, Norm) and output.dtype == given[0].dtype
@@ -163,7 +142,11 @@ def test_bfloat16_rounds_neither_rays_nor_materials_nor_the_last_layers(family: 
     for name, module in network.named_modules():
         if isinstance(module, Norm | nn.Linear | nn.Conv2d):
             module.register_forward_hook(functools.partial(note, name))
-    assert predicted(network, make_batch(scenes(2)), RESOLUTION, "bfloat16").dtype == torch.float32
+    rounded = predicted(network, batch, RESOLUTION, "bfloat16")
+    assert rounded.dtype == torch.float32 and not torch.equal(rounded, exact_picture)
+    exact_ones, ours = positions[: len(positions) // 2], positions[len(positions) // 2 :]
+    for one, other in zip(exact_ones, ours, strict=True):
+        assert other.dtype == torch.float32 and torch.equal(one, other)
     exact = {"encoder.tokens.material", "encoder.tokens.normal", "decoder.rays"}
     exact |= {"decoder.head.last"} | ({"decoder.head.widen"} if family == "dpt" else set())
     assert {name: found[name] for name in exact} == dict.fromkeys(exact, "float32")
@@ -226,17 +209,124 @@ def test_a_fresh_network_learns_eight_pictures() -> None:
     assert min(report.grad_norm for report in reports) > 0.01
 
 
-@pytest.mark.slow("training")
-def test_the_large_network_takes_steps() -> None:
-    """All 483 M parameters, on a processor: one scene, one window of 64 pixels, 8 GB of memory."""
-    changes = {"resolution": 64, "precision": "float32", "loss.perceptual": "ms_ssim"}
-    settings = changed_run("paper-pretrain-large", changes)
-    state = new_state(settings)
-    assert count_parameters(state.model) > 480e6
-    batch = make_batch([training_scene(toy_sample(0, resolution=64), 64)])
-    before = state.model.decoder.rays.weight.detach().clone()
-    stepped = stepper(state, settings)
-    reports = [stepped.step([batch], 1e-5) for _ in range(2)]
-    assert all(report.applied for report in reports)
-    assert reports[1].loss < reports[0].loss
-    assert not torch.equal(state.model.decoder.rays.weight, before)
+LATE = tiny_run(ema_decay=0.9, muon_rate=3.0, muon_takes="hidden", weight_decay=0.1)
+
+
+@pytest.fixture
+def late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have a processor decide as a card does."""
+    for module in (step_module, optim, muon):
+        monkeypatch.setattr(module, "decides_late", lambda _: True)
+
+
+def batch_of(index: int, *, bad: bool = False) -> TrainingBatch:
+    made = make_batch([training_scene(toy_sample(index), 16)])
+    if bad:
+        made.target_BVRR3[0, 0, 0, 0, 0] = math.inf
+    return made
+
+
+def taken(batches: list[TrainingBatch]) -> tuple[TrainState, list[bool]]:
+    """Take steps and learn only at the end what they did."""
+    state = new_state(LATE, muon_precision="float32")
+    late, unread = stepper(state, LATE), []
+    for each in batches:
+        unread.append(late.take([each], 3e-3))
+        state.step += 1
+    return state, [report.applied for report in late.read(unread).reports]
+
+
+def tensors(state: TrainState) -> dict[str, Tensor]:
+    assert state.mean_model is not None
+    return {
+        **state.model.state_dict(),
+        **{f"mean/{name}": each for name, each in state.mean_model.state_dict().items()},
+        **state.updater.memories(),
+    }
+
+
+def test_steps_that_are_not_finite_leave_no_trace(late: None) -> None:
+    """Not in weights, means, memories or counts, at the start of a training or within it."""
+    with_bad, applied = taken(
+        [batch_of(0, bad=True), batch_of(1), batch_of(0, bad=True), batch_of(2)]
+    )
+    without, _ = taken([batch_of(1), batch_of(2)])
+    assert applied == [False, True, False, True]
+    found, wanted = tensors(with_bad), tensors(without)
+    assert found.keys() == wanted.keys()
+    for name, each in wanted.items():
+        assert torch.equal(found[name], each), name
+
+
+def test_kernels_update_as_the_host_does_but_for_rounding(
+    request: pytest.FixtureRequest,
+) -> None:
+    host, late = with_gradients(), with_gradients()
+    Updater(host, LATE, "float32").step(3e-3)
+    request.getfixturevalue("late")
+    decision = Decision(applied=torch.tensor(True), updates=0, is_late=True)
+    Updater(late, LATE, "float32").step(3e-3, decision)
+    for found, wanted in zip(late.parameters(), host.parameters(), strict=True):
+        # units of the last place: the fused kernels add up in another order
+        torch.testing.assert_close(found, wanted, rtol=2e-6, atol=1e-8)
+
+
+@for_each("applied", [True, False])
+def test_kernels_move_as_the_host_does_or_touch_nothing(applied: bool) -> None:
+    generator = torch.Generator().manual_seed(0)
+    x, goal = (torch.randn(5, 7, generator=generator) for _ in range(2))
+    if not applied:
+        goal[0, 0] = math.nan
+    decision = Decision(applied=torch.tensor(applied), updates=torch.tensor(30.0), is_late=True)
+    share = mean_share(0.99, torch.tensor(30.0, dtype=torch.float64))
+    assert float(share) == pytest.approx(mean_share(0.99, 30), rel=1e-7)
+    assert isinstance(share, torch.Tensor) and share.dtype == torch.float32
+    for move, by_hand in (
+        (lambda y, late: move_towards([y], [goal], 0.05, late), x + 0.05 * (goal - x)),
+        (lambda y, late: move_towards([y], [goal], share, late), x + float(share) * (goal - x)),
+        (lambda y, late: move_along([y], [goal], 0.1, 0.02, late), 0.98 * x - 0.1 * goal),
+    ):
+        y = x.clone()
+        move(y, decision)
+        torch.testing.assert_close(y, by_hand if applied else x, rtol=1e-6, atol=1e-7)
+
+
+def test_a_run_that_learns_late_is_the_same_run(
+    late: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the window; skipped steps are named with their scenes; resumed to the bit."""
+    write_toy_dataset(tmp_path / "data", train=6, validation=1)
+    original = Stepper.take
+
+    def spoilt(self: Stepper, batches: list[TrainingBatch], *given: Any, **rest: Any) -> Tensor:
+        for each in batches if self._state.step in (1, 6) else ():
+            each.target_BVRR3[:] = math.inf
+        return original(self, batches, *given, **rest)
+
+    monkeypatch.setattr(Stepper, "take", spoilt)
+
+    def run(log_every: int, *, resume: bool = False) -> RunFolder:
+        settings = tiny_run(num_steps=8, schedule="wsd", decay_share=0.4, log_every=log_every)
+        out = tmp_path / f"window {log_every}"
+        return trained(settings, [str(tmp_path / "data")], out, resume=resume).folder
+
+    each, window = run(1), run(4)
+    rows = [row for row in read_rows(window.metrics) if "loss" in row]
+    first = [row["loss"] for row in read_rows(each.metrics) if "loss" in row][:4]
+    assert first[1] is None
+    assert rows[0]["loss"] == pytest.approx(sum(loss or 0 for loss in first) / 3)
+    assert [row["skipped_steps"] for row in rows] == [1, 2]
+    skips = [note for note in read_rows(window.notes) if "was skipped" in note["text"]]
+    assert [note["step"] for note in skips] == [2, 7]
+    assert all("its scenes were 0000" in note["text"] for note in skips)
+
+    last = path_of_step(window.checkpoints, 8)
+    wanted = read_checkpoint(path_of_step(each.checkpoints, 8)).arrays
+    found = [read_checkpoint(last).arrays]
+    last.unlink()
+    assert saved_steps(window.checkpoints)[-1] == 5, "where the rate begins to fall: in a window"
+    run(4, resume=True)
+    found.append(read_checkpoint(last).arrays)
+    for arrays in found:
+        assert arrays.keys() == wanted.keys()
+        assert all(np.array_equal(arrays[name], wanted[name]) for name in wanted)
