@@ -17,6 +17,7 @@ SLOW_KINDS = {
     "browser": "a page in headless Chromium",
     "commands": "what documents tell a reader to type, as processes",
     "every": "every preset, object or example scene, where quick tests take two",
+    "gpu": "steps on a GPU that is not there",
     "hostile": "hundreds of hostile inputs",
     "kills": "processes that are killed, stopped or starved",
     "memory": "sizes at the end of a range, and memory that must stay flat",
