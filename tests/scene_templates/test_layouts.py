@@ -16,6 +16,7 @@ from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
 from storage.seeds import rng_for
+from tests.for_each import for_each
 from tests.scene_templates.balls import (
     BALL,
     Ball,
@@ -44,12 +45,8 @@ def _sixty(name: str) -> list[Drawn]:
     return drawn_once(template_settings(name), 60)
 
 
-def test_equal_generators_give_equal_layouts() -> None:
-    for name in list(TEMPLATES):
-        _check_equal_generators_give_equal_layouts(name)
-
-
-def _check_equal_generators_give_equal_layouts(name: str) -> None:
+@for_each("name", TEMPLATES)
+def test_equal_generators_give_equal_layouts(name: str) -> None:
     again = drawn(template_settings(name), 3)
     for first, second in zip(_sixty(name)[:3], again, strict=True):
         _require_equal(first.layout, second.layout)
@@ -68,12 +65,8 @@ def _require_equal(one: Layout, other: Layout) -> None:
         assert e.radiance_rgb == f.radiance_rgb
 
 
-def test_objects_do_not_meet_nor_leave_the_room() -> None:
-    for name in list(TEMPLATES):
-        _check_objects_do_not_meet_nor_leave_the_room(name)
-
-
-def _check_objects_do_not_meet_nor_leave_the_room(name: str) -> None:
+@for_each("name", TEMPLATES)
+def test_objects_do_not_meet_nor_leave_the_room(name: str) -> None:
     overlapping = 0
     for one in _sixty(name):
         if one.plan.overlaps:
@@ -161,12 +154,8 @@ def test_objects_that_cannot_fit_are_rejected_with_a_reason() -> None:
     assert len(one_drawn(overlapping, 0).layout.objects) == 3
 
 
-def test_emitters_hang_outside() -> None:
-    for name in list(TEMPLATES):
-        _check_emitters_hang_outside(name)
-
-
-def _check_emitters_hang_outside(name: str) -> None:
+@for_each("name", TEMPLATES)
+def test_emitters_hang_outside(name: str) -> None:
     counts = set()
     for one in _sixty(name):
         layout = one.layout
@@ -188,13 +177,9 @@ def _check_emitters_hang_outside(name: str) -> None:
     assert counts == set(range(1, 9))
 
 
-def test_emitters_keep_to_their_sector_and_apart() -> None:
+@for_each("name", TEMPLATES)
+def test_emitters_keep_to_their_sector_and_apart(name: str) -> None:
     """Measured without jitter, as seen from the origin, on a sphere of radius 0.866."""
-    for name in list(TEMPLATES):
-        _check_emitters_keep_to_their_sector_and_apart(name)
-
-
-def _check_emitters_keep_to_their_sector_and_apart(name: str) -> None:
     settings = template_settings(name, {"lights.target_jitter": 0.0, "lights.count": [8, 8]})
     sector = TEMPLATES[name].lights
     for seed, one in enumerate(drawn(settings, 20)):
@@ -240,12 +225,8 @@ def test_directions_are_uniform_by_solid_angle() -> None:
     assert abs(towards[:, 2].mean() - (low + high) / 2) < 5 * standard_error
 
 
-def test_cameras_stand_at_their_distance_and_look_near_the_origin() -> None:
-    for name in list(TEMPLATES):
-        _check_cameras_stand_at_their_distance_and_look_near_the_origin(name)
-
-
-def _check_cameras_stand_at_their_distance_and_look_near_the_origin(name: str) -> None:
+@for_each("name", TEMPLATES)
+def test_cameras_stand_at_their_distance_and_look_near_the_origin(name: str) -> None:
     rng = np.random.default_rng(0)
     for _ in range(60):
         pose = camera_rand(rng, CameraSettings(), TEMPLATES[name].cameras)

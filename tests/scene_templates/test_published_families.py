@@ -1,8 +1,6 @@
 """The families of renderformer-v1 are the published ones, in both background policies."""
 
 import itertools
-from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ from scene_templates.rooms import SIDES, PatchPlacement, patch, plane_of
 from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
+from tests.for_each import for_each
 from tests.scene_templates.balls import one_drawn
 from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row, side_row
 
@@ -44,13 +43,8 @@ def test_our_families_are_the_stated_ones() -> None:
     assert _as_rows(DEFAULT_FAMILIES) == DEFAULT
 
 
-def test_every_side_has_its_published_ranges() -> None:
-    cases: Iterable[Any] = itertools.product(POLICIES, STAGES)
-    for case in cases:
-        _check_every_side_has_its_published_ranges(*case)
-
-
-def _check_every_side_has_its_published_ranges(policy: Policy, stage: int) -> None:
+@for_each(("policy", "stage"), itertools.product(POLICIES, STAGES))
+def test_every_side_has_its_published_ranges(policy: Policy, stage: int) -> None:
     for family in STAGES[stage][0](policy):
         assert isinstance(family.shell, SeparateSides)
         for part in TEMPLATES[family.template].parts:

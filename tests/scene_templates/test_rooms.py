@@ -2,8 +2,6 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +18,7 @@ from scene_templates.rooms import (
     plane_of,
 )
 from scene_templates.templates import TEMPLATES
+from tests.for_each import for_each
 from tests.scene_templates.balls import drawn, template_settings
 
 ROUNDING = 1e-12
@@ -49,13 +48,8 @@ def _shells(ranges: SharedRoom, name: str, count: int) -> list[tuple[ShellPart, 
     return [one.layout.shell for one in drawn(settings, count)]
 
 
-def test_parts_are_flat_patches_of_128_faces_that_face_the_room() -> None:
-    cases: Iterable[Any] = itertools.product([SQUARE, LOOSE], list(TEMPLATES))
-    for case in cases:
-        _check_parts_are_flat_patches_of_128_faces_that_face_the_room(*case)
-
-
-def _check_parts_are_flat_patches_of_128_faces_that_face_the_room(
+@for_each(("ranges", "name"), itertools.product([SQUARE, LOOSE], list(TEMPLATES)))
+def test_parts_are_flat_patches_of_128_faces_that_face_the_room(
     ranges: SharedRoom, name: str
 ) -> None:
     for shell in _shells(ranges, name, 20):
@@ -114,14 +108,9 @@ def test_in_square_rooms_walls_stand_exactly_on_the_floors_edge(name: str) -> No
             assert gaps.max() < ROUNDING
 
 
-def test_nothing_shines_through_the_seams() -> None:
+@for_each(("ranges", "name"), itertools.product([SQUARE, LOOSE], ["wall", "corner", "open_box"]))
+def test_nothing_shines_through_the_seams(ranges: SharedRoom, name: str) -> None:
     """From the middle of the room, a look at any point near a seam meets a floor or wall."""
-    cases: Iterable[Any] = itertools.product([SQUARE, LOOSE], ["wall", "corner", "open_box"])
-    for case in cases:
-        _check_nothing_shines_through_the_seams(*case)
-
-
-def _check_nothing_shines_through_the_seams(ranges: SharedRoom, name: str) -> None:
     for seed in range(60):
         room, patches = _room(ranges, name, seed)
         rng = np.random.default_rng([seed, 1])

@@ -1,8 +1,6 @@
 """Strata: shares in every stretch of scenes, and settings that refuse contradictions."""
 
 from collections import Counter
-from collections.abc import Iterable
-from typing import Any
 
 import pytest
 
@@ -10,6 +8,7 @@ from pipeline.builds.named import named_build
 from scene_templates.strata import Stratum, stratum_of
 from storage.errors import TrilightError
 from storage.settings.changes import changed
+from tests.for_each import for_each
 
 STRATA = (
     Stratum(name="rare", weight=0.1),
@@ -18,13 +17,8 @@ STRATA = (
 )
 
 
-def test_every_stretch_holds_each_share() -> None:
-    cases: Iterable[Any] = [0, 7, 1000, 999_999_900]
-    for first in cases:
-        _check_every_stretch_holds_each_share(first)
-
-
-def _check_every_stretch_holds_each_share(first: int) -> None:
+@for_each("first", [0, 7, 1000, 999_999_900])
+def test_every_stretch_holds_each_share(first: int) -> None:
     for length in (10, 40, 100):
         found = Counter(stratum_of(STRATA, first + k).name for k in range(length))
         for stratum in STRATA:
@@ -39,18 +33,16 @@ def test_weights_are_relative_and_history_changes_no_scene() -> None:
         assert stratum_of(STRATA, index).name == stratum_of(other, index).name
 
 
-def test_contradictions_are_named() -> None:
-    cases: Iterable[Any] = [
+@for_each(
+    ("strata", "message"),
+    [
         ([{"name": "a", "weight": 1}, {"name": "a", "weight": 1}], "unique names"),
         ([{"name": "a", "weight": 1, "families": ["tunnel"]}], "tunnel"),
         ([{"name": "a", "weight": 1, "changes": [["lights.cuont", [1, 2]]]}], "cuont"),
         ([{"name": "a", "weight": 0}], "weight"),
-    ]
-    for case in cases:
-        _check_contradictions_are_named(*case)
-
-
-def _check_contradictions_are_named(strata: list[dict[str, object]], message: str) -> None:
+    ],
+)
+def test_contradictions_are_named(strata: list[dict[str, object]], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
         changed(named_build("smoke").scenes, {"strata": strata})
 

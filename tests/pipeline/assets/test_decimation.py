@@ -11,6 +11,7 @@ from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.distance import Surface
 from pipeline.assets.recipe import methods_of
 from storage.errors import Rejected
+from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import cleaned, knot, sphere
 
 UNIFORM = np.random.default_rng(0).random((4000, 3))
@@ -25,12 +26,8 @@ def p99(mesh: TriangleMesh, budget: int, method: str) -> float:
     return Surface(mesh, UNIFORM).deviation(decimate(mesh, budget, method)).two_way(99)
 
 
-def test_budgets_are_met_and_the_error_falls_with_them() -> None:
-    for method in METHODS:
-        _check_budgets_are_met_and_the_error_falls_with_them(method)
-
-
-def _check_budgets_are_met_and_the_error_falls_with_them(method: str) -> None:
+@for_each("method", METHODS)
+def test_budgets_are_met_and_the_error_falls_with_them(method: str) -> None:
     mesh = cleaned(knot())
     surface, errors = Surface(mesh, UNIFORM), []
     for budget in (1600, 800, 300):

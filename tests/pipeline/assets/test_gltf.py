@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.assets.reading.load import load_mesh
 from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import (
     geometry,
     gltf_tree,
@@ -108,12 +108,8 @@ TREES: dict[str, tuple[str, Callable[[dict[str, Any]], None]]] = {
 }
 
 
-def test_bad_trees(tmp_path: Path) -> None:
-    for folder, name in with_folders(tmp_path, TREES):
-        _check_bad_trees(folder, name)
-
-
-def _check_bad_trees(tmp_path: Path, name: str) -> None:
+@for_each("name", TREES)
+def test_bad_trees(tmp_path: Path, name: str) -> None:
     reason, change = TREES[name]
     tree, buffer = _broken_tree(change)
     assert reason_of(write_glb(tmp_path / "a.glb", tree, buffer)) == reason
@@ -130,14 +126,8 @@ HARMLESS: dict[str, Callable[[dict[str, Any]], None]] = {
 }
 
 
-def test_what_changes_no_vertex_is_read_as_if_it_were_not_there(tmp_path: Path) -> None:
-    for folder, name in with_folders(tmp_path, HARMLESS):
-        _check_what_changes_no_vertex_is_read_as_if_it_were_not_there(folder, name)
-
-
-def _check_what_changes_no_vertex_is_read_as_if_it_were_not_there(
-    tmp_path: Path, name: str
-) -> None:
+@for_each("name", HARMLESS)
+def test_what_changes_no_vertex_is_read_as_if_it_were_not_there(tmp_path: Path, name: str) -> None:
     tree, buffer = _broken_tree(HARMLESS[name])
     changed = prepare(write_glb(tmp_path / "a.glb", tree, buffer))
     plain = prepare(write_glb(tmp_path / "b.glb", *gltf_tree(BALL)))
@@ -163,24 +153,20 @@ def test_instances_count_as_faces(tmp_path: Path) -> None:
     assert reason_of(path, AssetSettings(max_source_faces=7999)) == "too_many_faces"
 
 
-def test_buffers_do_not_lead_out(tmp_path: Path) -> None:
-    for folder, uri in with_folders(
-        tmp_path,
-        [
-            "../secret.bin",
-            "a/../../secret.bin",
-            "%2e%2e/secret.bin",
-            "/etc/hostname",
-            "file:///etc/hostname",
-            "http://127.0.0.1:1/a.bin",
-            "//host/a.bin",
-            "link.bin",
-        ],
-    ):
-        _check_buffers_do_not_lead_out(folder, uri)
-
-
-def _check_buffers_do_not_lead_out(tmp_path: Path, uri: str) -> None:
+@for_each(
+    "uri",
+    [
+        "../secret.bin",
+        "a/../../secret.bin",
+        "%2e%2e/secret.bin",
+        "/etc/hostname",
+        "file:///etc/hostname",
+        "http://127.0.0.1:1/a.bin",
+        "//host/a.bin",
+        "link.bin",
+    ],
+)
+def test_buffers_do_not_lead_out(tmp_path: Path, uri: str) -> None:
     (tmp_path / "secret.bin").write_bytes(bytes(10_000))
     folder = tmp_path / "objects"
     folder.mkdir()

@@ -2,8 +2,6 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.quality.parts import Parts, label_parts
 from pipeline.assets.quality.silhouette import intersection_over_union, silhouette
 from pipeline.assets.quality.triangles import area_variation, count_edges, smallest_angles_deg
+from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import cleaned, cube, joined, knot, moved, sphere
 from tests.pipeline.assets.quality.test_gate import sheet
 
@@ -39,12 +38,8 @@ def angles_of(corners: list[list[float]]) -> list[float]:
     return angles
 
 
-def test_smallest_angles() -> None:
-    for name in MESHES:
-        _check_smallest_angles(name)
-
-
-def _check_smallest_angles(name: str) -> None:
+@for_each("name", MESHES)
+def test_smallest_angles(name: str) -> None:
     mesh = MESHES[name]
     slow = [min(angles_of(corners)) for corners in mesh.corners.tolist()]
     np.testing.assert_allclose(smallest_angles_deg(mesh), slow, rtol=1e-9)  # double precision
@@ -61,12 +56,8 @@ def test_angles_of_known_triangles() -> None:
     np.testing.assert_allclose(smallest_angles_deg(mesh), expected, rtol=1e-3)
 
 
-def test_area_variation() -> None:
-    for name in MESHES:
-        _check_area_variation(name)
-
-
-def _check_area_variation(name: str) -> None:
+@for_each("name", MESHES)
+def test_area_variation(name: str) -> None:
     areas = []
     for a, b, c in MESHES[name].corners.tolist():
         sides = [math.dist(a, b), math.dist(b, c), math.dist(c, a)]
@@ -78,18 +69,16 @@ def _check_area_variation(name: str) -> None:
     assert area_variation(MESHES[name]) == pytest.approx(expected, rel=1e-6, abs=1e-7)
 
 
-def test_edges() -> None:
-    cases: Iterable[Any] = [
+@for_each(
+    ("name", "expected"),
+    [
         ("knot", (0, 0, 2)),
         ("cube", (48, 0, 2)),
         ("fan", (6, 1, 3)),
         ("sheet", (24, 0, 2)),
-    ]
-    for case in cases:
-        _check_edges(*case)
-
-
-def _check_edges(name: str, expected: tuple[int, int, int]) -> None:
+    ],
+)
+def test_edges(name: str, expected: tuple[int, int, int]) -> None:
     mesh = MESHES[name]
     shared = Counter(
         frozenset(pair) for a, b, c in mesh.faces.tolist() for pair in ((a, b), (b, c), (c, a))

@@ -16,7 +16,7 @@ import pytest
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings, GateSettings
 from storage.errors import Rejected
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import (
     gltf_tree,
     knot,
@@ -65,12 +65,8 @@ OFF_FILES: dict[str, tuple[str, TriangleMesh]] = {
 }
 
 
-def test_bad_numbers(tmp_path: Path) -> None:
-    for folder, name in with_folders(tmp_path, OFF_FILES):
-        _check_bad_numbers(folder, name)
-
-
-def _check_bad_numbers(tmp_path: Path, name: str) -> None:
+@for_each("name", OFF_FILES)
+def test_bad_numbers(tmp_path: Path, name: str) -> None:
     reason, mesh = OFF_FILES[name]
     assert reason_of(write_off(tmp_path / "a.off", mesh)) == reason
 
@@ -109,14 +105,11 @@ def _zip(data: bytes) -> bytes:
     return stream.getvalue()
 
 
-def test_archives_are_not_opened(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path, itertools.product([".obj", ".glb", ".stl", ".ply"], [_zip, _tar, gzip.compress])
-    ):
-        _check_archives_are_not_opened(folder, *case)
-
-
-def _check_archives_are_not_opened(
+@for_each(
+    ("suffix", "pack"),
+    itertools.product([".obj", ".glb", ".stl", ".ply"], [_zip, _tar, gzip.compress]),
+)
+def test_archives_are_not_opened(
     tmp_path: Path, suffix: str, pack: Callable[[bytes], bytes]
 ) -> None:
     path = tmp_path / f"a{suffix}"
@@ -188,12 +181,8 @@ RAW_FILES: dict[str, tuple[str, str, bytes]] = (
 )
 
 
-def test_bad_files(tmp_path: Path) -> None:
-    for folder, name in with_folders(tmp_path, RAW_FILES):
-        _check_bad_files(folder, name)
-
-
-def _check_bad_files(tmp_path: Path, name: str) -> None:
+@for_each("name", RAW_FILES)
+def test_bad_files(tmp_path: Path, name: str) -> None:
     reason, suffix, data = RAW_FILES[name]
     path = tmp_path / f"a{suffix}"
     path.write_bytes(data)
@@ -215,12 +204,8 @@ def test_files_that_were_cut_off(tmp_path: Path, keep: float) -> None:
         assert reason_of(path) in expected
 
 
-def test_limits_of_size(tmp_path: Path) -> None:
-    for folder, write in with_folders(tmp_path, [write_stl, write_ply, write_off, write_obj]):
-        _check_limits_of_size(folder, write)
-
-
-def _check_limits_of_size(tmp_path: Path, write: Callable[[Path, TriangleMesh], Path]) -> None:
+@for_each("write", [write_stl, write_ply, write_off, write_obj])
+def test_limits_of_size(tmp_path: Path, write: Callable[[Path, TriangleMesh], Path]) -> None:
     path = write(tmp_path / f"a.{write.__name__[-3:]}", BALL)
     assert reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
     small = AssetSettings(max_source_bytes=path.stat().st_size - 1)
@@ -241,12 +226,8 @@ def test_levels_beyond_the_bound_are_left_out(tmp_path: Path) -> None:
     assert [level.record.budget for level in asset.levels] == [1400]
 
 
-def test_what_is_no_file(tmp_path: Path) -> None:
-    for folder, make in with_folders(tmp_path, ["nothing", "folder", "pipe", "link to nothing"]):
-        _check_what_is_no_file(folder, make)
-
-
-def _check_what_is_no_file(tmp_path: Path, make: str) -> None:
+@for_each("make", ["nothing", "folder", "pipe", "link to nothing"])
+def test_what_is_no_file(tmp_path: Path, make: str) -> None:
     path = tmp_path / "a.obj"
     if make == "folder":
         path.mkdir()

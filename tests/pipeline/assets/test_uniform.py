@@ -8,7 +8,7 @@ import pytest
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings
 from storage.records.asset import LevelQuality
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import cube, knot, moved, prepare, sphere, write_obj
 
 UNIFORM = "pymeshlab_uniform"
@@ -62,14 +62,10 @@ def test_a_coarse_box_gains_triangles(tmp_path: Path) -> None:
         assert level.record.quality.min_angle_p5_deg > 25
 
 
-def test_budgets_hold(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path, [(knot(), 240), (stretched_sphere(), 500), (cube(), 2000), (sphere(), 3000)]
-    ):
-        _check_budgets_hold(folder, *case)
-
-
-def _check_budgets_hold(tmp_path: Path, mesh: TriangleMesh, budget: int) -> None:
+@for_each(
+    ("mesh", "budget"), [(knot(), 240), (stretched_sphere(), 500), (cube(), 2000), (sphere(), 3000)]
+)
+def test_budgets_hold(tmp_path: Path, mesh: TriangleMesh, budget: int) -> None:
     path = write_obj(tmp_path / "a.obj", mesh)
     settings = AssetSettings(profile="uniform", budgets=(budget,))
     (level,) = prepare(path, settings, UNIFORM).levels

@@ -14,7 +14,7 @@ from pipeline.assets.reading.load import load_mesh
 from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings
 from storage.records.asset import decode_asset
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.pipeline.assets.child_kit import Bench
 from tests.pipeline.assets.meshes_by_hand import as_rows, cube, geometry, moved, prepare, reason_of
 from tests.pipeline.assets.own.textured_kit import CORNERS, KEEP, UV_UP, lost, picture_bytes
@@ -77,12 +77,8 @@ def _turned_round(mesh: TriangleMesh) -> float:
     return float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
 
 
-def test_windings_stay_outward(tmp_path: Path) -> None:
-    for folder, case in with_folders(tmp_path, itertools.product([False, True], [False, True])):
-        _check_windings_stay_outward(folder, *case)
-
-
-def _check_windings_stay_outward(tmp_path: Path, left_handed: bool, mirrored: bool) -> None:
+@for_each(("left_handed", "mirrored"), itertools.product([False, True], [False, True]))
+def test_windings_stay_outward(tmp_path: Path, left_handed: bool, mirrored: bool) -> None:
     stage = new_stage()
     mesh = BOX if not left_handed else dataclasses.replace(BOX, faces=BOX.faces[:, ::-1])
     made = usd_mesh(stage, mesh)
@@ -147,12 +143,8 @@ REFUSED: dict[str, tuple[str, Callable[[Usd.Stage], object]]] = {
 }
 
 
-def test_what_would_give_another_mesh_is_refused(tmp_path: Path) -> None:
-    for folder, name in with_folders(tmp_path, REFUSED):
-        _check_what_would_give_another_mesh_is_refused(folder, name)
-
-
-def _check_what_would_give_another_mesh_is_refused(tmp_path: Path, name: str) -> None:
+@for_each("name", REFUSED)
+def test_what_would_give_another_mesh_is_refused(tmp_path: Path, name: str) -> None:
     reason, change = REFUSED[name]
     folder = tmp_path / "objects"
     folder.mkdir()

@@ -16,6 +16,7 @@ from pipeline.scenes.pool import PooledAsset
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.records.scene import Scene
+from tests.for_each import for_each
 from tests.scene_templates.balls import template_settings
 
 BLIND = {
@@ -48,12 +49,8 @@ PROVOKED: list[tuple[str, str, Mapping[str, Any], str]] = [
 ]
 
 
-def test_each_reason_is_given_where_it_holds(pool: list[PooledAsset]) -> None:
-    for case in PROVOKED:
-        _check_each_reason_is_given_where_it_holds(pool, *case)
-
-
-def _check_each_reason_is_given_where_it_holds(
+@for_each(("reason", "template", "changes", "message"), PROVOKED)
+def test_each_reason_is_given_where_it_holds(
     pool: list[PooledAsset], reason: str, template: str, changes: Mapping[str, Any], message: str
 ) -> None:
     settings = template_settings(template, changes)

@@ -15,6 +15,7 @@ from storage.errors import Rejected
 from storage.licences import share_alike_camp
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
+from tests.for_each import for_each
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 
 LICENCES = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC0-1.0", "cc-by-sa-4.0", "GPL-3.0-only")
@@ -58,13 +59,9 @@ def test_the_first_object_is_drawn_evenly_whatever_its_licence() -> None:
     assert all(310 < firsts[row] < 490 for row in range(5))
 
 
-def test_what_is_drawn_fits_though_the_simplest_may_be_of_the_other_camp() -> None:
+@for_each("seed", range(20))
+def test_what_is_drawn_fits_though_the_simplest_may_be_of_the_other_camp(seed: int) -> None:
     """Entry 0 alone is small, and may not stand beside b, of which three do not fit."""
-    for seed in range(20):
-        _check_what_is_drawn_fits_though_the_simplest_may_be_of_the_other_camp(seed)
-
-
-def _check_what_is_drawn_fits_though_the_simplest_may_be_of_the_other_camp(seed: int) -> None:
     rng = np.random.default_rng(seed)
     sizes, camps = [1, 10, 12, 30], ["a", "b", "", "a"]
     rows = drawn_within(rng, range(4), sizes, 3, 28, camps)

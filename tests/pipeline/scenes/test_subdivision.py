@@ -13,6 +13,7 @@ from pipeline.scenes.subdivision import filled, subdivided
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from scene_templates.rooms import PATCH_FACES, SIDES, PatchPlacement, patch
 from storage.records.scene import SceneObject
+from tests.for_each import for_each
 
 ROUNDING = 1e-6
 """Positions below 1 are float32, good to 6e-8; areas and distances are a few sums of them."""
@@ -92,13 +93,9 @@ def test_the_number_is_met_to_within_one_edge_and_what_was_closed_stays_closed()
             assert set(_edges(after).values()) == {2} or name not in CLOSED, where
 
 
-def test_the_surface_stays_where_it_is_with_its_materials() -> None:
+@for_each("name", ALL)
+def test_the_surface_stays_where_it_is_with_its_materials(name: str) -> None:
     """Each part lies in one old triangle: in its plane, inside it, of its material and side."""
-    for name in ALL:
-        _check_the_surface_stays_where_it_is_with_its_materials(name)
-
-
-def _check_the_surface_stays_where_it_is_with_its_materials(name: str) -> None:
     piece = _piece(ALL[name], smooth=True)
     after = subdivided(piece, 200)
     old, new = _corners(piece), _corners(after)

@@ -18,6 +18,7 @@ from scene_templates.textures import TextureSettings
 from storage.records.material import default_rows
 from storage.records.scene import Scene, SceneObject
 from storage.settings.changes import changed
+from tests.for_each import for_each
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scene_templates.statistics import require_plausible, share
 
@@ -64,12 +65,8 @@ def test_the_share_is_left_out_of_the_settings_where_it_is_none() -> None:
     assert widths == 64
 
 
-def test_the_sides_of_a_cube_show_a_texture_upright_and_unmirrored() -> None:
-    for side in range(6):
-        _check_the_sides_of_a_cube_show_a_texture_upright_and_unmirrored(side)
-
-
-def _check_the_sides_of_a_cube_show_a_texture_upright_and_unmirrored(side: int) -> None:
+@for_each("side", range(6))
+def test_the_sides_of_a_cube_show_a_texture_upright_and_unmirrored(side: int) -> None:
     axis, sign = side // 2, 1 if side % 2 == 0 else -1
     normal = sign * np.eye(3)[axis]
     up = np.array([0.0, 1, 0]) if axis == 2 else np.array([0.0, 0, 1])

@@ -1,11 +1,9 @@
 """Colours of black bodies, against Planck's law and the observer of 1931."""
 
-from collections.abc import Iterable
-from typing import Any
-
 import numpy as np
 
 from scene_templates.skies.colour import COOLEST_MIRED, WARMEST_MIRED, planckian_rgb
+from tests.for_each import for_each
 
 WAVELENGTHS_NM = np.arange(380.0, 781.0)
 _XYZ_TO_REC709 = np.linalg.inv(
@@ -32,13 +30,8 @@ OBSERVER = np.stack(
 """The fit of Wyman et al. (2013), table 1."""
 
 
-def test_a_black_body_has_the_colour_of_plancks_law() -> None:
-    cases: Iterable[Any] = [COOLEST_MIRED, 80, 153.8, 249, 251, 300, 400, 449, 451, 499]
-    for mired in cases:
-        _check_a_black_body_has_the_colour_of_plancks_law(mired)
-
-
-def _check_a_black_body_has_the_colour_of_plancks_law(mired: float) -> None:
+@for_each("mired", [COOLEST_MIRED, 80, 153.8, 249, 251, 300, 400, 449, 451, 499])
+def test_a_black_body_has_the_colour_of_plancks_law(mired: float) -> None:
     metres = WAVELENGTHS_NM * 1e-9
     spectrum = metres**-5 / np.expm1(0.014387769 / metres / (1e6 / mired))
     rgb = _XYZ_TO_REC709 @ (OBSERVER @ spectrum)

@@ -1,6 +1,5 @@
 """`draw_sky`: which families, how bright, and what is refused."""
 
-from collections.abc import Iterable
 from typing import Any
 
 import pytest
@@ -10,6 +9,7 @@ from scene_templates.skies.families import OUR_SKIES, SKIES
 from storage.errors import TrilightError
 from storage.seeds import rng_for
 from storage.settings.described import described
+from tests.for_each import for_each
 from tests.scene_templates.statistics import choices, require_plausible, share, uniform
 
 
@@ -30,8 +30,9 @@ def test_all_of_ours_are_drawn_by_default() -> None:
     assert SkyMapSettings().families == OUR_SKIES == tuple(SKIES)
 
 
-def test_a_contradiction_is_one_line_that_names_its_field() -> None:
-    cases: Iterable[Any] = [
+@for_each(
+    ("name", "value"),
+    [
         ("families", ()),
         ("families", ("fog",)),
         ("height", 0),
@@ -41,12 +42,9 @@ def test_a_contradiction_is_one_line_that_names_its_field() -> None:
         ("coloured_share", 2.0),
         ("sun_elevation_deg", (0.0, 91.0)),
         ("sun_to_sky", (2.0, 1.0)),
-    ]
-    for case in cases:
-        _check_a_contradiction_is_one_line_that_names_its_field(*case)
-
-
-def _check_a_contradiction_is_one_line_that_names_its_field(name: str, value: Any) -> None:
+    ],
+)
+def test_a_contradiction_is_one_line_that_names_its_field(name: str, value: Any) -> None:
     with pytest.raises(TrilightError) as caught:
         SkyMapSettings(**{name: value})
     message = str(caught.value)

@@ -1,14 +1,13 @@
 """Texels of the sphere: orientation, solid angles, shapes with exact flux, noise without a seam."""
 
 import math
-from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import pytest
 
 from scene_templates.skies.texels import SkyTexels
 from storage.seeds import rng_for
+from tests.for_each import for_each
 
 
 def uv_of(direction: np.ndarray) -> tuple[float, float]:
@@ -22,20 +21,18 @@ def _unit(seed: int) -> np.ndarray:
     return vector / np.sqrt(np.square(vector).sum())
 
 
-def test_orientation_is_blenders() -> None:
-    cases: Iterable[Any] = [
+@for_each(
+    ("u", "v", "axis"),
+    [
         (0.5, 0.5, (1, 0, 0)),
         (0.25, 0.5, (0, 1, 0)),
         (0.75, 0.5, (0, -1, 0)),
         (0.0, 0.5, (-1, 0, 0)),
         (0.5, 1.0, (0, 0, 1)),
         (0.5, 0.0, (0, 0, -1)),
-    ]
-    for case in cases:
-        _check_orientation_is_blenders(*case)
-
-
-def _check_orientation_is_blenders(u: float, v: float, axis: tuple[int, int, int]) -> None:
+    ],
+)
+def test_orientation_is_blenders(u: float, v: float, axis: tuple[int, int, int]) -> None:
     height = 64
     row, column = min(int((1 - v) * height), height - 1), int(u * 2 * height)
     found = SkyTexels(height).directions[row, column]
@@ -54,13 +51,8 @@ def test_texel_centres_are_where_the_convention_shows_them() -> None:
             assert (1 - v) * height == pytest.approx(row + 0.5, abs=1e-9)
 
 
-def test_solid_angles_sum_to_the_sphere() -> None:
-    cases: Iterable[Any] = [1, 2, 7, 64]
-    for height in cases:
-        _check_solid_angles_sum_to_the_sphere(height)
-
-
-def _check_solid_angles_sum_to_the_sphere(height: int) -> None:
+@for_each("height", [1, 2, 7, 64])
+def test_solid_angles_sum_to_the_sphere(height: int) -> None:
     texels = SkyTexels(height)
     ones = np.ones((height, 2 * height))
     assert float(texels.flux(ones)) == pytest.approx(4 * math.pi, rel=1e-13)
@@ -73,13 +65,8 @@ def test_a_white_sky_sends_pi_onto_the_ground() -> None:
     np.testing.assert_allclose(found, math.pi, rtol=5e-4)
 
 
-def test_a_spot_has_unit_flux_and_is_where_it_should_be() -> None:
-    cases: Iterable[Any] = [1, 2, 8, 33, 64, 256]
-    for height in cases:
-        _check_a_spot_has_unit_flux_and_is_where_it_should_be(height)
-
-
-def _check_a_spot_has_unit_flux_and_is_where_it_should_be(height: int) -> None:
+@for_each("height", [1, 2, 8, 33, 64, 256])
+def test_a_spot_has_unit_flux_and_is_where_it_should_be(height: int) -> None:
     texels = SkyTexels(height)
     for seed in range(12):
         towards = _unit(seed) if seed else np.array([0.0, 0.0, 1.0])

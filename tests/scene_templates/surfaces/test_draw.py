@@ -1,6 +1,5 @@
 """`draw_surface`: which families, which sizes, and what is refused."""
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from scene_templates.surfaces.families import OUR_SURFACES, SURFACES
 from storage.errors import TrilightError
 from storage.seeds import rng_for
 from storage.settings.described import described
+from tests.for_each import for_each
 from tests.scene_templates.statistics import choices, require_plausible, share
 
 
@@ -42,8 +42,9 @@ def test_colours_that_are_not_natural_are_in_the_stated_range() -> None:
     assert np.ptp(maps.diffuse_rgb, axis=-1).max() == 0
 
 
-def test_a_contradiction_is_one_line_that_names_its_field() -> None:
-    cases: Iterable[Any] = [
+@for_each(
+    ("name", "value"),
+    [
         ("families", ()),
         ("families", ("gold",)),
         ("size", 0),
@@ -54,12 +55,9 @@ def test_a_contradiction_is_one_line_that_names_its_field() -> None:
         ("albedo", (0.5, 0.1)),
         ("albedo", (0.0, 1.0)),
         ("roughness_clip", (0.0, 1.5)),
-    ]
-    for case in cases:
-        _check_a_contradiction_is_one_line_that_names_its_field(*case)
-
-
-def _check_a_contradiction_is_one_line_that_names_its_field(name: str, value: Any) -> None:
+    ],
+)
+def test_a_contradiction_is_one_line_that_names_its_field(name: str, value: Any) -> None:
     with pytest.raises(TrilightError) as caught:
         SurfaceMapSettings(**{name: value})
     message = str(caught.value)

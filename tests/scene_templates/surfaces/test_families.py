@@ -17,6 +17,7 @@ from scene_templates.surfaces.texels import Texels
 from storage.seeds import rng_for
 from storage.settings.changes import changed
 from tests.extensions_kit import loaded, written
+from tests.for_each import for_each
 from tests.scene_templates.named_draws import merged, stated_table
 from tests.scene_templates.statistics import require_plausible
 
@@ -33,13 +34,9 @@ def _all_three(maps: SurfaceMaps) -> NDArray[np.float32]:
     return np.concatenate([maps.diffuse_rgb, maps.specular_rgb, maps.roughness], axis=-1)
 
 
-def test_parameters_are_distributed_as_stated() -> None:
+@for_each("family", OUR_SURFACES)
+def test_parameters_are_distributed_as_stated(family: str) -> None:
     """At one texel, where a family draws the same and makes no picture."""
-    for family in OUR_SURFACES:
-        _check_parameters_are_distributed_as_stated(family)
-
-
-def _check_parameters_are_distributed_as_stated(family: str) -> None:
 
     def made(seed: int, natural_share: float) -> SurfaceDraws:
         rng = rng_for(seed, "surface", int(natural_share))
@@ -53,12 +50,8 @@ def _check_parameters_are_distributed_as_stated(family: str) -> None:
         require_plausible(stated_table(found))
 
 
-def test_albedos_and_roughness_are_lawful() -> None:
-    for family in OUR_SURFACES:
-        _check_albedos_and_roughness_are_lawful(family)
-
-
-def _check_albedos_and_roughness_are_lawful(family: str) -> None:
+@for_each("family", OUR_SURFACES)
+def test_albedos_and_roughness_are_lawful(family: str) -> None:
     for size in (1, 2, 8):
         maps = _surface(family, 0, size=size)
         assert np.isfinite(_all_three(maps)).all()
@@ -91,13 +84,10 @@ class Shifted(Texels):
         return super().v + self.moved[1]
 
 
-def test_every_surface_repeats_in_both_directions() -> None:
+@for_each("family", OUR_SURFACES)
+def test_every_surface_repeats_in_both_directions(family: str) -> None:
     """Seen three texels further right, five further down and whole turns away: the same, rolled."""
-    for family in OUR_SURFACES:
-        _require_repeating(family)
 
-
-def _require_repeating(family: str) -> None:
     def made(texels: Texels) -> Finish:
         draws = SurfaceDraws(rng_for(7, "surface"), natural_share=1.0, albedo=ALBEDO)
         return SURFACES[family](draws, texels)
@@ -115,13 +105,9 @@ def _require_repeating(family: str) -> None:
         assert np.abs(rolled - (other + whole)).max() < 1e-9, family
 
 
-def test_the_same_seed_is_the_same_surface_at_every_size() -> None:
+@for_each("family", OUR_SURFACES)
+def test_the_same_seed_is_the_same_surface_at_every_size(family: str) -> None:
     """A finer map, averaged, is the coarse one but for what the coarse one cannot show."""
-    for family in OUR_SURFACES:
-        _check_the_same_seed_is_the_same_surface_at_every_size(family)
-
-
-def _check_the_same_seed_is_the_same_surface_at_every_size(family: str) -> None:
     coarse, fine = _surface(family, 0, size=128), _surface(family, 0, size=256)
     assert coarse.parameters == fine.parameters
     averaged = fine.diffuse_rgb.reshape(128, 2, 128, 2, 3).mean(axis=(1, 3), dtype=float)

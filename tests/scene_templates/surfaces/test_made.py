@@ -1,8 +1,5 @@
 """Rust covers the share that is drawn; threads that are too fine to show keep their mean."""
 
-from collections.abc import Iterable
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -10,15 +7,11 @@ from scene_templates.surfaces.draw import SurfaceMapSettings, draw_surface
 from scene_templates.surfaces.made import exceeded_by
 from scene_templates.surfaces.texels import Texels
 from storage.seeds import rng_for
+from tests.for_each import for_each
 
 
-def test_a_level_is_exceeded_by_its_share() -> None:
-    cases: Iterable[Any] = [0.0, 0.1, 0.5, 1.0]
-    for share in cases:
-        _check_a_level_is_exceeded_by_its_share(share)
-
-
-def _check_a_level_is_exceeded_by_its_share(share: float) -> None:
+@for_each("share", [0.0, 0.1, 0.5, 1.0])
+def test_a_level_is_exceeded_by_its_share(share: float) -> None:
     noise = Texels(64).noise(rng_for(0, "noise"), (4, 4), octaves=3)
     # of 4,096 values, the one at the level itself does not exceed it
     assert (noise > exceeded_by(noise, share)).mean() == pytest.approx(share, abs=2 / 4096)

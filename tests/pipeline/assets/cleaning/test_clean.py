@@ -1,13 +1,12 @@
 """Cleaning is exact: it forgets scale, place and order, and keeps every real triangle."""
 
 import itertools
-from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
 from pipeline.assets.cleaning.clean import GRID, geometry_sha256
 from pipeline.assets.mesh import TriangleMesh
+from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import as_rows, cleaned, knot, sphere
 
 
@@ -28,13 +27,8 @@ def test_positions_survive_float32() -> None:
     assert np.array_equal(positions.astype(np.float32).astype(np.float64), positions)
 
 
-def test_scale_and_offset_are_forgotten() -> None:
-    cases: Iterable[Any] = itertools.product([1e-6, 0.37, 4.0, 1e7], [0.0, 12.3])
-    for case in cases:
-        _check_scale_and_offset_are_forgotten(*case)
-
-
-def _check_scale_and_offset_are_forgotten(scale: float, offset: float) -> None:
+@for_each(("scale", "offset"), itertools.product([1e-6, 0.37, 4.0, 1e7], [0.0, 12.3]))
+def test_scale_and_offset_are_forgotten(scale: float, offset: float) -> None:
     mesh = knot()
     moved = TriangleMesh(positions=(mesh.positions + offset) * scale, faces=mesh.faces)
     assert same(cleaned(moved), cleaned(mesh))

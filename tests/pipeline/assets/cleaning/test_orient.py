@@ -1,13 +1,12 @@
 """Whatever the windings were, faces end up counter-clockwise from outside."""
 
 import itertools
-from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.mesh import TriangleMesh
+from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import cleaned, flip_some, knot, sphere, volume
 
 
@@ -15,13 +14,8 @@ def oriented(mesh: TriangleMesh) -> TriangleMesh:
     return orient_outward(cleaned(mesh))[0]
 
 
-def test_flipped_faces_are_turned_back() -> None:
-    cases: Iterable[Any] = itertools.product([0.0, 0.3, 1.0], [sphere(), knot()])
-    for case in cases:
-        _check_flipped_faces_are_turned_back(*case)
-
-
-def _check_flipped_faces_are_turned_back(share: float, mesh: TriangleMesh) -> None:
+@for_each(("share", "mesh"), itertools.product([0.0, 0.3, 1.0], [sphere(), knot()]))
+def test_flipped_faces_are_turned_back(share: float, mesh: TriangleMesh) -> None:
     right = cleaned(mesh).faces
     flipped = oriented(flip_some(mesh, share, np.random.default_rng(2)))
     assert np.array_equal(flipped.faces, right)

@@ -1,7 +1,6 @@
 """The search for the fewest triangles: near the best for any law of errors, and never a failure."""
 
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
@@ -9,6 +8,7 @@ from hypothesis import strategies as st
 
 from pipeline.assets.decimation.smallest import smallest_passing
 from storage.errors import Rejected
+from tests.for_each import for_each
 
 
 def counted(passes: Callable[[int], bool]) -> tuple[Callable[[int], int], list[int]]:
@@ -63,12 +63,7 @@ def test_other_errors_are_not_taken_for_failures() -> None:
         smallest_passing(attempt, 1000)
 
 
-def test_the_smallest_budgets() -> None:
-    cases: Iterable[Any] = [1, 2, 3, 4, 5]
-    for largest in cases:
-        _check_the_smallest_budgets(largest)
-
-
-def _check_the_smallest_budgets(largest: int) -> None:
+@for_each("largest", [1, 2, 3, 4, 5])
+def test_the_smallest_budgets(largest: int) -> None:
     attempt, _ = counted(lambda budget: True)
     assert smallest_passing(attempt, largest) == min(largest, 4)

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.assets.own.picture import Picture
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from storage.conventions import linear_from_srgb8
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import prepare as prepare_asset
 from tests.pipeline.assets.meshes_by_hand import reason_of, write_glb
 from tests.pipeline.assets.own.textured_kit import (
@@ -57,12 +57,8 @@ UNREADABLE: dict[str, tuple[str, bytes]] = {
 }
 
 
-def test_bad_pictures_are_lost_with_a_reason(tmp_path: Path) -> None:
-    for folder, name in with_folders(tmp_path, UNREADABLE):
-        _check_bad_pictures_are_lost_with_a_reason(folder, name)
-
-
-def _check_bad_pictures_are_lost_with_a_reason(tmp_path: Path, name: str) -> None:
+@for_each("name", UNREADABLE)
+def test_bad_pictures_are_lost_with_a_reason(tmp_path: Path, name: str) -> None:
     reason, data = UNREADABLE[name]
     path = textured_glb(tmp_path / "a.glb", data)
     assert lost(path) == reason
@@ -106,12 +102,8 @@ OUTSIDE = [
 ]
 
 
-def test_pictures_do_not_lead_out(tmp_path: Path) -> None:
-    for folder, uri in with_folders(tmp_path, OUTSIDE):
-        _check_pictures_do_not_lead_out(folder, uri)
-
-
-def _check_pictures_do_not_lead_out(tmp_path: Path, uri: str) -> None:
+@for_each("uri", OUTSIDE)
+def test_pictures_do_not_lead_out(tmp_path: Path, uri: str) -> None:
     (tmp_path / "secret.png").write_bytes(picture_bytes(CORNERS))
     folder = tmp_path / "objects"
     folder.mkdir()
@@ -186,12 +178,8 @@ FORMS: dict[str, bytes] = {
 }
 
 
-def test_forms_of_pictures(tmp_path: Path) -> None:
-    for folder, form in with_folders(tmp_path, FORMS):
-        _check_forms_of_pictures(folder, form)
-
-
-def _check_forms_of_pictures(tmp_path: Path, form: str) -> None:
+@for_each("form", FORMS)
+def test_forms_of_pictures(tmp_path: Path, form: str) -> None:
     asset = prepare_asset(textured_glb(tmp_path / "a.glb", FORMS[form]), KEEP)
     places = {(-0.25, 0.25): 40, (0.25, 0.25): 200, (-0.25, -0.25): 120, (0.25, -0.25): 250}
     for place, code in places.items():

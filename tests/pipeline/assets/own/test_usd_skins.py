@@ -10,7 +10,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 from storage.conventions import linear_from_srgb8
 from storage.records.asset import Asset
-from tests.for_each import with_folders
+from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import geometry, prepare, sphere, write_glb
 from tests.pipeline.assets.own.test_own_skins import SLOPE, STORED, F
 from tests.pipeline.assets.own.textured_kit import (
@@ -46,13 +46,9 @@ def assert_corners(asset: Asset) -> None:
         assert np.abs(seen_at(asset, right, up) - wanted).max() < SLOPE, (right, up)
 
 
-def test_a_quad_keeps_its_corner_colours(tmp_path: Path) -> None:
+@for_each("suffix", ["usda", "usdc", "usd", "usdz"])
+def test_a_quad_keeps_its_corner_colours(tmp_path: Path, suffix: str) -> None:
     """In every form of the file, in centimetres with Y up."""
-    for folder, suffix in with_folders(tmp_path, ["usda", "usdc", "usd", "usdz"]):
-        _check_a_quad_keeps_its_corner_colours(folder, suffix)
-
-
-def _check_a_quad_keeps_its_corner_colours(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
     picture = picture_bytes(CORNERS)
     assert_corners(prepare(textured_usd(path, picture, y_up=True, unit=0.01), KEEP))
@@ -148,23 +144,19 @@ GREY = np.full((2, 2, 3), 128, np.uint8)
 GREY[0, 0] = 129  # else it is a constant
 
 
-def test_the_colour_space_of_the_shader_counts(tmp_path: Path) -> None:
-    """And not what the picture says of itself: this one claims to be linear."""
-    for folder, case in with_folders(
-        tmp_path,
-        [
-            ("sRGB", False, linear_from_srgb8()[128]),
-            ("raw", False, 128 / 255),
-            (None, False, linear_from_srgb8()[128]),
-            (None, True, 128 / 255),
-        ],
-    ):
-        _check_the_colour_space_of_the_shader_counts(folder, *case)
-
-
-def _check_the_colour_space_of_the_shader_counts(
+@for_each(
+    ("space", "grey", "linear"),
+    [
+        ("sRGB", False, linear_from_srgb8()[128]),
+        ("raw", False, 128 / 255),
+        (None, False, linear_from_srgb8()[128]),
+        (None, True, 128 / 255),
+    ],
+)
+def test_the_colour_space_of_the_shader_counts(
     tmp_path: Path, space: str | None, grey: bool, linear: float
 ) -> None:
+    """And not what the picture says of itself: this one claims to be linear."""
 
     def state(stage: Usd.Stage) -> None:
         if space:
@@ -192,12 +184,8 @@ def test_scale_and_bias_and_a_single_channel(tmp_path: Path) -> None:
     assert np.abs(seen_at(asset, -0.25, -0.25) - 0.25 * (1 - F)).max() < SLOPE  # red
 
 
-def test_wrap_modes_beyond_the_picture(tmp_path: Path) -> None:
-    for folder, wrap in with_folders(tmp_path, ["repeat", "mirror", "clamp", "black"]):
-        _check_wrap_modes_beyond_the_picture(folder, wrap)
-
-
-def _check_wrap_modes_beyond_the_picture(tmp_path: Path, wrap: str) -> None:
+@for_each("wrap", ["repeat", "mirror", "clamp", "black"])
+def test_wrap_modes_beyond_the_picture(tmp_path: Path, wrap: str) -> None:
     def state(stage: Usd.Stage) -> None:
         set_inputs(stage, TEXTURE, {"wrapS": wrap, "wrapT": "clamp"})
 

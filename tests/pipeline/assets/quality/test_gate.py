@@ -1,8 +1,7 @@
 """The gate: a spoilt result is refused by the name of what is wrong, a good one is measured."""
 
 import itertools
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.settings import GateSettings
 from storage.errors import Rejected
 from storage.records.asset import LevelQuality
+from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import (
     cleaned,
     cube,
@@ -80,12 +80,8 @@ SPOILT: dict[str, tuple[str, TriangleMesh, Spoil]] = {
 }
 
 
-def test_the_gate_names_what_is_wrong() -> None:
-    for name in SPOILT:
-        _check_the_gate_names_what_is_wrong(name)
-
-
-def _check_the_gate_names_what_is_wrong(name: str) -> None:
+@for_each("name", SPOILT)
+def test_the_gate_names_what_is_wrong(name: str) -> None:
     reason, source, spoil = SPOILT[name]
     with pytest.raises(Rejected) as caught:
         gate(source, spoil(source))
@@ -105,14 +101,9 @@ def test_each_limit_alone_decides(name: str) -> None:
     gate(source, spoil(source), **lifted)
 
 
-def test_a_vertex_may_leave_the_box_by_one_percent() -> None:
+@for_each(("side", "axis"), itertools.product([-1, 1], [0, 1, 2]))
+def test_a_vertex_may_leave_the_box_by_one_percent(side: int, axis: int) -> None:
     """Of the diagonal: rounded shapes bulge a little when their vertices are placed freely."""
-    cases: Iterable[Any] = itertools.product([-1, 1], [0, 1, 2])
-    for case in cases:
-        _check_a_vertex_may_leave_the_box_by_one_percent(*case)
-
-
-def _check_a_vertex_may_leave_the_box_by_one_percent(side: int, axis: int) -> None:
     ball = BALL.positions
     end = int(np.argmax(side * ball[:, axis]))
 
