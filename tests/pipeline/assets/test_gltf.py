@@ -1,4 +1,4 @@
-"""glTF trees that would load wrongly or reach outside are refused, each by its own name."""
+"""Files of glTF and of scenes that would load wrongly are refused, each by its own name."""
 
 import json
 from collections.abc import Callable
@@ -6,18 +6,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
+from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.reading.load import load_mesh
 from pipeline.assets.reading.source_file import read_source
+from pipeline.assets.scene_mesh import load_scene_mesh
 from pipeline.assets.settings import AssetSettings
+from storage.errors import Rejected
 from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import (
     geometry,
     gltf_tree,
+    knot,
     prepare,
     reason_of,
     sphere,
     write_glb,
+    write_obj,
 )
 
 BALL = sphere(rings=5, columns=8)
@@ -184,3 +190,30 @@ def test_a_missing_buffer_is_a_missing_file(tmp_path: Path) -> None:
     path = tmp_path / "a.gltf"
     path.write_text(json.dumps(tree))
     assert reason_of(path) == "missing_file"
+
+
+SETTINGS = AssetSettings()
+
+
+def test_remeshing_keeps_size_place_and_number(tmp_path: Path) -> None:
+    moved = TriangleMesh(positions=3 * knot().positions + [5, -2, 1], faces=knot().faces)
+    path = write_obj(tmp_path / "knot.obj", moved)
+    as_it_is = load_scene_mesh(path, SETTINGS, None).mesh
+    even = load_scene_mesh(path, SETTINGS, 1000).mesh
+    assert len(as_it_is.faces) == len(moved.faces)
+    assert 500 < len(even.faces) <= 1000
+    for end in ("min", "max"):
+        before, after = (getattr(mesh.positions, end)(axis=0) for mesh in (as_it_is, even))
+        # A thousand triangles cut the corners of a tube by a few percent of its box at most.
+        np.testing.assert_allclose(after, before, atol=0.03 * np.ptp(moved.positions))
+
+
+def test_a_mesh_without_area_cannot_be_remeshed(tmp_path: Path) -> None:
+    line = TriangleMesh(
+        positions=np.outer(np.arange(6.0), [1.0, 2.0, 3.0]), faces=np.array([[0, 1, 2], [3, 4, 5]])
+    )
+    path = write_obj(tmp_path / "line.obj", line)
+    assert len(load_scene_mesh(path, SETTINGS, None).mesh.faces) == 2
+    with pytest.raises(Rejected) as caught:
+        load_scene_mesh(path, SETTINGS, 100)
+    assert caught.value.reason == "remesh_failed"

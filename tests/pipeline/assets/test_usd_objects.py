@@ -15,7 +15,7 @@ from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings
 from storage.records.asset import decode_asset
 from tests.for_each import for_each
-from tests.pipeline.assets.child_kit import Bench
+from tests.pipeline.assets.child_kit import Bench, run
 from tests.pipeline.assets.meshes_by_hand import as_rows, cube, geometry, moved, prepare, reason_of
 from tests.pipeline.assets.own.textured_kit import CORNERS, KEEP, UV_UP, lost, picture_bytes
 from tests.pipeline.assets.own.usd_kit import (
@@ -28,7 +28,6 @@ from tests.pipeline.assets.own.usd_kit import (
     textured_usd,
     usd_mesh,
 )
-from tests.pipeline.assets.stage_kit import run
 
 SETTINGS = AssetSettings()
 BOX = moved(cube(), scale=[1.0, 0.5, 0.25])

@@ -1,9 +1,11 @@
-"""The door before Prefect's server: own names and own pages pass, all else is turned away."""
+"""Our Prefect server: own names and pages pass its door, and a port that is taken is told."""
 
 import asyncio
+import socket
 import stat
 import subprocess
 import sys
+import threading
 from collections.abc import MutableMapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ from typing import Any
 import pytest
 
 from pipeline.flows.guarded_server import Door
+from pipeline.flows.prefect_server import wait_until_healthy
 from storage.cache import open_private, private_folder
 from storage.errors import TrilightError
 from tests.for_each import for_each
@@ -111,3 +114,23 @@ def test_what_is_private_is_so_from_the_first_byte(tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match="shared by all users"):
         private_folder(folder)
     assert stat.S_IMODE(folder.stat().st_mode) == 0o1777
+
+
+def test_an_answer_that_is_no_http_is_not_our_server(tmp_path: Path) -> None:
+    """Seen once: a Dask scheduler answered, and the start ended in a traceback."""
+    ending = [sys.executable, "-c", "import time; time.sleep(0.5)"]
+    with socket.create_server(("127.0.0.1", 0)) as listener, subprocess.Popen(ending) as server:
+
+        def answer() -> None:
+            while True:
+                try:
+                    connection, _ = listener.accept()
+                except OSError:
+                    return
+                with connection:
+                    connection.sendall(b":\x00\x00\x00\x00compression\n\n")
+
+        threading.Thread(target=answer, daemon=True).start()
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        with pytest.raises(TrilightError, match="did not start"):
+            wait_until_healthy(url, server, tmp_path / "server.log")

@@ -1,8 +1,11 @@
-"""What is shown of a run: where the report is, an honest rate, and never the end of the run."""
+"""What is shown of a run, also by an array: an honest rate, the report, and never its end."""
 
 import base64
+import dataclasses
 import io
+import json
 import logging
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,13 +13,20 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipeline.flows import watching
+from pipeline.executors.arrays.job import ArrayJob
+from pipeline.executors.arrays.machines import ArrayMachines
+from pipeline.executors.arrays.order import DatasetByArray
+from pipeline.executors.arrays.submission import machines_here
+from pipeline.executors.registry import find_executor
+from pipeline.flows import array_flow, watching
+from pipeline.flows.array_flow import make_by_array
 from pipeline.flows.prefect_runner import PrefectRunner
 from pipeline.flows.watching import Watched, report_url, small_picture, usd_per_core_hour
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.run import TaskOutcome
 from storage.errors import TrilightError
 from tests.for_each import for_each
+from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
 @for_each(
@@ -131,3 +141,116 @@ def test_a_price_that_is_none_is_named_at_the_start(
     monkeypatch.setenv("TRILIGHT_USD_PER_CORE_HOUR", text)
     with pytest.raises(TrilightError, match=rf"TRILIGHT_USD_PER_CORE_HOUR is '{text}'; expected"):
         Watched(DatasetOrder())
+
+
+Shown = list[tuple[str, dict[str, str]]]
+
+
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
+    """Key and rows of each table; there is no server, and the dataset is looked at all the time."""
+    tables: Shown = []
+
+    def table(rows: list[dict[str, str]], key: str, description: str) -> None:
+        tables.append((key, {row["what"]: row["value"] for row in rows}))
+
+    monkeypatch.setattr(array_flow, "create_table_artifact", table)
+    monkeypatch.setattr(array_flow, "create_progress_artifact", lambda *args, **named: "id")
+    monkeypatch.setattr(array_flow, "update_progress_artifact", lambda *args: None)
+    monkeypatch.setattr(array_flow, "create_image_artifact", lambda *args, **named: None)
+    monkeypatch.setattr(array_flow, "get_run_logger", lambda: logging.getLogger("trilight.test"))
+    monkeypatch.setattr(array_flow, "LOOK_S", 0.01)
+    return tables
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
+    """The tasks of each array; a thread works on them, as a cluster would."""
+    without_rendering(monkeypatch)
+    monkeypatch.setattr("pipeline.executors.slurm.ThreadRunner", Undocumented)
+    arrays: list[list[int]] = []
+
+    def submitted(job: ArrayJob, on: str, machines: ArrayMachines) -> str:
+        def work() -> None:
+            for task in job.tasks:
+                monkeypatch.setenv("SHARDS_PER_TASK", str(job.per_task))
+                monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(task))
+                find_executor("slurm", None, None).make(job.order, None)
+            Path(job.order.place, "README.md").write_text("# A set")  # the last document
+
+        arrays.append(list(job.tasks))
+        threading.Thread(target=work).start()
+        return "4711"
+
+    monkeypatch.setattr(array_flow, "submitted", submitted)
+    return arrays
+
+
+def run(**given: Any) -> None:
+    plain = {
+        each.name: getattr(tiny_order(), each.name) for each in dataclasses.fields(DatasetOrder)
+    }
+    own = {name: DatasetByArray.__dataclass_fields__[name].default for name in _OWN}
+    flow: Any = make_by_array
+    checked = flow.validate_parameters(
+        {**plain, **own, "changes": {"scenes": {"num_views": 2}}, **given}
+    )
+    flow.fn(**checked)
+
+
+_OWN = set(DatasetByArray.__dataclass_fields__) - set(DatasetOrder.__dataclass_fields__)
+
+
+def test_what_is_missing_is_asked_for_and_shown_to_the_end(
+    shown: Shown, cluster: list[list[int]], tmp_path: Path
+) -> None:
+    out = str(tmp_path / "set")
+    run(out=out, scenes=20, shards_per_task=2)
+    assert cluster == [[0, 1, 2]]
+    key, summary = shown[-1]
+    assert key == "summary" and summary["shards"] == "5 of 5" and len(summary["dataset digest"]) > 8
+    assert all(key == "progress" for key, _ in shown[:-1])
+    run(out=out, scenes=20, shards_per_task=2)
+    assert len(cluster) == 1, "nothing is missing"
+    (tmp_path / "set" / "train-000003.tar").unlink()
+    run(out=out, scenes=20, shards_per_task=2)
+    assert cluster[1:] == [[1]], "the task of the shard that is gone"
+    assert (tmp_path / "set" / "train-000003.tar").exists()
+
+
+def test_who_watches_alone_asks_for_nothing_and_waits_so_long(
+    shown: Shown, cluster: list[list[int]], tmp_path: Path
+) -> None:
+    with pytest.raises(TrilightError, match=r"no new scene for 0\.0001 hours \(none made\)"):
+        run(out=str(tmp_path / "set"), scheduler="none", quiet_hours=0.0001)
+    assert cluster == [] and shown == []
+
+
+def test_a_page_that_cannot_be_shown_does_not_end_an_array(
+    shown: Shown,
+    cluster: list[list[int]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def gone(*args: object, **named: object) -> None:
+        raise ConnectionError("gone")
+
+    monkeypatch.setattr(array_flow, "create_progress_artifact", gone)
+    monkeypatch.setattr(array_flow, "create_table_artifact", gone)
+    run(out=str(tmp_path / "set"), scenes=4)
+    assert [record.levelname for record in caplog.records].count("WARNING") == 1
+
+
+def test_machines_are_those_of_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who may start a run chooses neither an image nor an account."""
+    assert not _OWN & set(ArrayMachines.__dataclass_fields__)
+    assert machines_here() == ArrayMachines()
+    stated = tmp_path / "machines.json"
+    monkeypatch.setenv("TRILIGHT_MACHINES", str(stated))
+    stated.write_text(json.dumps({"where": "a-queue", "cores": 4}))
+    assert machines_here() == ArrayMachines(where="a-queue", cores=4)
+    for text, message in (("{", "cannot be read"), ('{"core": 4}', "core")):
+        stated.write_text(text)
+        with pytest.raises(TrilightError, match=message):
+            machines_here()

@@ -1,14 +1,26 @@
-"""Laws of the triangle budget: which objects fit, and which of their levels."""
+"""The triangle budget: which objects are drawn to fit, under which licences, at which level."""
 
+import dataclasses
 import itertools
+from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
+from pipeline.scenes import fitting
 from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
+from pipeline.scenes.fitting import FitTable, drawn_rows
+from pipeline.scenes.pool import PooledAsset
+from scene_templates.families import DEFAULT_FAMILIES
+from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
+from storage.licences import share_alike_camp
 from storage.records.asset import Asset, Level, LevelRecord
-from tests.pipeline.scenes.small_pool import QUALITY, SOURCE, with_error
+from storage.records.scene import Scene
+from storage.records.scene_file import scene_digest
+from tests.for_each import for_each
+from tests.pipeline.scenes.small_pool import QUALITY, SOURCE, first_scene, small_pool, with_error
 
 Rungs = list[tuple[int, float]]
 """Triangles and error of each level."""
@@ -166,3 +178,128 @@ def test_where_only_the_simplest_fits_it_is_taken() -> None:
     # Two left over: the 7 may come once, in any place, and the 9 never.
     found = {"".join(drawn_within(rng, "abc", [9, 5, 7], 3, 17)) for _ in range(200)}
     assert found == {"bbb", "cbb", "bcb", "bbc"}
+
+
+LICENCES = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC0-1.0", "cc-by-sa-4.0", "GPL-3.0-only")
+SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
+
+
+def _under(licences: Sequence[str]) -> list[PooledAsset]:
+    return [
+        dataclasses.replace(entry, locked=dataclasses.replace(entry.locked, licence=licence))
+        for entry, licence in zip(small_pool(), licences, strict=True)
+    ]
+
+
+def _scenes(licences: Sequence[str], count: int) -> list[Scene]:
+    pool = _under(licences)
+    return [first_scene(SETTINGS, pool, seed=5, scene_index=index) for index in range(count)]
+
+
+def test_no_scene_mixes_two_share_alike_licences() -> None:
+    camps = Counter[frozenset[str]]()
+    for scene in _scenes(LICENCES, 30):
+        uids = {entry.uid for entry in scene.objects if entry.kind == "object"}
+        met = {entry.licence for entry in scene.objects if entry.uid in uids}
+        camps[frozenset(filter(None, map(share_alike_camp, met)))] += 1
+    assert max(len(met) for met in camps) == 1
+    assert len(camps) == 4  # each of the three licences, and none: the draw reaches them all
+
+
+def test_scenes_do_not_change_where_at_most_one_licence_is_share_alike() -> None:
+    """Frozen sets stay what they are: a rule that does not bind takes no number."""
+    usual = [scene_digest(scene) for scene in _scenes(["CC0-1.0"] * 5, 6)]
+    one = [scene_digest(scene) for scene in _scenes(["CC-BY-SA-4.0", *["MIT"] * 4], 6)]
+    assert one == usual
+
+
+def test_the_first_object_is_drawn_evenly_whatever_its_licence() -> None:
+    rng = np.random.default_rng(0)
+    camps = ["a", "b", "", "", "b"]
+    firsts = Counter(drawn_within(rng, range(5), [1] * 5, 3, 9, camps)[0] for _ in range(2000))
+    # 400 expected of each; the deviation of a binomial is 18, and 5 deviations are 90
+    assert all(310 < firsts[row] < 490 for row in range(5))
+
+
+@for_each("seed", range(20))
+def test_what_is_drawn_fits_though_the_simplest_may_be_of_the_other_camp(seed: int) -> None:
+    """Entry 0 alone is small, and may not stand beside b, of which three do not fit."""
+    rng = np.random.default_rng(seed)
+    sizes, camps = [1, 10, 12, 30], ["a", "b", "", "a"]
+    rows = drawn_within(rng, range(4), sizes, 3, 28, camps)
+    assert sum(sizes[row] for row in rows) <= 28
+    assert len({camps[row] for row in rows} - {""}) <= 1
+
+
+def test_a_scene_without_room_for_any_camp_is_rejected() -> None:
+    with pytest.raises(Rejected, match="do not fit"):
+        drawn_within(np.random.default_rng(0), "ab", [5, 5], 3, 14, ["a", "b"])
+
+
+def _slow_twin(
+    rng: np.random.Generator, least: Sequence[int], camps: Sequence[str], count: int, total: int
+) -> list[int] | None:
+    """Look at every row for each object, and at every row after each of them."""
+    allowed, left, drawn = set(range(len(least))), total, list[int]()
+    for following in range(count - 1, -1, -1):
+        fitting_rows = []
+        for row in sorted(allowed):
+            beside = [
+                least[other]
+                for other in allowed
+                if not camps[row] or camps[other] in ("", camps[row])
+            ]
+            if least[row] + following * min(beside) <= left:
+                fitting_rows.append(row)
+        if not fitting_rows:
+            return None
+        row = fitting_rows[int(rng.integers(len(fitting_rows)))]
+        drawn.append(row)
+        left -= least[row]
+        if camps[row]:
+            allowed = {other for other in allowed if camps[other] in ("", camps[row])}
+    return drawn
+
+
+def test_parts_change_no_draw(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fitting, "_PART", 7)
+    rejected = several = 0
+    for trial in range(300):
+        rng = np.random.default_rng(trial)
+        num_rows, count = int(rng.integers(1, 40)), int(rng.integers(1, 5))
+        least = rng.integers(1, 100, num_rows).tolist()
+        camps = rng.choice(["", "", "a", "b"], num_rows).tolist()
+        total = int(rng.integers(1, 300))
+        expected = _slow_twin(np.random.default_rng(trial), least, camps, count, total)
+        table = FitTable.of(least, camps)
+        try:
+            assert drawn_rows(np.random.default_rng(trial), table, count, total) == expected
+        except Rejected:
+            assert expected is None
+        rejected += expected is None
+        several += bool(expected) and max(expected or [0]) >= 7
+    assert 15 < rejected < 150
+    assert several > 75
+
+
+def test_no_row_is_looked_at_where_all_fit() -> None:
+    """Of a million objects, two are read for each that is drawn."""
+
+    class Counting:
+        def __init__(self, values: Sequence[int]) -> None:
+            self.values, self.read = np.array(values), 0
+
+        def __len__(self) -> int:
+            return len(self.values)
+
+        def __getitem__(self, rows: slice) -> np.ndarray:
+            found = self.values[rows]
+            self.read += len(found)
+            return found
+
+    least, camp = Counting(range(1, 1001)), Counting([0] * 1000)
+    table = FitTable(least, camp, [""], FitTable.of(range(1, 1001)).sizes)
+    drawn_rows(np.random.default_rng(0), table, 3, 3000)
+    assert (least.read, camp.read) == (3, 3)
+    drawn_rows(np.random.default_rng(0), table, 3, 2000)
+    assert least.read > 1000

@@ -17,9 +17,8 @@ from storage.seeds import rng_for
 from storage.settings.changes import changed
 from tests.extensions_kit import loaded, written
 from tests.for_each import for_each
-from tests.scene_templates.named_draws import merged, stated_table
-from tests.scene_templates.skies.test_texels import uv_of
-from tests.scene_templates.statistics import require_plausible
+from tests.scene_templates.skies.test_skies import uv_of
+from tests.scene_templates.statistics import merged, require_plausible, stated_table
 
 MANY = 60
 

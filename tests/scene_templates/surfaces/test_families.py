@@ -18,8 +18,7 @@ from storage.seeds import rng_for
 from storage.settings.changes import changed
 from tests.extensions_kit import loaded, written
 from tests.for_each import for_each
-from tests.scene_templates.named_draws import merged, stated_table
-from tests.scene_templates.statistics import require_plausible
+from tests.scene_templates.statistics import merged, require_plausible, stated_table
 
 MANY = 100
 ALBEDO = (0.02, 0.9)

@@ -12,15 +12,17 @@ from storage.conventions import linear_from_srgb8
 from storage.records.asset import Asset
 from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import geometry, prepare, sphere, write_glb
-from tests.pipeline.assets.own.test_own_skins import SLOPE, STORED, F
 from tests.pipeline.assets.own.textured_kit import (
     CORNERS,
     GREEN,
     KEEP,
     QUARTERS,
     RED,
+    SLOPE,
     SQUARE,
+    STORED,
     UV_UP,
+    F,
     picture_bytes,
     seen_at,
     textured_glb,

@@ -29,6 +29,14 @@ SQUARE = TriangleMesh(
 UV_UP = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
 """[4, 2] of its corners, v up."""
 
+F = 0.04 + 0.96 / 21
+"""Specular albedo of an ordinary dielectric: the mean of Schlick's term for F0 = 0.04."""
+STORED = 0.006
+"""Half a step of 8 bits in sRGB near white."""
+SLOPE = 0.04
+"""Colours of two texels change by 2 over the width, and texels are inset by a quarter of a cell of
+a sixteenth of it; a wrong corner is off by 0.9."""
+
 OWN = OwnMaterialSettings(keep=True, texels=16)
 KEEP = AssetSettings(own_materials=OWN)
 REFUSE = AssetSettings(own_materials=OwnMaterialSettings(keep=True, texels=16, if_lost="reject"))
