@@ -19,19 +19,8 @@ from pipeline.isolation import IsolatedChild
 from pipeline.making.prepare_isolated import asset_child
 from storage.records.asset import Asset, decode_asset
 from tests.conftest import ROOT
-from tests.pipeline.assets.meshes_by_hand import (
-    cube,
-    gltf_tree,
-    joined,
-    knot,
-    moved,
-    prepare,
-    record_of,
-    sphere,
-    write_obj,
-    write_off,
-    write_ply,
-)
+from tests.pipeline.assets import meshes_by_hand as by_hand
+from tests.pipeline.assets.meshes_by_hand import prepare
 
 WATCH = """
 import json, sys
@@ -74,14 +63,14 @@ def obj_with_material(tmp_path: Path) -> Path:
     (tmp_path / "secret.mtl").write_text("newmtl a\nmap_Kd ../../../../../etc/hostname\n")
     folder = tmp_path / "objects"
     folder.mkdir()
-    path = write_obj(folder / "a.obj", knot(segments=80))
+    path = by_hand.write_obj(folder / "a.obj", by_hand.knot(segments=80))
     text = "mtllib ../secret.mtl\nmtllib /etc/hostname\nusemtl a\n" + path.read_text()
     path.write_text(text)
     return path
 
 
 def gltf_with_pictures(tmp_path: Path) -> Path:
-    tree, buffer = gltf_tree(sphere())
+    tree, buffer = by_hand.gltf_tree(by_hand.sphere())
     tree["buffers"][0]["uri"] = "a.bin"
     tree["images"] = [{"uri": "../../etc/hostname"}, {"uri": "http://127.0.0.1:1/a.png"}]
     tree["textures"] = [{"source": 0}, {"source": 1}]
@@ -96,12 +85,12 @@ def gltf_with_pictures(tmp_path: Path) -> Path:
 def test_odd_names_are_names(tmp_path: Path) -> None:
     for name in (b"line\nbreak.obj", b"not-utf8-\xff\xfe.obj", b"'; --.obj"):
         path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name))
-        write_obj(path, sphere(rings=5, columns=8))
+        by_hand.write_obj(path, by_hand.sphere(rings=5, columns=8))
         assert prepare(path).levels, name
 
 
 def test_the_second_method_serves_where_the_first_died(tmp_path: Path) -> None:
-    path = write_obj(tmp_path / "knot.obj", knot())
+    path = by_hand.write_obj(tmp_path / "knot.obj", by_hand.knot())
     asset = prepare(path, AssetSettings(), "meshoptimizer_sloppy")
     assert {level.record.method for level in asset.levels} == {"meshoptimizer_sloppy"}
     for level in asset.levels:
@@ -129,7 +118,7 @@ def outcome(child: IsolatedChild, tmp_path: Path) -> Callable[..., Outcome]:
 
     def prepare(path: Path, settings: AssetSettings | None = None) -> Outcome:
         prepared, failures = prepare_assets(
-            [record_of(path)],
+            [by_hand.record_of(path)],
             settings or AssetSettings(),
             AssetStore(tmp_path / "store"),
             borrow_child=borrow,
@@ -180,7 +169,7 @@ def soup(faces: int) -> TriangleMesh:
 
 def boxes(count: int) -> TriangleMesh:
     places = np.random.default_rng(0).random((count, 3)) * 50
-    return joined(*(moved(cube(), 1.0, place) for place in places))
+    return by_hand.joined(*(by_hand.moved(by_hand.cube(), 1.0, place) for place in places))
 
 
 def with_repeated_corners(mesh: TriangleMesh) -> TriangleMesh:
@@ -192,8 +181,10 @@ def test_faces_with_repeated_corners_are_dropped(
     outcome: Callable[..., Outcome], tmp_path: Path
 ) -> None:
     settings = AssetSettings(budgets=(500,))
-    dirty, _ = outcome(write_obj(tmp_path / "a.obj", with_repeated_corners(knot(80))), settings)
-    tidy, _ = outcome(write_obj(tmp_path / "b.obj", knot(80)), settings)
+    dirty, _ = outcome(
+        by_hand.write_obj(tmp_path / "a.obj", with_repeated_corners(by_hand.knot(80))), settings
+    )
+    tidy, _ = outcome(by_hand.write_obj(tmp_path / "b.obj", by_hand.knot(80)), settings)
     assert check(dirty).geometry_sha256 == check(tidy).geometry_sha256
     assert dirty is not None and dirty.source.repaired
     assert tidy is not None and not tidy.source.repaired
@@ -203,9 +194,9 @@ def test_faces_with_repeated_corners_are_dropped(
 def test_both_sides_of_every_face_count_once(
     outcome: Callable[..., Outcome], tmp_path: Path
 ) -> None:
-    one = knot(80)
-    both = joined(one, TriangleMesh(positions=one.positions, faces=one.faces[:, ::-1]))
-    asset, _ = outcome(write_obj(tmp_path / "a.obj", both), AssetSettings(budgets=(500,)))
+    one = by_hand.knot(80)
+    both = by_hand.joined(one, TriangleMesh(positions=one.positions, faces=one.faces[:, ::-1]))
+    asset, _ = outcome(by_hand.write_obj(tmp_path / "a.obj", both), AssetSettings(budgets=(500,)))
     assert check(asset).source.num_faces == 1920
     assert asset is not None and asset.source.watertight
 
@@ -215,7 +206,7 @@ def test_many_faces_on_one_edge_end(
     outcome: Callable[..., Outcome], tmp_path: Path, pages: int
 ) -> None:
     settings = AssetSettings(budgets=(1400, 340, 240))
-    asset, _ = outcome(write_obj(tmp_path / "a.obj", book(pages)), settings)
+    asset, _ = outcome(by_hand.write_obj(tmp_path / "a.obj", book(pages)), settings)
     assert check(asset).levels[0].record.method == "source"
     assert asset is not None and asset.source.nonmanifold_edges == 1
     if pages == 400:
@@ -228,7 +219,7 @@ def test_a_random_soup_ends_with_a_reason(
     outcome: Callable[..., Outcome], tmp_path: Path, profile: str
 ) -> None:
     settings = AssetSettings(budgets=(500,), profile=profile)  # type: ignore[arg-type]
-    asset, reason = outcome(write_obj(tmp_path / "a.obj", soup(1000)), settings)
+    asset, reason = outcome(by_hand.write_obj(tmp_path / "a.obj", soup(1000)), settings)
     assert asset is None
     geometric = {"area_changed", "bbox_escaped", "budget_missed", "error_over_bound"}
     assert reason in {*geometric, "crashed_signal_11"}
@@ -241,14 +232,14 @@ def test_a_polygon_of_fifty_thousand_corners_ends(
 ) -> None:
     """Its hub has a valence of 50 000; the child of a run that used its seconds is killed."""
     settings = AssetSettings(budgets=(1400,), profile=profile)  # type: ignore[arg-type]
-    asset, reason = outcome(write_obj(tmp_path / "a.obj", polygon(50_000)), settings)
+    asset, reason = outcome(by_hand.write_obj(tmp_path / "a.obj", polygon(50_000)), settings)
     assert not reason.startswith(("timeout", "crashed", "killed", "out_of_memory"))
     if asset is not None:
         check(asset)
 
 
 def test_a_wide_fan_is_kept_from_pymeshlab(outcome: Callable[..., Outcome], tmp_path: Path) -> None:
-    path = write_obj(tmp_path / "a.obj", polygon(600))
+    path = by_hand.write_obj(tmp_path / "a.obj", polygon(600))
     asset, reason = outcome(path, AssetSettings(budgets=(500,)))
     assert reason == ""
     used = {level.record.method for level in check(asset).levels}
@@ -259,14 +250,14 @@ def test_a_wide_fan_is_kept_from_pymeshlab(outcome: Callable[..., Outcome], tmp_
 def test_five_thousand_boxes_do_not_fit_into_240_triangles(
     outcome: Callable[..., Outcome], tmp_path: Path
 ) -> None:
-    path = write_obj(tmp_path / "a.obj", boxes(5000))
+    path = by_hand.write_obj(tmp_path / "a.obj", boxes(5000))
     asset, reason = outcome(path, AssetSettings(budgets=(240,)))
     assert asset is None
     assert reason in {"area_changed", "error_over_bound", "parts_lost", "budget_missed"}
 
 
 def test_fifty_boxes_do_not_fit_either(outcome: Callable[..., Outcome], tmp_path: Path) -> None:
-    path = write_obj(tmp_path / "a.obj", boxes(50))
+    path = by_hand.write_obj(tmp_path / "a.obj", boxes(50))
     asset, reason = outcome(path, AssetSettings(budgets=(240,)))
     assert asset is None
     assert reason in {"area_changed", "error_over_bound", "parts_lost", "budget_missed"}
@@ -279,34 +270,34 @@ def test_a_floor_of_two_triangles_is_an_object(
     floor = TriangleMesh(positions=corners, faces=np.array([[0, 1, 2], [0, 2, 3]]))
     for profile in ("faithful", "uniform"):
         settings = AssetSettings(profile=profile)
-        asset, _ = outcome(write_off(tmp_path / "a.off", floor), settings)
+        asset, _ = outcome(by_hand.write_off(tmp_path / "a.off", floor), settings)
         assert check(asset).source.num_parts == 1
         assert asset is not None and asset.source.front_share == pytest.approx(0.5, abs=0.2)
 
 
 def test_sizes_that_are_no_sizes(outcome: Callable[..., Outcome], tmp_path: Path) -> None:
     for scale in (1e-200, 1e-10, 1e10, 1e200):
-        path = write_obj(tmp_path / f"{scale}.obj", moved(sphere(), scale))
+        path = by_hand.write_obj(tmp_path / f"{scale}.obj", by_hand.moved(by_hand.sphere(), scale))
         assert outcome(path)[1] == "extent_range", scale
 
 
-@pytest.mark.parametrize("write", [write_ply, write_obj], ids=["ply", "obj"])
+@pytest.mark.parametrize("write", [by_hand.write_ply, by_hand.write_obj], ids=["ply", "obj"])
 def test_an_object_far_from_its_origin(
     outcome: Callable[..., Outcome], tmp_path: Path, write: Callable[[Path, TriangleMesh], Path]
 ) -> None:
     """PLY is usually single precision, so an offset of 1e6 extents is refused; text is exact."""
-    path = write(tmp_path / f"a.{write.__name__[-3:]}", moved(sphere(), 1.0, 1e6))
+    path = write(tmp_path / f"a.{write.__name__[-3:]}", by_hand.moved(by_hand.sphere(), 1.0, 1e6))
     asset, reason = outcome(path)
-    assert reason == ("offset_precision" if write is write_ply else "")
-    assert (asset is None) == (write is write_ply)
+    assert reason == ("offset_precision" if write is by_hand.write_ply else "")
+    assert (asset is None) == (write is by_hand.write_ply)
 
 
 def test_a_vertex_ten_thousand_extents_away(
     outcome: Callable[..., Outcome], tmp_path: Path
 ) -> None:
-    ball = sphere()
+    ball = by_hand.sphere()
     far = np.concatenate([ball.positions, [[1e4, 0, 0], [1e4, 1e-3, 0], [1e4, 0, 1e-3]]])
     count = len(ball.positions)
     speck = np.array([[count, count + 1, count + 2]])
     mesh = TriangleMesh(positions=far, faces=np.concatenate([ball.faces, speck]))
-    assert outcome(write_obj(tmp_path / "a.obj", mesh))[1] in {"far_outlier", "degenerate"}
+    assert outcome(by_hand.write_obj(tmp_path / "a.obj", mesh))[1] in {"far_outlier", "degenerate"}

@@ -12,20 +12,7 @@ from pipeline.isolation.landlock import landlock_version
 from pipeline.isolation.seccomp import _NUMBERS, _program, seccomp_works
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.for_each import for_each
-from tests.pipeline.isolation.called import (
-    call_kernel,
-    double,
-    end_process,
-    nothing,
-    process_id,
-    read,
-    refused_reads,
-    refused_sockets,
-    refused_writes,
-    replace,
-    start_program,
-    write,
-)
+from tests.pipeline.isolation import called
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=20, calls_per_child=100)
 needs_landlock = pytest.mark.skipif(not landlock_version(), reason="no Landlock here")
@@ -46,7 +33,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def child(place: Path) -> Iterator[IsolatedChild]:
     allowed = reach(files=[place / "in" / "file"], writes=[place / "out"])
-    child = IsolatedChild(limits=LIMITS, setup=nothing, confined_to=allowed)
+    child = IsolatedChild(limits=LIMITS, setup=called.nothing, confined_to=allowed)
     yield child
     child.close()
 
@@ -58,9 +45,9 @@ def _refused(child: IsolatedChild, function: object, *args: object) -> None:
 
 @needs_landlock
 def test_inputs_are_read_and_outputs_written(child: IsolatedChild, place: Path) -> None:
-    assert child.call(read, place / "in" / "file") == "in"
-    child.call(write, place / "out" / "new")
-    child.call(replace, place / "out" / "file", place / "out" / "new")
+    assert child.call(called.read, place / "in" / "file") == "in"
+    child.call(called.write, place / "out" / "new")
+    child.call(called.replace, place / "out" / "file", place / "out" / "new")
     assert (place / "out" / "file").read_text() == "written"
 
 
@@ -68,52 +55,54 @@ def test_inputs_are_read_and_outputs_written(child: IsolatedChild, place: Path) 
 def test_a_file_outside_is_not_read(child: IsolatedChild, place: Path) -> None:
     outside = [place / name for name in ("outside/file", "in/link", "in/../outside/file")]
     secrets = Path(f"/proc/{os.getpid()}/environ")  # of another process
-    assert child.call(refused_reads, [*outside, secrets]) == [*outside, secrets]
+    assert child.call(called.refused_reads, [*outside, secrets]) == [*outside, secrets]
 
 
 @needs_landlock
 def test_nothing_is_written_outside_of_the_output(child: IsolatedChild, place: Path) -> None:
     paths = [place / name for name in ("in/file", "in/new", "outside/file", "new")]
-    assert child.call(refused_writes, paths) == paths
+    assert child.call(called.refused_writes, paths) == paths
     assert (place / "in" / "file").read_text() == "in"
 
 
 @needs_seccomp
 def test_nothing_is_connected_to(child: IsolatedChild) -> None:
     families = [int(each) for each in (socket.AF_INET, socket.AF_INET6, socket.AF_UNIX)]
-    assert child.call(refused_sockets, families) == families
+    assert child.call(called.refused_sockets, families) == families
 
 
 @needs_seccomp
 def test_no_program_is_started(child: IsolatedChild) -> None:
-    _refused(child, start_program)
+    _refused(child, called.start_program)
 
 
 @pytest.mark.skipif(landlock_version() < 6, reason="Landlock of Linux 6.12 is needed")
 def test_no_signal_reaches_another_process(child: IsolatedChild) -> None:
-    _refused(child, end_process, os.getpid())
+    _refused(child, called.end_process, os.getpid())
 
 
 @needs_seccomp
 @pytest.mark.skipif(os.uname().machine != "x86_64", reason="numbers of x86_64")
 @for_each("name", ["ptrace", "mount", "bpf", "unshare", "keyctl", "io_uring_setup"])
 def test_ways_around_are_refused(child: IsolatedChild, name: str) -> None:
-    assert child.call(call_kernel, _NUMBERS[name][0]) == 1  # EPERM
-    assert child.call(call_kernel, _NUMBERS[name][0] | 0x40000000) == 1  # by the second set
-    assert child.call(call_kernel, 39) == 0  # getpid
+    assert child.call(called.call_kernel, _NUMBERS[name][0]) == 1  # EPERM
+    assert child.call(called.call_kernel, _NUMBERS[name][0] | 0x40000000) == 1  # by the second set
+    assert child.call(called.call_kernel, 39) == 0  # getpid
 
 
 @needs_landlock
 def test_another_folder_costs_a_fresh_child_and_the_same_one_none(place: Path) -> None:
-    child = IsolatedChild(limits=LIMITS, setup=nothing, confined_to=reach(files=[place / "in"]))
+    child = IsolatedChild(
+        limits=LIMITS, setup=called.nothing, confined_to=reach(files=[place / "in"])
+    )
     try:
-        first = child.call(process_id)
+        first = child.call(called.process_id)
         child.may(reach(files=[place / "in" / "file"]))
-        assert child.call(process_id) == first
+        assert child.call(called.process_id) == first
         child.may(reach(files=[place / "outside" / "file"]))
-        assert child.call(read, place / "outside" / "file") == "outside"
-        assert child.call(read, place / "in" / "file") == "in"
-        assert child.call(process_id) != first
+        assert child.call(called.read, place / "outside" / "file") == "outside"
+        assert child.call(called.read, place / "in" / "file") == "in"
+        assert child.call(called.process_id) != first
     finally:
         child.close()
 
@@ -127,19 +116,21 @@ def test_packages_that_a_path_of_pythons_names_are_read_and_its_other_folders_no
         folder.mkdir(parents=True)
         (folder / "file").write_text("found")
         monkeypatch.syspath_prepend(str(folder))
-    child = IsolatedChild(limits=LIMITS, setup=nothing, confined_to=reach())
+    child = IsolatedChild(limits=LIMITS, setup=called.nothing, confined_to=reach())
     try:
-        assert child.call(read, packages / "file") == "found"
-        _refused(child, read, other / "file")
+        assert child.call(called.read, packages / "file") == "found"
+        _refused(child, called.read, other / "file")
     finally:
         child.close()
 
 
 def test_off_confines_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(confinement.VARIABLE, "off")
-    child = IsolatedChild(limits=LIMITS, setup=nothing, confined_to=reach(files=[place / "in"]))
+    child = IsolatedChild(
+        limits=LIMITS, setup=called.nothing, confined_to=reach(files=[place / "in"])
+    )
     try:
-        assert child.call(read, place / "outside" / "file") == "outside"
+        assert child.call(called.read, place / "outside" / "file") == "outside"
     finally:
         child.close()
 
@@ -153,9 +144,9 @@ def test_what_cannot_be_had_is_said(
 ) -> None:
     monkeypatch.setenv(confinement.VARIABLE, word)
     monkeypatch.setattr(confinement, "landlock_version", lambda: 0)
-    child = IsolatedChild(limits=LIMITS, setup=nothing, confined_to=reach())
+    child = IsolatedChild(limits=LIMITS, setup=called.nothing, confined_to=reach())
     with pytest.raises(error, match=said):
-        child.call(double, 2)
+        child.call(called.double, 2)
     monkeypatch.setenv(confinement.VARIABLE, "auto")
     assert confinement.confinement_wanted()
 

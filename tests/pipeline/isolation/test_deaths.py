@@ -18,14 +18,7 @@ from pipeline.isolation import (
 from pipeline.isolation.deaths import ENDS, with_retries
 from storage.errors import EnvironmentFailure
 from tests.for_each import for_each
-from tests.pipeline.isolation.called import (
-    count_and_die,
-    die_by,
-    double,
-    fail_set_up,
-    nothing,
-    set_up_dying,
-)
+from tests.pipeline.isolation import called
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=9)
 
@@ -41,17 +34,17 @@ def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def child() -> Iterator[IsolatedChild]:
-    child = child_with(nothing)
+    child = child_with(called.nothing)
     yield child
     child.close()
 
 
 def test_a_signal_of_native_code_is_told_from_one_of_somebody_else(child: IsolatedChild) -> None:
     with pytest.raises(ChildFailed, match="SIGSEGV") as caught:
-        child.call(die_by, signal.SIGSEGV)
+        child.call(called.die_by, signal.SIGSEGV)
     assert (caught.value.reason, caught.value.is_verdict) == ("crashed_signal_11", True)
     with pytest.raises(ChildFailed, match="SIGTERM") as caught:
-        child.call(die_by, signal.SIGTERM)
+        child.call(called.die_by, signal.SIGTERM)
     assert (caught.value.reason, caught.value.is_verdict) == ("killed", False)
 
 
@@ -77,7 +70,7 @@ def test_ends_by_other_signals_are_told_apart_by_the_status(
 
 
 def test_the_same_call_is_made_again(child: IsolatedChild, tmp_path: Path) -> None:
-    assert call_with_retries(child, count_and_die, str(tmp_path), signal.SIGKILL, 2) == 3
+    assert call_with_retries(child, called.count_and_die, str(tmp_path), signal.SIGKILL, 2) == 3
 
 
 @for_each(("reason", "end"), ENDS.items())
@@ -106,28 +99,28 @@ def test_every_end_has_tries_and_only_two_are_verdicts() -> None:
 
 
 def test_a_kill_while_a_child_is_set_up_is_tried_again(tmp_path: Path) -> None:
-    child = child_with(set_up_dying, str(tmp_path), signal.SIGKILL, 2)
+    child = child_with(called.set_up_dying, str(tmp_path), signal.SIGKILL, 2)
     try:
-        assert child.call(double, 4) == 8
+        assert child.call(called.double, 4) == 8
     finally:
         child.close()
     assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_kills_of_every_set_up_end_the_run(tmp_path: Path) -> None:
-    child = child_with(set_up_dying, str(tmp_path), signal.SIGKILL, 99)
+    child = child_with(called.set_up_dying, str(tmp_path), signal.SIGKILL, 99)
     with pytest.raises(EnvironmentFailure, match="cannot be set up.*SIGKILL.*doctor"):
-        child.call(double, 4)
+        child.call(called.double, 4)
     assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_a_set_up_that_cannot_succeed_is_tried_once_at_each_call(tmp_path: Path) -> None:
     """And no call is made in a child that was not set up."""
-    child = child_with(fail_set_up, str(tmp_path))
+    child = child_with(called.fail_set_up, str(tmp_path))
     try:
         for calls in (1, 2):
             with pytest.raises(EnvironmentFailure, match="cannot be set up.*a library is broken"):
-                child.call(double, 4)
+                child.call(called.double, 4)
             assert len(list(tmp_path.iterdir())) == calls
     finally:
         child.close()

@@ -26,57 +26,46 @@ from pipeline.isolation import (
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from tests.conftest import ROOT
 from tests.for_each import for_each
-from tests.pipeline.isolation.called import (
-    burn,
-    crash,
-    divide,
-    double,
-    eat_memory,
-    hang,
-    mistake,
-    nothing,
-    prepare,
-    process_id,
-    reject,
-    wait_for,
-)
+from tests.pipeline.isolation import called
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=2, calls_per_child=3)
 
 
 @pytest.fixture
 def child(tmp_path: Path) -> Iterator[IsolatedChild]:
-    child = IsolatedChild(limits=LIMITS, setup=prepare, setup_args=(str(tmp_path),))
+    child = IsolatedChild(limits=LIMITS, setup=called.prepare, setup_args=(str(tmp_path),))
     yield child
     child.close()
 
 
 def test_results_and_rejections_come_back(child: IsolatedChild) -> None:
-    assert child.call(double, 21) == 42
+    assert child.call(called.double, 21) == 42
     with pytest.raises(Rejected, match="no_faces: nothing there"):
-        child.call(reject)
+        child.call(called.reject)
     with pytest.raises(TrilightError, match="output: cannot be written"):
-        child.call(mistake)
+        child.call(called.mistake)
 
 
 @for_each(
     ("function", "reason"),
     [
-        (crash, "crashed_signal_11"),
-        (eat_memory, "out_of_memory"),
-        (divide, "exception: .*ZeroDivisionError"),
+        (called.crash, "crashed_signal_11"),
+        (called.eat_memory, "out_of_memory"),
+        (called.divide, "exception: .*ZeroDivisionError"),
     ],
 )
 def test_a_failure_costs_one_call(child: IsolatedChild, function, reason: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ChildFailed, match=f"(?s){reason}"):
         child.call(function)
-    assert child.call(double, 4) == 8
+    assert child.call(called.double, 4) == 8
 
 
 def test_a_child_that_cannot_be_set_up_stops_the_run(tmp_path: Path) -> None:
-    child = IsolatedChild(limits=LIMITS, setup=prepare, setup_args=(str(tmp_path / "nowhere"),))
+    child = IsolatedChild(
+        limits=LIMITS, setup=called.prepare, setup_args=(str(tmp_path / "nowhere"),)
+    )
     with pytest.raises(TrilightError, match=r"cannot be set up.*FileNotFoundError.*doctor"):
-        child.call(double, 1)
+        child.call(called.double, 1)
     child.close()
 
 
@@ -97,15 +86,15 @@ def test_a_fork_server_that_is_killed_is_replaced(
     monkeypatch.setattr(popen_forkserver.Popen, "_launch", launch)
     child.retire()
     if times < 3:
-        assert child.call(double, 4) == 8
+        assert child.call(called.double, 4) == 8
     else:
         with pytest.raises(EnvironmentFailure, match="cannot be started"):
-            child.call(double, 4)
+            child.call(called.double, 4)
 
 
 def test_a_child_is_replaced_after_its_calls(child: IsolatedChild, tmp_path: Path) -> None:
     for _ in range(LIMITS.calls_per_child + 1):
-        child.call(double, 1)
+        child.call(called.double, 1)
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -114,7 +103,7 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
 
     def wait() -> None:
         try:
-            child.call(hang)
+            child.call(called.hang)
         except (ChildFailed, ChildClosed) as failure:  # closed in the call, or still starting
             failures.append(failure)
 
@@ -126,19 +115,19 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
     assert not caller.is_alive()
     assert failures
     with pytest.raises(ChildClosed):
-        child.call(double, 1)
+        child.call(called.double, 1)
 
 
 @pytest.mark.slow("kills")
 def test_processor_seconds_are_for_one_call_each() -> None:
     """A call that uses them up ends its child; several that stay below do not add up."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, cpu_s=1, calls_per_child=9)
-    child = IsolatedChild(limits=limits, setup=nothing)
+    child = IsolatedChild(limits=limits, setup=called.nothing)
     try:
-        assert len({child.call(burn, 0.6) for _ in range(3)}) == 1
+        assert len({child.call(called.burn, 0.6) for _ in range(3)}) == 1
         with pytest.raises(ChildFailed, match="timeout_cpu: used its 1 processor seconds"):
-            child.call(burn, 30.0)
-        assert child.call(double, 4) == 8
+            child.call(called.burn, 30.0)
+        assert child.call(called.double, 4) == 8
     finally:
         child.close()
 
@@ -146,24 +135,24 @@ def test_processor_seconds_are_for_one_call_each() -> None:
 def test_waiting_uses_no_processor_seconds() -> None:
     """It uses the time of its call, and costs no more than that."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=1.5, cpu_s=1, calls_per_child=9)
-    child = IsolatedChild(limits=limits, setup=nothing)
+    child = IsolatedChild(limits=limits, setup=called.nothing)
     try:
         with pytest.raises(ChildFailed, match="timeout_wall"):
-            child.call(hang)
-        assert child.call(double, 4) == 8
+            child.call(called.hang)
+        assert child.call(called.double, 4) == 8
     finally:
         child.close()
 
 
 def test_a_retired_child_is_replaced(child: IsolatedChild) -> None:
-    first = child.call(process_id)
-    assert child.call(process_id) == first
+    first = child.call(called.process_id)
+    assert child.call(called.process_id) == first
     child.retire()
     child.retire()
-    second = child.call(process_id)
+    second = child.call(called.process_id)
     assert second != first
     assert not _alive(first)
-    assert child.call(double, 4) == 8
+    assert child.call(called.double, 4) == 8
 
 
 def test_a_call_to_exit_is_a_crash(child: IsolatedChild) -> None:
@@ -223,7 +212,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[IsolatedChild]:
     monkeypatch.setattr(waiting, "LOOK_S", 0.05)
     monkeypatch.setattr(waiting, "LOOKS_BEFORE_KILL", 15)
     monkeypatch.setattr(deaths, "_PAUSE_S", 0.0)
-    watched = IsolatedChild(limits=PATIENT, setup=nothing)
+    watched = IsolatedChild(limits=PATIENT, setup=called.nothing)
     yield watched
     watched.close()
 
@@ -231,10 +220,10 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[IsolatedChild]:
 def test_a_stopped_child_is_noticed_and_its_work_done_again(
     watched: IsolatedChild, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    stopped = watched.call(process_id)
+    stopped = watched.call(called.process_id)
     os.kill(stopped, signal.SIGSTOP)
     (tmp_path / "go").touch()
-    assert call_with_retries(watched, wait_for, str(tmp_path / "go")) != stopped
+    assert call_with_retries(watched, called.wait_for, str(tmp_path / "go")) != stopped
     (record,) = caplog.records
     assert record.levelno == logging.WARNING
     assert f"child process {stopped} has been stopped" in record.getMessage()
@@ -242,16 +231,16 @@ def test_a_stopped_child_is_noticed_and_its_work_done_again(
 
 
 def test_a_child_that_stays_stopped_is_the_fault_of_the_environment(watched: IsolatedChild) -> None:
-    os.kill(watched.call(process_id), signal.SIGSTOP)
+    os.kill(watched.call(called.process_id), signal.SIGSTOP)
     with pytest.raises(ChildFailed, match="stopped: stopped from outside") as caught:
-        watched.call(process_id)
+        watched.call(called.process_id)
     assert not caught.value.is_verdict
 
 
 def test_a_child_that_is_continued_in_time_answers_itself(
     watched: IsolatedChild, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    first = watched.call(process_id)
+    first = watched.call(called.process_id)
     os.kill(first, signal.SIGSTOP)
 
     def go_on() -> None:
@@ -262,7 +251,7 @@ def test_a_child_that_is_continued_in_time_answers_itself(
         (tmp_path / "go").touch()
 
     threading.Thread(target=go_on).start()
-    assert watched.call(wait_for, str(tmp_path / "go")) == first
+    assert watched.call(called.wait_for, str(tmp_path / "go")) == first
     assert len(caplog.records) == 1
 
 
