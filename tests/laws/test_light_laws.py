@@ -114,16 +114,6 @@ def test_light_adds_up() -> None:
     assert_agree(both, total)
 
 
-def test_turning_scene_and_camera_together_changes_nothing() -> None:
-    scene = _glossy_room(1.0)
-    axis, angle = np.array([0.3, -0.5, 0.8]), 1.1
-    axis /= np.linalg.norm(axis)
-    cross = np.cross(np.eye(3), axis)
-    rotation = np.eye(3) - np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    turned = render_blocks(_turned(scene, rotation), first_seed=99, passes=8)
-    assert_agree(turned, render_blocks(scene, passes=8))
-
-
 def test_an_emitter_is_hidden_from_the_camera_but_seen_in_a_mirror() -> None:
     radiance = 3.0
     mirror = quad(FLOOR, material(specular=1.0, roughness=0.01))
@@ -204,17 +194,6 @@ def _bowl(albedo: float) -> Part:
     below = (whole.triangles[..., 2] < 1e-9).all(axis=1)
     return dataclasses.replace(
         whole, triangles=whole.triangles[below], normals=whole.normals[below]
-    )
-
-
-def _turned(scene: Scene, rotation: NDArray) -> Scene:
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    return dataclasses.replace(
-        scene,
-        vertex_positions=(scene.vertex_positions @ rotation.T).astype(np.float32),
-        vertex_normals=(scene.vertex_normals @ rotation.T).astype(np.float32),
-        c2w=(pose @ scene.c2w[0])[None].astype(np.float32),
     )
 
 

@@ -29,6 +29,7 @@ from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row, side
 ROUNDING = 1e-12
 """Coordinates about 1 after ten float64 operations are good to 1e-15; a thousand times that."""
 
+STILL = PatchPlacement(rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0))
 SQUARE = SharedRoom(square_share=1.0)
 LOOSE = SharedRoom(square_share=0.0)
 
@@ -71,22 +72,16 @@ def test_parts_are_flat_patches_of_128_faces_that_face_the_room(
 
 
 def test_the_nominal_room_is_the_unit_cube() -> None:
-    still = PatchPlacement(
-        rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0)
-    )
     for side in SIDES.values():
-        positions = patch(side, still)
+        positions = patch(side, STILL)
         assert np.array_equal(positions[:, side.axis], np.full(81, 0.5 * side.sign))
         for axis in {0, 1, 2} - {side.axis}:
             assert (positions[:, axis].min(), positions[:, axis].max()) == (-0.5, 0.5)
 
 
 def test_a_quarter_spin_keeps_the_outline_and_swaps_the_diagonals() -> None:
-    still = PatchPlacement(
-        rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0)
-    )
-    plain = patch(SIDES["floor"], still)
-    spun = patch(SIDES["floor"], dataclasses.replace(still, rotation_deg=(0, 0, 90)))
+    plain = patch(SIDES["floor"], STILL)
+    spun = patch(SIDES["floor"], dataclasses.replace(STILL, rotation_deg=(0, 0, 90)))
     order, spun_order = np.lexsort(plain.round(9).T), np.lexsort(spun.round(9).T)
     assert np.abs(plain[order] - spun[spun_order]).max() < ROUNDING
 
@@ -215,14 +210,11 @@ def test_only_the_original_box_turns_one_wall_away(policy: Policy) -> None:
 
 @pytest.mark.parametrize("policy", POLICIES)
 def test_patch_families_are_the_exact_unit_box(policy: Policy) -> None:
-    still = PatchPlacement(
-        rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0)
-    )
     seen = set()
     for family in (*stage_1_families(policy), *stage_2_families(policy)):
         if "patch" in family.name:
             for part in _shell(family):
-                assert np.array_equal(part.positions, patch(SIDES[part.name], still))
+                assert np.array_equal(part.positions, patch(SIDES[part.name], STILL))
                 assert (np.abs(part.positions[:, SIDES[part.name].axis]) == 0.5).all()
                 seen.add((family.template, part.name))
     assert len(seen) == 3 + 4 + 2  # parts of corner, box and wall

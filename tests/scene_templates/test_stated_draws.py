@@ -82,19 +82,6 @@ def test_a_stream_leaves_what_is_drawn_after_it() -> None:
     assert rest(0) == rest(1000)
 
 
-def test_a_statement_reads_as_words() -> None:
-    words = {name: str(draw) for name, draw in _drawn().made.items()}
-    assert words == {
-        "number": "uniform, -2 to 5",
-        "count": "whole number, 3 to 9",
-        "it holds": "true with probability 0.3",
-        "word": "one of a, b, c, equally likely",
-        "colour": "each channel uniform from (0.1 0.2 0.3) to (0.2 0.9 0.3)",
-        "shade": "uniform on the line from (0 0 0) to (1 0.5 0.1)",
-        "direction": "uniform by solid angle, elevation -30 to 60 degrees",
-    }
-
-
 def test_parameters_are_plain_values() -> None:
     draws = StatedDraws(rng_for(0, "x"))
     draws.colour("colour", (0, 0, 0), (1, 1, 1))
@@ -179,14 +166,6 @@ def test_contradictions_are_named(strata: list[dict[str, object]], message: str)
         changed(named_build("smoke").scenes, {"strata": strata})
 
 
-def test_a_build_without_strata_does_not_record_them() -> None:
-    build = named_build("smoke")
-    assert "strata" not in build.as_json()["scenes"]
-    with_one = changed(build, {"scenes.strata": [{"name": "all", "weight": 1}]})
-    (stored,) = with_one.as_json()["scenes"]["strata"]
-    assert stored["name"] == "all" and with_one.digest != build.digest
-
-
 def test_a_plan_depends_on_seed_and_index_alone() -> None:
     one = [scene_plan(DEFAULTS, seed=0, scene_index=index) for index in range(40)]
     again = [scene_plan(DEFAULTS, seed=0, scene_index=index) for index in reversed(range(40))]
@@ -220,17 +199,6 @@ def test_every_excursion_meets_every_family_equally_often(turns: int) -> None:
         )
         assert len(found) == 4 * count
         assert set(found.values()) == {turns}
-
-
-def test_weights_are_relative() -> None:
-    """A family of almost no weight hardly ever comes, and one of all the weight always does."""
-    heavy, *light = (
-        dataclasses.replace(family, weight=1e9 if row == 0 else 1e-9)
-        for row, family in enumerate(ONE_FAMILY_EACH)
-    )
-    settings = SceneSettings(families=(*light, heavy))
-    names = {scene_plan(settings, seed=0, scene_index=i).family.name for i in range(200)}
-    assert names == {heavy.name}
 
 
 ANGLES = np.linspace(-math.pi, math.pi, 20001)

@@ -64,29 +64,9 @@ def _without(attempt: AssetAttempt, below: int) -> AssetAttempt:
     return dataclasses.replace(attempt, asset=asset, missed={**attempt.missed, **gone})
 
 
-def crash(source: Path) -> None:
-    ctypes.string_at(0)
-
-
 def burn(source: Path) -> None:
     while True:
         pass
-
-
-def sleep(source: Path) -> None:
-    time.sleep(600)
-
-
-def eat(source: Path) -> None:
-    bytearray(64 << 30)
-
-
-def die(source: Path) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def leave(source: Path) -> None:
-    os._exit(3)
 
 
 def fail(source: Path) -> None:
@@ -97,31 +77,22 @@ def refuse(source: Path) -> None:
     raise Rejected("degenerate", "planned")
 
 
-def vanish(source: Path) -> None:
-    source.unlink()
-
-
-def grow(source: Path) -> None:
-    with source.open("a") as stream:
-        stream.write("# more\n")
-
-
 def mistake(source: Path) -> None:
     raise TrilightError("planned mistake.")
 
 
-_ACTIONS: Mapping[str, Callable[[Path], None]] = {
+_ACTIONS: Mapping[str, Callable[[Path], object]] = {
     "work": lambda source: None,
-    "crash": crash,
+    "crash": lambda source: ctypes.string_at(0),
     "burn": burn,
-    "sleep": sleep,
-    "eat": eat,
-    "die": die,
-    "leave": leave,
+    "sleep": lambda source: time.sleep(600),
+    "eat": lambda source: bytearray(64 << 30),
+    "die": lambda source: os.kill(os.getpid(), signal.SIGKILL),
+    "leave": lambda source: os._exit(3),
     "fail": fail,
     "refuse": refuse,
-    "vanish": vanish,
-    "grow": grow,
+    "vanish": Path.unlink,
+    "grow": lambda source: source.write_text(source.read_text() + "# more\n"),
     "mistake": mistake,
 }
 

@@ -5,8 +5,9 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -98,7 +99,7 @@ def test_the_second_method_serves_where_the_first_died(tmp_path: Path) -> None:
         assert level.record.quality.error_p99 <= AssetSettings().gate.max_error_p99
 
 
-Outcome = tuple[Asset | None, str]
+Outcome = Callable[..., tuple[Asset | None, str]]
 
 
 @pytest.fixture(scope="module")
@@ -109,19 +110,18 @@ def child() -> Iterator[IsolatedChild]:
 
 
 @pytest.fixture
-def outcome(child: IsolatedChild, tmp_path: Path) -> Callable[..., Outcome]:
-    """The asset of a file, or the reason for having none."""
+def outcome(child: IsolatedChild, tmp_path: Path) -> Outcome:
+    """The asset of a mesh in a file, or the reason for having none."""
 
-    @contextmanager
-    def borrow() -> Iterator[IsolatedChild]:
-        yield child
-
-    def prepare(path: Path, settings: AssetSettings | None = None) -> Outcome:
+    def prepare(
+        mesh: TriangleMesh, settings: AssetSettings | None = None, suffix: str = ".obj"
+    ) -> tuple[Asset | None, str]:
+        path = by_hand.WRITERS[suffix](tmp_path / f"a{suffix}", mesh)
         prepared, failures = prepare_assets(
             [by_hand.record_of(path)],
             settings or AssetSettings(),
             AssetStore(tmp_path / "store"),
-            borrow_child=borrow,
+            borrow_child=lambda: nullcontext(child),
             workers=1,
             done=lambda: None,
         )
@@ -177,36 +177,27 @@ def with_repeated_corners(mesh: TriangleMesh) -> TriangleMesh:
     return TriangleMesh(positions=mesh.positions, faces=np.concatenate([mesh.faces, doubled]))
 
 
-def test_faces_with_repeated_corners_are_dropped(
-    outcome: Callable[..., Outcome], tmp_path: Path
-) -> None:
+def test_faces_with_repeated_corners_are_dropped(outcome: Outcome) -> None:
     settings = AssetSettings(budgets=(500,))
-    dirty, _ = outcome(
-        by_hand.write_obj(tmp_path / "a.obj", with_repeated_corners(by_hand.knot(80))), settings
-    )
-    tidy, _ = outcome(by_hand.write_obj(tmp_path / "b.obj", by_hand.knot(80)), settings)
+    dirty, _ = outcome(with_repeated_corners(by_hand.knot(80)), settings)
+    tidy, _ = outcome(by_hand.knot(80), settings)
     assert check(dirty).geometry_sha256 == check(tidy).geometry_sha256
     assert dirty is not None and dirty.source.repaired
     assert tidy is not None and not tidy.source.repaired
     assert dirty.source.num_faces_read == 1920 + 640
 
 
-def test_both_sides_of_every_face_count_once(
-    outcome: Callable[..., Outcome], tmp_path: Path
-) -> None:
+def test_both_sides_of_every_face_count_once(outcome: Outcome) -> None:
     one = by_hand.knot(80)
     both = by_hand.joined(one, TriangleMesh(positions=one.positions, faces=one.faces[:, ::-1]))
-    asset, _ = outcome(by_hand.write_obj(tmp_path / "a.obj", both), AssetSettings(budgets=(500,)))
+    asset, _ = outcome(both, AssetSettings(budgets=(500,)))
     assert check(asset).source.num_faces == 1920
     assert asset is not None and asset.source.watertight
 
 
 @pytest.mark.parametrize("pages", [8, 9, 400])
-def test_many_faces_on_one_edge_end(
-    outcome: Callable[..., Outcome], tmp_path: Path, pages: int
-) -> None:
-    settings = AssetSettings(budgets=(1400, 340, 240))
-    asset, _ = outcome(by_hand.write_obj(tmp_path / "a.obj", book(pages)), settings)
+def test_many_faces_on_one_edge_end(outcome: Outcome, pages: int) -> None:
+    asset, _ = outcome(book(pages), AssetSettings(budgets=(1400, 340, 240)))
     assert check(asset).levels[0].record.method == "source"
     assert asset is not None and asset.source.nonmanifold_edges == 1
     if pages == 400:
@@ -215,11 +206,8 @@ def test_many_faces_on_one_edge_end(
 
 
 @pytest.mark.parametrize("profile", ["faithful", "uniform"])
-def test_a_random_soup_ends_with_a_reason(
-    outcome: Callable[..., Outcome], tmp_path: Path, profile: str
-) -> None:
-    settings = AssetSettings(budgets=(500,), profile=profile)  # type: ignore[arg-type]
-    asset, reason = outcome(by_hand.write_obj(tmp_path / "a.obj", soup(1000)), settings)
+def test_a_random_soup_ends_with_a_reason(outcome: Outcome, profile: Any) -> None:
+    asset, reason = outcome(soup(1000), AssetSettings(budgets=(500,), profile=profile))
     assert asset is None
     geometric = {"area_changed", "bbox_escaped", "budget_missed", "error_over_bound"}
     assert reason in {*geometric, "crashed_signal_11"}
@@ -227,77 +215,55 @@ def test_a_random_soup_ends_with_a_reason(
 
 @pytest.mark.slow("hostile")
 @pytest.mark.parametrize("profile", ["faithful", "uniform"])
-def test_a_polygon_of_fifty_thousand_corners_ends(
-    outcome: Callable[..., Outcome], tmp_path: Path, profile: str
-) -> None:
+def test_a_polygon_of_fifty_thousand_corners_ends(outcome: Outcome, profile: Any) -> None:
     """Its hub has a valence of 50 000; the child of a run that used its seconds is killed."""
-    settings = AssetSettings(budgets=(1400,), profile=profile)  # type: ignore[arg-type]
-    asset, reason = outcome(by_hand.write_obj(tmp_path / "a.obj", polygon(50_000)), settings)
+    asset, reason = outcome(polygon(50_000), AssetSettings(budgets=(1400,), profile=profile))
     assert not reason.startswith(("timeout", "crashed", "killed", "out_of_memory"))
     if asset is not None:
         check(asset)
 
 
-def test_a_wide_fan_is_kept_from_pymeshlab(outcome: Callable[..., Outcome], tmp_path: Path) -> None:
-    path = by_hand.write_obj(tmp_path / "a.obj", polygon(600))
-    asset, reason = outcome(path, AssetSettings(budgets=(500,)))
+def test_a_wide_fan_is_kept_from_pymeshlab(outcome: Outcome) -> None:
+    asset, reason = outcome(polygon(600), AssetSettings(budgets=(500,)))
     assert reason == ""
     used = {level.record.method for level in check(asset).levels}
     assert used <= {"meshoptimizer", "meshoptimizer_sloppy"}
 
 
-@pytest.mark.slow("hostile")
-def test_five_thousand_boxes_do_not_fit_into_240_triangles(
-    outcome: Callable[..., Outcome], tmp_path: Path
-) -> None:
-    path = by_hand.write_obj(tmp_path / "a.obj", boxes(5000))
-    asset, reason = outcome(path, AssetSettings(budgets=(240,)))
+@pytest.mark.parametrize("count", [50, pytest.param(5000, marks=pytest.mark.slow("hostile"))])
+def test_many_boxes_do_not_fit_into_240_triangles(outcome: Outcome, count: int) -> None:
+    asset, reason = outcome(boxes(count), AssetSettings(budgets=(240,)))
     assert asset is None
     assert reason in {"area_changed", "error_over_bound", "parts_lost", "budget_missed"}
 
 
-def test_fifty_boxes_do_not_fit_either(outcome: Callable[..., Outcome], tmp_path: Path) -> None:
-    path = by_hand.write_obj(tmp_path / "a.obj", boxes(50))
-    asset, reason = outcome(path, AssetSettings(budgets=(240,)))
-    assert asset is None
-    assert reason in {"area_changed", "error_over_bound", "parts_lost", "budget_missed"}
-
-
-def test_a_floor_of_two_triangles_is_an_object(
-    outcome: Callable[..., Outcome], tmp_path: Path
-) -> None:
+def test_a_floor_of_two_triangles_is_an_object(outcome: Outcome) -> None:
     corners = np.array([[0, 0, 0], [4, 0, 0], [4, 3, 0], [0, 3, 0]], float)
     floor = TriangleMesh(positions=corners, faces=np.array([[0, 1, 2], [0, 2, 3]]))
     for profile in ("faithful", "uniform"):
-        settings = AssetSettings(profile=profile)
-        asset, _ = outcome(by_hand.write_off(tmp_path / "a.off", floor), settings)
+        asset, _ = outcome(floor, AssetSettings(profile=profile), ".off")
         assert check(asset).source.num_parts == 1
         assert asset is not None and asset.source.front_share == pytest.approx(0.5, abs=0.2)
 
 
-def test_sizes_that_are_no_sizes(outcome: Callable[..., Outcome], tmp_path: Path) -> None:
+def test_sizes_that_are_no_sizes(outcome: Outcome) -> None:
     for scale in (1e-200, 1e-10, 1e10, 1e200):
-        path = by_hand.write_obj(tmp_path / f"{scale}.obj", by_hand.moved(by_hand.sphere(), scale))
-        assert outcome(path)[1] == "extent_range", scale
+        mesh = by_hand.moved(by_hand.sphere(), scale)
+        assert outcome(mesh)[1] == "extent_range", scale
 
 
-@pytest.mark.parametrize("write", [by_hand.write_ply, by_hand.write_obj], ids=["ply", "obj"])
-def test_an_object_far_from_its_origin(
-    outcome: Callable[..., Outcome], tmp_path: Path, write: Callable[[Path, TriangleMesh], Path]
-) -> None:
+@pytest.mark.parametrize(("suffix", "reason"), [(".ply", "offset_precision"), (".obj", "")])
+def test_an_object_far_from_its_origin(outcome: Outcome, suffix: str, reason: str) -> None:
     """PLY is usually single precision, so an offset of 1e6 extents is refused; text is exact."""
-    path = write(tmp_path / f"a.{write.__name__[-3:]}", by_hand.moved(by_hand.sphere(), 1.0, 1e6))
-    asset, reason = outcome(path)
-    assert reason == ("offset_precision" if write is by_hand.write_ply else "")
-    assert (asset is None) == (write is by_hand.write_ply)
+    asset, found = outcome(by_hand.moved(by_hand.sphere(), 1.0, 1e6), suffix=suffix)
+    assert found == reason
+    assert (asset is None) == bool(reason)
 
 
-def test_a_vertex_ten_thousand_extents_away(
-    outcome: Callable[..., Outcome], tmp_path: Path
-) -> None:
+def test_a_vertex_ten_thousand_extents_away(outcome: Outcome) -> None:
     ball = by_hand.sphere()
     far = np.concatenate([ball.positions, [[1e4, 0, 0], [1e4, 1e-3, 0], [1e4, 0, 1e-3]]])
     count = len(ball.positions)
     speck = np.array([[count, count + 1, count + 2]])
     mesh = TriangleMesh(positions=far, faces=np.concatenate([ball.faces, speck]))
-    assert outcome(by_hand.write_obj(tmp_path / "a.obj", mesh))[1] in {"far_outlier", "degenerate"}
+    assert outcome(mesh)[1] in {"far_outlier", "degenerate"}

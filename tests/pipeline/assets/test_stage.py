@@ -42,11 +42,6 @@ def small_knot() -> TriangleMesh:
     return knot(segments=60)
 
 
-def test_the_first_method_is_enough_where_it_works(bench: Bench) -> None:
-    assert methods(made(bench)) == [(1000, FIRST), (500, FIRST), (340, FIRST)]
-    assert [call["method"] for call in bench.calls] == [FIRST]
-
-
 def test_the_next_method_starts_in_a_new_child_where_one_crashed(bench: Bench) -> None:
     bench.set(pymeshlab_collapse="crash")
     assert methods(made(bench)) == [(1000, SECOND), (500, SECOND), (340, SECOND)]
@@ -109,11 +104,13 @@ def test_a_method_that_stood_in_for_another_is_not_tried_twice(bench: Bench) -> 
     assert [call["method"] for call in bench.calls] == [FIRST, THIRD]
 
 
-def test_an_unusable_object_is_tried_once(bench: Bench) -> None:
+def test_an_unusable_object_is_tried_once_and_its_refusal_is_plain_text(bench: Bench) -> None:
     bench.set(pymeshlab_collapse="refuse")
     _, (failure,) = run(bench, "knot.obj")
     assert failure.reason == "degenerate"
     assert len(bench.calls) == 1
+    (path,) = (bench.root.parent / "store").rglob("*.json")
+    assert json.loads(path.read_text()) == {"reason": "degenerate", "message": "planned"}
 
 
 def test_a_mistake_of_the_user_stops_the_run(bench: Bench) -> None:
@@ -166,13 +163,6 @@ def test_a_store_that_cannot_be_written_stops_the_run(bench: Bench) -> None:
     with pytest.raises(TrilightError, match="cannot write"):
         run(bench, "knot.obj")
     assert not bench.calls
-
-
-def test_refusals_are_plain_text(bench: Bench) -> None:
-    bench.set(pymeshlab_collapse="refuse")
-    run(bench, "knot.obj")
-    (path,) = (bench.root.parent / "store").rglob("*.json")
-    assert json.loads(path.read_text()) == {"reason": "degenerate", "message": "planned"}
 
 
 def test_a_file_that_the_system_will_not_open_is_refused_today_only(bench: Bench) -> None:

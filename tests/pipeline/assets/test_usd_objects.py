@@ -16,7 +16,15 @@ from pipeline.assets.settings import AssetSettings
 from storage.records.asset import decode_asset
 from tests.for_each import for_each
 from tests.pipeline.assets.child_kit import Bench, run
-from tests.pipeline.assets.meshes_by_hand import as_rows, cube, geometry, moved, prepare, reason_of
+from tests.pipeline.assets.meshes_by_hand import (
+    as_rows,
+    cube,
+    geometry,
+    moved,
+    prepare,
+    reason_of,
+    volume,
+)
 from tests.pipeline.assets.own.textured_kit import CORNERS, KEEP, UV_UP, lost, picture_bytes
 from tests.pipeline.assets.own.usd_kit import (
     MESH,
@@ -71,11 +79,6 @@ def test_all_meshes_are_one_in_their_places_and_instances_too(tmp_path: Path) ->
     assert rows_of(loaded(stage, tmp_path / "a.usda")) == wanted
 
 
-def _turned_round(mesh: TriangleMesh) -> float:
-    corners = mesh.corners
-    return float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
-
-
 @for_each(("left_handed", "mirrored"), itertools.product([False, True], [False, True]))
 def test_windings_stay_outward(tmp_path: Path, left_handed: bool, mirrored: bool) -> None:
     stage = new_stage()
@@ -84,8 +87,7 @@ def test_windings_stay_outward(tmp_path: Path, left_handed: bool, mirrored: bool
     made.CreateOrientationAttr("leftHanded" if left_handed else "rightHanded")
     if mirrored:
         UsdGeom.Xformable(made).AddScaleOp().Set((-1, 1, 1))
-    volume = _turned_round(loaded(stage, tmp_path / "a.usda"))
-    assert volume == pytest.approx(0.125, rel=1e-5)
+    assert volume(loaded(stage, tmp_path / "a.usda")) == pytest.approx(0.125, rel=1e-5)
 
 
 def _reference(name: str) -> Callable[[Usd.Stage], object]:

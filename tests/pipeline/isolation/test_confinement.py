@@ -55,13 +55,13 @@ def test_inputs_are_read_and_outputs_written(child: IsolatedChild, place: Path) 
 def test_a_file_outside_is_not_read(child: IsolatedChild, place: Path) -> None:
     outside = [place / name for name in ("outside/file", "in/link", "in/../outside/file")]
     secrets = Path(f"/proc/{os.getpid()}/environ")  # of another process
-    assert child.call(called.refused_reads, [*outside, secrets]) == [*outside, secrets]
+    assert child.call(called.refused_paths, [*outside, secrets], False) == [*outside, secrets]
 
 
 @needs_landlock
 def test_nothing_is_written_outside_of_the_output(child: IsolatedChild, place: Path) -> None:
     paths = [place / name for name in ("in/file", "in/new", "outside/file", "new")]
-    assert child.call(called.refused_writes, paths) == paths
+    assert child.call(called.refused_paths, paths, True) == paths
     assert (place / "in" / "file").read_text() == "in"
 
 

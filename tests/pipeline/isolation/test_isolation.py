@@ -60,15 +60,6 @@ def test_a_failure_costs_one_call(child: IsolatedChild, function, reason: str) -
     assert child.call(called.double, 4) == 8
 
 
-def test_a_child_that_cannot_be_set_up_stops_the_run(tmp_path: Path) -> None:
-    child = IsolatedChild(
-        limits=LIMITS, setup=called.prepare, setup_args=(str(tmp_path / "nowhere"),)
-    )
-    with pytest.raises(TrilightError, match=r"cannot be set up.*FileNotFoundError.*doctor"):
-        child.call(called.double, 1)
-    child.close()
-
-
 @for_each("times", [1, 3])
 def test_a_fork_server_that_is_killed_is_replaced(
     child: IsolatedChild, monkeypatch: pytest.MonkeyPatch, times: int

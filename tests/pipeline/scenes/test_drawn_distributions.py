@@ -3,7 +3,6 @@
 The line between chance and a defect is that of tests.scene_templates.statistics.
 """
 
-import itertools
 from collections import Counter
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 import trimesh
 
 from pipeline.builds.named import named_build
-from pipeline.scenes.budget import drawn_within
 from pipeline.scenes.pieces import object_piece, shell_piece
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.shapes import MeshShape
@@ -32,46 +30,6 @@ from tests.scene_templates.statistics import (
     share,
     uniform,
 )
-
-SIZES = [40, 30, 20, 10]
-"""Least triangles of four objects."""
-
-
-def _draws(total: int, count: int, times: int = 4000) -> list[str]:
-    rng = np.random.default_rng(0)
-    return ["".join(drawn_within(rng, "abcd", SIZES, count, total)) for _ in range(times)]
-
-
-def test_where_all_fit_every_object_is_as_likely_in_every_place() -> None:
-    draws = _draws(120, 3)
-    even = dict.fromkeys("abcd", 1.0)
-    table = {f"place {row}": choices([draw[row] for draw in draws], even) for row in range(3)}
-    triples = dict.fromkeys(("".join(three) for three in itertools.product("abcd", repeat=3)), 1.0)
-    table["all three"] = choices(draws, triples)
-    require_plausible(table)
-
-
-@pytest.mark.parametrize("total", [70])
-def test_where_not_all_fit_each_draw_is_even_among_what_does(total: int) -> None:
-    """Against the odds of every triple, one draw at a time: the simplest must fit after each."""
-    odds: dict[str, float] = {}
-    _enumerate("", 1.0, total, 3, odds)
-    assert sum(odds.values()) == pytest.approx(1)
-    draws = _draws(total, 3, 12_000)
-    require_plausible({"triples": choices(draws, odds)})
-    even = dict.fromkeys(odds, 1.0)
-    assert len(odds) < 4**3
-    assert implausible({"as if even": choices(draws, even)})
-
-
-def _enumerate(drawn: str, odds: float, left: int, count: int, found: dict[str, float]) -> None:
-    if count == 0:
-        found[drawn] = odds
-        return
-    sizes = dict(zip("abcd", SIZES, strict=True))
-    fitting = [one for one in "abcd" if sizes[one] + 10 * (count - 1) <= left]
-    for one in fitting:
-        _enumerate(drawn + one, odds / len(fitting), left - sizes[one], count - 1, found)
 
 
 @pytest.fixture(scope="module")

@@ -5,12 +5,11 @@ import dataclasses
 import itertools
 import multiprocessing
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
 from pipeline.scenes.compose import compose_scene
@@ -71,34 +70,25 @@ def _rejection(settings: SceneSettings, pool: Sequence[PooledAsset], index: int)
     return caught.value
 
 
-def _with_positions(
-    entry: PooledAsset, change: Callable[[NDArray[np.float32]], object]
-) -> PooledAsset:
-    """The same object with the positions of every level changed in place."""
+Damage = tuple[Any, float]
+DAMAGES: dict[str, Damage] = {
+    "one vertex is no number": (0, np.nan),
+    "one is infinite": ((0, 1), np.inf),
+    "all are one point": (slice(None), 0),
+    "all are on one line": ((slice(None), slice(1, None)), 0),
+}
+"""Which positions have which value."""
+
+
+def _damaged(entry: PooledAsset, damage: Damage) -> PooledAsset:
+    """The same object with some positions of every level changed."""
     levels = []
     for level in entry.asset.levels:
         positions = level.positions.copy()
-        change(positions)
+        positions[damage[0]] = damage[1]
         levels.append(dataclasses.replace(level, positions=positions))
-    return PooledAsset(
-        locked=entry.locked, asset=dataclasses.replace(entry.asset, levels=tuple(levels))
-    )
-
-
-def _one_nan(positions: NDArray[np.float32]) -> None:
-    positions[0] = np.nan
-
-
-def _one_infinite(positions: NDArray[np.float32]) -> None:
-    positions[0, 1] = np.inf
-
-
-def _one_point(positions: NDArray[np.float32]) -> None:
-    positions[:] = 0
-
-
-def _one_line(positions: NDArray[np.float32]) -> None:
-    positions[:, 1:] = 0
+    asset = dataclasses.replace(entry.asset, levels=tuple(levels))
+    return dataclasses.replace(entry, asset=asset)
 
 
 @pytest.mark.filterwarnings("ignore:invalid value encountered")
@@ -113,9 +103,8 @@ def test_a_mesh_without_usable_triangles_is_rejected(pool: list[PooledAsset], bu
     overlapping = dataclasses.replace(
         settings, placement=dataclasses.replace(settings.placement, overlap_share=1.0)
     )
-    damages = (_one_nan, _one_infinite, _one_point, _one_line)
-    for damage, each, index in itertools.product(damages, (settings, overlapping), range(4)):
-        damaged = [_with_positions(pool[1], damage)]
+    for damage, each, index in itertools.product(DAMAGES, (settings, overlapping), range(4)):
+        damaged = [_damaged(pool[1], DAMAGES[damage])]
         try:
             scene = compose_scene(each, damaged, seed=0, scene_index=index, attempt=0)
         except Rejected as rejection:

@@ -9,7 +9,6 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipeline.builds.named import named_build
 from pipeline.scenes.pieces import ScenePiece, emitter_piece, object_piece, shell_piece
 from pipeline.scenes.shading import flat_shaded
 from pipeline.scenes.subdivision import filled, subdivided
@@ -59,16 +58,6 @@ def test_as_many_surfaces_are_textured_as_stated() -> None:
             index_M3 = scene.material_textures
             found.append(index_M3 is not None and bool((index_M3[mine] >= 0).any()))
     require_plausible({"textured": share(found, 0.5)})
-
-
-def test_the_share_is_left_out_of_the_settings_where_it_is_none() -> None:
-    """So that digests of builds without textures stay what they were."""
-    assert "textures" not in named_build("pretrain-256").as_json()["scenes"]
-    build = named_build("pretrain-256", changes={"scenes.textures.share": 0.25})
-    assert build.as_json()["scenes"]["textures"]["share"] == 0.25
-    assert named_build("textured-256").scenes.textures.share == 0.5
-    widths = changed(PLAIN, {"textures.surfaces.size": 64}).textures.surfaces.size
-    assert widths == 64
 
 
 @for_each("side", range(6))

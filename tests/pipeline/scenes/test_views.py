@@ -9,9 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
-from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.laws import require_laws
-from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
 from pipeline.scenes.sight import Sight
 from pipeline.scenes.views import (
@@ -73,17 +71,6 @@ def test_accepted_views_hold_on_a_finer_grid_that_shares_no_ray(scenes: list[Sce
             assert coverage > SETTINGS.views.min_coverage - 0.01
             assert shell_back < SETTINGS.views.max_shell_back + 0.01
             assert depth > SETTINGS.views.min_depth
-
-
-def test_cameras_keep_their_ranges(scenes: list[Scene]) -> None:
-    for scene in scenes:
-        assert (scene.fov_deg >= 30).all()
-        assert (scene.fov_deg <= 60).all()
-        for c2w in scene.c2w.astype(np.float64):
-            # The point looked at is 1.5 to 2.0 ahead, within 0.2 of the origin per axis; steps of
-            # 0.25 mm along the axis leave half a step.
-            ahead = c2w[:3, 3] - np.linspace(1.5, 2.0, 2001)[:, None] * c2w[:3, 2]
-            assert np.abs(ahead).max(axis=1).min() <= 0.2 + 2.5e-4
 
 
 def test_cameras_are_outside_of_every_objects_box(scenes: list[Scene]) -> None:
@@ -191,14 +178,6 @@ def test_the_cameras_of_a_view_need_nothing_but_the_stored_scene(scenes: list[Sc
     )
     np.testing.assert_array_equal([row.c2w for row in one], [row.c2w for row in other])
     assert [row.attempt for row in one] == [row.attempt for row in other]
-
-
-def test_views_that_nobody_can_find_are_rejected(pool: list[PooledAsset]) -> None:
-    settings = dataclasses.replace(SETTINGS, views=ViewLaws(min_coverage=1.0))
-    with pytest.raises(Rejected) as caught:
-        compose_scene(settings, pool, seed=0, scene_index=0, attempt=0)
-    assert caught.value.reason == "no_camera"
-    assert "sees too little of the objects x16" in caught.value.message
 
 
 SMOKE = named_build("smoke").scenes

@@ -34,25 +34,6 @@ def _unit(seed: int) -> np.ndarray:
     return vector / np.sqrt(np.square(vector).sum())
 
 
-@for_each(
-    ("u", "v", "axis"),
-    [
-        (0.5, 0.5, (1, 0, 0)),
-        (0.25, 0.5, (0, 1, 0)),
-        (0.75, 0.5, (0, -1, 0)),
-        (0.0, 0.5, (-1, 0, 0)),
-        (0.5, 1.0, (0, 0, 1)),
-        (0.5, 0.0, (0, 0, -1)),
-    ],
-)
-def test_orientation_is_blenders(u: float, v: float, axis: tuple[int, int, int]) -> None:
-    height = 64
-    row, column = min(int((1 - v) * height), height - 1), int(u * 2 * height)
-    found = SkyTexels(height).directions[row, column]
-    # half a texel, in both directions, from the place that is meant
-    assert math.acos(np.clip(found @ axis, -1, 1)) < math.sqrt(0.5) * math.pi / height * 1.01
-
-
 def test_texel_centres_are_where_the_convention_shows_them() -> None:
     height = 16
     directions = SkyTexels(height).directions
@@ -324,8 +305,3 @@ def test_only_the_sky_is_new() -> None:
     for field in dataclasses.fields(Scene):
         if field.name not in ("environment", "provenance", "objects"):
             np.testing.assert_array_equal(getattr(before, field.name), getattr(after, field.name))
-
-
-def test_settings_without_skies_are_recorded_as_before() -> None:
-    records = [named_build(name).as_json()["scenes"] for name in ("pretrain-256", "sky-256")]
-    assert "skies" not in records[0] and records[1]["skies"]["share"] == 0.75

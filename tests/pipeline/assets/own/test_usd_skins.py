@@ -232,10 +232,3 @@ def test_what_nothing_here_can_show_is_named(tmp_path: Path) -> None:
     asset = prepare(usd_kit.exported(stage, tmp_path / "a.usda"), kit.KEEP)
     assert asset.materials is not None
     assert asset.materials.lost == ("clearcoat", "emission", "transparency")
-
-
-def test_materials_change_no_triangle(tmp_path: Path) -> None:
-    path = usd_kit.textured_usd(tmp_path / "a.usdz", kit.picture_bytes(kit.CORNERS))
-    assert geometry(prepare(path, kit.KEEP)) == geometry(prepare(path))
-    twin = prepare(kit.textured_glb(tmp_path / "a.glb", kit.picture_bytes(kit.CORNERS)))
-    assert geometry(prepare(path)) == geometry(twin)
