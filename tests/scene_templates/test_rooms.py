@@ -13,7 +13,6 @@ from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_fa
 from scene_templates.rooms import (
     PATCH_FACES,
     SIDES,
-    PatchPlacement,
     Room,
     SharedRoom,
     patch,
@@ -23,13 +22,12 @@ from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from tests.for_each import for_each
-from tests.scene_templates.balls import drawn, one_drawn, template_settings
+from tests.scene_templates.balls import STILL, drawn, one_drawn, template_settings
 from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row, side_row
 
 ROUNDING = 1e-12
 """Coordinates about 1 after ten float64 operations are good to 1e-15; a thousand times that."""
 
-STILL = PatchPlacement(rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0))
 SQUARE = SharedRoom(square_share=1.0)
 LOOSE = SharedRoom(square_share=0.0)
 

@@ -77,9 +77,8 @@ print(json.dumps({
 """
 
 
-@pytest.fixture(scope="module")
-def told(shared: Path) -> dict:
-    """What a process without pymeshlab makes of a real object."""
+def test_faithful_works_without_pymeshlab_and_uniform_says_what_to_do(shared: Path) -> None:
+    """In a process without it, of a real object; the recipe says so, and nothing is loaded."""
     result = subprocess.run(
         [sys.executable, "-c", PROGRAM, str(shared / "objects" / "classic" / "spot.obj")],
         cwd=ROOT,
@@ -88,29 +87,15 @@ def told(shared: Path) -> dict:
         text=True,
         check=True,
     )
-    answer: dict = json.loads(result.stdout.splitlines()[-1])
-    return answer
-
-
-def test_faithful_works_by_the_other_library(told: dict) -> None:
+    told = json.loads(result.stdout.splitlines()[-1])
     assert told["methods"] == ["meshoptimizer", "meshoptimizer_sloppy"]
-    assert told["missed"] == []
-    for method, faces in told["levels"]:
-        assert method == "meshoptimizer"
-        assert faces <= 1400
-    assert len(told["levels"]) == 2
-
-
-def test_uniform_says_what_is_missing_and_what_to_do(told: dict) -> None:
-    assert "profile uniform" in told["refusal"]
+    assert [method for method, _ in told["levels"]] == ["meshoptimizer"] * 2
+    assert max(faces for _, faces in told["levels"]) <= 1400
+    assert (told["missed"], told["loaded"]) == ([], [])
+    assert re.search("profile uniform.*faithful", told["refusal"])
     assert "pymeshlab is not installed" in told["refusal"]
-    assert "faithful" in told["refusal"]
-
-
-def test_the_recipe_says_so_and_nothing_of_it_is_loaded(told: dict) -> None:
     assert "pymeshlab=absent" in told["recipe"]
     assert "pymeshlab=absent" not in RECIPE
-    assert told["loaded"] == []
     assert methods_of("faithful")[0] == "pymeshlab_collapse"
 
 

@@ -7,7 +7,7 @@ import json
 import logging
 import threading
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -43,19 +43,42 @@ def test_the_link_to_the_report(
     assert report_url("data/mine") == url
 
 
-@pytest.fixture
-def tables(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, str]]]:
-    """Key and rows of each table that is shown; there is no server."""
-    shown: list[tuple[str, dict[str, str]]] = []
+Shown = list[tuple[str, dict[str, str]]]
+
+
+def _shown_by(module: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Shown:
+    """Key and rows of each table that a module shows; there is no server."""
+    shown: Shown = []
 
     def table(rows: list[dict[str, str]], key: str, description: str) -> None:
         shown.append((key, {row["what"]: row["value"] for row in rows}))
 
-    monkeypatch.setattr(watching, "create_table_artifact", table)
-    monkeypatch.setattr(watching, "create_progress_artifact", lambda *args, **named: "id")
-    monkeypatch.setattr(watching, "update_progress_artifact", lambda *args: None)
-    monkeypatch.setattr(watching, "get_run_logger", lambda: logging.getLogger("trilight.test"))
+    monkeypatch.setattr(module, "create_table_artifact", table)
+    monkeypatch.setattr(module, "create_progress_artifact", lambda *args, **named: "id")
+    monkeypatch.setattr(module, "update_progress_artifact", lambda *args: None)
+    monkeypatch.setattr(module, "create_image_artifact", lambda *args, **named: None)
+    monkeypatch.setattr(module, "get_run_logger", lambda: logging.getLogger("trilight.test"))
     return shown
+
+
+def _cannot_show(module: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(*args: object, **named: object) -> None:
+        raise ConnectionError("gone")
+
+    monkeypatch.setattr(module, "create_progress_artifact", gone)
+    monkeypatch.setattr(module, "create_table_artifact", gone)
+
+
+@pytest.fixture
+def tables(monkeypatch: pytest.MonkeyPatch) -> Shown:
+    return _shown_by(watching, monkeypatch)
+
+
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
+    """The dataset is looked at all the time."""
+    monkeypatch.setattr(array_flow, "LOOK_S", 0.01)
+    return _shown_by(array_flow, monkeypatch)
 
 
 def _task(scenes: int, seconds: float) -> TaskOutcome:
@@ -65,11 +88,7 @@ def _task(scenes: int, seconds: float) -> TaskOutcome:
 def test_a_page_that_cannot_be_shown_does_not_end_the_run(
     tables: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def gone(*args: object, **named: object) -> None:
-        raise ConnectionError("gone")
-
-    monkeypatch.setattr(watching, "create_progress_artifact", gone)
-    monkeypatch.setattr(watching, "create_table_artifact", gone)
+    _cannot_show(watching, monkeypatch)
     watched = Watched(DatasetOrder(out=str(tmp_path)))
     watched.task_done(None, _task(1, 1.0))  # type: ignore[arg-type]
     watched.failed(ValueError("x"))
@@ -90,7 +109,7 @@ def test_the_rate_begins_with_the_first_scene(
 
 
 def test_a_page_shows_the_scenes_and_where_their_report_is(
-    tables: list[tuple[str, dict[str, str]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pictures: list[str] = []
     monkeypatch.setattr(
@@ -117,7 +136,7 @@ def test_a_page_shows_the_scenes_and_where_their_report_is(
 
 
 def test_a_run_that_fails_says_so_in_its_summary(
-    tables: list[tuple[str, dict[str, str]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*arguments: object) -> None:
         raise TrilightError("the disk is full of https://me:secret@host/x")
@@ -141,26 +160,6 @@ def test_a_price_that_is_none_is_named_at_the_start(
     monkeypatch.setenv("TRILIGHT_USD_PER_CORE_HOUR", text)
     with pytest.raises(TrilightError, match=rf"TRILIGHT_USD_PER_CORE_HOUR is '{text}'; expected"):
         Watched(DatasetOrder())
-
-
-Shown = list[tuple[str, dict[str, str]]]
-
-
-@pytest.fixture
-def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
-    """Key and rows of each table; there is no server, and the dataset is looked at all the time."""
-    tables: Shown = []
-
-    def table(rows: list[dict[str, str]], key: str, description: str) -> None:
-        tables.append((key, {row["what"]: row["value"] for row in rows}))
-
-    monkeypatch.setattr(array_flow, "create_table_artifact", table)
-    monkeypatch.setattr(array_flow, "create_progress_artifact", lambda *args, **named: "id")
-    monkeypatch.setattr(array_flow, "update_progress_artifact", lambda *args: None)
-    monkeypatch.setattr(array_flow, "create_image_artifact", lambda *args, **named: None)
-    monkeypatch.setattr(array_flow, "get_run_logger", lambda: logging.getLogger("trilight.test"))
-    monkeypatch.setattr(array_flow, "LOOK_S", 0.01)
-    return tables
 
 
 @pytest.fixture
@@ -233,11 +232,7 @@ def test_a_page_that_cannot_be_shown_does_not_end_an_array(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    def gone(*args: object, **named: object) -> None:
-        raise ConnectionError("gone")
-
-    monkeypatch.setattr(array_flow, "create_progress_artifact", gone)
-    monkeypatch.setattr(array_flow, "create_table_artifact", gone)
+    _cannot_show(array_flow, monkeypatch)
     run(out=str(tmp_path / "set"), scenes=4)
     assert [record.levelname for record in caplog.records].count("WARNING") == 1
 

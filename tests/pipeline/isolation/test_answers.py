@@ -7,6 +7,7 @@ import os
 import pickle  # noqa: TID251 - what an attacker would send
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -186,16 +187,13 @@ def test_a_hostile_pickle_makes_no_file(child: IsolatedChild, tmp_path: Path, fo
 def test_an_answer_that_never_ends_does() -> None:
     """Neither its length nor its pieces, each of which comes in time, hold its owner."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=1, calls_per_child=100)
-    child = IsolatedChild(limits=limits, setup=nothing)
     endless, trickle = (1 << 60).to_bytes(8, "little"), (200).to_bytes(8, "little")
     began_s = time.monotonic()
-    try:
+    with closing(IsolatedChild(limits=limits, setup=nothing)) as child:
         with pytest.raises(ChildFailed, match="nonsense: its answer would have"):
             child.call(taken_over, [endless], 0.0)
         with pytest.raises(ChildFailed, match="timeout_wall"):
             child.call(taken_over, [trickle, *([b"x"] * 199)], 0.1)
-    finally:
-        child.close()
     assert time.monotonic() - began_s < 15  # a busy machine starts a child in that
 
 

@@ -3,11 +3,12 @@
 import os
 import socket
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, confinement, reach
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Reach, confinement, reach
 from pipeline.isolation.landlock import landlock_version
 from pipeline.isolation.seccomp import _NUMBERS, _program, seccomp_works
 from storage.errors import EnvironmentFailure, TrilightError
@@ -17,6 +18,10 @@ from tests.pipeline.isolation import called
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=20, calls_per_child=100)
 needs_landlock = pytest.mark.skipif(not landlock_version(), reason="no Landlock here")
 needs_seccomp = pytest.mark.skipif(not seccomp_works(), reason="no seccomp here")
+
+
+def confined(allowed: Reach) -> IsolatedChild:
+    return IsolatedChild(limits=LIMITS, setup=called.nothing, confined_to=allowed)
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +37,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def child(place: Path) -> Iterator[IsolatedChild]:
-    allowed = reach(files=[place / "in" / "file"], writes=[place / "out"])
-    child = IsolatedChild(limits=LIMITS, setup=called.nothing, confined_to=allowed)
+    child = confined(reach(files=[place / "in" / "file"], writes=[place / "out"]))
     yield child
     child.close()
 
@@ -92,10 +96,7 @@ def test_ways_around_are_refused(child: IsolatedChild, name: str) -> None:
 
 @needs_landlock
 def test_another_folder_costs_a_fresh_child_and_the_same_one_none(place: Path) -> None:
-    child = IsolatedChild(
-        limits=LIMITS, setup=called.nothing, confined_to=reach(files=[place / "in"])
-    )
-    try:
+    with closing(confined(reach(files=[place / "in"]))) as child:
         first = child.call(called.process_id)
         child.may(reach(files=[place / "in" / "file"]))
         assert child.call(called.process_id) == first
@@ -103,8 +104,6 @@ def test_another_folder_costs_a_fresh_child_and_the_same_one_none(place: Path) -
         assert child.call(called.read, place / "outside" / "file") == "outside"
         assert child.call(called.read, place / "in" / "file") == "in"
         assert child.call(called.process_id) != first
-    finally:
-        child.close()
 
 
 @needs_landlock
@@ -116,23 +115,15 @@ def test_packages_that_a_path_of_pythons_names_are_read_and_its_other_folders_no
         folder.mkdir(parents=True)
         (folder / "file").write_text("found")
         monkeypatch.syspath_prepend(str(folder))
-    child = IsolatedChild(limits=LIMITS, setup=called.nothing, confined_to=reach())
-    try:
+    with closing(confined(reach())) as child:
         assert child.call(called.read, packages / "file") == "found"
         _refused(child, called.read, other / "file")
-    finally:
-        child.close()
 
 
 def test_off_confines_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(confinement.VARIABLE, "off")
-    child = IsolatedChild(
-        limits=LIMITS, setup=called.nothing, confined_to=reach(files=[place / "in"])
-    )
-    try:
+    with closing(confined(reach(files=[place / "in"]))) as child:
         assert child.call(called.read, place / "outside" / "file") == "outside"
-    finally:
-        child.close()
 
 
 @for_each(
@@ -144,7 +135,7 @@ def test_what_cannot_be_had_is_said(
 ) -> None:
     monkeypatch.setenv(confinement.VARIABLE, word)
     monkeypatch.setattr(confinement, "landlock_version", lambda: 0)
-    child = IsolatedChild(limits=LIMITS, setup=called.nothing, confined_to=reach())
+    child = confined(reach())
     with pytest.raises(error, match=said):
         child.call(called.double, 2)
     monkeypatch.setenv(confinement.VARIABLE, "auto")

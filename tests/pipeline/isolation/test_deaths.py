@@ -2,6 +2,7 @@
 
 import signal
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -99,11 +100,8 @@ def test_every_end_has_tries_and_only_two_are_verdicts() -> None:
 
 
 def test_a_kill_while_a_child_is_set_up_is_tried_again(tmp_path: Path) -> None:
-    child = child_with(called.set_up_dying, str(tmp_path), signal.SIGKILL, 2)
-    try:
+    with closing(child_with(called.set_up_dying, str(tmp_path), signal.SIGKILL, 2)) as child:
         assert child.call(called.double, 4) == 8
-    finally:
-        child.close()
     assert len(list(tmp_path.iterdir())) == 3
 
 
@@ -116,11 +114,8 @@ def test_kills_of_every_set_up_end_the_run(tmp_path: Path) -> None:
 
 def test_a_set_up_that_cannot_succeed_is_tried_once_at_each_call(tmp_path: Path) -> None:
     """And no call is made in a child that was not set up."""
-    child = child_with(called.fail_set_up, str(tmp_path))
-    try:
+    with closing(child_with(called.fail_set_up, str(tmp_path))) as child:
         for calls in (1, 2):
             with pytest.raises(EnvironmentFailure, match="cannot be set up.*a library is broken"):
                 child.call(called.double, 4)
             assert len(list(tmp_path.iterdir())) == calls
-    finally:
-        child.close()

@@ -9,6 +9,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from multiprocessing import popen_forkserver
 from pathlib import Path
 
@@ -113,26 +114,20 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
 def test_processor_seconds_are_for_one_call_each() -> None:
     """A call that uses them up ends its child; several that stay below do not add up."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, cpu_s=1, calls_per_child=9)
-    child = IsolatedChild(limits=limits, setup=called.nothing)
-    try:
+    with closing(IsolatedChild(limits=limits, setup=called.nothing)) as child:
         assert len({child.call(called.burn, 0.6) for _ in range(3)}) == 1
         with pytest.raises(ChildFailed, match="timeout_cpu: used its 1 processor seconds"):
             child.call(called.burn, 30.0)
         assert child.call(called.double, 4) == 8
-    finally:
-        child.close()
 
 
 def test_waiting_uses_no_processor_seconds() -> None:
     """It uses the time of its call, and costs no more than that."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=1.5, cpu_s=1, calls_per_child=9)
-    child = IsolatedChild(limits=limits, setup=called.nothing)
-    try:
+    with closing(IsolatedChild(limits=limits, setup=called.nothing)) as child:
         with pytest.raises(ChildFailed, match="timeout_wall"):
             child.call(called.hang)
         assert child.call(called.double, 4) == 8
-    finally:
-        child.close()
 
 
 def test_a_retired_child_is_replaced(child: IsolatedChild) -> None:

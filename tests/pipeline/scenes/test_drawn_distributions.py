@@ -3,7 +3,9 @@
 The line between chance and a defect is that of tests.scene_templates.statistics.
 """
 
+import dataclasses
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,12 +17,13 @@ from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.shapes import MeshShape
 from scene_templates.layout import ShellPart, SurfaceLook
 from scene_templates.layout_rand import layout_rand, scene_plan
-from scene_templates.rooms import PATCH_FACES, SIDES, PatchPlacement, patch
+from scene_templates.rooms import PATCH_FACES, SIDES, patch
 from storage.records.material import DIFFUSE
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
 from tests.pipeline.scenes.scene_facts import rows_of
-from tests.pipeline.scenes.small_pool import first_scene
+from tests.pipeline.scenes.small_pool import LOOK, first_scene
+from tests.scene_templates.balls import STILL
 from tests.scene_templates.published import DEFAULT, STAGE_1
 from tests.scene_templates.statistics import (
     Table,
@@ -117,23 +120,13 @@ def test_how_far_meshes_shift_sizes(
         assert np.abs(values - np.arange(len(values)) / len(values)).max() < most
 
 
-def _surface(colours: str) -> SurfaceLook:
-    return SurfaceLook(
-        diffuse_scale=0.8,
-        diffuse_rgb=(0.1, 0.2, 0.3),
-        specular_rgb=(0.1, 0.1, 0.1),
-        roughness=0.5,
-        smooth=True,
-        colours=colours,  # type: ignore[arg-type]
-    )
+def _surface(colours: Any) -> SurfaceLook:
+    return dataclasses.replace(LOOK, diffuse_scale=0.8, smooth=True, colours=colours)
 
 
 def test_many_colours_are_even_below_the_diffuse_scale() -> None:
     rng = np.random.default_rng(0)
-    still = PatchPlacement(
-        rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0)
-    )
-    positions = patch(SIDES["floor"], still)
+    positions = patch(SIDES["floor"], STILL)
     part = ShellPart(
         name="floor", positions=positions, faces=PATCH_FACES, surface=_surface("triangles")
     )

@@ -14,7 +14,7 @@ from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.redrawn import with_new_lights
 from pipeline.scenes.subdivision import subdivided
 from scene_templates.families import DEFAULT_FAMILIES
-from scene_templates.layout import Emitter, SurfaceLook
+from scene_templates.layout import Emitter
 from scene_templates.settings import SceneSettings
 from storage.records.asset import Level
 from storage.records.lookup import texture_values
@@ -25,7 +25,7 @@ from storage.records.scene import Scene, SceneObject
 from storage.records.skin import LevelSkin, SkinQuality
 from storage.records.texture import Texture
 from storage.settings.changes import changed
-from tests.pipeline.scenes.small_pool import first_scene, pooled, small_pool
+from tests.pipeline.scenes.small_pool import LOOK, first_scene, pooled, small_pool
 from tests.scene_templates.statistics import require_plausible, share
 
 DRAWN = SceneSettings(families=DEFAULT_FAMILIES, num_views=1)
@@ -36,14 +36,6 @@ QUALITY = SkinQuality(
     missed_cells=0.0,
     torn_seams=0.0,
     texels_per_length=1.0,
-)
-LOOK = SurfaceLook(
-    diffuse_scale=1.0,
-    diffuse_rgb=(0.1, 0.2, 0.3),
-    specular_rgb=(0, 0, 0),
-    roughness=0.5,
-    smooth=False,
-    colours="one",
 )
 
 

@@ -106,25 +106,6 @@ def test_meshes_may_meet_where_the_plan_lets_them(pool: list[PooledAsset]) -> No
     assert sum(_meeting(scene) > 0 for scene in scenes) > 3
 
 
-def test_spheres_may_overlap_while_meshes_do_not(scenes: list[Scene]) -> None:
-    """Else large objects would crowd each other out, and thin ones keep far too much room."""
-    overlapping = 0
-    for index, scene in enumerate(scenes):
-        if scene_plan(SETTINGS, seed=3, scene_index=index).overlaps:
-            continue
-        spheres = []
-        for row in rows_of(scene, "object"):
-            points = triangles_of(scene, row).reshape(-1, 3)
-            centre = (points.min(axis=0) + points.max(axis=0)) / 2
-            spheres.append((centre, np.linalg.norm(points - centre, axis=1).max()))
-        overlapping += any(
-            np.linalg.norm(a - b) < r + s
-            for k, (a, r) in enumerate(spheres)
-            for b, s in spheres[:k]
-        )
-    assert overlapping > 8
-
-
 def _pose(rng: np.random.Generator, radius: float) -> Pose:
     return Pose(
         centre=rng.uniform(-0.35, 0.35, size=3), radius=radius, rotation=uniform_rotation(rng)
@@ -188,14 +169,6 @@ TOUCH = 1e-6
 """Coordinates below 2 in float32: 1.2e-7 of rounding each, three to a height."""
 
 
-def _any_pose(rng: np.random.Generator) -> Pose:
-    return Pose(
-        centre=rng.uniform(-0.5, 0.5, size=3),
-        radius=rng.uniform(0.2, 0.5),
-        rotation=uniform_rotation(rng),
-    )
-
-
 def _off_centre() -> NDArray[np.float32]:
     """A level that is not in the middle of its source: half of a ball is gone."""
     ball = trimesh.creation.icosphere(2)
@@ -228,7 +201,7 @@ def test_otherwise_the_middle_of_the_source_does() -> None:
 def test_a_posed_mesh_fills_its_sphere(centring: str) -> None:
     rng = np.random.default_rng(0)
     for entry in small_pool():
-        pose = _any_pose(rng)
+        pose = _pose(rng, rng.uniform(0.2, 0.5))
         source = in_unit_sphere(entry.asset.levels[0].positions, centring)  # type: ignore[arg-type]
         points = posed(source, pose)
         assert points.dtype == np.float32
@@ -240,7 +213,7 @@ def test_posing_is_a_similarity() -> None:
     rng = np.random.default_rng(1)
     for entry in small_pool():
         source = in_unit_sphere(entry.asset.levels[-1].positions, "box")
-        pose = _any_pose(rng)
+        pose = _pose(rng, rng.uniform(0.2, 0.5))
         points = posed(source, pose).astype(np.float64)
         before = np.linalg.norm(source[:, None] - source[None], axis=-1)
         after = np.linalg.norm(points[:, None] - points[None], axis=-1)

@@ -14,8 +14,8 @@ from pipeline.scenes.shading import flat_shaded
 from pipeline.scenes.subdivision import filled, subdivided
 from pipeline.scenes.textured_pieces import cube_places, with_drawn_textures
 from scene_templates.families import DEFAULT_FAMILIES
-from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose, ShellPart, SurfaceLook
-from scene_templates.rooms import PATCH_FACES, SIDES, PatchPlacement, patch
+from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose, ShellPart
+from scene_templates.rooms import PATCH_FACES, SIDES, patch
 from scene_templates.rotations import rotated
 from scene_templates.settings import SceneSettings
 from scene_templates.surfaces.draw import SurfaceMapSettings
@@ -24,7 +24,8 @@ from storage.records.material import default_rows
 from storage.records.scene import Scene, SceneObject
 from storage.settings.changes import changed
 from tests.for_each import for_each
-from tests.pipeline.scenes.small_pool import first_scene, small_pool
+from tests.pipeline.scenes.small_pool import LOOK, first_scene, small_pool
+from tests.scene_templates.balls import STILL
 from tests.scene_templates.statistics import require_plausible, share
 
 SMALL = SurfaceMapSettings(size=8)
@@ -103,16 +104,8 @@ def test_an_objects_texture_turns_with_it() -> None:
             materials=default_rows(1),
             material_index=np.zeros(2, np.int64),
         )
-        look = SurfaceLook(
-            diffuse_scale=1.0,
-            diffuse_rgb=(0, 0, 0),
-            specular_rgb=(0, 0, 0),
-            roughness=1.0,
-            smooth=False,
-            colours="one",
-        )
         pose = Pose(centre=centre, radius=1.0, rotation=rotation)
-        placement = ObjectPlacement(pose=pose, surface=look)
+        placement = ObjectPlacement(pose=pose, surface=LOOK)
         layout = Layout(shell=(), objects=(placement,), emitters=())
         textures = TextureSettings(share=1.0, surfaces=SMALL)
         (textured,) = with_drawn_textures(
@@ -142,23 +135,13 @@ ROUNDING = 1e-6
 """Positions below 1 are float32, good to 6e-8; areas and distances are a few sums of them."""
 
 
-def _surface(*, smooth: bool) -> SurfaceLook:
-    return SurfaceLook(
-        diffuse_scale=0.5,
-        diffuse_rgb=(0.5, 0.4, 0.3),
-        specular_rgb=(0.4, 0.4, 0.4),
-        roughness=0.5,
-        smooth=smooth,
-        colours="triangles" if smooth else "one",
-    )
-
-
 def _piece(mesh: trimesh.Trimesh, *, smooth: bool) -> ScenePiece:
     entry = SceneObject(name="it", kind="object", uid="made/it")
     positions = (0.5 * mesh.vertices).astype(np.float32)
     faces = mesh.faces.astype(np.uint32)
     rng = np.random.default_rng(0)
-    return object_piece(entry, positions, faces, _surface(smooth=smooth), rng, 30.0)
+    look = dataclasses.replace(LOOK, smooth=smooth, colours="triangles" if smooth else "one")
+    return object_piece(entry, positions, faces, look, rng, 30.0)
 
 
 def _open_and_odd() -> trimesh.Trimesh:
@@ -297,14 +280,11 @@ def test_the_longest_edges_are_halved_first() -> None:
 
 
 def _shell() -> ScenePiece:
-    still = PatchPlacement(
-        rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0)
-    )
     part = ShellPart(
         name="floor",
-        positions=patch(SIDES["floor"], still),
+        positions=patch(SIDES["floor"], STILL),
         faces=PATCH_FACES,
-        surface=_surface(smooth=False),
+        surface=LOOK,
     )
     return shell_piece(part, np.random.default_rng(0), 30.0)
 

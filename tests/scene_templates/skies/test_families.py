@@ -3,7 +3,6 @@
 import hashlib
 import itertools
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from scene_templates.skies.families import OUR_SKIES, SKIES
 from scene_templates.skies.texels import SkyTexels
 from storage.seeds import rng_for
 from storage.settings.changes import changed
-from tests.extensions_kit import loaded, written
 from tests.for_each import for_each
 from tests.scene_templates.skies.test_skies import uv_of
 from tests.scene_templates.statistics import merged, require_plausible, stated_table
@@ -188,21 +186,3 @@ def test_a_sun_of_a_million_is_finite_and_exact() -> None:
 def test_overcast_is_brighter_above_than_at_the_horizon() -> None:
     found = np.mean([_sky("clouds", seed).radiance_rgb for seed in range(12)], axis=(0, 2, 3))
     assert found[0] > 1.3 * found[15]
-
-
-def test_an_extension_adds_a_sky(tmp_path: Path) -> None:
-    file = written(
-        tmp_path,
-        "import numpy as np\n"
-        "from scene_templates.skies.families import SKIES\n"
-        "def ceiling(draws, texels):\n"
-        "    '''A bright ceiling.'''\n"
-        "    colour = draws.light('ceiling', mired=(150, 300))\n"
-        "    return (texels.z > 0.5)[..., None] * np.ones((1, 2 * texels.height, 1)) * colour\n"
-        "SKIES.register('ceiling', ceiling)\n",
-    )
-    with loaded(file):
-        assert "ceiling" not in SkyMapSettings().families
-        sky = _sky("ceiling", 0)
-        assert sky.radiance_rgb[0].min() > 0 and sky.radiance_rgb[16:].max() == 0
-    assert "ceiling" not in SKIES

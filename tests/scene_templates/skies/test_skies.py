@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +13,8 @@ from scene_templates.skies.drawn_scene import SceneSky, lamp_irradiance, scene_s
 from scene_templates.skies.families import OUR_SKIES, SKIES
 from scene_templates.skies.settings import SkySettings
 from scene_templates.skies.texels import SkyTexels
-from storage.errors import TrilightError
 from storage.records.scene import Scene
 from storage.seeds import rng_for
-from storage.settings.described import described
 from tests.for_each import for_each
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scene_templates.statistics import choices, require_plausible, share, uniform
@@ -211,34 +208,6 @@ def test_families_brightness_and_colours_are_as_stated() -> None:
 
 def test_all_of_ours_are_drawn_by_default() -> None:
     assert SkyMapSettings().families == OUR_SKIES == tuple(SKIES)
-
-
-@for_each(
-    ("name", "value"),
-    [
-        ("families", ()),
-        ("families", ("fog",)),
-        ("height", 0),
-        ("height", 2048),
-        ("height", 8.5),
-        ("mean_radiance", (-1.0, 1.0)),
-        ("coloured_share", 2.0),
-        ("sun_elevation_deg", (0.0, 91.0)),
-        ("sun_to_sky", (2.0, 1.0)),
-    ],
-)
-def test_a_contradiction_is_one_line_that_names_its_field(name: str, value: Any) -> None:
-    with pytest.raises(TrilightError) as caught:
-        SkyMapSettings(**{name: value})
-    message = str(caught.value)
-    assert "\n" not in message
-    assert name in message or "'fog' is unknown" in message
-
-
-def test_every_setting_has_a_sentence() -> None:
-    for field in described(SkyMapSettings):
-        assert field.sentence.endswith(".")
-        assert field.expected
 
 
 SMALL = SkyMapSettings(height=8)

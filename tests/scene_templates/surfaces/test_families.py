@@ -1,7 +1,6 @@
 """Laws that every family of surfaces keeps: drawn as stated, lawful, tileable, reproducible."""
 
 import hashlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from scene_templates.surfaces.maps import Finish, SurfaceMaps
 from scene_templates.surfaces.texels import Texels
 from storage.seeds import rng_for
 from storage.settings.changes import changed
-from tests.extensions_kit import loaded, written
 from tests.for_each import for_each
 from tests.scene_templates.statistics import merged, require_plausible, stated_table
 
@@ -143,25 +141,3 @@ def test_bytes_are_the_same_everywhere(family: str) -> None:
     made = [_all_three(_surface(family, seed)).tobytes() for seed in range(4)]
     assert hashlib.sha256(b"".join(made)).hexdigest()[:16] == DIGESTS[family]
     assert len(set(made)) == 4
-
-
-def test_an_extension_adds_a_family(tmp_path: Path) -> None:
-    file = written(
-        tmp_path,
-        "import numpy as np\n"
-        "from scene_templates.surfaces.families import SURFACES\n"
-        "def dots(draws, texels):\n"
-        "    '''Round dots.'''\n"
-        "    paper = draws.finish('paper', low=(0.8,) * 3, high=(0.9,) * 3, roughness=(0.5, 1.0))\n"
-        "    ink = draws.finish('ink', low=(0.0,) * 3, high=(0.1,) * 3, roughness=(0.5, 1.0))\n"
-        "    x, y = (4 * axis - np.floor(4 * axis) - 0.5 for axis in (texels.u, texels.v))\n"
-        "    return paper.covered(ink, (x * x + y * y < 0.1) * 1.0)\n"
-        "SURFACES.register('dots', dots)\n",
-    )
-    with loaded(file):
-        assert "dots" not in SurfaceMapSettings().families
-        maps = _surface("dots", 0)
-        # a circle of that radius in each of sixteen squares, counted by texel centres
-        dark = (maps.diffuse_rgb.max(axis=-1) < 0.2).mean()
-        assert abs(dark - 0.1 * np.pi) < 0.03
-    assert "dots" not in SURFACES

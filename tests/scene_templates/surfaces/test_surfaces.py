@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +13,7 @@ from scene_templates.surfaces.made import exceeded_by
 from scene_templates.surfaces.maps import MOST_ALBEDO, finish, surface_maps
 from scene_templates.surfaces.texels import Texels, stones
 from scene_templates.textures import TexturedLook, TextureSettings, draw_look
-from storage.errors import TrilightError
 from storage.seeds import rng_for
-from storage.settings.described import described
 from tests.for_each import for_each
 from tests.scene_templates.statistics import choices, require_plausible, share, uniform
 
@@ -215,18 +212,6 @@ def test_a_level_is_exceeded_by_its_share(share: float) -> None:
     assert (noise > exceeded_by(noise, share)).mean() == pytest.approx(share, abs=2 / 4096)
 
 
-def test_a_coarse_map_of_fabric_has_the_colour_of_a_fine_one() -> None:
-    for seed in range(2):
-        means = [
-            draw_surface(
-                rng_for(seed, "surface"), SurfaceMapSettings(families=("fabric",), size=size)
-            ).diffuse_rgb.mean((0, 1), dtype=float)
-            for size in (64, 256)
-        ]
-        # two texels a thread have a mean of 1/4 where the curve has 1/3, and no fluff: 4 % and 2 %
-        np.testing.assert_allclose(means[0], means[1], rtol=0.08)
-
-
 def test_families_are_equally_likely_and_natural_as_often_as_stated() -> None:
     settings = SurfaceMapSettings(size=1, natural_share=0.4)
     found = [draw_surface(rng_for(seed, "surface"), settings) for seed in range(400)]
@@ -253,35 +238,6 @@ def test_colours_that_are_not_natural_are_in_the_stated_range() -> None:
     assert "light square: any colour" in maps.parameters
     # diffuse = (1 - share) x base: the same in every channel, as the base colour is
     assert np.ptp(maps.diffuse_rgb, axis=-1).max() == 0
-
-
-@for_each(
-    ("name", "value"),
-    [
-        ("families", ()),
-        ("families", ("gold",)),
-        ("size", 0),
-        ("size", 100),
-        ("size", 4096),
-        ("size", 64.0),
-        ("natural_share", 1.1),
-        ("albedo", (0.5, 0.1)),
-        ("albedo", (0.0, 1.0)),
-        ("roughness_clip", (0.0, 1.5)),
-    ],
-)
-def test_a_contradiction_is_one_line_that_names_its_field(name: str, value: Any) -> None:
-    with pytest.raises(TrilightError) as caught:
-        SurfaceMapSettings(**{name: value})
-    message = str(caught.value)
-    assert "\n" not in message
-    assert name in message or "'gold' is unknown" in message
-
-
-def test_every_setting_has_a_sentence() -> None:
-    for field in described(SurfaceMapSettings):
-        assert field.sentence.endswith(".")
-        assert field.expected
 
 
 SETTINGS = TextureSettings(

@@ -37,6 +37,7 @@ from tests.pipeline.assets.own.textured_kit import (
     STORED,
     UV_UP,
     F,
+    assert_corners,
     lost,
     picture_bytes,
     seen_at,
@@ -57,10 +58,7 @@ FILES: dict[str, Callable[[Path], Path]] = {
 @pytest.mark.parametrize("kind", FILES)
 def test_a_quad_keeps_its_corner_colours(tmp_path: Path, kind: str) -> None:
     """A mirrored u or v, or a quarter turn, would swap them."""
-    asset = prepare(FILES[kind](tmp_path), KEEP)
-    for (right, up), colour in QUARTERS.items():
-        wanted = np.array(colour) / 255 * (1 - F)
-        assert np.abs(seen_at(asset, right, up) - wanted).max() < SLOPE, (right, up)
+    assert_corners(prepare(FILES[kind](tmp_path), KEEP))
 
 
 def test_the_mean_of_colours_is_one_of_light_and_not_of_codes(tmp_path: Path) -> None:
@@ -74,9 +72,7 @@ def test_the_mean_of_colours_is_one_of_light_and_not_of_codes(tmp_path: Path) ->
 @pytest.mark.parametrize("shift", [(0, 0), (3, -2), (-7, 1)])
 def test_coordinates_beyond_the_picture_repeat_it(tmp_path: Path, shift: tuple[int, int]) -> None:
     path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS), UV_UP + shift)
-    asset = prepare(path, KEEP)
-    for (right, up), colour in QUARTERS.items():
-        assert np.abs(seen_at(asset, right, up) - np.array(colour) / 255 * (1 - F)).max() < SLOPE
+    assert_corners(prepare(path, KEEP))
 
 
 def test_a_texture_transform_moves_the_picture(tmp_path: Path) -> None:

@@ -16,18 +16,12 @@ from tests.pipeline.assets.own import textured_kit as kit
 from tests.pipeline.assets.own import usd_kit
 
 
-def assert_corners(asset: Asset) -> None:
-    for (right, up), colour in kit.QUARTERS.items():
-        wanted = np.array(colour) / 255 * (1 - kit.F)
-        assert np.abs(kit.seen_at(asset, right, up) - wanted).max() < kit.SLOPE, (right, up)
-
-
 @for_each("suffix", ["usda", "usdc", "usd", "usdz"])
 def test_a_quad_keeps_its_corner_colours(tmp_path: Path, suffix: str) -> None:
     """In every form of the file, in centimetres with Y up."""
     path = tmp_path / f"a.{suffix}"
     picture = kit.picture_bytes(kit.CORNERS)
-    assert_corners(prepare(usd_kit.textured_usd(path, picture, y_up=True, unit=0.01), kit.KEEP))
+    kit.assert_corners(prepare(usd_kit.textured_usd(path, picture, y_up=True, unit=0.01), kit.KEEP))
 
 
 def test_coordinates_of_each_corner_are_read(tmp_path: Path) -> None:
@@ -36,7 +30,9 @@ def test_coordinates_of_each_corner_are_read(tmp_path: Path) -> None:
         usd_kit.coordinates(made, kit.UV_UP[kit.SQUARE.faces].reshape(-1, 2), "faceVarying")
 
     picture = kit.picture_bytes(kit.CORNERS)
-    assert_corners(prepare(usd_kit.textured_usd(tmp_path / "a.usda", picture, corners), kit.KEEP))
+    kit.assert_corners(
+        prepare(usd_kit.textured_usd(tmp_path / "a.usda", picture, corners), kit.KEEP)
+    )
 
 
 def test_a_quad_of_four_corners_and_a_place_of_its_own(tmp_path: Path) -> None:

@@ -129,6 +129,13 @@ def seen_at(asset: Asset, right: float, up: float, column: int = 0) -> NDArray[n
     raise AssertionError(f"no triangle at {right}, {up}")
 
 
+def assert_corners(asset: Asset) -> None:
+    """Assert that a square shows its picture upright and not mirrored."""
+    for (right, up), colour in QUARTERS.items():
+        wanted = np.array(colour) / 255 * (1 - F)
+        assert np.abs(seen_at(asset, right, up) - wanted).max() < SLOPE, (right, up)
+
+
 def lost(path: Path, settings: AssetSettings = KEEP) -> str:
     """Return why an object is accepted without its materials; its mesh is whole."""
     asset = prepare(path, settings)
