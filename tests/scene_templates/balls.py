@@ -13,6 +13,7 @@ from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.layout import Layout, Pose
 from scene_templates.layout_rand import ScenePlan, layout_rand, scene_plan
+from scene_templates.rooms import PatchPlacement
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.seeds import rng_for
@@ -20,6 +21,10 @@ from storage.settings.changes import changed
 
 DEFAULTS = SceneSettings(families=DEFAULT_FAMILIES)
 """What the training builds draw from; their budgets mean nothing where there are no meshes."""
+
+
+STILL = PatchPlacement(rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0))
+"""Of a floor or wall that stays as it is."""
 
 
 def _even_points(count: int) -> NDArray[np.float64]:

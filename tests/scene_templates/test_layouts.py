@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from scene_templates.cameras import CameraSettings, Sector, camera_rand
-from scene_templates.layout import Layout, Pose
+from scene_templates.layout import Pose
 from scene_templates.layout_rand import layout_rand, scene_plan
 from scene_templates.materials import MaterialSettings, surface_rand
 from scene_templates.placement import TOUCHING
@@ -16,6 +15,7 @@ from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
 from storage.seeds import rng_for
+from tests.for_each import for_each
 from tests.scene_templates.balls import (
     BALL,
     Ball,
@@ -44,36 +44,8 @@ def _sixty(name: str) -> list[Drawn]:
     return drawn_once(template_settings(name), 60)
 
 
-def test_equal_generators_give_equal_layouts() -> None:
-    for name in list(TEMPLATES):
-        _check_equal_generators_give_equal_layouts(name)
-
-
-def _check_equal_generators_give_equal_layouts(name: str) -> None:
-    again = drawn(template_settings(name), 3)
-    for first, second in zip(_sixty(name)[:3], again, strict=True):
-        _require_equal(first.layout, second.layout)
-
-
-def _require_equal(one: Layout, other: Layout) -> None:
-    for a, b in zip(one.shell, other.shell, strict=True):
-        assert np.array_equal(a.positions, b.positions)
-        assert a.surface == b.surface
-    for c, d in zip(one.objects, other.objects, strict=True):
-        assert np.array_equal(c.pose.centre, d.pose.centre)
-        assert np.array_equal(c.pose.rotation, d.pose.rotation)
-        assert (c.pose.radius, c.surface) == (d.pose.radius, d.surface)
-    for e, f in zip(one.emitters, other.emitters, strict=True):
-        assert np.array_equal(e.triangle, f.triangle)
-        assert e.radiance_rgb == f.radiance_rgb
-
-
-def test_objects_do_not_meet_nor_leave_the_room() -> None:
-    for name in list(TEMPLATES):
-        _check_objects_do_not_meet_nor_leave_the_room(name)
-
-
-def _check_objects_do_not_meet_nor_leave_the_room(name: str) -> None:
+@for_each("name", TEMPLATES)
+def test_objects_do_not_meet_nor_leave_the_room(name: str) -> None:
     overlapping = 0
     for one in _sixty(name):
         if one.plan.overlaps:
@@ -129,27 +101,6 @@ def test_the_largest_object_is_placed_first() -> None:
     assert len(later_is_smaller) >= 60 and all(later_is_smaller)
 
 
-def test_objects_of_very_different_sizes_do_not_meet() -> None:
-    """A large object could well be put down on a small one beside it."""
-    changes = {"families.object_scale": [0.2, 2.0], "families.num_objects": [2, 2]}
-    settings = template_settings("plane", {**changes, "placement.overlap_share": 0.0})
-    for one in drawn(settings, 100):
-        assert _gaps(one)[0] > 0
-
-
-def test_about_half_of_the_objects_rest_on_the_floor() -> None:
-    rests = []
-    for one in [one for name in TEMPLATES for one in _sixty(name)]:
-        floor = plane_of(one.layout.shell[0].positions)
-        for row in range(one.plan.num_objects):
-            lowest = float(floor.height(one.points(row)).min())
-            rests.append(abs(lowest) < ROUNDING)
-            assert lowest > -TOUCHING
-    # 480 coin tosses have a standard deviation of 0.023: four of them. A floating object may come
-    # to lie as near as a resting one with a probability of 1e-8.
-    assert 0.4 < np.mean(rests) < 0.6
-
-
 def test_objects_that_cannot_fit_are_rejected_with_a_reason() -> None:
     changes = {"families.object_scale": [2.0, 2.0], "families.num_objects": [3, 3]}
     settings = template_settings("open_box", {**changes, "placement.overlap_share": 0.0})
@@ -161,12 +112,8 @@ def test_objects_that_cannot_fit_are_rejected_with_a_reason() -> None:
     assert len(one_drawn(overlapping, 0).layout.objects) == 3
 
 
-def test_emitters_hang_outside() -> None:
-    for name in list(TEMPLATES):
-        _check_emitters_hang_outside(name)
-
-
-def _check_emitters_hang_outside(name: str) -> None:
+@for_each("name", TEMPLATES)
+def test_emitters_hang_outside(name: str) -> None:
     counts = set()
     for one in _sixty(name):
         layout = one.layout
@@ -188,13 +135,9 @@ def _check_emitters_hang_outside(name: str) -> None:
     assert counts == set(range(1, 9))
 
 
-def test_emitters_keep_to_their_sector_and_apart() -> None:
+@for_each("name", TEMPLATES)
+def test_emitters_keep_to_their_sector_and_apart(name: str) -> None:
     """Measured without jitter, as seen from the origin, on a sphere of radius 0.866."""
-    for name in list(TEMPLATES):
-        _check_emitters_keep_to_their_sector_and_apart(name)
-
-
-def _check_emitters_keep_to_their_sector_and_apart(name: str) -> None:
     settings = template_settings(name, {"lights.target_jitter": 0.0, "lights.count": [8, 8]})
     sector = TEMPLATES[name].lights
     for seed, one in enumerate(drawn(settings, 20)):
@@ -226,35 +169,3 @@ def test_surfaces_keep_their_energy() -> None:
             tinted += 1
     # Five standard deviations of a share of one half among 4000: 160.
     assert abs(tinted - 2000) < 160
-
-
-def test_directions_are_uniform_by_solid_angle() -> None:
-    sector = Sector(azimuth_deg=225, half_width_deg=45, elevation_deg=(3, 87))
-    rng = np.random.default_rng(0)
-    towards = np.array([sector.direction_rand(rng) for _ in range(4000)])
-    assert np.abs(np.linalg.norm(towards, axis=1) - 1).max() < ROUNDING
-    assert (towards[:, :2] < ROUNDING).all()  # the quarter of -X and -Y
-    low, high = math.sin(math.radians(3)), math.sin(math.radians(87))
-    # Solid angle is even in z: mean (low + high) / 2, variance (high - low)^2 / 12.
-    standard_error = (high - low) / math.sqrt(12 * 4000)
-    assert abs(towards[:, 2].mean() - (low + high) / 2) < 5 * standard_error
-
-
-def test_cameras_stand_at_their_distance_and_look_near_the_origin() -> None:
-    for name in list(TEMPLATES):
-        _check_cameras_stand_at_their_distance_and_look_near_the_origin(name)
-
-
-def _check_cameras_stand_at_their_distance_and_look_near_the_origin(name: str) -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(60):
-        pose = camera_rand(rng, CameraSettings(), TEMPLATES[name].cameras)
-        assert 30 <= pose.fov_deg <= 60
-        eye, forward = pose.c2w[:3, 3], -pose.c2w[:3, 2]
-        # The target is on the axis, 1.5 to 2.0 ahead, in the cube of the jitter.
-        ahead = np.linspace(1.5, 2.0, 2001)[:, None] * forward + eye
-        # Steps of 0.25 mm along the axis: half a step off at most.
-        assert np.abs(ahead).max(axis=1).min() <= 0.2 + 2.5e-4
-        assert eye[2] > -0.2  # above the highest floor, -0.375
-        # Up within atan(0.1 sqrt 2 / 0.9) = 9 degrees of +Z, seen from the horizon or not.
-        assert pose.c2w[2, 1] > 0 or abs(forward[2]) > 0.98

@@ -6,8 +6,6 @@ defect is that of `statistics`.
 
 import itertools
 import math
-from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +17,7 @@ from scene_templates.lights import LightSettings, emitters_rand
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.rooms import SIDES, PatchPlacement, SharedRoom, plane_of
 from scene_templates.templates import TEMPLATES
+from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS, MANY, Drawn, drawn, drawn_once, template_settings
 from tests.scene_templates.published import side_row
 from tests.scene_templates.statistics import (
@@ -71,19 +70,17 @@ def test_shared_rooms_are_drawn_as_stated() -> None:
         assert len({(one.scale, one.translation) for one in patches}) == 1
 
 
-def test_a_wrong_room_is_noticed() -> None:
-    cases: Iterable[Any] = [
+@for_each(
+    ("shell", "rows"),
+    [
         (SharedRoom(square_share=0.35), {"square"}),
         (SharedRoom(scale=(1.0, 1.3)), {"scale x", "scale y", "scale z"}),
         (SharedRoom(shift=0.03), {"move x", "move y"}),
         (SharedRoom(raise_z=(0.0, 0.2)), {"move z"}),
         (SharedRoom(tilt_deg=1.5), {"floor tilt 0", "wall0 tilt 2", "wall1 tilt 1"}),
-    ]
-    for case in cases:
-        _check_a_wrong_room_is_noticed(*case)
-
-
-def _check_a_wrong_room_is_noticed(shell: SharedRoom, rows: set[str]) -> None:
+    ],
+)
+def test_a_wrong_room_is_noticed(shell: SharedRoom, rows: set[str]) -> None:
     assert rows <= set(implausible(_shared_room_table(shell)))
 
 
@@ -113,13 +110,8 @@ def _sides_table(stage: int, drawn_policy: Policy, stated_policy: Policy) -> Tab
     return {" ".join(key): uniform(values, *stated[key]) for key, values in found.items()}
 
 
-def test_separate_sides_are_drawn_as_published() -> None:
-    cases: Iterable[Any] = itertools.product(["original", "de-biased"], [1, 2])
-    for case in cases:
-        _check_separate_sides_are_drawn_as_published(*case)
-
-
-def _check_separate_sides_are_drawn_as_published(policy: Policy, stage: int) -> None:
+@for_each(("policy", "stage"), itertools.product(["original", "de-biased"], [1, 2]))
+def test_separate_sides_are_drawn_as_published(policy: Policy, stage: int) -> None:
     table = _sides_table(stage, policy, policy)
     require_plausible(table)
     if policy == "original":
@@ -233,12 +225,8 @@ def _light_centres(sector: Sector, **changes: object) -> NDArray[np.float64]:
     return np.stack([one.triangle.mean(axis=0) for one in drawn_ones])
 
 
-def test_lights_hang_evenly_in_their_sector() -> None:
-    for name in list(TEMPLATES):
-        _check_lights_hang_evenly_in_their_sector(name)
-
-
-def _check_lights_hang_evenly_in_their_sector(name: str) -> None:
+@for_each("name", TEMPLATES)
+def test_lights_hang_evenly_in_their_sector(name: str) -> None:
     sector = TEMPLATES[name].lights
     centres = _light_centres(sector, target_jitter=0.0)
     distance = np.linalg.norm(centres, axis=1)
@@ -290,12 +278,8 @@ def _roll_twin(sector: Sector) -> list[float]:
     ]
 
 
-def test_cameras_are_drawn_as_stated() -> None:
-    for name in list(TEMPLATES):
-        _check_cameras_are_drawn_as_stated(name)
-
-
-def _check_cameras_are_drawn_as_stated(name: str) -> None:
+@for_each("name", TEMPLATES)
+def test_cameras_are_drawn_as_stated(name: str) -> None:
     require_plausible(_camera_table(TEMPLATES[name].cameras))
 
 

@@ -1,26 +1,29 @@
-"""Shells: 128 triangles each, flat, facing the room, and without gaps at their seams."""
+"""Shells: flat, closed at their seams, and in the published families as published."""
 
 import dataclasses
 import itertools
-from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scene_templates.families import DEFAULT_FAMILIES, Family
 from scene_templates.layout import ShellPart
+from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.rooms import (
     PATCH_FACES,
     SIDES,
-    PatchPlacement,
     Room,
     SharedRoom,
     patch,
     plane_of,
 )
+from scene_templates.separate_sides import SeparateSides
+from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
-from tests.scene_templates.balls import drawn, template_settings
+from tests.for_each import for_each
+from tests.scene_templates.balls import STILL, drawn, one_drawn, template_settings
+from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row, side_row
 
 ROUNDING = 1e-12
 """Coordinates about 1 after ten float64 operations are good to 1e-15; a thousand times that."""
@@ -49,13 +52,8 @@ def _shells(ranges: SharedRoom, name: str, count: int) -> list[tuple[ShellPart, 
     return [one.layout.shell for one in drawn(settings, count)]
 
 
-def test_parts_are_flat_patches_of_128_faces_that_face_the_room() -> None:
-    cases: Iterable[Any] = itertools.product([SQUARE, LOOSE], list(TEMPLATES))
-    for case in cases:
-        _check_parts_are_flat_patches_of_128_faces_that_face_the_room(*case)
-
-
-def _check_parts_are_flat_patches_of_128_faces_that_face_the_room(
+@for_each(("ranges", "name"), itertools.product([SQUARE, LOOSE], list(TEMPLATES)))
+def test_parts_are_flat_patches_of_128_faces_that_face_the_room(
     ranges: SharedRoom, name: str
 ) -> None:
     for shell in _shells(ranges, name, 20):
@@ -72,22 +70,16 @@ def _check_parts_are_flat_patches_of_128_faces_that_face_the_room(
 
 
 def test_the_nominal_room_is_the_unit_cube() -> None:
-    still = PatchPlacement(
-        rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0)
-    )
     for side in SIDES.values():
-        positions = patch(side, still)
+        positions = patch(side, STILL)
         assert np.array_equal(positions[:, side.axis], np.full(81, 0.5 * side.sign))
         for axis in {0, 1, 2} - {side.axis}:
             assert (positions[:, axis].min(), positions[:, axis].max()) == (-0.5, 0.5)
 
 
 def test_a_quarter_spin_keeps_the_outline_and_swaps_the_diagonals() -> None:
-    still = PatchPlacement(
-        rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0)
-    )
-    plain = patch(SIDES["floor"], still)
-    spun = patch(SIDES["floor"], dataclasses.replace(still, rotation_deg=(0, 0, 90)))
+    plain = patch(SIDES["floor"], STILL)
+    spun = patch(SIDES["floor"], dataclasses.replace(STILL, rotation_deg=(0, 0, 90)))
     order, spun_order = np.lexsort(plain.round(9).T), np.lexsort(spun.round(9).T)
     assert np.abs(plain[order] - spun[spun_order]).max() < ROUNDING
 
@@ -114,14 +106,9 @@ def test_in_square_rooms_walls_stand_exactly_on_the_floors_edge(name: str) -> No
             assert gaps.max() < ROUNDING
 
 
-def test_nothing_shines_through_the_seams() -> None:
+@for_each(("ranges", "name"), itertools.product([SQUARE, LOOSE], ["wall", "corner", "open_box"]))
+def test_nothing_shines_through_the_seams(ranges: SharedRoom, name: str) -> None:
     """From the middle of the room, a look at any point near a seam meets a floor or wall."""
-    cases: Iterable[Any] = itertools.product([SQUARE, LOOSE], ["wall", "corner", "open_box"])
-    for case in cases:
-        _check_nothing_shines_through_the_seams(*case)
-
-
-def _check_nothing_shines_through_the_seams(ranges: SharedRoom, name: str) -> None:
     for seed in range(60):
         room, patches = _room(ranges, name, seed)
         rng = np.random.default_rng([seed, 1])
@@ -158,3 +145,74 @@ def _meets(
     )[..., 0]
     inside = (solved[:, :2] >= -ROUNDING) & (solved[:, :2] <= 1 + ROUNDING)
     return inside.all(axis=1) & (solved[:, 2] > 0)
+
+
+POLICIES: tuple[Policy, ...] = ("original", "de-biased")
+
+STAGES = {1: (stage_1_families, STAGE_1), 2: (stage_2_families, STAGE_2)}
+
+
+def _as_rows(families: tuple[Family, ...]) -> tuple[Row, ...]:
+    for family in families:
+        assert family.template == family.name.split("-")[0]
+    return tuple(
+        (one.name, one.weight, one.num_objects, one.object_scale, one.smooth_share)
+        for one in families
+    )
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_families_are_the_published_ones(policy: Policy) -> None:
+    first, second = stage_1_families(policy), stage_2_families(policy)
+    assert _as_rows(first) == STAGE_1
+    assert _as_rows(second) == STAGE_2
+    assert (len(first), sum(family.weight for family in first)) == (21, 46)
+    assert (len(second), sum(family.weight for family in second)) == (14, 42)
+
+
+def test_our_families_are_the_stated_ones() -> None:
+    assert _as_rows(DEFAULT_FAMILIES) == DEFAULT
+
+
+@for_each(("policy", "stage"), itertools.product(POLICIES, STAGES))
+def test_every_side_has_its_published_ranges(policy: Policy, stage: int) -> None:
+    for family in STAGES[stage][0](policy):
+        assert isinstance(family.shell, SeparateSides)
+        for part in TEMPLATES[family.template].parts:
+            side = getattr(family.shell, part)
+            moves = (side.shift_x, side.shift_y, side.shift_z)
+            found = (side.spin_deg, side.tilt_deg, side.scale, *moves)
+            assert found == side_row(family.name, part, policy, stage), (family.name, part)
+        assert family.shell.wall2_faces_out == (
+            policy == "original" and ("open_box" in family.name or "patch" in family.name)
+        )
+
+
+def _shell(family: Family) -> tuple[ShellPart, ...]:
+    return one_drawn(SceneSettings(families=(family,)), 0).layout.shell
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_only_the_original_box_turns_one_wall_away(policy: Policy) -> None:
+    """The normal of each face, against the direction to the middle of the nominal room."""
+    for family in (*stage_1_families(policy), *stage_2_families(policy)):
+        if family.template != "open_box":
+            continue
+        for part in _shell(family):
+            corners = part.positions[part.faces]
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            inward = np.einsum("tk,k->t", normals, plane_of(part.positions).normal)
+            turned_away = part.name == "wall2" and policy == "original"
+            assert ((inward < 0) == turned_away).all()
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_patch_families_are_the_exact_unit_box(policy: Policy) -> None:
+    seen = set()
+    for family in (*stage_1_families(policy), *stage_2_families(policy)):
+        if "patch" in family.name:
+            for part in _shell(family):
+                assert np.array_equal(part.positions, patch(SIDES[part.name], STILL))
+                assert (np.abs(part.positions[:, SIDES[part.name].axis]) == 0.5).all()
+                seen.add((family.template, part.name))
+    assert len(seen) == 3 + 4 + 2  # parts of corner, box and wall

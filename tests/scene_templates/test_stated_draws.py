@@ -1,12 +1,29 @@
-"""Named draws: distributed as they say, remembered, and independent of what else is drawn."""
+"""Draws: named ones, rotations, strata, layouts by index, and exact operations alone."""
+
+import ast
+import dataclasses
+import math
+from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.builds.named import named_build
+from scene_templates.exact import cosine, dot, eased, mixed, ramp, sine
+from scene_templates.frozen_v1 import ONE_FAMILY_EACH
+from scene_templates.layout_rand import scene_plan
+from scene_templates.rotations import rotated, rotation_xyz, uniform_rotation
+from scene_templates.settings import SceneSettings
 from scene_templates.stated_draws import StatedDraws
+from scene_templates.strata import Stratum, stratum_of
+from storage.errors import TrilightError
 from storage.seeds import rng_for
-from tests.scene_templates.named_draws import stated_table
-from tests.scene_templates.statistics import implausible, require_plausible
+from storage.settings.changes import changed
+from tests.conftest import ROOT
+from tests.for_each import for_each
+from tests.scene_templates.balls import DEFAULTS
+from tests.scene_templates.statistics import implausible, require_plausible, stated_table
 
 MANY = 1000
 
@@ -65,19 +82,6 @@ def test_a_stream_leaves_what_is_drawn_after_it() -> None:
     assert rest(0) == rest(1000)
 
 
-def test_a_statement_reads_as_words() -> None:
-    words = {name: str(draw) for name, draw in _drawn().made.items()}
-    assert words == {
-        "number": "uniform, -2 to 5",
-        "count": "whole number, 3 to 9",
-        "it holds": "true with probability 0.3",
-        "word": "one of a, b, c, equally likely",
-        "colour": "each channel uniform from (0.1 0.2 0.3) to (0.2 0.9 0.3)",
-        "shade": "uniform on the line from (0 0 0) to (1 0.5 0.1)",
-        "direction": "uniform by solid angle, elevation -30 to 60 degrees",
-    }
-
-
 def test_parameters_are_plain_values() -> None:
     draws = StatedDraws(rng_for(0, "x"))
     draws.colour("colour", (0, 0, 0), (1, 1, 1))
@@ -86,3 +90,162 @@ def test_parameters_are_plain_values() -> None:
     assert found["count"] == (1,)
     (colour,) = found["colour"]
     assert isinstance(colour, list) and len(colour) == 3
+
+
+def test_uniform_rotations_are_proper() -> None:
+    rng = np.random.default_rng(0)
+    matrices = np.stack([uniform_rotation(rng) for _ in range(200)])
+    gram = np.einsum("nij,nkj->nik", matrices, matrices)
+    # A handful of float64 operations: a few units of 2e-16.
+    assert np.abs(gram - np.eye(3)).max() < 1e-14
+    assert np.abs(np.linalg.det(matrices) - 1).max() < 1e-14
+
+
+def test_uniform_rotations_follow_the_haar_measure() -> None:
+    """The turning angle has density (1 - cos a) / pi, hence the mean pi/2 + 2/pi."""
+    rng = np.random.default_rng(1)
+    matrices = np.stack([uniform_rotation(rng) for _ in range(20000)])
+    angles = np.arccos(np.clip((np.trace(matrices, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    standard_error = angles.std() / math.sqrt(len(angles))
+    # Five standard errors: one false alarm in two million seeds.
+    assert abs(angles.mean() - (math.pi / 2 + 2 / math.pi)) < 5 * standard_error
+    # The scalar part w of a uniform unit quaternion has E[w^4] = 1/8; trace = 4 w^2 - 1. A
+    # quaternion normalised from a cube instead of a Gaussian fails here and nowhere else.
+    fourth = np.square((np.trace(matrices, axis1=1, axis2=2) + 1) / 4)
+    assert abs(fourth.mean() - 1 / 8) < 5 * fourth.std() / math.sqrt(len(fourth))
+    # Each entry has mean 0 and variance 1/3 on SO(3); nine entries share the bound.
+    assert np.abs(matrices.mean(axis=0)).max() < 5 * math.sqrt(1 / 3 / len(matrices))
+
+
+def test_euler_angles_turn_about_x_then_y_then_z() -> None:
+    rng = np.random.default_rng(2)
+    for angles in rng.uniform(-180, 180, size=(50, 3)):
+        x, y, z = (rotation_xyz(np.where(np.arange(3) == axis, angles, 0)) for axis in range(3))
+        assert np.abs(rotation_xyz(angles) - z @ y @ x).max() < 1e-14
+
+
+def test_a_quarter_turn_about_z_brings_x_to_y() -> None:
+    turned = rotated(np.array([[1.0, 0, 0]]), rotation_xyz([0, 0, 90]))
+    assert np.abs(turned - [[0, 1, 0]]).max() < 1e-15
+
+
+STRATA = (
+    Stratum(name="rare", weight=0.1),
+    Stratum(name="often", weight=0.6),
+    Stratum(name="some", weight=0.3),
+)
+
+
+@for_each("first", [0, 7, 1000, 999_999_900])
+def test_every_stretch_holds_each_share(first: int) -> None:
+    for length in (10, 40, 100):
+        found = Counter(stratum_of(STRATA, first + k).name for k in range(length))
+        for stratum in STRATA:
+            assert abs(found[stratum.name] - stratum.weight * length) < 2.5, (length, found)
+
+
+def test_weights_are_relative_and_history_changes_no_scene() -> None:
+    other = [
+        Stratum(name=one.name, weight=10 * one.weight, earlier_weights=(1.0,)) for one in STRATA
+    ]
+    for index in range(50):
+        assert stratum_of(STRATA, index).name == stratum_of(other, index).name
+
+
+@for_each(
+    ("strata", "message"),
+    [
+        ([{"name": "a", "weight": 1}, {"name": "a", "weight": 1}], "unique names"),
+        ([{"name": "a", "weight": 1, "families": ["tunnel"]}], "tunnel"),
+        ([{"name": "a", "weight": 1, "changes": [["lights.cuont", [1, 2]]]}], "cuont"),
+        ([{"name": "a", "weight": 0}], "weight"),
+    ],
+)
+def test_contradictions_are_named(strata: list[dict[str, object]], message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        changed(named_build("smoke").scenes, {"strata": strata})
+
+
+def test_a_plan_depends_on_seed_and_index_alone() -> None:
+    one = [scene_plan(DEFAULTS, seed=0, scene_index=index) for index in range(40)]
+    again = [scene_plan(DEFAULTS, seed=0, scene_index=index) for index in reversed(range(40))]
+    assert one == again[::-1]
+    other = [scene_plan(DEFAULTS, seed=1, scene_index=index) for index in range(40)]
+    assert sum(a == b for a, b in zip(one, other, strict=True)) < 10
+    # What is not of the plan does not move it.
+    finer = dataclasses.replace(DEFAULTS, max_triangles=4096, num_views=1, enough_error=0.0)
+    assert [scene_plan(finer, seed=0, scene_index=index) for index in range(40)] == one
+
+
+def test_families_in_turn_have_exactly_their_share() -> None:
+    settings = SceneSettings(families=ONE_FAMILY_EACH, families_in_turn=True)
+    names = [scene_plan(settings, seed=5, scene_index=i).family.name for i in range(200)]
+    assert names[:4] == ["plane", "wall", "corner", "open_box"]
+    assert set(Counter(names).values()) == {50}
+    drawn = dataclasses.replace(settings, families_in_turn=False)
+    names = [scene_plan(drawn, seed=5, scene_index=i).family.name for i in range(200)]
+    assert set(Counter(names).values()) != {50}
+
+
+@pytest.mark.parametrize("turns", [1, 3])
+def test_every_excursion_meets_every_family_equally_often(turns: int) -> None:
+    """Were both to turn with the index, 37 and 4 would still meet; 36 and 4 would not."""
+    settings = named_build("out-of-range").scenes
+    for count in (37, 36):
+        chosen = dataclasses.replace(settings, excursions=settings.excursions[:count])
+        found = Counter(
+            (chosen.excursion_of(i), scene_plan(chosen, seed=0, scene_index=i).family.name)
+            for i in range(4 * count * turns)
+        )
+        assert len(found) == 4 * count
+        assert set(found.values()) == {turns}
+
+
+ANGLES = np.linspace(-math.pi, math.pi, 20001)
+
+
+def test_sine_and_cosine_are_those_of_the_library() -> None:
+    # a folded angle is off by half an ulp of pi, 2.2e-16, and a dozen products round as much again
+    assert np.abs(sine(ANGLES) - np.sin(ANGLES)).max() < 1e-15
+    assert np.abs(cosine(ANGLES) - np.cos(ANGLES)).max() < 1e-15
+    assert float(sine(0.0)) == 0
+
+
+def test_easing_and_ramps() -> None:
+    assert eased([-1, 0, 0.5, 1, 2]).tolist() == [0, 0, 0.5, 1, 1]
+    slope = np.diff(eased(np.linspace(0, 1, 1001)))
+    # 3 s^2 of a first step of a thousandth: no kink at either end
+    assert slope[0] < 4e-6 and slope[-1] < 4e-6 and (slope > 0).all()
+    assert ramp([-2, -0.5, 0, 0.25, 0.5, 2]).tolist() == [0, 0, 0.5, 0.75, 1, 1]
+    assert mixed([0.0, 2.0], [1.0, 4.0], 0.5).tolist() == [0.5, 3.0]
+    assert float(dot(np.array([1.0, 2, 3]), np.array([4.0, 5, 6]))) == 32
+
+
+INEXACT = set(
+    "sin cos tan exp log log2 log10 power float_power arctan2 arccos arcsin hypot cbrt einsum "
+    "matmul linalg uniform normal standard_normal exponential pow fsum exp2 expm1 log1p".split()
+)
+"""Functions whose last bit depends on the processor or on the order in which a library sums."""
+
+
+def _sources() -> list[Path]:
+    folder = ROOT / "scene_templates"
+    found = [*(folder / "surfaces").glob("*.py"), *(folder / "skies").glob("*.py")]
+    drawn = [path for path in found if path.name != "drawn_scene.py"]  # turns and scales a map
+    return [*drawn, folder / "exact.py", folder / "stated_draws.py"]
+
+
+def test_maps_are_made_of_exact_operations_alone() -> None:
+    """`draws.uniform`, of ours, is exact; everything else of that name belongs to numpy."""
+    assert len(_sources()) > 12
+    found = []
+    for path in _sources():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow | ast.MatMult):
+                whole = isinstance(node.left, ast.Constant) or ast.unparse(node.left).isupper()
+                if isinstance(node.op, ast.MatMult) or not whole:
+                    found.append(f"{path.name}:{node.lineno} {ast.unparse(node)}")
+            if isinstance(node, ast.Attribute) and node.attr in INEXACT:
+                if ast.unparse(node.value) not in ("draws", "self"):
+                    found.append(f"{path.name}:{node.lineno} {ast.unparse(node)}")
+    assert not found

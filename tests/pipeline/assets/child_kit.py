@@ -1,4 +1,4 @@
-"""Work for children that goes wrong on purpose, and a record of who was called.
+"""Work for children that goes wrong on purpose, a record of who was called, and the stage on it.
 
 `recorded_attempt` stands in for `stage.attempt_in_child`. It runs in another process, so it is told
 what to do by a file beside the source, and writes down its calls in another one.
@@ -18,9 +18,12 @@ from typing import Any
 
 from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.settings import AssetSettings
+from pipeline.assets.stage import PreparedAsset, prepare_assets
+from pipeline.assets.store import AssetStore
 from pipeline.isolation import ChildLimits, IsolatedChild, preload
 from storage.errors import Rejected, TrilightError
-from storage.records.objects import ObjectRecord
+from storage.records.asset import Asset, decode_asset
+from storage.records.objects import Failure, ObjectRecord
 
 LIMITS = ChildLimits(memory_bytes=3 << 30, wall_s=60, cpu_s=20, calls_per_child=50)
 CALLS = "calls.jsonl"
@@ -61,29 +64,9 @@ def _without(attempt: AssetAttempt, below: int) -> AssetAttempt:
     return dataclasses.replace(attempt, asset=asset, missed={**attempt.missed, **gone})
 
 
-def crash(source: Path) -> None:
-    ctypes.string_at(0)
-
-
 def burn(source: Path) -> None:
     while True:
         pass
-
-
-def sleep(source: Path) -> None:
-    time.sleep(600)
-
-
-def eat(source: Path) -> None:
-    bytearray(64 << 30)
-
-
-def die(source: Path) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def leave(source: Path) -> None:
-    os._exit(3)
 
 
 def fail(source: Path) -> None:
@@ -94,31 +77,22 @@ def refuse(source: Path) -> None:
     raise Rejected("degenerate", "planned")
 
 
-def vanish(source: Path) -> None:
-    source.unlink()
-
-
-def grow(source: Path) -> None:
-    with source.open("a") as stream:
-        stream.write("# more\n")
-
-
 def mistake(source: Path) -> None:
     raise TrilightError("planned mistake.")
 
 
-_ACTIONS: Mapping[str, Callable[[Path], None]] = {
+_ACTIONS: Mapping[str, Callable[[Path], object]] = {
     "work": lambda source: None,
-    "crash": crash,
+    "crash": lambda source: ctypes.string_at(0),
     "burn": burn,
-    "sleep": sleep,
-    "eat": eat,
-    "die": die,
-    "leave": leave,
+    "sleep": lambda source: time.sleep(600),
+    "eat": lambda source: bytearray(64 << 30),
+    "die": lambda source: os.kill(os.getpid(), signal.SIGKILL),
+    "leave": lambda source: os._exit(3),
     "fail": fail,
     "refuse": refuse,
-    "vanish": vanish,
-    "grow": grow,
+    "vanish": Path.unlink,
+    "grow": lambda source: source.write_text(source.read_text() + "# more\n"),
     "mistake": mistake,
 }
 
@@ -155,3 +129,31 @@ class Bench:
         from tests.pipeline.assets.meshes_by_hand import record_of
 
         return record_of(self.root / name, name)
+
+
+FIRST, SECOND, THIRD = "pymeshlab_collapse", "meshoptimizer", "meshoptimizer_sloppy"
+SETTINGS = AssetSettings(budgets=(1000, 500, 340))
+
+
+def run(
+    bench: Bench, *names: str, settings: AssetSettings = SETTINGS, store: str = "store"
+) -> tuple[list[PreparedAsset], list[Failure]]:
+    """Prepare objects with a store beside the sources."""
+    return prepare_assets(
+        [bench.record(name) for name in names],
+        settings,
+        AssetStore(bench.root.parent / store),
+        borrow_child=bench.borrow,
+        workers=1,
+        done=lambda: None,
+    )
+
+
+def made(bench: Bench, settings: AssetSettings = SETTINGS) -> Asset:
+    (prepared,), failures = run(bench, "knot.obj", settings=settings)
+    assert not failures
+    return decode_asset(prepared.path.read_bytes())
+
+
+def methods(asset: Asset) -> list[tuple[int, str]]:
+    return [(level.record.budget, level.record.method) for level in asset.levels]

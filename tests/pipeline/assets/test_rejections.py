@@ -16,21 +16,10 @@ import pytest
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings, GateSettings
 from storage.errors import Rejected
-from tests.for_each import with_folders
-from tests.pipeline.assets.meshes_by_hand import (
-    gltf_tree,
-    knot,
-    prepare,
-    reason_of,
-    sphere,
-    write_glb,
-    write_obj,
-    write_off,
-    write_ply,
-    write_stl,
-)
+from tests.for_each import for_each
+from tests.pipeline.assets import meshes_by_hand as by_hand
 
-BALL = sphere(rings=5, columns=8)
+BALL = by_hand.sphere(rings=5, columns=8)
 
 
 def with_vertex(value: list[float], row: int = 3, mesh: TriangleMesh = BALL) -> TriangleMesh:
@@ -58,28 +47,24 @@ OFF_FILES: dict[str, tuple[str, TriangleMesh]] = {
     "outlier": (
         "far_outlier",
         TriangleMesh(
-            positions=np.concatenate([knot().positions, [[1e4, 0, 0], [1e4, 1e-3, 0]]]),
-            faces=np.concatenate([knot().faces, [[0, 1920, 1921]]]),
+            positions=np.concatenate([by_hand.knot().positions, [[1e4, 0, 0], [1e4, 1e-3, 0]]]),
+            faces=np.concatenate([by_hand.knot().faces, [[0, 1920, 1921]]]),
         ),
     ),
 }
 
 
-def test_bad_numbers(tmp_path: Path) -> None:
-    for folder, name in with_folders(tmp_path, OFF_FILES):
-        _check_bad_numbers(folder, name)
-
-
-def _check_bad_numbers(tmp_path: Path, name: str) -> None:
+@for_each("name", OFF_FILES)
+def test_bad_numbers(tmp_path: Path, name: str) -> None:
     reason, mesh = OFF_FILES[name]
-    assert reason_of(write_off(tmp_path / "a.off", mesh)) == reason
+    assert by_hand.reason_of(by_hand.write_off(tmp_path / "a.off", mesh)) == reason
 
 
 def test_an_offset_is_judged_by_the_precision_of_the_format(tmp_path: Path) -> None:
     far = moved(1.0, 1e6)
-    assert reason_of(write_stl(tmp_path / "a.stl", far)) == "offset_precision"
-    near = prepare(write_obj(tmp_path / "a.obj", BALL))
-    exact = prepare(write_obj(tmp_path / "b.obj", far))
+    assert by_hand.reason_of(by_hand.write_stl(tmp_path / "a.stl", far)) == "offset_precision"
+    near = by_hand.prepare(by_hand.write_obj(tmp_path / "a.obj", BALL))
+    exact = by_hand.prepare(by_hand.write_obj(tmp_path / "b.obj", far))
     # Text keeps 17 digits: at 1e6 the ball is still known to 1e-10, far below the grid of 1e-6.
     assert exact.geometry_sha256 == near.geometry_sha256
 
@@ -88,8 +73,8 @@ def test_unused_vertices_do_not_count(tmp_path: Path) -> None:
     """A vertex without a face may be anything: exporters leave them behind."""
     positions = np.concatenate([[[1e30, np.nan, 0]], BALL.positions])
     mesh = TriangleMesh(positions=positions, faces=BALL.faces + 1)
-    dirty = prepare(write_off(tmp_path / "a.off", mesh))
-    tidy = prepare(write_off(tmp_path / "b.off", BALL))
+    dirty = by_hand.prepare(by_hand.write_off(tmp_path / "a.off", mesh))
+    tidy = by_hand.prepare(by_hand.write_off(tmp_path / "b.off", BALL))
     assert dirty.geometry_sha256 == tidy.geometry_sha256
 
 
@@ -109,19 +94,16 @@ def _zip(data: bytes) -> bytes:
     return stream.getvalue()
 
 
-def test_archives_are_not_opened(tmp_path: Path) -> None:
-    for folder, case in with_folders(
-        tmp_path, itertools.product([".obj", ".glb", ".stl", ".ply"], [_zip, _tar, gzip.compress])
-    ):
-        _check_archives_are_not_opened(folder, *case)
-
-
-def _check_archives_are_not_opened(
+@for_each(
+    ("suffix", "pack"),
+    itertools.product([".obj", ".glb", ".stl", ".ply"], [_zip, _tar, gzip.compress]),
+)
+def test_archives_are_not_opened(
     tmp_path: Path, suffix: str, pack: Callable[[bytes], bytes]
 ) -> None:
     path = tmp_path / f"a{suffix}"
     path.write_bytes(pack(b"v 0 0 0\n" * 100_000))
-    assert reason_of(path) == "archive_refused"
+    assert by_hand.reason_of(path) == "archive_refused"
 
 
 def _ply(header: str, body: bytes = b"") -> bytes:
@@ -188,74 +170,62 @@ RAW_FILES: dict[str, tuple[str, str, bytes]] = (
 )
 
 
-def test_bad_files(tmp_path: Path) -> None:
-    for folder, name in with_folders(tmp_path, RAW_FILES):
-        _check_bad_files(folder, name)
-
-
-def _check_bad_files(tmp_path: Path, name: str) -> None:
+@for_each("name", RAW_FILES)
+def test_bad_files(tmp_path: Path, name: str) -> None:
     reason, suffix, data = RAW_FILES[name]
     path = tmp_path / f"a{suffix}"
     path.write_bytes(data)
-    assert reason_of(path) == reason
+    assert by_hand.reason_of(path) == reason
 
 
 @pytest.mark.parametrize("keep", [0.1, 0.5, 0.97])
 def test_files_that_were_cut_off(tmp_path: Path, keep: float) -> None:
-    tree, buffer = gltf_tree(BALL)
+    tree, buffer = by_hand.gltf_tree(BALL)
     for path in (
-        write_glb(tmp_path / "a.glb", tree, buffer),
-        write_stl(tmp_path / "a.stl", BALL),
-        write_ply(tmp_path / "a.ply", BALL),
-        write_off(tmp_path / "a.off", BALL),
+        by_hand.write_glb(tmp_path / "a.glb", tree, buffer),
+        by_hand.write_stl(tmp_path / "a.stl", BALL),
+        by_hand.write_ply(tmp_path / "a.ply", BALL),
+        by_hand.write_off(tmp_path / "a.off", BALL),
     ):
         data = path.read_bytes()
         path.write_bytes(data[: int(keep * len(data))])
         expected = {"load_error", "header_size_mismatch", "index_range", "no_faces"}
-        assert reason_of(path) in expected
+        assert by_hand.reason_of(path) in expected
 
 
-def test_limits_of_size(tmp_path: Path) -> None:
-    for folder, write in with_folders(tmp_path, [write_stl, write_ply, write_off, write_obj]):
-        _check_limits_of_size(folder, write)
-
-
-def _check_limits_of_size(tmp_path: Path, write: Callable[[Path, TriangleMesh], Path]) -> None:
+@for_each("write", [by_hand.write_stl, by_hand.write_ply, by_hand.write_off, by_hand.write_obj])
+def test_limits_of_size(tmp_path: Path, write: Callable[[Path, TriangleMesh], Path]) -> None:
     path = write(tmp_path / f"a.{write.__name__[-3:]}", BALL)
-    assert reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
+    assert by_hand.reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
     small = AssetSettings(max_source_bytes=path.stat().st_size - 1)
-    assert reason_of(path, small) == "too_large_bytes"
+    assert by_hand.by_hand.reason_of(path, small) == "too_large_bytes"
 
 
 def test_a_header_of_too_many_faces_is_enough(tmp_path: Path) -> None:
     """They are refused before anything is made of them: what follows may be no faces at all."""
-    path = write_ply(tmp_path / "a.ply", BALL)
+    path = by_hand.write_ply(tmp_path / "a.ply", BALL)
     header, end, body = path.read_bytes().partition(b"end_header\n")
     path.write_bytes(header + end + b"\xff" * len(body))
-    assert reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
-    assert reason_of(path, AssetSettings(max_source_faces=80)) != "too_many_faces"
+    assert by_hand.reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
+    assert by_hand.reason_of(path, AssetSettings(max_source_faces=80)) != "too_many_faces"
 
 
 def test_an_error_beyond_the_bound_is_stated(tmp_path: Path) -> None:
-    path = write_obj(tmp_path / "a.obj", knot())
+    path = by_hand.write_obj(tmp_path / "a.obj", by_hand.knot())
     settings = AssetSettings(budgets=(1000,), gate=GateSettings(max_error_p99=1e-4))
     with pytest.raises(Rejected, match=r"error_over_bound: p99 distance \d+\.\d+%"):
-        prepare(path, settings)
+        by_hand.prepare(path, settings)
 
 
 def test_levels_beyond_the_bound_are_left_out(tmp_path: Path) -> None:
-    path = write_obj(tmp_path / "a.obj", knot())
+    path = by_hand.write_obj(tmp_path / "a.obj", by_hand.knot())
     gate = GateSettings(max_error_p99=0.01)
-    asset = prepare(path, AssetSettings(budgets=(1400, 60), gate=gate))
+    asset = by_hand.prepare(path, AssetSettings(budgets=(1400, 60), gate=gate))
     assert [level.record.budget for level in asset.levels] == [1400]
 
 
-def test_what_is_no_file(tmp_path: Path) -> None:
-    for folder, make in with_folders(tmp_path, ["nothing", "folder", "pipe", "link to nothing"]):
-        _check_what_is_no_file(folder, make)
-
-
-def _check_what_is_no_file(tmp_path: Path, make: str) -> None:
+@for_each("make", ["nothing", "folder", "pipe", "link to nothing"])
+def test_what_is_no_file(tmp_path: Path, make: str) -> None:
     path = tmp_path / "a.obj"
     if make == "folder":
         path.mkdir()
@@ -263,4 +233,4 @@ def _check_what_is_no_file(tmp_path: Path, make: str) -> None:
         os.mkfifo(path)
     elif make == "link to nothing":
         path.symlink_to(tmp_path / "b.obj")
-    assert reason_of(path) == "missing_file"
+    assert by_hand.reason_of(path) == "missing_file"

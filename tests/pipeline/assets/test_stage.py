@@ -1,21 +1,35 @@
-"""The stage: the next method where one fails, each object once, and only lasting refusals kept."""
+"""The stage: the next method where one fails, each object once; deaths change no data."""
 
+import contextlib
 import dataclasses
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from pipeline.assets import stage
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.assets.stage import _rising, prepare_assets
 from pipeline.assets.store import AssetStore
+from pipeline.isolation import is_passing
 from storage.errors import TrilightError
-from tests.pipeline.assets.child_kit import Bench
+from tests.pipeline.assets.child_kit import (
+    FIRST,
+    LIMITS,
+    SECOND,
+    SETTINGS,
+    THIRD,
+    Bench,
+    made,
+    methods,
+    run,
+)
 from tests.pipeline.assets.meshes_by_hand import knot, write_obj
-from tests.pipeline.assets.stage_kit import FIRST, SECOND, SETTINGS, THIRD, made, methods, run
 
 
 @pytest.fixture(autouse=True)
@@ -26,11 +40,6 @@ def source(bench: Bench) -> Path:
 
 def small_knot() -> TriangleMesh:
     return knot(segments=60)
-
-
-def test_the_first_method_is_enough_where_it_works(bench: Bench) -> None:
-    assert methods(made(bench)) == [(1000, FIRST), (500, FIRST), (340, FIRST)]
-    assert [call["method"] for call in bench.calls] == [FIRST]
 
 
 def test_the_next_method_starts_in_a_new_child_where_one_crashed(bench: Bench) -> None:
@@ -95,11 +104,13 @@ def test_a_method_that_stood_in_for_another_is_not_tried_twice(bench: Bench) -> 
     assert [call["method"] for call in bench.calls] == [FIRST, THIRD]
 
 
-def test_an_unusable_object_is_tried_once(bench: Bench) -> None:
+def test_an_unusable_object_is_tried_once_and_its_refusal_is_plain_text(bench: Bench) -> None:
     bench.set(pymeshlab_collapse="refuse")
     _, (failure,) = run(bench, "knot.obj")
     assert failure.reason == "degenerate"
     assert len(bench.calls) == 1
+    (path,) = (bench.root.parent / "store").rglob("*.json")
+    assert json.loads(path.read_text()) == {"reason": "degenerate", "message": "planned"}
 
 
 def test_a_mistake_of_the_user_stops_the_run(bench: Bench) -> None:
@@ -154,13 +165,6 @@ def test_a_store_that_cannot_be_written_stops_the_run(bench: Bench) -> None:
     assert not bench.calls
 
 
-def test_refusals_are_plain_text(bench: Bench) -> None:
-    bench.set(pymeshlab_collapse="refuse")
-    run(bench, "knot.obj")
-    (path,) = (bench.root.parent / "store").rglob("*.json")
-    assert json.loads(path.read_text()) == {"reason": "degenerate", "message": "planned"}
-
-
 def test_a_file_that_the_system_will_not_open_is_refused_today_only(bench: Bench) -> None:
     loop = bench.root / "loop.obj"
     loop.symlink_to(loop)
@@ -169,3 +173,113 @@ def test_a_file_that_the_system_will_not_open_is_refused_today_only(bench: Bench
     loop.unlink()
     write_obj(loop, small_knot())
     assert run(bench, "loop.obj")[1] == []
+
+
+Hurried = Callable[..., Bench]
+
+
+@pytest.fixture
+def hurried(bench: Bench) -> Iterator[Hurried]:
+    """The same bench with other limits."""
+    with contextlib.ExitStack() as stack:
+
+        def make(**limits: Any) -> Bench:
+            other = Bench(bench.root, limits=dataclasses.replace(LIMITS, **limits))
+            stack.callback(other.child.close)
+            return other
+
+        yield make
+
+
+ENDS = [
+    ("die", "killed", 3),
+    ("eat", "out_of_memory", 3),
+    ("leave", "crashed", 3),
+    ("fail", "exception", 3),
+    ("sleep", "timeout_wall", 2),
+]
+"""What children do, the reason, and how often the same is tried; none is a verdict on a mesh."""
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [("die", "eat", "leave", "fail", "crash"),
+     pytest.param(("sleep",), marks=pytest.mark.slow("kills"))],
+    ids=["deaths", "sleep"],
+)  # fmt: skip
+def test_a_child_that_dies_once_changes_no_byte(
+    bench: Bench, hurried: Hurried, actions: tuple[str, ...]
+) -> None:
+    """A mesh of 1440 faces takes less than a second, and far below 15 on a busy machine."""
+    bench = hurried(wall_s=15.0) if "sleep" in actions else bench
+    (undisturbed,), _ = run(bench, "knot.obj", store="undisturbed")
+    for times, action in enumerate(actions, start=1):
+        bench.set(**{FIRST: f"{action} once"})
+        (disturbed,), _ = run(bench, "knot.obj", store=action)
+        assert [call["method"] for call in bench.calls] == [FIRST] * (1 + 2 * times), action
+        assert disturbed.asset_sha256 == undisturbed.asset_sha256, action
+
+
+@pytest.mark.parametrize(("action", "reason", "tries"), ENDS)
+def test_what_the_environment_did_is_not_kept_and_leads_to_no_other_method(
+    bench: Bench, hurried: Hurried, action: str, reason: str, tries: int
+) -> None:
+    bench.set(**{FIRST: action})
+    prepared, (failure,) = run(hurried(wall_s=0.7) if action == "sleep" else bench, "knot.obj")
+    assert (prepared, failure.reason) == ([], reason)
+    assert is_passing(failure.reason)
+    assert [call["method"] for call in bench.calls] == [FIRST] * tries
+    assert len({call["pid"] for call in bench.calls}) == tries
+    assert not [path for path in (bench.root.parent / "store").rglob("*.*") if path.is_file()]
+    if action == "die":
+        bench.set()
+        assert methods(made(bench)) == [(1000, FIRST), (500, FIRST), (340, FIRST)]
+
+
+def test_no_level_is_lost_because_its_child_died(bench: Bench) -> None:
+    misses = {f"{FIRST} misses": "900"}
+    bench.set(**misses)
+    (undisturbed,), _ = run(bench, "knot.obj", store="undisturbed")
+    bench.set(**misses, **{SECOND: "die"})
+    prepared, (failure,) = run(bench, "knot.obj")
+    assert (prepared, failure.reason) == ([], "killed")
+    bench.set(**misses)
+    (disturbed,), _ = run(bench, "knot.obj")
+    assert disturbed.asset_sha256 == undisturbed.asset_sha256
+
+
+@pytest.mark.parametrize(
+    ("action", "reason", "tries"),
+    [("crash", "crashed_signal_11", 2), ("burn", "timeout_cpu", 1), ("refuse", "degenerate", 1)],
+)
+def test_a_verdict_is_kept(
+    bench: Bench,
+    hurried: Hurried,
+    action: str,
+    reason: str,
+    tries: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(stage, "methods_of", lambda profile: (FIRST,))
+    bench.set(**{FIRST: action})
+    prepared, (failure,) = run(hurried(cpu_s=1), "knot.obj")
+    assert (prepared, failure.reason) == ([], reason)
+    assert not is_passing(failure.reason)
+    assert len(bench.calls) == tries
+    bench.set()
+    assert run(bench, "knot.obj") == ([], [failure])
+    assert len(bench.calls) == tries
+
+
+@pytest.mark.parametrize("gone", [True, False])
+def test_a_source_that_changes_meanwhile_is_judged_by_the_next_run(
+    bench: Bench, source: Path, gone: bool
+) -> None:
+    """What a child found in another file is neither an asset nor a refusal of this one."""
+    data = source.read_bytes()
+    bench.set(**{FIRST: "vanish" if gone else "grow"})
+    _, (failure,) = run(bench, "knot.obj")
+    assert failure.reason == ("missing_file" if gone else "unreadable_file")
+    bench.set()
+    source.write_bytes(data)
+    assert methods(made(bench)) == [(1000, FIRST), (500, FIRST), (340, FIRST)]

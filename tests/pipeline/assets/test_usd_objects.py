@@ -14,9 +14,17 @@ from pipeline.assets.reading.load import load_mesh
 from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings
 from storage.records.asset import decode_asset
-from tests.for_each import with_folders
-from tests.pipeline.assets.child_kit import Bench
-from tests.pipeline.assets.meshes_by_hand import as_rows, cube, geometry, moved, prepare, reason_of
+from tests.for_each import for_each
+from tests.pipeline.assets.child_kit import Bench, run
+from tests.pipeline.assets.meshes_by_hand import (
+    as_rows,
+    cube,
+    geometry,
+    moved,
+    prepare,
+    reason_of,
+    volume,
+)
 from tests.pipeline.assets.own.textured_kit import CORNERS, KEEP, UV_UP, lost, picture_bytes
 from tests.pipeline.assets.own.usd_kit import (
     MESH,
@@ -28,7 +36,6 @@ from tests.pipeline.assets.own.usd_kit import (
     textured_usd,
     usd_mesh,
 )
-from tests.pipeline.assets.stage_kit import run
 
 SETTINGS = AssetSettings()
 BOX = moved(cube(), scale=[1.0, 0.5, 0.25])
@@ -72,25 +79,15 @@ def test_all_meshes_are_one_in_their_places_and_instances_too(tmp_path: Path) ->
     assert rows_of(loaded(stage, tmp_path / "a.usda")) == wanted
 
 
-def _turned_round(mesh: TriangleMesh) -> float:
-    corners = mesh.corners
-    return float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
-
-
-def test_windings_stay_outward(tmp_path: Path) -> None:
-    for folder, case in with_folders(tmp_path, itertools.product([False, True], [False, True])):
-        _check_windings_stay_outward(folder, *case)
-
-
-def _check_windings_stay_outward(tmp_path: Path, left_handed: bool, mirrored: bool) -> None:
+@for_each(("left_handed", "mirrored"), itertools.product([False, True], [False, True]))
+def test_windings_stay_outward(tmp_path: Path, left_handed: bool, mirrored: bool) -> None:
     stage = new_stage()
     mesh = BOX if not left_handed else dataclasses.replace(BOX, faces=BOX.faces[:, ::-1])
     made = usd_mesh(stage, mesh)
     made.CreateOrientationAttr("leftHanded" if left_handed else "rightHanded")
     if mirrored:
         UsdGeom.Xformable(made).AddScaleOp().Set((-1, 1, 1))
-    volume = _turned_round(loaded(stage, tmp_path / "a.usda"))
-    assert volume == pytest.approx(0.125, rel=1e-5)
+    assert volume(loaded(stage, tmp_path / "a.usda")) == pytest.approx(0.125, rel=1e-5)
 
 
 def _reference(name: str) -> Callable[[Usd.Stage], object]:
@@ -147,12 +144,8 @@ REFUSED: dict[str, tuple[str, Callable[[Usd.Stage], object]]] = {
 }
 
 
-def test_what_would_give_another_mesh_is_refused(tmp_path: Path) -> None:
-    for folder, name in with_folders(tmp_path, REFUSED):
-        _check_what_would_give_another_mesh_is_refused(folder, name)
-
-
-def _check_what_would_give_another_mesh_is_refused(tmp_path: Path, name: str) -> None:
+@for_each("name", REFUSED)
+def test_what_would_give_another_mesh_is_refused(tmp_path: Path, name: str) -> None:
     reason, change = REFUSED[name]
     folder = tmp_path / "objects"
     folder.mkdir()

@@ -146,23 +146,12 @@ def replace(path: Path, by: Path) -> None:
     os.replace(by, path)
 
 
-def refused_reads(paths: list[Path]) -> list[Path]:
-    """Return those of the files that may not be read."""
+def refused_paths(paths: list[Path], writing: bool) -> list[Path]:
+    """Return those of the files that may not be read, or written."""
     refused = []
     for path in paths:
         try:
-            path.read_text()
-        except PermissionError:
-            refused.append(path)
-    return refused
-
-
-def refused_writes(paths: list[Path]) -> list[Path]:
-    """Return those of the files that may not be written."""
-    refused = []
-    for path in paths:
-        try:
-            path.write_text("written")
+            path.write_text("written") if writing else path.read_text()
         except PermissionError:
             refused.append(path)
     return refused

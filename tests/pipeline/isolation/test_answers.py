@@ -1,10 +1,13 @@
-"""Whatever bytes a child sends, its owner gets what was declared, or a sentence; nothing is run."""
+"""Whatever bytes a child sends, its owner gets what was declared, or a sentence."""
 
+import ast
+import importlib
 import json
 import os
 import pickle  # noqa: TID251 - what an attacker would send
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,8 @@ from pipeline.isolation.answers import (
     encode_result,
 )
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
+from storage.installation import module_name
+from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.pipeline.isolation.called import (
     anything,
@@ -182,16 +187,13 @@ def test_a_hostile_pickle_makes_no_file(child: IsolatedChild, tmp_path: Path, fo
 def test_an_answer_that_never_ends_does() -> None:
     """Neither its length nor its pieces, each of which comes in time, hold its owner."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=1, calls_per_child=100)
-    child = IsolatedChild(limits=limits, setup=nothing)
     endless, trickle = (1 << 60).to_bytes(8, "little"), (200).to_bytes(8, "little")
     began_s = time.monotonic()
-    try:
+    with closing(IsolatedChild(limits=limits, setup=nothing)) as child:
         with pytest.raises(ChildFailed, match="nonsense: its answer would have"):
             child.call(taken_over, [endless], 0.0)
         with pytest.raises(ChildFailed, match="timeout_wall"):
             child.call(taken_over, [trickle, *([b"x"] * 199)], 0.1)
-    finally:
-        child.close()
     assert time.monotonic() - began_s < 15  # a busy machine starts a child in that
 
 
@@ -218,3 +220,52 @@ def test_large_values_come_whole(child: IsolatedChild) -> None:
 def test_a_builtin_returns_nothing() -> None:
     assert declared_form(os._exit).unpack(None, Any) is None  # type: ignore[arg-type]
     assert frames._LENGTH == 8
+
+
+_CALLS = {"call_with_retries": 1, "_call": 1, "call": 0}
+"""Who calls in a child, and which of its arguments is the function."""
+
+
+def _called() -> Iterator[tuple[str, str]]:
+    """Yield (module, function) of what is handed to such a call by its name."""
+    for package in ("pipeline", "infra"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+            for node in ast.walk(ast.parse(path.read_text())):
+                name = _function_of(node)
+                if name:
+                    yield module, name
+
+
+def _function_of(node: ast.AST) -> str | None:
+    if not isinstance(node, ast.Call):
+        return None
+    called = node.func
+    name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")
+    if name not in _CALLS or len(node.args) <= _CALLS[name]:
+        return None
+    given = node.args[_CALLS[name]]
+    if isinstance(given, ast.Attribute) and isinstance(given.value, ast.Name):
+        return f"{given.value.id}.{given.attr}"
+    return given.id if isinstance(given, ast.Name) else None
+
+
+def _found(module: str, name: str) -> object:
+    found: object = importlib.import_module(module_name(module))
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    return found
+
+
+def test_what_is_called_in_children_can_be_checked() -> None:
+    pytest.importorskip("torch", reason="some of it needs torch")
+    functions = {each: _found(*each) for each in _called()}
+    known = {each: found for each, found in functions.items() if callable(found)}
+    assert len(known) > 20, "the walk finds them"
+    wrong = {}
+    for each, function in known.items():
+        try:
+            declared_form(function)
+        except TypeError as error:
+            wrong[each] = str(error)
+    assert not wrong

@@ -1,35 +1,40 @@
-"""A child that a file has taken over: what it then tries is refused, and reading goes on."""
+"""A child that a file has taken over, or that dies: its tries are refused, its end is judged."""
 
 import os
+import signal
 import socket
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, confinement, reach
+from pipeline.isolation import (
+    ChildFailed,
+    ChildLimits,
+    IsolatedChild,
+    Reach,
+    call_with_retries,
+    confinement,
+    deaths,
+    is_passing,
+    reach,
+)
+from pipeline.isolation.deaths import ENDS, with_retries
 from pipeline.isolation.landlock import landlock_version
 from pipeline.isolation.seccomp import _NUMBERS, _program, seccomp_works
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.for_each import for_each
-from tests.pipeline.isolation.called import (
-    call_kernel,
-    double,
-    end_process,
-    nothing,
-    process_id,
-    read,
-    refused_reads,
-    refused_sockets,
-    refused_writes,
-    replace,
-    start_program,
-    write,
-)
+from tests.pipeline.isolation import called
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=20, calls_per_child=100)
 needs_landlock = pytest.mark.skipif(not landlock_version(), reason="no Landlock here")
 needs_seccomp = pytest.mark.skipif(not seccomp_works(), reason="no seccomp here")
+
+
+def confined(allowed: Reach) -> IsolatedChild:
+    return IsolatedChild(limits=LIMITS, setup=called.nothing, confined_to=allowed)
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +50,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def child(place: Path) -> Iterator[IsolatedChild]:
-    allowed = reach(files=[place / "in" / "file"], writes=[place / "out"])
-    child = IsolatedChild(limits=LIMITS, setup=nothing, confined_to=allowed)
+    child = confined(reach(files=[place / "in" / "file"], writes=[place / "out"]))
     yield child
     child.close()
 
@@ -58,9 +62,9 @@ def _refused(child: IsolatedChild, function: object, *args: object) -> None:
 
 @needs_landlock
 def test_inputs_are_read_and_outputs_written(child: IsolatedChild, place: Path) -> None:
-    assert child.call(read, place / "in" / "file") == "in"
-    child.call(write, place / "out" / "new")
-    child.call(replace, place / "out" / "file", place / "out" / "new")
+    assert child.call(called.read, place / "in" / "file") == "in"
+    child.call(called.write, place / "out" / "new")
+    child.call(called.replace, place / "out" / "file", place / "out" / "new")
     assert (place / "out" / "file").read_text() == "written"
 
 
@@ -68,54 +72,51 @@ def test_inputs_are_read_and_outputs_written(child: IsolatedChild, place: Path) 
 def test_a_file_outside_is_not_read(child: IsolatedChild, place: Path) -> None:
     outside = [place / name for name in ("outside/file", "in/link", "in/../outside/file")]
     secrets = Path(f"/proc/{os.getpid()}/environ")  # of another process
-    assert child.call(refused_reads, [*outside, secrets]) == [*outside, secrets]
+    assert child.call(called.refused_paths, [*outside, secrets], False) == [*outside, secrets]
 
 
 @needs_landlock
 def test_nothing_is_written_outside_of_the_output(child: IsolatedChild, place: Path) -> None:
     paths = [place / name for name in ("in/file", "in/new", "outside/file", "new")]
-    assert child.call(refused_writes, paths) == paths
+    assert child.call(called.refused_paths, paths, True) == paths
     assert (place / "in" / "file").read_text() == "in"
 
 
 @needs_seccomp
 def test_nothing_is_connected_to(child: IsolatedChild) -> None:
     families = [int(each) for each in (socket.AF_INET, socket.AF_INET6, socket.AF_UNIX)]
-    assert child.call(refused_sockets, families) == families
+    assert child.call(called.refused_sockets, families) == families
 
 
 @needs_seccomp
 def test_no_program_is_started(child: IsolatedChild) -> None:
-    _refused(child, start_program)
+    _refused(child, called.start_program)
 
 
 @pytest.mark.skipif(landlock_version() < 6, reason="Landlock of Linux 6.12 is needed")
 def test_no_signal_reaches_another_process(child: IsolatedChild) -> None:
-    _refused(child, end_process, os.getpid())
+    _refused(child, called.end_process, os.getpid())
 
 
 @needs_seccomp
 @pytest.mark.skipif(os.uname().machine != "x86_64", reason="numbers of x86_64")
 @for_each("name", ["ptrace", "mount", "bpf", "unshare", "keyctl", "io_uring_setup"])
 def test_ways_around_are_refused(child: IsolatedChild, name: str) -> None:
-    assert child.call(call_kernel, _NUMBERS[name][0]) == 1  # EPERM
-    assert child.call(call_kernel, _NUMBERS[name][0] | 0x40000000) == 1  # by the second set
-    assert child.call(call_kernel, 39) == 0  # getpid
+    assert child.call(called.call_kernel, _NUMBERS[name][0]) == 1  # EPERM
+    assert child.call(called.call_kernel, _NUMBERS[name][0] | 0x40000000) == 1  # by the second set
+    assert child.call(called.call_kernel, 39) == 0  # getpid
 
 
 @needs_landlock
 def test_another_folder_costs_a_fresh_child_and_the_same_one_none(place: Path) -> None:
-    child = IsolatedChild(limits=LIMITS, setup=nothing, confined_to=reach(files=[place / "in"]))
-    try:
-        first = child.call(process_id)
+    with closing(confined(reach(files=[place / "in"]))) as child:
+        first = child.call(called.process_id)
         child.may(reach(files=[place / "in" / "file"]))
-        assert child.call(process_id) == first
+        assert child.call(called.process_id) == first
         child.may(reach(files=[place / "outside" / "file"]))
-        assert child.call(read, place / "outside" / "file") == "outside"
-        assert child.call(read, place / "in" / "file") == "in"
-        assert child.call(process_id) != first
-    finally:
-        child.close()
+        assert child.call(called.read, place / "outside" / "file") == "outside"
+        assert child.call(called.read, place / "in" / "file") == "in"
+        assert child.call(called.process_id) != first
 
 
 @needs_landlock
@@ -127,21 +128,15 @@ def test_packages_that_a_path_of_pythons_names_are_read_and_its_other_folders_no
         folder.mkdir(parents=True)
         (folder / "file").write_text("found")
         monkeypatch.syspath_prepend(str(folder))
-    child = IsolatedChild(limits=LIMITS, setup=nothing, confined_to=reach())
-    try:
-        assert child.call(read, packages / "file") == "found"
-        _refused(child, read, other / "file")
-    finally:
-        child.close()
+    with closing(confined(reach())) as child:
+        assert child.call(called.read, packages / "file") == "found"
+        _refused(child, called.read, other / "file")
 
 
 def test_off_confines_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(confinement.VARIABLE, "off")
-    child = IsolatedChild(limits=LIMITS, setup=nothing, confined_to=reach(files=[place / "in"]))
-    try:
-        assert child.call(read, place / "outside" / "file") == "outside"
-    finally:
-        child.close()
+    with closing(confined(reach(files=[place / "in"]))) as child:
+        assert child.call(called.read, place / "outside" / "file") == "outside"
 
 
 @for_each(
@@ -153,9 +148,9 @@ def test_what_cannot_be_had_is_said(
 ) -> None:
     monkeypatch.setenv(confinement.VARIABLE, word)
     monkeypatch.setattr(confinement, "landlock_version", lambda: 0)
-    child = IsolatedChild(limits=LIMITS, setup=nothing, confined_to=reach())
+    child = confined(reach())
     with pytest.raises(error, match=said):
-        child.call(double, 2)
+        child.call(called.double, 2)
     monkeypatch.setenv(confinement.VARIABLE, "auto")
     assert confinement.confinement_wanted()
 
@@ -178,3 +173,107 @@ def test_every_jump_of_the_filter_ends_at_its_last_two_steps(machine: str) -> No
         assert at + 1 + taken == len(steps) - 1
         assert other == 0
     assert 1 + 1 + steps[1][2] == len(steps) - 1  # another architecture
+
+
+PATIENT = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=9)
+
+
+def child_with(setup, *args: object) -> IsolatedChild:  # type: ignore[no-untyped-def]
+    return IsolatedChild(limits=PATIENT, setup=setup, setup_args=args)
+
+
+@pytest.fixture(autouse=True)
+def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(deaths, "_PAUSE_S", 0.0)
+
+
+@pytest.fixture
+def plain_child() -> Iterator[IsolatedChild]:
+    plain_child = child_with(called.nothing)
+    yield plain_child
+    plain_child.close()
+
+
+def test_a_signal_of_native_code_is_told_from_one_of_somebody_else(
+    plain_child: IsolatedChild,
+) -> None:
+    with pytest.raises(ChildFailed, match="SIGSEGV") as caught:
+        plain_child.call(called.die_by, signal.SIGSEGV)
+    assert (caught.value.reason, caught.value.is_verdict) == ("crashed_signal_11", True)
+    with pytest.raises(ChildFailed, match="SIGTERM") as caught:
+        plain_child.call(called.die_by, signal.SIGTERM)
+    assert (caught.value.reason, caught.value.is_verdict) == ("killed", False)
+
+
+@for_each(
+    ("number", "reason"),
+    [
+        (signal.SIGABRT, "crashed_signal_6"),
+        (signal.SIGFPE, "crashed_signal_8"),
+        (signal.SIGKILL, "killed"),
+        (signal.SIGHUP, "killed"),
+        (signal.SIGBUS, "killed"),
+        (signal.SIGXCPU, "killed"),  # a limit of somebody else: these children have none
+    ],
+)
+def test_ends_by_other_signals_are_told_apart_by_the_status(
+    plain_child: IsolatedChild, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, reason: str
+) -> None:
+    ended = SimpleNamespace(exitcode=-number, join=lambda timeout_s: None)
+    monkeypatch.setattr(plain_child, "_process", ended)
+    death = plain_child._death()
+    assert (death.reason, death.is_verdict) == (reason, reason != "killed")
+    assert number.name in death.message
+
+
+def test_the_same_call_is_made_again(plain_child: IsolatedChild, tmp_path: Path) -> None:
+    assert (
+        call_with_retries(plain_child, called.count_and_die, str(tmp_path), signal.SIGKILL, 2) == 3
+    )
+
+
+@for_each(("reason", "end"), ENDS.items())
+def test_tries_end(reason: str, end: deaths.End) -> None:
+    calls: list[str] = []
+
+    def fail() -> None:
+        calls.append(reason)
+        raise ChildFailed(reason, "as ever")
+
+    with pytest.raises(ChildFailed) as caught:
+        with_retries(fail)
+    assert (len(calls), caught.value.is_verdict) == (end.tries, end.is_verdict)
+
+
+def test_every_end_has_tries_and_only_two_are_verdicts() -> None:
+    """A verdict may be kept, and lead to other data: whoever adds one must say so here."""
+    assert {name for name, end in ENDS.items() if end.is_verdict} == {
+        "timeout_cpu",
+        "crashed_signal",
+    }
+    assert all(1 <= end.tries <= 3 for end in ENDS.values())
+    tries = {name: ENDS[name].tries for name in ("killed", "exception", "crashed_signal")}
+    assert tries == {"killed": 3, "exception": 3, "crashed_signal": 2}
+    assert not is_passing("degenerate")
+
+
+def test_a_kill_while_a_child_is_set_up_is_tried_again(tmp_path: Path) -> None:
+    with closing(child_with(called.set_up_dying, str(tmp_path), signal.SIGKILL, 2)) as plain_child:
+        assert plain_child.call(called.double, 4) == 8
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_kills_of_every_set_up_end_the_run(tmp_path: Path) -> None:
+    plain_child = child_with(called.set_up_dying, str(tmp_path), signal.SIGKILL, 99)
+    with pytest.raises(EnvironmentFailure, match="cannot be set up.*SIGKILL.*doctor"):
+        plain_child.call(called.double, 4)
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_set_up_that_cannot_succeed_is_tried_once_at_each_call(tmp_path: Path) -> None:
+    """And no call is made in a child that was not set up."""
+    with closing(child_with(called.fail_set_up, str(tmp_path))) as plain_child:
+        for calls in (1, 2):
+            with pytest.raises(EnvironmentFailure, match="cannot be set up.*a library is broken"):
+                plain_child.call(called.double, 4)
+            assert len(list(tmp_path.iterdir())) == calls

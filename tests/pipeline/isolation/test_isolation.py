@@ -1,72 +1,64 @@
-"""Native code may crash, hang, or eat memory in a child, and costs one call."""
+"""Native code may crash, hang, stand still or eat memory in a child, and costs one call."""
 
+import logging
 import os
+import signal
 import subprocess
 import sys
 import textwrap
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from multiprocessing import popen_forkserver
 from pathlib import Path
 
 import pytest
 
-from pipeline.isolation import ChildClosed, ChildFailed, ChildLimits, IsolatedChild
+from pipeline.isolation import (
+    ChildClosed,
+    ChildFailed,
+    ChildLimits,
+    IsolatedChild,
+    call_with_retries,
+    deaths,
+    waiting,
+)
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from tests.conftest import ROOT
 from tests.for_each import for_each
-from tests.pipeline.isolation.called import (
-    burn,
-    crash,
-    divide,
-    double,
-    eat_memory,
-    hang,
-    mistake,
-    nothing,
-    prepare,
-    process_id,
-    reject,
-)
+from tests.pipeline.isolation import called
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=2, calls_per_child=3)
 
 
 @pytest.fixture
 def child(tmp_path: Path) -> Iterator[IsolatedChild]:
-    child = IsolatedChild(limits=LIMITS, setup=prepare, setup_args=(str(tmp_path),))
+    child = IsolatedChild(limits=LIMITS, setup=called.prepare, setup_args=(str(tmp_path),))
     yield child
     child.close()
 
 
 def test_results_and_rejections_come_back(child: IsolatedChild) -> None:
-    assert child.call(double, 21) == 42
+    assert child.call(called.double, 21) == 42
     with pytest.raises(Rejected, match="no_faces: nothing there"):
-        child.call(reject)
+        child.call(called.reject)
     with pytest.raises(TrilightError, match="output: cannot be written"):
-        child.call(mistake)
+        child.call(called.mistake)
 
 
 @for_each(
     ("function", "reason"),
     [
-        (crash, "crashed_signal_11"),
-        (eat_memory, "out_of_memory"),
-        (divide, "exception: .*ZeroDivisionError"),
+        (called.crash, "crashed_signal_11"),
+        (called.eat_memory, "out_of_memory"),
+        (called.divide, "exception: .*ZeroDivisionError"),
     ],
 )
 def test_a_failure_costs_one_call(child: IsolatedChild, function, reason: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ChildFailed, match=f"(?s){reason}"):
         child.call(function)
-    assert child.call(double, 4) == 8
-
-
-def test_a_child_that_cannot_be_set_up_stops_the_run(tmp_path: Path) -> None:
-    child = IsolatedChild(limits=LIMITS, setup=prepare, setup_args=(str(tmp_path / "nowhere"),))
-    with pytest.raises(TrilightError, match=r"cannot be set up.*FileNotFoundError.*doctor"):
-        child.call(double, 1)
-    child.close()
+    assert child.call(called.double, 4) == 8
 
 
 @for_each("times", [1, 3])
@@ -86,15 +78,15 @@ def test_a_fork_server_that_is_killed_is_replaced(
     monkeypatch.setattr(popen_forkserver.Popen, "_launch", launch)
     child.retire()
     if times < 3:
-        assert child.call(double, 4) == 8
+        assert child.call(called.double, 4) == 8
     else:
         with pytest.raises(EnvironmentFailure, match="cannot be started"):
-            child.call(double, 4)
+            child.call(called.double, 4)
 
 
 def test_a_child_is_replaced_after_its_calls(child: IsolatedChild, tmp_path: Path) -> None:
     for _ in range(LIMITS.calls_per_child + 1):
-        child.call(double, 1)
+        child.call(called.double, 1)
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -103,7 +95,7 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
 
     def wait() -> None:
         try:
-            child.call(hang)
+            child.call(called.hang)
         except (ChildFailed, ChildClosed) as failure:  # closed in the call, or still starting
             failures.append(failure)
 
@@ -115,44 +107,38 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
     assert not caller.is_alive()
     assert failures
     with pytest.raises(ChildClosed):
-        child.call(double, 1)
+        child.call(called.double, 1)
 
 
 @pytest.mark.slow("kills")
 def test_processor_seconds_are_for_one_call_each() -> None:
     """A call that uses them up ends its child; several that stay below do not add up."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, cpu_s=1, calls_per_child=9)
-    child = IsolatedChild(limits=limits, setup=nothing)
-    try:
-        assert len({child.call(burn, 0.6) for _ in range(3)}) == 1
+    with closing(IsolatedChild(limits=limits, setup=called.nothing)) as child:
+        assert len({child.call(called.burn, 0.6) for _ in range(3)}) == 1
         with pytest.raises(ChildFailed, match="timeout_cpu: used its 1 processor seconds"):
-            child.call(burn, 30.0)
-        assert child.call(double, 4) == 8
-    finally:
-        child.close()
+            child.call(called.burn, 30.0)
+        assert child.call(called.double, 4) == 8
 
 
 def test_waiting_uses_no_processor_seconds() -> None:
     """It uses the time of its call, and costs no more than that."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=1.5, cpu_s=1, calls_per_child=9)
-    child = IsolatedChild(limits=limits, setup=nothing)
-    try:
+    with closing(IsolatedChild(limits=limits, setup=called.nothing)) as child:
         with pytest.raises(ChildFailed, match="timeout_wall"):
-            child.call(hang)
-        assert child.call(double, 4) == 8
-    finally:
-        child.close()
+            child.call(called.hang)
+        assert child.call(called.double, 4) == 8
 
 
 def test_a_retired_child_is_replaced(child: IsolatedChild) -> None:
-    first = child.call(process_id)
-    assert child.call(process_id) == first
+    first = child.call(called.process_id)
+    assert child.call(called.process_id) == first
     child.retire()
     child.retire()
-    second = child.call(process_id)
+    second = child.call(called.process_id)
     assert second != first
     assert not _alive(first)
-    assert child.call(double, 4) == 8
+    assert child.call(called.double, 4) == 8
 
 
 def test_a_call_to_exit_is_a_crash(child: IsolatedChild) -> None:
@@ -201,3 +187,100 @@ def test_children_die_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     while _alive(pid) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not _alive(pid)
+
+
+PATIENT = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
+
+
+@pytest.fixture
+def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[IsolatedChild]:
+    """Looked at twenty times a second, and given up after three quarters of one."""
+    monkeypatch.setattr(waiting, "LOOK_S", 0.05)
+    monkeypatch.setattr(waiting, "LOOKS_BEFORE_KILL", 15)
+    monkeypatch.setattr(deaths, "_PAUSE_S", 0.0)
+    watched = IsolatedChild(limits=PATIENT, setup=called.nothing)
+    yield watched
+    watched.close()
+
+
+def test_a_stopped_child_is_noticed_and_its_work_done_again(
+    watched: IsolatedChild, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    stopped = watched.call(called.process_id)
+    os.kill(stopped, signal.SIGSTOP)
+    (tmp_path / "go").touch()
+    assert call_with_retries(watched, called.wait_for, str(tmp_path / "go")) != stopped
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert f"child process {stopped} has been stopped" in record.getMessage()
+    assert f"`kill -CONT {stopped}`" in record.getMessage()
+
+
+def test_a_child_that_stays_stopped_is_the_fault_of_the_environment(watched: IsolatedChild) -> None:
+    os.kill(watched.call(called.process_id), signal.SIGSTOP)
+    with pytest.raises(ChildFailed, match="stopped: stopped from outside") as caught:
+        watched.call(called.process_id)
+    assert not caught.value.is_verdict
+
+
+def test_a_child_that_is_continued_in_time_answers_itself(
+    watched: IsolatedChild, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = watched.call(called.process_id)
+    os.kill(first, signal.SIGSTOP)
+
+    def go_on() -> None:
+        while not caplog.records:
+            time.sleep(0.01)
+        os.kill(first, signal.SIGCONT)
+        time.sleep(1.0)  # longer than a child may be stopped: looks at one that runs do not count
+        (tmp_path / "go").touch()
+
+    threading.Thread(target=go_on).start()
+    assert watched.call(called.wait_for, str(tmp_path / "go")) == first
+    assert len(caplog.records) == 1
+
+
+CALLED = """
+import os, time
+
+def wait_for(path) -> int:
+    while not os.path.exists(path):
+        time.sleep(0.02)
+    return os.getpid()
+"""
+
+PROGRAM = """
+import sys
+sys.path.insert(0, {root!r})
+from called import wait_for
+from pipeline.isolation import ChildLimits, IsolatedChild
+
+limits = ChildLimits(memory_bytes=2 << 30, wall_s=2, calls_per_child=9)
+child = IsolatedChild(limits=limits, setup=int)
+print(child.call(wait_for, __file__), flush=True)
+print(child.call(wait_for, __file__ + ".go"), flush=True)
+"""
+
+
+def test_a_command_that_is_stopped_as_a_whole_goes_on_where_it_was(tmp_path: Path) -> None:
+    """As by Ctrl-Z and `fg`: the pause is longer than the child's wall time, and nobody is told."""
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM.format(root=str(ROOT)))
+    (tmp_path / "called.py").write_text(CALLED)
+    with subprocess.Popen(
+        [sys.executable, str(program)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        process_group=0,
+    ) as process:
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        os.killpg(process.pid, signal.SIGTSTP)
+        time.sleep(2.5)
+        assert waiting._is_stopped(process.pid) and waiting._is_stopped(int(first))
+        (tmp_path / "program.py.go").touch()
+        os.killpg(process.pid, signal.SIGCONT)
+        second, errors = process.communicate(timeout=120)
+    assert (second, errors) == (first, "")

@@ -9,6 +9,7 @@ import trimesh
 
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
+from scene_templates.layout import SurfaceLook
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
@@ -44,6 +45,17 @@ SOURCE = SourceFacts(
 STEP_ERROR = 0.02
 """Error of each level beyond that of the next finer one: far above what any build calls enough, so
 that finer levels are wanted wherever they fit."""
+
+
+LOOK = SurfaceLook(
+    diffuse_scale=1.0,
+    diffuse_rgb=(0.1, 0.2, 0.3),
+    specular_rgb=(0, 0, 0),
+    roughness=0.5,
+    smooth=False,
+    colours="one",
+)
+"""A surface of one colour."""
 
 
 def with_error(quality: LevelQuality, error: float) -> LevelQuality:

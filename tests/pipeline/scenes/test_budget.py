@@ -1,15 +1,26 @@
-"""Laws of the triangle budget: which objects fit, and which of their levels."""
+"""The triangle budget: which objects are drawn to fit, under which licences, at which level."""
 
+import dataclasses
 import itertools
+from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
+from pipeline.scenes import fitting
 from pipeline.scenes.budget import least_triangles, levels_within
+from pipeline.scenes.fitting import FitTable, drawn_rows
+from pipeline.scenes.pool import PooledAsset
+from scene_templates.families import DEFAULT_FAMILIES
+from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
+from storage.licences import share_alike_camp
 from storage.records.asset import Asset, Level, LevelRecord
+from storage.records.scene import Scene
+from storage.records.scene_file import scene_digest
 from tests.pipeline.scenes.draw_kit import drawn_within
-from tests.pipeline.scenes.small_pool import QUALITY, SOURCE, with_error
+from tests.pipeline.scenes.small_pool import QUALITY, SOURCE, first_scene, small_pool, with_error
 
 Rungs = list[tuple[int, float]]
 """Triangles and error of each level."""
@@ -101,21 +112,6 @@ def test_the_worst_error_is_the_least_that_the_budget_allows() -> None:
     assert better > 100  # else any choice would do
 
 
-def test_a_larger_budget_is_never_worse() -> None:
-    rng = np.random.default_rng(2)
-    fell = 0
-    for _ in range(100):
-        assets = _assets_rand(rng)
-        least = sum(least_triangles(asset) for asset in assets)
-        before = np.inf
-        for total in range(least, least + 3000, 250):
-            worst = max(_error(level) for level in levels_within(assets, total, 0.0))
-            assert worst <= before
-            fell += worst < before < np.inf
-            before = worst
-    assert fell > 50
-
-
 def test_without_an_error_that_is_enough_everything_goes_as_fine_as_it_fits() -> None:
     assets = [_asset([(12, 0.03), (300, 0.002)]), _asset([(20, 0.001), (400, 0.0005)])]
     for total, expected in ((32, [12, 20]), (319, [12, 20]), (320, [300, 20]), (700, [300, 400])):
@@ -147,23 +143,108 @@ def test_too_little_is_rejected_with_the_numbers() -> None:
     assert caught.value.reason == "over_budget"
 
 
-def test_drawn_objects_always_fit_together() -> None:
-    rng = np.random.default_rng(3)
-    tight = 0
-    for _ in range(400):
-        sizes = rng.integers(1, 400, size=rng.integers(1, 12)).tolist()
-        count = int(rng.integers(0, 7))
-        total = int(count * min(sizes) + rng.integers(0, 900))
-        rows = drawn_within(rng, range(len(sizes)), sizes, count, total)
-        assert len(rows) == count
-        assert sum(sizes[row] for row in rows) <= total
-        tight += count * max(sizes) > total
-    assert tight > 100
+LICENCES = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC0-1.0", "cc-by-sa-4.0", "GPL-3.0-only")
+SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
 
 
-def test_where_only_the_simplest_fits_it_is_taken() -> None:
-    rng = np.random.default_rng(4)
-    assert drawn_within(rng, "abc", [9, 5, 7], 4, 20) == ["b"] * 4
-    # Two left over: the 7 may come once, in any place, and the 9 never.
-    found = {"".join(drawn_within(rng, "abc", [9, 5, 7], 3, 17)) for _ in range(200)}
-    assert found == {"bbb", "cbb", "bcb", "bbc"}
+def _under(licences: Sequence[str]) -> list[PooledAsset]:
+    return [
+        dataclasses.replace(entry, locked=dataclasses.replace(entry.locked, licence=licence))
+        for entry, licence in zip(small_pool(), licences, strict=True)
+    ]
+
+
+def _scenes(licences: Sequence[str], count: int) -> list[Scene]:
+    pool = _under(licences)
+    return [first_scene(SETTINGS, pool, seed=5, scene_index=index) for index in range(count)]
+
+
+def test_no_scene_mixes_two_share_alike_licences() -> None:
+    camps = Counter[frozenset[str]]()
+    for scene in _scenes(LICENCES, 30):
+        uids = {entry.uid for entry in scene.objects if entry.kind == "object"}
+        met = {entry.licence for entry in scene.objects if entry.uid in uids}
+        camps[frozenset(filter(None, map(share_alike_camp, met)))] += 1
+    assert max(len(met) for met in camps) == 1
+    assert len(camps) == 4  # each of the three licences, and none: the draw reaches them all
+
+
+def test_scenes_do_not_change_where_at_most_one_licence_is_share_alike() -> None:
+    """Frozen sets stay what they are: a rule that does not bind takes no number."""
+    usual = [scene_digest(scene) for scene in _scenes(["CC0-1.0"] * 5, 6)]
+    one = [scene_digest(scene) for scene in _scenes(["CC-BY-SA-4.0", *["MIT"] * 4], 6)]
+    assert one == usual
+
+
+def test_a_scene_without_room_for_any_camp_is_rejected() -> None:
+    with pytest.raises(Rejected, match="do not fit"):
+        drawn_within(np.random.default_rng(0), "ab", [5, 5], 3, 14, ["a", "b"])
+
+
+def _slow_twin(
+    rng: np.random.Generator, least: Sequence[int], camps: Sequence[str], count: int, total: int
+) -> list[int] | None:
+    """Look at every row for each object, and at every row after each of them."""
+    allowed, left, drawn = set(range(len(least))), total, list[int]()
+    for following in range(count - 1, -1, -1):
+        fitting_rows = []
+        for row in sorted(allowed):
+            beside = [
+                least[other]
+                for other in allowed
+                if not camps[row] or camps[other] in ("", camps[row])
+            ]
+            if least[row] + following * min(beside) <= left:
+                fitting_rows.append(row)
+        if not fitting_rows:
+            return None
+        row = fitting_rows[int(rng.integers(len(fitting_rows)))]
+        drawn.append(row)
+        left -= least[row]
+        if camps[row]:
+            allowed = {other for other in allowed if camps[other] in ("", camps[row])}
+    return drawn
+
+
+def test_parts_change_no_draw(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fitting, "_PART", 7)
+    rejected = several = 0
+    for trial in range(300):
+        rng = np.random.default_rng(trial)
+        num_rows, count = int(rng.integers(1, 40)), int(rng.integers(1, 5))
+        least = rng.integers(1, 100, num_rows).tolist()
+        camps = rng.choice(["", "", "a", "b"], num_rows).tolist()
+        total = int(rng.integers(1, 300))
+        expected = _slow_twin(np.random.default_rng(trial), least, camps, count, total)
+        table = FitTable.of(least, camps)
+        try:
+            assert drawn_rows(np.random.default_rng(trial), table, count, total) == expected
+        except Rejected:
+            assert expected is None
+        rejected += expected is None
+        several += bool(expected) and max(expected or [0]) >= 7
+    assert 15 < rejected < 150
+    assert several > 75
+
+
+def test_no_row_is_looked_at_where_all_fit() -> None:
+    """Of a million objects, two are read for each that is drawn."""
+
+    class Counting:
+        def __init__(self, values: Sequence[int]) -> None:
+            self.values, self.read = np.array(values), 0
+
+        def __len__(self) -> int:
+            return len(self.values)
+
+        def __getitem__(self, rows: slice) -> np.ndarray:
+            found = self.values[rows]
+            self.read += len(found)
+            return found
+
+    least, camp = Counting(range(1, 1001)), Counting([0] * 1000)
+    table = FitTable(least, camp, [""], FitTable.of(range(1, 1001)).sizes)
+    drawn_rows(np.random.default_rng(0), table, 3, 3000)
+    assert (least.read, camp.read) == (3, 3)
+    drawn_rows(np.random.default_rng(0), table, 3, 2000)
+    assert least.read > 1000

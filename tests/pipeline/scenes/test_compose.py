@@ -120,14 +120,6 @@ def test_emitters_add_up_and_have_rows_of_their_own(scenes: list[Scene]) -> None
         assert len(set(scene.object_index[emits].tolist())) == len(rows)
 
 
-def test_emitters_are_outside_of_all_geometry(scenes: list[Scene]) -> None:
-    for scene in scenes:
-        emits = scene.triangle_emits
-        solid = np.linalg.norm(scene.vertex_positions[scene.faces[~emits].ravel()], axis=1)
-        lights = np.linalg.norm(scene.vertex_positions[scene.faces[emits].ravel()], axis=1)
-        assert lights.min() > solid.max()
-
-
 def test_objects_stay_in_the_room(scenes: list[Scene]) -> None:
     for scene in scenes:
         planes = planes_of(scene)
@@ -136,16 +128,6 @@ def test_objects_stay_in_the_room(scenes: list[Scene]) -> None:
             heights = points @ planes[:, :3].T + planes[:, 3]
             assert heights.min() > -TOUCH
             assert np.abs(points).max() < 1.2  # beside the room by half a radius at most
-
-
-def test_about_half_of_the_objects_touch_the_floor(scenes: list[Scene]) -> None:
-    touches = []
-    for scene in scenes:
-        floor = planes_of(scene)[0]
-        heights = [points_of(scene, row) @ floor[:3] + floor[3] for row in rows_of(scene, "object")]
-        touches += [height.min() < TOUCH for height in heights]
-    # 200 objects: a standard deviation of 0.035, four of which are 0.14.
-    assert 0.36 < np.mean(touches) < 0.64
 
 
 def test_shading_normals_face_the_side_of_their_triangle(scenes: list[Scene]) -> None:

@@ -3,8 +3,9 @@
 The line between chance and a defect is that of tests.scene_templates.statistics.
 """
 
-import itertools
+import dataclasses
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,13 +17,13 @@ from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.shapes import MeshShape
 from scene_templates.layout import ShellPart, SurfaceLook
 from scene_templates.layout_rand import layout_rand, scene_plan
-from scene_templates.rooms import PATCH_FACES, SIDES, PatchPlacement, patch
+from scene_templates.rooms import PATCH_FACES, SIDES, patch
 from storage.records.material import DIFFUSE
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
-from tests.pipeline.scenes.draw_kit import drawn_within
 from tests.pipeline.scenes.scene_facts import rows_of
-from tests.pipeline.scenes.small_pool import first_scene
+from tests.pipeline.scenes.small_pool import LOOK, first_scene
+from tests.scene_templates.balls import STILL
 from tests.scene_templates.published import DEFAULT, STAGE_1
 from tests.scene_templates.statistics import (
     Table,
@@ -32,46 +33,6 @@ from tests.scene_templates.statistics import (
     share,
     uniform,
 )
-
-SIZES = [40, 30, 20, 10]
-"""Least triangles of four objects."""
-
-
-def _draws(total: int, count: int, times: int = 4000) -> list[str]:
-    rng = np.random.default_rng(0)
-    return ["".join(drawn_within(rng, "abcd", SIZES, count, total)) for _ in range(times)]
-
-
-def test_where_all_fit_every_object_is_as_likely_in_every_place() -> None:
-    draws = _draws(120, 3)
-    even = dict.fromkeys("abcd", 1.0)
-    table = {f"place {row}": choices([draw[row] for draw in draws], even) for row in range(3)}
-    triples = dict.fromkeys(("".join(three) for three in itertools.product("abcd", repeat=3)), 1.0)
-    table["all three"] = choices(draws, triples)
-    require_plausible(table)
-
-
-@pytest.mark.parametrize("total", [70])
-def test_where_not_all_fit_each_draw_is_even_among_what_does(total: int) -> None:
-    """Against the odds of every triple, one draw at a time: the simplest must fit after each."""
-    odds: dict[str, float] = {}
-    _enumerate("", 1.0, total, 3, odds)
-    assert sum(odds.values()) == pytest.approx(1)
-    draws = _draws(total, 3, 12_000)
-    require_plausible({"triples": choices(draws, odds)})
-    even = dict.fromkeys(odds, 1.0)
-    assert len(odds) < 4**3
-    assert implausible({"as if even": choices(draws, even)})
-
-
-def _enumerate(drawn: str, odds: float, left: int, count: int, found: dict[str, float]) -> None:
-    if count == 0:
-        found[drawn] = odds
-        return
-    sizes = dict(zip("abcd", SIZES, strict=True))
-    fitting = [one for one in "abcd" if sizes[one] + 10 * (count - 1) <= left]
-    for one in fitting:
-        _enumerate(drawn + one, odds / len(fitting), left - sizes[one], count - 1, found)
 
 
 @pytest.fixture(scope="module")
@@ -159,23 +120,13 @@ def test_how_far_meshes_shift_sizes(
         assert np.abs(values - np.arange(len(values)) / len(values)).max() < most
 
 
-def _surface(colours: str) -> SurfaceLook:
-    return SurfaceLook(
-        diffuse_scale=0.8,
-        diffuse_rgb=(0.1, 0.2, 0.3),
-        specular_rgb=(0.1, 0.1, 0.1),
-        roughness=0.5,
-        smooth=True,
-        colours=colours,  # type: ignore[arg-type]
-    )
+def _surface(colours: Any) -> SurfaceLook:
+    return dataclasses.replace(LOOK, diffuse_scale=0.8, smooth=True, colours=colours)
 
 
 def test_many_colours_are_even_below_the_diffuse_scale() -> None:
     rng = np.random.default_rng(0)
-    still = PatchPlacement(
-        rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0)
-    )
-    positions = patch(SIDES["floor"], still)
+    positions = patch(SIDES["floor"], STILL)
     part = ShellPart(
         name="floor", positions=positions, faces=PATCH_FACES, surface=_surface("triangles")
     )

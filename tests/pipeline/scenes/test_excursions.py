@@ -115,22 +115,6 @@ def test_each_excursion_changes_its_own_settings_only() -> None:
                 assert bounds[0] == bounds[1], field.name
 
 
-def _triangles(scene: Scene) -> float:
-    return scene.num_triangles
-
-
-def _fov(scene: Scene) -> float:
-    return float(scene.fov_deg[0])
-
-
-def _lights(scene: Scene) -> float:
-    return len(rows_of(scene, "emitter"))
-
-
-def _objects(scene: Scene) -> float:
-    return len(rows_of(scene, "object"))
-
-
 def _roughness(scene: Scene) -> float:
     solid = ~np.any(scene.materials[:, EMISSION] > 0, axis=1)
     values = scene.materials[solid][:, ROUGHNESS]
@@ -163,9 +147,9 @@ def _light_strength(scene: Scene) -> float:
 
 
 MEASURED: dict[str, Callable[[Scene], float]] = {
-    "fov_deg": _fov,
-    "lights": _lights,
-    "objects": _objects,
+    "fov_deg": lambda scene: float(scene.fov_deg[0]),
+    "lights": lambda scene: len(rows_of(scene, "emitter")),
+    "objects": lambda scene: len(rows_of(scene, "object")),
     "roughness": _roughness,
     "light_size": _light_size,
     "light_strength": _light_strength,

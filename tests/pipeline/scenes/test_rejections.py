@@ -1,13 +1,15 @@
-"""Every reason for which a scene is rejected, provoked; nothing else ever comes out."""
+"""Scenes that are rejected, each for a reason that is provoked, and the same bytes anywhere."""
 
+import concurrent.futures
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+import multiprocessing
+import os
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
 from pipeline.scenes.compose import compose_scene
@@ -16,6 +18,9 @@ from pipeline.scenes.pool import PooledAsset
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.records.scene import Scene
+from tests.for_each import for_each
+from tests.pipeline.scenes.scene_facts import digest
+from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scene_templates.balls import template_settings
 
 BLIND = {
@@ -48,12 +53,8 @@ PROVOKED: list[tuple[str, str, Mapping[str, Any], str]] = [
 ]
 
 
-def test_each_reason_is_given_where_it_holds(pool: list[PooledAsset]) -> None:
-    for case in PROVOKED:
-        _check_each_reason_is_given_where_it_holds(pool, *case)
-
-
-def _check_each_reason_is_given_where_it_holds(
+@for_each(("reason", "template", "changes", "message"), PROVOKED)
+def test_each_reason_is_given_where_it_holds(
     pool: list[PooledAsset], reason: str, template: str, changes: Mapping[str, Any], message: str
 ) -> None:
     settings = template_settings(template, changes)
@@ -69,34 +70,25 @@ def _rejection(settings: SceneSettings, pool: Sequence[PooledAsset], index: int)
     return caught.value
 
 
-def _with_positions(
-    entry: PooledAsset, change: Callable[[NDArray[np.float32]], object]
-) -> PooledAsset:
-    """The same object with the positions of every level changed in place."""
+Damage = tuple[Any, float]
+DAMAGES: dict[str, Damage] = {
+    "one vertex is no number": (0, np.nan),
+    "one is infinite": ((0, 1), np.inf),
+    "all are one point": (slice(None), 0),
+    "all are on one line": ((slice(None), slice(1, None)), 0),
+}
+"""Which positions have which value."""
+
+
+def _damaged(entry: PooledAsset, damage: Damage) -> PooledAsset:
+    """The same object with some positions of every level changed."""
     levels = []
     for level in entry.asset.levels:
         positions = level.positions.copy()
-        change(positions)
+        positions[damage[0]] = damage[1]
         levels.append(dataclasses.replace(level, positions=positions))
-    return PooledAsset(
-        locked=entry.locked, asset=dataclasses.replace(entry.asset, levels=tuple(levels))
-    )
-
-
-def _one_nan(positions: NDArray[np.float32]) -> None:
-    positions[0] = np.nan
-
-
-def _one_infinite(positions: NDArray[np.float32]) -> None:
-    positions[0, 1] = np.inf
-
-
-def _one_point(positions: NDArray[np.float32]) -> None:
-    positions[:] = 0
-
-
-def _one_line(positions: NDArray[np.float32]) -> None:
-    positions[:, 1:] = 0
+    asset = dataclasses.replace(entry.asset, levels=tuple(levels))
+    return dataclasses.replace(entry, asset=asset)
 
 
 @pytest.mark.filterwarnings("ignore:invalid value encountered")
@@ -111,9 +103,8 @@ def test_a_mesh_without_usable_triangles_is_rejected(pool: list[PooledAsset], bu
     overlapping = dataclasses.replace(
         settings, placement=dataclasses.replace(settings.placement, overlap_share=1.0)
     )
-    damages = (_one_nan, _one_infinite, _one_point, _one_line)
-    for damage, each, index in itertools.product(damages, (settings, overlapping), range(4)):
-        damaged = [_with_positions(pool[1], damage)]
+    for damage, each, index in itertools.product(DAMAGES, (settings, overlapping), range(4)):
+        damaged = [_damaged(pool[1], DAMAGES[damage])]
         try:
             scene = compose_scene(each, damaged, seed=0, scene_index=index, attempt=0)
         except Rejected as rejection:
@@ -165,3 +156,82 @@ def test_an_emitter_in_the_box_of_an_object_is_found_and_one_beside_it_is_not(
             assert caught.value.reason == "emitter_inside"
         else:
             require_laws(lit, settings)
+
+
+SCENES = {
+    "pretrain-256": tuple(range(8)),
+    "renderformer-v1-512": tuple(range(8)),
+    "out-of-range": (0, *range(5, 37, 4)),
+}
+"""Of the last, one with many triangles, and one of every other axis."""
+
+
+def composed_digest(build: str, seed: int, index: int) -> str:
+    """Compose one scene with the small pool; the work of one process."""
+    settings = named_build(build).scenes
+    return digest(first_scene(settings, small_pool(), seed=seed, scene_index=index))
+
+
+def _digests(build: str, order: Sequence[int], seed: int = 0) -> dict[int, str]:
+    return {index: composed_digest(build, seed, index) for index in order}
+
+
+def _hold_to_one_processor() -> None:
+    os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+
+
+def _from_workers(workers: int) -> dict[str, dict[int, str]]:
+    """Compose all scenes in so many new processes, the last scene first."""
+    with concurrent.futures.ProcessPoolExecutor(
+        workers,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_hold_to_one_processor if workers == 1 else None,
+    ) as executor:
+        jobs = {
+            build: {
+                index: executor.submit(composed_digest, build, 0, index)
+                for index in reversed(indices)
+            }
+            for build, indices in SCENES.items()
+        }
+        return {
+            build: {index: job.result() for index, job in found.items()}
+            for build, found in jobs.items()
+        }
+
+
+@pytest.mark.slow("kills")
+def test_one_and_three_processes_make_the_same_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One of them is held to one processor and one thread, which no other is."""
+    here = {build: _digests(build, indices) for build, indices in SCENES.items()}
+    for workers in (3, 1):
+        if workers == 1:
+            for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+                monkeypatch.setenv(name, "1")
+        assert _from_workers(workers) == here
+    # The comparison can fail: other scenes and other builds are other bytes.
+    count = sum(len(indices) for indices in SCENES.values())
+    assert len({sha for scenes in here.values() for sha in scenes.values()}) == count
+
+
+def test_order_does_not_matter_and_seed_zero_is_a_seed() -> None:
+    forward = _digests("pretrain-256", [0, 1, 2, 3, 4, 5])
+    assert forward == _digests("pretrain-256", [5, 3, 1, 4, 2, 0])
+    other = _digests("pretrain-256", [0, 1, 2, 3, 4, 5], seed=1)
+    assert len({*forward.values(), *other.values()}) == 12
+
+
+@pytest.mark.parametrize("build", SCENES)
+def test_what_is_planned_does_not_depend_on_the_pool(build: str) -> None:
+    """Which objects a scene holds may change with the pool, its kind may not."""
+    settings = named_build(build).scenes
+    pool = small_pool()
+    for index in SCENES[build][1:5]:
+        few, many = (
+            first_scene(settings, entries, seed=0, scene_index=index)
+            for entries in (pool[:4], pool)
+        )
+        for name in ("template", "family", "scene_index", "seed"):
+            assert few.provenance[name] == many.provenance[name]
+        kinds = [[entry.kind for entry in scene.objects] for scene in (few, many)]
+        assert kinds[0] == kinds[1]

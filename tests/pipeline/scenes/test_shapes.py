@@ -1,4 +1,4 @@
-"""Objects do not meet, unless the plan lets them; judged by a slow twin that shares nothing."""
+"""Bringing meshes to their places, where they do not meet; judged by a slow twin."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.scenes.pool import PooledAsset
-from pipeline.scenes.posing import posed
+from pipeline.scenes.posing import in_unit_sphere, posed, without_slivers
 from pipeline.scenes.shapes import MeshShape
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Pose
@@ -18,8 +18,63 @@ from scene_templates.settings import SceneSettings
 from storage.records.scene import Scene
 from storage.settings.changes import changed
 from tests.pipeline.scenes.scene_facts import rows_of, triangles_of
-from tests.pipeline.scenes.slow_crossings import cross, encloses
-from tests.pipeline.scenes.small_pool import first_scene, level
+from tests.pipeline.scenes.small_pool import first_scene, level, small_pool
+
+CHUNK = 64
+
+
+def cross(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Return whether two triangle soups [T, 3, 3] cut each other.
+
+    Triangles that cut each other, and do not lie in one plane, have an edge of one through the
+    inside of the other. Mere touching is left open.
+    """
+    return _edges_cut(one, other) or _edges_cut(other, one)
+
+
+def _edges_cut(soup: NDArray[np.float64], triangles: NDArray[np.float64]) -> bool:
+    start = soup.reshape(-1, 3)
+    along = (np.roll(soup, -1, axis=1) - soup).reshape(-1, 3)
+    near = _boxes_near(start, start + along, triangles.reshape(-1, 3))
+    start, along = start[near], along[near]
+    a, ab, ac = (
+        triangles[:, 0],
+        triangles[:, 1] - triangles[:, 0],
+        triangles[:, 2] - triangles[:, 0],
+    )
+    for rows in np.array_split(np.arange(len(start)), max(1, len(start) // CHUNK)):
+        p = np.cross(along[rows, None], ac[None])
+        det = np.sum(p * ab, axis=-1)
+        away = start[rows, None] - a
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.sum(p * away, axis=-1) / det
+            q = np.cross(away, ab[None])
+            v = np.sum(along[rows, None] * q, axis=-1) / det
+            t = np.sum(q * ac, axis=-1) / det
+            inside = (u > 0) & (v > 0) & (u + v < 1) & (t > 0) & (t < 1)
+        if inside.any():
+            return True
+    return False
+
+
+def _boxes_near(
+    start: NDArray[np.float64], end: NDArray[np.float64], points: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether segments come into the box of some points."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    below = np.maximum(start, end) < low
+    above = np.minimum(start, end) > high
+    return np.asarray(~(below | above).any(axis=1))
+
+
+def encloses(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Return whether the box of one soup lies in the box of the other."""
+    low, high = one.min(axis=(0, 1)), one.max(axis=(0, 1))
+    other_low, other_high = other.min(axis=(0, 1)), other.max(axis=(0, 1))
+    inside = (low >= other_low).all() and (high <= other_high).all()
+    outside = (low <= other_low).all() and (high >= other_high).all()
+    return bool(inside or outside)
+
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
 
@@ -49,25 +104,6 @@ def test_meshes_may_meet_where_the_plan_lets_them(pool: list[PooledAsset]) -> No
     settings = changed(SETTINGS, changes)
     scenes = [first_scene(settings, pool, seed=0, scene_index=index) for index in range(12)]
     assert sum(_meeting(scene) > 0 for scene in scenes) > 3
-
-
-def test_spheres_may_overlap_while_meshes_do_not(scenes: list[Scene]) -> None:
-    """Else large objects would crowd each other out, and thin ones keep far too much room."""
-    overlapping = 0
-    for index, scene in enumerate(scenes):
-        if scene_plan(SETTINGS, seed=3, scene_index=index).overlaps:
-            continue
-        spheres = []
-        for row in rows_of(scene, "object"):
-            points = triangles_of(scene, row).reshape(-1, 3)
-            centre = (points.min(axis=0) + points.max(axis=0)) / 2
-            spheres.append((centre, np.linalg.norm(points - centre, axis=1).max()))
-        overlapping += any(
-            np.linalg.norm(a - b) < r + s
-            for k, (a, r) in enumerate(spheres)
-            for b, s in spheres[:k]
-        )
-    assert overlapping > 8
 
 
 def _pose(rng: np.random.Generator, radius: float) -> Pose:
@@ -127,3 +163,71 @@ def test_a_shape_may_be_asked_at_any_size() -> None:
         near = dataclasses.replace(far, centre=np.array([radius + 0.17, 0, 0]))
         assert not ball.meets(pose, ball, far)
         assert ball.meets(pose, ball, near)
+
+
+TOUCH = 1e-6
+"""Coordinates below 2 in float32: 1.2e-7 of rounding each, three to a height."""
+
+
+def _off_centre() -> NDArray[np.float32]:
+    """A level that is not in the middle of its source: half of a ball is gone."""
+    ball = trimesh.creation.icosphere(2)
+    points = level(ball).positions
+    return points[points[:, 0] > 0]
+
+
+def test_the_mean_of_the_vertices_becomes_the_centre_where_published() -> None:
+    for entry in small_pool():
+        points = in_unit_sphere(entry.asset.levels[0].positions, "vertex_mean")
+        # Sums of a thousand float64 below 1.
+        assert np.abs(points.mean(axis=0)).max() < 1e-12
+        assert abs(np.linalg.norm(points, axis=1).max() - 1) < 1e-12
+    moved = in_unit_sphere(_off_centre() + np.float32(0.3), "vertex_mean")
+    # Positions are float32 before they are centred: 6e-8 of a number below 1, over a radius of 0.5.
+    assert np.abs(moved - in_unit_sphere(_off_centre(), "vertex_mean")).max() < TOUCH
+
+
+def test_otherwise_the_middle_of_the_source_does() -> None:
+    """It is the origin of the asset's unit box, however a level is cut: levels fit each other."""
+    points = in_unit_sphere(_off_centre(), "box")
+    assert np.array_equal(
+        points, _off_centre() / np.linalg.norm(_off_centre().astype(float), axis=1).max()
+    )
+    assert abs(np.linalg.norm(points, axis=1).max() - 1) < 1e-12
+    assert points[:, 0].min() >= 0  # the middle is where the other half would begin
+
+
+@pytest.mark.parametrize("centring", ["box", "vertex_mean"])
+def test_a_posed_mesh_fills_its_sphere(centring: str) -> None:
+    rng = np.random.default_rng(0)
+    for entry in small_pool():
+        pose = _pose(rng, rng.uniform(0.2, 0.5))
+        source = in_unit_sphere(entry.asset.levels[0].positions, centring)  # type: ignore[arg-type]
+        points = posed(source, pose)
+        assert points.dtype == np.float32
+        reach = np.linalg.norm(points - pose.centre, axis=1).max()
+        assert abs(reach - pose.radius) < TOUCH
+
+
+def test_posing_is_a_similarity() -> None:
+    rng = np.random.default_rng(1)
+    for entry in small_pool():
+        source = in_unit_sphere(entry.asset.levels[-1].positions, "box")
+        pose = _pose(rng, rng.uniform(0.2, 0.5))
+        points = posed(source, pose).astype(np.float64)
+        before = np.linalg.norm(source[:, None] - source[None], axis=-1)
+        after = np.linalg.norm(points[:, None] - points[None], axis=-1)
+        assert np.abs(after - pose.radius * before).max() < 5 * TOUCH  # differences of differences
+        # Not mirrored: the volume of four of its points keeps its sign.
+        assert np.linalg.det(pose.rotation) > 0
+
+
+def test_slivers_go_and_all_else_stays() -> None:
+    mesh = trimesh.creation.icosphere(1)
+    positions = mesh.vertices.astype(np.float32)
+    faces = mesh.faces.astype(np.uint32)
+    middle = (positions[0] + positions[1]) / 2
+    padded = np.concatenate([positions, [middle.astype(np.float32)]])
+    sliver = np.array([[0, 1, 1], [0, 0, 0]], np.uint32)
+    kept = without_slivers(padded, np.concatenate([faces[:3], sliver, faces[3:]]))
+    assert np.array_equal(kept, faces)

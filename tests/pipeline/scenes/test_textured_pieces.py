@@ -1,16 +1,21 @@
-"""Procedural textures in composed scenes: where they lie, and that they change nothing else."""
+"""Procedural textures and subdivided triangles in composed scenes: they change nothing else."""
 
 import dataclasses
+import itertools
 
 import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipeline.builds.named import named_build
-from pipeline.scenes.pieces import ScenePiece
+from pipeline.scenes.pieces import ScenePiece, emitter_piece, object_piece, shell_piece
 from pipeline.scenes.shading import flat_shaded
+from pipeline.scenes.subdivision import filled, subdivided
 from pipeline.scenes.textured_pieces import cube_places, with_drawn_textures
 from scene_templates.families import DEFAULT_FAMILIES
-from scene_templates.layout import Layout, ObjectPlacement, Pose, SurfaceLook
+from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose, ShellPart
+from scene_templates.rooms import PATCH_FACES, SIDES, patch
 from scene_templates.rotations import rotated
 from scene_templates.settings import SceneSettings
 from scene_templates.surfaces.draw import SurfaceMapSettings
@@ -18,7 +23,9 @@ from scene_templates.textures import TextureSettings
 from storage.records.material import default_rows
 from storage.records.scene import Scene, SceneObject
 from storage.settings.changes import changed
-from tests.pipeline.scenes.small_pool import first_scene, small_pool
+from tests.for_each import for_each
+from tests.pipeline.scenes.small_pool import LOOK, first_scene, small_pool
+from tests.scene_templates.balls import STILL
 from tests.scene_templates.statistics import require_plausible, share
 
 SMALL = SurfaceMapSettings(size=8)
@@ -54,22 +61,8 @@ def test_as_many_surfaces_are_textured_as_stated() -> None:
     require_plausible({"textured": share(found, 0.5)})
 
 
-def test_the_share_is_left_out_of_the_settings_where_it_is_none() -> None:
-    """So that digests of builds without textures stay what they were."""
-    assert "textures" not in named_build("pretrain-256").as_json()["scenes"]
-    build = named_build("pretrain-256", changes={"scenes.textures.share": 0.25})
-    assert build.as_json()["scenes"]["textures"]["share"] == 0.25
-    assert named_build("textured-256").scenes.textures.share == 0.5
-    widths = changed(PLAIN, {"textures.surfaces.size": 64}).textures.surfaces.size
-    assert widths == 64
-
-
-def test_the_sides_of_a_cube_show_a_texture_upright_and_unmirrored() -> None:
-    for side in range(6):
-        _check_the_sides_of_a_cube_show_a_texture_upright_and_unmirrored(side)
-
-
-def _check_the_sides_of_a_cube_show_a_texture_upright_and_unmirrored(side: int) -> None:
+@for_each("side", range(6))
+def test_the_sides_of_a_cube_show_a_texture_upright_and_unmirrored(side: int) -> None:
     axis, sign = side // 2, 1 if side % 2 == 0 else -1
     normal = sign * np.eye(3)[axis]
     up = np.array([0.0, 1, 0]) if axis == 2 else np.array([0.0, 0, 1])
@@ -111,16 +104,8 @@ def test_an_objects_texture_turns_with_it() -> None:
             materials=default_rows(1),
             material_index=np.zeros(2, np.int64),
         )
-        look = SurfaceLook(
-            diffuse_scale=1.0,
-            diffuse_rgb=(0, 0, 0),
-            specular_rgb=(0, 0, 0),
-            roughness=1.0,
-            smooth=False,
-            colours="one",
-        )
         pose = Pose(centre=centre, radius=1.0, rotation=rotation)
-        placement = ObjectPlacement(pose=pose, surface=look)
+        placement = ObjectPlacement(pose=pose, surface=LOOK)
         layout = Layout(shell=(), objects=(placement,), emitters=())
         textures = TextureSettings(share=1.0, surfaces=SMALL)
         (textured,) = with_drawn_textures(
@@ -144,3 +129,192 @@ def test_an_objects_texture_is_never_mirrored_and_hardly_stretched() -> None:
     ratio = on_texture / on_surface
     # A projection shrinks areas by the cosine to the nearest of six directions: at least 1/sqrt(3).
     assert (ratio > 0).all() and ratio.max() / ratio.min() < np.sqrt(3) * 1.01
+
+
+ROUNDING = 1e-6
+"""Positions below 1 are float32, good to 6e-8; areas and distances are a few sums of them."""
+
+
+def _piece(mesh: trimesh.Trimesh, *, smooth: bool) -> ScenePiece:
+    entry = SceneObject(name="it", kind="object", uid="made/it")
+    positions = (0.5 * mesh.vertices).astype(np.float32)
+    faces = mesh.faces.astype(np.uint32)
+    rng = np.random.default_rng(0)
+    look = dataclasses.replace(LOOK, smooth=smooth, colours="triangles" if smooth else "one")
+    return object_piece(entry, positions, faces, look, rng, 30.0)
+
+
+def _open_and_odd() -> trimesh.Trimesh:
+    """Three sheets on one edge, which no two-sided surface has, and a needle beside them."""
+    sheets = np.array([[0, 0, 0], [1, 0, 0], [0.4, 1, 0], [0.5, -0.2, 1], [0.3, -0.9, -0.4]])
+    needle = np.array([[0, 0, 2], [3, 0, 2], [3, 1e-3, 2]])
+    faces = [[0, 1, 2], [1, 0, 3], [0, 1, 4], [5, 6, 7]]
+    return trimesh.Trimesh(np.concatenate([sheets, needle]), faces, process=False)
+
+
+CLOSED = {
+    "box": trimesh.creation.box(extents=(1, 2, 0.5)),
+    "ball": trimesh.creation.icosphere(1),
+    "ring": trimesh.creation.torus(0.5, 0.2, 9, 7),
+    "cone": trimesh.creation.cone(0.5, 1, sections=11),
+}
+ALL = {**CLOSED, "odd": _open_and_odd()}
+
+COUNTS = (13, 200, 701)
+
+
+def _corners(piece: ScenePiece) -> NDArray[np.float64]:
+    return piece.mesh.positions[piece.mesh.faces].astype(np.float64)
+
+
+def _areas(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(np.linalg.norm(cross, axis=1) / 2)
+
+
+def _edges(piece: ScenePiece) -> dict[frozenset[bytes], int]:
+    """How many faces each edge has, by the bytes of its ends: as a renderer meets them."""
+    found: dict[frozenset[bytes], int] = {}
+    positions = piece.mesh.positions + np.float32(0)  # one zero, not two
+    for face in piece.mesh.faces:
+        ends = [positions[vertex].tobytes() for vertex in face]
+        for pair in zip(ends, ends[1:] + ends[:1], strict=True):
+            found[frozenset(pair)] = found.get(frozenset(pair), 0) + 1
+    return found
+
+
+def test_the_number_is_met_to_within_one_edge_and_what_was_closed_stays_closed() -> None:
+    """No vertex in the middle of a neighbour's edge: through such a seam light may leak."""
+    for name, smooth in itertools.product(ALL, (False, True)):
+        piece = _piece(ALL[name], smooth=smooth)
+        had, edges = len(piece.mesh.faces), set(_edges(piece).values())
+        assert edges == {2} or name not in CLOSED
+        for count in COUNTS:
+            after = subdivided(piece, count)
+            where = (name, smooth, count)
+            if count <= had:
+                assert len(after.mesh.faces) == had, where
+            else:
+                assert count - max(edges) < len(after.mesh.faces) <= count, where
+            assert set(_edges(after).values()) == {2} or name not in CLOSED, where
+
+
+@for_each("name", ALL)
+def test_the_surface_stays_where_it_is_with_its_materials(name: str) -> None:
+    """Each part lies in one old triangle: in its plane, inside it, of its material and side."""
+    piece = _piece(ALL[name], smooth=True)
+    after = subdivided(piece, 200)
+    old, new = _corners(piece), _corners(after)
+    assert abs(_areas(new).sum() / _areas(old).sum() - 1) < ROUNDING
+    owner = np.array([_owner(old, corners) for corners in new])
+    assert (np.bincount(owner, minlength=len(old)) > 0).all()
+    assert np.array_equal(piece.materials, after.materials)
+    assert np.array_equal(piece.material_index[owner], after.material_index)
+    assert np.array_equal(piece.mesh.groups[owner], after.mesh.groups)
+    for row, area in enumerate(_areas(old)):
+        assert abs(_areas(new)[owner == row].sum() - area) < ROUNDING
+    facing = np.sum(_unit_normals(old)[owner] * _unit_normals(new), axis=1)
+    # The needle is 0.5 mm wide: rounding of 6e-8 turns its smallest parts by a few 1e-4.
+    assert facing.min() > 0.999
+
+
+def _unit_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(cross / np.linalg.norm(cross, axis=1, keepdims=True))
+
+
+def _owner(old: NDArray[np.float64], corners: NDArray[np.float64]) -> int:
+    """The old triangle that holds all three corners, by barycentric coordinates and height."""
+    normal = _unit_normals(old)
+    a, b, c = old[:, 0], old[:, 1], old[:, 2]
+    worst = np.zeros(len(old))
+    doubled = 2 * _areas(old)
+    for point in corners:
+        height = np.abs(np.sum((point - a) * normal, axis=1))
+        inside = [
+            np.sum(np.cross(q - p, point - p) * normal, axis=1) / doubled
+            for p, q in ((a, b), (b, c), (c, a))
+        ]
+        # In units of the triangle a rounding of 1e-7 is 2e-4 of the needle's width.
+        outside = np.maximum(-np.min(inside, axis=0) - 1e-3, 0)
+        worst = np.maximum(worst, height + outside)
+    nearest = int(worst.argmin())
+    assert worst[nearest] < ROUNDING
+    return nearest
+
+
+def test_an_edge_of_three_faces_is_halved_in_all_three() -> None:
+    piece = _piece(_open_and_odd(), smooth=False)
+    after = _edges(subdivided(piece, 900))
+    before = list(_edges(piece).values())
+    assert before.count(3) == 1
+    assert list(after.values()).count(3) >= 8
+    assert set(after.values()) == {1, 2, 3}
+
+
+@pytest.mark.parametrize("name", ["ball", "ring"])
+def test_shading_stays_as_it_was(name: str) -> None:
+    """Normals are unit, and in the middle of an edge the mean of its ends: as interpolated."""
+    piece = _piece(CLOSED[name], smooth=True)
+    after = subdivided(piece, 600)
+    assert np.abs(np.linalg.norm(after.mesh.normals, axis=1) - 1).max() < ROUNDING
+    # The vertices of before come first; of a sharp edge there are several in one place.
+    before = len(piece.mesh.positions)
+    assert np.array_equal(after.mesh.positions[:before], piece.mesh.positions)
+    assert np.abs(after.mesh.normals[:before] - piece.mesh.normals).max() < ROUNDING
+    flat = subdivided(_piece(CLOSED[name], smooth=False), 600)
+    geometric = _unit_normals(_corners(flat))
+    assert np.abs(flat.mesh.normals[flat.mesh.faces] - geometric[:, None]).max() < 1e-4
+
+
+def test_the_longest_edges_are_halved_first() -> None:
+    """A plank of twelve long triangles gets ever shorter ones."""
+    piece = _piece(trimesh.creation.box(extents=(4, 0.2, 0.2)), smooth=False)
+    before = np.inf
+    for count in (50, 200, 1000):
+        corners = _corners(subdivided(piece, count))
+        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+        assert edges.max() < before / 1.5
+        before = edges.max()
+    assert before < 4.005 / 20  # of the diagonal of the plank as it was
+
+
+def _shell() -> ScenePiece:
+    part = ShellPart(
+        name="floor",
+        positions=patch(SIDES["floor"], STILL),
+        faces=PATCH_FACES,
+        surface=LOOK,
+    )
+    return shell_piece(part, np.random.default_rng(0), 30.0)
+
+
+def _light() -> ScenePiece:
+    triangle = np.array([[0, 0, 2], [0.1, 0, 2], [0, 0.1, 2.0]])
+    return emitter_piece(
+        Emitter(triangle=triangle, radiance_rgb=(9.0, 9.0, 9.0), reflectance=0.0), 0
+    )
+
+
+@pytest.mark.parametrize("fill_to", [1000, 2048])
+def test_a_scene_is_filled_by_its_objects_alone(fill_to: int) -> None:
+    pieces = [_shell(), _piece(CLOSED["box"], smooth=False), _piece(CLOSED["ball"], smooth=True)]
+    pieces.append(_light())
+    after = filled(pieces, fill_to)
+    assert [after[0], after[3]] == [pieces[0], pieces[3]]
+    total = sum(len(piece.mesh.faces) for piece in after)
+    # Short by less than the two faces of an edge for each object, and by what its share rounds off.
+    assert fill_to - 2 * 3 < total <= fill_to
+    box, ball = (len(piece.mesh.faces) for piece in after[1:3])
+    # In proportion to what they had, 12 and 80, to the same few.
+    assert abs(box / (box + ball) - 12 / 92) < 4 / fill_to
+
+
+def test_nothing_to_fill_stays_as_it_is() -> None:
+    bare = [_shell(), _light()]
+    assert filled(bare, 5000) == bare
+    full = [_shell(), _piece(CLOSED["ball"], smooth=False)]
+    same = filled(full, 208)
+    assert [len(piece.mesh.faces) for piece in same] == [128, 80]
+    assert np.array_equal(_corners(same[1]), _corners(full[1]))
+    assert dataclasses.replace(same[1].entry) == full[1].entry

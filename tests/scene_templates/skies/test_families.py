@@ -3,7 +3,6 @@
 import hashlib
 import itertools
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,10 +14,9 @@ from scene_templates.skies.families import OUR_SKIES, SKIES
 from scene_templates.skies.texels import SkyTexels
 from storage.seeds import rng_for
 from storage.settings.changes import changed
-from tests.extensions_kit import loaded, written
-from tests.scene_templates.named_draws import merged, stated_table
-from tests.scene_templates.skies.test_texels import uv_of
-from tests.scene_templates.statistics import require_plausible
+from tests.for_each import for_each
+from tests.scene_templates.skies.test_skies import uv_of
+from tests.scene_templates.statistics import merged, require_plausible, stated_table
 
 MANY = 60
 
@@ -28,13 +26,9 @@ def _sky(family: str, seed: int, **changes: Any) -> SkyMap:
     return draw_sky(rng_for(seed, "sky"), settings)
 
 
-def test_parameters_are_distributed_as_stated() -> None:
+@for_each("family", OUR_SKIES)
+def test_parameters_are_distributed_as_stated(family: str) -> None:
     """On two texels, where a family draws the same and makes no picture."""
-    for family in OUR_SKIES:
-        _check_parameters_are_distributed_as_stated(family)
-
-
-def _check_parameters_are_distributed_as_stated(family: str) -> None:
 
     def made(seed: int, coloured_share: float) -> SkyDraws:
         draws = SkyDraws(
@@ -52,12 +46,8 @@ def _check_parameters_are_distributed_as_stated(family: str) -> None:
         require_plausible(stated_table(found))
 
 
-def test_the_mean_over_the_sphere_is_the_stated_one() -> None:
-    for family in OUR_SKIES:
-        _check_the_mean_over_the_sphere_is_the_stated_one(family)
-
-
-def _check_the_mean_over_the_sphere_is_the_stated_one(family: str) -> None:
+@for_each("family", OUR_SKIES)
+def test_the_mean_over_the_sphere_is_the_stated_one(family: str) -> None:
     for seed, height in enumerate((1, 2, 8, 33, 64)):
         sky = _sky(family, seed, height=height, coloured_share=float(seed % 2))
         found = sky.radiance_rgb
@@ -75,12 +65,8 @@ def test_a_sky_without_light_is_black() -> None:
         assert (_sky(family, 0, mean_radiance=[0.0, 0.0]).radiance_rgb == 0).all(), family
 
 
-def test_the_same_seed_is_the_same_sky_at_every_height() -> None:
-    for family in OUR_SKIES:
-        _require_same_at_every_height(family)
-
-
-def _require_same_at_every_height(family: str) -> None:
+@for_each("family", OUR_SKIES)
+def test_the_same_seed_is_the_same_sky_at_every_height(family: str) -> None:
     coarse, fine = _sky(family, 1), _sky(family, 1, height=64)
     assert coarse.parameters == fine.parameters
     moments = [
@@ -96,13 +82,9 @@ def _require_same_at_every_height(family: str) -> None:
     assert np.abs(moments[0] - moments[1]).max() < 0.1 * 4 * math.pi, family
 
 
-def test_there_is_no_seam_where_the_edges_meet() -> None:
+@for_each("family", OUR_SKIES)
+def test_there_is_no_seam_where_the_edges_meet(family: str) -> None:
     """Nowhere are steps over the seam larger than all steps of maps that hold it elsewhere."""
-    for family in OUR_SKIES:
-        _require_no_seam(family)
-
-
-def _require_no_seam(family: str) -> None:
     found = np.log1p(np.stack([_sky(family, seed, height=64).radiance_rgb for seed in range(6)]))
     seam = np.square(found[:, :, 0] - found[:, :, -1]).mean()
     inside = np.square(np.diff(found, axis=2)).mean(axis=(0, 1, 3))
@@ -204,21 +186,3 @@ def test_a_sun_of_a_million_is_finite_and_exact() -> None:
 def test_overcast_is_brighter_above_than_at_the_horizon() -> None:
     found = np.mean([_sky("clouds", seed).radiance_rgb for seed in range(12)], axis=(0, 2, 3))
     assert found[0] > 1.3 * found[15]
-
-
-def test_an_extension_adds_a_sky(tmp_path: Path) -> None:
-    file = written(
-        tmp_path,
-        "import numpy as np\n"
-        "from scene_templates.skies.families import SKIES\n"
-        "def ceiling(draws, texels):\n"
-        "    '''A bright ceiling.'''\n"
-        "    colour = draws.light('ceiling', mired=(150, 300))\n"
-        "    return (texels.z > 0.5)[..., None] * np.ones((1, 2 * texels.height, 1)) * colour\n"
-        "SKIES.register('ceiling', ceiling)\n",
-    )
-    with loaded(file):
-        assert "ceiling" not in SkyMapSettings().families
-        sky = _sky("ceiling", 0)
-        assert sky.radiance_rgb[0].min() > 0 and sky.radiance_rgb[16:].max() == 0
-    assert "ceiling" not in SKIES

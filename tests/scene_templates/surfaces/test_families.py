@@ -1,7 +1,6 @@
 """Laws that every family of surfaces keeps: drawn as stated, lawful, tileable, reproducible."""
 
 import hashlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,9 +15,8 @@ from scene_templates.surfaces.maps import Finish, SurfaceMaps
 from scene_templates.surfaces.texels import Texels
 from storage.seeds import rng_for
 from storage.settings.changes import changed
-from tests.extensions_kit import loaded, written
-from tests.scene_templates.named_draws import merged, stated_table
-from tests.scene_templates.statistics import require_plausible
+from tests.for_each import for_each
+from tests.scene_templates.statistics import merged, require_plausible, stated_table
 
 MANY = 100
 ALBEDO = (0.02, 0.9)
@@ -33,13 +31,9 @@ def _all_three(maps: SurfaceMaps) -> NDArray[np.float32]:
     return np.concatenate([maps.diffuse_rgb, maps.specular_rgb, maps.roughness], axis=-1)
 
 
-def test_parameters_are_distributed_as_stated() -> None:
+@for_each("family", OUR_SURFACES)
+def test_parameters_are_distributed_as_stated(family: str) -> None:
     """At one texel, where a family draws the same and makes no picture."""
-    for family in OUR_SURFACES:
-        _check_parameters_are_distributed_as_stated(family)
-
-
-def _check_parameters_are_distributed_as_stated(family: str) -> None:
 
     def made(seed: int, natural_share: float) -> SurfaceDraws:
         rng = rng_for(seed, "surface", int(natural_share))
@@ -53,12 +47,8 @@ def _check_parameters_are_distributed_as_stated(family: str) -> None:
         require_plausible(stated_table(found))
 
 
-def test_albedos_and_roughness_are_lawful() -> None:
-    for family in OUR_SURFACES:
-        _check_albedos_and_roughness_are_lawful(family)
-
-
-def _check_albedos_and_roughness_are_lawful(family: str) -> None:
+@for_each("family", OUR_SURFACES)
+def test_albedos_and_roughness_are_lawful(family: str) -> None:
     for size in (1, 2, 8):
         maps = _surface(family, 0, size=size)
         assert np.isfinite(_all_three(maps)).all()
@@ -91,13 +81,10 @@ class Shifted(Texels):
         return super().v + self.moved[1]
 
 
-def test_every_surface_repeats_in_both_directions() -> None:
+@for_each("family", OUR_SURFACES)
+def test_every_surface_repeats_in_both_directions(family: str) -> None:
     """Seen three texels further right, five further down and whole turns away: the same, rolled."""
-    for family in OUR_SURFACES:
-        _require_repeating(family)
 
-
-def _require_repeating(family: str) -> None:
     def made(texels: Texels) -> Finish:
         draws = SurfaceDraws(rng_for(7, "surface"), natural_share=1.0, albedo=ALBEDO)
         return SURFACES[family](draws, texels)
@@ -115,13 +102,9 @@ def _require_repeating(family: str) -> None:
         assert np.abs(rolled - (other + whole)).max() < 1e-9, family
 
 
-def test_the_same_seed_is_the_same_surface_at_every_size() -> None:
+@for_each("family", OUR_SURFACES)
+def test_the_same_seed_is_the_same_surface_at_every_size(family: str) -> None:
     """A finer map, averaged, is the coarse one but for what the coarse one cannot show."""
-    for family in OUR_SURFACES:
-        _check_the_same_seed_is_the_same_surface_at_every_size(family)
-
-
-def _check_the_same_seed_is_the_same_surface_at_every_size(family: str) -> None:
     coarse, fine = _surface(family, 0, size=128), _surface(family, 0, size=256)
     assert coarse.parameters == fine.parameters
     averaged = fine.diffuse_rgb.reshape(128, 2, 128, 2, 3).mean(axis=(1, 3), dtype=float)
@@ -158,25 +141,3 @@ def test_bytes_are_the_same_everywhere(family: str) -> None:
     made = [_all_three(_surface(family, seed)).tobytes() for seed in range(4)]
     assert hashlib.sha256(b"".join(made)).hexdigest()[:16] == DIGESTS[family]
     assert len(set(made)) == 4
-
-
-def test_an_extension_adds_a_family(tmp_path: Path) -> None:
-    file = written(
-        tmp_path,
-        "import numpy as np\n"
-        "from scene_templates.surfaces.families import SURFACES\n"
-        "def dots(draws, texels):\n"
-        "    '''Round dots.'''\n"
-        "    paper = draws.finish('paper', low=(0.8,) * 3, high=(0.9,) * 3, roughness=(0.5, 1.0))\n"
-        "    ink = draws.finish('ink', low=(0.0,) * 3, high=(0.1,) * 3, roughness=(0.5, 1.0))\n"
-        "    x, y = (4 * axis - np.floor(4 * axis) - 0.5 for axis in (texels.u, texels.v))\n"
-        "    return paper.covered(ink, (x * x + y * y < 0.1) * 1.0)\n"
-        "SURFACES.register('dots', dots)\n",
-    )
-    with loaded(file):
-        assert "dots" not in SurfaceMapSettings().families
-        maps = _surface("dots", 0)
-        # a circle of that radius in each of sixteen squares, counted by texel centres
-        dark = (maps.diffuse_rgb.max(axis=-1) < 0.2).mean()
-        assert abs(dark - 0.1 * np.pi) < 0.03
-    assert "dots" not in SURFACES

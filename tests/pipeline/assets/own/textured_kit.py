@@ -29,6 +29,14 @@ SQUARE = TriangleMesh(
 UV_UP = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
 """[4, 2] of its corners, v up."""
 
+F = 0.04 + 0.96 / 21
+"""Specular albedo of an ordinary dielectric: the mean of Schlick's term for F0 = 0.04."""
+STORED = 0.006
+"""Half a step of 8 bits in sRGB near white."""
+SLOPE = 0.04
+"""Colours of two texels change by 2 over the width, and texels are inset by a quarter of a cell of
+a sixteenth of it; a wrong corner is off by 0.9."""
+
 OWN = OwnMaterialSettings(keep=True, texels=16)
 KEEP = AssetSettings(own_materials=OWN)
 REFUSE = AssetSettings(own_materials=OwnMaterialSettings(keep=True, texels=16, if_lost="reject"))
@@ -119,6 +127,13 @@ def seen_at(asset: Asset, right: float, up: float, column: int = 0) -> NDArray[n
         if (weights >= -1e-9).all():
             return texture_values(level.skin.textures[column], weights @ uv)
     raise AssertionError(f"no triangle at {right}, {up}")
+
+
+def assert_corners(asset: Asset) -> None:
+    """Assert that a square shows its picture upright and not mirrored."""
+    for (right, up), colour in QUARTERS.items():
+        wanted = np.array(colour) / 255 * (1 - F)
+        assert np.abs(seen_at(asset, right, up) - wanted).max() < SLOPE, (right, up)
 
 
 def lost(path: Path, settings: AssetSettings = KEEP) -> str:

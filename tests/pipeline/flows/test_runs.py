@@ -1,0 +1,154 @@
+"""Who makes a dataset's parts: ranges, task runs, Dask workers, and programs that end."""
+
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from pipeline.flows import dataset_flows as building
+from pipeline.flows import on_dask
+from pipeline.flows import prefect_runner as runner
+from pipeline.flows.limits import GPU_LIMIT
+from pipeline.flows.orders import DatasetInRuns, dataset_in_runs
+from pipeline.flows.process import run_to_end
+from pipeline.making.dataset_order import DatasetOrder
+from pipeline.making.tasks import shard_ranges
+from storage.errors import TrilightError
+from tests.for_each import for_each
+
+
+def _parameters(**given: Any) -> dict[str, Any]:
+    example = DatasetInRuns()
+    plain = {name: getattr(example, name) for name in DatasetInRuns.__dataclass_fields__}
+    return {**plain, "changes": None, **given}
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
+    """Which ranges are made, those of other runs first; nothing is."""
+    ranges: list[str | None] = []
+
+    def started(deployment: str, *, parameters: dict[str, Any], **options: Any) -> None:
+        ranges.append(f"{deployment} {parameters['shards']}")
+
+    status = SimpleNamespace(shards_planned=10)
+    monkeypatch.setattr(building, "prepare_assets", lambda **given: None)
+    monkeypatch.setattr(building, "read_status", lambda out: status)
+    monkeypatch.setattr(building, "run_deployment", started)
+    monkeypatch.setattr(building, "generate_scenes", lambda **given: ranges.append(given["shards"]))
+    return ranges
+
+
+def test_so_many_flow_runs_are_so_many_in_all(made: list[str | None]) -> None:
+    flow: Any = building.build_dataset
+    flow.fn(**_parameters(flow_runs=3, deployment="d/x"))
+    assert made == ["d/x 3:6", "d/x 6:10", "0:3", None]
+    made.clear()
+    flow.fn(**_parameters())
+    assert made == [None]
+
+
+def test_there_are_no_more_ranges_than_shards() -> None:
+    assert shard_ranges(2, 5) == ["0:1", "1:2"]
+    assert shard_ranges(7, 1) == ["0:7"]
+
+
+@for_each(
+    ("given", "message"),
+    [
+        ({"flow_runs": 0}, "flow_runs is 0; expected a whole number from 1"),
+        ({"flow_runs": 10**6}, "flow_runs is 1000000"),
+        ({"shards": "0:2"}, "shards is '0:2'; expected no range"),
+    ],
+)
+def test_wrong_numbers_of_runs_are_named(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        dataset_in_runs(_parameters(**given))
+
+
+@for_each(("variant", "held"), [("cuda_ad_rgb", [1]), ("llvm_ad_rgb", [])])
+def test_rendering_on_a_card_takes_its_limit(
+    monkeypatch: pytest.MonkeyPatch, variant: str, held: list[int]
+) -> None:
+    taken: list[int] = []
+
+    @contextlib.contextmanager
+    def limit(name: str, *, occupy: int, strict: bool) -> Iterator[None]:
+        assert name == GPU_LIMIT
+        taken.append(occupy)
+        yield
+
+    monkeypatch.setattr(runner, "concurrency", limit)
+    monkeypatch.setattr(runner, "choose_variant", lambda: SimpleNamespace(name=variant))
+    monkeypatch.setattr(runner, "make_task", lambda job, pieces: (job, pieces, list(taken)))
+    work = SimpleNamespace(job="job", pieces=())
+    assert cast(Any, runner.make_scenes).fn("0", work) == ("job", (), held)
+
+
+def test_documents_are_tried_again_where_that_can_help() -> None:
+    task = cast(Any, runner.write_documents_task)
+    assert task.retries == cast(Any, runner.make_scenes).retries > 0
+    assert task.retry_condition_fn is runner.may_pass
+
+
+def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_path: Path) -> None:
+    class Client:
+        """Two workers, of which the second is on another machine."""
+
+        def run(self, function: Any, *arguments: Any) -> dict[str, bool]:
+            return {"tcp://a:1": function(*arguments), "tcp://b:1": False}
+
+    order = DatasetOrder(out=str(tmp_path / "set"))
+    with pytest.raises(TrilightError, match="1 of 2 Dask workers do not see.*such as tcp://b:1"):
+        on_dask._require_shared(cast(Any, Client()), order)
+    assert list((tmp_path / "set" / ".staging").iterdir()) == []
+
+
+def test_a_dask_scheduler_that_does_not_answer_is_named() -> None:
+    pytest.importorskip("distributed", reason="needs the package distributed (setup-all)")
+    with (
+        pytest.raises(TrilightError, match="--address http://127.0.0.1:1: no Dask scheduler"),
+        on_dask._client("http://127.0.0.1:1"),
+    ):
+        pass
+
+
+SAVES = """
+import signal, sys, time
+from pathlib import Path
+told = []
+signal.signal(signal.SIGTERM, lambda *_: told.append(1))
+print("begun", flush=True)
+while not told:
+    time.sleep(0.01)
+print("x" * 200_000, flush=True)  # more than a pipe holds
+time.sleep(0.3)
+Path(sys.argv[1]).write_text(str(len(told)))
+"""
+
+
+class Cancelled(BaseException):
+    """As Prefect raises it for a SIGTERM."""
+
+
+def test_what_is_cancelled_is_told_once_and_saves(tmp_path: Path) -> None:
+    def cancel(line: str) -> None:
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        run_to_end([sys.executable, "-c", SAVES, str(tmp_path / "saved")], cancel)
+    assert (tmp_path / "saved").read_text() == "1"
+
+
+def test_status_and_lines_are_passed_on() -> None:
+    lines: list[str] = []
+    program = "import os, sys; print('a'); print(os.getpgid(0) == os.getpid()); sys.exit(3)"
+    assert run_to_end([sys.executable, "-c", program], lines.append) == (3, "True")
+    assert lines == ["a", "True"]
+    ended = run_to_end([sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"], lines.append)
+    assert ended == (-signal.SIGKILL, "")
