@@ -23,9 +23,8 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures
 from storage.records.sample import sample_key
-from tests.pipeline.making.batches_kit import object_records, use_mesher
 from tests.pipeline.making.bucket_kit import OUT, Killed, Machines
-from tests.pipeline.making.frozen_kit import asked, frozen, prepared
+from tests.pipeline.making.frozen_kit import asked, frozen, object_records, prepared, use_mesher
 from tests.pipeline.making.test_publication import _dataset, _locked, make_tiny_shard
 from tests.pipeline.making.tiny_scenes_kit import tiny_order
 from tests.scenes_by_hand import tiny_sample

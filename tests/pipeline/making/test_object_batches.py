@@ -16,8 +16,7 @@ from pipeline.making.object_batches import (
 from pipeline.objects.listing import Fetched, failure
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
-from tests.pipeline.making.batches_kit import Mesher, object_records, use_mesher
-from tests.pipeline.making.frozen_kit import begun
+from tests.pipeline.making.frozen_kit import Mesher, begun, object_records, use_mesher
 
 
 @pytest.fixture

@@ -1,24 +1,32 @@
-"""Workers in one folder or one bucket: each prepares some objects, and all freeze the same lock."""
+"""Workers in one folder or one bucket: objects are shared, and arrays that are killed go on."""
 
+import dataclasses
 import os
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from pipeline.executors.array_job import array_job
+from pipeline.executors.kubernetes import PLACE
+from pipeline.executors.kubernetes_array import KubernetesOptions, job_manifest
+from pipeline.executors.registry import find_executor
 from pipeline.making.pipeline import prepare_dataset
 from storage.dataset.dataset import open_dataset
+from storage.dataset.verify import verify_dataset
 from storage.remote import claims
 from storage.remote.bucket import Bucket
 from storage.remote.url import RemoteUrl, parse_url
 from tests.conftest import ROOT
-from tests.pipeline.making.batch_worker import BATCH
-from tests.pipeline.making.batches_kit import object_records, use_mesher
 from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, Writes
-from tests.pipeline.making.tiny_scenes_kit import tiny_order
+from tests.pipeline.making.frozen_kit import object_records, use_mesher
+from tests.pipeline.making.killed_worker import BATCH, KILL_AFTER_S
+from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
 pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
@@ -41,11 +49,10 @@ def lock_of_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bytes:
     return (out / "objects.lock.jsonl").read_bytes()
 
 
-def _start(out: str, tmp_path: Path, *numbers: int, cache: str) -> "subprocess.Popen[str]":
-    words = [out, str(tmp_path / "objects"), str(tmp_path / "notes"), *map(str, numbers)]
+def _start(words: Sequence[str], **environment: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(
-        [sys.executable, "-m", "tests.pipeline.making.batch_worker", *words],
-        cwd=ROOT, env={**os.environ, "TRILIGHT_CACHE": str(tmp_path / cache)}, text=True,
+        [sys.executable, "-m", "tests.pipeline.making.killed_worker", *words],
+        cwd=ROOT, env={**os.environ, **environment}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
 
@@ -60,8 +67,9 @@ def test_workers_share_the_objects(
         request.getfixturevalue("bucket")
     out, notes = OUT if is_bucket else str(tmp_path / "set"), tmp_path / "notes"
     notes.mkdir()
-    killed = _start(out, tmp_path, WORKERS, KILL_AFTER, cache="killed")
-    others = [_start(out, tmp_path, WORKERS, cache=str(number)) for number in (1, 2)]
+    words = [out, str(tmp_path / "objects"), str(notes), str(WORKERS)]
+    killed = _start([*words, str(KILL_AFTER)], TRILIGHT_CACHE=str(tmp_path / "killed"))
+    others = [_start(words, TRILIGHT_CACHE=str(tmp_path / name)) for name in "12"]
     for process in (killed, *others):
         said, _ = process.communicate(timeout=300)
         assert process.returncode == (-9 if process is killed else 0), said
@@ -117,3 +125,39 @@ def test_a_claim_keeps_other_machines_off_until_it_ends(
     monkeypatch.setattr(claims, "LEASE_S", 0.0)
     with b.claimed("z") as theirs:
         assert theirs
+
+
+OPTIONS = KubernetesOptions(image="not pulled", cores=2)
+
+
+@pytest.mark.slow("kills")
+def test_arrays_that_are_killed_end_in_the_digest_of_one_that_was_not(
+    bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each array goes on where the one before was killed: four of Kubernetes, then one of Slurm."""
+    order, rng, killed = tiny_order(out=OUT, scenes=12), np.random.default_rng(0), 0
+    without_rendering(monkeypatch)
+    monkeypatch.setattr("pipeline.executors.threads.ThreadRunner", Undocumented)
+    alone = dataclasses.replace(order, out=str(tmp_path / "whole"))
+    find_executor("threads", None, None).make(alone, None)
+    missing = [0, 1]
+    for number, on in enumerate([*4 * ["kubernetes"], "slurm"]):
+        job = array_job(order, per_task=2, at_once=None, on=on)
+        assert set(job.tasks) <= set(missing)  # only what is missing
+        missing = list(job.tasks)
+        for place, task in enumerate(job.tasks):
+            pod = job_manifest(job, OPTIONS)["spec"]["template"]["spec"]["containers"][0]
+            variables = {row["name"]: row["value"] for row in pod["env"]}
+            if on == "slurm":
+                variables["SLURM_ARRAY_TASK_ID"] = str(task)
+            else:
+                variables |= {PLACE: str(place), KILL_AFTER_S: str(rng.uniform(0, 0.4))}
+            variables["TRILIGHT_CACHE"] = str(tmp_path / f"{number}-{place}")
+            run = _start([*pod["command"][1:-1], on], **variables)
+            said, _ = run.communicate(timeout=300)
+            assert run.returncode in (0, -9), said
+            killed += run.returncode == -9
+    assert killed >= 2
+    assert array_job(order, per_task=2, at_once=None).tasks == []
+    assert verify_dataset(OUT).problems == []
+    assert open_dataset(OUT).digest == open_dataset(str(tmp_path / "whole")).digest

@@ -1,13 +1,16 @@
-"""Our side and plain Mitsuba's, as experiments render them: the product's own pictures."""
+"""Our side, plain Mitsuba's and that of coarser meshes, as experiments render them."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+import trimesh
 
 from infra.bench.sides.judged_pictures import raw_reference, shrunk
 from infra.bench.sides.sampled_pictures import bare_pictures, render_levels
 from infra.bench.sides.shots import SEED, fixed_samples, shots
+from infra.bench.subjects.mesh_pictures import picture_db
+from pipeline.assets.mesh import TriangleMesh
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from storage.metrics import psnr_log_db
@@ -78,3 +81,21 @@ def test_bare_pictures_come_nearer_with_samples() -> None:
     assert denoised[0].core_s > sampled[0].core_s > 0
     # the mean of all samples is the scene's light: five standard errors of 1 % each
     assert abs(sampled[2].radiance_rgb.mean() / reference.mean() - 1) < 0.05
+
+
+def _ball(subdivisions: int) -> TriangleMesh:
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.5)
+    return TriangleMesh(
+        positions=np.asarray(mesh.vertices, np.float64), faces=np.asarray(mesh.faces, np.int64)
+    )
+
+
+def test_a_finer_ball_looks_more_like_its_source() -> None:
+    """20480 triangles as the source, then 80, 320, 1280 and itself."""
+    meshes = [_ball(5), _ball(1), _ball(2), _ball(3), _ball(5)]
+    coarse, middle, fine, same, other_samples = picture_db(meshes, fixed_samples(32, 64))
+    # a quarter of the distance with every step, 12 dB at most; a third of that is asked for
+    assert coarse + 4 < middle and middle + 4 < fine
+    assert same == 100.0  # equal meshes, equal random numbers, equal bits
+    # denoised twice with other samples: far from equal, and far from another shape
+    assert coarse < other_samples < 100

@@ -6,9 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.builds.named import named_build
-from pipeline.making.render_sample import BegunScene, render_sample
-from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.kept_light import with_mean_of
 from pipeline.renders.load_tracer import load_tracer
@@ -16,17 +13,21 @@ from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
-from storage.dataset.manifest import Manifest
-from storage.dataset.verify import check_sample
+from pipeline.renders.vector_tracer import VectorTracer
 from storage.errors import Rejected
 from storage.metrics import psnr_log_db
 from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import MAX_LIGHTS, light_rows, rounded_to_half, sum_of_lights
-from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene, SceneObject
-from tests.pipeline.renders.sampling import SIGMAS, Estimate, camera_of
+from tests.oracle.plugin_tracer import PluginTracer
+from tests.pipeline.renders.sampling import (
+    assert_agree,
+    blocks_of,
+    camera_of,
+    render_passes,
+    render_view,
+)
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sphere
-from tests.scenes_by_hand import tiny_scene
 
 SETTINGS = RenderSettings(
     resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32, aux_spp=16, per_light=True
@@ -52,18 +53,13 @@ def lit_scene(factors: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Scene:
     return join(parts, eye=(0, -3, 2), target=(0, 0, 0.4), fov_deg=45)
 
 
-def _render(scene: Scene, settings: RenderSettings = SETTINGS, seed: int = 0) -> RenderedView:
-    renderer = SceneRenderer(scene, settings)
-    return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
-
-
 def _lights(view: RenderedView) -> NDArray[np.float32]:
     assert view.lights_rgb is not None
     return view.lights_rgb
 
 
 def test_the_stored_picture_is_the_sum_of_its_lights() -> None:
-    view = _render(lit_scene())
+    view = render_view(lit_scene(), SETTINGS)
     lights = _lights(view)
     assert lights.shape == (3, 32, 32, 3)
     np.testing.assert_array_equal(lights, rounded_to_half(lights))
@@ -73,14 +69,14 @@ def test_the_stored_picture_is_the_sum_of_its_lights() -> None:
 
 def test_lights_stand_in_the_order_of_their_objects() -> None:
     """The red, the green and the blue light are objects 0, 2 and 4."""
-    for light_rgb, colour in zip(_lights(_render(lit_scene())), COLOURS, strict=True):
+    for light_rgb, colour in zip(_lights(render_view(lit_scene(), SETTINGS)), COLOURS, strict=True):
         assert np.argmax(light_rgb.mean(axis=(0, 1))) == np.argmax(colour)
 
 
 def test_doubling_one_light_doubles_its_picture_and_no_other() -> None:
     """Samples do not depend on a light's strength; twice a float is exact, in halves too."""
-    once = _lights(_render(lit_scene(), RAW))
-    twice = _lights(_render(lit_scene((1, 2, 1)), RAW))
+    once = _lights(render_view(lit_scene(), RAW))
+    twice = _lights(render_view(lit_scene((1, 2, 1)), RAW))
     np.testing.assert_array_equal(twice[[0, 2]], once[[0, 2]])
     # below 6e-5 half floats are steps of 6e-8, of which twice the value has twice as many
     np.testing.assert_allclose(twice[1], 2 * once[1], rtol=0, atol=6e-8)
@@ -98,12 +94,14 @@ def test_lights_apart_add_up_to_one_denoised_picture() -> None:
     raw = samples.mean().sum(axis=0)
     expected = with_mean_of(denoise(raw, features, "high"), raw)
     # rounded to half floats four times, each light and their sum: 2^-11 of each
-    np.testing.assert_allclose(_render(scene).radiance_rgb, expected, rtol=2 * 2**-11, atol=1e-6)
+    np.testing.assert_allclose(
+        render_view(scene, SETTINGS).radiance_rgb, expected, rtol=2 * 2**-11, atol=1e-6
+    )
 
 
 def test_denoised_lights_are_linear_within_their_noise() -> None:
     """The denoiser is not linear: what it changes in the other lights is below the floor."""
-    once, twice = _render(lit_scene()), _render(lit_scene((1, 2, 1)))
+    once, twice = render_view(lit_scene(), SETTINGS), render_view(lit_scene((1, 2, 1)), SETTINGS)
     for index, factor in enumerate((1, 2, 1)):
         agreement = psnr_log_db(factor * _lights(once)[index], _lights(twice)[index])
         assert agreement > once.noise_floor_db
@@ -116,54 +114,32 @@ def test_lights_are_mixed_without_rendering_again() -> None:
     and of the sum.
     """
     weights = (0.5, 4.0, 0.25)
-    lights = _lights(_render(lit_scene(), RAW)).astype(np.float64)
+    lights = _lights(render_view(lit_scene(), RAW)).astype(np.float64)
     mixed = np.einsum("l,lijc->ijc", weights, lights)
-    rendered = _render(lit_scene(weights), RAW).radiance_rgb
+    rendered = render_view(lit_scene(weights), RAW).radiance_rgb
     np.testing.assert_allclose(rendered, mixed, rtol=2 * 2**-11, atol=1e-6)
 
 
 def test_the_sum_is_the_picture_of_all_lights_at_once(llvm: None) -> None:
     """The same integral, by other samples: raw means of 8 x 8 blocks agree within their errors."""
     scene = lit_scene()
-    apart, together = (_block_estimate(scene, per_light=per_light) for per_light in (True, False))
-    error = np.sqrt(apart.error**2 + together.error**2)
-    assert (abs(apart.mean - together.mean) <= SIGMAS * error + 1e-9).all()
-    # and the errors are small enough to tell: the lights' own share is far larger
-    assert np.median(error) < 0.02 * together.mean.mean()
-
-
-def _block_estimate(scene: Scene, *, per_light: bool) -> Estimate:
     tracer = load_tracer(scene, max_depth=6, rr_depth=5)
-    parts = [tracer.only_light(row) for row in light_rows(scene)] if per_light else [tracer]
-    camera = camera_of(scene, 32)
-    means = []
-    for seed in range(12):
-        total = sum(part.radiance(camera, seed=seed, spp=64).astype(np.float64) for part in parts)
-        means.append(np.asarray(total).reshape(4, 8, 4, 8, 3).mean(axis=(1, 3)))
-    stack = np.array(means)
-    return Estimate(mean=stack.mean(axis=0), error=stack.std(axis=0, ddof=1) / np.sqrt(12))
+    lights = [tracer.only_light(row) for row in light_rows(scene)]
+    apart = blocks_of(sum(render_passes(one, scene, passes=12) for one in lights), 8)
+    together = blocks_of(render_passes(tracer, scene, passes=12), 8)
+    assert_agree(apart, together)
+    # and the errors are small enough to tell: the lights' own share is far larger
+    assert np.median(np.hypot(apart.error, together.error)) < 0.02 * together.mean.mean()
 
 
 @pytest.mark.slow("statistics")
 def test_both_tracers_switch_the_same_light_on(llvm: None) -> None:
-    from pipeline.renders.vector_tracer import VectorTracer
-    from tests.oracle.plugin_tracer import PluginTracer
-
     scene = lit_scene()
-    camera = camera_of(scene, 16)
     for row in (0, 4):
+        tracers = [kind(scene, max_depth=2, rr_depth=5) for kind in (VectorTracer, PluginTracer)]
         means = [
-            np.mean(
-                [
-                    kind(scene, max_depth=2, rr_depth=5)
-                    .only_light(row)
-                    .radiance(camera, seed=seed, spp=64)
-                    .mean(axis=(0, 1), dtype=np.float64)
-                    for seed in range(4)
-                ],
-                axis=0,
-            )
-            for kind in (VectorTracer, PluginTracer)
+            render_passes(one.only_light(row), scene, resolution=16, passes=4).mean(axis=(0, 1, 2))
+            for one in tracers
         ]
         # 65,536 paths of direct light with a relative deviation near 1: half a percent is exceeded
         # once in five by chance, 2 % never; the wrong light would be off by a factor of 5 or more
@@ -176,23 +152,18 @@ def test_a_light_that_is_off_still_casts_a_shadow_and_is_still_hidden() -> None:
     lamp = light([[-0.5, -0.5, 3], [0.5, -0.5, 3], [0, 0.5, 3]], 50.0)
     screen = light([[-9, -9, 1], [9, -9, 1], [0, 18, 1]], 1.0)
     scene = join([floor, lamp, screen], eye=(0, -0.1, 2))
-    lamp_rgb, screen_rgb = _lights(_render(scene, RAW))
+    lamp_rgb, screen_rgb = _lights(render_view(scene, RAW))
     assert lamp_rgb.max() == 0
     assert screen_rgb.min() > 0  # the floor fills the picture, seen through the screen
 
 
 def test_lights_apart_have_an_honest_floor_and_reach_a_target() -> None:
     settings = dataclasses.replace(SETTINGS, noise_floor_db=38.0, max_spp=2048)
-    view = _render(lit_scene(), settings)
+    view = render_view(lit_scene(), settings)
     assert view.noise_floor_db >= 38.0 and not view.at_cap
     converged = dataclasses.replace(SETTINGS, min_spp=2048, max_spp=2048, per_light=False)
-    truth = _render(lit_scene(), converged, seed=1)
+    truth = render_view(lit_scene(), converged, seed=1)
     assert view.noise_floor_db < psnr_log_db(view.radiance_rgb, truth.radiance_rgb)
-
-
-def test_without_the_setting_there_are_no_lights() -> None:
-    settings = dataclasses.replace(SETTINGS, per_light=False)
-    assert _render(lit_scene(), settings).lights_rgb is None
 
 
 def test_one_light_alone_is_the_picture_but_for_its_rounding() -> None:
@@ -202,8 +173,9 @@ def test_one_light_alone_is_the_picture_but_for_its_rounding() -> None:
         light(LAMPS, 20.0),
     ]
     scene = join(parts, eye=(0, -3, 2))
-    together = _render(scene, dataclasses.replace(SETTINGS, per_light=False))
-    apart = _render(scene)
+    together = render_view(scene, dataclasses.replace(SETTINGS, per_light=False))
+    assert together.lights_rgb is None
+    apart = render_view(scene, SETTINGS)
     np.testing.assert_array_equal(apart.radiance_rgb, rounded_to_half(together.radiance_rgb))
     assert apart.noise_floor_db == together.noise_floor_db
 
@@ -222,32 +194,3 @@ def test_an_emitter_without_triangles_is_rejected() -> None:
     more = dataclasses.replace(scene, objects=(*scene.objects, empty))
     with pytest.raises(Rejected, match="unlit_scene"):
         SceneRenderer(more, SETTINGS)
-
-
-def test_a_build_with_the_setting_stores_what_verify_accepts() -> None:
-    """`--set renders.per_light=true`, from the settings to the members of a sample."""
-    changes = {
-        "renders.per_light": True,
-        "renders.min_spp": 8,
-        "renders.max_spp": 8,
-        "scenes.num_views": 2,
-    }
-    settings = named_build("smoke", resolution=16, changes=changes)
-    scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
-    sample = render_sample(
-        "000000007", BegunScene(scene=scene), settings, [], ViewProgress(None, 7)
-    )
-    manifest = Manifest(
-        build="smoke",
-        settings=settings.as_json(),
-        environment={},
-        num_scenes=1,
-        num_views=2,
-        objects_lock_sha256="",
-        shards=(),
-    )
-    back = decode_sample(sample.key, encode_sample(sample))
-    assert list(check_sample(back, "train", manifest, {})) == []
-    assert back.lights_rgb is not None
-    assert back.lights_rgb.shape == (2, 1, 16, 16, 3)
-    np.testing.assert_array_equal(back.radiance_rgb, sample.radiance_rgb)

@@ -23,6 +23,7 @@ from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
 from storage.settings.changes import changed
 from tests.conftest import ROOT
+from tests.pipeline.renders.sampling import render_view
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
 
 CHEAP = RenderSettings(resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32)
@@ -39,17 +40,12 @@ def simple_scene(radiance: float = 20.0) -> Scene:
     return join(parts, eye=(0, -3, 2), target=(0, 0, 0.4), fov_deg=45)
 
 
-def _render(scene: Scene, settings: RenderSettings = CHEAP, seed: int = 0) -> RenderedView:
-    renderer = SceneRenderer(scene, settings)
-    return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
-
-
 def digest(view: RenderedView) -> str:
     return hashlib.sha256(view.radiance_rgb.tobytes() + view.hits.tobytes()).hexdigest()
 
 
 def test_a_view_is_finite_lit_and_black_outside() -> None:
-    view = _render(simple_scene())
+    view = render_view(simple_scene(), CHEAP)
     assert view.radiance_rgb.dtype == np.float32 and view.radiance_rgb.shape == (32, 32, 3)
     assert np.isfinite(view.radiance_rgb).all() and (view.radiance_rgb >= 0).all()
     assert view.hits.any() and not view.hits.all()
@@ -63,7 +59,7 @@ def test_the_same_bits_for_any_number_of_threads_and_in_any_process() -> None:
     digests = []
     for threads in (1, 2):
         set_threads(threads)
-        digests.append(digest(_render(scene, settings)))
+        digests.append(digest(render_view(scene, settings)))
     # The other process has rendered another scene before, and runs on one thread.
     code = (
         "import numpy as np\n"
@@ -72,10 +68,10 @@ def test_the_same_bits_for_any_number_of_threads_and_in_any_process() -> None:
         "from tests.pipeline.renders import test_renderer as t\n"
         "from tests.pipeline.renders.scene_kit import sampled_like_scene\n"
         "t.set_threads(1)\n"
-        "t._render(t.simple_scene())\n"
+        "t.render_view(t.simple_scene(), t.CHEAP)\n"
         f"settings = t.{settings!r}\n"
         "scene = sampled_like_scene(np.random.default_rng(5), num_views=1)\n"
-        "print(t.digest(t._render(scene, settings)))\n"
+        "print(t.digest(t.render_view(scene, settings)))\n"
     )
     child = subprocess.run(
         [sys.executable, "-c", code],
@@ -100,12 +96,12 @@ def test_views_do_not_depend_on_the_views_before_them() -> None:
 
 def test_sampling_stops_at_the_target_or_at_the_cap() -> None:
     scene = simple_scene()
-    easy = _render(scene, dataclasses.replace(GROWING, noise_floor_db=10.0))
+    easy = render_view(scene, dataclasses.replace(GROWING, noise_floor_db=10.0))
     assert easy.spp == 64 and not easy.at_cap
-    hard = _render(scene, dataclasses.replace(GROWING, noise_floor_db=95.0))
+    hard = render_view(scene, dataclasses.replace(GROWING, noise_floor_db=95.0))
     assert hard.spp == 256 and hard.at_cap
     between = easy.noise_floor_db + 2
-    wanted = _render(scene, dataclasses.replace(GROWING, noise_floor_db=between, max_spp=4096))
+    wanted = render_view(scene, dataclasses.replace(GROWING, noise_floor_db=between, max_spp=4096))
     assert wanted.noise_floor_db >= between and not wanted.at_cap
     assert 64 < wanted.spp < 4096 and wanted.spp % 32 == 0
 
@@ -113,10 +109,10 @@ def test_sampling_stops_at_the_target_or_at_the_cap() -> None:
 def test_a_build_may_refuse_what_stays_noisy() -> None:
     strict = dataclasses.replace(CHEAP, noise_floor_db=95.0, max_spp=32, reject_at_cap=True)
     with pytest.raises(Rejected, match="expected 95") as rejection:
-        _render(simple_scene(), strict)
+        render_view(simple_scene(), strict)
     assert rejection.value.reason == "floor_not_reached"
     easy = dataclasses.replace(strict, noise_floor_db=10.0)
-    assert _render(simple_scene(), easy).noise_floor_db >= 10
+    assert render_view(simple_scene(), easy).noise_floor_db >= 10
 
 
 def test_a_view_says_how_far_it_is() -> None:
@@ -135,7 +131,7 @@ def test_a_view_says_how_far_it_is() -> None:
     assert all(step.spp <= step.expected_spp <= 256 for step in seen)
     assert [step.missing_db is None for step in seen] == [True] * 4 + [False] * 6
     assert all(0 < (step.missing_db or 0) < 95 for step in seen[4:])
-    assert digest(view) == digest(_render(scene, settings))
+    assert digest(view) == digest(render_view(scene, settings))
 
 
 def test_halves_of_many_samples_have_the_best_filter(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,35 +144,35 @@ def test_halves_of_many_samples_have_the_best_filter(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(renderer_module, "denoise", noted)
     settings = dataclasses.replace(GROWING, noise_floor_db=95.0, min_spp=64, max_spp=512)
-    _render(simple_scene(), settings)
+    render_view(simple_scene(), settings)
     # Two halves at 256 and at 512 samples, and the picture.
     assert filtered == ["fast"] * 2 + ["high"] * 2 + ["high"]
     filtered.clear()
-    _render(simple_scene(), dataclasses.replace(settings, denoiser="fast"))
+    render_view(simple_scene(), dataclasses.replace(settings, denoiser="fast"))
     assert filtered == ["fast"] * 5
 
 
 def test_a_linear_target_goes_on_where_the_log_one_is_reached() -> None:
     easy = dataclasses.replace(GROWING, noise_floor_db=10.0, max_spp=4096)
-    first = _render(simple_scene(), easy)
+    first = render_view(simple_scene(), easy)
     wanted = first.noise_floor_linear_db + 1
-    both = _render(simple_scene(), dataclasses.replace(easy, noise_floor_linear_db=wanted))
+    both = render_view(simple_scene(), dataclasses.replace(easy, noise_floor_linear_db=wanted))
     assert both.spp > first.spp == 64
     assert both.noise_floor_linear_db >= wanted and not both.at_cap
     alone = dataclasses.replace(easy, noise_floor_db=None, noise_floor_linear_db=wanted)
-    assert digest(_render(simple_scene(), alone)) == digest(both)
+    assert digest(render_view(simple_scene(), alone)) == digest(both)
 
 
 def test_a_target_over_objects_goes_on_where_most_is_background() -> None:
     scene = simple_scene()
     far = dataclasses.replace(scene, fov_deg=np.array([110.0], np.float32))
     easy = dataclasses.replace(GROWING, max_spp=4096)
-    first = _render(far, dataclasses.replace(easy, noise_floor_db=10.0))
+    first = render_view(far, dataclasses.replace(easy, noise_floor_db=10.0))
     assert first.hits.mean() < 0.25
     assert first.object_noise_floor_db < first.noise_floor_db - 6
     reached = first.object_noise_floor_db + 1
-    whole = _render(far, dataclasses.replace(easy, noise_floor_db=reached))
-    objects = _render(
+    whole = render_view(far, dataclasses.replace(easy, noise_floor_db=reached))
+    objects = render_view(
         far, dataclasses.replace(easy, noise_floor_db=reached, noise_floor_objects_db=reached)
     )
     assert whole.spp == 64 < objects.spp
@@ -185,9 +181,9 @@ def test_a_target_over_objects_goes_on_where_most_is_background() -> None:
 
 def test_a_target_that_is_reached_costs_nothing() -> None:
     easy = dataclasses.replace(CHEAP, noise_floor_db=40.0, max_spp=4096)
-    first = _render(simple_scene(), easy)
+    first = render_view(simple_scene(), easy)
     more = dataclasses.replace(easy, noise_floor_linear_db=5.0, noise_floor_objects_db=5.0)
-    assert digest(_render(simple_scene(), more)) == digest(first)
+    assert digest(render_view(simple_scene(), more)) == digest(first)
 
 
 @pytest.mark.parametrize(
@@ -199,10 +195,10 @@ def test_a_target_that_is_reached_costs_nothing() -> None:
 )
 def test_every_target_counts_at_the_cap(name: str, metric: str) -> None:
     easy = dataclasses.replace(CHEAP, noise_floor_db=10.0, reject_at_cap=True)
-    assert not _render(simple_scene(), changed(easy, {name: 5.0})).at_cap
+    assert not render_view(simple_scene(), changed(easy, {name: 5.0})).at_cap
     with pytest.raises(Rejected, match=f"^floor_not_reached: {metric} is .* dB; expected 95$"):
-        _render(simple_scene(), changed(easy, {name: 95.0}))
-    view = _render(simple_scene(), changed(easy, {name: 95.0, "reject_at_cap": False}))
+        render_view(simple_scene(), changed(easy, {name: 95.0}))
+    view = render_view(simple_scene(), changed(easy, {name: 95.0, "reject_at_cap": False}))
     assert view.at_cap and view.noise_floor_db > 10
 
 
@@ -210,7 +206,7 @@ def test_every_target_counts_at_the_cap(name: str, metric: str) -> None:
 def truth() -> NDArray[np.float32]:
     """Return the simple scene of 64 x 64 pixels, nearly converged."""
     converged = dataclasses.replace(CHEAP, resolution=64, min_spp=1024, max_spp=1024, aux_spp=64)
-    return _render(simple_scene(), converged, seed=1).radiance_rgb
+    return render_view(simple_scene(), converged, seed=1).radiance_rgb
 
 
 def test_the_measured_floor_is_below_the_true_agreement_here(truth: NDArray[np.float32]) -> None:
@@ -220,7 +216,7 @@ def test_the_measured_floor_is_below_the_true_agreement_here(truth: NDArray[np.f
     about 3 dB, far more than what is left in them.
     """
     settings = dataclasses.replace(CHEAP, resolution=64, min_spp=64, max_spp=64, aux_spp=64)
-    view = _render(simple_scene(), settings)
+    view = render_view(simple_scene(), settings)
     true_db = psnr_log_db(view.radiance_rgb, truth)
     assert view.noise_floor_db < true_db
     assert view.noise_floor_db > true_db - 10
@@ -230,7 +226,9 @@ def test_denoising_helps_and_can_be_left_out(truth: NDArray[np.float32]) -> None
     settings = dataclasses.replace(CHEAP, resolution=64)
     errors = [
         -psnr_log_db(
-            _render(simple_scene(), dataclasses.replace(settings, denoiser=quality)).radiance_rgb,
+            render_view(
+                simple_scene(), dataclasses.replace(settings, denoiser=quality)
+            ).radiance_rgb,
             truth,
         )
         for quality in ("high", "fast", "off")
@@ -245,17 +243,17 @@ def test_black_views_are_rejected() -> None:
     with pytest.raises(Rejected, match="black_view"):
         renderer.render_view(away, 40.0, seed=0)
     with pytest.raises(Rejected, match="black_view"):
-        _render(simple_scene(radiance=1e-3))
+        render_view(simple_scene(radiance=1e-3), CHEAP)
 
 
 def test_values_that_are_not_finite_are_found_before_the_denoiser_hides_them() -> None:
     with pytest.raises(Rejected, match="nonfinite_radiance"):
-        _render(simple_scene(radiance=3e38))
+        render_view(simple_scene(radiance=3e38), CHEAP)
 
 
 def test_pictures_beyond_half_floats_are_rejected() -> None:
     with pytest.raises(Rejected, match="radiance_overflow"):
-        _render(simple_scene(radiance=1e8))
+        render_view(simple_scene(radiance=1e8), CHEAP)
 
 
 def test_a_scene_of_emitters_alone_is_rejected() -> None:
