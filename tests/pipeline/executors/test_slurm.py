@@ -22,7 +22,7 @@ from storage.dataset.dataset import open_dataset
 from storage.dataset.progress import missing_shards
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.number_ranges import number_ranges
+from storage.number_ranges import number_ranges, numbers_of
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.for_each import for_each
@@ -45,18 +45,11 @@ def test_the_tasks_of_an_array_have_equal_shares() -> None:
     by_two = [shards_of_task(_array(k, 1, 5, 3), _shards(6)) for k in (1, 3, 5)]  # --array=1-5:2
     assert by_two == ["0:2", "2:4", "4:6"]
     assert shards_of_task(_array(7, 7, 7, 1), _shards(6)) == "0:6"
-
-
-def test_more_tasks_than_shards_share_them() -> None:
     shares = [shards_of_task(_array(k, 0, 4, 5), _shards(2)) for k in range(5)]
-    assert shares == ["0:1", "1:2", "0:1", "1:2", "0:1"]
-
-
-def test_a_stated_number_of_shards_depends_on_the_task_alone() -> None:
-    """A single task can be submitted again; the dataset need not even be begun."""
+    assert shares == ["0:1", "1:2", "0:1", "1:2", "0:1"], "more tasks than shards"
 
     def unknown() -> int:
-        raise AssertionError("nobody needs to know")
+        raise AssertionError("nobody needs to know: the dataset need not even be begun")
 
     alone = {"SLURM_ARRAY_TASK_ID": "2", "SHARDS_PER_TASK": "4"}
     assert shards_of_task(alone, unknown) == "8:12"
@@ -129,6 +122,7 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 def test_ranges(numbers: tuple[int, ...], text: str) -> None:
     assert number_ranges(numbers) == text
+    assert numbers_of(text) == sorted(set(numbers))
 
 
 def test_an_array_fits_the_cluster_and_covers_every_shard(cluster: Path) -> None:

@@ -260,18 +260,6 @@ def maps_in(dataset: Dataset) -> list[list[str]]:
     return names
 
 
-def test_a_merge_carries_maps_and_knows_what_it_has(tmp_path: Path) -> None:
-    a = finished(tmp_path / "a", textured_scenes())
-    b = finished(tmp_path / "b", scenes(1), seed=1)
-    merged = shards_made(tmp_path / "c", MERGE, b, a)
-    expected = {**given(scenes(1)), **given(textured_scenes(), offset=6)}
-    found = samples_of(merged)
-    assert sorted(found) == sorted(expected)
-    assert {key: members for key, (_, members) in found.items()} == {
-        key: members for key, (_, members) in expected.items()
-    }
-
-
 def test_a_selection_takes_the_maps_that_it_needs_and_no_other(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", textured_scenes())
     chosen = Derive(operation="select", selection=Selection(where=f'key == "{sample_key(3)}"'))

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -89,15 +88,6 @@ def _dataset(root: Path, scenes: int = 8) -> Publication:
     return publication
 
 
-def test_a_finished_dataset_verifies(tmp_path: Path) -> None:
-    publication = _dataset(tmp_path)
-    found = verify_dataset(tmp_path)
-    assert found.problems == []
-    assert found.num_samples == 8
-    assert read_manifest(tmp_path / "manifest.json") == publication.manifest
-    assert len(read_failures(publication.folder.failures)) == 8
-
-
 def test_the_digest_knows_nothing_of_place_or_order(tmp_path: Path) -> None:
     forwards = _dataset(tmp_path / "a").manifest
     build = _build()
@@ -118,11 +108,10 @@ def test_growing_keeps_the_shards(tmp_path: Path) -> None:
     again = _begin(tmp_path, _build(), 4)  # asking for fewer takes nothing away
     assert again.manifest == dataclasses.replace(grown, shards=())
     assert again.finish() == grown
-    assert verify_dataset(tmp_path).problems == []
-
-
-def test_scenes_are_rounded_up_to_whole_shards(tmp_path: Path) -> None:
-    assert _begin(tmp_path, _build(), 5).manifest.num_scenes == 8
+    found = verify_dataset(tmp_path)
+    assert (found.problems, found.num_samples) == ([], 12)
+    assert len(read_failures(again.folder.failures)) == 12
+    assert _begin(tmp_path, _build(), 13).manifest.num_scenes == 16  # whole shards
 
 
 def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
@@ -212,6 +201,9 @@ def test_documents_of_others_are_not_replaced(tmp_path: Path, name: str) -> None
     with pytest.raises(TrilightError, match=rf"{name} is there.*another --out"):
         _begin(tmp_path, _build())
     assert not (tmp_path / "manifest.json").exists()
+    (tmp_path / "train-000000.tar").write_bytes(b"")
+    with pytest.raises(TrilightError, match=r"shards but no manifest\.json"):
+        _begin(tmp_path, _build())
 
 
 def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None:
@@ -240,12 +232,6 @@ def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None
     assert "CC-BY-SA-3.0 and CC-BY-SA-4.0 meet" in problems[0]
 
 
-def test_shards_without_a_manifest_are_not_touched(tmp_path: Path) -> None:
-    (tmp_path / "train-000000.tar").write_bytes(b"")
-    with pytest.raises(TrilightError, match=r"shards but no manifest\.json"):
-        _begin(tmp_path, _build())
-
-
 @for_each("name", BUILDS)
 def test_every_build_is_json_and_has_a_stable_digest(name: str) -> None:
     build = named_build(name)
@@ -254,41 +240,6 @@ def test_every_build_is_json_and_has_a_stable_digest(name: str) -> None:
     assert list(differences(build.as_json(), named_build(name, seed=5).as_json())) == [
         ("seed", build.seed, 5)
     ]
-
-
-@for_each(
-    ("arguments", "message"),
-    [
-        ({"name": "nonsense"}, "build 'nonsense' is unknown; expected one of smoke"),
-        ({"name": "smoke", "seed": -1}, "'seed' is -1"),
-        ({"name": "smoke", "resolution": 100}, "resolution"),
-        ({"name": "smoke", "noise_floor_db": -3.0}, "noise_floor_db"),
-        ({"name": "smoke", "changes": {"storage.profile": "tiny"}}, "profile' is 'tiny'; expected"),
-    ],
-)
-def test_wrong_settings_are_named(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(TrilightError, match=message):
-        named_build(**arguments)
-
-
-def test_the_profile_is_a_setting_and_stands_in_the_manifest(tmp_path: Path) -> None:
-    """Builds to learn from are compact, those to judge by exact; `--set` changes it."""
-    assert {name: named_build(name).storage.profile for name in ("smoke", "benchmark-v1")} == {
-        "smoke": "compact",
-        "benchmark-v1": "lossless",
-    }
-    build = named_build("smoke", changes={"storage.profile": "lossless"})
-    publication = _begin(tmp_path, build, 4)
-    assert publication.manifest.settings["storage"] == {"profile": "lossless"}
-    with pytest.raises(TrilightError, match=r"storage\.profile was 'lossless', now 'compact'"):
-        _begin(tmp_path, named_build("smoke"), 4)
-
-
-def test_a_shard_is_packed_as_the_settings_say(tmp_path: Path) -> None:
-    assert _build().storage.profile == "compact"
-    (shard, *_) = _dataset(tmp_path, 4).manifest.shards
-    found = open_dataset(str(tmp_path)).suffixes(shard)
-    assert found == {"scene.safetensors.gz", "json", "0.exr", "1.exr"}
 
 
 def test_a_shard_in_the_folder_of_a_worker_alone_is_no_shard(
@@ -363,20 +314,7 @@ def test_a_dataset_in_parts_is_whole(tmp_path: Path) -> None:
     assert _most_entries(tmp_path) == 2
     assert publication.missing_shards() == []
     assert read_progress(publication.folder).scenes_done == 20
-
-
-@pytest.mark.usefixtures("two_each")
-def test_a_dataset_grows_into_parts(tmp_path: Path) -> None:
-    before = _dataset(tmp_path, scenes=8).manifest
-    grown = _dataset(tmp_path, scenes=16).manifest
-    assert grown.shards[:2] == before.shards
-    assert verify_dataset(tmp_path).problems == []
-
-
-@pytest.mark.usefixtures("two_each")
-def test_a_shard_in_a_part_is_missed_found_and_unlisted(tmp_path: Path) -> None:
-    publication = _dataset(tmp_path, scenes=16)
-    path = tmp_path / publication.manifest.shards[3].name
+    path = tmp_path / names[3]
     moved = path.rename(tmp_path / "away")
     assert verify_dataset(tmp_path).problems == ["part-0001/train-000003.tar: missing"]
     assert publication.missing_shards() == [3]

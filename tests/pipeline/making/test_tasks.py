@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -77,13 +78,6 @@ def test_several_at_once_all_have_work_until_the_end(at_once: int) -> None:
     assert left == 0
 
 
-def test_two_million_slow_scenes_are_at_most_a_thousand_tasks() -> None:
-    sizes = TaskSizes()
-    sizes.measured(1, 100.0)
-    splits = SplitSettings(scenes_per_shard=256)
-    assert sum(1 for _ in cut_tasks(range(2_000_000 // 256), splits, sizes)) <= MOST_TASKS
-
-
 def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
     splits, left, rounds = SplitSettings(scenes_per_shard=1), TasksLeft(), list[int]()
     with pytest.raises(EnvironmentFailure, match="run the same command again"):
@@ -98,9 +92,7 @@ def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
     [
         ({"build": "nonsense"}, "build 'nonsense'"),
         ({"scenes": 0}, "scenes is 0"),
-        ({"workers": 0}, "workers is 0"),
         ({"failure_budget": 1.5}, "failure_budget is 1.5"),
-        ({"shards": "4"}, "shards is '4'"),
         ({"shards": "4:4"}, "shards is '4:4'"),
         ({"views": 2}, "--views is 2"),
         ({"scenes_from": "a", "scenes": 3}, "expected neither"),
@@ -136,7 +128,7 @@ ASKED = DatasetOrder(
 def test_every_option_that_was_given_is_there() -> None:
     words = generate_words(ASKED)
     assert words[:4] == ["generate", "pretrain-256", "--objects", "my objects"]
-    for pair in (
+    assert set(pairwise(words)) >= {
         ("--scenes", "2000000"),
         ("--seed", "7"),
         ("--resolution", "64"),
@@ -147,32 +139,20 @@ def test_every_option_that_was_given_is_there() -> None:
         ("--allow-licences", "MIT"),
         ("--licence", "CC0-1.0"),
         ("--failure-budget", "0.2"),
-    ):
-        at = [i for i, word in enumerate(words) if word == pair[0]]
-        assert pair[1] in [words[i + 1] for i in at]
+    }
     assert "--accept-environment" in words
     changes = [words[i + 1] for i, word in enumerate(words) if word == "--changes"]
     assert parse_changes(changes) == json.loads(json.dumps(dict(ASKED.changes)))
-
-
-def test_what_nobody_asked_for_is_not_there() -> None:
-    assert generate_words(DatasetOrder(workers=3, shards="0:2", out="x")) == ["generate", "smoke"]
-
-
-def test_every_option_of_an_order_is_one_of_the_command() -> None:
     shown = trilight(["generate", "--help"], env={"COLUMNS": "200"}).output
-    for word in generate_words(ASKED):
-        assert not word.startswith("--") or word in shown
+    assert all(word in shown for word in words if word.startswith("--"))
 
 
-def test_words_that_are_json_stay_words() -> None:
-    order = DatasetOrder(changes={"source": "12", "storage.profile": "true"})
-    assert parse_changes(generate_words(order)[3::2]) == {"source": "12", "storage.profile": "true"}
-
-
-def test_a_password_is_not_repeated() -> None:
-    order = DatasetOrder(objects="https://me:secret@host/objects?key=1")
-    assert generate_words(order)[3] == "https://host/objects"
+def test_words_are_what_was_asked_for_and_no_more() -> None:
+    assert generate_words(DatasetOrder(workers=3, shards="0:2", out="x")) == ["generate", "smoke"]
+    changes = {"source": "12", "storage.profile": "true"}  # words that are JSON stay words
+    assert parse_changes(generate_words(DatasetOrder(changes=changes))[3::2]) == changes
+    with_password = DatasetOrder(objects="https://me:secret@host/objects?key=1")
+    assert generate_words(with_password)[3] == "https://host/objects"
 
 
 def test_a_place_that_is_free_is_taken_before_the_result_is_looked_at() -> None:

@@ -105,6 +105,9 @@ def test_a_guided_picture_has_the_same_bits_for_any_number_of_threads() -> None:
 def test_a_matt_scene_has_nothing_to_learn() -> None:
     scene = join([quad(FLOOR, material(diffuse=0.6)), light(LAMP, 30.0)], eye=(0, -2, 1))
     assert _tracer(scene).guided()._scene.guide is None
+    nothing = np.zeros(0, np.int64)
+    cells = GuideCells(np.random.default_rng(5).normal(size=(9, 3, 3)))
+    assert learn(cells, Photons(cell=nothing, bin=nothing, power=np.zeros(0))) is None
 
 
 _ADAPTIVE = RenderSettings(
@@ -283,9 +286,3 @@ def test_shares_become_whole_numbers_that_add_up() -> None:
     counts = apportioned(shares)
     assert (counts.sum(axis=1) == ENTRIES).all()
     assert np.abs(counts - shares * ENTRIES).max() < 1 + 1e-6  # rounded at both ends
-
-
-def test_no_photon_anywhere_means_no_table() -> None:
-    nothing = np.zeros(0, np.int64)
-    cells = GuideCells(np.random.default_rng(5).normal(size=(9, 3, 3)))
-    assert learn(cells, Photons(cell=nothing, bin=nothing, power=np.zeros(0))) is None

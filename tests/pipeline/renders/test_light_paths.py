@@ -14,7 +14,6 @@ from pipeline.renders.device_memory import read_back
 from pipeline.renders.emission_cone import EmissionCone
 from pipeline.renders.film import Film
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.renderer import set_threads
 from pipeline.renders.splats import Splats, splat_unit
 from pipeline.renders.vector_tracer import VectorTracer, even_numbers
 from storage.conventions import camera_rays
@@ -185,19 +184,6 @@ def test_a_caustic_has_a_fraction_of_the_noise() -> None:
     assert_agree(together, alone)
     direct = render_blocks(scene, max_depth=2, rr_depth=2, passes=4)
     assert (together.mean - direct.mean).max() > 0.2 * direct.mean.max()
-
-
-def test_the_same_bits_for_any_number_of_threads() -> None:
-    scene = _ball(0.1, lamp_diffuse=0.5, closed=True)
-    tracer = load_tracer(scene, max_depth=10, rr_depth=2)
-    pictures = []
-    for threads in (1, 2, 3):
-        set_threads(threads)
-        pictures.append(tracer.radiance(camera_of(scene, 32), seed=3, spp=16))
-    set_threads(2)
-    assert pictures[0].max() > 0
-    for picture in pictures[1:]:
-        np.testing.assert_array_equal(picture, pictures[0])
 
 
 def _means(

@@ -25,13 +25,14 @@ from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.settings.described import settings_record
 from tests.oracle.plugin_tracer import PluginTracer
-from tests.pipeline.renders.guided_scenes import lit_by_a_mirror, mirrors
+from tests.pipeline.renders.guided_scenes import mirrors
 from tests.pipeline.renders.sampling import (
     Estimate,
     assert_agree,
     blocks_of,
     camera_of,
     exact,
+    render_blocks,
     render_view,
 )
 from tests.pipeline.renders.scene_kit import box, furnace, join, light, material, quad, sphere
@@ -198,7 +199,7 @@ def test_a_build_with_the_setting_stores_what_verify_accepts(
     assert back.views == sample.views
     shape = (2, 1, 16, 16, 3) if per_light else (2, 16, 16, 3)
     pictures = [*(back.parts_rgb or {}).values(), *([back.lights_rgb] if per_light else [])]
-    assert {np.shape(picture) for picture in pictures} == {shape}
+    assert {picture.shape for picture in pictures if picture is not None} == {shape}
     assert (back.parts_rgb is not None) == bool(kind)
     np.testing.assert_array_equal(back.radiance_rgb, sample.radiance_rgb)
 
@@ -324,27 +325,6 @@ def test_a_surface_without_a_lobe_has_none_of_its_light() -> None:
         np.testing.assert_array_equal(found[f"diffuse_{bounce}"][shiny], 0)
         assert found[f"diffuse_{bounce}"][matt].mean() > 1e-3
         assert found[f"specular_{bounce}"][shiny].mean() > 1e-3
-
-
-def test_where_no_lamp_is_in_sight_all_light_is_indirect() -> None:
-    scene = lit_by_a_mirror(0.1)
-    kind = {"bounces": True, "lobes": False}
-    found = _passes(scene, **kind)
-    in_sight = found["direct"][0].max(axis=-1) > 0
-    assert in_sight.mean() < 0.2  # the mirror alone sees the lamp in its box
-    assert found["indirect"][0][~in_sight].mean() > 1e-3
-
-
-def test_a_lone_floor_has_direct_light_alone() -> None:
-    scene = join([quad(SMALL_FLOOR, material(diffuse=0.5)), light(NEAR_LAMP, 20.0)], eye=(0, -2, 2))
-    for bounces, lobes in KERNEL_KINDS:
-        kind = {"bounces": bounces, "lobes": lobes}
-        found = _passes(scene, **kind)
-        for name, part in found.items():
-            if "indirect" in name or "specular" in name:
-                np.testing.assert_array_equal(part, 0)
-            else:
-                assert part.mean() > 0.01
 
 
 def test_kernels_of_other_parts_are_apart() -> None:

@@ -106,15 +106,6 @@ def test_sampling_stops_at_the_target_or_at_the_cap() -> None:
     assert 64 < wanted.spp < 4096 and wanted.spp % 32 == 0
 
 
-def test_a_build_may_refuse_what_stays_noisy() -> None:
-    strict = dataclasses.replace(CHEAP, noise_floor_db=95.0, max_spp=32, reject_at_cap=True)
-    with pytest.raises(Rejected, match="expected 95") as rejection:
-        render_view(simple_scene(), strict)
-    assert rejection.value.reason == "floor_not_reached"
-    easy = dataclasses.replace(strict, noise_floor_db=10.0)
-    assert render_view(simple_scene(), easy).noise_floor_db >= 10
-
-
 def test_a_view_says_how_far_it_is() -> None:
     scene = simple_scene()
     settings = dataclasses.replace(GROWING, noise_floor_db=95.0)
@@ -163,32 +154,10 @@ def test_a_linear_target_goes_on_where_the_log_one_is_reached() -> None:
     assert digest(render_view(simple_scene(), alone)) == digest(both)
 
 
-def test_a_target_over_objects_goes_on_where_most_is_background() -> None:
-    scene = simple_scene()
-    far = dataclasses.replace(scene, fov_deg=np.array([110.0], np.float32))
-    easy = dataclasses.replace(GROWING, max_spp=4096)
-    first = render_view(far, dataclasses.replace(easy, noise_floor_db=10.0))
-    assert first.hits.mean() < 0.25
-    assert first.object_noise_floor_db < first.noise_floor_db - 6
-    reached = first.object_noise_floor_db + 1
-    whole = render_view(far, dataclasses.replace(easy, noise_floor_db=reached))
-    objects = render_view(
-        far, dataclasses.replace(easy, noise_floor_db=reached, noise_floor_objects_db=reached)
-    )
-    assert whole.spp == 64 < objects.spp
-    assert objects.object_noise_floor_db >= reached
-
-
-def test_a_target_that_is_reached_costs_nothing() -> None:
-    easy = dataclasses.replace(CHEAP, noise_floor_db=40.0, max_spp=4096)
-    first = render_view(simple_scene(), easy)
-    more = dataclasses.replace(easy, noise_floor_linear_db=5.0, noise_floor_objects_db=5.0)
-    assert digest(render_view(simple_scene(), more)) == digest(first)
-
-
 @pytest.mark.parametrize(
     ("name", "metric"),
     [
+        ("noise_floor_db", "psnr_log_db"),
         ("noise_floor_linear_db", "psnr_linear_db"),
         ("noise_floor_objects_db", "object_psnr_log_db"),
     ],
@@ -202,14 +171,7 @@ def test_every_target_counts_at_the_cap(name: str, metric: str) -> None:
     assert view.at_cap and view.noise_floor_db > 10
 
 
-@pytest.fixture(scope="module")
-def truth() -> NDArray[np.float32]:
-    """Return the simple scene of 64 x 64 pixels, nearly converged."""
-    converged = dataclasses.replace(CHEAP, resolution=64, min_spp=1024, max_spp=1024, aux_spp=64)
-    return render_view(simple_scene(), converged, seed=1).radiance_rgb
-
-
-def test_the_measured_floor_is_below_the_true_agreement_here(truth: NDArray[np.float32]) -> None:
+def test_the_measured_floor_is_below_the_true_agreement_here() -> None:
     """An honest floor: the picture is at least as close to a converged one as it claims.
 
     Sixteen times the samples are not the truth, but an ordinary scene's floor is understated by
@@ -217,46 +179,21 @@ def test_the_measured_floor_is_below_the_true_agreement_here(truth: NDArray[np.f
     """
     settings = dataclasses.replace(CHEAP, resolution=64, min_spp=64, max_spp=64, aux_spp=64)
     view = render_view(simple_scene(), settings)
+    converged = dataclasses.replace(settings, min_spp=1024, max_spp=1024)
+    truth = render_view(simple_scene(), converged, seed=1).radiance_rgb
     true_db = psnr_log_db(view.radiance_rgb, truth)
     assert view.noise_floor_db < true_db
     assert view.noise_floor_db > true_db - 10
 
 
-def test_denoising_helps_and_can_be_left_out(truth: NDArray[np.float32]) -> None:
-    settings = dataclasses.replace(CHEAP, resolution=64)
-    errors = [
-        -psnr_log_db(
-            render_view(
-                simple_scene(), dataclasses.replace(settings, denoiser=quality)
-            ).radiance_rgb,
-            truth,
-        )
-        for quality in ("high", "fast", "off")
-    ]
-    assert errors[0] < errors[2] - 3 and errors[1] < errors[2] - 3
-
-
-def test_black_views_are_rejected() -> None:
+def test_pictures_without_right_light_are_rejected() -> None:
     scene = simple_scene()
     renderer = SceneRenderer(scene, CHEAP)
     away = look_at_c2w(eye=[0, -3, 2], target=[0, -9, 4], up=[0, 0, 1])
     with pytest.raises(Rejected, match="black_view"):
         renderer.render_view(away, 40.0, seed=0)
-    with pytest.raises(Rejected, match="black_view"):
-        render_view(simple_scene(radiance=1e-3), CHEAP)
-
-
-def test_values_that_are_not_finite_are_found_before_the_denoiser_hides_them() -> None:
-    with pytest.raises(Rejected, match="nonfinite_radiance"):
-        render_view(simple_scene(radiance=3e38), CHEAP)
-
-
-def test_pictures_beyond_half_floats_are_rejected() -> None:
-    with pytest.raises(Rejected, match="radiance_overflow"):
-        render_view(simple_scene(radiance=1e8), CHEAP)
-
-
-def test_a_scene_of_emitters_alone_is_rejected() -> None:
-    scene = join([light([[0, 0, 1], [1, 0, 1], [0, 1, 1]], 1.0)])
+    for radiance, reason in ((1e-3, "black_view"), (3e38, "nonfinite"), (1e8, "radiance_overflow")):
+        with pytest.raises(Rejected, match=reason):  # before the denoiser hides it
+            render_view(simple_scene(radiance=radiance), CHEAP)
     with pytest.raises(Rejected, match="no_surfaces"):
-        SceneRenderer(scene, CHEAP)
+        SceneRenderer(join([light([[0, 0, 1], [1, 0, 1], [0, 1, 1]], 1.0)]), CHEAP)

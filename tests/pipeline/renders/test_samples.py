@@ -64,15 +64,11 @@ def test_passes_are_the_largest_that_fit() -> None:
 
 
 def test_the_mean_weighs_passes_by_their_samples() -> None:
-    samples, _ = _passes(32, 256, 4096)
+    samples, asked = _passes(32, 256, 4096)
+    assert len({seed for _, seed in asked}) == len(asked), "no two passes have the same seed"
     expected = (4 * 16 * 16 + 64 * 64) / 128
     assert samples.mean().max() == samples.mean().min() == expected
     assert [float(half.mean()) for half in samples.half_means()] == [expected, expected]
-
-
-def test_no_two_passes_have_the_same_seed() -> None:
-    _, asked = _passes(32, 512, 4096)
-    assert len({seed for _, seed in asked}) == len(asked)
 
 
 GOOD: dict[str, Any] = {
@@ -124,6 +120,10 @@ def test_one_target_is_enough_and_one_is_needed() -> None:
     }
     with pytest.raises(TrilightError, match="noise_floor_db is None; expected one of"):
         RenderSettings(**{**GOOD, "noise_floor_db": None})
+    common: dict[str, Any] = {"resolution": 64, "max_spp": 512}
+    assert one_picture(**common).targets_db == {"psnr_log_db": 40.0}
+    linear = one_picture(**common, noise_floor_linear_db=35.0)
+    assert linear.targets_db == {"psnr_linear_db": 35.0}
 
 
 def test_a_record_holds_later_targets_only_where_they_are_set() -> None:
@@ -134,15 +134,6 @@ def test_a_record_holds_later_targets_only_where_they_are_set() -> None:
         assert from_record(RenderSettings, settings_record(settings)) == settings
     more = settings_record(RenderSettings(**GOOD, noise_floor_linear_db=30.0))
     assert more == settings_record(plain) | {"noise_floor_linear_db": 30.0}
-
-
-def test_a_picture_that_is_asked_for_has_the_targets_that_are_asked_for() -> None:
-    common: dict[str, Any] = {"resolution": 64, "max_spp": 512}
-    assert one_picture(**common).targets_db == {"psnr_log_db": 40.0}
-    linear = one_picture(**common, noise_floor_linear_db=35.0)
-    assert linear.targets_db == {"psnr_linear_db": 35.0}
-    both = one_picture(**common, noise_floor_db=44.0, noise_floor_objects_db=43.0)
-    assert both.targets_db == {"psnr_log_db": 44.0, "object_psnr_log_db": 43.0}
 
 
 def log_goal(target_db: float, step: int, max_spp: int) -> Goal:
@@ -172,6 +163,10 @@ def test_a_gap_of_one_slope_doubles_the_samples() -> None:
     assert next_spp(first, log_goal(2.4, 128, 4096)) == 256
     assert next_spp(first, log_goal(99.0, 128, 4096)) == 256
     assert next_spp(logs((512, 0.0)), log_goal(99.0, 128, 640)) == 640
+    assert expected_spp(first, log_goal(1.2, 128, 4096)) == 256
+    assert expected_spp(first, log_goal(4.8, 128, 4096)) == 2048, "past the next step"
+    assert next_spp(first, log_goal(4.8, 128, 4096)) == 256
+    assert expected_spp(first, log_goal(1e9, 128, 4096)) == 4096
 
 
 def test_two_floors_say_what_the_next_doubling_buys() -> None:
@@ -187,14 +182,6 @@ def test_two_floors_say_what_the_next_doubling_buys() -> None:
 def test_a_floor_that_fell_is_not_believed_to_fall_on() -> None:
     fell = slope_db(logs((128, 40.0), (256, 39.0)), "psnr_log_db")
     assert 0 < fell < slope_db(logs((128, 40.0), (256, 50.0)), "psnr_log_db") <= 3.0
-
-
-def test_the_expected_number_of_samples_looks_past_the_next_step() -> None:
-    first = logs((128, 0.0))
-    assert expected_spp(first, log_goal(1.2, 128, 4096)) == 256
-    assert expected_spp(first, log_goal(4.8, 128, 4096)) == 2048
-    assert next_spp(first, log_goal(4.8, 128, 4096)) == 256
-    assert expected_spp(first, log_goal(1e9, 128, 4096)) == 4096
 
 
 TWICE = [
@@ -216,17 +203,10 @@ def test_the_target_that_needs_most_samples_governs() -> None:
     assert expected_spp(TWICE, both) == 1024  # two doublings: the gap of 3 dB takes 1.5
     alone = Goal(targets_db={"psnr_log_db": 46.0}, step=128, max_spp=8192)
     assert expected_spp(TWICE, alone) == 1024
-
-
-def test_a_target_that_is_reached_costs_nothing() -> None:
-    alone = Goal(targets_db={"psnr_log_db": 44.0}, step=128, max_spp=8192)
-    beside = Goal(
-        targets_db={"psnr_log_db": 44.0, "psnr_linear_db": 31.0, "object_psnr_log_db": 39.0},
-        step=128,
-        max_spp=8192,
-    )
-    assert expected_spp(TWICE, beside) == expected_spp(TWICE, alone) == 512
-    assert next_spp(TWICE, beside) == next_spp(TWICE, alone) == 512
+    reached = {"psnr_log_db": 44.0, "psnr_linear_db": 31.0, "object_psnr_log_db": 39.0}
+    for targets_db in ({"psnr_log_db": 44.0}, reached):  # what is reached costs nothing
+        goal = Goal(targets_db=targets_db, step=128, max_spp=8192)
+        assert expected_spp(TWICE, goal) == next_spp(TWICE, goal) == 512
 
 
 PX = 32

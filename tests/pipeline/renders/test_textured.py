@@ -266,14 +266,6 @@ def test_a_sky_of_two_texels() -> None:
     np.testing.assert_allclose(means[0], means[1], rtol=0.05)
 
 
-def test_a_texture_of_one_texel_is_its_colour() -> None:
-    """It is looked up in the kernel, since nobody took it out of the scene before."""
-    one = textured_floor(Texture(texels=np.array([[[0.6, 0.3, 0.1]]], np.float32)))
-    seen = load_tracer(one, max_depth=3, rr_depth=2).features(camera_of(one, 16), spp=4)
-    middle = seen.albedo[8, 8]
-    assert middle == pytest.approx([0.6, 0.3, 0.1], abs=1e-6)
-
-
 @pytest.mark.parametrize("upright", [False, True])
 def test_the_longest_texture_is_looked_up_as_the_records_do(upright: bool) -> None:
     """A ramp of 16,384 texels, whose neighbours differ by 1/16384: float32 places lose no texel."""
