@@ -16,7 +16,6 @@ from pipeline.making.begin_publication import begin
 from pipeline.making.bucket_publication import joined
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset, make_task, prepare_dataset
-from pipeline.making.run import ShardJob
 from pipeline.shards.derive import _extensions
 from scene_templates.families import FAMILIES
 from storage.dataset.asked import read_asked, write_asked
@@ -30,7 +29,12 @@ from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions
 from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import edit_manifest
 from tests.pipeline.making.test_publication import ENVIRONMENT, begin_tiny, make_tiny_shard
-from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
+from tests.pipeline.making.tiny_scenes_kit import (
+    Undocumented,
+    shard_job,
+    tiny_order,
+    without_rendering,
+)
 
 TEMPLATE = EXAMPLES / "template.py"
 TRAP = "from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n"
@@ -72,15 +76,7 @@ def test_a_manifest_without_extensions_is_what_it_was(tmp_path: Path) -> None:
 
 
 def test_a_worker_without_the_extension_is_refused(tmp_path: Path) -> None:
-    job = ShardJob(
-        folder=DatasetFolder(tmp_path),
-        settings=named_build("smoke"),
-        environment={},
-        accepted=None,  # type: ignore[arg-type]
-        lock_sha256="",
-        num_at_once=1,
-        extensions={"template.py": "1" * 64},
-    )
+    job = shard_job(tmp_path, extensions={"template.py": "1" * 64})
     with pytest.raises(TrilightError, match=r"this worker: .* add --extend template\.py"):
         make_task(job, ())
 

@@ -168,6 +168,17 @@ def test_damage_is_named(tmp_path: Path, fast: bool) -> None:
     assert verify_dataset(tmp_path, fast=fast).problems
 
 
+def _make_again(publication: Publication, samples: list[Sample]) -> None:
+    """Replace the first shard by one of these samples."""
+    name = shard_name(0, _build().splits)
+    for index, sample in enumerate(samples):
+        again = dataclasses.replace(sample, key=sample_key(index))
+        stage_scene(publication.folder.staged_shard(name), index, again, [], "lossless")
+    publication.folder.shard(name).unlink()  # the first writer of a shard wins
+    publication.add_shard(pack_shard(publication.folder, name, range(len(samples))))
+    publication.finish()
+
+
 def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
     publication = _dataset(tmp_path, 4)
     publication.lock_objects([dataclasses.replace(_locked(), split="test")])
@@ -175,14 +186,7 @@ def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
     scene = tiny_scene()
     used = dataclasses.replace(scene.objects[0], kind="object", uid="a")
     sample = dataclasses.replace(_sample(0), scene=tiny_scene(objects=(used, *scene.objects[1:])))
-    name = shard_name(0, _build().splits)
-    folder = publication.folder.staged_shard(name)
-    for index in range(4):
-        again = dataclasses.replace(sample, key=sample_key(index))
-        stage_scene(folder, index, again, [], "lossless")
-    publication.folder.shard(name).unlink()  # the first writer of a shard wins
-    publication.add_shard(pack_shard(publication.folder, name, range(4)))
-    publication.finish()
+    _make_again(publication, [sample] * 4)
     assert "belongs to split test" in verify_dataset(tmp_path).problems[0]
 
 
@@ -213,18 +217,15 @@ def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None
     publication.lock_objects(rows)
     scene = tiny_scene()
     floor = scene.objects[0]
-    name = shard_name(0, _build().splits)
+    samples = []
     for index in range(4):
         used = [
             dataclasses.replace(floor, name=uid, kind="object", uid=uid, licence=licence)
             for uid, licence in zip("abc", licences, strict=True)
         ][index % 2 :]
         objects = (*scene.objects, *used)
-        sample = dataclasses.replace(_sample(index), scene=tiny_scene(objects=objects))
-        stage_scene(publication.folder.staged_shard(name), index, sample, [], "lossless")
-    publication.folder.shard(name).unlink()  # the first writer of a shard wins
-    publication.add_shard(pack_shard(publication.folder, name, range(4)))
-    publication.finish()
+        samples.append(dataclasses.replace(_sample(index), scene=tiny_scene(objects=objects)))
+    _make_again(publication, samples)
     problems = [text for text in verify_dataset(tmp_path).problems if "share-alike" in text]
     assert [problem.split(":")[1] for problem in problems] == [
         " sample 000000000", " sample 000000002",

@@ -34,7 +34,7 @@ from storage.errors import TrilightError
 from storage.records.objects import Failure
 from storage.records.sample import sample_key
 from tests.pipeline.making.test_publication import _build, _sample, begin_tiny, make_tiny_shard
-from tests.scenes_by_hand import tiny_sample
+from tests.pipeline.making.tiny_scenes_kit import shard_job
 
 NAME = "train-000000.tar"
 
@@ -50,23 +50,13 @@ class FakeChild:
         if scene_index == self._broken and attempt == 0:
             raise ChildFailed("crashed_signal_11", "native code ended by SIGSEGV")
         self._made[scene_index] += 1
-        sample = dataclasses.replace(tiny_sample(seed=scene_index), key=sample_key(scene_index))
-        return SceneAttempt(sample=sample, failures=[])
+        return SceneAttempt(sample=_sample(scene_index), failures=[])
 
 
 def _make(root: Path, first: int, last: int, made: "Counter[int]", broken: int = -1) -> Any:
     child = cast(IsolatedChild, FakeChild(made, broken))
     piece = Piece(shard_index=0, first=first, last=last)
-    job = ShardJob(
-        folder=DatasetFolder(root),
-        settings=_build(),
-        environment={},
-        accepted=AcceptedObjects(num_objects=0, num_found=0),
-        lock_sha256="",
-        num_at_once=1,
-        extensions={},
-    )
-    _, shard = make_piece(job, piece, child)
+    _, shard = make_piece(shard_job(root), piece, child)
     return shard
 
 

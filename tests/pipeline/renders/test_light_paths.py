@@ -25,7 +25,7 @@ from tests.pipeline.renders.sampling import (
     camera_of,
     render_blocks,
 )
-from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
+from tests.pipeline.renders.scene_kit import Part, box, join, light, material, quad, sphere
 from tests.pipeline.renders.test_ggx import kernel_lobes, seen_at
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -65,12 +65,34 @@ class LightPathsOnly(VectorTracer):
 LAMP = [[0.8, 0.3, 1.6], [1.1, 0.3, 1.6], [0.9, 0.6, 1.7]]
 
 
+WIDE = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]
+WALL = [[-2, 1, 0], [2, 1, 0], [2, 1, 2], [-2, 1, 2]]
+
+
+def _matt() -> Scene:
+    parts = [quad(corners, material(diffuse=[0.7, 0.5, 0.3])) for corners in (WIDE, WALL)]
+    return join([*parts, light(LAMP, 40.0)], eye=(0, -2.2, 1.2), fov_deg=60)
+
+
+def _leaning() -> Scene:
+    """A large light shines on a wall that a wrong shading normal turns upwards by 30 degrees."""
+    wall = quad(WALL, material(specular=0.9, roughness=0.8))
+    turned = np.broadcast_to([0, -np.sqrt(0.75), 0.5], wall.normals.shape)
+    floor = quad(WIDE, material(diffuse=0.6))
+    return _by_a_large_light([floor, dataclasses.replace(wall, normals=turned)])
+
+
+def _by_a_large_light(parts: list[Part]) -> Scene:
+    lamp = light([[-1, -1, 1.5], [1, -1, 1.5], [0, -1, 2.5]], 5.0, 0.5)
+    return join([*parts, lamp], eye=(0, -0.2, 2), target=(0, 0.3, 0), fov_deg=40)
+
+
 def _ball(roughness: float, *, lamp_diffuse: float = 0.0, closed: bool = False) -> Scene:
     """A coarse ball with smooth normals throws light on a floor that is a little glossy."""
     floor = material(diffuse=[0.6, 0.5, 0.4], specular=0.2, roughness=0.5)
     metal = material(diffuse=0.05, specular=[0.9, 0.8, 0.7], roughness=roughness)
     parts = [
-        quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], floor),
+        quad(WIDE, floor),
         sphere([0, 0, 0.5], 0.4, metal, rings=5),
         light(LAMP, 40.0, lamp_diffuse),
         light(np.array(LAMP) - [1.5, 0, 0.8], [1.0, 2.0, 4.0], lamp_diffuse),
@@ -79,26 +101,6 @@ def _ball(roughness: float, *, lamp_diffuse: float = 0.0, closed: bool = False) 
         walls = material(diffuse=0.5, specular=0.2, roughness=0.3)
         parts.append(box([0, 0, 1], 5.0, walls, kind="shell"))
     return join(parts, eye=(0, -2.2, 1.2), target=(0, 0, 0.3), fov_deg=45)
-
-
-def _matt() -> Scene:
-    grey = material(diffuse=[0.7, 0.5, 0.3])
-    floor, wall = (
-        quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], grey),
-        quad([[-2, 1, 0], [2, 1, 0], [2, 1, 2], [-2, 1, 2]], grey),
-    )
-    return join([floor, wall, light(LAMP, 40.0)], eye=(0, -2.2, 1.2), fov_deg=60)
-
-
-def _leaning() -> Scene:
-    """A large light shines on a wall that a wrong shading normal turns upwards by 30 degrees."""
-    floor = quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=0.6))
-    corners = [[-2, 1, 0], [2, 1, 0], [2, 1, 2], [-2, 1, 2]]
-    wall = quad(corners, material(specular=0.9, roughness=0.8))
-    turned = np.broadcast_to([0, -np.sqrt(0.75), 0.5], wall.normals.shape)
-    wall = dataclasses.replace(wall, normals=turned)
-    lamp = light([[-1, -1, 1.5], [1, -1, 1.5], [0, -1, 2.5]], 5.0, 0.5)
-    return join([floor, wall, lamp], eye=(0, -0.2, 2), target=(0, 0.3, 0), fov_deg=40)
 
 
 @pytest.mark.slow("statistics")
@@ -149,12 +151,7 @@ def test_any_number_of_light_paths_gives_the_same_light(monkeypatch: pytest.Monk
 def test_beside_light_paths_without_number_only_direct_light_is_left() -> None:
     """Of a large light, so that as much would be hit as picked."""
     row = material(diffuse=0.3, specular=0.5, roughness=0.4)
-    floor, wall = (
-        quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], row),
-        quad([[-2, 1, 0], [2, 1, 0], [2, 1, 2], [-2, 1, 2]], row),
-    )
-    lamp = light([[-1, -1, 1.5], [1, -1, 1.5], [0, -1, 2.5]], 5.0, 0.5)
-    scene = join([floor, wall, lamp], eye=(0, -0.2, 2), target=(0, 0.3, 0), fov_deg=40)
+    scene = _by_a_large_light([quad(WIDE, row), quad(WALL, row)])
     left = _means(CameraPathsLeft, scene, first_seed=100, passes=12)
     # Weights leave a millionth, but more where a vertex is close to the next one, in the corner.
     assert_agree(left, _means(CameraPathsOnly, scene, max_depth=2, passes=12), slack=1e-3)
@@ -162,7 +159,7 @@ def test_beside_light_paths_without_number_only_direct_light_is_left() -> None:
 
 def test_light_paths_do_not_show_emitters_either() -> None:
     """A white panel above a lit floor fills the picture, and stays hidden from the camera."""
-    floor = quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=0.6))
+    floor = quad(WIDE, material(diffuse=0.6))
     panel = light([[-2.0, 1.0, 0.5], [2.0, 1.0, 0.5], [0.0, 1.0, 4.0]], 1.0, 1.0)
     parts = [floor, panel, light(LAMP, 40.0)]
     scene = join(parts, eye=(0, -2, 1), target=(0, 1, 1.5), fov_deg=20)
@@ -172,7 +169,7 @@ def test_light_paths_do_not_show_emitters_either() -> None:
 
 def test_a_caustic_has_a_fraction_of_the_noise() -> None:
     """What a mirror beside the picture throws on the floor; measured: 0.12 of the variance."""
-    floor = quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=0.5))
+    floor = quad(WIDE, material(diffuse=0.5))
     mirror = material(specular=0.9, roughness=0.1)
     wall = quad([[-1.5, -1, 0], [-1.5, 1, 0], [-1.5, 1, 1], [-1.5, -1, 1]], mirror)
     lamp = light([[1.2, -0.1, 1.4], [1.2, 0.1, 1.4], [1.2, 0, 1.6]], 40.0)

@@ -36,7 +36,7 @@ from tests.pipeline.renders.sampling import (
     render_view,
 )
 from tests.pipeline.renders.scene_kit import box, furnace, join, light, material, quad, sphere
-from tests.pipeline.renders.test_lights_apart import lit_scene
+from tests.pipeline.renders.test_renderer import lit_scene
 from tests.scenes_by_hand import tiny_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")

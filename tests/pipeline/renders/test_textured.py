@@ -66,10 +66,14 @@ def _floor(row: NDArray[np.float64]) -> Part:
 
 
 def _textured(
-    parts: list[Part], textures: tuple[Texture, ...], of_floor: list[int], scale: float = 1.0
+    parts: list[Part],
+    textures: tuple[Texture, ...],
+    of_floor: list[int],
+    scale: float = 1.0,
+    fov: float = 30,
 ) -> Scene:
     """Return parts, of which the first is textured; u and v go with x and y: 0 to 1 over it."""
-    scene = join(parts, eye=(0, -0.02, 4), fov_deg=30)
+    scene = join(parts, eye=(0, -0.02, 4), fov_deg=fov)
     index = np.full((len(parts), 3), -1, np.int32)
     index[0] = of_floor
     xy = scene.vertex_positions[scene.faces.ravel(), :2]
@@ -218,15 +222,9 @@ def floor_scene(sky: Environment | None, *, mirror: bool = False) -> Scene:
     return join([quad(FLOOR_CORNERS, row), LAMP], eye=(0, -2.5, 2), fov_deg=40, sky=sky)
 
 
-def textured_floor(*textures: Texture) -> Scene:
-    """Return the floor under a diffuse texture whose u runs once over it with x."""
-    scene = join([quad(FLOOR_CORNERS, material(diffuse=0.5)), LAMP], eye=(0, -0.02, 4), fov_deg=24)
-    index = np.full((len(scene.materials), 3), -1, np.int32)
-    index[scene.material_index[0], 0] = 0
-    xy = scene.vertex_positions[scene.faces.ravel(), :2]
-    made = with_textures(scene, ((xy + 1) / 2).astype(np.float32), textures, index)
-    made.check()
-    return made
+def _textured_floor(texture: Texture) -> Scene:
+    """Return the floor alone in the picture, under a diffuse texture."""
+    return _textured([_floor(material(diffuse=0.5)), LAMP], (texture,), [0, -1, -1], fov=24)
 
 
 def _shown(scene: Scene) -> RenderedView:
@@ -271,7 +269,7 @@ def test_the_longest_texture_is_looked_up_as_the_records_do(upright: bool) -> No
     """A ramp of 16,384 texels, whose neighbours differ by 1/16384: float32 places lose no texel."""
     ramp = np.linspace(0, 1, MAX_SIDE, dtype=np.float32)
     texels = np.repeat(ramp[:, None, None] if upright else ramp[None, :, None], 3, axis=-1)
-    scene = textured_floor(Texture(texels=np.ascontiguousarray(texels)))
+    scene = _textured_floor(Texture(texels=np.ascontiguousarray(texels)))
     tracer = load_tracer(scene, max_depth=3, rr_depth=2)
     found = tracer.features(camera_of(scene, 16), spp=4).albedo.mean(axis=(0, 1))
     pixels = first_hits(scene, resolution=32).material[..., :3]
@@ -281,7 +279,7 @@ def test_the_longest_texture_is_looked_up_as_the_records_do(upright: bool) -> No
 def test_memory_for_texels_is_what_is_stated() -> None:
     """16 bytes a colour and no more: they are decoded in blocks, not as a whole in doubles."""
     texels = np.random.default_rng(0).integers(0, 200, (64, MAX_SIDE, 3), np.uint8)
-    scene = textured_floor(Texture(texels=texels, is_srgb=True))
+    scene = _textured_floor(Texture(texels=texels, is_srgb=True))
     tracemalloc.start()
     try:
         KernelTextures(scene, np.arange(scene.num_triangles))
@@ -299,7 +297,7 @@ def test_maps_that_break_a_law_never_reach_a_kernel(value: float) -> None:
     below = dataclasses.replace(floor_scene(None), environment=Environment(radiance_rgb=texels))
     look = np.full((2, 2, 3), 0.25, np.float32)
     look[0, 1, 1] = value
-    plain = textured_floor(Texture(texels=np.full((2, 2, 3), 0.25, np.float32)))
+    plain = _textured_floor(Texture(texels=np.full((2, 2, 3), 0.25, np.float32)))
     wrong = dataclasses.replace(plain, textures=(Texture(texels=look),))
     for scene, name in ((below, "environment.radiance_rgb"), (wrong, "textures")):
         with pytest.raises(TrilightError, match=name):
