@@ -19,7 +19,7 @@ from infra.cli.app import main
 from pipeline.making.pipeline import prepare_dataset
 from storage.remote import claims
 from tests.pipeline.making.frozen_kit import use_mesher
-from tests.pipeline.making.tiny_scenes_kit import tiny_order, without_rendering
+from tests.pipeline.making.tiny_scenes_kit import tiny_order, without_probe, without_rendering
 
 BATCH = 8
 LEASE_S = 10.0
@@ -63,7 +63,7 @@ if __name__ == "__main__":
         patch.setattr("pipeline.documents.report._SECTIONS", {})
         main()
     else:
-        os.environ["TRILIGHT_VARIANT"] = "scalar_rgb"  # needs no probe
+        without_probe(pytest.MonkeyPatch())
         claims.LEASE_S = LEASE_S
         out, objects, notes, *numbers = sys.argv[1:]
         prepare(out, Path(objects), Path(notes), *map(int, numbers))

@@ -22,7 +22,7 @@ from storage.records.objects import Failure, decode_failures
 from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, other_shard
 from tests.pipeline.making.frozen_kit import asked, frozen, object_records, prepared, use_mesher
 from tests.pipeline.making.test_publication import _dataset, _locked, make_tiny_shard
-from tests.pipeline.making.tiny_scenes_kit import tiny_order
+from tests.pipeline.making.tiny_scenes_kit import tiny_order, without_probe
 
 FIRST = "train-000000.tar"
 
@@ -193,7 +193,7 @@ def _told(names: Any, read: list[str]) -> list[str]:
 def test_what_a_killed_machine_has_prepared_is_not_prepared_again(
     bucket: Any, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")
+    without_probe(monkeypatch)
     mesher = use_mesher(monkeypatch, batch=8)
     object_records(tmp_path / "objects")
     order = tiny_order(out=OUT, objects=str(tmp_path / "objects"), scenes=4)

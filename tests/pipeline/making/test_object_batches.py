@@ -36,7 +36,12 @@ from tests.conftest import ROOT
 from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, Writes
 from tests.pipeline.making.frozen_kit import Mesher, begun, object_records, use_mesher
 from tests.pipeline.making.killed_worker import BATCH, KILL_AFTER_S
-from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
+from tests.pipeline.making.tiny_scenes_kit import (
+    Undocumented,
+    tiny_order,
+    without_probe,
+    without_rendering,
+)
 
 
 @pytest.fixture
@@ -186,7 +191,7 @@ KILL_AFTER = BATCH // 2
 @pytest.fixture
 def lock_of_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bytes:
     """The lock that one worker freezes alone."""
-    monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")
+    without_probe(monkeypatch)
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "alone-cache"))
     mesher = use_mesher(monkeypatch, batch=BATCH)
     objects, out = tmp_path / "objects", tmp_path / "alone"

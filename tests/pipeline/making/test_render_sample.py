@@ -177,6 +177,8 @@ def test_what_stores_some_says_so_in_the_order_of_the_table() -> None:
     assert build(**ASKED).digest != build().digest
     with pytest.raises(TrilightError, match=r"storage.passes.*no pass 'dept'; did you mean depth"):
         build(**{"storage.passes": ["dept"]})
+    with pytest.raises(TrilightError, match="profile' is 'tiny'; expected"):
+        build(**{"storage.profile": "tiny"})
 
 
 def test_a_rendered_sample_holds_what_is_asked() -> None:

@@ -64,9 +64,14 @@ def without_rendering(
     monkeypatch.setattr("pipeline.making.pipeline.share_mesh_work", lambda *given: None)
     monkeypatch.setattr("pipeline.making.pipeline.accept_objects", accept)
     monkeypatch.setattr("pipeline.making.pipeline.make_scene", make)
+    without_probe(monkeypatch)
+    return scenes
+
+
+def without_probe(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Try no library: nothing is rendered."""
     unprobed = Variant(name="llvm_ad_rgb", libllvm="", note="")
     monkeypatch.setattr("pipeline.renders.variant._on_processor", lambda: unprobed)
-    return scenes
 
 
 class Undocumented(ThreadRunner):

@@ -1,5 +1,7 @@
 """Pictures with their own standard errors, for tests that compare estimates."""
 
+import subprocess
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +15,7 @@ from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Tracer
 from storage.records.scene import Scene
+from tests.conftest import ROOT
 
 SIGMAS = 5.0
 """How many standard errors an honest estimate may be off: 1 in 2 million for one value, so that a
@@ -127,3 +130,10 @@ def scores(ours: Estimate, theirs: Estimate) -> NDArray[np.float64]:
 
 def exact(mean: NDArray[np.float64]) -> Estimate:
     return Estimate(mean=mean, error=np.zeros_like(mean))
+
+
+def printed_by(code: str) -> str:
+    """Return what another process prints that runs this code."""
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout.strip()

@@ -1,8 +1,6 @@
 """Open Image Denoise as we call it; converged highlights stay, and no picture loses light."""
 
 import dataclasses
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -25,8 +23,7 @@ from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tiles import TileChoice
 from pipeline.renders.tracer import Chosen, Features
-from tests.conftest import ROOT
-from tests.pipeline.renders.sampling import camera_of, render_view
+from tests.pipeline.renders.sampling import camera_of, printed_by, render_view
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 
 
@@ -61,10 +58,8 @@ def test_the_denoiser_brings_no_torch() -> None:
         "import sys; from pipeline.renders.denoiser import load_oidn; load_oidn(); "
         "print('torch' in sys.modules)"
     )
-    child = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    assert child.stdout.strip() == "False"
+    said = printed_by(code)
+    assert said == "False"
 
 
 def test_what_has_no_light_stays_black_and_no_other_light_is_lost() -> None:

@@ -2,9 +2,6 @@
 
 import dataclasses
 import hashlib
-import os
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -28,12 +25,12 @@ from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
 from storage.records.scene import Scene, SceneObject
 from storage.settings.changes import changed
-from tests.conftest import ROOT
 from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.renders.sampling import (
     assert_agree,
     blocks_of,
     camera_of,
+    printed_by,
     render_passes,
     render_view,
 )
@@ -86,16 +83,9 @@ def test_the_same_bits_for_any_number_of_threads_and_in_any_process() -> None:
         "scene = sampled_like_scene(np.random.default_rng(5), num_views=1)\n"
         "print(t.digest(t.render_view(scene, settings)))\n"
     )
-    child = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        env=dict(os.environ),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    said = printed_by(code)
     assert digests == [digests[0]] * 2
-    assert child.stdout.split()[-1] == digests[0]
+    assert said.split()[-1] == digests[0]
 
 
 def test_views_do_not_depend_on_the_views_before_them() -> None:

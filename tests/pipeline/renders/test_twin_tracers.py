@@ -1,9 +1,6 @@
 """Our path tracer against Mitsuba's stock plugins and closed forms; emitters and their picks."""
 
 import json
-import os
-import subprocess
-import sys
 from typing import Any
 
 import drjit as dr
@@ -20,7 +17,6 @@ from pipeline.renders.settings import RenderSettings
 from storage.conventions import camera_rays
 from storage.errors import Rejected
 from storage.records.scene import Scene
-from tests.conftest import ROOT
 from tests.oracle.kernel_bsdf import exact_twin
 from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.renders.closed_forms import lambert_irradiance
@@ -29,6 +25,7 @@ from tests.pipeline.renders.sampling import (
     assert_honest,
     camera_of,
     exact,
+    printed_by,
     render_blocks,
 )
 from tests.pipeline.renders.scene_kit import Part, box, flat, join, light, material, quad, sphere
@@ -107,15 +104,8 @@ print(json.dumps([means, int(tracer.hits(camera).sum())]))
 @pytest.mark.usefixtures("llvm")
 def test_the_oracle_agrees_where_nothing_is_compiled() -> None:
     """In `scalar_rgb` it shares neither LLVM nor a kernel with ours."""
-    result = subprocess.run(
-        [sys.executable, "-c", _IN_SCALAR],
-        cwd=ROOT,
-        env=dict(os.environ),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    means, num_hits = json.loads(result.stdout)
+    said = printed_by(_IN_SCALAR)
+    means, num_hits = json.loads(said)
     scene = _room(5)
     ours = render_blocks(scene, resolution=16, block=16)
     error = np.hypot(np.std(means, axis=0, ddof=1) / np.sqrt(len(means)), ours.error[0, 0])

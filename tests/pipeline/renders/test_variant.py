@@ -3,9 +3,7 @@
 import copy
 import dataclasses
 import json
-import os
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,9 +24,14 @@ from pipeline.renders.variant_probe import BLOCK, probe_scene, wrong_picture
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.scene_file import encode_scene
 from tests.command_line import trilight
-from tests.conftest import ROOT
 from tests.oracle.kernel_bsdf import exact_twin
-from tests.pipeline.renders.sampling import Estimate, assert_agree, camera_of, render_blocks
+from tests.pipeline.renders.sampling import (
+    Estimate,
+    assert_agree,
+    camera_of,
+    printed_by,
+    render_blocks,
+)
 from tests.pipeline.renders.test_stored_pictures import scenes
 from tests.scenes_by_hand import tiny_scene
 
@@ -192,15 +195,8 @@ def test_asking_does_not_import_mitsuba() -> None:
         "import pipeline.renders.renderer, pipeline.renders.facts; "
         "print(sorted({'mitsuba', 'drjit', 'pyoidn'} & set(sys.modules)))"
     )
-    child = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        env=dict(os.environ),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert child.stdout.strip() == "[]"
+    said = printed_by(code)
+    assert said == "[]"
 
 
 def test_facts_name_versions_device_and_threads(variant: Variant) -> None:
