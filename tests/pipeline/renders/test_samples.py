@@ -124,6 +124,8 @@ def test_one_target_is_enough_and_one_is_needed() -> None:
     assert one_picture(**common).targets_db == {"psnr_log_db": 40.0}
     linear = one_picture(**common, noise_floor_linear_db=35.0)
     assert linear.targets_db == {"psnr_linear_db": 35.0}
+    both = one_picture(**common, noise_floor_db=44.0, noise_floor_objects_db=43.0)
+    assert both.targets_db == {"psnr_log_db": 44.0, "object_psnr_log_db": 43.0}
 
 
 def test_a_record_holds_later_targets_only_where_they_are_set() -> None:
