@@ -20,9 +20,13 @@ from storage.records.lobes import Lobes, lobes_of
 from storage.records.material import EMISSION
 from storage.records.multiscatter import Smith, scattered_again
 from storage.records.scene import Scene
-from tests.oracle.compensated_texture import PLUGIN, register_plugin
-from tests.oracle.plugin_sky import plugin_sky
-from tests.oracle.plugin_textures import textured_albedo, textured_slots
+from tests.oracle.plugin_textures import (
+    PLUGIN,
+    plugin_sky,
+    register_plugin,
+    textured_albedo,
+    textured_slots,
+)
 
 _TWIN_OFFSET = 1e-4
 """World units between a twin and the emitter itself: ten times what shadow rays stop short."""

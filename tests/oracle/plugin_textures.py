@@ -1,9 +1,19 @@
-"""Textured materials as stock Mitsuba plugins: `bitmap` textures, and two of our own beside them.
+"""Textured materials, multiple scattering and skies as Mitsuba plugins, stock ones and our own.
 
 A texture goes into a `bitmap` as it is: Mitsuba has v = 0 at the first row of a bitmap that a mesh
 of arrays is given, which is the bottom row here. Values are linear, hence `raw`. Share and widths
 of the lobes are no bilinear functions of the textures: the share is a constant here (any will do),
 the GGX width is squared after the lookup, and multiple scattering is found from both.
+
+The scale of storage.records.multiscatter depends on the direction of the viewer, which no stock
+texture reads; one of our own may. `roughconductor` has the separable Smith term, so the table is
+that one's: from every direction the surface returns as much light as in the kernel, but the shape
+of a rough lobe differs (0.6 % of direct light at roughness 0.6, 4.5 % at 1, root mean square).
+
+A sky is an `envmap`. Mitsuba has its axes turned by a cyclic permutation: the middle of its picture
+is +Z, a quarter from the left is +X, the top is +Y. And its first and last rows lie on the poles,
+where ours are half a texel from them. Rows between ours, of which each is the mean of its
+neighbours, make both the same function: its interpolation between them is ours.
 """
 
 from functools import cache
@@ -14,9 +24,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.records.environment import Environment
 from storage.records.lobes import MIN_ALPHA
 from storage.records.material import laid_out
-from storage.records.multiscatter import ROUGHNESS_STEPS, Smith, mean_albedo
+from storage.records.multiscatter import ROUGHNESS_STEPS, X_STEPS, Smith, albedo_table, mean_albedo
 from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, TEXTURED
 
@@ -130,3 +141,76 @@ def _register_again() -> None:
             return True
 
     mi.register_texture(_AGAIN, ScatteredAgain)
+
+
+PLUGIN = "compensated_specular"
+"""Name in scene dictionaries; it has the textures specular, again (Fms) and alpha."""
+
+_LEAST_COS = 1e-4
+"""Only rays along the surface are below; the lookup divides by the cosine."""
+
+
+@cache
+def register_plugin() -> None:
+    """Make PLUGIN known to Mitsuba; a variant must be set, and stays for the process."""
+
+    class CompensatedSpecular(mi.Texture):
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self._specular = properties.get_texture("specular")
+            self._again = properties.get_texture("again")
+            self._alpha = properties.get_texture("alpha")
+            texels = mi.TensorXf(albedo_table("separable").astype(np.float32)[..., None])
+            bilinear: Any = mi.Texture2f
+            self._table = bilinear(texels, wrap_mode=dr.WrapMode.Clamp)
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            place = _place_in_table(si.wi.z, self._alpha.eval_1(si, active))
+            albedo = self._table.eval(place)[0]
+            more = self._again.eval(si, active) * ((1 - albedo) / albedo)
+            return self._specular.eval(si, active) * (1 + more)
+
+        def mean(self) -> Any:
+            return self._specular.mean()
+
+        def is_spatially_varying(self) -> bool:
+            return True
+
+    mi.register_texture(PLUGIN, CompensatedSpecular)
+
+
+def _place_in_table(cosine: Any, alpha: Any) -> Any:
+    cosine = dr.maximum(cosine, _LEAST_COS)
+    cos_sq = cosine * cosine
+    stretched = cosine * dr.rsqrt(cos_sq + alpha * alpha * (1 - cos_sq))
+    # The centre of texel k of n lies at (k + 0.5) / n.
+    u = (dr.sqrt(stretched) * (X_STEPS - 1) + 0.5) / X_STEPS
+    v = (dr.sqrt(alpha) * (ROUGHNESS_STEPS - 1) + 0.5) / ROUGHNESS_STEPS
+    return mi.Point2f(u, v)
+
+
+_TO_OUR_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""X becomes Y, Y becomes Z, Z becomes X."""
+
+
+def plugin_sky(sky: Environment, sampling_weight: float) -> Any:
+    """Return the emitter, picked with a weight beside those of other emitters."""
+    to_world = np.eye(4)
+    to_world[:3, :3] = sky.rotation.astype(np.float64) @ _TO_OUR_AXES
+    return mi.load_dict(
+        {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(from_pole_to_pole(sky.radiance_rgb)),
+            "to_world": mi.ScalarTransform4f(to_world.tolist()),
+            "sampling_weight": sampling_weight,
+        }
+    )
+
+
+def from_pole_to_pole(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a map [H, W, 3] as rows [2 H + 1, W, 3] at equal steps, from +Z to -Z."""
+    rows = np.zeros((2 * len(radiance_rgb) + 1, *radiance_rgb.shape[1:]), np.float32)
+    rows[1::2] = radiance_rgb
+    rows[2:-1:2] = (radiance_rgb[:-1] + radiance_rgb[1:]) / 2
+    rows[0], rows[-1] = radiance_rgb[0], radiance_rgb[-1]
+    return rows

@@ -3,7 +3,7 @@
 `VectorTracer` is compared with it. It runs on any variant of Mitsuba. Two things differ from
 `VectorTracer`, neither beyond noise in smooth or mostly diffuse scenes: the Smith term of rough
 lobes, and silhouettes of smooth low-poly mirrors, where Mitsuba turns a shading normal over that
-faces away.
+faces away. Its sums of passes are in numpy's memory: those of the kernel are compared with them.
 """
 
 import copy
@@ -14,14 +14,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
-from pipeline.renders.tracer import Chosen, Features
+from pipeline.renders.tracer import Chosen, Features, Tracer
 from storage.records.scene import Scene
-from tests.oracle.host_sum import HostSum
-from tests.oracle.plugin_scene import (
-    plugin_background,
-    plugin_feature_scene,
-    plugin_scene,
-)
+from tests.oracle.plugin_scene import plugin_background, plugin_feature_scene, plugin_scene
+
+
+class HostSum:
+    """A `PassSum` in numpy's memory, for a tracer that returns its passes there anyway."""
+
+    def __init__(self, tracer: Tracer, camera: Camera) -> None:
+        self._tracer, self._camera = tracer, camera
+        self._total = np.zeros((camera.resolution, camera.resolution, 3))
+        self._squares = np.zeros((camera.resolution, camera.resolution))
+
+    def add(self, *, seed: int, spp: int, chosen: Chosen = None) -> None:
+        means = self._tracer.radiance(self._camera, seed=seed, spp=spp, chosen=chosen)
+        mean = means.astype(np.float64)
+        self._total += spp * mean
+        self._squares += spp * np.square(mean.mean(axis=-1))
+
+    def guide(self) -> None:
+        """Do nothing: other tracers are not guided."""
+
+    def read(self) -> NDArray[np.float64]:
+        return self._total[None].copy()
+
+    def read_squares(self) -> NDArray[np.float64]:
+        return self._squares.copy()
+
 
 _BLOCK_SIZE = 8
 """Pixels; fixed, because the random numbers of `scalar_rgb` belong to blocks."""

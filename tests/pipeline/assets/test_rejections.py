@@ -198,7 +198,7 @@ def test_limits_of_size(tmp_path: Path, write: Callable[[Path, TriangleMesh], Pa
     path = write(tmp_path / f"a.{write.__name__[-3:]}", BALL)
     assert by_hand.reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
     small = AssetSettings(max_source_bytes=path.stat().st_size - 1)
-    assert by_hand.by_hand.reason_of(path, small) == "too_large_bytes"
+    assert by_hand.reason_of(path, small) == "too_large_bytes"
 
 
 def test_a_header_of_too_many_faces_is_enough(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """A bucket on a real S3 server, and machines that make a dataset of tiny scenes in it."""
 
 import contextlib
+import dataclasses
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,11 +13,15 @@ from pipeline.builds.named import named_build
 from pipeline.making import bucket_publication
 from pipeline.making.bucket_publication import begin_dataset, joined
 from pipeline.making.publication import Publication
+from pipeline.shards.pack import pack_shard
 from storage.dataset.layout import dataset_folder
+from storage.dataset.staging import stage_scene
+from storage.records.objects import Failure
+from storage.records.sample import sample_key
 from storage.remote import bucket as remote_bucket
 from storage.remote import tries
 from storage.remote import url as remote_url
-from tests.pipeline.making.test_publication import ENVIRONMENT, _build
+from tests.pipeline.making.test_publication import ENVIRONMENT, _build, _sample
 from tests.s3_server import CREDENTIALS, control
 
 OUT = "s3://shards/set"
@@ -89,3 +94,13 @@ class Machines:
         build = named_build("smoke", changes=changes) if changes else _build()
         with joined(folder):
             yield begin_dataset(folder, build, ENVIRONMENT, scenes, accept_environment=False)
+
+
+def other_shard(publication: Publication) -> Any:
+    """Pack a first shard of other bytes, as another processor may, with rejections of its own."""
+    for index in range(4):
+        sample = dataclasses.replace(_sample(9 + index), key=sample_key(index))
+        failure = Failure(stage="renders", item=sample_key(index), reason="other", message="y")
+        staged = publication.folder.staged_shard("train-000000.tar")
+        stage_scene(staged, index, sample, [failure], "lossless")
+    return pack_shard(publication.folder, "train-000000.tar", range(4))

@@ -18,6 +18,8 @@ def _bare(bare_reports: None) -> None:
 
 @pytest.fixture(scope="session")
 def moto() -> Iterator[int]:
+    pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
+    pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
     with s3_server() as port:
         yield port
 

@@ -1,14 +1,18 @@
-"""Datasets with frozen objects that no mesh stage has made: assets by hand in a store."""
+"""Objects that no mesh stage has made: files and assets by hand, and what stands for the stage."""
 
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
+
+import pytest
 
 from pipeline.assets.stage import PreparedAsset
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
+from pipeline.making import object_batches
 from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.begin_publication import begin
 from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects
@@ -18,7 +22,7 @@ from pipeline.making.publication import Publication
 from storage.dataset.layout import DatasetFolder
 from storage.digests import sha256_hex
 from storage.records.asset import encode_asset
-from storage.records.objects import ObjectRecord
+from storage.records.objects import Failure, ObjectRecord
 from tests.pipeline.making.test_publication import ENVIRONMENT
 from tests.pipeline.scenes.small_pool import small_pool
 
@@ -73,3 +77,61 @@ def asked(
 def frozen(publication: Publication, objects: Sequence[PreparedAsset]) -> AcceptedObjects:
     """Freeze objects, as after the mesh stage."""
     return freeze_objects(asked(publication), [*map(prepared_object, objects)], [], len(objects))
+
+
+class Mesher:
+    """Stands for the mesh stage: counts what it prepares, and fails where a test says so."""
+
+    def __init__(self) -> None:
+        self.made: Counter[str] = Counter()
+        self.reasons: dict[str, str] = {}
+        self.before_each: Callable[[str], None] = lambda uid: None
+
+    def prepare(
+        self, records: list[ObjectRecord], done: Callable[[], None]
+    ) -> tuple[list[PreparedAsset], list[Failure]]:
+        assets, failures = [], []
+        for record in records:
+            self.before_each(record.uid)
+            self.made[record.uid] += 1
+            if reason := self.reasons.get(record.uid):
+                failures.append(
+                    Failure(stage="assets", item=record.uid, reason=reason, message="x")
+                )
+            else:
+                made = vars(prepared(int(record.uid[7:]))) | {"record": record}
+                assets.append(PreparedAsset(**made))
+            done()
+        return assets, failures
+
+    def __enter__(self) -> "Mesher":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Hold nothing."""
+
+
+def use_mesher(monkeypatch: pytest.MonkeyPatch, *, batch: int) -> Mesher:
+    """Replace the mesh stage, with batches of so many objects and short pauses."""
+    mesher = Mesher()
+    monkeypatch.setattr(object_batches, "_NUM_OBJECTS", batch)
+    monkeypatch.setattr(object_batches, "_PAUSES_S", (0.001, 0.05))
+    monkeypatch.setattr(object_batches, "MeshWork", lambda settings, workers: mesher)
+    return mesher
+
+
+def object_records(folder: Path, count: int = 30, suffix: str = ".ply") -> list[ObjectRecord]:
+    """Return records of objects, whose files are written where they are missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    records = []
+    for number in range(count):
+        path = folder / f"object {number:05d}{suffix}"
+        if not path.exists():
+            path.write_text(str(number))
+        records.append(
+            ObjectRecord(
+                uid=path.stem, title="", licence="MIT", licence_source="tests",
+                attribution="", source_url="", path=str(path),
+            )
+        )  # fmt: skip
+    return records

@@ -1,7 +1,6 @@
 """Two makers in one bucket, one of them late: nothing that the first has said is lost."""
 
 import contextlib
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,22 +15,14 @@ from pipeline.making.pipeline import prepare_dataset
 from pipeline.making.prepare_isolated import asset_store
 from pipeline.making.publication import Publication
 from pipeline.shards import mirror
-from pipeline.shards.pack import pack_shard
 from storage.dataset.dataset import open_dataset
-from storage.dataset.staging import stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures
-from storage.records.sample import sample_key
-from tests.pipeline.making.batches_kit import object_records, use_mesher
-from tests.pipeline.making.bucket_kit import OUT, Killed, Machines
-from tests.pipeline.making.frozen_kit import asked, frozen, prepared
+from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, other_shard
+from tests.pipeline.making.frozen_kit import asked, frozen, object_records, prepared, use_mesher
 from tests.pipeline.making.test_publication import _dataset, _locked, make_tiny_shard
-from tests.pipeline.making.tiny_scenes_kit import tiny_order
-from tests.scenes_by_hand import tiny_sample
-
-pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
-pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
+from tests.pipeline.making.tiny_scenes_kit import tiny_order, without_probe
 
 FIRST = "train-000000.tar"
 
@@ -54,16 +45,6 @@ def test_who_freezes_late_takes_nothing_back(bucket: Any, machines: Machines) ->
         assert set(rejected) < set(open_dataset(OUT).failures())
 
 
-def _other_shard(publication: Publication) -> Any:
-    """Pack a first shard of other bytes, as another processor may, with rejections of its own."""
-    for index in range(4):
-        sample = dataclasses.replace(tiny_sample(seed=9 + index), key=sample_key(index))
-        failure = Failure(stage="renders", item=sample_key(index), reason="other", message="y")
-        staged = publication.folder.staged_shard(FIRST)
-        stage_scene(staged, index, sample, [failure], "lossless")
-    return pack_shard(publication.folder, FIRST, range(4))
-
-
 def test_the_rejections_are_those_of_the_shard_that_is_there(
     bucket: Any, machines: Machines
 ) -> None:
@@ -72,7 +53,7 @@ def test_the_rejections_are_those_of_the_shard_that_is_there(
         first.lock_objects([_locked()])
         machines.use("b")
         second.lock_objects([_locked()])
-        other = _other_shard(second)
+        other = other_shard(second)
         machines.use("a")
         make_tiny_shard(first, 0)
         machines.use("b")
@@ -89,7 +70,7 @@ def test_a_shard_whose_maker_died_at_once_gets_the_rejections_of_the_next(
 ) -> None:
     with machines.maker("a") as publication:
         publication.lock_objects([_locked()])
-        other = _other_shard(publication)
+        other = other_shard(publication)
         bucket.pipe_file(f"shards/set/{FIRST}", publication.folder.shard(FIRST).read_bytes())
         publication.add_shard(other)
     assert {row.reason for row in open_dataset(OUT).failures()} == {"other"}
@@ -212,7 +193,7 @@ def _told(names: Any, read: list[str]) -> list[str]:
 def test_what_a_killed_machine_has_prepared_is_not_prepared_again(
     bucket: Any, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")
+    without_probe(monkeypatch)
     mesher = use_mesher(monkeypatch, batch=8)
     object_records(tmp_path / "objects")
     order = tiny_order(out=OUT, objects=str(tmp_path / "objects"), scenes=4)

@@ -16,14 +16,16 @@ from storage.dataset.progress import read_status
 from storage.dataset.staging import is_staged, stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.records.sample import sample_key
-from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, Writes
-from tests.pipeline.making.test_publication import _build, _dataset, _locked, make_tiny_shard
+from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, Writes, other_shard
+from tests.pipeline.making.test_publication import (
+    _build,
+    _dataset,
+    _locked,
+    _sample,
+    make_tiny_shard,
+)
 from tests.s3_server import control
 from tests.scenes_by_hand import tiny_sample
-
-pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
-pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
 
 FIRST, SECOND = "train-000000.tar", "train-000001.tar"
 
@@ -58,24 +60,6 @@ def test_an_array_is_of_what_a_bucket_lacks(bucket: Any, machines: Machines) -> 
         assert array_job(order, per_task=None, at_once=None).tasks == [0, 1]
 
 
-def test_two_machines_end_in_the_bytes_of_one_folder(
-    bucket: Any, machines: Machines, tmp_path: Path
-) -> None:
-    plain = _dataset(tmp_path / "plain")
-    with machines.maker("a") as publication:
-        make(publication, 0)
-        assert publication.missing_shards() == [1]
-    with machines.maker("b") as publication:
-        assert publication.missing_shards() == [1]
-        make(publication, 1)
-        assert publication.missing_shards() == []
-    for path in (plain.folder.manifest, plain.folder.failures, plain.folder.objects_lock):
-        assert bucket.cat_file(f"shards/set/{path.name}") == path.read_bytes(), path.name
-    for name in (FIRST, SECOND):
-        assert bucket.cat_file(f"shards/set/{name}") == plain.folder.shard(name).read_bytes()
-    assert verify_dataset(OUT).problems == []
-
-
 def test_a_kill_before_any_request_loses_nothing(
     bucket: Any, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -97,7 +81,10 @@ def test_a_kill_before_any_request_loses_nothing(
                 assert shard == plain.folder.shard(name).read_bytes()
     assert runs > 10  # each run gets at least one write further than the one before
     assert open_dataset(OUT).digest == plain.manifest.dataset_digest
-    assert bucket.cat_file("shards/set/manifest.json") == plain.folder.manifest.read_bytes()
+    for path in (plain.folder.manifest, plain.folder.failures, plain.folder.objects_lock):
+        assert bucket.cat_file(f"shards/set/{path.name}") == path.read_bytes(), path.name
+    for name in (FIRST, SECOND):
+        assert bucket.cat_file(f"shards/set/{name}") == plain.folder.shard(name).read_bytes()
 
 
 def test_the_first_writer_of_a_shard_wins(bucket: Any, machines: Machines) -> None:
@@ -106,10 +93,7 @@ def test_the_first_writer_of_a_shard_wins(bucket: Any, machines: Machines) -> No
         make(first)
         with machines.maker("b") as second:
             make(second)
-            for index in range(4):
-                sample = dataclasses.replace(tiny_sample(seed=9 + index), key=sample_key(index))
-                stage_scene(second.folder.staged_shard(FIRST), index, sample, [], "lossless")
-            other = pack_shard(second.folder, FIRST, range(4))
+            other = other_shard(second)
             machines.use("a")
             make(first, 0)
             machines.use("b")
@@ -194,8 +178,7 @@ def test_a_shard_is_listed_only_when_it_is_in_the_bucket(bucket: Any, machines: 
         make(publication, 0)
         folder, profile = publication.folder, _build().storage.profile
         for index in range(4, 8):
-            sample = dataclasses.replace(tiny_sample(seed=index), key=sample_key(index))
-            stage_scene(folder.staged_shard(SECOND), index, sample, [], profile)
+            stage_scene(folder.staged_shard(SECOND), index, _sample(index), [], profile)
         pack_shard(folder, SECOND, range(4, 8))
         publication.finish()
         assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST]

@@ -1,7 +1,8 @@
-"""Datasets that a user's own files had part in: what is recorded, refused, never imported."""
+"""Whom a begun dataset binds; a user's own files are recorded, refused, never imported."""
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -10,9 +11,11 @@ from prefect.exceptions import ParameterTypeError
 from infra.repair import repair
 from pipeline.builds.named import BUILDS, named_build, typed_build
 from pipeline.exchange.reader import file_child
+from pipeline.executors.threads import ThreadRunner
 from pipeline.making.begin_publication import begin
-from pipeline.making.pipeline import make_task
-from pipeline.making.run import ShardJob
+from pipeline.making.bucket_publication import joined
+from pipeline.making.dataset_order import DatasetOrder
+from pipeline.making.pipeline import make_dataset, make_task, prepare_dataset
 from pipeline.shards.derive import _extensions
 from scene_templates.families import FAMILIES
 from storage.dataset.asked import read_asked, write_asked
@@ -21,9 +24,17 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest, write_manifest
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
+from storage.removed import removal_message
 from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions, written
 from tests.for_each import for_each
+from tests.pipeline.documents.dataset_by_hand import edit_manifest
 from tests.pipeline.making.test_publication import ENVIRONMENT, begin_tiny, make_tiny_shard
+from tests.pipeline.making.tiny_scenes_kit import (
+    Undocumented,
+    shard_job,
+    tiny_order,
+    without_rendering,
+)
 
 TEMPLATE = EXAMPLES / "template.py"
 TRAP = "from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n"
@@ -65,15 +76,7 @@ def test_a_manifest_without_extensions_is_what_it_was(tmp_path: Path) -> None:
 
 
 def test_a_worker_without_the_extension_is_refused(tmp_path: Path) -> None:
-    job = ShardJob(
-        folder=DatasetFolder(tmp_path),
-        settings=named_build("smoke"),
-        environment={},
-        accepted=None,  # type: ignore[arg-type]
-        lock_sha256="",
-        num_at_once=1,
-        extensions={"template.py": "1" * 64},
-    )
+    job = shard_job(tmp_path, extensions={"template.py": "1" * 64})
     with pytest.raises(TrilightError, match=r"this worker: .* add --extend template\.py"):
         make_task(job, ())
 
@@ -176,3 +179,74 @@ def test_derived_sets_name_the_extensions_of_their_sources(tmp_path: Path) -> No
     manifests = [dataclasses.replace(manifest, extensions=each) for each in (one, other)]
     assert _extensions([manifest, *manifests]) == {"a.py": "1 2", "b.py": "3"}
     assert _extensions([manifest]) == {}
+
+
+@for_each("source", ["OBJECTZ", "empty", "builtin:many", "env:TRILIGHT_NOWHERE"])
+def test_a_mistyped_source_leaves_nothing_behind(
+    source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(TrilightError, match="objects"):
+        make_dataset(DatasetOrder(objects=source, out="set"), ThreadRunner())
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+
+
+def test_what_was_only_begun_is_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a run leaves it that ended over its objects: other settings and fewer scenes are free."""
+    without_rendering(monkeypatch)
+    folder = DatasetFolder(tmp_path / "set")
+    with folder.joined():
+        begin(folder, named_build("smoke", seed=5), {}, 24, accept_environment=False)
+    run = prepare_dataset(tiny_order(out=str(folder.root), scenes=4, seed=7))
+    assert run.publication.manifest.settings["seed"] == 7
+    assert run.publication.manifest.num_scenes == 4
+
+
+def test_what_has_objects_or_scenes_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    without_rendering(monkeypatch)
+    order = tiny_order(out=str(tmp_path / "set"), scenes=4, seed=5)
+    prepare_dataset(order)  # its objects are frozen, no more
+    other = dataclasses.replace(order, seed=7)
+    with pytest.raises(TrilightError, match="begun with another setting: seed was 5, now 7"):
+        prepare_dataset(other)
+    make_dataset(order, Undocumented())
+    with pytest.raises(TrilightError, match="seed was 5, now 7"):
+        prepare_dataset(other)
+
+
+def test_nobody_forgets_while_another_is_at_work(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path / "set")
+    with joined(folder):
+        begin(folder, named_build("smoke", seed=5), {}, 4, accept_environment=False)
+        with joined(folder):
+            assert read_manifest(folder.manifest).settings["seed"] == 5
+
+
+def test_who_was_replaced_all_the_same_stops(tmp_path: Path) -> None:
+    """Locks do not reach every machine: a maker whose manifest has become another's says so."""
+    folder = DatasetFolder(tmp_path / "set")
+    with folder.joined():
+        mine = begin(folder, named_build("smoke", seed=5), {}, 4, accept_environment=False)
+        folder.manifest.unlink()
+        begin(folder, named_build("smoke", seed=7), {}, 4, accept_environment=False)
+        with pytest.raises(TrilightError, match="another dataset has been begun here"):
+            mine.lock_objects([])
+
+
+def test_a_dataset_of_removed_settings_is_read_and_not_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_rendering(monkeypatch)
+    order = tiny_order(out=str(tmp_path / "set"), scenes=4)
+    make_dataset(order, Undocumented())
+    dataset = open_dataset(str(tmp_path / "set"))
+    settings = dict(dataset.manifest.settings)
+    settings["splits"] = {**settings["splits"], "object_parts": 2}
+    edit_manifest(dataset, settings=settings)
+    assert verify_dataset(str(tmp_path / "set")).problems == []
+    refusal = re.escape(removal_message("setting 'splits.object_parts'"))
+    with pytest.raises(TrilightError, match=refusal):
+        make_dataset(order, Undocumented())
+    with pytest.raises(TrilightError, match=refusal):
+        named_build("smoke", changes={"splits.object_parts": 2})

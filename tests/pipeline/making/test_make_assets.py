@@ -18,7 +18,7 @@ from pipeline.objects.sources import find_objects
 from storage.errors import TrilightError
 from storage.records.objects import read_failures
 from tests.command_line import trilight
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.pipeline.assets.meshes_by_hand import cube, sphere, write_obj
 
 REAL = (
@@ -88,24 +88,21 @@ def made(source: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
     return out, run(source, out, workers=2)
 
 
-def test_every_object_has_its_outcome(made: tuple[Path, AssetReport]) -> None:
-    _, report = made
+def test_every_object_has_its_outcome_and_meshes_open_elsewhere(
+    made: tuple[Path, AssetReport],
+) -> None:
+    out, report = made
     assert len(report.rows) == len(REAL)
     assert [failure.reason for failure in report.failures] == [why for _, why in BAD.values()]
     for row in report.rows:
         assert 1 <= row.num_faces <= BUDGET
         assert row.quality.error_p99 <= 0.03
         assert (row.method == "source") == (row.source.num_faces <= BUDGET)
-    assert any(row.method != "source" for row in report.rows)
-
-
-def test_the_meshes_open_elsewhere(made: tuple[Path, AssetReport]) -> None:
-    out, report = made
-    for row in report.rows:
         mesh = trimesh.load_mesh(out / row.path, process=False)
         assert len(mesh.faces) == row.num_faces
         # The box of the source is 1 wide; a vertex may leave it by 1 % of its diagonal.
         assert mesh.extents.max() == pytest.approx(1, abs=2 * 0.01 * 3**0.5)
+    assert any(row.method != "source" for row in report.rows)
 
 
 def test_the_folder_is_a_source_of_objects(made: tuple[Path, AssetReport], tmp_path: Path) -> None:
@@ -231,22 +228,17 @@ def test_a_mistake_is_one_line(tmp_path: Path, option: tuple[str, str]) -> None:
     assert not (out / "objects.jsonl").exists()
 
 
-def _asked(epsilon: str) -> assets.Meshes:
-    return assets.Meshes(source="builtin:", out=Path("meshes"), epsilon=epsilon)
+def test_epsilons_are_shares_or_percent() -> None:
+    def settings(epsilon: str) -> AssetSettings:
+        return assets._settings(assets.Meshes(source="builtin:", out=Path("a"), epsilon=epsilon))
 
-
-@for_each("epsilon", ["half", "9", "-1%", "nan", "inf", "0", "%", "1%%", "5 %."])
-def test_epsilons_without_meaning_are_refused(epsilon: str) -> None:
-    with pytest.raises(TrilightError, match="epsilon is"):
-        assets._settings(_asked(epsilon))
-
-
-@for_each(("text", "share"), [("0.5%", 0.005), ("0.005", 0.005), (" 1 %", 0.01)])
-def test_epsilons_are_shares_or_percent(text: str, share: float) -> None:
-    settings = assets._settings(_asked(text))
-    # One division in double precision.
-    assert settings.epsilon == pytest.approx(share, rel=1e-15)
-    assert settings.budgets == (4096,)
+    for text in ("half", "9", "-1%", "nan", "inf", "0", "%", "1%%", "5 %."):
+        with case(text), pytest.raises(TrilightError, match="epsilon is"):
+            settings(text)
+    for text, share in (("0.5%", 0.005), ("0.005", 0.005), (" 1 %", 0.01)):
+        # One division in double precision.
+        assert settings(text).epsilon == pytest.approx(share, rel=1e-15)
+        assert settings(text).budgets == (4096,)
 
 
 @pytest.mark.slow("kills")

@@ -1,23 +1,47 @@
-"""The mesh stage in batches: shared by workers, resumed, remembered, and never of another file."""
+"""The mesh stage in batches: shared by workers, resumed, remembered, and killed with arrays."""
 
 import dataclasses
-from collections.abc import Callable
+import os
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline.assets.settings import AssetSettings
+from pipeline.executors.array_job import array_job
+from pipeline.executors.kubernetes import PLACE
+from pipeline.executors.kubernetes_array import KubernetesOptions, job_manifest
+from pipeline.executors.registry import find_executor
 from pipeline.making.object_batches import (
     ObjectWork,
     PrepareResult,
     cut_objects,
     prepare_in_batches,
 )
+from pipeline.making.pipeline import prepare_dataset
 from pipeline.objects.listing import Fetched, failure
+from storage.dataset.dataset import open_dataset
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
-from tests.pipeline.making.batches_kit import Mesher, object_records, use_mesher
-from tests.pipeline.making.frozen_kit import begun
+from storage.remote import claims
+from storage.remote.bucket import Bucket
+from storage.remote.url import RemoteUrl, parse_url
+from tests.conftest import ROOT
+from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, Writes
+from tests.pipeline.making.frozen_kit import Mesher, begun, object_records, use_mesher
+from tests.pipeline.making.killed_worker import BATCH, KILL_AFTER_S
+from tests.pipeline.making.tiny_scenes_kit import (
+    Undocumented,
+    tiny_order,
+    without_probe,
+    without_rendering,
+)
 
 
 @pytest.fixture
@@ -157,3 +181,135 @@ def test_a_file_of_another_user(
     unreadable = tmp_path / "two"
     with pytest.raises(TrilightError, match="Permission denied; expected a file that every worker"):
         _prepare(records, tmp_path / "two")
+
+
+NUM_OBJECTS = 120
+WORKERS = 3
+KILL_AFTER = BATCH // 2
+
+
+@pytest.fixture
+def lock_of_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bytes:
+    """The lock that one worker freezes alone."""
+    without_probe(monkeypatch)
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "alone-cache"))
+    mesher = use_mesher(monkeypatch, batch=BATCH)
+    objects, out = tmp_path / "objects", tmp_path / "alone"
+    object_records(objects, NUM_OBJECTS)
+    prepare_dataset(tiny_order(out=str(out), objects=str(objects), scenes=4))
+    assert set(mesher.made.values()) == {1} and len(mesher.made) == NUM_OBJECTS
+    return (out / "objects.lock.jsonl").read_bytes()
+
+
+def _start(words: Sequence[str], **environment: str) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.pipeline.making.killed_worker", *words],
+        cwd=ROOT, env={**os.environ, **environment}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+
+
+@pytest.mark.slow("kills")
+@pytest.mark.parametrize("is_bucket", [False, True], ids=["folder", "bucket"])
+def test_workers_share_the_objects(
+    is_bucket: bool, lock_of_one: bytes, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """One of them is killed, and what it had in hand is prepared by another one."""
+    if is_bucket:
+        request.getfixturevalue("bucket")
+    out, notes = OUT if is_bucket else str(tmp_path / "set"), tmp_path / "notes"
+    notes.mkdir()
+    words = [out, str(tmp_path / "objects"), str(notes), str(WORKERS)]
+    killed = _start([*words, str(KILL_AFTER)], TRILIGHT_CACHE=str(tmp_path / "killed"))
+    others = [_start(words, TRILIGHT_CACHE=str(tmp_path / name)) for name in "12"]
+    for process in (killed, *others):
+        said, _ = process.communicate(timeout=300)
+        assert process.returncode == (-9 if process is killed else 0), said
+    made = {path.name: path.read_text().splitlines() for path in notes.iterdir()}
+    assert all(0 < len(uids) < NUM_OBJECTS for uids in made.values())
+    times = Counter(uid for uids in made.values() for uid in uids)
+    assert len(times) == NUM_OBJECTS
+    twice = {uid for uid, count in times.items() if count > 1}
+    assert twice <= set(made[str(killed.pid)])
+    assert max(times.values()) <= 2 and len(twice) < 2 * BATCH, "the two batches in hand"
+    assert open_dataset(out).lock_bytes() == lock_of_one
+
+
+def test_a_kill_before_any_write_leaves_the_same_lock(
+    lock_of_one: bytes, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The n-th write of each run never happens; two machines take turns until one gets through."""
+    monkeypatch.setattr(claims, "LEASE_S", 0.0)
+    monkeypatch.setattr("pipeline.making.object_batches._NUM_OBJECTS", NUM_OBJECTS // 2)
+    order = tiny_order(out=OUT, objects=str(tmp_path / "objects"), scenes=4)
+    writes, runs = Writes(monkeypatch), 0
+    while True:
+        writes.left, runs = runs, runs + 1
+        machines.use("ab"[runs % 2])
+        try:
+            prepare_dataset(order)
+            break
+        except Killed:
+            pass
+    assert runs > 5
+    assert open_dataset(OUT).lock_bytes() == lock_of_one
+
+
+def _claims(tmp_path: Path, name: str) -> claims.BucketClaims:
+    url = parse_url(OUT, what="bucket")
+    assert isinstance(url, RemoteUrl)
+    return claims.BucketClaims(Bucket(url), tmp_path / name)
+
+
+def test_a_claim_keeps_other_machines_off_until_it_ends(
+    bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends with its block, and for a machine that dies when the lease is over."""
+    a, b = _claims(tmp_path, "a"), _claims(tmp_path, "b")
+    for holder, other in ((a, b), (b, a)):
+        with holder.claimed("x") as ours, other.claimed("x") as theirs, other.claimed("y") as free:
+            assert (ours, theirs, free) == (True, False, True)
+    monkeypatch.setattr(claims.BucketClaims, "_free", lambda self, claim: None)
+    with a.claimed("z") as ours:
+        assert ours
+    with b.claimed("z") as theirs, _claims(tmp_path, "a").claimed("z") as again:
+        assert (theirs, again) == (False, True), "a machine that is started again has its claims"
+    monkeypatch.setattr(claims, "LEASE_S", 0.0)
+    with b.claimed("z") as theirs:
+        assert theirs
+
+
+OPTIONS = KubernetesOptions(image="not pulled", cores=2)
+
+
+@pytest.mark.slow("kills")
+def test_arrays_that_are_killed_end_in_the_digest_of_one_that_was_not(
+    bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each array goes on where the one before was killed: four of Kubernetes, then one of Slurm."""
+    order, rng, killed = tiny_order(out=OUT, scenes=12), np.random.default_rng(0), 0
+    without_rendering(monkeypatch)
+    monkeypatch.setattr("pipeline.executors.threads.ThreadRunner", Undocumented)
+    alone = dataclasses.replace(order, out=str(tmp_path / "whole"))
+    find_executor("threads", None, None).make(alone, None)
+    missing = [0, 1]
+    for number, on in enumerate([*4 * ["kubernetes"], "slurm"]):
+        job = array_job(order, per_task=2, at_once=None, on=on)
+        assert set(job.tasks) <= set(missing)  # only what is missing
+        missing = list(job.tasks)
+        for place, task in enumerate(job.tasks):
+            pod = job_manifest(job, OPTIONS)["spec"]["template"]["spec"]["containers"][0]
+            variables = {row["name"]: row["value"] for row in pod["env"]}
+            if on == "slurm":
+                variables["SLURM_ARRAY_TASK_ID"] = str(task)
+            else:
+                variables |= {PLACE: str(place), KILL_AFTER_S: str(rng.uniform(0, 0.4))}
+            variables["TRILIGHT_CACHE"] = str(tmp_path / f"{number}-{place}")
+            run = _start([*pod["command"][1:-1], on], **variables)
+            said, _ = run.communicate(timeout=300)
+            assert run.returncode in (0, -9), said
+            killed += run.returncode == -9
+    assert killed >= 2
+    assert array_job(order, per_task=2, at_once=None).tasks == []
+    assert verify_dataset(OUT).problems == []
+    assert open_dataset(OUT).digest == open_dataset(str(tmp_path / "whole")).digest

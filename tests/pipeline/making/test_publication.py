@@ -1,8 +1,8 @@
 """A dataset is begun once, refuses to become another, and grows without changing what is there."""
 
 import dataclasses
+import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -11,19 +11,24 @@ from pipeline.builds.settings import BuildSettings, differences
 from pipeline.making import publication as publications
 from pipeline.making.begin_publication import begin
 from pipeline.making.publication import Publication
+from pipeline.objects.generated import generate_objects
 from pipeline.shards.pack import pack_shard
+from storage.dataset import layout
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import read_manifest
+from storage.dataset.manifest import index_shard, read_manifest
+from storage.dataset.progress import read_progress
+from storage.dataset.settings import SplitSettings
 from storage.dataset.shard import scan_members
 from storage.dataset.shard_notes import note_of
 from storage.dataset.splits import scenes_of_shard, shard_name
-from storage.dataset.staging import stage_scene
+from storage.dataset.staging import is_staged, stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import Failure, LockedObject, read_failures
 from storage.records.sample import Sample, sample_key
 from tests.for_each import for_each
+from tests.pipeline.documents.dataset_by_hand import edit_manifest
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 ENVIRONMENT = {"mitsuba_variant": "llvm_ad_rgb", "libraries": {"mitsuba": "3.9.1"}}
@@ -83,15 +88,6 @@ def _dataset(root: Path, scenes: int = 8) -> Publication:
     return publication
 
 
-def test_a_finished_dataset_verifies(tmp_path: Path) -> None:
-    publication = _dataset(tmp_path)
-    found = verify_dataset(tmp_path)
-    assert found.problems == []
-    assert found.num_samples == 8
-    assert read_manifest(tmp_path / "manifest.json") == publication.manifest
-    assert len(read_failures(publication.folder.failures)) == 8
-
-
 def test_the_digest_knows_nothing_of_place_or_order(tmp_path: Path) -> None:
     forwards = _dataset(tmp_path / "a").manifest
     build = _build()
@@ -112,7 +108,9 @@ def test_growing_keeps_the_shards(tmp_path: Path) -> None:
     again = _begin(tmp_path, _build(), 4)  # asking for fewer takes nothing away
     assert again.manifest == dataclasses.replace(grown, shards=())
     assert again.finish() == grown
-    assert verify_dataset(tmp_path).problems == []
+    found = verify_dataset(tmp_path)
+    assert (found.problems, found.num_samples) == ([], 12)
+    assert len(read_failures(again.folder.failures)) == 12
 
 
 def test_scenes_are_rounded_up_to_whole_shards(tmp_path: Path) -> None:
@@ -176,6 +174,17 @@ def test_damage_is_named(tmp_path: Path, fast: bool) -> None:
     assert verify_dataset(tmp_path, fast=fast).problems
 
 
+def _make_again(publication: Publication, samples: list[Sample]) -> None:
+    """Replace the first shard by one of these samples."""
+    name = shard_name(0, _build().splits)
+    for index, sample in enumerate(samples):
+        again = dataclasses.replace(sample, key=sample_key(index))
+        stage_scene(publication.folder.staged_shard(name), index, again, [], "lossless")
+    publication.folder.shard(name).unlink()  # the first writer of a shard wins
+    publication.add_shard(pack_shard(publication.folder, name, range(len(samples))))
+    publication.finish()
+
+
 def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
     publication = _dataset(tmp_path, 4)
     publication.lock_objects([dataclasses.replace(_locked(), split="test")])
@@ -183,14 +192,7 @@ def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
     scene = tiny_scene()
     used = dataclasses.replace(scene.objects[0], kind="object", uid="a")
     sample = dataclasses.replace(_sample(0), scene=tiny_scene(objects=(used, *scene.objects[1:])))
-    name = shard_name(0, _build().splits)
-    folder = publication.folder.staged_shard(name)
-    for index in range(4):
-        again = dataclasses.replace(sample, key=sample_key(index))
-        stage_scene(folder, index, again, [], "lossless")
-    publication.folder.shard(name).unlink()  # the first writer of a shard wins
-    publication.add_shard(pack_shard(publication.folder, name, range(4)))
-    publication.finish()
+    _make_again(publication, [sample] * 4)
     assert "belongs to split test" in verify_dataset(tmp_path).problems[0]
 
 
@@ -209,6 +211,9 @@ def test_documents_of_others_are_not_replaced(tmp_path: Path, name: str) -> None
     with pytest.raises(TrilightError, match=rf"{name} is there.*another --out"):
         _begin(tmp_path, _build())
     assert not (tmp_path / "manifest.json").exists()
+    (tmp_path / "train-000000.tar").write_bytes(b"")
+    with pytest.raises(TrilightError, match=r"shards but no manifest\.json"):
+        _begin(tmp_path, _build())
 
 
 def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None:
@@ -218,29 +223,20 @@ def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None
     publication.lock_objects(rows)
     scene = tiny_scene()
     floor = scene.objects[0]
-    name = shard_name(0, _build().splits)
+    samples = []
     for index in range(4):
         used = [
             dataclasses.replace(floor, name=uid, kind="object", uid=uid, licence=licence)
             for uid, licence in zip("abc", licences, strict=True)
         ][index % 2 :]
         objects = (*scene.objects, *used)
-        sample = dataclasses.replace(_sample(index), scene=tiny_scene(objects=objects))
-        stage_scene(publication.folder.staged_shard(name), index, sample, [], "lossless")
-    publication.folder.shard(name).unlink()  # the first writer of a shard wins
-    publication.add_shard(pack_shard(publication.folder, name, range(4)))
-    publication.finish()
+        samples.append(dataclasses.replace(_sample(index), scene=tiny_scene(objects=objects)))
+    _make_again(publication, samples)
     problems = [text for text in verify_dataset(tmp_path).problems if "share-alike" in text]
     assert [problem.split(":")[1] for problem in problems] == [
         " sample 000000000", " sample 000000002",
     ]  # fmt: skip
     assert "CC-BY-SA-3.0 and CC-BY-SA-4.0 meet" in problems[0]
-
-
-def test_shards_without_a_manifest_are_not_touched(tmp_path: Path) -> None:
-    (tmp_path / "train-000000.tar").write_bytes(b"")
-    with pytest.raises(TrilightError, match=r"shards but no manifest\.json"):
-        _begin(tmp_path, _build())
 
 
 @for_each("name", BUILDS)
@@ -251,41 +247,6 @@ def test_every_build_is_json_and_has_a_stable_digest(name: str) -> None:
     assert list(differences(build.as_json(), named_build(name, seed=5).as_json())) == [
         ("seed", build.seed, 5)
     ]
-
-
-@for_each(
-    ("arguments", "message"),
-    [
-        ({"name": "nonsense"}, "build 'nonsense' is unknown; expected one of smoke"),
-        ({"name": "smoke", "seed": -1}, "'seed' is -1"),
-        ({"name": "smoke", "resolution": 100}, "resolution"),
-        ({"name": "smoke", "noise_floor_db": -3.0}, "noise_floor_db"),
-        ({"name": "smoke", "changes": {"storage.profile": "tiny"}}, "profile' is 'tiny'; expected"),
-    ],
-)
-def test_wrong_settings_are_named(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(TrilightError, match=message):
-        named_build(**arguments)
-
-
-def test_the_profile_is_a_setting_and_stands_in_the_manifest(tmp_path: Path) -> None:
-    """Builds to learn from are compact, those to judge by exact; `--set` changes it."""
-    assert {name: named_build(name).storage.profile for name in ("smoke", "benchmark-v1")} == {
-        "smoke": "compact",
-        "benchmark-v1": "lossless",
-    }
-    build = named_build("smoke", changes={"storage.profile": "lossless"})
-    publication = _begin(tmp_path, build, 4)
-    assert publication.manifest.settings["storage"] == {"profile": "lossless"}
-    with pytest.raises(TrilightError, match=r"storage\.profile was 'lossless', now 'compact'"):
-        _begin(tmp_path, named_build("smoke"), 4)
-
-
-def test_a_shard_is_packed_as_the_settings_say(tmp_path: Path) -> None:
-    assert _build().storage.profile == "compact"
-    (shard, *_) = _dataset(tmp_path, 4).manifest.shards
-    found = open_dataset(str(tmp_path)).suffixes(shard)
-    assert found == {"scene.safetensors.gz", "json", "0.exr", "1.exr"}
 
 
 def test_a_shard_in_the_folder_of_a_worker_alone_is_no_shard(
@@ -308,3 +269,87 @@ def test_a_shard_in_the_folder_of_a_worker_alone_is_no_shard(
     monkeypatch.setattr(publications.time, "sleep", appear)
     publication.add_shard(elsewhere)
     assert open_dataset(str(tmp_path / "here")).manifest.shards == (elsewhere,)
+
+
+LIMIT = 4096 + 900
+"""Files of one folder, its parts (244 of a million shards) and what else lies there."""
+
+
+@pytest.fixture()
+def two_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two files in a folder stand for 4,096: the rule is the same."""
+    monkeypatch.setattr(layout, "FILES_PER_FOLDER", 2)
+
+
+def _most_entries(root: Path) -> int:
+    folders = [root, *(path for path in root.rglob("*") if path.is_dir())]
+    return max(sum(1 for _ in folder.glob("[a-z0-9]*[0-9].*")) for folder in folders)
+
+
+def test_the_first_shards_stay_where_the_design_has_them() -> None:
+    splits = SplitSettings(scenes_per_shard=4)
+    assert shard_name(0, splits) == "train-000000.tar"
+    assert shard_name(4093, splits) == "test-004093.tar"
+    assert shard_name(4096, splits) == "part-0001/train-004096.tar"
+    assert shard_name(999_999, splits) == "part-0244/train-999999.tar"
+
+
+def test_a_million_shards_fill_no_folder_beyond_the_limit() -> None:
+    folders: dict[str, int] = {}
+    for index in range(0, 1_000_000, 8):  # eight that follow each other have one folder
+        folder, _, _ = layout.numbered(index, "x").rpartition("/")
+        folders[folder] = folders.get(folder, 0) + 8
+    assert layout.FILES_PER_FOLDER % 8 == 0
+    assert max(folders.values()) + len(folders) < LIMIT < 5000
+
+
+@pytest.mark.usefixtures("two_each")
+def test_a_dataset_in_parts_is_whole(tmp_path: Path) -> None:
+    """Shards, rejections and logs move together; reading and verifying find them."""
+    publication = _dataset(tmp_path, scenes=20)
+    names = [shard.name for shard in publication.manifest.shards]
+    assert names == [
+        "train-000000.tar", "train-000001.tar", "part-0001/validation-000002.tar",
+        "part-0001/train-000003.tar", "part-0002/train-000004.tar",
+    ]  # fmt: skip
+    assert read_manifest(tmp_path / "manifest.json") == publication.manifest
+    found = verify_dataset(tmp_path)
+    assert (found.problems, found.num_samples) == ([], 20)
+    dataset = open_dataset(str(tmp_path))
+    keys = [s.key for shard in dataset.manifest.shards for s in dataset.read_shard(shard)]
+    assert keys == [sample_key(index) for index in range(20)]
+    assert _most_entries(tmp_path) == 2
+    assert publication.missing_shards() == []
+    assert read_progress(publication.folder).scenes_done == 20
+    path = tmp_path / names[3]
+    moved = path.rename(tmp_path / "away")
+    assert verify_dataset(tmp_path).problems == ["part-0001/train-000003.tar: missing"]
+    assert publication.missing_shards() == [3]
+    moved.rename(path)
+    assert index_shard(path) == publication.manifest.shards[3]
+    path.with_name("train-000009.tar").write_bytes(b"")
+    assert verify_dataset(tmp_path).problems == ["part-0001/train-000009.tar: not in the manifest"]
+
+
+@pytest.mark.usefixtures("two_each")
+def test_staged_scenes_and_built_in_objects_stand_in_parts(tmp_path: Path) -> None:
+    for index in range(5):
+        stage_scene(tmp_path / "shard", index, _sample(index), [], "lossless")
+    assert all(is_staged(tmp_path / "shard", index) for index in range(5))
+    objects = generate_objects("builtin:30", tmp_path / "objects")
+    assert len({entry.uid for entry in objects}) == 30
+    assert all("part" not in entry.uid for entry in objects)
+    assert _most_entries(tmp_path) == 2
+
+
+@for_each(
+    "name",
+    ["../train-000000.tar", "part-0001/../train-000000.tar", "/train-000000.tar",
+     "part-1/train-000000.tar", "a/train-000000.tar", "part-0001/part-0001/train-000000.tar"],
+)  # fmt: skip
+def test_a_manifest_that_names_a_file_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
+    publication: Publication = _dataset(tmp_path, scenes=4)
+    shards = json.loads(publication.folder.manifest.read_text())["shards"]
+    root = edit_manifest(open_dataset(str(tmp_path)), shards=[{**shards[0], "name": name}])
+    with pytest.raises(TrilightError, match="shard name"):
+        open_dataset(str(root))

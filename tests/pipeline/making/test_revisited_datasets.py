@@ -243,8 +243,6 @@ def test_a_damaged_source_is_named(source: Dataset, tmp_path: Path) -> None:
     [
         ({"cameras": "bogus"}, "--cameras is 'bogus'; expected keep; a number"),
         ({"cameras": "0"}, "cameras: 0 for each scene; expected 1 to 1000"),
-        ({"cameras": "new:0"}, "cameras: 0 for each scene; expected 1 to 1000"),
-        ({"cameras": "1001"}, "cameras: 1001 for each scene; expected 1 to 1000"),
         ({"lights": "none"}, "--lights is 'none'; expected keep, new, or a number"),
         ({"lights": "65"}, "num_lights is 65; expected a whole number from 1 to 64"),
         ({"materials": "old"}, "materials is 'old'; expected keep or new"),

@@ -1,34 +1,40 @@
-"""Pieces of shards by several makers: every scene once, one packer, nothing taken from others."""
+"""Pieces of shards by several makers: every scene once, one packer; rounds wait for others."""
 
 import contextlib
 import dataclasses
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 from PIL import Image
 
-from pipeline.builds.named import named_build
-from pipeline.builds.settings import BuildSettings
 from pipeline.isolation import ChildFailed, IsolatedChild
-from pipeline.making import unfinished_shard
+from pipeline.making import pipeline, render_children, tasks, unfinished_shard
 from pipeline.making.attempt_scene import SceneAttempt
+from pipeline.making.children import ChildPool
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.freeze_objects import AcceptedObjects
-from pipeline.making.pipeline import make_piece
-from pipeline.making.run import ShardJob
+from pipeline.making.pipeline import make_dataset, make_piece
+from pipeline.making.run import Run, ShardJob, TaskOutcome
 from pipeline.making.tasks import Piece
 from pipeline.making.unfinished_shard import UnfinishedShard
+from pipeline.shards.pack import pack_shard
 from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry, index_shard
 from storage.dataset.shard import write_shard
 from storage.dataset.shard_notes import ShardNote, note_shard, noted_shard
-from storage.dataset.staging import is_staged, read_staged_scene
+from storage.dataset.staging import is_staged, read_staged_scene, stage_scene
+from storage.dataset.statistics import Statistics
+from storage.errors import TrilightError
+from storage.records.objects import Failure
 from storage.records.sample import sample_key
-from tests.scenes_by_hand import tiny_sample
+from tests.pipeline.making.test_publication import _build, _sample, begin_tiny, make_tiny_shard
+from tests.pipeline.making.tiny_scenes_kit import shard_job
 
 NAME = "train-000000.tar"
 
@@ -44,28 +50,13 @@ class FakeChild:
         if scene_index == self._broken and attempt == 0:
             raise ChildFailed("crashed_signal_11", "native code ended by SIGSEGV")
         self._made[scene_index] += 1
-        sample = dataclasses.replace(tiny_sample(seed=scene_index), key=sample_key(scene_index))
-        return SceneAttempt(sample=sample, failures=[])
-
-
-def _build() -> BuildSettings:
-    build = named_build("smoke", resolution=16)
-    return dataclasses.replace(build, scenes=dataclasses.replace(build.scenes, num_views=2))
+        return SceneAttempt(sample=_sample(scene_index), failures=[])
 
 
 def _make(root: Path, first: int, last: int, made: "Counter[int]", broken: int = -1) -> Any:
     child = cast(IsolatedChild, FakeChild(made, broken))
     piece = Piece(shard_index=0, first=first, last=last)
-    job = ShardJob(
-        folder=DatasetFolder(root),
-        settings=_build(),
-        environment={},
-        accepted=AcceptedObjects(num_objects=0, num_found=0),
-        lock_sha256="",
-        num_at_once=1,
-        extensions={},
-    )
-    _, shard = make_piece(job, piece, child)
+    _, shard = make_piece(shard_job(root), piece, child)
     return shard
 
 
@@ -185,3 +176,125 @@ def test_a_note_of_an_earlier_shard_is_not_believed(tmp_path: Path) -> None:
     (tmp_path / NAME).unlink()
     write_shard(tmp_path / NAME, [(sample_key(0), {"json": b"[]"})])  # of the same size
     assert noted_shard(folder, NAME).shard == index_shard(tmp_path / NAME) != before.shard
+
+
+class Idle:
+    """A runner that finds everything taken, and counts."""
+
+    num_at_once = 1
+    window = None
+
+    def __init__(self) -> None:
+        self.rounds: list[int] = []
+
+    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
+        self.rounds.append(0)
+        for _ in tasks:
+            self.rounds[-1] += 1
+            yield TaskOutcome(shards=(), scenes=0, seconds=0.0, core_s=0.0)
+
+    def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
+        raise AssertionError("not finished")
+
+
+def _run(root: Path, scenes: int) -> Run:
+    return Run(
+        order=DatasetOrder(out=str(root), scenes=scenes),
+        settings=_build(),
+        listed=None,
+        publication=begin_tiny(root, scenes),
+        accepted=AcceptedObjects(num_objects=0, num_found=0),
+    )
+
+
+def _claim(folder: DatasetFolder, scene: int) -> Any:
+    return claimed(folder.staged_shard(NAME) / f"{sample_key(scene)}.claim")
+
+
+def test_waiting_for_others_takes_few_looks_and_no_tasks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, runner, pauses = _run(tmp_path, 4), Idle(), list[float]()
+    held = contextlib.ExitStack()
+
+    def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) == 8:  # one of them dies: there is something to do
+            held.close()
+        if len(pauses) == 10:  # and somebody else was quicker
+            make_tiny_shard(begin_tiny(tmp_path, 4), 0)
+
+    monkeypatch.setattr(tasks.time, "sleep", sleep)
+    for scene in range(4):
+        held.enter_context(_claim(run.publication.folder, scene))
+    pipeline.make_shards(run, runner, lambda run, outcome: None)
+    assert pauses == [1, 2, 4, 8, 16, 32, 60, 60, 60, 60]
+    assert runner.rounds == [1, 1, 1]  # at first, after the eighth pause, after the ninth
+
+
+def test_a_range_leaves_to_others_what_they_are_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def sleep(seconds: float) -> None:
+        raise AssertionError("nobody waits")
+
+    monkeypatch.setattr(tasks.time, "sleep", sleep)
+    run, runner = _run(tmp_path, 8), Idle()
+    ranged = dataclasses.replace(run, order=dataclasses.replace(run.order, shards="0:1"))
+    pipeline.make_shards(ranged, runner, lambda run, outcome: None)
+    assert runner.rounds == [1]
+    assert ranged.missing_shards() == [0]
+    assert run.missing_shards() == [0, 1]
+
+
+def test_what_is_free_is_what_nobody_is_at(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path)
+    shard = UnfinishedShard(folder, _build().splits, 0)
+    assert shard.is_free()
+    for scene in range(3):
+        stage_scene(folder.staged_shard(NAME), scene, _sample(scene), [], "lossless")
+    with _claim(folder, 3):
+        assert not shard.is_free()
+    assert shard.is_free()
+    stage_scene(folder.staged_shard(NAME), 3, _sample(3), [], "lossless")
+    assert shard.is_free()  # to be packed
+    with claimed(folder.staged_shard(NAME) / "pack.claim"):
+        assert not shard.is_free()
+    pack_shard(folder, NAME, range(4))
+    assert not shard.is_free()
+
+
+def test_a_rerun_does_not_escape_the_failure_budget(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All shards are there, but an earlier run stopped since too many scenes were given up."""
+    run = _run(tmp_path, 4)
+    folder = run.publication.folder
+    for scene in range(4):
+        failure = Failure(stage="scenes", item=sample_key(scene), reason="no", message="x")
+        stage_scene(folder.staged_shard(NAME), scene, None, [failure], "lossless")
+    run.publication.add_shard(pack_shard(folder, NAME, range(4)))
+    monkeypatch.setattr(pipeline, "_begun", lambda order: contextlib.nullcontext(run))
+    with pytest.raises(TrilightError, match="4 of 4 scenes could not be made"):
+        make_dataset(run.order, Idle())
+
+
+def test_only_children_that_nobody_uses_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another run may be at work on the same Dask worker."""
+    closed: list[str] = []
+
+    def pool(name: str) -> ChildPool:
+        child = SimpleNamespace(close=lambda: closed.append(name))
+        return ChildPool(lambda number: cast(IsolatedChild, child), 1)
+
+    job = cast(Any, SimpleNamespace(
+        folder=DatasetFolder(Path("a")), settings=SimpleNamespace(digest="d"), lock_sha256="l"
+    ))  # fmt: skip
+    monkeypatch.setattr(render_children, "_pools", {("b", "d", "l"): pool("other")})
+    monkeypatch.setattr(render_children, "_render_pool", lambda job: pool("ours"))
+    with render_children.render_child(job):
+        assert closed == ["other"]
+        render_children.close_idle_children()
+        assert closed == ["other"]
+    render_children.close_idle_children()
+    assert closed == ["other", "ours"]

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,17 +11,33 @@ from pipeline.executors.threads import ThreadRunner
 from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.freeze_objects import AcceptedObjects
+from pipeline.making.run import ShardJob
 from pipeline.renders.variant import Variant
+from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
-from tests.pipeline.making.test_publication import _locked
+from tests.pipeline.making.test_publication import _build, _locked
 from tests.scenes_by_hand import tiny_sample
 
 
 def tiny_order(**changes: Any) -> DatasetOrder:
     """Return an order that fits the scenes by hand: two views of 16 pixels, four to a shard."""
     return DatasetOrder(**{"resolution": 16, "changes": {"scenes.num_views": 2}, **changes})
+
+
+def shard_job(root: Path, **changes: Any) -> ShardJob:
+    """Return what workers are told of a dataset of tiny scenes without objects."""
+    job = ShardJob(
+        folder=DatasetFolder(root),
+        settings=_build(),
+        environment={},
+        accepted=AcceptedObjects(num_objects=0, num_found=0),
+        lock_sha256="",
+        num_at_once=1,
+        extensions={},
+    )
+    return dataclasses.replace(job, **changes)
 
 
 def without_rendering(
@@ -47,9 +64,14 @@ def without_rendering(
     monkeypatch.setattr("pipeline.making.pipeline.share_mesh_work", lambda *given: None)
     monkeypatch.setattr("pipeline.making.pipeline.accept_objects", accept)
     monkeypatch.setattr("pipeline.making.pipeline.make_scene", make)
+    without_probe(monkeypatch)
+    return scenes
+
+
+def without_probe(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Try no library: nothing is rendered."""
     unprobed = Variant(name="llvm_ad_rgb", libllvm="", note="")
     monkeypatch.setattr("pipeline.renders.variant._on_processor", lambda: unprobed)
-    return scenes
 
 
 class Undocumented(ThreadRunner):

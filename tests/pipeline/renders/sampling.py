@@ -1,5 +1,7 @@
 """Pictures with their own standard errors, for tests that compare estimates."""
 
+import subprocess
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,8 +10,12 @@ from scipy import stats
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
+from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Tracer
 from storage.records.scene import Scene
+from tests.conftest import ROOT
 
 SIGMAS = 5.0
 """How many standard errors an honest estimate may be off: 1 in 2 million for one value, so that a
@@ -32,6 +38,12 @@ def camera_of(scene: Scene, resolution: int, view: int = 0) -> Camera:
         fov_deg=float(scene.fov_deg[view]),
         resolution=resolution,
     )
+
+
+def render_view(scene: Scene, settings: RenderSettings, seed: int = 0) -> RenderedView:
+    """Return the first view of a scene, as the stage makes it."""
+    renderer = SceneRenderer(scene, settings)
+    return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
 
 
 def render_blocks(
@@ -63,10 +75,17 @@ def render_passes(
 
 def blocks_of(pictures: NDArray[np.float64], block: int) -> Estimate:
     """Return the means of `block` x `block` pixels of independent pictures."""
-    passes, count = len(pictures), pictures.shape[1] // block
-    cells = pictures.reshape(passes, count, block, count, block, 3).mean(axis=(2, 4))
+    cells, passes = block_means(pictures, block), len(pictures)
     error = cells.std(axis=0, ddof=1) / np.sqrt(passes)
     return Estimate(mean=cells.mean(axis=0), error=error, freedom=passes - 1)
+
+
+def block_means(pictures: NDArray, block: int) -> NDArray[np.float64]:
+    """Return pictures [..., R, R, 3] as means of `block` x `block` pixels."""
+    *more, size, _, _ = pictures.shape
+    cut = pictures.reshape(*more, size // block, block, size // block, block, 3)
+    means: NDArray[np.float64] = cut.astype(np.float64).mean(axis=(-4, -2))
+    return means
 
 
 def assert_same_light(a: NDArray[np.float64], b: NDArray[np.float64], *, name: str = "") -> None:
@@ -92,5 +111,29 @@ def assert_agree(a: Estimate, b: Estimate, *, slack: float = 0.0, name: str = ""
     assert excess.max() < 1, f"{name}: {off}" if name else off
 
 
+def assert_honest(ours: Estimate, theirs: Estimate, most: float = 1.3, bias: float = 0.35) -> None:
+    """Compare what is lit in standard errors: they spread by about 1, around 0.
+
+    Errors estimated from 16 passes each: the scores spread by 1.04 if both are unbiased, and a bias
+    of a third of the noise in every block would show in the mean of some 100 scores.
+    """
+    score = scores(ours, theirs)
+    assert 0.8 < np.sqrt(np.mean(score**2)) < most
+    assert len(score) > 90 and abs(score.mean()) < bias
+
+
+def scores(ours: Estimate, theirs: Estimate) -> NDArray[np.float64]:
+    """Return the differences of what is lit, in standard errors."""
+    lit = ours.mean > 0.01 * ours.mean.max()
+    return (ours.mean - theirs.mean)[lit] / np.hypot(ours.error, theirs.error)[lit]
+
+
 def exact(mean: NDArray[np.float64]) -> Estimate:
     return Estimate(mean=mean, error=np.zeros_like(mean))
+
+
+def printed_by(code: str) -> str:
+    """Return what another process prints that runs this code."""
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout.strip()

@@ -1,4 +1,4 @@
-"""Passes beside Mitsuba's own `aov` integrator, on the scenes of stock plugins.
+"""Rays and passes: of storage.conventions, beside our records and Mitsuba's `aov` integrator.
 
 Mitsuba means other things in two places. Its depth begins at the near plane of its camera, not at
 its centre. Its albedo is that of the diffuse lobe wherever the specular one is narrow, since an
@@ -11,10 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders.load_tracer import load_tracer
+from storage.records.first_hits import first_hits
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
+from tests.oracle import plugin_scene, plugin_tracer
+from tests.oracle.plugin_tracer import _NEAR_CLIP
 from tests.pipeline.renders.sampling import camera_of
-from tests.pipeline.renders.scene_kit import sampled_like_scene
+from tests.pipeline.renders.scene_kit import flat, join, light, material, quad, sampled_like_scene
 
 RESOLUTION = 32
 CHANNELS = {
@@ -31,8 +34,6 @@ AOVS = "d:depth,p:position,g:geo_normal,s:sh_normal,t:prim_index,a:albedo"
 def _mitsuba(scene: Scene, a_side: int) -> NDArray[np.float64]:
     """Return the channels [R, R, 14], of rays on the same grid; 0 where rays meet nothing."""
     load_tracer(scene, max_depth=2, rr_depth=5)  # chooses a variant
-    from tests.oracle import plugin_scene, plugin_tracer
-
     picture = plugin_tracer._render(
         plugin_scene.plugin_feature_scene(scene),
         plugin_tracer._integrator(type="aov", aovs=AOVS),
@@ -67,10 +68,75 @@ def test_mitsuba_sees_the_same(seed: int, a_side: int) -> None:
 
 
 def _compare_depth(scene: Scene, ours: dict[str, NDArray], theirs: NDArray[np.float64]) -> None:
-    from tests.oracle.plugin_tracer import _NEAR_CLIP
-
     full = ours["coverage"] == 1
     # the piece of a ray before the near plane is longer to the side
     before = _NEAR_CLIP * ours["depth_ray_m"][full] / ours["depth_axis_m"][full]
     off = abs(theirs[..., 0][full] + before - ours["depth_ray_m"][full])
     assert (off > 5e-6).mean() <= 0.002
+
+
+def test_a_lit_square_covers_the_pixels_that_it_should() -> None:
+    """Edges on pixel borders: inside fully lit, outside exactly black, nothing mirrored."""
+    resolution, distance = 16, 2.0
+    unit = 2 * np.tan(np.radians(20)) * distance / resolution  # one pixel at the square's depth
+    left, right, top, bottom = 3, 7, 2, 10  # in pixels from the top left corner
+    x0, x1 = (unit * (column - resolution / 2) for column in (left, right))
+    z0, z1 = (unit * (resolution / 2 - row) for row in (bottom, top))
+    square = quad([[x0, 0, z0], [x1, 0, z0], [x1, 0, z1], [x0, 0, z1]], material(diffuse=1))
+    lamp = light([[-50, -30, -30], [50, -30, -30], [0, -30, 60]], 1.0)
+    scene = join([square, lamp], eye=(0, -distance, 0), fov_deg=40)
+    tracer = load_tracer(scene, max_depth=2, rr_depth=5)
+    camera = camera_of(scene, resolution)
+    expected = np.zeros((resolution, resolution), bool)
+    expected[top:bottom, left:right] = True
+    picture = tracer.radiance(camera, seed=0, spp=64)
+    features = tracer.features(camera, spp=64)
+    np.testing.assert_array_equal(tracer.hits(camera), expected)
+    # A sample within a float32 rounding of a border may fall on its other side.
+    np.testing.assert_allclose(features.albedo[..., 0], expected, atol=0.02)
+    np.testing.assert_allclose(features.normal, expected[..., None] * [0, -1, 0], atol=0.02)
+    assert (picture[expected] > 0.2).all()
+    assert (picture[~expected] < 0.02).all()
+
+
+def test_emitters_are_invisible_to_the_auxiliary_pictures() -> None:
+    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.5))
+    in_front = flat([[[-1, -1, 0.5], [1, -1, 0.5], [0, 1, 0.5]]], material(emission=1), "emitter")
+    lamp = light([[-1, -1, 3], [1, -1, 3], [0, 1, 3]], 1.0)
+    pictures = [
+        load_tracer(join(parts, eye=(0, -0.1, 2)), max_depth=2, rr_depth=5)
+        for parts in ([floor, lamp], [floor, lamp, in_front])
+    ]
+    camera = camera_of(join([floor, lamp], eye=(0, -0.1, 2)), 16)
+    without, with_emitter = (tracer.features(camera, spp=16) for tracer in pictures)
+    np.testing.assert_array_equal(without.albedo, with_emitter.albedo)
+    np.testing.assert_array_equal(without.normal, with_emitter.normal)
+    np.testing.assert_array_equal(pictures[0].hits(camera), pictures[1].hits(camera))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_renderer_meets_surfaces_at_the_same_pixels(seed: int) -> None:
+    scene = sampled_like_scene(np.random.default_rng(seed), num_views=2)
+    tracer = load_tracer(scene, max_depth=4, rr_depth=5)
+    for view in range(scene.num_views):
+        seen = first_hits(scene, view=view, resolution=32)
+        assert 0 < seen.met.sum()
+        # a ray along a rim may go either way: two builds of Embree round differently
+        assert (tracer.hits(camera_of(scene, 32, view)) != seen.met).sum() <= 1
+        features = tracer.features(camera_of(scene, 32, view), spp=64)
+        _same_normals(seen.shading_normal, features.normal)
+
+
+def _same_normals(exact: np.ndarray, averaged: np.ndarray) -> None:
+    """Where a pixel's average is a unit vector, all of the pixel has one normal: that one.
+
+    Up to its sign: the renderer turns the normals of surfaces that are seen from behind.
+    """
+    even = np.linalg.norm(averaged, axis=-1) > 0.9999
+    even &= np.isfinite(exact[..., 0])
+    assert even.sum() > 50
+    cosine = abs(np.sum(exact * averaged, axis=-1))[even]
+    # unit vectors whose average is as long as 0.9999 lie within 0.8 degrees of it on average;
+    # the centre of a pixel may lie at the edge of that
+    assert np.median(cosine) > 0.9999
+    assert cosine.min() > 0.99

@@ -1,13 +1,26 @@
-"""Previews: any number of samples from one, unbiased before the denoiser, and no stated error."""
+"""Previews of any number of samples, the parts that price them, and pictures that grow."""
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
+from pipeline.making import progressive_tracer as module
+from pipeline.making.progressive_tracer import ProgressiveTracer
+from pipeline.renders import preview
+from pipeline.renders.camera import Camera
+from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings, usual_filter
+from pipeline.renders.preview_parts import all_parts, preview_parts, seconds_of, timed_parts
+from pipeline.renders.progressive import FIRST_LOOKS_SPP, ProgressiveRenderer
+from pipeline.renders.renderer import SceneRenderer, finished
+from pipeline.renders.results import GrowingPicture, Sampling
+from pipeline.renders.settings import Filtered, RenderSettings
+from pipeline.renders.tracer import Features
+from pipeline.renders.variant import choose_variant
 from storage.errors import Rejected, TrilightError
+from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
 from tests.pipeline.renders.sampling import SIGMAS
 from tests.pipeline.renders.scene_kit import sampled_like_scene
@@ -101,3 +114,136 @@ def test_light_that_no_file_holds_is_refused_and_not_hidden(emission: float) -> 
     for denoiser in ("off", "fast"):
         with pytest.raises(Rejected, match="radiance_overflow|nonfinite_radiance"):
             made(bright, 4, denoiser=denoiser)
+
+
+class CountingTracer:
+    """Makes flat pictures, and remembers by the names of parts what it was asked for."""
+
+    def __init__(self) -> None:
+        self.asked: Counter[str] = Counter()
+
+    def radiance(self, camera: Camera, *, seed: int, spp: int) -> Any:
+        self.asked[f"pass of {spp}"] += 1
+        return np.ones((camera.resolution, camera.resolution, 3), np.float32)
+
+    def features(self, camera: Camera, *, spp: int) -> Features:
+        self.asked[f"guides of {spp}"] += 1
+        flat = np.ones((camera.resolution, camera.resolution, 3), np.float32)
+        return Features(albedo=flat, normal=flat)
+
+
+@pytest.mark.parametrize("denoiser", ["off", "fast", "high"])
+def test_a_preview_is_made_of_its_parts(
+    denoiser: Filtered, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracer, scene = CountingTracer(), tiny_scene()
+    monkeypatch.setattr(preview, "load_tracer", lambda scene, **depths: tracer)
+
+    def filtered(picture: Any, features: Features, quality: str) -> Any:
+        tracer.asked[quality] += 1
+        return picture
+
+    monkeypatch.setattr(preview, "denoise", filtered)
+    for spp in (1, 2, 3, 15, 16, 63, 64, 85, 1024, 4096):
+        tracer.asked.clear()
+        settings = PreviewSettings(resolution=8, spp=spp, denoiser=denoiser)
+        finished(PreviewRenderer(scene, settings).view_steps(scene.c2w[0], 40.0, 0))
+        assert tracer.asked == preview_parts(spp, denoiser), spp
+        assert set(tracer.asked) <= set(all_parts())
+
+
+def test_each_part_is_timed_in_its_order() -> None:
+    """A clock that ticks once a look gives each part one tick, since each is timed between two."""
+    ticks = iter(range(10_000))
+    found = timed_parts(tiny_scene(), 16, lambda: float(next(ticks)))
+    assert set(found) == set(all_parts())
+    assert set(found.values()) == {1.0}
+    assert seconds_of(preview_parts(8, "fast"), found) == 4  # two passes, guides and the filter
+
+
+GROWING = RenderSettings(
+    resolution=32, noise_floor_db=95.0, min_spp=16, max_spp=256, min_mean_radiance=0.0
+)
+
+
+def looks(scene: Scene) -> list[GrowingPicture]:
+    found: list[Sampling] = []
+    steps = ProgressiveRenderer(scene, GROWING).view_steps(scene.c2w[0], 45.0, 7)
+    try:
+        while True:
+            found.append(next(steps))
+    except StopIteration as end:
+        found.append(end.value)
+    return [step for step in found if isinstance(step, GrowingPicture)]
+
+
+def test_the_last_look_is_the_picture_and_the_others_come_nearer() -> None:
+    scene = tiny_scene()
+    view = finished(SceneRenderer(scene, GROWING).view_steps(scene.c2w[0], 45.0, 7))
+    seen = looks(scene)
+    np.testing.assert_array_equal(seen[-1].radiance_rgb, view.radiance_rgb)
+    assert seen[-1].floor is not None and seen[-1].floor.log_db == view.noise_floor_db
+    few = len(FIRST_LOOKS_SPP)
+    assert [look.spp for look in seen[:few]] == list(FIRST_LOOKS_SPP)
+    assert all(look.floor is None for look in seen[:few])
+    measured = seen[few:]
+    assert len(measured) > 1 and [look.spp for look in measured] == sorted(
+        {look.spp for look in measured}
+    )
+    assert all(look.floor is not None for look in measured)
+    errors_db = [psnr_log_db(look.radiance_rgb, view.radiance_rgb) for look in seen[:-1]]
+    assert errors_db[few] > errors_db[0] + 3
+    spent = [look.core_s for look in measured]
+    assert spent == sorted(spent) and all(look.core_s > 0 for look in seen)
+
+
+def test_a_preview_of_the_same_scene_is_the_one_that_render_makes() -> None:
+    scene = tiny_scene()
+    renderer = ProgressiveRenderer(scene, GROWING)
+    for spp in (4, 64):
+        steps = renderer.preview_steps(scene.c2w[0], 45.0, 7, spp)
+        first = next(steps)
+        look = finished(steps)
+        assert not isinstance(first, GrowingPicture) and first.expected_spp == spp
+        assert (look.spp, look.floor) == (spp, None) and look.core_s > 0
+        asked = PreviewSettings(resolution=32, spp=spp, denoiser=usual_filter(spp))
+        alone = finished(PreviewRenderer(scene, asked).view_steps(scene.c2w[0], 45.0, 7))
+        np.testing.assert_array_equal(look.radiance_rgb, alone.radiance_rgb)
+
+
+def test_the_child_keeps_the_scene_and_ends_where_it_is_told_to() -> None:
+    class Enough(Exception):
+        pass
+
+    scene, told = tiny_scene(), list[Sampling]()
+    tracer = ProgressiveTracer(variant=choose_variant(), threads=1)
+    camera = (scene.c2w[0], 45.0)
+
+    def stop(step: Sampling) -> None:
+        raise Enough
+
+    try:
+        with pytest.raises(Enough):
+            tracer.paint(scene, "a", camera, GROWING, stop)
+        tracer.paint(scene, "a", camera, GROWING, told.append)
+        last = told[-1]
+        assert isinstance(last, GrowingPicture)
+        expected = looks(scene)[-1].radiance_rgb
+        assert psnr_log_db(last.radiance_rgb, expected) > 30
+        tracer.paint(scene, "a", camera, GROWING, told.append, preview_spp=4)
+        assert isinstance(told[-1], GrowingPicture) and told[-1].spp == 4
+        assert tracer._child.call(_num_loaded) == 1, "a preview loads no scene anew"
+        dark = tiny_scene(faces=tiny_scene().faces[2:], material_index=np.array([1], np.uint16),
+                          object_index=np.array([1], np.uint16))  # fmt: skip
+        with pytest.raises(TrilightError, match="no_surfaces"):
+            tracer.paint(dark, "dark", camera, GROWING, told.append)
+        for key in ("b", "c", "d"):
+            tracer.paint(scene, key, camera, GROWING, told.append)
+        kept = tracer._child.call(_num_loaded)
+        assert kept == module.MOST_SCENES
+    finally:
+        tracer.close()
+
+
+def _num_loaded() -> int:
+    return len(module._state.loaded)

@@ -1,10 +1,7 @@
-"""The stage: stop rule, rejections, and the same bits whatever runs beside it."""
+"""The stage: stop rule, rejections, the same bits whatever runs beside it; each emitter alone."""
 
 import dataclasses
 import hashlib
-import os
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -12,17 +9,31 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import renderer as renderer_module
-from pipeline.renders.denoiser import Quality
+from pipeline.renders.denoiser import Quality, denoise
+from pipeline.renders.kept_light import with_mean_of
+from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import RenderedView
+from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Features
+from pipeline.renders.vector_tracer import VectorTracer
 from storage.conventions import look_at_c2w
 from storage.errors import Rejected
 from storage.metrics import psnr_log_db
-from storage.records.scene import Scene
+from storage.records.exr import decode_exr, encode_exr
+from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
+from storage.records.scene import Scene, SceneObject
 from storage.settings.changes import changed
-from tests.conftest import ROOT
+from tests.oracle.plugin_tracer import PluginTracer
+from tests.pipeline.renders.sampling import (
+    assert_agree,
+    blocks_of,
+    camera_of,
+    printed_by,
+    render_passes,
+    render_view,
+)
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
 
 CHEAP = RenderSettings(resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32)
@@ -39,17 +50,12 @@ def simple_scene(radiance: float = 20.0) -> Scene:
     return join(parts, eye=(0, -3, 2), target=(0, 0, 0.4), fov_deg=45)
 
 
-def _render(scene: Scene, settings: RenderSettings = CHEAP, seed: int = 0) -> RenderedView:
-    renderer = SceneRenderer(scene, settings)
-    return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
-
-
 def digest(view: RenderedView) -> str:
     return hashlib.sha256(view.radiance_rgb.tobytes() + view.hits.tobytes()).hexdigest()
 
 
 def test_a_view_is_finite_lit_and_black_outside() -> None:
-    view = _render(simple_scene())
+    view = render_view(simple_scene(), CHEAP)
     assert view.radiance_rgb.dtype == np.float32 and view.radiance_rgb.shape == (32, 32, 3)
     assert np.isfinite(view.radiance_rgb).all() and (view.radiance_rgb >= 0).all()
     assert view.hits.any() and not view.hits.all()
@@ -63,7 +69,7 @@ def test_the_same_bits_for_any_number_of_threads_and_in_any_process() -> None:
     digests = []
     for threads in (1, 2):
         set_threads(threads)
-        digests.append(digest(_render(scene, settings)))
+        digests.append(digest(render_view(scene, settings)))
     # The other process has rendered another scene before, and runs on one thread.
     code = (
         "import numpy as np\n"
@@ -72,21 +78,14 @@ def test_the_same_bits_for_any_number_of_threads_and_in_any_process() -> None:
         "from tests.pipeline.renders import test_renderer as t\n"
         "from tests.pipeline.renders.scene_kit import sampled_like_scene\n"
         "t.set_threads(1)\n"
-        "t._render(t.simple_scene())\n"
+        "t.render_view(t.simple_scene(), t.CHEAP)\n"
         f"settings = t.{settings!r}\n"
         "scene = sampled_like_scene(np.random.default_rng(5), num_views=1)\n"
-        "print(t.digest(t._render(scene, settings)))\n"
+        "print(t.digest(t.render_view(scene, settings)))\n"
     )
-    child = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        env=dict(os.environ),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    said = printed_by(code)
     assert digests == [digests[0]] * 2
-    assert child.stdout.split()[-1] == digests[0]
+    assert said.split()[-1] == digests[0]
 
 
 def test_views_do_not_depend_on_the_views_before_them() -> None:
@@ -100,23 +99,14 @@ def test_views_do_not_depend_on_the_views_before_them() -> None:
 
 def test_sampling_stops_at_the_target_or_at_the_cap() -> None:
     scene = simple_scene()
-    easy = _render(scene, dataclasses.replace(GROWING, noise_floor_db=10.0))
+    easy = render_view(scene, dataclasses.replace(GROWING, noise_floor_db=10.0))
     assert easy.spp == 64 and not easy.at_cap
-    hard = _render(scene, dataclasses.replace(GROWING, noise_floor_db=95.0))
+    hard = render_view(scene, dataclasses.replace(GROWING, noise_floor_db=95.0))
     assert hard.spp == 256 and hard.at_cap
     between = easy.noise_floor_db + 2
-    wanted = _render(scene, dataclasses.replace(GROWING, noise_floor_db=between, max_spp=4096))
+    wanted = render_view(scene, dataclasses.replace(GROWING, noise_floor_db=between, max_spp=4096))
     assert wanted.noise_floor_db >= between and not wanted.at_cap
     assert 64 < wanted.spp < 4096 and wanted.spp % 32 == 0
-
-
-def test_a_build_may_refuse_what_stays_noisy() -> None:
-    strict = dataclasses.replace(CHEAP, noise_floor_db=95.0, max_spp=32, reject_at_cap=True)
-    with pytest.raises(Rejected, match="expected 95") as rejection:
-        _render(simple_scene(), strict)
-    assert rejection.value.reason == "floor_not_reached"
-    easy = dataclasses.replace(strict, noise_floor_db=10.0)
-    assert _render(simple_scene(), easy).noise_floor_db >= 10
 
 
 def test_a_view_says_how_far_it_is() -> None:
@@ -135,7 +125,7 @@ def test_a_view_says_how_far_it_is() -> None:
     assert all(step.spp <= step.expected_spp <= 256 for step in seen)
     assert [step.missing_db is None for step in seen] == [True] * 4 + [False] * 6
     assert all(0 < (step.missing_db or 0) < 95 for step in seen[4:])
-    assert digest(view) == digest(_render(scene, settings))
+    assert digest(view) == digest(render_view(scene, settings))
 
 
 def test_halves_of_many_samples_have_the_best_filter(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,117 +138,207 @@ def test_halves_of_many_samples_have_the_best_filter(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(renderer_module, "denoise", noted)
     settings = dataclasses.replace(GROWING, noise_floor_db=95.0, min_spp=64, max_spp=512)
-    _render(simple_scene(), settings)
+    render_view(simple_scene(), settings)
     # Two halves at 256 and at 512 samples, and the picture.
     assert filtered == ["fast"] * 2 + ["high"] * 2 + ["high"]
     filtered.clear()
-    _render(simple_scene(), dataclasses.replace(settings, denoiser="fast"))
+    render_view(simple_scene(), dataclasses.replace(settings, denoiser="fast"))
     assert filtered == ["fast"] * 5
 
 
 def test_a_linear_target_goes_on_where_the_log_one_is_reached() -> None:
     easy = dataclasses.replace(GROWING, noise_floor_db=10.0, max_spp=4096)
-    first = _render(simple_scene(), easy)
+    first = render_view(simple_scene(), easy)
     wanted = first.noise_floor_linear_db + 1
-    both = _render(simple_scene(), dataclasses.replace(easy, noise_floor_linear_db=wanted))
+    both = render_view(simple_scene(), dataclasses.replace(easy, noise_floor_linear_db=wanted))
     assert both.spp > first.spp == 64
     assert both.noise_floor_linear_db >= wanted and not both.at_cap
     alone = dataclasses.replace(easy, noise_floor_db=None, noise_floor_linear_db=wanted)
-    assert digest(_render(simple_scene(), alone)) == digest(both)
-
-
-def test_a_target_over_objects_goes_on_where_most_is_background() -> None:
-    scene = simple_scene()
-    far = dataclasses.replace(scene, fov_deg=np.array([110.0], np.float32))
-    easy = dataclasses.replace(GROWING, max_spp=4096)
-    first = _render(far, dataclasses.replace(easy, noise_floor_db=10.0))
-    assert first.hits.mean() < 0.25
-    assert first.object_noise_floor_db < first.noise_floor_db - 6
-    reached = first.object_noise_floor_db + 1
-    whole = _render(far, dataclasses.replace(easy, noise_floor_db=reached))
-    objects = _render(
-        far, dataclasses.replace(easy, noise_floor_db=reached, noise_floor_objects_db=reached)
-    )
-    assert whole.spp == 64 < objects.spp
-    assert objects.object_noise_floor_db >= reached
-
-
-def test_a_target_that_is_reached_costs_nothing() -> None:
-    easy = dataclasses.replace(CHEAP, noise_floor_db=40.0, max_spp=4096)
-    first = _render(simple_scene(), easy)
-    more = dataclasses.replace(easy, noise_floor_linear_db=5.0, noise_floor_objects_db=5.0)
-    assert digest(_render(simple_scene(), more)) == digest(first)
+    assert digest(render_view(simple_scene(), alone)) == digest(both)
 
 
 @pytest.mark.parametrize(
     ("name", "metric"),
     [
+        ("noise_floor_db", "psnr_log_db"),
         ("noise_floor_linear_db", "psnr_linear_db"),
         ("noise_floor_objects_db", "object_psnr_log_db"),
     ],
 )
 def test_every_target_counts_at_the_cap(name: str, metric: str) -> None:
     easy = dataclasses.replace(CHEAP, noise_floor_db=10.0, reject_at_cap=True)
-    assert not _render(simple_scene(), changed(easy, {name: 5.0})).at_cap
+    assert not render_view(simple_scene(), changed(easy, {name: 5.0})).at_cap
     with pytest.raises(Rejected, match=f"^floor_not_reached: {metric} is .* dB; expected 95$"):
-        _render(simple_scene(), changed(easy, {name: 95.0}))
-    view = _render(simple_scene(), changed(easy, {name: 95.0, "reject_at_cap": False}))
+        render_view(simple_scene(), changed(easy, {name: 95.0}))
+    view = render_view(simple_scene(), changed(easy, {name: 95.0, "reject_at_cap": False}))
     assert view.at_cap and view.noise_floor_db > 10
 
 
-@pytest.fixture(scope="module")
-def truth() -> NDArray[np.float32]:
-    """Return the simple scene of 64 x 64 pixels, nearly converged."""
-    converged = dataclasses.replace(CHEAP, resolution=64, min_spp=1024, max_spp=1024, aux_spp=64)
-    return _render(simple_scene(), converged, seed=1).radiance_rgb
-
-
-def test_the_measured_floor_is_below_the_true_agreement_here(truth: NDArray[np.float32]) -> None:
+def test_the_measured_floor_is_below_the_true_agreement_here() -> None:
     """An honest floor: the picture is at least as close to a converged one as it claims.
 
     Sixteen times the samples are not the truth, but an ordinary scene's floor is understated by
     about 3 dB, far more than what is left in them.
     """
     settings = dataclasses.replace(CHEAP, resolution=64, min_spp=64, max_spp=64, aux_spp=64)
-    view = _render(simple_scene(), settings)
+    view = render_view(simple_scene(), settings)
+    converged = dataclasses.replace(settings, min_spp=1024, max_spp=1024)
+    truth = render_view(simple_scene(), converged, seed=1).radiance_rgb
     true_db = psnr_log_db(view.radiance_rgb, truth)
     assert view.noise_floor_db < true_db
     assert view.noise_floor_db > true_db - 10
 
 
-def test_denoising_helps_and_can_be_left_out(truth: NDArray[np.float32]) -> None:
-    settings = dataclasses.replace(CHEAP, resolution=64)
-    errors = [
-        -psnr_log_db(
-            _render(simple_scene(), dataclasses.replace(settings, denoiser=quality)).radiance_rgb,
-            truth,
-        )
-        for quality in ("high", "fast", "off")
-    ]
-    assert errors[0] < errors[2] - 3 and errors[1] < errors[2] - 3
-
-
-def test_black_views_are_rejected() -> None:
+def test_pictures_without_right_light_are_rejected() -> None:
     scene = simple_scene()
     renderer = SceneRenderer(scene, CHEAP)
     away = look_at_c2w(eye=[0, -3, 2], target=[0, -9, 4], up=[0, 0, 1])
     with pytest.raises(Rejected, match="black_view"):
         renderer.render_view(away, 40.0, seed=0)
-    with pytest.raises(Rejected, match="black_view"):
-        _render(simple_scene(radiance=1e-3))
-
-
-def test_values_that_are_not_finite_are_found_before_the_denoiser_hides_them() -> None:
-    with pytest.raises(Rejected, match="nonfinite_radiance"):
-        _render(simple_scene(radiance=3e38))
-
-
-def test_pictures_beyond_half_floats_are_rejected() -> None:
-    with pytest.raises(Rejected, match="radiance_overflow"):
-        _render(simple_scene(radiance=1e8))
-
-
-def test_a_scene_of_emitters_alone_is_rejected() -> None:
-    scene = join([light([[0, 0, 1], [1, 0, 1], [0, 1, 1]], 1.0)])
+    for radiance, reason in ((1e-3, "black_view"), (3e38, "nonfinite"), (1e8, "radiance_overflow")):
+        with pytest.raises(Rejected, match=reason):  # before the denoiser hides it
+            render_view(simple_scene(radiance=radiance), CHEAP)
     with pytest.raises(Rejected, match="no_surfaces"):
-        SceneRenderer(scene, CHEAP)
+        SceneRenderer(join([light([[0, 0, 1], [1, 0, 1], [0, 1, 1]], 1.0)]), CHEAP)
+
+
+SETTINGS = RenderSettings(
+    resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32, aux_spp=16, per_light=True
+)
+RAW = dataclasses.replace(SETTINGS, denoiser="off")
+LAMPS = np.array([[-0.5, -1.5, 2], [0.5, -1.5, 2], [0, -1, 2.4]])
+COLOURS = ([20.0, 2.0, 2.0], [1.0, 10.0, 1.0], [0.5, 0.5, 5.0])
+
+
+def _beside(*, x: float) -> NDArray[np.float64]:
+    return np.add(LAMPS, [x, 0, 0])
+
+
+def lit_scene(factors: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Scene:
+    """Return a ball on a floor below a red, a green and a blue light, beside each other."""
+    parts = [
+        light(_beside(x=-1.2), np.multiply(COLOURS[0], factors[0])),
+        quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=[0.7, 0.5, 0.3])),
+        light(LAMPS, np.multiply(COLOURS[1], factors[1])),
+        sphere([0, 0, 0.5], 0.5, material(diffuse=0.4, specular=0.4, roughness=0.5), rings=8),
+        light(_beside(x=1.2), np.multiply(COLOURS[2], factors[2])),
+    ]
+    return join(parts, eye=(0, -3, 2), target=(0, 0, 0.4), fov_deg=45)
+
+
+def _lights(view: RenderedView) -> NDArray[np.float32]:
+    assert view.lights_rgb is not None
+    return view.lights_rgb
+
+
+def test_the_stored_picture_is_the_sum_of_its_lights_in_the_order_of_objects() -> None:
+    view = render_view(lit_scene(), SETTINGS)
+    lights = _lights(view)
+    assert lights.shape == (3, 32, 32, 3)
+    np.testing.assert_array_equal(lights, rounded_to_half(lights))
+    np.testing.assert_array_equal(sum_of_lights(lights), view.radiance_rgb)
+    np.testing.assert_array_equal(decode_exr(encode_exr(view.radiance_rgb)), view.radiance_rgb)
+    for light_rgb, colour in zip(lights, COLOURS, strict=True):  # objects 0, 2 and 4
+        assert np.argmax(light_rgb.mean(axis=(0, 1))) == np.argmax(colour)
+
+
+def test_doubling_one_light_doubles_its_picture_and_no_other() -> None:
+    """Samples do not depend on a light's strength; twice a float is exact, in halves too."""
+    once = _lights(render_view(lit_scene(), RAW))
+    twice = _lights(render_view(lit_scene((1, 2, 1)), RAW))
+    np.testing.assert_array_equal(twice[[0, 2]], once[[0, 2]])
+    # below 6e-5 half floats are steps of 6e-8, of which twice the value has twice as many
+    np.testing.assert_allclose(twice[1], 2 * once[1], rtol=0, atol=6e-8)
+    assert twice[1].max() > 0
+
+
+def test_lights_apart_add_up_to_one_denoised_picture() -> None:
+    """Not to a sum of denoised ones, each with its bias, in which the floor would not be honest."""
+    scene = lit_scene()
+    tracer = load_tracer(scene, max_depth=SETTINGS.max_depth, rr_depth=SETTINGS.rr_depth)
+    parts = [tracer.only_light(row) for row in light_rows(scene)]
+    samples = HalfSamples(parts, camera_of(scene, 32), 0, first_spp=32, max_spp=32)
+    assert len(list(samples.passes_to(SETTINGS.max_spp))) == 2
+    features = tracer.features(camera_of(scene, 32), spp=SETTINGS.aux_spp)
+    raw = samples.mean().sum(axis=0)
+    expected = with_mean_of(denoise(raw, features, "high"), raw)
+    # rounded to half floats four times, each light and their sum: 2^-11 of each
+    np.testing.assert_allclose(
+        render_view(scene, SETTINGS).radiance_rgb, expected, rtol=2 * 2**-11, atol=1e-6
+    )
+
+
+def test_denoised_lights_are_linear_within_their_noise() -> None:
+    """The denoiser is not linear: what it changes in the other lights is below the floor."""
+    once, twice = render_view(lit_scene(), SETTINGS), render_view(lit_scene((1, 2, 1)), SETTINGS)
+    for index, factor in enumerate((1, 2, 1)):
+        agreement = psnr_log_db(factor * _lights(once)[index], _lights(twice)[index])
+        assert agreement > once.noise_floor_db
+
+
+def test_the_sum_is_the_picture_of_all_lights_at_once(llvm: None) -> None:
+    """The same integral, by other samples: raw means of 8 x 8 blocks agree within their errors."""
+    scene = lit_scene()
+    tracer = load_tracer(scene, max_depth=6, rr_depth=5)
+    lights = [tracer.only_light(row) for row in light_rows(scene)]
+    apart = blocks_of(np.sum([render_passes(one, scene, passes=12) for one in lights], axis=0), 8)
+    together = blocks_of(render_passes(tracer, scene, passes=12), 8)
+    assert_agree(apart, together)
+    # and the errors are small enough to tell: the lights' own share is far larger
+    assert np.median(np.hypot(apart.error, together.error)) < 0.02 * together.mean.mean()
+
+
+@pytest.mark.slow("statistics")
+def test_both_tracers_switch_the_same_light_on(llvm: None) -> None:
+    scene = lit_scene()
+    for row in (0, 4):
+        tracers = [kind(scene, max_depth=2, rr_depth=5) for kind in (VectorTracer, PluginTracer)]
+        means = [
+            render_passes(one.only_light(row), scene, resolution=16, passes=4).mean(axis=(0, 1, 2))
+            for one in tracers
+        ]
+        # 65,536 paths of direct light with a relative deviation near 1: half a percent is exceeded
+        # once in five by chance, 2 % never; the wrong light would be off by a factor of 5 or more
+        np.testing.assert_allclose(means[0], means[1], rtol=0.02)
+
+
+def test_a_light_that_is_off_still_casts_a_shadow_and_is_still_hidden() -> None:
+    """A large emitter between floor and lamp: off, it darkens the floor, and no camera sees it."""
+    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.5))
+    lamp = light([[-0.5, -0.5, 3], [0.5, -0.5, 3], [0, 0.5, 3]], 50.0)
+    screen = light([[-9, -9, 1], [9, -9, 1], [0, 18, 1]], 1.0)
+    scene = join([floor, lamp, screen], eye=(0, -0.1, 2))
+    lamp_rgb, screen_rgb = _lights(render_view(scene, RAW))
+    assert lamp_rgb.max() == 0
+    assert screen_rgb.min() > 0  # the floor fills the picture, seen through the screen
+
+
+def test_lights_apart_have_an_honest_floor_and_reach_a_target() -> None:
+    settings = dataclasses.replace(SETTINGS, noise_floor_db=38.0, max_spp=2048)
+    view = render_view(lit_scene(), settings)
+    assert view.noise_floor_db >= 38.0 and not view.at_cap
+    converged = dataclasses.replace(SETTINGS, min_spp=2048, max_spp=2048, per_light=False)
+    truth = render_view(lit_scene(), converged, seed=1)
+    assert view.noise_floor_db < psnr_log_db(view.radiance_rgb, truth.radiance_rgb)
+
+
+def test_one_light_alone_is_the_picture_but_for_its_rounding() -> None:
+    """With one emitter, both ways draw the same samples."""
+    parts = [
+        quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=0.5)),
+        light(LAMPS, 20.0),
+    ]
+    scene = join(parts, eye=(0, -3, 2))
+    together = render_view(scene, dataclasses.replace(SETTINGS, per_light=False))
+    assert together.lights_rgb is None
+    apart = render_view(scene, SETTINGS)
+    np.testing.assert_array_equal(apart.radiance_rgb, rounded_to_half(together.radiance_rgb))
+    assert apart.noise_floor_db == together.noise_floor_db
+
+
+def test_an_emitter_without_triangles_is_rejected() -> None:
+    scene = lit_scene()
+    empty = SceneObject(name="nothing", kind="emitter")
+    more = dataclasses.replace(scene, objects=(*scene.objects, empty))
+    with pytest.raises(Rejected, match="unlit_scene"):
+        SceneRenderer(more, SETTINGS)

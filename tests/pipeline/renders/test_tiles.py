@@ -18,11 +18,10 @@ from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tiles import TILE_PX, TileChoice, passes_of_tiles
 from pipeline.renders.tracer import Chosen, Tracer
-from tests.oracle.host_sum import HostSum
+from tests.oracle.plugin_tracer import HostSum
 from tests.pipeline.renders.sampling import camera_of
 from tests.pipeline.renders.scene_kit import sampled_like_scene
-from tests.pipeline.renders.test_lights_apart import lit_scene
-from tests.pipeline.renders.test_renderer import digest
+from tests.pipeline.renders.test_renderer import digest, lit_scene
 
 PASS = 64
 CAMERA = Camera(c2w=np.eye(4), fov_deg=40.0, resolution=32)
