@@ -25,7 +25,7 @@ from storage.records.exr import decode_exr
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
 from tests.for_each import case
-from tests.infra.rendering.test_cameras import HereReader
+from tests.infra.rendering.test_plan import HereReader
 from tests.scenes_by_hand import tiny_scene
 
 
