@@ -51,18 +51,10 @@ class Postgres:
         self._user = "postgres" if os.geteuid() == 0 else None
         if self._user:
             shutil.chown(folder, self._user)
+        self._where = ("--host", "127.0.0.1", "--port", str(self.port), "--username", "me")
         self._run("initdb", "--pgdata", str(folder / "db"), "--auth", "trust", "--username", "me")
         self.start()
-        self._run(
-            "createdb",
-            "--host",
-            "127.0.0.1",
-            "--port",
-            str(self.port),
-            "--username",
-            "me",
-            "prefect",
-        )
+        self._run("createdb", *self._where, "prefect")
 
     @property
     def url(self) -> str:
@@ -71,26 +63,18 @@ class Postgres:
     def start(self) -> None:
         options = f"-p {self.port} -c listen_addresses=127.0.0.1 -c unix_socket_directories="
         log = str(self.folder / "log")
-        self._run(
-            "pg_ctl",
-            "start",
-            "--wait",
-            "--pgdata",
-            str(self.folder / "db"),
-            "--log",
-            log,
-            "--options",
-            options,
-        )
+        self._control("start", "--wait", "--log", log, "--options", options)
 
     def stop(self) -> None:
-        self._run("pg_ctl", "stop", "--mode", "immediate", "--pgdata", str(self.folder / "db"))
+        self._control("stop", "--mode", "immediate")
+
+    def _control(self, *arguments: str) -> None:
+        self._run("pg_ctl", *arguments, "--pgdata", str(self.folder / "db"))
 
     def dump(self) -> str:
         """Return every row of every table of Prefect's, as SQL."""
-        where = ["--host", "127.0.0.1", "--port", str(self.port), "--username", "me"]
         done = subprocess.run(
-            [_tools("pg_dump")[0], *where, "--data-only", "prefect"],
+            [_tools("pg_dump")[0], *self._where, "--data-only", "prefect"],
             check=True, timeout=START_S, stdin=subprocess.DEVNULL, capture_output=True, text=True,
         )  # fmt: skip
         return done.stdout

@@ -44,13 +44,6 @@ def copied(tmp_path: Path) -> Callable[[str], Path]:
     return copy
 
 
-def test_there_is_one_of_each() -> None:
-    assert FILES == [
-        "build.py", "executor.py", "family.py", "material_column.py", "metric.py", "model_size.py",
-        "object_source.py", "run.py", "scene_format.py", "sky.py", "surface.py", "template.py",
-    ]  # fmt: skip
-
-
 @for_each("name", FILES)
 def test_an_example_is_short_and_shows_its_command(name: str) -> None:
     text = (EXAMPLES / name).read_text()

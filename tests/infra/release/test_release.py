@@ -189,16 +189,7 @@ def test_what_kind_a_folder_is(dataset: Dataset, tmp_path: Path) -> None:
 
 def test_nothing_is_sent_that_nobody_could_use(dataset: Dataset, tmp_path: Path) -> None:
     root = dataset.folder.root
-    for name in (
-        "set",
-        "a/b/c",
-        "/set",
-        "ada/",
-        "ada/my set",
-        "ada/-set",
-        "a--b/set",
-        "ada/set.git",
-    ):
+    for name in ("set", "a/b/c", "ada/my set", "ada/-set", "a--b/set", "ada/set.git"):
         with pytest.raises(TrilightError, match="expected USER/NAME"):
             planned_upload(root, name)
     (root / "README.md").unlink()

@@ -34,18 +34,12 @@ def network(tmp_path: Path) -> Path:
     return write_network(tmp_path / "model.safetensors", max_triangles=2)
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
-    return tmp_path / "tiny.safetensors"
-
-
 def neural(source: str | Path, out: Path, network: Path, *more: str) -> dict[str, object]:
     return render(source, "--out", out, "--engine", "neural", "--checkpoint", network, *more)
 
 
 def test_every_form_of_a_scene_gives_the_picture_of_the_api(
-    network: Path, scene: Path, tmp_path: Path
+    network: Path, source: Path, tmp_path: Path
 ) -> None:
     shard = tmp_path / "train-000000.tar"
     write_shard(shard, [("000000012", encode_sample(tiny_sample(key="000000012")))])
@@ -55,14 +49,14 @@ def test_every_form_of_a_scene_gives_the_picture_of_the_api(
     with pytest.warns(UserWarning, match="3 triangles"):
         expected = renderer.render(tiny_scene(), 16)[1]
     sources: list[str | Path] = [
-        scene,
+        source,
         f"{shard}::000000012",
         tmp_path / "tiny.usda",
         tmp_path / "tiny.h5",
     ]
-    for row, source in enumerate(sources):
+    for row, form in enumerate(sources):
         out = tmp_path / f"{row}.exr"
-        found = neural(source, out, network, "--view", "1")
+        found = neural(form, out, network, "--view", "1")
         picture = decode_exr(out.read_bytes())
         # half floats are exact to 2^-11 of their value; HDF5 orders the triangles anew
         np.testing.assert_allclose(picture, expected, rtol=1e-3, atol=1e-4)
@@ -72,9 +66,9 @@ def test_every_form_of_a_scene_gives_the_picture_of_the_api(
     assert "trained on at most 2" in str(found["notes"])
 
 
-def test_the_picture_names_its_network(network: Path, scene: Path, tmp_path: Path) -> None:
+def test_the_picture_names_its_network(network: Path, source: Path, tmp_path: Path) -> None:
     out = tmp_path / "x.exr"
-    neural(scene, out, network)
+    neural(source, out, network)
     first = out.read_bytes()
     header = OpenEXR.File(io.BytesIO(first), header_only=True).header()
     assert header["trilight.engine"] == "neural"
@@ -88,13 +82,13 @@ def test_the_picture_names_its_network(network: Path, scene: Path, tmp_path: Pat
         "skip_empty_bundles": False,
     }
     assert str(tmp_path) not in str(header)
-    neural(scene, out, network)
+    neural(source, out, network)
     assert out.read_bytes() == first
 
 
-def test_both_engines_stand_side_by_side(network: Path, scene: Path, tmp_path: Path) -> None:
+def test_both_engines_stand_side_by_side(network: Path, source: Path, tmp_path: Path) -> None:
     out, arguments = tmp_path / "x.exr", ("--engine", "both", "--checkpoint", network)
-    found = render(scene, "--out", out, *arguments)
+    found = render(source, "--out", out, *arguments)
     traced, drawn = (
         decode_exr((tmp_path / f"x.{name}.exr").read_bytes()) for name in ("mitsuba", "neural")
     )
@@ -108,19 +102,19 @@ def test_both_engines_stand_side_by_side(network: Path, scene: Path, tmp_path: P
     np.testing.assert_array_equal(left, preview_srgb8(traced))
     np.testing.assert_array_equal(middle, preview_srgb8(drawn))
     np.testing.assert_array_equal(right, error_picture(drawn, traced))
-    render(scene, "--out", out, *arguments, "--exposure", "-2")
+    render(source, "--out", out, *arguments, "--exposure", "-2")
     darker = np.asarray(Image.open(tmp_path / "x.png"))
     np.testing.assert_array_equal(darker[24::16, :256:16], preview_srgb8(traced / 4))
     np.testing.assert_array_equal(darker[24:, 528:], sheet[24:, 528:])  # an error stays one
-    words = [str(word) for word in ("render", scene, "--out", out, *arguments, *SMALL)]
+    words = [str(word) for word in ("render", source, "--out", out, *arguments, *SMALL)]
     printed = trilight(words).output.replace("\n", "")
     for text in ("agreement", "samples per pixel", "model.safetensors; passes: 1", "x.png"):
         assert text in printed
 
 
-def test_radiance_beyond_half_floats_is_clipped_and_told(scene: Path, tmp_path: Path) -> None:
+def test_radiance_beyond_half_floats_is_clipped_and_told(source: Path, tmp_path: Path) -> None:
     bright = write_network(tmp_path / "bright.safetensors", bias=6.0)
-    found = neural(scene, tmp_path / "x.exr", bright)
+    found = neural(source, tmp_path / "x.exr", bright)
     assert found["clipped_pixels"] == 16 * 16
     assert "neural: pixels beyond what half floats hold were clipped" in str(found["notes"])
     assert decode_exr((tmp_path / "x.exr").read_bytes()).max() == 65504
@@ -137,7 +131,7 @@ def test_lights_are_rendered_in_groups_of_the_size_that_is_asked_for(
         assert found["passes"] == passes
 
 
-def test_mistakes_are_one_line(network: Path, scene: Path, tmp_path: Path) -> None:
+def test_mistakes_are_one_line(network: Path, source: Path, tmp_path: Path) -> None:
     out = tmp_path / "x.exr"
     for words, message in (
         (("--checkpoint", network), "expected --engine neural or both beside it"),
@@ -145,26 +139,26 @@ def test_mistakes_are_one_line(network: Path, scene: Path, tmp_path: Path) -> No
             ("--engine", "neural", "--checkpoint", tmp_path / "no"),
             f"checkpoint {tmp_path / 'no'}: no such file",
         ),
-        (("--engine", "neural", "--checkpoint", scene), str(tmp_path)),
-        (("--engine", "neural", "--checkpoint", network, "--resolution", "20"), "resolution is 20"),
+        (("--engine", "neural", "--checkpoint", source), str(tmp_path)),
         (
             ("--engine", "neural", "--checkpoint", network, "--precision", "half"),
             "--precision is 'half'; expected one of float32",
         ),
         (("--engine", "both", "--checkpoint", network, "--view", "2"), "--view is 2"),
     ):
-        assert message in mistake(scene, "--out", out, *words)
+        assert message in mistake(source, "--out", out, *words)
     assert not out.exists()
-    assert "no such file" in mistake(tmp_path / "none", "--out", tmp_path / "all")
     assert "only files of this machine" in mistake("https://h/{0..1}.h5", "--out", tmp_path / "all")
-    bad = mistake(scene, "--out", tmp_path / "all", "--cameras", tmp_path / "none.json")
+    bad = mistake(source, "--out", tmp_path / "all", "--cameras", tmp_path / "none.json")
     assert "none.json: no such file" in bad
-    assert "--view is 9" in mistake(scene, "--out", tmp_path / "all", "--orbit", "2", "--view", "9")
+    assert "--view is 9" in mistake(
+        source, "--out", tmp_path / "all", "--orbit", "2", "--view", "9"
+    )
 
 
-def test_a_turn_is_path_traced_to_a_video_and_kept(scene: Path, tmp_path: Path) -> None:
+def test_a_turn_is_path_traced_to_a_video_and_kept(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "turn.webp"
-    words = (scene, "--out", out, "--orbit", "3", "--fps", "10")
+    words = (source, "--out", out, "--orbit", "3", "--fps", "10")
     found = render(*words)
     assert found["video"] == str(out)
     assert [picture["kept"] for picture in found["pictures"]] == [False] * 3

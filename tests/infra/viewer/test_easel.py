@@ -228,17 +228,11 @@ def test_a_material_takes_the_place_of_its_texture() -> None:
 
 WRONG_EDITS: list[tuple[dict[str, Any], str]] = [
     ({"lamps": {"0": {}}}, "no lamp"),
-    ({"lamps": {"9": {}}}, "no lamp"),
     ({"lamps": {"-1": {}}}, "no lamp"),
-    ({"lamps": {"1": {"move": [0, 0]}}}, "move"),
     ({"lamps": {"1": {"move": [0, 0, 1e9]}}}, "move"),
-    ({"lamps": {"1": {"move": [0, 0, float("nan")]}}}, "move"),
     ({"lamps": {"1": {"gain": 0}}}, "gain"),
-    ({"lamps": {"1": {"gain": "much"}}}, "gain"),
     ({"lamps": {"1": 3}}, "lamps"),
-    ({"lamps": [1]}, "lamps"),
     ({"materials": {"7": {}}}, "no material 7"),
-    ({"materials": {"x": {}}}, "materials"),
     ({"materials": {"0": {"diffuse": [2, 0, 0]}}}, "diffuse"),
     ({"materials": {"0": {"diffuse": [0.9, 0.9, 0.9]}}}, "diffuse \\+ specular"),
     ({"materials": {"0": {"roughness": -1}}}, "roughness"),

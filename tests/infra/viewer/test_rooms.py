@@ -63,15 +63,11 @@ def asker(dataset: Dataset) -> Iterator[Asker]:
 FILTERS = [
     {},
     {"split": "train"},
-    {"template": "wall"},
     {"split": "validation", "template": "wall"},
-    {"triangles_min": "6"},
     {"triangles_min": "6", "triangles_max": "8"},
     {"lights_max": "0"},
-    {"floor_min": "33"},
     {"floor_min": "31.5", "floor_max": "35"},
     {"coverage_min": "0.3", "coverage_max": "0.7"},
-    {"coverage_min": "0.7"},
 ]
 
 
