@@ -15,8 +15,15 @@ from storage.dataset.dataset import open_dataset
 from storage.extensions import is_reference
 from tests.command_line import trilight
 from tests.conftest import ROOT
-from tests.end_to_end.production_kit import copy_objects, copy_of_the_project
-from tests.end_to_end.tutorial_kit import answer_of, shell_lines, steps_of, tutorial, viewed
+from tests.end_to_end.production_kit import (
+    answer_of,
+    copy_objects,
+    copy_of_the_project,
+    shell_lines,
+    steps_of,
+    tutorial,
+    viewed,
+)
 from tests.for_each import for_each
 
 README = ROOT / "README.md"

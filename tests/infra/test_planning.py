@@ -143,13 +143,10 @@ def test_each_finding_comes_before_the_next_look() -> None:
     assert told == ["machine", "disk"]
 
 
-def test_what_is_looked_at_is_called_as_what_is_found(findings: list[doctor.Finding]) -> None:
-    assert [finding.name for finding in findings] == list(doctor.CHECKS)
-
-
 def test_whatever_is_not_well_names_its_consequence_and_cure(
     findings: list[doctor.Finding],
 ) -> None:
+    assert [finding.name for finding in findings] == list(doctor.CHECKS)
     for finding in findings:
         assert bool(finding.consequence) == bool(finding.mend) == (finding.state != "ok")
 

@@ -37,7 +37,7 @@ from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
 from tests.for_each import case
-from tests.infra.bench.bench_kit import TINY, measured_rows
+from tests.infra.bench.test_harness import TINY, measured_rows
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.runs import RUNS, named_run
 
@@ -301,14 +301,13 @@ def test_an_interrupted_installation_does_not_count(
     assert len(steps) == 2 + 3  # and is remembered
 
 
-def test_a_python_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_python_that_is_missing_and_a_failing_step_are_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
     monkeypatch.setattr(environment, "PYTHON", "3.0")
     with pytest.raises(TrilightError, match=r"^Blender .*python3\.0 is not on the path.*\.$"):
         environment.blender_python()
-
-
-def test_what_a_failing_step_says_last_is_the_message() -> None:
     with pytest.raises(TrilightError, match=r"^Blender .*could not load it: no such wheel\.$"):
         environment._run("load it", ["sh", "-c", "echo first; echo no such wheel >&2; exit 3"])
 

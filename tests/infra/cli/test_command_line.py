@@ -15,7 +15,7 @@ from infra.cli.commands import COMMANDS
 from infra.cli.options import ALIASES
 from infra.cli.words import choices_of, is_repeated, takes_names, value_of
 from infra.cli.words import kind_of as kind_of_field
-from infra.setup.command_line_page import Command, every_command
+from infra.setup.command_line_page import every_command
 from infra.setup.generated_pages import PAGES
 from pipeline.shards.expression import TEXTS, condition, kind_of
 from storage.records.passes.declared import MOTION, declared_passes
@@ -76,12 +76,9 @@ def test_the_short_option_helps_everywhere() -> None:
         assert shown.stdout.startswith(f"Usage: {' '.join(['trilight', *words[:-1]])} ")
 
 
-def test_no_words_are_a_question_for_help() -> None:
+def test_no_words_are_a_question_for_help_and_the_version_is_a_number() -> None:
     assert trilight([]).stdout == trilight(["--help"]).stdout
     assert "--extend FILE.py" in trilight([]).stdout
-
-
-def test_the_version_is_that_of_the_distribution() -> None:
     shown = trilight(["--version"])
     assert (shown.exit_code, shown.stdout.split()[0]) == (0, "trilight")
     assert shown.stdout.split()[1][0].isdigit()
@@ -176,11 +173,6 @@ def test_an_option_that_two_classes_have_is_refused() -> None:
         command()(twice)
 
 
-def test_the_command_of_a_page_has_its_options() -> None:
-    assert isinstance(ALL["doctor"], Command)
-    assert [option.names for option in ALL["doctor"].options] == [("--measure",), ("--json",)]
-
-
 WORDS: dict[Any, tuple[str | tuple[str, ...], Any]] = {
     int: ("3", 3),
     float: ("0.5", 0.5),
@@ -232,13 +224,9 @@ def test_a_signal_in_the_middle_of_a_write_is_answered(name: str, number: int) -
     assert (run.returncode, run.stderr) == (130, "interrupted\n")
 
 
-def test_every_page_is_made() -> None:
-    for name, page in PAGES.items():
-        with case(name):
-            assert page().startswith("# ") and "\n| --- |" in page()
-
-
 def test_the_page_of_passes_names_every_pass() -> None:
+    for each_page in PAGES.values():
+        assert each_page().startswith("# ") and "\n| --- |" in each_page()
     page = PAGES["passes"]()
     for each in declared_passes():
         (row,) = [line for line in page.split("\n") if line.startswith(f"| `{each.name}` |")]

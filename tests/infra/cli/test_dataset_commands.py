@@ -48,6 +48,10 @@ def test_the_report_stands_in_the_dataset(tmp_path: Path) -> None:
     assert (tmp_path / "report.html").exists()
     assert (tmp_path / "contact_sheet.png").exists()
     assert len(list((tmp_path / "report").iterdir())) == 5
+    read = json.loads(inspect(tmp_path, "--json"))
+    assert read["distributions"]["quantities"]["objects_per_scene"]["max"] == 2
+    assert read["licences"] == {"CC-BY-4.0": 1, "CC0-1.0": 3}
+    assert read["rejections"][0] == ["scenes", "no_room", 2]
 
 
 def test_a_run_is_summed_up_and_the_command_that_shows_it_named(tmp_path: Path) -> None:
@@ -74,15 +78,6 @@ def test_a_read_only_dataset_is_summed_up(tmp_path: Path, monkeypatch: pytest.Mo
     assert "5 (1 test, 4 train)" in printed
     assert "--out" in printed
     assert not (tmp_path / "report.html").exists()
-
-
-def test_json_holds_the_distributions(tmp_path: Path) -> None:
-    five_scenes(tmp_path)
-    read = json.loads(inspect(tmp_path, "--json"))
-    assert read["distributions"]["quantities"]["objects_per_scene"]["max"] == 2
-    assert read["licences"] == {"CC-BY-4.0": 1, "CC0-1.0": 3}
-    assert read["rejections"][0] == ["scenes", "no_room", 2]
-    assert (tmp_path / "report.html").exists()
 
 
 def test_parts_show_with_their_floors(tmp_path: Path) -> None:

@@ -122,23 +122,22 @@ def test_routes_mistakes_and_bodies(asker: Asker) -> None:
     assert asker.ask("api/echo", "x" * MAX_BODY_BYTES)[0] == 413
 
 
-def test_no_other_verb_is_known(asker: Asker) -> None:
+def sent(asker: Asker, verb: str, head: str, text: str = "") -> str:
+    """Return the answer to a request that no library would send."""
+    with socket.create_connection(("127.0.0.1", asker.port), timeout=30) as line:
+        request = f"{verb} /{asker.word}/api/echo HTTP/1.1\r\nHost: {asker.here}\r\n{head}"
+        line.sendall(f"{request}Connection: close\r\n\r\n{text}".encode())
+        return line.makefile("rb").read().decode()
+
+
+def test_no_other_verb_is_known_and_a_body_that_is_no_json_is_a_sentence(asker: Asker) -> None:
     for verb in ("PUT", "DELETE", "OPTIONS", "HEAD"):
-        with socket.create_connection(("127.0.0.1", asker.port), timeout=30) as line:
-            request = f"{verb} /{asker.word}/api/echo HTTP/1.1\r\nHost: {asker.here}\r\n\r\n"
-            line.sendall(request.encode())
-            answer = line.recv(1 << 16).decode()
+        answer = sent(asker, verb, "")
         assert answer.startswith("HTTP/1.1 501"), verb
         assert "access-control" not in answer.lower()
-
-
-def test_a_body_that_is_no_json_is_a_sentence(asker: Asker) -> None:
-    with socket.create_connection(("127.0.0.1", asker.port), timeout=30) as line:
-        text = "[" * 100_000
-        head = f"POST /{asker.word}/api/echo HTTP/1.1\r\nHost: {asker.here}\r\n"
-        head += f"Origin: http://{asker.here}\r\nContent-Length: {len(text)}\r\n"
-        line.sendall(f"{head}Connection: close\r\n\r\n{text}".encode())
-        assert b"the request is no JSON" in line.makefile("rb").read()
+    text = "[" * 100_000
+    head = f"Origin: http://{asker.here}\r\nContent-Length: {len(text)}\r\n"
+    assert "the request is no JSON" in sent(asker, "POST", head, text)
 
 
 def test_it_listens_on_this_machine_alone_and_says_which_port_is_taken() -> None:
