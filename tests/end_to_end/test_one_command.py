@@ -46,7 +46,10 @@ BAD_INPUT = [
     (("generate", "smoke", "--address", "tcp://127.0.0.1:9"), "--runner is threads"),
     (("generate", "smoke", "--shards", "7"), "shards is '7'"),
     (("generate", "smoke", "--scenes", "8", "--shards", "2:4"), "one that begins below 2"),
-    (("generate", "smoke", "--objects", "env:TRILIGHT_NONE"), "'TRILIGHT_NONE' is not set"),
+    (
+        ("generate", "smoke", "--objects", "env:TRILIGHT_SOURCE_X"),
+        "'TRILIGHT_SOURCE_X' is not set",
+    ),
     (("verify", "empty"), "no manifest.json"),
     (("train", "smoke", "--data", "empty"), "no manifest.json"),
     (("shards", "select", "empty", "--out", "c", "--split", "no"), "--split is 'no'"),

@@ -258,7 +258,7 @@ def test_a_shard_needs_a_key_that_it_has_and_a_lawful_scene(tmp_path: Path) -> N
     with pytest.raises(TrilightError, match="train-000000.tar|000000012"):
         load_source(scene_source(f"{shard}::000000012"))
     lawless = tiny_scene(fov_deg=np.array([45, 181], np.float32))
-    _shard(shard, lawless)
+    shard = _shard(tmp_path / "train-000001.tar", lawless)
     with pytest.raises(TrilightError, match=r"sample 000000012: scene: fov_deg\[1\] is 181"):
         load_source(scene_source(f"{shard}::000000012"))
 

@@ -306,12 +306,10 @@ def test_missing_pictures_are_counted_and_the_first_is_named(folder: Path, tmp_p
 
 
 BAD_PICTURES: list[tuple[bytes, str]] = [
-    (encoded(picture(0, 12)), "12 x 12 pixels; expected 8 x 8 or 16 x 16"),
-    (encoded(picture(0)[:8]), "16 x 8 pixels; expected 8 x 8 or 16 x 16"),
-    (encoded(picture(0, 8)), "has 8"),
-    (b"", "no readable OpenEXR picture of channels R, G"),
-    (b"\x76\x2f\x31\x01 cut", "no readable OpenEXR picture of channels R, G"),
-    (encode_channels({"Y": picture(0)[..., 0].copy()}), "no readable OpenEXR picture"),
+    (encoded(picture(0)[:8]), ": 16 x 8 pixels; expected 8 x 8 or 16 x 16"),
+    (encoded(picture(0, 8)), " has 8"),
+    (b"\x76\x2f\x31\x01 cut", ": no readable OpenEXR picture of channels R, G"),
+    (encode_channels({"Y": picture(0)[..., 0].copy()}), ": no readable OpenEXR picture"),
 ]
 
 
@@ -319,10 +317,7 @@ def test_what_is_no_picture_of_the_set_is_said(folder: Path) -> None:
     for data, said in BAD_PICTURES:
         with case(said):
             (folder / picture_name(*SHOWN[2])).write_bytes(data)
-            told = refusal(folder)
-            assert f"000000001_view_0.exr: {said}" in told or (
-                "several widths" in told and f"000000001_view_0.exr {said}" in told
-            )
+            assert f"000000001_view_0.exr{said}" in refusal(folder)
 
 
 def test_values_that_are_no_radiance_are_said_with_their_place(folder: Path) -> None:

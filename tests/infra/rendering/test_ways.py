@@ -226,14 +226,10 @@ def costs_of_here() -> PictureCosts:
     return PictureCosts(machine=machine_name(VARIANT), rows=tuple(slower))
 
 
-@pytest.mark.usefixtures("cache")
-def test_without_a_file_costs_are_shipped() -> None:
+def test_costs_that_were_measured_here_win(cache: Path) -> None:
     found = known_costs(VARIANT)
     assert found.costs == shipped_table().costs
     assert f"costs as shipped: `{MEASURE}` measures this machine" == found.source
-
-
-def test_costs_that_were_measured_here_win(cache: Path) -> None:
     path = keep_machine_costs(costs_of_here())
     assert path == machine_costs_path() and path.is_relative_to(cache)
     found = known_costs(VARIANT)

@@ -168,9 +168,6 @@ def test_a_broken_manifest_is_found() -> None:
             rows = copy.deepcopy(documents())
             BROKEN_MANIFESTS[fault](rows)
             assert any(fault in said for said in faults_of_manifests(rows, job_template()))
-
-
-def test_a_broken_job_template_is_found() -> None:
     broken = json.loads(json.dumps(job_template()).replace("RuntimeDefault", "Unconfined"))
     said = list(faults_of_manifests(documents(), broken))
     assert said == ["job template: no seccomp profile"]

@@ -197,14 +197,9 @@ def test_a_scene_is_saved_with_its_changes_and_nothing_is_written_here() -> None
                     assert asker.ask("api/export", {"form": bad})[0] == 422
 
 
-def test_nothing_is_the_scene_itself() -> None:
-    scene = tiny_scene()
-    assert edited(scene, {}) is scene
-    assert edited(scene, {"lamps": {}, "materials": {}}) is scene
-
-
 def test_a_lamp_moves_and_shines_brighter_and_all_else_stays() -> None:
     scene = tiny_scene()
+    assert edited(scene, {}) is edited(scene, {"lamps": {}, "materials": {}}) is scene
     found = edited(scene, {"lamps": {str(LIGHT): {"move": [0.5, 0, -1], "gain": 2}}})
     lamp = scene.faces[2]
     assert found.vertex_positions[lamp] == pytest.approx(
@@ -281,11 +276,8 @@ def test_every_triangle_stands_in_the_group_of_its_object_and_material() -> None
     assert head["materials"][0]["maps"] == {"diffuse": 0, "roughness": 1}
     assert head["cameras"][1]["c2w"] == pytest.approx(scene.c2w[1].reshape(-1).tolist())
     assert [lamp["object"] for lamp in head["lamps"]] == [1]
-
-
-def test_a_scene_without_textures_has_no_coordinates() -> None:
-    head, _, _, uv = parts(tiny_scene())
-    assert not head["uv"] and not len(uv)
+    plain, _, _, none = parts(tiny_scene())
+    assert not plain["uv"] and not len(none), "without textures there are no coordinates"
 
 
 def test_textures_come_with_their_bottom_row_last() -> None:
