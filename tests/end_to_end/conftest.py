@@ -5,8 +5,9 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -73,17 +74,20 @@ def marked_environment() -> tuple[str, dict[str, str]]:
     return mark, {**os.environ, name: value}
 
 
-def processes_with(mark: str) -> list[str]:
-    """Return the command lines of all living processes that carry the mark."""
-    found = []
+def _marked(mark: str) -> Iterator[tuple[int, str]]:
+    """Yield number and command line of every process that carries the mark; the dead have none."""
     for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            alive = (folder / "stat").read_text().rsplit(")")[-1].split()[0] != "Z"
-            if alive and mark.encode() in (folder / "environ").read_bytes():
-                found.append((folder / "cmdline").read_text().replace("\0", " "))
-        except OSError:
-            continue
-    return found
+        with contextlib.suppress(OSError):
+            if mark.encode() in (folder / "environ").read_bytes():
+                yield int(folder.name), (folder / "cmdline").read_text().replace("\0", " ")
+
+
+def wait_until_nobody_is_left(mark: str) -> None:
+    """Wait for the end of all processes that carry the mark."""
+    deadline = time.monotonic() + 30
+    while (left := list(_marked(mark))) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not left
 
 
 def kill_one(word: str, mark: str, rng: np.random.Generator) -> bool:
@@ -92,15 +96,9 @@ def kill_one(word: str, mark: str, rng: np.random.Generator) -> bool:
     Returns:
         Whether there was any.
     """
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            carries = mark.encode() in (folder / "environ").read_bytes()  # the dead have none
-            line = (folder / "cmdline").read_bytes().replace(b"\0", b" ")
-            if carries and word.encode() in line:
-                found.append(int(folder.name))
+    found = sorted(number for number, line in _marked(mark) if word in line)
     try:
-        os.kill(int(rng.choice(sorted(found))), signal.SIGKILL)
+        os.kill(int(rng.choice(found)), signal.SIGKILL)
     except (ValueError, ProcessLookupError):  # nobody to choose from, or just ended
         return False
     return True

@@ -1,4 +1,4 @@
-"""The production path, private to a test: PostgreSQL, what `make serve` starts, a Dask cluster."""
+"""The documented ways: a private production path, and what tutorials tell a reader to do."""
 
 import contextlib
 import json
@@ -6,13 +6,17 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import time
 import tomllib
+import urllib.error
+import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -51,18 +55,10 @@ class Postgres:
         self._user = "postgres" if os.geteuid() == 0 else None
         if self._user:
             shutil.chown(folder, self._user)
+        self._where = ("--host", "127.0.0.1", "--port", str(self.port), "--username", "me")
         self._run("initdb", "--pgdata", str(folder / "db"), "--auth", "trust", "--username", "me")
         self.start()
-        self._run(
-            "createdb",
-            "--host",
-            "127.0.0.1",
-            "--port",
-            str(self.port),
-            "--username",
-            "me",
-            "prefect",
-        )
+        self._run("createdb", *self._where, "prefect")
 
     @property
     def url(self) -> str:
@@ -71,26 +67,18 @@ class Postgres:
     def start(self) -> None:
         options = f"-p {self.port} -c listen_addresses=127.0.0.1 -c unix_socket_directories="
         log = str(self.folder / "log")
-        self._run(
-            "pg_ctl",
-            "start",
-            "--wait",
-            "--pgdata",
-            str(self.folder / "db"),
-            "--log",
-            log,
-            "--options",
-            options,
-        )
+        self._control("start", "--wait", "--log", log, "--options", options)
 
     def stop(self) -> None:
-        self._run("pg_ctl", "stop", "--mode", "immediate", "--pgdata", str(self.folder / "db"))
+        self._control("stop", "--mode", "immediate")
+
+    def _control(self, *arguments: str) -> None:
+        self._run("pg_ctl", *arguments, "--pgdata", str(self.folder / "db"))
 
     def dump(self) -> str:
         """Return every row of every table of Prefect's, as SQL."""
-        where = ["--host", "127.0.0.1", "--port", str(self.port), "--username", "me"]
         done = subprocess.run(
-            [_tools("pg_dump")[0], *where, "--data-only", "prefect"],
+            [_tools("pg_dump")[0], *self._where, "--data-only", "prefect"],
             check=True, timeout=START_S, stdin=subprocess.DEVNULL, capture_output=True, text=True,
         )  # fmt: skip
         return done.stdout
@@ -261,3 +249,72 @@ def _wait_for_workers(address: str, workers: int) -> None:
             client.wait_for_workers(workers, timeout=START_S)
             return
     raise AssertionError("the Dask cluster did not start")
+
+
+_BLOCK = re.compile(r"```(sh|python)\n(.*?)```", re.DOTALL)
+
+_END_S = 600
+"""The end waits for the step at hand: 13 s on two busy cores, and over a minute on busier ones."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """One thing that a reader does."""
+
+    language: str
+    """`sh` or `python`."""
+    text: str
+    """A command, or the whole block of Python."""
+
+
+def tutorial(name: str) -> Path:
+    """Return the file of a tutorial."""
+    return ROOT / "docs" / "tutorials" / f"{name}.md"
+
+
+def steps_of(page: Path) -> Iterator[Step]:
+    """Yield the commands of a page's `sh` blocks, and its `python` blocks, in their order."""
+    for language, text in _BLOCK.findall(page.read_text()):
+        if language == "python":
+            yield Step(language="python", text=text)
+        else:
+            for line in shell_lines(text):
+                yield Step(language="sh", text=line)
+
+
+def shell_lines(text: str) -> list[str]:
+    """Return the commands of a script, each on one line, without comments."""
+    lines = (line.split(" #")[0].strip() for line in text.replace("\\\n", " ").splitlines())
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+@contextlib.contextmanager
+def viewed(command: Sequence[str], folder: Path) -> Iterator[str]:
+    """Yield the address of a page that a command serves; it has to end cleanly at Ctrl-C."""
+    run = subprocess.Popen(
+        [*command, "--no-browser"], cwd=folder,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "COLUMNS": "200"},
+    )  # fmt: skip
+    assert run.stdout is not None
+    try:
+        assert run.stdout.readline().startswith("Opening")
+        while not (found := re.search(r"http://\S+", line := run.stdout.readline())):
+            assert line, "it has ended before it said an address"
+        yield found[0]
+        with contextlib.suppress(urllib.error.HTTPError):
+            answer_of(found[0], "api/none")  # comes once the source is open: Ctrl-C is waited for
+        run.send_signal(signal.SIGINT)
+        out, errors = run.communicate(timeout=_END_S)
+        assert (run.returncode, errors) == (0, ""), errors
+        assert out.rstrip().endswith("Ended.")
+    finally:
+        run.kill()
+        run.wait()
+
+
+def answer_of(address: str, path: str) -> bytes:
+    """Return what a page is told, as its script asks for it."""
+    with urllib.request.urlopen(address + path, timeout=120) as answer:
+        data: bytes = answer.read()
+    return data

@@ -16,7 +16,12 @@ import pytest
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import shard_row
 from storage.dataset.verify import verify_dataset
-from tests.end_to_end.conftest import kill_one, marked_environment, num_meshes, processes_with
+from tests.end_to_end.conftest import (
+    kill_one,
+    marked_environment,
+    num_meshes,
+    wait_until_nobody_is_left,
+)
 from tests.end_to_end.production_kit import call, postgres, served, start_served, stop_served
 from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import five_scenes
@@ -181,7 +186,7 @@ def test_kills_of_everything_end_in_the_same_digest(tmp_path: Path) -> None:
     assert verify_dataset(out).problems == []
     assert set(killed) >= set(list(SHARES)[:KILLS]), killed  # a kill is too few to be of each kind
     _nothing_was_made_twice(out)
-    _wait_until_nobody_is_left(mark)
+    wait_until_nobody_is_left(mark)
 
 
 def _nothing_was_made_twice(out: Path) -> None:
@@ -192,10 +197,3 @@ def _nothing_was_made_twice(out: Path) -> None:
     ]
     assert [scene for scene, number in Counter(rows).items() if number > 1] == []
     assert SCENES - KILLS <= len(rows) <= SCENES
-
-
-def _wait_until_nobody_is_left(mark: str) -> None:
-    deadline = time.monotonic() + 30
-    while (left := processes_with(mark)) and time.monotonic() < deadline:
-        time.sleep(0.2)
-    assert not left

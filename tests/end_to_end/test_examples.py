@@ -44,13 +44,6 @@ def copied(tmp_path: Path) -> Callable[[str], Path]:
     return copy
 
 
-def test_there_is_one_of_each() -> None:
-    assert FILES == [
-        "build.py", "executor.py", "family.py", "material_column.py", "metric.py", "model_size.py",
-        "object_source.py", "run.py", "scene_format.py", "sky.py", "surface.py", "template.py",
-    ]  # fmt: skip
-
-
 @for_each("name", FILES)
 def test_an_example_is_short_and_shows_its_command(name: str) -> None:
     text = (EXAMPLES / name).read_text()
@@ -60,16 +53,13 @@ def test_an_example_is_short_and_shows_its_command(name: str) -> None:
     assert all(f" {name}" in line for line in shown)
 
 
-def test_a_template_makes_scenes(copied: Callable[[str], Path]) -> None:
+def test_a_template_and_a_family_make_scenes(copied: Callable[[str], Path]) -> None:
     with loaded(copied("template.py")):
         settings = named_build("smoke", changes={"scenes.families": "corridor"}).scenes
         layouts = [one_drawn(settings, index).layout for index in range(8)]
     assert {tuple(part.name for part in layout.shell) for layout in layouts} == {
         ("floor", "wall1", "wall2")
     }
-
-
-def test_a_family_makes_scenes(copied: Callable[[str], Path]) -> None:
     with loaded(copied("family.py")):
         settings = named_build("smoke", changes={"scenes.families": "crowd"}).scenes
         assert 5 <= len(one_drawn(settings, 0).layout.objects) <= 8
@@ -108,16 +98,12 @@ def test_a_material_column_is_drawn_and_stored(copied: Callable[[str], Path]) ->
         decode_scene_file(stored, "scene")
 
 
-def test_a_build_of_a_file(copied: Callable[[str], Path]) -> None:
+def test_a_build_and_a_run_of_a_file(copied: Callable[[str], Path]) -> None:
     with room_for_extensions():
         build = typed_build(f"{copied('build.py')}:sunsets")
         settings = named_build(build, seed=3)
         assert (settings.build, settings.seed, BUILDS[build].num_scenes) == ("sunsets", 3, 32)
         assert settings.scenes.lights.count == (1, 2)
-
-
-def test_a_run_of_a_file(copied: Callable[[str], Path]) -> None:
-    with room_for_extensions():
         run = typed_run(f"{copied('run.py')}:quick_lights")
         assert changed_run(run, {"seed": 4}, steps=60).warmup_steps == 10
 

@@ -24,7 +24,7 @@ from tests.end_to_end.conftest import (
     kill_one,
     marked_environment,
     num_meshes,
-    processes_with,
+    wait_until_nobody_is_left,
 )
 
 ARGUMENTS = (
@@ -43,13 +43,6 @@ def _start(out: Path, workers: int, environment: dict[str, str]) -> "subprocess.
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-
-
-def _wait_until_nobody_is_left(mark: str) -> None:
-    deadline = time.monotonic() + 15
-    while (left := processes_with(mark)) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not left
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,11 +94,11 @@ def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path, whole: Whole) -
         except subprocess.TimeoutExpired:
             run.kill()
             run.wait()
-        _wait_until_nobody_is_left(mark)
+        wait_until_nobody_is_left(mark)
         for shard in (tmp_path / "killed").glob("*.tar"):
             assert shard.read_bytes() == (whole.folder / shard.name).read_bytes()
     assert _start(tmp_path / "killed", 2, environment).wait() == 0
-    _wait_until_nobody_is_left(mark)
+    wait_until_nobody_is_left(mark)
     assert open_dataset(str(tmp_path / "killed")).digest == whole.digest
     assert verify_dataset(tmp_path / "killed").problems == []
     # young leftovers may be somebody's work on another machine; old ones go with the next run
@@ -142,7 +135,7 @@ def test_kills_of_children_end_in_the_same_digest(tmp_path: Path, whole: Whole) 
     assert min(killed["meshes"], killed["scenes"]) > 0
     assert open_dataset(str(out)).digest == whole.digest
     assert [row for row in open_dataset(str(out)).failures() if is_passing(row.reason)] == []
-    _wait_until_nobody_is_left(mark)
+    wait_until_nobody_is_left(mark)
 
 
 @pytest.mark.slow("kills")
@@ -175,7 +168,7 @@ def test_ctrl_c_says_what_to_do_and_leaves_nobody(tmp_path: Path, moment: str) -
     told = f"trilight: interrupted. What was finished is safe; to go on, run: {again}"
     assert bytes(shown).rstrip().endswith(told.encode())
     assert shown.rfind(b"\x1b[?25h") > shown.rfind(b"\x1b[?25l") >= 0
-    _wait_until_nobody_is_left(mark)
+    wait_until_nobody_is_left(mark)
 
 
 def _read_all(terminal: int, shown: bytearray) -> None:

@@ -1,12 +1,15 @@
-"""Real objects with their licenses, and mistakes that one line answers."""
+"""`trilight generate` on real files, shards made anew, and mistakes that one line answers."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.staging import stage_scene
 from storage.records.objects import read_failures
 from tests.end_to_end.conftest import Trilight
 from tests.end_to_end.production_kit import copy_objects
@@ -34,20 +37,22 @@ def test_real_objects_with_their_licences(trilight: Trilight, shared: Path, tmp_
 BAD_INPUT = [
     (("generate", "nonsense"), "build 'nonsense' is unknown; expected one of smoke"),
     (("generate", "smoke", "--objects", "nowhere"), "nowhere"),
-    (("generate", "smoke", "--objects", "empty"), "empty"),
     (("generate", "smoke", "--objects", "broken"), "none was accepted"),
     (("generate", "smoke", "--objects", "twice"), "objects.jsonl:2: uid 'a' is already used"),
     (("generate", "smoke", "--out", "/proc/nowhere"), "cannot write"),
     (("generate", "smoke", "--resolution", "100"), "resolution"),
-    (("generate", "smoke", "--scenes", "0"), "scenes is 0"),
-    (("generate", "smoke", "--workers", "0"), "workers is 0"),
+    (("generate", "smoke", "--runner", "ray"), "--runner is 'ray'"),
+    (("generate", "smoke", "--runner", "dask"), "--address is None"),
+    (("generate", "smoke", "--address", "tcp://127.0.0.1:9"), "--runner is threads"),
+    (("generate", "smoke", "--shards", "7"), "shards is '7'"),
+    (("generate", "smoke", "--scenes", "8", "--shards", "2:4"), "one that begins below 2"),
+    (
+        ("generate", "smoke", "--objects", "env:TRILIGHT_SOURCE_X"),
+        "'TRILIGHT_SOURCE_X' is not set",
+    ),
     (("verify", "empty"), "no manifest.json"),
-    (("inspect", "empty"), "no manifest.json"),
     (("train", "smoke", "--data", "empty"), "no manifest.json"),
-    (("train", "nonsense", "--data", "empty"), "'nonsense'"),
-    (("shards", "merge", "empty", "empty", "--out", "c"), "no manifest.json"),
     (("shards", "select", "empty", "--out", "c", "--split", "no"), "--split is 'no'"),
-    (("bench", "nonsense"), "experiment 'nonsense' is unknown"),
 ]
 
 
@@ -62,3 +67,152 @@ def test_bad_input_is_one_clear_line(refused: Callable[..., str], tmp_path: Path
     (tmp_path / "twice" / "objects.jsonl").write_text(2 * (json.dumps(row) + "\n"))
     for arguments, message in BAD_INPUT:
         assert message in refused(*arguments), arguments
+
+
+TWO_SHARDS = (
+    "--scenes", "8", "--seed", "3", "--resolution", "32", "--noise-floor", "20",
+    "--set", "scenes.num_views=2", "--set", "scenes.families.0.weight=2",
+)  # fmt: skip
+
+
+@pytest.mark.slow("commands")
+def test_bad_and_missing_shards_are_made_anew(
+    trilight: Trilight, refused: Callable[..., str], tmp_path: Path
+) -> None:
+    made = trilight("generate", "smoke", "--out", "set", *TWO_SHARDS)
+    assert made.returncode == 0, made.stderr
+    root = tmp_path / "set"
+    names = sorted(path.name for path in root.glob("*.tar"))
+    assert len(names) == 2
+    whole = {name: (root / name).read_bytes() for name in names}
+    manifest = json.loads((root / "manifest.json").read_text())
+    times = {name: (root / name).stat().st_mtime_ns for name in names}
+
+    damaged = bytearray(whole[names[1]])
+    damaged[len(damaged) // 2] ^= 1
+    (root / names[1]).write_bytes(damaged)
+    found = trilight("verify", "set", "--json")
+    assert found.returncode == 1
+    assert json.loads(found.stdout)["bad_shards"] == [names[1]]
+
+    repaired = trilight("verify", "set", "--repair")
+    assert repaired.returncode == 0, repaired.stdout + repaired.stderr
+    assert {name: (root / name).read_bytes() for name in names} == whole
+    assert json.loads((root / "manifest.json").read_text()) == manifest
+    assert (root / names[0]).stat().st_mtime_ns == times[names[0]]
+    assert not list(root.glob("*.bad"))
+    assert "cannot be read" in refused("verify", "http://127.0.0.1:1/set", "--repair")
+
+
+EXACT = (
+    *("--resolution", "64", "--noise-floor", "20", "--json"),
+    *("--set", 'storage.profile="lossless"'),  # so that a sample that was read is staged as it was
+)
+
+
+@pytest.fixture
+def scenes(shared: Path, tmp_path: Path) -> Path:
+    """A folder with two scenes, and with the meshes of all."""
+    source = shared / "renderformer_scenes"
+    for name in ("objects", "templates"):
+        shutil.copytree(source / name, tmp_path / "scenes" / name)
+    for name in ("cbox", "crystals"):
+        shutil.copy(source / f"{name}.json", tmp_path / "scenes")
+    return tmp_path / "scenes"
+
+
+@pytest.mark.slow("commands")
+def test_existing_scenes_become_a_dataset(
+    trilight: Trilight, refused: Callable[..., str], scenes: Path, tmp_path: Path
+) -> None:
+    def generate(out: str, *more: str) -> dict[str, object]:
+        made = trilight("generate", "smoke", "--scenes-from", "scenes", "--out", out, *EXACT, *more)
+        assert made.returncode == 0, made.stderr
+        return dict(json.loads(made.stdout[made.stdout.index("{") :]))
+
+    outcome = generate("set")
+    assert (outcome["scenes"], outcome["views"], outcome["notes"]) == (2, 2, [])
+    assert trilight("verify", "set").returncode == 0
+
+    dataset = open_dataset(str(tmp_path / "set"))
+    (shard,) = dataset.manifest.shards
+    assert (shard.name, shard.split) == ("test-000000.tar", "test")
+    samples = list(dataset.read_shard(shard))
+    assert [sample.scene.provenance["scene_file"]["name"] for sample in samples] == [
+        "cbox.json",
+        "crystals.json",
+    ]
+    for sample in samples:
+        assert sample.radiance_rgb.shape == (1, 64, 64, 3)
+        assert sample.radiance_rgb.mean() > 0.01
+
+    # as a kill leaves it: no shard, and one of its two scenes finished
+    (tmp_path / "set" / shard.name).unlink()
+    stage_scene(dataset.folder.staged_shard(shard.name), 0, samples[0], [], "lossless")
+    log = dataset.folder.logs / f"{shard.name}.jsonl"
+    before = len(log.read_text().splitlines())
+    assert generate("set")["dataset_digest"] == outcome["dataset_digest"]
+    assert len(log.read_text().splitlines()) == before + 1
+
+    whole = (tmp_path / "set" / shard.name).read_bytes()
+    damaged = bytearray(whole)
+    damaged[len(damaged) // 2] ^= 1
+    (tmp_path / "set" / shard.name).write_bytes(damaged)
+    assert "expected --scenes-from FOLDER" in refused("verify", "set", "--repair")
+    repaired = trilight("verify", "set", "--repair", "--scenes-from", "scenes")
+    assert repaired.returncode == 0, repaired.stdout + repaired.stderr
+    assert (tmp_path / "set" / shard.name).read_bytes() == whole
+    assert open_dataset(str(tmp_path / "set")).manifest == dataset.manifest
+
+    with (scenes / "objects/cbox/tall-box.obj").open("a") as stream:
+        stream.write("\n")
+    changed = refused("generate", "smoke", "--scenes-from", "scenes", "--out", "set", *EXACT)
+    assert "scene file objects/cbox/tall-box.obj: has changed" in changed
+    assert DatasetFolder(tmp_path / "set").shard(shard.name).exists()
+
+
+def test_bad_scenes_are_one_clear_line(
+    refused: Callable[..., str], scenes: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "bad.json").write_text('{"scene_name": "x", "version": "1.0"}')
+    for arguments, message in (
+        (("--scenes-from", "bad"), "none of the 1 scene files is usable; the first: bad.json: "),
+        (("--scenes-from", "scenes", "--albedo-over-one", "no"), "expected one of scale, refuse"),
+        (("--scenes-from", "nowhere"), "no such folder"),
+        (("--views", "2"), "--views is 2"),
+    ):
+        assert message in refused("generate", "smoke", "--out", "set", *arguments)
+
+
+@pytest.mark.slow("commands")
+def test_a_bad_file_and_a_dark_scene_cost_themselves(
+    trilight: Trilight, refused: Callable[..., str], scenes: Path, tmp_path: Path
+) -> None:
+    """The first of three is no scene, the second dark; the third has albedos that add up to 1.1."""
+    (scenes / "bad.json").write_text('{"scene_name": "x", "version": "1.0", "objects": {}}')
+    dark = json.loads((scenes / "cbox.json").read_text())
+    dark["objects"]["light_0"]["material"]["emissive"] = [0.1, 0.1, 0.1]
+    (scenes / "cbox.json").write_text(json.dumps(dark))
+    bright = json.loads((scenes / "crystals.json").read_text())
+    bright["objects"]["background_0"]["material"] |= {"diffuse": [0.6] * 3, "specular": [0.5] * 3}
+    (scenes / "crystals.json").write_text(json.dumps(bright))
+    arguments = ("--scenes-from", "scenes", "--out", "set", "--failure-budget", "0.4")
+    made = trilight("generate", "smoke", *arguments, *EXACT)
+    assert made.returncode == 0, made.stderr
+    outcome = json.loads(made.stdout[made.stdout.index("{") :])
+    assert (outcome["scenes"], outcome["scenes_given_up"]) == (1, 2)
+    assert any("background_0: diffuse + specular is 1.1000" in note for note in outcome["notes"])
+    failures = read_failures(DatasetFolder(tmp_path / "set").failures)
+    rows = sorted(failures, key=lambda row: row.item)
+    assert [(row.item, row.reason, row.attempt) for row in rows] == [
+        ("000000000", "unusable_scene_file", 0),
+        ("000000001", "black_view", 0),
+    ]
+    assert "bad.json: cameras is missing" in rows[0].message
+    assert trilight("verify", "set").returncode == 0
+    again = trilight("generate", "smoke", *arguments, *EXACT, "--workers", "2")
+    assert json.loads(again.stdout)["dataset_digest"] == outcome["dataset_digest"]
+    # it would be another set
+    strict = refused("generate", "smoke", *arguments, *EXACT, "--albedo-over-one", "refuse")
+    assert "scene file crystals.json: is missing" in strict

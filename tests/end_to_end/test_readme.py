@@ -1,4 +1,4 @@
-"""The commands of README and tutorials do what is said; those of all pages exist."""
+"""The commands of README, tutorials and how-to pages do what is said; those of all pages exist."""
 
 import json
 import os
@@ -10,11 +10,21 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from infra.setup.generated_pages import PAGES as GENERATED
 from storage.dataset.dataset import open_dataset
+from storage.extensions import is_reference
 from tests.command_line import trilight
 from tests.conftest import ROOT
-from tests.end_to_end.production_kit import copy_objects, copy_of_the_project
-from tests.end_to_end.tutorial_kit import answer_of, shell_lines, steps_of, tutorial, viewed
+from tests.end_to_end.production_kit import (
+    answer_of,
+    copy_objects,
+    copy_of_the_project,
+    shell_lines,
+    steps_of,
+    tutorial,
+    viewed,
+)
+from tests.for_each import for_each
 
 README = ROOT / "README.md"
 TUTORIALS = [
@@ -46,8 +56,10 @@ def _shell_lines(page: Path) -> list[str]:
     return shell_lines(text)
 
 
-PAGES = [README, SCRIPT, *sorted((ROOT / "docs").rglob("*.md"))]
-USED = sorted({line for page in PAGES for line in _shell_lines(page)})
+PAGES = [README, ROOT / "CONTRIBUTING.md", SCRIPT, *sorted((ROOT / "docs").rglob("*.md"))]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+SHOWN = re.findall(r"^    (trilight .*)$", "".join(e.read_text() for e in EXAMPLES), re.MULTILINE)
+USED = sorted({*SHOWN, *(line for page in PAGES for line in _shell_lines(page))})
 """Every command that a person is told to type."""
 
 
@@ -69,8 +81,6 @@ COMMANDS = sorted({_command(words) for line in USED if (words := _trilight_words
 
 
 def test_readme_and_tutorials_show_commands() -> None:
-    assert "make dataset" in _shell_lines(README)
-    assert "`make test`" in README.read_text()
     for page in (README, *TUTORIALS[1:], SCRIPT):
         assert any(_trilight_words(line) for line in _shell_lines(page)), page
     assert set(TUTORIALS) == set((ROOT / "docs" / "tutorials").glob("*.md")) - {
@@ -103,18 +113,6 @@ def test_links_lead_somewhere(page: Path) -> None:
     """Those between the pages of docs/ are held by its strict build."""
     for target in re.findall(r"\[[^\]]*\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):
         assert (ROOT / target).exists(), target
-
-
-def test_every_folder_has_its_line() -> None:
-    page = (ROOT / "docs" / "reference" / "folders.md").read_text()
-    folders = [p for p in (ROOT / "pipeline").iterdir() if p.is_dir() and p.name[0] not in "_."]
-    tops = ("storage", "scene_templates", "model", "train", "infra", "tests")
-    for name in [*tops, *(f"pipeline/{folder.name}" for folder in folders)]:
-        assert f"`{name}/`" in page, name
-
-
-def test_the_readme_is_short() -> None:
-    assert len(README.read_text().splitlines()) <= 100
 
 
 def _run(command: str, folder: Path) -> None:
@@ -204,3 +202,40 @@ def test_the_whole_line_runs(tmp_path: Path) -> None:
     _run("OBJECTS=builtin:24 SCENES=6 NOISE_FLOOR=20 sh examples/whole_line.sh", tmp_path)
     assert (tmp_path / "data" / "whole-line" / "both.png").stat().st_size > 1_000
     assert (tmp_path / "runs" / "whole-line" / "evaluation" / "evaluation.md").exists()
+
+
+OWN_PAGES = [
+    ROOT / "CONTRIBUTING.md",
+    *(p for p in sorted((ROOT / "docs" / "how-to").glob("*.md")) if "/examples/" in p.read_text()),
+]
+"""Of those who add something of their own."""
+SCREEN = 60
+"""Lines of a page: what is seen without scrolling, or once."""
+
+
+@for_each("page", OWN_PAGES)
+def test_a_page_is_one_screen_and_leads_somewhere(page: Path) -> None:
+    text = page.read_text()
+    assert len(text.splitlines()) <= SCREEN or page.name == "CONTRIBUTING.md"
+    for target in re.findall(r"\[[^\]]*\]\(([^)#:]+)\)", text):
+        is_generated = Path(target).stem in GENERATED
+        assert is_generated or (page.parent / target).exists(), target
+    for named in re.findall(r"`([\w/.-]+/[\w.-]*)`", text):
+        if named.split("/")[0] in ("data", "runs"):
+            continue
+        assert (ROOT / named).exists(), named
+
+
+def test_every_example_has_a_page_and_every_page_a_command() -> None:
+    texts = "".join(page.read_text() for page in OWN_PAGES)
+    for example in EXAMPLES:
+        assert f"](../../examples/{example.name})" in texts, example.name
+    assert all(_shell_lines(page) for page in OWN_PAGES)
+
+
+def test_files_that_are_named_exist() -> None:
+    for line in (line for page in OWN_PAGES for line in _shell_lines(page)):
+        for word in shlex.split(line):
+            path = word.rpartition(":")[0] if is_reference(word) else word
+            if path.startswith(("tests/", "examples/")):
+                assert (ROOT / path).exists(), word

@@ -91,11 +91,8 @@ def test_the_wheel_holds_one_package_and_what_belongs_to_it(wheel: Path) -> None
         assert f"trilight/{name}" in names
 
 
-def test_it_says_its_version(trilight: Run) -> None:
+def test_it_says_its_version_and_renders_by_both_engines(place: Path, trilight: Run) -> None:
     assert trilight("--version").startswith("trilight 0.")
-
-
-def test_it_renders_by_both_engines(place: Path, trilight: Run) -> None:
     small = ("--resolution", "16", "--max-spp", "8", "--noise-floor", "10")
     trilight("render", "scene.safetensors", "--engine", "both", *small, "--out", "both.exr")
     assert (place / "both.mitsuba.exr").is_file()

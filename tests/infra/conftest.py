@@ -1,6 +1,11 @@
 """What every test of `infra` may ask for."""
 
+from pathlib import Path
+
 import pytest
+
+from storage.records.scene_file import encode_scene
+from tests.scenes_by_hand import tiny_scene
 
 
 @pytest.fixture
@@ -9,3 +14,11 @@ def children_here(monkeypatch: pytest.MonkeyPatch) -> None:
     from tests.infra.child_here import use_children_here
 
     use_children_here(monkeypatch)
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    """The file of the tiny scene, which has two cameras."""
+    path = tmp_path / "tiny.safetensors"
+    path.write_bytes(encode_scene(tiny_scene()))
+    return path

@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pytest
@@ -13,20 +14,82 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from infra.bench import run as running
-from infra.bench.catalogue import every_experiment
-from infra.bench.experiment import FULL, QUICK, columns_of
+from infra.bench.catalogue import every_experiment, experiment_of
+from infra.bench.context import BenchContext
+from infra.bench.experiment import FULL, QUICK, Column, Experiment, Figures, Point, columns_of
 from infra.bench.machine import commit_text, machine_record
 from infra.bench.plot import plot
-from infra.bench.rows import rows_of, table_of
+from infra.bench.rows import Row, rows_of, table_of
 from infra.bench.run import run
 from infra.bench.store import Run, Store
 from infra.bench_options import BenchOptions
 from infra.cost_tables import COST_NOISE, on_front
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
 from storage.intervals import mean_interval
 from tests.command_line import trilight
 from tests.for_each import case
-from tests.infra.bench.bench_kit import FIGURES, TINY, calls, experiment
+
+TINY = dataclasses.replace(
+    QUICK, scenes=1, resolution=32, max_spp=128, reference_spp=128, picture_px=64, objects=2,
+    repeats=1, steps=2, held_out=2, growth=1,
+)  # fmt: skip
+
+calls: list[tuple[str, str]] = []
+"""What the experiment below measured, in order."""
+FIGURES = {"cheap": (1.0, 30.0), "default": (2.0, 40.0), "waste": (3.0, 35.0)}
+"""Cost and error in decibels by point."""
+
+
+def measure(
+    context: BenchContext, points: Sequence[Point], trial: str
+) -> Iterable[tuple[str, Figures]]:
+    """Return made-up figures; the trial `bad` cannot be used, and `killed` ends the run."""
+    for point in points:
+        if trial == "bad" and point.name == "default":
+            raise Rejected("no_scene", "it has no light")
+        calls.append((trial, point.name))
+        if trial == "killed" and point.name == "waste" and not context.options.data:
+            raise KeyboardInterrupt
+        cost, db = FIGURES[point.name]
+        late = 0.5 * (trial == "c")
+        yield point.name, {"core_s": cost + late, "db": db}
+
+
+def experiment(*trials: str, warm_up: bool = False) -> Experiment:
+    """Return three points that are measured in these trials."""
+    return Experiment(
+        name="made-up",
+        title="Made up",
+        about="Nothing real.",
+        cost=Column(name="core-seconds", figure="core_s", over="mean"),
+        error=Column(name="psnr_log_db, dB", figure="db"),
+        better="higher",
+        columns=(
+            Column(name="a second", figure="core_s", over="mean", then=lambda s: 1 / s),
+            Column(name="more than default, dB", figure="db", over="pair"),
+        ),
+        points=lambda scale, options: [
+            Point(
+                name=name,
+                default=name == "default",
+                kind="cheap ones" if name == "cheap" else "others",
+                rival=None if name == "default" else "default",
+            )
+            for name in FIGURES
+        ],
+        trials=lambda scale, options: trials,
+        measure=measure,
+        warm_up=warm_up,
+    )
+
+
+def measured_rows(name: str, folder: Path, options: BenchOptions | None = None) -> dict[str, Row]:
+    """Measure an experiment for real at the scale TINY; return its rows by point."""
+    one, out = experiment_of(name), folder / f"{name}.jsonl"
+    found = run(one, TINY, options or BenchOptions(), out)
+    assert found.seconds is not None
+    assert out.with_suffix(".png").stat().st_size > 5000
+    return {row.point.name: row for row in rows_of(one, found)}
 
 
 @pytest.fixture(autouse=True)
@@ -82,13 +145,9 @@ def test_columns_are_over_the_trials_and_pairs_have_their_interval(tmp_path: Pat
     assert cheap.intervals[name] == mean_interval([-12.0, -10.0, -5.0], ["a", "b", "c"])
     assert name not in default.values, "the rival is not its own rival"
     assert waste.intervals[name] == (-5.0, -5.0)
-
-
-def test_intervals_are_over_clusters(tmp_path: Path) -> None:
-    one = dataclasses.replace(experiment("a", "b"), cluster=lambda trial: "one scene")
-    cheap, *_ = rows_of(one, measured(tmp_path, "a", "b"))
-    low, high = cheap.intervals[one.columns[1].name]
-    assert low == high == -10.0
+    of_one_scene = dataclasses.replace(one, cluster=lambda trial: "one scene")
+    low, high = rows_of(of_one_scene, found)[0].intervals[name]
+    assert low == high == cheap.values[name], "intervals are over clusters"
 
 
 def test_a_trial_that_fails_for_one_point_counts_for_none(tmp_path: Path) -> None:
@@ -182,11 +241,13 @@ def test_the_table_has_every_point_and_the_plot_every_kind(tmp_path: Path) -> No
         assert {(31, 119, 180), (255, 127, 14)} <= set(picture.convert("RGB").get_flattened_data())
 
 
-def test_a_name_that_is_there_twice_is_refused(tmp_path: Path) -> None:
+def test_a_name_that_is_there_twice_and_what_is_missing_are_named(tmp_path: Path) -> None:
     one = experiment("a")
     twice = dataclasses.replace(one, points=lambda *given: [*one.points(*given)] * 2)
-    with pytest.raises(TrilightError, match="'cheap' is there twice"):
-        run(twice, TINY, BenchOptions(), tmp_path / "x.jsonl")
+    bare = dataclasses.replace(one, needs=("data",))
+    for wrong, said in ((twice, "'cheap' is there twice"), (bare, "--data is not given; expected")):
+        with pytest.raises(TrilightError, match=said):
+            run(wrong, TINY, BenchOptions(), tmp_path / "x.jsonl")
 
 
 def test_an_unknown_name_is_answered_with_those_that_exist() -> None:
@@ -196,12 +257,6 @@ def test_an_unknown_name_is_answered_with_those_that_exist() -> None:
         assert name in done.stderr
     listed = trilight(["bench"])
     assert listed.exit_code == 0 and "paired-training" in listed.stdout
-
-
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
-    one = dataclasses.replace(experiment("a"), needs=("data",))
-    with pytest.raises(TrilightError, match="--data is not given; expected the root"):
-        run(one, TINY, BenchOptions(), tmp_path / "x.jsonl")
 
 
 def test_an_installed_trilight_says_where_the_bench_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,13 +5,21 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated, Any, Literal, Optional
 
 import pytest
 
 from infra.cli.commands import COMMANDS
 from infra.cli.options import ALIASES
-from infra.setup.command_line_page import Command, every_command
+from infra.cli.words import choices_of, is_repeated, takes_names, value_of
+from infra.cli.words import kind_of as kind_of_field
+from infra.setup.command_line_page import every_command
+from infra.setup.generated_pages import PAGES
+from pipeline.shards.expression import TEXTS, condition, kind_of
+from storage.records.passes.declared import MOTION, declared_passes
+from storage.records.quantities import QUANTITIES
 from storage.settings.described import option_of
 from tests.command_line import trilight
 from tests.conftest import ROOT
@@ -68,12 +76,9 @@ def test_the_short_option_helps_everywhere() -> None:
         assert shown.stdout.startswith(f"Usage: {' '.join(['trilight', *words[:-1]])} ")
 
 
-def test_no_words_are_a_question_for_help() -> None:
+def test_no_words_are_a_question_for_help_and_the_version_is_a_number() -> None:
     assert trilight([]).stdout == trilight(["--help"]).stdout
     assert "--extend FILE.py" in trilight([]).stdout
-
-
-def test_the_version_is_that_of_the_distribution() -> None:
     shown = trilight(["--version"])
     assert (shown.exit_code, shown.stdout.split()[0]) == (0, "trilight")
     assert shown.stdout.split()[1][0].isdigit()
@@ -107,10 +112,7 @@ def test_a_mistyped_command_line_is_one_line() -> None:
 
 REFUSED = {
     "generate smoke --scenes 0": "--scenes is 0; expected a whole number from 1 to 1000000000",
-    "generate smoke --scenes few": "--scenes is 'few'; expected a whole number from 1 to",
     "generate smoke --noise-floor nan": "--noise-floor-db is nan; expected a number above 0",
-    "plan smoke --samples 3": "--samples is 3; expected a whole number from 4",
-    "train smoke --processes 0": "--processes is 0; expected a whole number from 1 to 1024",
     "render x --out y.exr --exposure -99": "--exposure-ev is -99",
 }
 
@@ -171,6 +173,73 @@ def test_an_option_that_two_classes_have_is_refused() -> None:
         command()(twice)
 
 
-def test_the_command_of_a_page_has_its_options() -> None:
-    assert isinstance(ALL["doctor"], Command)
-    assert [option.names for option in ALL["doctor"].options] == [("--measure",), ("--json",)]
+WORDS: dict[Any, tuple[str | tuple[str, ...], Any]] = {
+    int: ("3", 3),
+    float: ("0.5", 0.5),
+    str: ("3", "3"),
+    Path: ("a/b", Path("a/b")),
+    Literal["fast", "high"]: ("fast", "fast"),
+    tuple[float, ...]: (("1", "2.5"), (1.0, 2.5)),
+    tuple[Literal["a", "b"], ...]: (("a", "b"), ("a", "b")),
+    Mapping[str, Any]: (("a.b=3", "c=x"), {"a.b": 3, "c": "x"}),
+}
+
+
+def test_an_optional_field_takes_the_words_that_it_takes_otherwise() -> None:
+    for hint, (words, value) in WORDS.items():
+        for each in (hint, hint | None, Optional[hint], Annotated[hint | None, "a note"]):  # noqa: UP045
+            with case(each):
+                assert value_of(words, each) == value
+                for ask in (choices_of, kind_of_field, is_repeated, takes_names):
+                    assert ask(each) == ask(hint)
+
+
+INTERRUPTED_WRITE = """
+import io, os, signal, sys
+from infra.cli.leaving import leave
+
+class Interrupted(io.RawIOBase):
+    def writable(self):
+        return True
+    def fileno(self):
+        return NUMBER
+    def write(self, data):
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(1000):  # Python answers a signal between two of its instructions
+            pass
+        return os.write(NUMBER, data)
+
+signal.signal(signal.SIGINT, lambda number, frame: leave("interrupted", 130))
+stream = io.TextIOWrapper(io.BufferedWriter(Interrupted()))
+sys.NAME = sys.__NAME__ = stream
+stream.write("words\\n")
+stream.flush()
+"""
+
+
+@pytest.mark.parametrize(("name", "number"), [("stdout", 1), ("stderr", 2)])
+def test_a_signal_in_the_middle_of_a_write_is_answered(name: str, number: int) -> None:
+    program = INTERRUPTED_WRITE.replace("NUMBER", str(number)).replace("NAME", name)
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (run.returncode, run.stderr) == (130, "interrupted\n")
+
+
+def test_the_page_of_passes_names_every_pass() -> None:
+    for each_page in PAGES.values():
+        assert each_page().startswith("# ") and "\n| --- |" in each_page()
+    page = PAGES["passes"]()
+    for each in declared_passes():
+        (row,) = [line for line in page.split("\n") if line.startswith(f"| `{each.name}` |")]
+        assert f"| {each.means} |" in row
+        assert each.name == MOTION or f"`{each.exr_channels[0]}`" in row
+
+
+def test_the_page_of_quantities_names_what_a_condition_can_ask() -> None:
+    page = PAGES["quantities"]()
+    for name in (*QUANTITIES, *TEXTS):
+        assert kind_of(name) is not None
+        assert f"| `{name}` |" in page
+    shown = [line.split("'")[1] for line in page.splitlines() if "--where" in line]
+    assert len(shown) == 3
+    for text in shown:
+        condition(text)

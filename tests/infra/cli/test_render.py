@@ -16,7 +16,6 @@ from PIL import Image
 
 from infra.rendering.request import Asked
 from pipeline.exchange.open_scene import load_source, scene_source
-from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.making import path_tracer
 from storage.conventions import preview_srgb8
 from storage.dataset.shard import write_shard
@@ -124,24 +123,9 @@ def test_one_scene_gives_one_picture_whatever_it_is_read_from(
     np.testing.assert_array_equal(shown[::16, ::16], preview_srgb8(pictures[0]))
 
 
-def test_the_published_layout_gives_the_picture_of_its_scene(tmp_path: Path) -> None:
-    write_renderformer_h5(tmp_path / "tiny.h5", tiny_scene(), texture_type="float32")
-    found = render(tmp_path / "tiny.h5", "--out", tmp_path / "h5.exr")
-    (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
-    render(tmp_path / "tiny.safetensors", "--out", tmp_path / "scene.exr")
-    pictures = [decode_exr((tmp_path / f"{name}.exr").read_bytes()) for name in ("h5", "scene")]
-    assert pictures[1].mean() > 0.01
-    # The same geometry and materials; the denoised few samples may fall on other seams of rounding.
-    np.testing.assert_allclose(pictures[0], pictures[1], rtol=0.02, atol=1e-3)
-    assert all(note.startswith("tiny.h5: ") for note in found["notes"][:-1])
-    (tmp_path / "no.h5").write_bytes(b"no scene")
-    assert "no.h5" in mistake(tmp_path / "no.h5", "--out", tmp_path / "no.exr")
-
-
-def test_the_picture_says_how_it_was_made(tmp_path: Path) -> None:
-    (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
+def test_the_picture_says_how_it_was_made(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "tiny.exr"
-    outcome = render(tmp_path / "tiny.safetensors", "--out", out, "--seed", str(1 << 40))
+    outcome = render(source, "--out", out, "--seed", str(1 << 40))
     header = OpenEXR.File(io.BytesIO(out.read_bytes()), header_only=True).header()
     assert header["trilight.source"] == "tiny.safetensors"
     assert header["trilight.scene_sha256"] == scene_digest(tiny_scene())
@@ -159,13 +143,12 @@ def test_the_picture_says_how_it_was_made(tmp_path: Path) -> None:
     assert "mitsuba_variant" in json.loads(header["trilight.environment"])
     assert str(tmp_path) not in str(header)
     first = out.read_bytes()
-    render(tmp_path / "tiny.safetensors", "--out", out, "--seed", str(1 << 40))
+    render(source, "--out", out, "--seed", str(1 << 40))
     assert out.read_bytes() == first
 
 
-def test_a_person_is_told_where_to_look(tmp_path: Path) -> None:
-    (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
-    words = ["render", str(tmp_path / "tiny.safetensors"), "--out", str(tmp_path / "x.exr"), *SMALL]
+def test_a_person_is_told_where_to_look(source: Path, tmp_path: Path) -> None:
+    words = ["render", str(source), "--out", str(tmp_path / "x.exr"), *SMALL]
     printed = trilight(words).output
     for text in ("x.png", "psnr_log_db", "the cap came before", "in the PNG a pixel is 16 x 16"):
         assert text in printed.replace("\n", "")
@@ -176,9 +159,7 @@ def unwrapped(printed: str) -> str:
     return " ".join(printed.split())
 
 
-def test_the_last_line_says_all_three_floors(tmp_path: Path) -> None:
-    source = tmp_path / "tiny.safetensors"
-    source.write_bytes(encode_scene(tiny_scene()))
+def test_the_last_line_says_all_three_floors(source: Path, tmp_path: Path) -> None:
     words = ["render", str(source), "--resolution", "16", "--max-spp", "8"]
     of_one = trilight([*words, "--out", str(tmp_path / "x.exr")], env=WIDE).output
     floors = r"noise floor -?\d+\.\d dB \(linear -?\d+\.\d, objects -?\d+\.\d\)$"
@@ -189,9 +170,10 @@ def test_the_last_line_says_all_three_floors(tmp_path: Path) -> None:
         assert f"({metric}" in of_one and f"({metric})" in of_two
 
 
-def test_a_linear_target_alone_governs_and_is_said_beside_what_came_of_it(tmp_path: Path) -> None:
-    source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
-    source.write_bytes(encode_scene(tiny_scene()))
+def test_a_linear_target_alone_governs_and_is_said_beside_what_came_of_it(
+    source: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "x.exr"
     words = ["render", str(source), "--out", str(out), "--resolution", "16"]
     printed = unwrapped(
         trilight([*words, "--noise-floor-linear", "5", "--max-spp", "64"], env=WIDE).output
@@ -206,9 +188,8 @@ def test_a_linear_target_alone_governs_and_is_said_beside_what_came_of_it(tmp_pa
     assert "geometry is seen; the cap came before 95 dB)" in both
 
 
-def test_the_words_of_what_was_asked_give_the_picture_again(tmp_path: Path) -> None:
-    source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
-    source.write_bytes(encode_scene(tiny_scene()))
+def test_the_words_of_what_was_asked_give_the_picture_again(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
     asked = Asked(
         source=str(source), out=out, resolution=16, max_spp=256, noise_floor_linear_db=22.5,
         noise_floor_objects_db=20.25,
@@ -222,10 +203,9 @@ def test_the_words_of_what_was_asked_give_the_picture_again(tmp_path: Path) -> N
     assert pictures[0] == pictures[1]
 
 
-def test_parts_stand_as_layers_in_the_file_of_the_picture(tmp_path: Path) -> None:
+def test_parts_stand_as_layers_in_the_file_of_the_picture(source: Path, tmp_path: Path) -> None:
     """With their floors in its header; a film's files with layers are kept like others."""
-    source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
-    source.write_bytes(encode_scene(tiny_scene()))
+    out = tmp_path / "x.exr"
     words = ["render", str(source), "--out", str(out), "--split", *SMALL]
     assert "layer indirect" in unwrapped(trilight(words, env=WIDE).output)
     file = OpenEXR.File(io.BytesIO(out.read_bytes()))
@@ -249,9 +229,7 @@ BAD_SOURCES = {
     "absent.json": "no such file",
     "https://me:secret@host/a.json": "https://host/a.json: only files of this",
     "simplecache::https://host/a.tar::0": "only files of this machine",
-    "absent.tar::000000000": "no such file",
     "absent.tar::../x": "no shard and key",
-    "absent.json::000000000": "no shard and key",
     "set": "a folder; expected a scene",
     "text.safetensors": "text.safetensors: safetensors: the header claims",
     "pipe.safetensors": "pipe.safetensors: expected a regular file",
@@ -270,7 +248,7 @@ def test_a_bad_source_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert "secret" not in str(caught.value), source
 
 
-def test_a_shard_needs_a_key_that_it_has(tmp_path: Path) -> None:
+def test_a_shard_needs_a_key_that_it_has_and_a_lawful_scene(tmp_path: Path) -> None:
     shard = _shard(tmp_path / "train-000000.tar", tiny_scene())
     with pytest.raises(TrilightError, match="expected .*train-000000.tar::KEY"):
         scene_source(str(shard))
@@ -279,11 +257,8 @@ def test_a_shard_needs_a_key_that_it_has(tmp_path: Path) -> None:
     shard.write_bytes(shard.read_bytes()[:700])
     with pytest.raises(TrilightError, match="train-000000.tar|000000012"):
         load_source(scene_source(f"{shard}::000000012"))
-
-
-def test_a_scene_in_a_shard_obeys_the_laws(tmp_path: Path) -> None:
     lawless = tiny_scene(fov_deg=np.array([45, 181], np.float32))
-    shard = _shard(tmp_path / "train-000000.tar", lawless)
+    shard = _shard(tmp_path / "train-000001.tar", lawless)
     with pytest.raises(TrilightError, match=r"sample 000000012: scene: fov_deg\[1\] is 181"):
         load_source(scene_source(f"{shard}::000000012"))
 
@@ -311,29 +286,16 @@ def test_a_mesh_outside_of_the_folder_is_refused(described: Path) -> None:
         load_source(scene_source(str(described)))
 
 
-def test_mistakes_on_the_command_line_are_one_line(tmp_path: Path) -> None:
-    source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
-    source.write_bytes(encode_scene(tiny_scene()))
+def test_mistakes_on_the_command_line_are_one_line(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
     for words, message in (
         (("--engine", "cycles"), "--engine is 'cycles'; expected one of mitsuba, neural, both"),
-        (("--tone-map", "grey"), "--tone-map is 'grey'; expected one of plain, filmic"),
-        (("--fps", "0"), "--fps is 0"),
         (("--exposure", "33"), "--exposure-ev is 33.0; expected a number from -32 to 32 stops"),
-        (("--exposure", "nan"), "--exposure-ev is nan"),
-        (("--arc", "361"), "--arc-deg is 361"),
-        (("--orbit", "0"), "--orbit is 0"),
         (("--orbit", "3"), "expected a folder, X.mp4 or X.webp"),
         (("--orbit", "3", "--cameras", "a.json"), "expected no --orbit beside it"),
-        (("--lights-per-pass", "0"), "--lights-per-pass is 0"),
         (("--resolution", "20"), "resolution is 20; expected a multiple of 8"),
         (("--max-spp", "100"), "max_spp 100; expected multiples of 8"),
-        (("--noise-floor", "0"), "--noise-floor-db is 0.0; expected a number above 0"),
-        (("--noise-floor-linear", "0"), "--noise-floor-linear-db is 0.0; expected a number above"),
-        (("--noise-floor-linear", "101"), "--noise-floor-linear-db is 101.0; expected a number"),
-        (("--noise-floor-linear", "nan"), "--noise-floor-linear-db is nan"),
-        (("--noise-floor-objects", "-3"), "--noise-floor-objects-db is -3.0; expected a number"),
         (("--noise-floor-objects", "loud"), "--noise-floor-objects-db is 'loud'"),
-        (("--seed", "-1"), "--seed is -1"),
         (("--threads", "0"), "--threads is 0"),
     ):
         assert message in mistake(source, "--out", out, *words)
@@ -342,9 +304,8 @@ def test_mistakes_on_the_command_line_are_one_line(tmp_path: Path) -> None:
     assert not out.exists()
 
 
-def test_what_only_the_child_finds_out_is_one_line_too(tmp_path: Path) -> None:
-    source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
-    source.write_bytes(encode_scene(tiny_scene()))
+def test_what_only_the_child_finds_out_is_one_line_too(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
     assert "--view is 2; expected 0 to 1" in mistake(source, "--out", out, *SMALL, "--view", "2")
     materials = tiny_scene().materials.copy()
     materials[1, 7:] = 3e38
@@ -355,11 +316,9 @@ def test_what_only_the_child_finds_out_is_one_line_too(tmp_path: Path) -> None:
 
 
 def test_a_crash_in_native_code_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In a real child, which loads no renderer to be quick."""
-    source = tmp_path / "tiny.safetensors"
-    source.write_bytes(encode_scene(tiny_scene()))
     use_processes(monkeypatch)
     monkeypatch.setattr(path_tracer, "set_up_renderer", operator.is_)
     monkeypatch.setattr(path_tracer, "_open_scene", crash)

@@ -1,4 +1,4 @@
-"""What a person who types `trilight train` reads, and what Ctrl-C does, in real processes."""
+"""`trilight train` as it is typed and stopped, and the settings that it shares with others."""
 
 import json
 import os
@@ -13,14 +13,25 @@ from typing import Any, NoReturn
 
 import pytest
 
+from infra.cli.changes import Shared, all_changes
 from infra.cli.console import progress_bars
+from infra.cli.dataset_changes import with_shared
+from infra.cli.settings_file import read_settings_file
 from infra.cli.train import _BarProgress, _QuietProgress
+from pipeline.builds.named import BUILDS, named_build
+from pipeline.making.dataset_order import DatasetOrder
+from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
+from storage.settings.changes import changed
+from storage.settings.described import settings_record
 from tests.command_line import trilight
 from tests.conftest import ROOT
+from tests.for_each import case
+from tests.pipeline.making.test_publication import begin_tiny
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
 from train.loop.interrupts import SAVED_STATUS
+from train.runs import RUNS, named_run
 from train.watching.rows import read_rows
 
 TRILIGHT = [sys.executable, "-m", "trilight"]
@@ -72,14 +83,22 @@ def test_mistakes_and_the_first_words_come_before_torch(tmp_path: Path) -> None:
     assert "train needs PyTorch, which is not installed" in said["steps"]
 
 
-@pytest.mark.slow("kills")
-def test_a_run_that_is_stopped_says_what_goes_on_and_that_does(tmp_path: Path) -> None:
-    """As printed, in a folder with a blank in its name; threads wait without burning a core."""
+@pytest.fixture
+def command(tmp_path: Path) -> list[str]:
+    """The words of a run without end, in a folder with a blank in its name."""
     data = write_toy_dataset(tmp_path / "the data", train=4, validation=0, resolution=16)
+    words = ["train", "smoke", "--data", str(data.folder.root)]
+    words += ["--out", str(tmp_path / "my runs" / "first"), "--device", "cpu"]
+    words += ["--set", "checkpoint_every=50000", "--steps", "100000"]
+    return words + [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
+
+
+@pytest.mark.slow("kills")
+def test_a_run_that_is_stopped_says_what_goes_on_and_that_does(
+    command: list[str], tmp_path: Path
+) -> None:
+    """As printed, in a folder with a blank in its name; threads wait without burning a core."""
     out = tmp_path / "my runs" / "first"
-    command = ["train", "smoke", "--data", str(data.folder.root), "--out", str(out)]
-    command += ["--device", "cpu", "--set", "checkpoint_every=50000", "--steps", "100000"]
-    command += [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
     words, mistake = _stopped_after(command, out, 1)
     assert "Stopping after this step" in words
     assert "the data has no validation split" in words
@@ -96,14 +115,10 @@ def test_a_run_that_is_stopped_says_what_goes_on_and_that_does(tmp_path: Path) -
 
 
 def test_a_run_that_is_stopped_says_what_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In this process; the slow test types what is said here, in real ones."""
-    data = write_toy_dataset(tmp_path / "the data", train=4, validation=0, resolution=16)
     out = tmp_path / "my runs" / "first"
-    command = ["train", "smoke", "--data", str(data.folder.root), "--out", str(out)]
-    command += ["--device", "cpu", "--set", "checkpoint_every=50000", "--steps", "100000"]
-    command += [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
     monkeypatch.setattr(sys, "argv", ["trilight", *command, "--resume"])
     advance = _BarProgress.advance
     steps: list[int] = []
@@ -191,21 +206,6 @@ def test_a_run_that_hangs_and_is_to_stop_ends_with_status_1(
     assert "trilight: training: step 7 hangs; --resume goes on from the last checkpoint." in said
 
 
-def test_how_it_is_watched_is_passed_on_to_all_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[list[str]] = []
-
-    def replaced(program: str, words: list[str]) -> NoReturn:
-        seen.append(words)
-        sys.exit(0)
-
-    monkeypatch.setattr(os, "execv", replaced)
-    asked = ["train", "smoke", "--processes", "2", "--hang-after", "9", "--profile", "2"]
-    assert trilight([*asked, "--wandb", "light"]).exit_code == 0
-    assert " ".join(seen[0][6:]) == (
-        "trilight train smoke --hang-after-s 9.0 --profile 2 --wandb light"
-    )
-
-
 def test_a_wait_policy_of_the_users_own_stays() -> None:
     code = (
         "import os, sys; sys.argv = ['trilight', '--help']\n"
@@ -234,6 +234,145 @@ def test_several_processes_are_launched_by_torchrun(monkeypatch: pytest.MonkeyPa
     (words,) = seen
     assert words[1:6] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m"]
     assert " ".join(words[6:]) == "trilight train smoke --most-unusable 1 --changes seed=3 --json"
+    watched = ["train", "smoke", "--processes", "2", "--hang-after", "9", "--profile", "2"]
+    assert trilight([*watched, "--wandb", "light"]).exit_code == 0
+    assert " ".join(seen.pop()[6:]) == (
+        "trilight train smoke --hang-after-s 9.0 --profile 2 --wandb light"
+    )
     monkeypatch.setenv("RANK", "0")
     assert trilight(asked).mistake.startswith("--processes is 2 under torchrun")
     assert len(seen) == 1
+
+
+FAR = "out-of-range"
+
+
+def _file(folder: Path, text: str) -> str:
+    path = folder / "mine.yaml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_a_build_like_another_is_that_other() -> None:
+    for build in BUILDS:
+        with case(build):
+            other = named_build(build)
+            changes = all_changes(named_build("smoke"), Shared(), other.as_json(), {})
+            assert changed(named_build("smoke"), changes).as_json() == other.as_json()
+            assert all_changes(other, Shared(), other.as_json(), {}) == {}
+
+
+def test_a_run_like_another_is_that_other() -> None:
+    for run in RUNS:
+        with case(run):
+            other = named_run(run)
+            changes = all_changes(named_run("smoke"), Shared(), settings_record(other), {})
+            assert changed(named_run("smoke"), changes) == other
+
+
+def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
+    publication = begin_tiny(tmp_path / "set", 12)
+    record = read_manifest(publication.folder.manifest).settings
+    shared = Shared(
+        like=str(tmp_path / "set"),
+        settings=_file(tmp_path, "renders: {resolution: 96, max_spp: 64}\nseed: 1\n"),
+    )
+    alike = with_shared(DatasetOrder(build=FAR), Shared(like=shared.like))
+    found = named_build(FAR, changes=alike.changes).as_json()
+    assert found == {**record, "build": FAR}
+    order = DatasetOrder(build=FAR, resolution=32, changes={"renders.max_spp": 128})
+    changes = with_shared(order, shared).changes
+    settings = named_build(FAR, changes=changes)
+    assert (settings.seed, settings.renders.resolution, settings.renders.max_spp) == (1, 32, 128)
+    assert settings.scenes.num_views == record["scenes"]["num_views"]
+
+
+def test_a_floor_that_is_asked_for_replaces_those_of_a_file(tmp_path: Path) -> None:
+    file = _file(tmp_path, "renders: {noise_floor_db: 44, noise_floor_objects_db: 43}\n")
+    order = with_shared(DatasetOrder(noise_floor_linear_db=36.0), Shared(settings=file))
+    assert named_build("smoke", changes=order.changes).renders.targets_db == {
+        "psnr_linear_db": 36.0
+    }
+    as_filed = with_shared(DatasetOrder(), Shared(settings=file)).changes
+    assert named_build("smoke", changes=as_filed).renders.targets_db == {
+        "psnr_log_db": 44.0,
+        "object_psnr_log_db": 43.0,
+    }
+
+
+def test_a_preset_takes_the_place_of_single_settings(tmp_path: Path) -> None:
+    file = _file(tmp_path, "model: {width: 60}\nloss.perceptual: none\n")
+    changes = all_changes(named_run("smoke"), Shared(settings=file), {}, {"model": "tiny"})
+    assert changes == {"loss.perceptual": "none", "model": "tiny"}
+
+
+def test_a_file_says_what_set_would() -> None:
+    """Plain words are JSON or words, and quoted ones texts: YAML's own rules read 1e-3 as one."""
+    stated = read_settings_file(str(Path(__file__).parent / "shared.yaml"))
+    found = {name: value for name, (value, _) in stated.items()}
+    assert found == {
+        "learning_rate": 1e-3,
+        "loss.perceptual": "none",
+        "loss.perceptual_weight": 0,
+        "model": "large",
+        "betas": [0.9, 0.99],
+        "run": "12",
+        "scenes.families": [{"weight": 2, "name": "on"}],
+        "resume": False,
+        "source": None,
+    }
+
+
+WRONG: dict[str, tuple[str, str]] = {
+    "seed: 1\nseed: 2\n": ("line 2", "seed is given twice"),
+    "- seed\n": ("line 1", "expected names with values"),
+    "? [a]\n: 1\n": ("line 1", "expected the name of a setting"),
+    "a: [{b: 1, b: 2}]\n": ("line 1", "a name is given twice"),
+    "seed: 1\nrenders:\n  resolution: wide\n": ("line 3", "'renders.resolution' is 'wide'"),
+    "seeed: 1\n": ("line 1", "did you mean seed?"),
+}
+
+
+def test_what_is_wrong_in_a_file_is_named_with_its_line(tmp_path: Path) -> None:
+    for command in ["generate", "plan"]:
+        for text in WRONG:
+            with case((command, text)):
+                file = _file(tmp_path, text)
+                told = trilight([command, "smoke", "--settings", file]).mistake
+                line, problem = WRONG[text]
+                assert told.startswith(f"{file}, {line}: ")
+                assert problem in told
+    for option in ("--settings", "--like"):
+        told = trilight(["train", "smoke", option, "nowhere"]).mistake
+        assert told.startswith(f"{option} nowhere: ")
+
+
+def test_a_run_is_followed_on_the_command_line(tmp_path: Path) -> None:
+    """As far as the data, which are not there: the settings were checked before."""
+    record: dict[str, Any] = settings_record(named_run("smoke")) | {"num_steps": 7}
+    (tmp_path / "settings.json").write_text(json.dumps({"settings": record}))
+    words = ["train", "smoke", "--like", str(tmp_path), "--data", str(tmp_path / "no")]
+    with pytest.raises(TrilightError, match="warmup_steps is 50"):
+        changed(named_run("smoke"), {"num_steps": 7})
+    assert "warmup_steps is 50" in trilight(words).mistake
+    ended = trilight([*words, "--set", "warmup_steps=2"])
+    assert "Run smoke: 7 steps" in ended.stdout
+
+
+def test_licences_are_allowed_beside_those_of_a_file(tmp_path: Path) -> None:
+    order = DatasetOrder(allow_licences=("CC-BY-NC-4.0",))
+    for text, others in (
+        ("seed: 1\n", named_build("smoke").allowed_licences),
+        ("allowed_licences: [MIT]\n", ("MIT",)),
+    ):
+        found = with_shared(order, Shared(settings=_file(tmp_path, text)))
+        settings = named_build("smoke", allow_licences=found.allow_licences, changes=found.changes)
+        assert settings.allowed_licences == tuple(sorted({*others, "CC-BY-NC-4.0"}))
+
+
+def test_an_order_without_shared_settings_stays_as_it_is_and_is_checked() -> None:
+    order = DatasetOrder(resolution=64, seed=3, changes={"renders.max_spp": 128})
+    assert with_shared(order, Shared()) == order
+    ended = trilight(["generate", "smoke", "--resolution", "20"])
+    assert "resolution is 20; expected a multiple of 8" in ended.mistake
+    assert ended.stdout == "", "before any work is announced"

@@ -1,4 +1,4 @@
-"""The command as a whole: who never lacks, what is compared, and that nothing is judged twice."""
+"""The command as a whole, its rows on disk, and the pictures of anybody."""
 
 import csv
 import dataclasses
@@ -7,12 +7,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from infra.leaderboard import contest as contest_module
 from infra.leaderboard import run as run_module
+from infra.leaderboard.chart import plot_leaderboard
 from infra.leaderboard.contest import NOISE
 from infra.leaderboard.order import LeaderboardOrder
+from infra.leaderboard.picture_folder import FolderContestant, folder_contestants
+from infra.leaderboard.rows import UNKNOWN_MACHINE, BoardRow, BoardRows, RowKey
 from infra.leaderboard.run import (
     NEAREST_OTHER,
     NEAREST_TRAINED,
@@ -20,14 +24,19 @@ from infra.leaderboard.run import (
     make_leaderboard,
     widths_of,
 )
+from infra.leaderboard.standings import Standing, WidthStandings
 from infra.rendering.methods import DIRECT_LIGHT, TRACED_LIGHT
 from model.open import save_published
 from pipeline.exchange.exports.export import export_dataset
+from pipeline.exchange.exports.scenes import picture_name
 from storage.errors import Rejected, TrilightError
+from storage.records.exr import encode_channels
 from tests.command_line import trilight
+from tests.for_each import case
 from tests.model.kit import awake
 from tests.model.published.test_convert import publishable
-from tests.train.toy import VIEWS, write_toy_dataset
+from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
+from train.evaluation.pairs import METRIC
 
 PX = 16
 SHIPPED = {"network builtin:", "network builtin:tokens"}
@@ -235,3 +244,159 @@ def test_mistakes_are_one_line(order: LeaderboardOrder, root: Path) -> None:
         board_of(lacks)
     with pytest.raises(TrilightError, match="the test split holds no scene"):
         board_of(dataclasses.replace(order, split="test"))
+
+
+SHOWN = [("000000000", 0), ("000000000", 1), ("000000001", 0), ("000000001", 1)]
+WIDTHS = [8, 16]
+
+
+def picture(seed: int, width: int = 16) -> np.ndarray:
+    return np.random.default_rng(seed).random((width, width, 3), np.float32)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "mine").mkdir()
+    for row, (key, view) in enumerate(SHOWN):
+        write(tmp_path / "mine" / picture_name(key, view), picture(row))
+    return tmp_path / "mine"
+
+
+def encoded(rgb: np.ndarray) -> bytes:
+    return encode_channels({"RGB": np.ascontiguousarray(rgb)})
+
+
+def write(path: Path, rgb: np.ndarray) -> None:
+    path.write_bytes(encoded(rgb))
+
+
+def refusal(folder: Path) -> str:
+    with pytest.raises(TrilightError) as refused:
+        FolderContestant(folder, SHOWN, WIDTHS)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+def test_pictures_are_shown_as_they_are_at_their_one_width(folder: Path) -> None:
+    rgb = picture(2)
+    rgb[3, 4] = [-0.001, 0, 1e5]  # networks of logarithms give a little less than nothing
+    alpha = np.full((16, 16), 0.5, np.float32)
+    channels = dict(zip("RGB", np.moveaxis(rgb, -1, 0).copy(), strict=True)) | {"A": alpha}
+    (folder / picture_name(*SHOWN[2])).write_bytes(encode_channels(channels))
+    one = FolderContestant(folder, SHOWN, WIDTHS)
+    assert one.name == "pictures of mine" and one.why_not(16) == ""
+    assert one.why_not(8) == "its pictures have 16 pixels"
+    shown = one.shown(toy_sample(1), 16, timed=True)
+    assert shown.first_s is None
+    np.testing.assert_array_equal(shown.radiance_VRR3[0], np.maximum(rgb, 0))
+    np.testing.assert_array_equal(shown.radiance_VRR3[1], picture(3))
+    before = one.digest(*SHOWN[0])
+    write(folder / picture_name(*SHOWN[0]), picture(9))
+    after = FolderContestant(folder, SHOWN, WIDTHS)
+    assert after.digest(*SHOWN[0]) != before and after.digest(*SHOWN[1]) == one.digest(*SHOWN[1])
+
+
+def test_missing_pictures_are_counted_and_the_first_is_named(folder: Path, tmp_path: Path) -> None:
+    for name in SHOWN[1:3]:
+        (folder / picture_name(*name)).unlink()
+    said = refusal(folder)
+    assert "2 of 4 pictures are missing, the first is 000000000_view_1.exr" in said
+    assert "--form exr" in said and "--scenes" in said
+    assert "no such folder; expected one" in refusal(tmp_path / "nowhere")
+
+
+BAD_PICTURES: list[tuple[bytes, str]] = [
+    (encoded(picture(0)[:8]), ": 16 x 8 pixels; expected 8 x 8 or 16 x 16"),
+    (encoded(picture(0, 8)), " has 8"),
+    (b"\x76\x2f\x31\x01 cut", ": no readable OpenEXR picture of channels R, G"),
+    (encode_channels({"Y": picture(0)[..., 0].copy()}), ": no readable OpenEXR picture"),
+]
+
+
+def test_what_is_no_picture_of_the_set_is_said(folder: Path) -> None:
+    for data, said in BAD_PICTURES:
+        with case(said):
+            (folder / picture_name(*SHOWN[2])).write_bytes(data)
+            assert f"000000001_view_0.exr{said}" in refusal(folder)
+
+
+def test_values_that_are_no_radiance_are_said_with_their_place(folder: Path) -> None:
+    for bad in [np.nan, -1.0]:
+        with case(bad):
+            rgb = picture(0)
+            rgb[5, 6, 1] = rgb[7, 8, 0] = bad
+            write(folder / picture_name(*SHOWN[2]), rgb)
+            said = refusal(folder)
+            assert "000000001_view_0.exr: row 5, column 6" in said and "channel G" in said
+            assert "2 pixels are like it; expected finite radiance of at least 0" in said
+
+
+def test_two_folders_of_one_name_are_refused(folder: Path) -> None:
+    assert list(folder_contestants([folder], SHOWN, WIDTHS)) == ["pictures of mine"]
+    with pytest.raises(TrilightError, match="another folder has the same name"):
+        folder_contestants([folder, folder], SHOWN, WIDTHS)
+
+
+KEY = RowKey(width=64, scene="000000001", view=0, name="somebody", digest="d")
+ROW = BoardRow(scores={"psnr_log_db": 30.0, "lpips": None}, first_s=0.5, further_s=0.25)
+
+
+def test_rows_come_back_and_the_later_of_two_counts(tmp_path: Path) -> None:
+    path = tmp_path / "board/rows.jsonl"
+    rows = BoardRows(path, "set a")
+    rows.add(KEY, BoardRow(scores={"psnr_log_db": 29.0}))
+    rows.add(KEY, ROW)
+    again = BoardRows(path, "set a")
+    assert again.get(KEY) == rows.get(KEY) == ROW
+    assert (
+        again.get(RowKey(width=64, scene="000000001", view=0, name="somebody", digest="e")) is None
+    )
+    assert len(path.read_text().splitlines()) == 3
+    # written before rows named their machine: a price of nowhere
+    assert rows.price(KEY, "somewhere") is None and again.machines() == {UNKNOWN_MACHINE}
+
+
+def test_a_line_that_a_kill_cut_short_is_judged_again(tmp_path: Path) -> None:
+    path = tmp_path / "rows.jsonl"
+    BoardRows(path, "set a").add(KEY, ROW)
+    whole = path.read_bytes()
+    path.write_bytes(whole + b'{"width": 64, "sce')
+    rows = BoardRows(path, "set a")
+    assert rows.get(KEY) == ROW and path.read_bytes() == whole
+    path.write_bytes(whole[: whole.index(b"\n") + 20])
+    assert BoardRows(path, "set a").get(KEY) is None
+    assert path.read_bytes() == whole[: whole.index(b"\n") + 1]
+
+
+OTHERS = [
+    ('{"set": "another"}\n', r"are of the set another, and SOURCE is set a.*another --out"),
+    ("nothing\n", "not the rows of a leaderboard.*another --out, or delete the file"),
+    ('{"set": "set a"}\n{"width": 64}\n', "not the rows of a leaderboard"),
+]
+
+
+def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    for text, said in OTHERS:
+        with case(text):
+            (tmp_path / "rows.jsonl").write_text(text)
+            with pytest.raises(TrilightError, match=said):
+                BoardRows(tmp_path / "rows.jsonl", "set a")
+
+
+FORMULA = r"runs of $\nothing$"
+"""What matplotlib refuses as a formula."""
+
+
+def test_dollar_signs_in_names_are_no_formula(tmp_path: Path) -> None:
+    priced, unpriced = (
+        Standing(
+            name=FORMULA, kind="network", first_s=seconds, further_s=seconds, timed_scenes=1,
+            scores={METRIC: {"median": 30.0}}, lead=None, on_front=None,
+        )
+        for seconds in (0.5, None)
+    )  # fmt: skip
+    one = WidthStandings(
+        width=64, num_scenes=1, num_views=1, standings=(priced, unpriced), pairs={}
+    )
+    plot_leaderboard([one], FORMULA, tmp_path / "board.png")
+    assert (tmp_path / "board.png").read_bytes().startswith(b"\x89PNG")

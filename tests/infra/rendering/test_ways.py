@@ -1,14 +1,20 @@
-"""Seconds or decibels choose a way: by brute force, at the ends, and as the table alone says."""
+"""Seconds or decibels choose a way, by costs that are shipped or measured here."""
 
+import dataclasses
 import itertools
+import json
 import math
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from infra.rendering.machine_costs import PROBED_PX, PROBES, Timed, costs_of
 from infra.rendering.way_table import (
+    MEASURE,
     NETWORK_SCENE,
     NETWORK_VIEW,
     KnownCosts,
@@ -16,6 +22,10 @@ from infra.rendering.way_table import (
     PictureCosts,
     WayError,
     WayTable,
+    keep_machine_costs,
+    known_costs,
+    machine_costs_path,
+    machine_name,
     shipped_table,
 )
 from infra.rendering.ways import (
@@ -26,9 +36,12 @@ from infra.rendering.ways import (
     reaching,
     within_seconds,
 )
+from infra.setup.preview_table import NETWORK, WIDTHS, ladder, part_names, table_of
 from pipeline.renders.preview_parts import all_parts
 from pipeline.renders.settings import Filtered
+from pipeline.renders.variant import Variant
 from storage.errors import TrilightError
+from storage.settings.described import settings_record
 from tests.for_each import case
 
 FILTERS: tuple[Filtered, ...] = ("fast", "high")
@@ -183,11 +196,6 @@ def test_a_choice_says_what_it_is_and_whether_it_fits() -> None:
 def test_the_shipped_table_is_whole() -> None:
     """Each way was measured at the least width, and what more samples bring is seen in it."""
     table = shipped_table()
-    known = {(row.part, row.width) for row in table.costs.rows}
-    widths = {width for _, width in known}
-    for name in (*all_parts(), NETWORK_SCENE, NETWORK_VIEW):
-        assert {(name, width) for width in widths} <= known
-    assert known == {(row.part, row.width) for row in table.probe.rows}
     assert all(row.serial_s + row.parallel_s > 0 for row in table.costs.rows)
     for denoiser in FILTERS:
         of_filter = {
@@ -201,3 +209,176 @@ def test_the_shipped_table_is_whole() -> None:
     assert all(
         math.isfinite(row.median_db) and row.least_db <= row.median_db for row in table.errors
     )
+
+
+VARIANT = Variant(name="llvm_ad_rgb", libllvm="", note="")
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
+    return tmp_path
+
+
+def costs_of_here() -> PictureCosts:
+    shipped = shipped_table().costs
+    slower = [dataclasses.replace(row, serial_s=row.serial_s + 1) for row in shipped.rows]
+    return PictureCosts(machine=machine_name(VARIANT), rows=tuple(slower))
+
+
+def test_costs_that_were_measured_here_win(cache: Path) -> None:
+    found = known_costs(VARIANT)
+    assert found.costs == shipped_table().costs
+    assert f"costs as shipped: `{MEASURE}` measures this machine" == found.source
+    path = keep_machine_costs(costs_of_here())
+    assert path == machine_costs_path() and path.is_relative_to(cache)
+    found = known_costs(VARIANT)
+    assert found.costs == costs_of_here()
+    assert found.source == "costs as measured here"
+
+
+@pytest.mark.usefixtures("cache")
+def test_costs_of_another_machine_are_not_used() -> None:
+    keep_machine_costs(dataclasses.replace(costs_of_here(), machine="another, 128 cores"))
+    found = known_costs(VARIANT)
+    assert found.costs == shipped_table().costs
+    assert "is of another machine (another, 128 cores)" in found.source
+    keep_machine_costs(costs_of_here())
+    card = dataclasses.replace(VARIANT, name="cuda_ad_rgb")
+    assert "of another machine" in known_costs(card).source, "a graphics card is another machine"
+
+
+def _record(**changes: Any) -> bytes:
+    return json.dumps(settings_record(costs_of_here()) | changes).encode()
+
+
+DAMAGED = [
+    (b"", "Expecting value"),
+    (b"[1, 2]", "expected"),
+    (_record(rows=[]), "is missing; expected each part at each width"),
+    (_record().replace(b'"width": 64', b'"width": 63.5', 1), "expected a whole number"),
+    (_record().replace(b'"serial_s": 1', b'"serial_s": -1', 1), "expected a number from 0"),
+    (_record(more=1), "does not exist"),
+]
+
+
+@pytest.mark.usefixtures("cache")
+def test_damaged_costs_are_not_used() -> None:
+    for data, said in DAMAGED:
+        with case(said):
+            path = machine_costs_path()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+            found = known_costs(VARIANT)
+            assert found.costs == shipped_table().costs
+            assert f"since {path} cannot be used" in found.source and said in found.source
+            assert f"`{MEASURE}` writes it anew" in found.source
+            assert "\n" not in found.source
+    machine_costs_path().unlink()
+    machine_costs_path().mkdir()
+    assert "cannot be used" in known_costs(VARIANT).source
+
+
+CORES = 8
+
+
+def timed_as_shipped(slower: float, serial: float) -> Timed:
+    """Return what probes take where everything is slower, and a share of it stays serial."""
+    table = shipped_table()
+    then = {(row.part, row.width): row.serial_s + row.parallel_s for row in table.probe.rows}
+    parts = {row.part for row in table.probe.rows}
+    return {
+        (px, threads): {
+            part: slower * then[part, px] * (serial + (1 - serial) / threads) for part in parts
+        }
+        for px in PROBED_PX
+        for threads in (1, CORES)
+    }
+
+
+def test_every_part_is_as_much_slower_and_as_serial() -> None:
+    for slower, serial in [(1.0, 0.0), (2.5, 0.25), (0.1, 1.0)]:
+        with case(slower):
+            table = shipped_table()
+            found = costs_of(table, timed_as_shipped(slower, serial), CORES, "here")
+            assert found.machine == "here"
+            for now, then in zip(found.rows, table.costs.rows, strict=True):
+                core_s = then.serial_s + then.parallel_s
+                assert (now.part, now.width) == (then.part, then.width)
+                # the table keeps four figures
+                assert now.serial_s == pytest.approx(slower * serial * core_s, rel=1e-3, abs=1e-9)
+                assert now.parallel_s == pytest.approx(
+                    slower * (1 - serial) * core_s, rel=1e-3, abs=1e-9
+                )
+
+
+def test_what_threads_seem_to_slow_down_is_serial() -> None:
+    """Beside other work all threads may take longer than one; nothing becomes negative."""
+    timed = timed_as_shipped(1.0, 0.0)
+    timed |= {(px, CORES): {p: 3 * s for p, s in timed[px, 1].items()} for px in PROBED_PX}
+    for row in costs_of(shipped_table(), timed, CORES, "here").rows:
+        assert row.parallel_s == 0 and row.serial_s > 0
+
+
+def test_one_core_is_measured_once() -> None:
+    timed: Timed = {(px, 1): each for (px, threads), each in timed_as_shipped(2.0, 0.0).items()
+             if threads == 1}  # fmt: skip
+    for row in costs_of(shipped_table(), timed, 1, "here").rows:
+        assert row.serial_s == 0 and row.parallel_s > 0
+
+
+def test_between_the_probed_widths_machines_differ_by_what_lies_between() -> None:
+    table = shipped_table()
+    timed = timed_as_shipped(1.0, 0.0)
+    low, high = PROBED_PX
+    timed |= {(high, n): {p: 3 * s for p, s in timed[high, n].items()} for n in (1, CORES)}
+    then = {(row.part, row.width): row.serial_s + row.parallel_s for row in table.costs.rows}
+    for row in costs_of(table, timed, CORES, "here").rows:
+        slower = float(np.interp(np.log2(row.width), np.log2((low, high)), (1.0, 3.0)))
+        assert row.parallel_s == pytest.approx(slower * then[row.part, row.width], rel=1e-3)
+
+
+def test_a_part_that_was_not_timed_costs_what_is_shipped() -> None:
+    timed: Timed = {
+        key: {part: s for part, s in each.items() if not part.startswith("network")}
+        for key, each in timed_as_shipped(2.0, 0.0).items()
+    }
+    shipped = {(row.part, row.width): row for row in shipped_table().costs.rows}
+    for row in costs_of(shipped_table(), timed, CORES, "here").rows:
+        if row.part.startswith("network"):
+            assert row == shipped[row.part, row.width]
+
+
+def test_scenes_become_medians_and_probes_means() -> None:
+    methods = {px: (NETWORK, *ladder(px)) for px in WIDTHS}
+    errors = {
+        scene: {
+            px: {method: 20.0 + row + 10 * scene for row, method in enumerate(methods[px])}
+            for px in WIDTHS
+        }
+        for scene in (0, *PROBES)
+    }
+    costs = {
+        scene: {px: dict.fromkeys(part_names(), float(spent)) for px in WIDTHS}
+        for scene, spent in zip((0, *PROBES), (1, 2, 6), strict=True)
+    }
+    table = table_of(errors, costs, "some processor, one thread")
+    assert (table.scenes, table.costs.machine) == (3, "some processor, one thread")
+    first = table.errors[0]
+    assert (first.rung, first.median_db, first.least_db) == ("network", 30.0, 20.0)
+    assert len(table.errors) == sum(map(len, methods.values()))
+    for row, probe in zip(table.costs.rows, table.probe.rows, strict=True):
+        assert (row.part, row.width) == (probe.part, probe.width)
+        assert row.serial_s + row.parallel_s == 2.0
+        assert probe.serial_s + probe.parallel_s == 4.0
+        assert (row.parallel_s == 0) == (row.part == "scene")
+
+
+def test_what_is_shipped_has_the_rows_that_this_makes() -> None:
+    shipped = shipped_table()
+    assert [(row.width, row.spp, row.denoiser) for row in shipped.errors] == [
+        (px, *method) for px in WIDTHS for method in (NETWORK, *ladder(px))
+    ]
+    wanted = [(part, px) for px in WIDTHS for part in part_names()]
+    assert [(row.part, row.width) for row in shipped.costs.rows] == wanted
+    assert [(row.part, row.width) for row in shipped.probe.rows] == wanted

@@ -1,37 +1,48 @@
-"""`make serve`: a part that fails takes the others along; `make stop`: exactly what was started."""
+"""`make serve`: its password, its parts that end together, and the form of its training."""
 
 import contextlib
+import dataclasses
 import http.server
+import json
 import os
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import threading
 import time
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from prefect.exceptions import ParameterTypeError
 
-from infra.serving import local
+from infra.serving import access, local
+from infra.serving.access import grant, next_command, revoke, settings_file, state_folder
 from infra.serving.limits import limits
 from infra.serving.local import running, start, stop
+from infra.serving.train_model import RunChanges, TrainOrder, train_model, train_order
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from pipeline.flows.prefect_server import TOLD_BY_ITS_STARTER, wait_until_healthy
 from storage.errors import TrilightError
+from storage.settings.described import described
+from tests.command_line import trilight
+from tests.conftest import ROOT
 from tests.for_each import case
+from train.runs import RUNS, named_run
+from train.settings import TrainSettings
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(120)"]
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
-    monkeypatch.delenv("PREFECT_SERVER_API_AUTH_STRING", raising=False)
-    (tmp_path / "serve").mkdir()
-    return tmp_path / "serve" / "mark"
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    """The file with the mark of what was started, in the cache of `checkout`."""
+    (tmp_path / "cache" / "serve").mkdir(parents=True)
+    return tmp_path / "cache" / "serve" / "mark"
 
 
 def _until_seen(number: int) -> None:
@@ -115,15 +126,12 @@ def healthy_server() -> Iterator[str]:
         stranger.shutdown()
 
 
-WRONG_VARIABLES = [
-    ("TRILIGHT_PORT", "x"), ("TRILIGHT_PORT", "0"), ("TRILIGHT_PORT", "65536"),
-    ("TRILIGHT_HOST", "::1"), ("TRILIGHT_WORKERS", "0"), ("TRILIGHT_WORKERS", "-1"),
-]  # fmt: skip
-
-
 def test_wrong_variables_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(local.shutil, "which", lambda name: name)
-    for variable, value in WRONG_VARIABLES:
+    for variable, value in (
+        ("TRILIGHT_PORT", "x"), ("TRILIGHT_PORT", "65536"), ("TRILIGHT_HOST", "::1"),
+        ("TRILIGHT_WORKERS", "0"),
+    ):  # fmt: skip
         with case((variable, value)), monkeypatch.context() as patch:
             patch.setenv(variable, value)
             with pytest.raises(SystemExit, match=rf"{variable} is '{value}'; expected"):
@@ -154,3 +162,207 @@ def test_cards_are_those_of_this_machine_or_of_all_workers(
             limits({"TRILIGHT_CARDS": wrong})
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assert limits({})[GPU_LIMIT] == 1  # a limit of 0 would let nothing begin
+
+
+URL = "http://127.0.0.1:4321/api"
+PASSWORDS = ("PREFECT_SERVER_API_AUTH_STRING", "PREFECT_API_AUTH_STRING")
+
+
+@pytest.fixture(autouse=True)
+def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache and a checkout of the test's own."""
+    for name in ("TRILIGHT_STATE", *PASSWORDS):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "checkout").mkdir()
+    monkeypatch.setattr(access, "LINK", tmp_path / "checkout" / "prefect.toml")
+    return tmp_path / "checkout"
+
+
+def _mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_each_start_has_a_password_of_its_own_in_a_private_file(checkout: Path) -> None:
+    first, second = grant(URL), grant(URL)
+    assert first[PASSWORDS[0]] == first[PASSWORDS[1]] != second[PASSWORDS[0]]
+    assert len(second[PASSWORDS[0]]) > 32
+    assert (_mode(state_folder()), _mode(settings_file())) == (0o700, 0o600)
+    written = tomllib.loads((checkout / "prefect.toml").read_text())
+    assert written == {"api": {"url": URL, "auth_string": second[PASSWORDS[0]]}}
+    # no copy of the checkout takes it along
+    assert (checkout / "prefect.toml").is_symlink()
+    revoke()
+    assert list(checkout.iterdir()) == [] and not settings_file().exists()
+    revoke()
+
+
+def test_prefect_reads_it_from_the_checkout_and_nothing_needs_to_be_exported(
+    checkout: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(PASSWORDS[0], 'me:a"quoted\\ pässword')
+    grant(URL)
+    (checkout / "pyproject.toml").write_text((ROOT / "pyproject.toml").read_text())
+    code = (
+        "import json, runpy, sys\n"
+        "from prefect.settings import get_current_settings as now\n"
+        "api = now().api\n"
+        "print(json.dumps([api.url, api.auth_string.get_secret_value()]), flush=True)\n"
+        "sys.argv = ['prefect', 'config', 'view']\n"
+        "runpy.run_module('prefect', run_name='__main__')\n"
+    )
+    bare = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=checkout, env=bare, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    read, _, shown = done.stdout.partition("\n")
+    assert json.loads(read) == [URL, 'me:a"quoted\\ pässword']
+    assert URL in shown and "quoted" not in shown + done.stderr
+
+
+def test_a_second_server_elsewhere_takes_no_command_away(
+    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grant(URL)
+    before = (checkout / "prefect.toml").read_text()
+    plain = "prefect deployment run generate-scenes/local --watch"
+    assert next_command() == plain
+    monkeypatch.setenv("TRILIGHT_STATE", str(tmp_path / "other state"))
+    grant("http://127.0.0.1:4322/api")
+    assert next_command() == f"cd '{tmp_path}/other state' && {plain}"
+    assert (tmp_path / "other state" / "prefect.toml").read_text() != before
+    revoke()
+    assert (checkout / "prefect.toml").read_text() == before
+
+
+def test_a_file_of_the_users_own_is_kept(checkout: Path) -> None:
+    (checkout / "prefect.toml").write_text("[api]\n")
+    with pytest.raises(TrilightError, match=r"prefect.toml is a file of your own; expected none"):
+        grant(URL)
+    revoke()
+    assert (checkout / "prefect.toml").read_text() == "[api]\n"
+    assert not settings_file().exists()
+
+
+def test_the_password_is_no_argument_and_is_not_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Arguments are seen by every user of the machine, and what is said gets into logs."""
+    told: list[str] = []
+    environments: list[Any] = []
+
+    def launch(name: str, command: Any, environment: Any) -> None:
+        told.extend(command)
+        environments.append(environment)
+
+    def call(command: list[str], environment: Any) -> None:
+        launch("step", command, environment)
+
+    monkeypatch.setattr(local, "_launch", launch)
+    monkeypatch.setattr(local, "_require_free", lambda *_: None)
+    monkeypatch.setattr(local, "wait_until_healthy", lambda *_: None)
+    monkeypatch.setattr(local, "_call", call)
+    monkeypatch.setattr(local.shutil, "which", lambda name: name)
+    monkeypatch.setenv("TRILIGHT_HOST", "my-host")
+    local.main(["start"])
+    password = tomllib.loads(settings_file().read_text())["api"]["auth_string"]
+    assert [environment[PASSWORDS[1]] for environment in environments] == [password] * 5
+    assert environments[0]["TRILIGHT_HOST_NAMES"].split(",")[0] == "my-host"
+    assert len(told) > 10 and not any(password in word for word in told)
+    said = capsys.readouterr().out
+    assert password not in said and str(settings_file()) in said
+    assert said.splitlines()[0].startswith("starting Prefect's server at http://my-host:4200")
+
+
+SECOND_STAGES = sorted(name for name in RUNS if named_run(name).from_weights)
+
+
+def _parameters(**given: Any) -> dict[str, Any]:
+    """Return what the flow is called with where nothing else is filled in."""
+    plain = {field.name: field.default for field in described(TrainOrder)}
+    return {**plain, "data": ["a"], "changes": None, **given}
+
+
+def test_training_is_launched_by_torchrun_where_there_are_several_processes() -> None:
+    one = TrainOrder(data=("a", "b"), resume=True, steps=5).command()
+    assert one[1:] == ("-m trilight train smoke --data a --data b --resume --steps 5").split()
+    two = TrainOrder(processes=2).command()
+    assert two[1:5] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    with pytest.raises(TrilightError, match="processes is 0"):
+        TrainOrder(processes=0)
+
+
+def test_the_form_has_every_run_and_every_setting() -> None:
+    schema = train_model.parameters.model_dump()
+    assert schema["properties"]["run"]["enum"] == list(RUNS)
+    groups = schema["definitions"]
+    settings = groups["TrainSettingsChanges"]["properties"]
+    assert set(settings) == {field.name for field in dataclasses.fields(TrainSettings)}
+    assert settings["learning_rate"]["anyOf"][0]["exclusiveMinimum"] == 0
+    assert groups["LossSettingsChanges"]["properties"]["perceptual"]["anyOf"][0]["enum"] == [
+        "lpips", "ms_ssim", "none",
+    ]  # fmt: skip
+
+
+WRONG_FORMS: list[tuple[dict[str, Any], str]] = [
+    ({"run": "pretain"}, "run"),
+    ({"changes": {"warm_up": 3}}, "changes.warm_up"),
+    ({"changes": {"model": {"width": 0}}}, "changes.model.width"),
+    ({"changes": {"betas": [0.9, 1.0]}}, "changes.betas: expected numbers from 0 to below 1"),
+]
+
+
+def test_a_wrong_form_is_refused_before_a_run_exists() -> None:
+    for parameters, message in WRONG_FORMS:
+        with case(parameters):
+            with pytest.raises(ParameterTypeError, match=message):
+                train_model.validate_parameters(parameters)
+
+
+UNLAWFUL: list[tuple[dict[str, Any], str]] = [
+    ({"changes": {"resolution": 60}}, "resolution is 60; expected a multiple of 8"),
+    ({"steps": 50, "changes": {"warmup_steps": 50}}, "warmup_steps is 50; expected 0 to 49"),
+    ({"run": "finetune"}, "expected begin_with"),
+    ({"run": "pretrain", "begin_with": "runs/x"}, "begin_with is runs/x"),
+]
+
+
+def test_laws_between_settings_are_checked_before_the_command() -> None:
+    """No schema can say them; the order is made in the flow's first moment."""
+    for given, message in UNLAWFUL:
+        with case(message):
+            form = RunChanges(**given["changes"]) if "changes" in given else None
+            with pytest.raises(TrilightError, match=message):
+                train_order(_parameters(**{**given, "changes": form}))
+
+
+def test_a_second_stage_begins_with_the_first() -> None:
+    for run in SECOND_STAGES:
+        with case(run):
+            form = RunChanges(**{"loss": {"perceptual_weight": 0.1}, "num_steps": 9000})
+            given = {"run": run, "begin_with": "runs/pretrain", "lpips": "hub", "changes": form}
+            command = train_order(_parameters(**given)).command()
+            words = " ".join(command[command.index("train") :])
+            assert words == (
+                f"train {run} --data a --begin-with runs/pretrain --lpips hub "
+                "--changes loss.perceptual_weight=0.1 --changes num_steps=9000"
+            )
+            going_on = {"resume": True, "changes": None, "decisions": {"learning_rate": 1e-5}}
+            command = train_order(_parameters(**going_on)).command()
+            assert (
+                " ".join(command[4:]) == "smoke --data a --resume --decisions learning_rate=1e-05"
+            )
+            again = TrainOrder(run=run, resume=True).command()
+            assert "--resume" in again and "--begin-with" not in again
+
+
+def test_the_command_line_takes_every_option_of_the_command(tmp_path: Path) -> None:
+    """It comes as far as the data, which is not there: after its options and the run's settings."""
+    order = TrainOrder(
+        run="finetune", data=(str(tmp_path / "none"),), out=str(tmp_path / "run"), steps=9000,
+        begin_with="runs/x", lpips="hub", changes={"loss.perceptual": "none"},
+    )  # fmt: skip
+    python, *words = order.command()
+    assert (python, words[:2]) == (sys.executable, ["-m", "trilight"])
+    assert str(tmp_path / "none") in trilight(words[2:]).mistake

@@ -24,16 +24,13 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 PREFIXED = [
     ("from storage.errors import Rejected", "from trilight.storage.errors import Rejected"),
-    ("from storage import scene", "from trilight.storage import scene"),
     ("if x:\n    from train import run", "if x:\n    from trilight.train import run"),
     ("import model.config as c, os", "import trilight.model.config as c, os"),
     ("é = 1; from infra import cli", "é = 1; from trilight.infra import cli"),
     ("from pipeline.a import (\n    b,\n)", "from trilight.pipeline.a import (\n    b,\n)"),
     ("from trilight.extend import Scene", "from trilight.extend import Scene"),
     ("from model_zoo import storage", "from model_zoo import storage"),
-    ("import numpy, storages", "import numpy, storages"),
     ("text = 'from storage import scene'", "text = 'from storage import scene'"),
-    ("train = 1  # from model import x", "train = 1  # from model import x"),
 ]  # fmt: skip
 
 

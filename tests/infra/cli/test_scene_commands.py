@@ -1,19 +1,20 @@
-"""`trilight convert`: every form to every form, shards, budgets, and one line for a mistake."""
+"""`trilight convert`, `passes` and `model`: what they make of files, and one line for a mistake."""
 
 import json
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
+import torch
 
+from model.open import open_network
+from model.weights import encode_weights
 from pipeline.exchange import convert as convert_scene
 from pipeline.exchange.open_scene import load_source, scene_source
-from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
-from pipeline.exchange.renderformer_json import described_files
+from pipeline.exchange.renderformer_h5 import read_renderformer_h5
 from storage.dataset.shard import write_shard
-from storage.errors import TrilightError
+from storage.records.passes.stored import decode_passes_exr, passes_exr
 from storage.records.profiles import Profile
 from storage.records.sample import encode_sample
 from storage.records.scene import Scene
@@ -22,6 +23,9 @@ from tests.command_line import trilight
 from tests.crash import crash
 from tests.for_each import case
 from tests.infra.child_here import use_processes
+from tests.model.kit import awake, tiny_config
+from tests.model.published.test_convert import publishable
+from tests.pipeline.documents.dataset_by_hand import furnished, sample, write_dataset
 from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
@@ -39,13 +43,9 @@ def convert(*arguments: str | Path) -> dict[str, Any]:
     return dict(json.loads(result.output))
 
 
-def refused(*arguments: str | Path) -> str:
+def refused(*words: str | Path) -> str:
     """Return the one line that a mistake ends in."""
-    words = ["convert", *(str(argument) for argument in arguments)]
-    result = trilight(words)
-    assert isinstance(result.exception, TrilightError), result.exception
-    assert "\n" not in str(result.exception)
-    return str(result.exception)
+    return trilight([*map(str, words)]).mistake
 
 
 def loaded(path: Path, key: str = "") -> Scene:
@@ -118,16 +118,9 @@ MISTAKES = (
     ("absent.usda", "a.json", "no such file"),
     ("a.txt", "a.json", "cannot be read as a scene"),
     ("a.usda", "a.obj", "cannot be written as a scene"),
-    ("a.usda", "a.usd", "cannot be written as a scene"),
     ("broken.usda", "a.json", "not readable as USD"),
-    ("broken.json", "a.usda", "not readable as JSON"),
     ("empty.h5", "a.usda", "not a readable HDF5 file"),
     ("https://x.y/a.usda", "a.json", "only files of this machine"),
-    ("circle.usda", "a.json", "in a circle"),
-    ("outside.usda", "a.json", "outside of its folder"),
-    ("meshless.json", "a.usda", "absent.obj"),
-    ("nan.json", "a.usda", "NaN is no JSON number"),
-    ("shapes.h5", "a.usda", "has shape"),
 )
 
 
@@ -135,23 +128,12 @@ def test_mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("a.txt", "empty.h5"):
         (tmp_path / name).touch()
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
-    for name in ("broken.usda", "broken.json"):
-        (tmp_path / name).write_text("{")
-    for name, layer in (("circle", "circle"), ("outside", "../other")):
-        arc = f'def "A" (references = @./{layer}.usda@</A>) {{}}'
-        (tmp_path / f"{name}.usda").write_text(f"#usda 1.0\n{arc}")
-    described = described_files(tiny_scene(), "s").json.decode()
-    (tmp_path / "meshless.json").write_text(described.replace("templates/", "absent.obj/"))
-    (tmp_path / "nan.json").write_text(described.replace("0.5", "NaN"))
-    write_renderformer_h5(tmp_path / "shapes.h5", tiny_scene())
-    with h5py.File(tmp_path / "shapes.h5", "r+") as file:
-        del file["vn"]
-        file["vn"] = np.zeros((2, 3, 3), np.float32)
+    (tmp_path / "broken.usda").write_text("{")
     monkeypatch.chdir(tmp_path)
     before = set(tmp_path.iterdir())
     for source, target, message in MISTAKES:
         with case(source):
-            assert message in refused(source, target)
+            assert message in refused("convert", source, target)
         assert set(tmp_path.iterdir()) == before, source
 
 
@@ -161,11 +143,113 @@ def test_a_crash_in_native_code_is_one_line(
     stage = write_stage(tmp_path)
     use_processes(monkeypatch)
     monkeypatch.setattr(convert_scene, "source_keys", crash)
-    told = refused(stage, tmp_path / "a.json")
+    told = refused("convert", stage, tmp_path / "a.json")
     assert told.startswith("stage.usda: could not be converted (crashed_signal_11")
 
 
 def test_budgets_that_cannot_be(tmp_path: Path) -> None:
     stage = write_stage(tmp_path)
-    assert "from 1 to" in refused(stage, tmp_path / "a.json", "--budget", "0")
-    assert "emitters take" in refused(stage, tmp_path / "a.json", "--budget", "20")
+    assert "from 1 to" in refused("convert", stage, tmp_path / "a.json", "--budget", "0")
+    assert "emitters take" in refused("convert", stage, tmp_path / "a.json", "--budget", "20")
+
+
+def run(*words: str | Path) -> dict[str, Any]:
+    result = trilight(["passes", *map(str, words), "--json"])
+    assert result.exit_code == 0, result.exception
+    return dict(json.loads(result.output))
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    scenes = {"train-000000.tar": [0, 1], "test-000001.tar": [2]}
+    shards = {name: [sample(i, furnished(["a"])) for i in rows] for name, rows in scenes.items()}
+    write_dataset(tmp_path / "data", shards)
+    return tmp_path / "data"
+
+
+def test_the_views_of_a_dataset(dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    found = run(dataset, "--passes", "normal,depth", "--passes", "object", "--out", out)
+    assert found["passes"] == ["object", "depth_axis_m", "shading_normal"]
+    assert [Path(path).name for path in found["files"]] == [
+        f"{scene:09d}.{view}.passes.exr" for scene in (2, 0, 1) for view in range(2)
+    ]
+    names = ("object", "depth_axis_m", "shading_normal")
+    data = (out / "000000002.1.passes.exr").read_bytes()
+    assert data == passes_exr(furnished(["a"]), names, view=1, resolution=16)
+
+
+def test_one_view_of_one_scene(dataset: Path, tmp_path: Path) -> None:
+    words = (dataset, "--scene", "1", "--view", "1", "--resolution", "8", "--rays-a-side", "2")
+    (path,) = run(*words, "--out", tmp_path / "out")["files"]
+    assert Path(path).name == "000000001.1.passes.exr"
+    assert set(decode_passes_exr(Path(path).read_bytes(), 8)) == {
+        *("object", "coverage", "depth_axis_m", "shading_normal")
+    }
+
+
+def test_the_file_of_a_scene(tmp_path: Path) -> None:
+    path = tmp_path / "floor.safetensors"
+    path.write_bytes(encode_scene(tiny_scene()))
+    found = run(path, "--view", "0", "--passes", "triangle", "--out", tmp_path)
+    assert found["files"] == [str(tmp_path / "floor.0.passes.exr")]
+    data = (tmp_path / "floor.0.passes.exr").read_bytes()
+    assert data == passes_exr(tiny_scene(), ["triangle"], view=0, resolution=256)
+
+
+def test_wrong_passes_are_named(dataset: Path, tmp_path: Path) -> None:
+    for words, message in (
+        (("--scene", "9"), "no scene 000000009; expected one of its 3"),
+        (("--view", "2"), "view is 2; expected 0 to 1"),
+        (("--passes", "dept"), "did you mean depth?"),
+        (("--passes", "motion_px"), "another moment"),
+    ):
+        assert message in refused("passes", dataset, *words, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def printed(*arguments: str) -> str:
+    result = trilight(["model", *arguments])
+    if result.exception:
+        raise result.exception
+    assert result.exit_code == 0
+    return result.stdout
+
+
+def test_a_size_is_described() -> None:
+    text = printed("base")
+    for word in ("194.96 M", "692.7 GFLOP", "memory, bfloat16", "cross-attention"):
+        assert word in text
+
+
+def test_json_holds_the_numbers() -> None:
+    found = json.loads(printed("large", "--json", "--views", "4", "--resolution", "512"))
+    assert sum(found["parameters"].values()) == 483_266_819
+    assert found["workload"] == {"resolution": 512, "triangles": 1536, "views": 4}
+    assert found["config"]["window_bundles"] == 8
+    assert found["weight_bytes"]["bfloat16"] < 0.51 * found["weight_bytes"]["float32"]
+
+
+def test_a_checkpoint_is_described_and_published(tmp_path: Path) -> None:
+    model = awake(publishable("swin"), torch.float32)
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(encode_weights(model))
+    target = tmp_path / "published"
+    text = printed(str(path), "--publish", str(target), "--json", "--resolution", "64")
+    assert json.loads(text)["config"]["window_bundles"] == 8
+    again = open_network(str(target))
+    for (name, a), b in zip(again.named_parameters(), model.parameters(), strict=True):
+        assert torch.equal(a, b), name
+
+
+def test_mistakes_about_a_model_are_named(tmp_path: Path) -> None:
+    for words, message in (
+        (["huge"], "neither a size nor a checkpoint here"),
+        (["large", "--resolution", "72"], "a multiple of 64"),
+        (["smoke", "--publish", "x"], "--publish needs a checkpoint"),
+    ):
+        assert message in refused("model", *words)
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(encode_weights(awake(tiny_config(), torch.float32)))
+    assert "head linear" in refused("model", str(path), "--publish", str(tmp_path / "out"))
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,289 @@
+"""What commands say of a dataset: status, verify, shards, inspect, assets, and of a run."""
+
+import dataclasses
+import json
+import os
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from infra.cli.assets_next import generate_from_meshes
+from infra.repair import repair
+from infra.run_record import is_run, run_facts
+from storage.dataset.asked import write_asked
+from storage.dataset.dataset import open_dataset
+from storage.dataset.scene_logs import log_scene
+from storage.dataset.shard import scan_members
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.records.sample import PartFloor
+from tests.command_line import trilight
+from tests.for_each import case
+from tests.infra.run_by_hand import write_run
+from tests.pipeline.documents.dataset_by_hand import (
+    five_scenes,
+    furnished,
+    sample,
+    write_dataset,
+)
+from tests.pipeline.making.derive_kit import finished, scenes
+from tests.pipeline.making.test_publication import begin_tiny, make_tiny_shard
+
+pytestmark = pytest.mark.usefixtures("bare_reports")
+
+
+def inspect(*arguments: str | Path) -> str:
+    result = trilight(["inspect", *(str(argument) for argument in arguments)])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_the_report_stands_in_the_dataset(tmp_path: Path) -> None:
+    five_scenes(tmp_path)
+    printed = inspect(tmp_path)
+    assert "5 (1 test, 4 train)" in printed
+    assert "report.html" in printed.replace("\n", "")  # a long path is wrapped
+    assert (tmp_path / "report.html").exists()
+    assert (tmp_path / "contact_sheet.png").exists()
+    assert len(list((tmp_path / "report").iterdir())) == 5
+    read = json.loads(inspect(tmp_path, "--json"))
+    assert read["distributions"]["quantities"]["objects_per_scene"]["max"] == 2
+    assert read["licences"] == {"CC-BY-4.0": 1, "CC0-1.0": 3}
+    assert read["rejections"][0] == ["scenes", "no_room", 2]
+
+
+def test_a_run_is_summed_up_and_the_command_that_shows_it_named(tmp_path: Path) -> None:
+    write_run(tmp_path / "my run")
+    printed = inspect(tmp_path / "my run")
+    assert f"tensorboard --logdir '{tmp_path}/my run'" in printed and "steps planned" in printed
+    assert json.loads(inspect(tmp_path / "my run", "--json"))["steps"] == 12
+
+
+def test_another_folder(tmp_path: Path) -> None:
+    five_scenes(tmp_path / "set")
+    before = {path: path.read_bytes() for path in (tmp_path / "set").iterdir()}
+    inspect(tmp_path / "set", "--out", tmp_path / "out")
+    assert {path: path.read_bytes() for path in (tmp_path / "set").iterdir()} == before
+    written = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert written == ["contact_sheet.png", "report", "report.html"]
+
+
+def test_a_read_only_dataset_is_summed_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    five_scenes(tmp_path)
+    # the superuser may write anywhere, so that permissions alone would not do
+    monkeypatch.setattr("os.access", lambda path, mode: not mode & os.W_OK)
+    printed = inspect(tmp_path)
+    assert "5 (1 test, 4 train)" in printed
+    assert "--out" in printed
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_parts_show_with_their_floors(tmp_path: Path) -> None:
+    made = sample(0, furnished(["a"]))
+    floors = {
+        name: PartFloor(noise_floor_db=db, noise_floor_linear_db=30.0, object_noise_floor_db=39.0)
+        for name, db in (("direct", 47.5), ("indirect", 38.25))
+    }
+    parts = {"direct": made.radiance_rgb, "indirect": np.zeros_like(made.radiance_rgb)}
+    views = tuple(dataclasses.replace(view, parts=floors) for view in made.views)
+    whole = dataclasses.replace(made, parts_rgb=parts, views=views)
+    write_dataset(tmp_path, {"train-000000.tar": [whole]})
+    assert "noise floor, indirect median 38.2 dB" in " ".join(inspect(tmp_path).split())
+    read = json.loads(inspect(tmp_path, "--json"))
+    assert read["part_noise_floor_db"] == {"direct": [47.5] * 2, "indirect": [38.25] * 2}
+    (page,) = (tmp_path / "report").glob("*.html")
+    assert "view 1, indirect" in page.read_text() and "38.25" in page.read_text()
+
+
+def _refused(dataset: Path) -> str:
+    """Return the one line that `inspect` ends with."""
+    return trilight(["inspect", str(dataset)]).mistake
+
+
+def test_an_empty_dataset_and_a_cut_shard_are_one_sentence(tmp_path: Path) -> None:
+    write_dataset(tmp_path, {})
+    assert "the dataset is empty" in _refused(tmp_path)
+    assert not (tmp_path / "report.html").exists()
+    dataset = five_scenes(tmp_path / "my set")
+    name = dataset.manifest.shards[0].name
+    path = dataset.folder.shard(name)
+    path.write_bytes(path.read_bytes()[:2000])
+    said = _refused(tmp_path / "my set")
+    assert said.startswith(f"{name}: 2000 bytes; expected ")
+    assert said.endswith(f"run `trilight verify '{tmp_path}/my set' --repair`.")
+
+
+@pytest.mark.parametrize("suffix", ["json", "scene", "0.exr"])
+def test_wrong_bytes_are_one_sentence_with_what_mends_it(suffix: str, tmp_path: Path) -> None:
+    """Of the same length, in the middle of each kind of member."""
+    dataset = five_scenes(tmp_path)
+    shard = dataset.manifest.shards[0]
+    path = dataset.folder.shard(shard.name)
+    with path.open("rb") as stream:
+        members = scan_members(stream, shard.name)
+        found = next(member for member in members if member.suffix.startswith(suffix))
+    offset, num_bytes = found.offset, found.num_bytes
+    data = bytearray(path.read_bytes())
+    data[offset : offset + num_bytes] = bytes(255 - byte for byte in data[offset:][:num_bytes])
+    path.write_bytes(data)
+    assert f"{shard.name}: " in _refused(tmp_path)
+    assert "--repair`." in _refused(tmp_path)
+
+
+def shards(*arguments: str | Path) -> str:
+    result = trilight(["shards", *(str(argument) for argument in arguments)])
+    if result.exception is not None:
+        raise result.exception
+    return result.output
+
+
+def test_merge_select_and_reshard(tmp_path: Path) -> None:
+    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
+    printed = shards("merge", a, b, "--out", tmp_path / "ab")
+    assert "12 (4 test, 8 train)" in printed and "trilight verify" in printed
+    chosen = ("--split", "train", "--template", "plane", "--min-noise-floor", "36.5")
+    shards("select", tmp_path / "ab", "--out", tmp_path / "c", *chosen)
+    c = open_dataset(str(tmp_path / "c"))
+    keys = [key for shard in c.manifest.shards for key in c.keys(shard)]
+    assert keys == ["000000003", "000000009"]
+    where = 'template == "plane" and min(noise_floor_db) >= 36.5 and split == "train"'
+    listed = shards("list", tmp_path / "ab", "--where", where)
+    assert "2 of 12 scenes" in listed and "000000009 train" in listed
+    words = shlex.split(listed.partition("Next: trilight shards ")[2])
+    shards(*words)  # as it is printed
+    assert open_dataset(f"{tmp_path / 'ab'}-selected").manifest.num_samples == 2
+    rows = json.loads(shards("list", tmp_path / "ab", "--where", where, "--json"))
+    assert [row["key"] for row in rows["scenes"]] == ["000000003", "000000009"]
+    assert "0 of 12 scenes" in shards("list", tmp_path / "ab", "--where", "max(coverage) > 2")
+    size = ("--scenes-per-shard", "5", "--json")
+    outcome = json.loads(shards("reshard", tmp_path / "ab", "--out", tmp_path / "d", *size))
+    assert outcome["scenes_by_split"] == {"test": 4, "train": 8}
+    assert outcome["dataset_digest"] == open_dataset(str(tmp_path / "d")).digest
+
+
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
+    a, out = finished(tmp_path / "a", scenes(0)), tmp_path / "c"
+    with pytest.raises(TrilightError, match="1 dataset; expected at least 2"):
+        shards("merge", a, "--out", out)
+    with pytest.raises(TrilightError, match="expected --where, --split, --template or --min-noise"):
+        shards("select", a, "--out", out)
+    assert not out.exists()
+
+
+def test_a_bad_derived_shard_is_made_of_its_sources_again(tmp_path: Path) -> None:
+    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
+    shards("merge", a, b, "--out", tmp_path / "ab")
+    (tmp_path / "ab" / "train-000001.tar").unlink()
+    found = trilight(["verify", str(tmp_path / "ab")])
+    assert found.exit_code == 1
+    assert "Make it again from its sources: trilight shards merge" in found.output
+    with pytest.raises(TrilightError, match=r"made by `trilight shards merge`; expected one of"):
+        repair(str(tmp_path / "ab"), ["train-000001.tar"], objects=None, scenes_from=None)
+    found = trilight(["verify", str(damaged := _without_a_shard(a))])
+    assert f"Next: trilight verify {damaged} --repair" in found.output
+
+
+def _without_a_shard(root: Path) -> Path:
+    (root / "train-000000.tar").unlink()
+    return root
+
+
+WIDE = {"COLUMNS": "200"}
+
+
+def test_an_unfinished_set_is_not_verified(tmp_path: Path) -> None:
+    publication = begin_tiny(tmp_path / "my set", 12)
+    place = str(tmp_path / "my set")
+    empty = trilight(["verify", place], env=WIDE)
+    assert empty.exit_code == 1
+    assert "Unfinished" in empty.output
+    assert "Verified" not in empty.output
+    make_tiny_shard(publication, 0)
+    write_asked(publication.folder, ["generate", "smoke", "--seed", "7"])
+    begun = trilight(["verify", place, "--fast"], env=WIDE)
+    assert begun.exit_code == 1
+    assert "1 of 3" in begun.output
+    assert f"Next: trilight generate smoke --seed 7 --out '{place}'" in begun.output
+    told = json.loads(trilight(["verify", place, "--fast", "--json"]).output)
+    assert (told["finished"], told["shards"], told["shards_planned"]) == (False, 1, 3)
+
+
+def test_words_that_do_not_print_are_not_repeated(tmp_path: Path) -> None:
+    """Whoever hands out a dataset may have written them."""
+    publication = begin_tiny(tmp_path, 12)
+    for words in (["train", "smoke"], ["generate", "smoke\x1b[2J"], ["generate", "a\nb"]):
+        write_asked(publication.folder, words)
+        shown = trilight(["verify", str(tmp_path)], env=WIDE).output
+        assert "Next:" not in shown
+        assert "run the trilight generate command that began it" in shown
+
+
+def test_status_says_how_far_and_what_next(tmp_path: Path) -> None:
+    publication = begin_tiny(tmp_path, 12)
+    make_tiny_shard(publication, 0)
+    log_scene(publication.folder, "x", 0, seconds=1800.0, cores=2, num_rejected=0)
+    shown = trilight(["status", str(tmp_path)], env={"COLUMNS": "200"})
+    assert shown.exit_code == 0, shown.output
+    for text in ("1 of 3", "4 of 12", "no_camera", "1.00 core-hours, 0.04 USD", "--scenes 12"):
+        assert text in shown.output
+    told = trilight(["status", str(tmp_path), "--json", "--price", "0.5"])
+    row = json.loads(told.output)
+    assert (row["shards_done"], row["scenes_planned"], row["finished"]) == (1, 12, False)
+    assert row["cost_usd"] == 0.5
+
+
+def test_a_price_that_is_none_is_refused_before_anything_is_done() -> None:
+    for price in ["-1", "nan", "inf", "1000.5"]:
+        for command in [("plan", "smoke"), ("status", "nowhere")]:
+            with case((price, command)):
+                told = trilight([*command, "--price", price])
+                assert isinstance(told.exception, TrilightError)
+                assert str(told.exception) == (
+                    f"--price is {float(price)!r}; expected a number from 0 to 1000 USD "
+                    "per core-hour."
+                )
+
+
+def test_objects_of_one_split_limit_the_scenes_to_that_split() -> None:
+    digests = [sha256_hex(str(number).encode()) for number in range(40)]
+    words = generate_from_meshes(digests, Path("meshes"), ())
+    assert words == ["generate", "smoke", "--objects", "meshes", "--out", "meshes-smoke"]
+    training, testing = sha256_hex(b"0"), sha256_hex(b"8")
+    assert generate_from_meshes([training], Path("meshes"), ())[-2:] == ["--scenes", "8"]
+    words = generate_from_meshes([testing], Path("meshes"), ())
+    assert words[-2:] == ["--set", "splits.one_split=true"]
+
+
+def test_the_facts_are_the_last_figures_that_are_numbers(tmp_path: Path) -> None:
+    write_run(tmp_path / "run")
+    assert is_run(tmp_path / "run") and not is_run(tmp_path)
+    facts = {
+        "run": "tiny",
+        "steps": 12,
+        "steps_planned": 12,
+        "finished": False,
+        "spikes": 1,
+        "training_loss": 1 / 12,
+        "validation_log_l1": 0.1,
+        "validation_psnr_log_db_median": 20.0,
+        "views_per_s": 3.0,
+    }
+    assert run_facts(tmp_path / "run") == facts
+    with (tmp_path / "run/metrics.jsonl").open("a") as log:
+        log.write('{"step": 12, "loss": null, "validation": {"log_l1": NaN}}\n')
+    (tmp_path / "run/summary.json").write_text("{}")
+    assert run_facts(tmp_path / "run") == facts | {"finished": True}
+    (tmp_path / "run/metrics.jsonl").write_text("")
+    assert run_facts(tmp_path / "run")["steps"] == 0
+
+
+def test_other_folders_and_damage_are_named(tmp_path: Path) -> None:
+    with pytest.raises(TrilightError, match="no run here; expected a folder that `trilight train`"):
+        run_facts(tmp_path)
+    write_run(tmp_path / "run")
+    for damaged in ("{\n", "[]\n", '{"loss": 1}\n', "3\n"):
+        (tmp_path / "run/metrics.jsonl").write_text(damaged)
+        with pytest.raises(TrilightError, match="is not readable .* Restore it from a copy"):
+            run_facts(tmp_path / "run")

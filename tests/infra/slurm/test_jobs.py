@@ -1,0 +1,274 @@
+"""Jobs of clusters: files, printed commands, flows that are watched, and a fake Slurm."""
+
+import contextlib
+import json
+import os
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+from uuid import UUID
+
+import pytest
+
+from pipeline.executors import array_job as arrays
+from pipeline.flows import submission
+from pipeline.flows.submission import SeenRun, Submitted
+from tests.command_line import trilight
+from tests.conftest import ROOT
+from tests.infra.slurm.fake_slurm import commands_in
+
+SCRIPT = ROOT / "infra" / "slurm" / "train.sbatch"
+
+PYTHON = """#!/bin/bash
+# in place of Python: works until it is asked to stop, or does what $BEHAVES says
+trap 'exit 1' USR1 TERM
+said=$FAKE_SLURM/node-$SLURM_NODEID
+{ printf '%s\\n' "$SLURM_NODEID" "$OMP_NUM_THREADS" "$@"; echo; } >> "$said"
+[ "$BEHAVES" != fails ] || exit 1
+mkdir -p "$OUT/checkpoints"
+count=$(ls "$OUT/checkpoints" | wc -l)
+[ "$SLURM_NODEID" != 0 ] || [ "$BEHAVES" = idles ] ||
+    touch "$OUT/checkpoints/step-00000000$count.safetensors"
+[ "$count" -lt 1 ] || exit 0  # the second call ends the run
+while [ $((turns += 1)) -lt 3000 ]; do sleep 0.02; done  # a minute, whatever becomes of the test
+exit 3
+"""
+
+
+class Job(NamedTuple):
+    """A job that was submitted."""
+
+    place: Path
+    """Folder of the fake Slurm."""
+    process: "subprocess.Popen[str]"
+
+    def when(self, name: str, file: str) -> None:
+        """Make a file of the fake Slurm once another one is there."""
+        while not (self.place / file).exists():
+            assert self.process.poll() is None, self.process.communicate()
+            time.sleep(0.01)
+        (self.place / name).touch()
+
+    def calls(self) -> list[list[str]]:
+        return [json.loads(line) for line in (self.place / "calls").read_text().splitlines()]
+
+    def starts(self, node: int) -> list[list[str]]:
+        """Return the words with which each start of a node called Python, after its own facts."""
+        blocks = (self.place / f"node-{node}").read_text().split("\n\n")
+        return [block.split("\n") for block in blocks if block]
+
+
+Submit = Callable[..., Job]
+"""Takes the words for sbatch, what each node does, and variables."""
+
+
+@pytest.fixture
+def submit(tmp_path: Path) -> Submit:
+    def submitted(*words: str, behaves: str = "works", **variables: str) -> Job:
+        place = tmp_path / "slurm"
+        place.mkdir()
+        python = tmp_path / "python"
+        python.write_text(PYTHON)
+        python.chmod(0o755)
+        environment = {
+            "PATH": f"{commands_in(place)}:{os.environ['PATH']}", "FAKE_SLURM": str(place),
+            "PYTHON": str(python), "BEHAVES": behaves, **variables,
+        }  # fmt: skip
+        return Job(
+            place,
+            subprocess.Popen(
+                ["sbatch", "--nodes=2", *words],
+                executable=place / "sbatch",
+                cwd=tmp_path,
+                env=environment,
+                stderr=subprocess.PIPE,
+                text=True,
+            ),
+        )
+
+    return submitted
+
+
+def test_each_node_starts_torchrun_and_a_job_whose_time_is_up_goes_on(submit: Submit) -> None:
+    job = submit(str(SCRIPT), "pretrain", "--data", "a b")
+    job.when("time-is-up", "../runs/pretrain/checkpoints/step-000000000.safetensors")
+    assert job.process.wait(timeout=60) == 0, "the second start ends the run"
+    (step, *_) = [words for words in job.calls() if words[0] == "srun"]
+    assert "--cpus-per-task=64" in step
+    for node in (0, 1):
+        first, second = job.starts(node)
+        assert first == second, "the same command goes on"
+        assert first[:2] == [str(node), "1"]
+        launch, run = first[2 : first.index("trilight")], first[first.index("trilight") :]
+        assert launch[:4] == ["-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=8"]
+        assert {"--rdzv-endpoint=localhost:24711", f"--rdzv-conf=is_host={1 - node}"} < set(launch)
+        assert "--shutdown-timeout=240" in launch
+        assert any("SIGUSR1" in word for word in launch if word.startswith("--signals-to-handle"))
+        rest = ["--out", "runs/pretrain", "--restartable", "--workers", "7"]
+        assert run == ["trilight", "train", "pretrain", "--data", "a b", *rest]
+
+
+def test_what_is_said_otherwise_holds(submit: Submit) -> None:
+    job = submit("--cpus-per-task=6", "--gpus-per-node=2", str(SCRIPT), "mine.py:mine",
+                 "--workers", "5", behaves="fails", OUT="elsewhere", RESTARTS="0")  # fmt: skip
+    assert job.process.wait(timeout=60) == 1
+    ((_, _, *words),) = job.starts(0)
+    assert {"--nproc-per-node=2", "--max-restarts=0"} < set(words)
+    run = ["mine.py:mine", "--workers", "5", "--out", "elsewhere", "--restartable"]
+    assert words[-len(run) :] == run
+    assert not any(words[:2] == ["scontrol", "requeue"] for words in job.calls())
+
+
+@pytest.mark.parametrize("name", ["cancel", "time-is-up"])
+def test_a_job_that_was_cancelled_or_saved_nothing_is_not_queued_again(
+    submit: Submit, name: str
+) -> None:
+    behaves = "works" if name == "cancel" else "idles"
+    job = submit(str(SCRIPT), "smoke", behaves=behaves)
+    saved = "/step-000000000.safetensors" if name == "cancel" else ""
+    job.when(name, f"../runs/smoke/checkpoints{saved}")
+    assert job.process.wait(timeout=60) != 0
+    assert not any(words[:2] == ["scontrol", "requeue"] for words in job.calls())
+
+
+def test_python_that_is_not_there_is_named(submit: Submit) -> None:
+    job = submit(str(SCRIPT), "smoke", PYTHON="/nowhere/python")
+    assert job.process.wait(timeout=60) == 2
+    assert job.process.stderr is not None
+    assert "PYTHON=/nowhere/python: no such program" in job.process.stderr.read()
+
+
+FAKE = """#!/bin/bash
+for word in "$@"; do
+    case $word in */*.yaml) test -s "$word" || exit 3 ;; esac
+done
+printf '%s\\n' "$(basename "$0") $*" >> "$FAKE_ASKED"
+if [ -n "$FAKE_REFUSES" ]; then echo "AlreadyExists" >&2; exit 1; fi
+"""
+
+
+@pytest.fixture
+def tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a tool that writes down what it is asked, and a bucket without a dataset."""
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "kubectl").write_text(FAKE)
+    (tmp_path / "bin" / "kubectl").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    monkeypatch.setenv("FAKE_ASKED", str(tmp_path / "asked"))
+    monkeypatch.setattr(arrays, "_is_begun", lambda place: False)
+    monkeypatch.setenv("TRILIGHT_IMAGE", "registry.example/trilight:1")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_printed_commands_do_what_submitting_does(tools: Path) -> None:
+    words = ["submit", "kubernetes", "smoke", "--out", "s3://sets/mine", "--files", "my jobs"]
+    dry = trilight([*words, "--dry-run", "--json"])
+    assert dry.exit_code == 0, dry.output
+    said = json.loads(dry.stdout)
+    assert said["array"] == "0-5" and not said["submitted"] and not (tools / "asked").exists()
+    assert all((tools / file).is_file() for file in said["files"])
+    printed = trilight([*words, "--dry-run"]).stdout.splitlines()
+    commands = [line for line in printed if line.startswith("kubectl ")]
+    assert len(commands) == len(said["commands"])
+    subprocess.run(["bash", "-ec", "\n".join(commands)], check=True)
+    asked = (tools / "asked").read_text()
+    (tools / "asked").unlink()
+    done = trilight(words)
+    assert done.exit_code == 0 and "trilight status s3://sets/mine" in done.stdout
+    assert (tools / "asked").read_text() == asked
+
+
+def test_refusals(tools: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["submit", "kubernetes", "smoke", "--out", "s3://sets/mine"]
+    monkeypatch.setenv("FAKE_REFUSES", "1")
+    assert "kubectl refused (AlreadyExists)" in trilight(words).mistake
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert "no kubectl here" in trilight(words).mistake
+    assert "--sbatch is an option of submit slurm" in trilight([*words, "--sbatch=-x"]).mistake
+    slurm = trilight(["submit", "slurm", "smoke", "--image", "x"])
+    assert "leave them out, and use --sbatch" in slurm.mistake
+    flow = trilight(["submit", "generate-scenes", "smoke", "--where", "x"])
+    assert "options of machines are those of submit slurm, kubernetes" in flow.mistake
+
+
+def test_status_prints_what_any_scheduler_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("infra.cli.status.missing_shards", lambda dataset: [0, 1, 5, 8])
+    words = ["status", "set", "--missing", "--shards-per-task", "2"]
+    assert trilight(words).stdout == "0,2,4\n"
+    assert trilight([*words, "--lines"]).stdout == "0:2\n4:6\n8:10\n"
+    assert json.loads(trilight([*words, "--json"]).stdout) == {
+        "missing": [0, 2, 4], "array": "0,2,4", "shards": ["0:2", "4:6", "8:10"],
+        "shards_per_task": 2,
+    }  # fmt: skip
+    assert "--lines is given; expected it only" in trilight(["status", "set", "--lines"]).mistake
+
+
+RUN = Submitted(
+    id=UUID(int=1),
+    name="a-run",
+    deployment="generate-scenes/local",
+    pool="local",
+    page="http://page",
+)
+
+
+def seen(state: str, **more: Any) -> SeenRun:
+    plain: dict[str, Any] = {"message": "", "percent": 50.0, "tables": {}}
+    ended = state in ("Completed", "Crashed")
+    told = {**plain, "is_final": ended, "is_completed": state == "Completed", **more}
+    return SeenRun(state=state, **told)
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What the server is asked for; its run is seen in `looks`, without any by default."""
+    found: list[Any] = []
+
+    def submit(client: object, flow: str, deployment: str | None, given: object) -> Submitted:
+        found.append((flow, deployment, given))
+        return RUN
+
+    monkeypatch.setattr(submission, "server", contextlib.nullcontext)
+    monkeypatch.setattr(submission, "submit", submit)
+    monkeypatch.setattr(submission, "workers_online", lambda client, pool: 1)
+    return found
+
+
+def test_a_run_is_watched_to_its_end(
+    asked: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    looks = [seen("Pending"), seen("Running"), seen("Running")]
+    looks.append(seen("Completed", tables={"summary": [("scenes", "2")]}))
+    monkeypatch.setattr(submission, "looks", lambda client, run: iter(looks))
+    words = ["submit", "generate-scenes", "smoke", "--scenes", "2", "--out", str(tmp_path)]
+    told = trilight(words).stdout
+    given = {"build": "smoke", "scenes": 2, "out": str(tmp_path)}
+    assert asked == [("generate-scenes", None, given)]
+    for line in ("Run a-run of generate-scenes/local: http://page", "Pending", "scenes  2"):
+        assert told.count(line) == 1, told
+    assert f"Next: trilight verify {tmp_path}" in told
+    assert json.loads(trilight([*words, "--json"]).stdout)["summary"] == {"scenes": "2"}
+
+
+def test_a_run_that_crashed_is_a_mistake_with_its_reason(
+    asked: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = seen("Crashed", message="it was killed.")
+    monkeypatch.setattr(submission, "looks", lambda client, run: iter([ended]))
+    failed = trilight(["submit", "generate-scenes", "smoke"])
+    assert "ended as Crashed: it was killed. Its log is at http://page" in failed.stderr
+
+
+def test_who_does_not_watch_gets_the_run(asked: list[Any]) -> None:
+    words = ["submit", "generate-scenes", "smoke", "--no-watch", "--deployment", "cluster"]
+    assert json.loads(trilight([*words, "--json"]).stdout)["flow_run"] == str(RUN.id)
+    assert asked[0][:2] == ("generate-scenes", "cluster")
+
+
+def test_a_flow_that_is_none_is_told_those_there_are() -> None:
+    assert "build-dataset, make-by-array, or of slurm" in trilight(["submit", "x", "smoke"]).mistake
