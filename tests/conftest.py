@@ -1,5 +1,6 @@
 """What every test may ask for."""
 
+import json
 import os
 from pathlib import Path
 
@@ -11,6 +12,9 @@ settings.register_profile("untimed", deadline=None, suppress_health_check=[Healt
 settings.load_profile("untimed")
 
 ROOT = Path(__file__).parents[1]
+
+BUDGET = json.loads((ROOT / "tests/architecture/budget.json").read_bytes())
+"""What lines, words, options and the quick tests' seconds may be (test_budget.py)."""
 
 SLOW_KINDS = {
     "benchmarks": "an experiment measured for real",
@@ -84,3 +88,25 @@ def _deal_items(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
 def _patience_s(item: pytest.Item) -> float:
     """Return the longest timeout that a test or its file states, s."""
     return max((float(mark.args[0]) for mark in item.iter_markers("timeout")), default=0.0)
+
+
+_SECONDS: list[float] = []
+"""Of every quick test of this session, set-up included."""
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Count the seconds of a test, in the process that hears from all workers."""
+    _SECONDS.append(report.duration)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail where the quick tests together took longer than the budget, and a tenth for noise."""
+    config = session.config
+    is_whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    is_quick = is_whole and config.getoption("markexpr") == "not slow"
+    if is_quick and not hasattr(config, "workerinput"):
+        most = 1.1 * BUDGET["quick_test_seconds"]
+        if sum(_SECONDS) > most:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+            message = f"quick tests took {sum(_SECONDS):.0f} s, at most {most:.0f}: budget.json"
+            config.get_terminal_writer().line(message)

@@ -6,6 +6,7 @@ Any process may read it. The rate is that of the logs (storage.dataset.scene_log
 import contextlib
 import functools
 import json
+import os
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -195,7 +196,8 @@ def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
 
 
 def _num_waiting(folder: DatasetFolder) -> int:
-    return sum(path.is_file() for path in folder.staged_samples.rglob("*.tar"))
+    walked = os.walk(folder.staged_samples)  # passes over a folder that a worker removes meanwhile
+    return sum(name.endswith(".tar") for _, _, names in walked for name in names)
 
 
 _LOGS_READ = 64
