@@ -1,7 +1,5 @@
 """Whatever bytes a child sends, its owner gets what was declared, or a sentence."""
 
-import ast
-import importlib
 import json
 import os
 import pickle  # noqa: TID251 - what an attacker would send
@@ -27,8 +25,6 @@ from pipeline.isolation.answers import (
     encode_result,
 )
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
-from storage.installation import module_name
-from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.pipeline.isolation.called import (
     anything,
@@ -123,13 +119,10 @@ def test_any_bytes_are_what_was_declared_or_a_sentence(sent: bytes) -> None:
         assert _is_declared(found)
 
 
-def test_brackets_without_end_are_nonsense() -> None:
+def test_heads_without_end_are_nonsense_and_long_ones_not_even_read() -> None:
     text = b'["result",' + b"[" * 200_000
     with pytest.raises(ChildFailed, match="nonsense: .*RecursionError"):
         decode_answer(memoryview(len(text).to_bytes(8, "little") + text), find)
-
-
-def test_a_long_head_is_not_even_read() -> None:
     sent = (MOST_HEAD_BYTES + 1).to_bytes(8, "little") + bytes(MOST_HEAD_BYTES + 1)
     with pytest.raises(ChildFailed, match="a head of"):
         decode_answer(memoryview(sent), find)
@@ -203,69 +196,14 @@ def test_a_child_that_reads_no_more_is_given_up(child: IsolatedChild) -> None:
         child.call(length_of, bytes(8 << 20))
 
 
-def test_who_returns_what_it_does_not_declare_is_told(child: IsolatedChild) -> None:
+def test_values_come_whole_and_only_as_their_function_declares_them(child: IsolatedChild) -> None:
     with pytest.raises(ChildFailed, match="exception: .*NotAsDeclared: a value of str"):
         child.call(lie)
-
-
-def test_a_function_whose_answer_cannot_be_checked_is_not_called(child: IsolatedChild) -> None:
     with pytest.raises(TypeError, match="declare what it is"):
         child.call(anything)
-
-
-def test_large_values_come_whole(child: IsolatedChild) -> None:
     assert child.call(large) == large()
 
 
 def test_a_builtin_returns_nothing() -> None:
     assert declared_form(os._exit).unpack(None, Any) is None  # type: ignore[arg-type]
     assert frames._LENGTH == 8
-
-
-_CALLS = {"call_with_retries": 1, "_call": 1, "call": 0}
-"""Who calls in a child, and which of its arguments is the function."""
-
-
-def _called() -> Iterator[tuple[str, str]]:
-    """Yield (module, function) of what is handed to such a call by its name."""
-    for package in ("pipeline", "infra"):
-        for path in sorted((ROOT / package).rglob("*.py")):
-            module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-            for node in ast.walk(ast.parse(path.read_text())):
-                name = _function_of(node)
-                if name:
-                    yield module, name
-
-
-def _function_of(node: ast.AST) -> str | None:
-    if not isinstance(node, ast.Call):
-        return None
-    called = node.func
-    name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")
-    if name not in _CALLS or len(node.args) <= _CALLS[name]:
-        return None
-    given = node.args[_CALLS[name]]
-    if isinstance(given, ast.Attribute) and isinstance(given.value, ast.Name):
-        return f"{given.value.id}.{given.attr}"
-    return given.id if isinstance(given, ast.Name) else None
-
-
-def _found(module: str, name: str) -> object:
-    found: object = importlib.import_module(module_name(module))
-    for part in name.split("."):
-        found = getattr(found, part, None)
-    return found
-
-
-def test_what_is_called_in_children_can_be_checked() -> None:
-    pytest.importorskip("torch", reason="some of it needs torch")
-    functions = {each: _found(*each) for each in _called()}
-    known = {each: found for each, found in functions.items() if callable(found)}
-    assert len(known) > 20, "the walk finds them"
-    wrong = {}
-    for each, function in known.items():
-        try:
-            declared_form(function)
-        except TypeError as error:
-            wrong[each] = str(error)
-    assert not wrong

@@ -135,12 +135,10 @@ def test_a_type_that_could_not_be_checked_is_refused(hint: Any) -> None:
     ("data", "hint"),
     [
         (["object", [1], "C"], NDArray[Any]),
-        (["V8", [1], "C"], NDArray[Any]),
         (["float64", [1], "C"], NDArray[np.float32]),
         (["float32", [3], "C"], NDArray[np.float32]),  # 12 of 8 bytes
         (["float32", [-1], "C"], NDArray[np.float32]),
         (["float32", [1 << 40, 1 << 40], "C"], NDArray[np.float32]),
-        (["float32", [1] * 17, "C"], NDArray[np.float32]),
         (["float32", [1], "A"], NDArray[np.float32]),
         (9, bytes),
         (-1, bytes),
@@ -159,21 +157,15 @@ def test_what_is_not_as_declared_is_refused(data: Any, hint: Any) -> None:
         form_of(hint).unpack(data, Bytes(memoryview(bytes(8))))
 
 
-def test_no_bytes_are_used_twice() -> None:
+def test_no_bytes_are_used_twice_truth_values_are_such_and_checks_of_a_class_are_made() -> None:
     """So that a short answer cannot fill the memory of who reads it."""
     rest = Bytes(memoryview(bytes(8)))
     form = form_of(tuple[bytes, bytes])
     assert form.unpack([8, 0], rest) == (bytes(8), b"")
     with pytest.raises(NotAsDeclared, match="bytes that are there"):
         form.unpack([8, 8], Bytes(memoryview(bytes(8))))
-
-
-def test_truth_values_are_such_whatever_their_bytes() -> None:
     found = form_of(NDArray[np.bool_]).unpack(["bool", [3], "C"], Bytes(memoryview(b"\0\1\7")))
     assert found.tobytes() == b"\0\1\1"
-
-
-def test_the_checks_of_a_class_are_made() -> None:
     data = pack(form_of(Inner), Inner(count=1, share=None), lambda piece: None)
     held = [[data] * 6, [], 0, "a", [], None]
     with pytest.raises(ValueError, match="too many"):
