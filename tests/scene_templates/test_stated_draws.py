@@ -41,16 +41,13 @@ def _drawn() -> StatedDraws:
     return draws
 
 
-def test_each_is_distributed_as_stated() -> None:
+def test_each_is_distributed_as_stated_and_another_statement_would_be_noticed() -> None:
     made = _drawn().made
     table = stated_table(made)
     require_plausible(table)
     # a colour has three numbers, a direction a height and an azimuth
     assert len(table) == 4 + 3 + 1 + 2
     assert not implausible({"nothing": 1.0})
-
-
-def test_another_statement_would_be_noticed() -> None:
     wrong = {"number": (-2.0, 6.0), "count": (3, 10), "it holds": 0.45, "word": ("a", "b")}
     for name, stated in wrong.items():
         made = _drawn().made
@@ -92,17 +89,14 @@ def test_parameters_are_plain_values() -> None:
     assert isinstance(colour, list) and len(colour) == 3
 
 
-def test_uniform_rotations_are_proper() -> None:
+def test_uniform_rotations_are_proper_and_follow_the_haar_measure() -> None:
     rng = np.random.default_rng(0)
     matrices = np.stack([uniform_rotation(rng) for _ in range(200)])
     gram = np.einsum("nij,nkj->nik", matrices, matrices)
     # A handful of float64 operations: a few units of 2e-16.
     assert np.abs(gram - np.eye(3)).max() < 1e-14
     assert np.abs(np.linalg.det(matrices) - 1).max() < 1e-14
-
-
-def test_uniform_rotations_follow_the_haar_measure() -> None:
-    """The turning angle has density (1 - cos a) / pi, hence the mean pi/2 + 2/pi."""
+    # The turning angle has density (1 - cos a) / pi, hence the mean pi/2 + 2/pi.
     rng = np.random.default_rng(1)
     matrices = np.stack([uniform_rotation(rng) for _ in range(20000)])
     angles = np.arccos(np.clip((np.trace(matrices, axis1=1, axis2=2) - 1) / 2, -1, 1))
@@ -117,14 +111,11 @@ def test_uniform_rotations_follow_the_haar_measure() -> None:
     assert np.abs(matrices.mean(axis=0)).max() < 5 * math.sqrt(1 / 3 / len(matrices))
 
 
-def test_euler_angles_turn_about_x_then_y_then_z() -> None:
+def test_rotations_turn_about_x_then_y_then_z_and_to_the_left() -> None:
     rng = np.random.default_rng(2)
     for angles in rng.uniform(-180, 180, size=(50, 3)):
         x, y, z = (rotation_xyz(np.where(np.arange(3) == axis, angles, 0)) for axis in range(3))
         assert np.abs(rotation_xyz(angles) - z @ y @ x).max() < 1e-14
-
-
-def test_a_quarter_turn_about_z_brings_x_to_y() -> None:
     turned = rotated(np.array([[1.0, 0, 0]]), rotation_xyz([0, 0, 90]))
     assert np.abs(turned - [[0, 1, 0]]).max() < 1e-15
 

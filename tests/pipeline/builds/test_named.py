@@ -40,7 +40,7 @@ def test_what_is_named_changes_and_nothing_else(name: str) -> None:
     assert after.digest != before.digest
 
 
-def test_the_floors_that_are_asked_for_replace_those_of_the_build() -> None:
+def test_floors_licences_and_mistakes_of_a_build() -> None:
     plain = named_build("smoke").renders
     linear = named_build("smoke", noise_floor_linear_db=33.0)
     assert linear.renders.targets_db == {"psnr_linear_db": 33.0}
@@ -48,15 +48,9 @@ def test_the_floors_that_are_asked_for_replace_those_of_the_build() -> None:
     assert added.renders.targets_db == {**plain.targets_db, "psnr_linear_db": 33.0}
     assert from_record(BuildSettings, linear.as_json()) == linear
     assert len({each.digest for each in (named_build("smoke"), linear, added)}) == 3
-
-
-def test_licences_are_added_and_sorted() -> None:
     plain = named_build("smoke").allowed_licences
     more = named_build("smoke", allow_licences=("ZZ-1.0", "AA-1.0", plain[0])).allowed_licences
     assert more == tuple(sorted({*plain, "ZZ-1.0", "AA-1.0"}))
-
-
-def test_mistakes_are_named() -> None:
     with pytest.raises(TrilightError, match=r"'smok' is unknown; did you mean smoke\? Expected"):
         named_build("smok")
     with pytest.raises(TrilightError, match=r"scenes\.lights\.number"):

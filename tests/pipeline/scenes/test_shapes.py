@@ -176,7 +176,7 @@ def _off_centre() -> NDArray[np.float32]:
     return points[points[:, 0] > 0]
 
 
-def test_the_mean_of_the_vertices_becomes_the_centre_where_published() -> None:
+def test_the_centre_is_the_mean_of_the_vertices_or_the_middle_of_the_source() -> None:
     for entry in small_pool():
         points = in_unit_sphere(entry.asset.levels[0].positions, "vertex_mean")
         # Sums of a thousand float64 below 1.
@@ -185,10 +185,7 @@ def test_the_mean_of_the_vertices_becomes_the_centre_where_published() -> None:
     moved = in_unit_sphere(_off_centre() + np.float32(0.3), "vertex_mean")
     # Positions are float32 before they are centred: 6e-8 of a number below 1, over a radius of 0.5.
     assert np.abs(moved - in_unit_sphere(_off_centre(), "vertex_mean")).max() < TOUCH
-
-
-def test_otherwise_the_middle_of_the_source_does() -> None:
-    """It is the origin of the asset's unit box, however a level is cut: levels fit each other."""
+    # It is the origin of the asset's unit box, however a level is cut: levels fit each other.
     points = in_unit_sphere(_off_centre(), "box")
     assert np.array_equal(
         points, _off_centre() / np.linalg.norm(_off_centre().astype(float), axis=1).max()
