@@ -1,4 +1,4 @@
-"""Draws: named ones, rotations, strata, layouts by index, and exact operations alone."""
+"""Draws: named ones, rotations, layouts by index, and exact operations alone."""
 
 import ast
 import dataclasses
@@ -16,12 +16,8 @@ from scene_templates.layout_rand import scene_plan
 from scene_templates.rotations import rotated, rotation_xyz, uniform_rotation
 from scene_templates.settings import SceneSettings
 from scene_templates.stated_draws import StatedDraws
-from scene_templates.strata import Stratum, stratum_of
-from storage.errors import TrilightError
 from storage.seeds import rng_for
-from storage.settings.changes import changed
 from tests.conftest import ROOT
-from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS
 from tests.scene_templates.statistics import implausible, require_plausible, stated_table
 
@@ -118,43 +114,6 @@ def test_rotations_turn_about_x_then_y_then_z_and_to_the_left() -> None:
         assert np.abs(rotation_xyz(angles) - z @ y @ x).max() < 1e-14
     turned = rotated(np.array([[1.0, 0, 0]]), rotation_xyz([0, 0, 90]))
     assert np.abs(turned - [[0, 1, 0]]).max() < 1e-15
-
-
-STRATA = (
-    Stratum(name="rare", weight=0.1),
-    Stratum(name="often", weight=0.6),
-    Stratum(name="some", weight=0.3),
-)
-
-
-@for_each("first", [0, 7, 1000, 999_999_900])
-def test_every_stretch_holds_each_share(first: int) -> None:
-    for length in (10, 40, 100):
-        found = Counter(stratum_of(STRATA, first + k).name for k in range(length))
-        for stratum in STRATA:
-            assert abs(found[stratum.name] - stratum.weight * length) < 2.5, (length, found)
-
-
-def test_weights_are_relative_and_history_changes_no_scene() -> None:
-    other = [
-        Stratum(name=one.name, weight=10 * one.weight, earlier_weights=(1.0,)) for one in STRATA
-    ]
-    for index in range(50):
-        assert stratum_of(STRATA, index).name == stratum_of(other, index).name
-
-
-@for_each(
-    ("strata", "message"),
-    [
-        ([{"name": "a", "weight": 1}, {"name": "a", "weight": 1}], "unique names"),
-        ([{"name": "a", "weight": 1, "families": ["tunnel"]}], "tunnel"),
-        ([{"name": "a", "weight": 1, "changes": [["lights.cuont", [1, 2]]]}], "cuont"),
-        ([{"name": "a", "weight": 0}], "weight"),
-    ],
-)
-def test_contradictions_are_named(strata: list[dict[str, object]], message: str) -> None:
-    with pytest.raises(TrilightError, match=message):
-        changed(named_build("smoke").scenes, {"strata": strata})
 
 
 def test_a_plan_depends_on_seed_and_index_alone() -> None:
