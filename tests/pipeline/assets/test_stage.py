@@ -60,7 +60,6 @@ def test_the_next_method_makes_only_what_the_first_one_missed_without_epsilon(be
     assert first["pid"] != second["pid"]
     (bench.root / CALLS).unlink()
     # A second method that only fills in coarser levels must not search for the smallest.
-    bench.set(**{f"{FIRST} misses": "900"})
     made(bench, AssetSettings(budgets=(1000, 240, 200), epsilon=0.005))
     first, *others = (call["epsilon"] for call in bench.calls)
     assert first == 0.005

@@ -19,7 +19,6 @@ from storage.licences import share_alike_camp
 from storage.records.asset import Asset, Level, LevelRecord
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
-from tests.pipeline.scenes.draw_kit import drawn_within
 from tests.pipeline.scenes.small_pool import QUALITY, SOURCE, first_scene, small_pool, with_error
 
 Rungs = list[tuple[int, float]]
@@ -133,10 +132,10 @@ def test_too_little_room_is_rejected_with_the_numbers() -> None:
     with pytest.raises(Rejected, match="1 objects need 300 triangles at least.*has 200"):
         levels_within([_asset([(300, 0.1), (600, 0.0)])], 200, 0.0)
     with pytest.raises(Rejected, match="3 objects of at least 50 .* into the 149") as caught:
-        drawn_within(np.random.default_rng(0), "ab", [50, 80], 3, 149)
+        drawn_rows(np.random.default_rng(0), FitTable.of([50, 80]), 3, 149)
     assert caught.value.reason == "over_budget"
     with pytest.raises(Rejected, match="do not fit"):
-        drawn_within(np.random.default_rng(0), "ab", [5, 5], 3, 14, ["a", "b"])
+        drawn_rows(np.random.default_rng(0), FitTable.of([5, 5], ["a", "b"]), 3, 14)
 
 
 LICENCES = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC0-1.0", "cc-by-sa-4.0", "GPL-3.0-only")

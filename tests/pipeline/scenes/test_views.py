@@ -27,13 +27,45 @@ from storage.errors import Rejected
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
 from storage.records.scene import ARRAY_FIELDS, Scene
 from storage.records.scene_facts import lights, surfaces
-from tests.pipeline.scenes.slow_rays import first_hits
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import tiny_scene
 from tests.sky_maps import constant, one_sun
 from tests.textured_by_hand import sky, textured_scene
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
+
+
+CHUNK = 64
+
+
+def first_hits(
+    origin: NDArray[np.float64], directions: NDArray[np.float64], triangles: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the first triangle (or -1) and the distance (or inf) of rays [N, 3] from one point.
+
+    Moeller and Trumbore 1997, two-sided, double precision, every ray against every triangle.
+    """
+    face, distance = [], []
+    a, ab, ac = (
+        triangles[:, 0],
+        triangles[:, 1] - triangles[:, 0],
+        triangles[:, 2] - triangles[:, 0],
+    )
+    for rays in np.array_split(directions, max(1, len(directions) // CHUNK)):
+        p = np.cross(rays[:, None], ac[None])
+        det = np.sum(p * ab, axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.sum(p * (origin - a), axis=-1) / det
+            q = np.cross(origin - a, ab)
+            v = np.sum(rays[:, None] * q, axis=-1) / det
+            t = np.sum(q * ac, axis=-1) / det
+            inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
+        t = np.where(inside, t, np.inf)
+        nearest = t.argmin(axis=1)
+        reached = t[np.arange(len(rays)), nearest]
+        face.append(np.where(np.isfinite(reached), nearest, -1))
+        distance.append(reached)
+    return np.concatenate(face), np.concatenate(distance)
 
 
 def _slow_view(scene: Scene, view: int, grid: int) -> tuple[float, float, float]:
