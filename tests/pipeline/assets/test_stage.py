@@ -61,8 +61,8 @@ def test_the_next_method_makes_only_what_the_first_one_missed_without_epsilon(be
     (bench.root / CALLS).unlink()
     # A second method that only fills in coarser levels must not search for the smallest.
     made(bench, AssetSettings(budgets=(1000, 240, 200), epsilon=0.005))
-    first, *others = (call["epsilon"] for call in bench.calls)
-    assert first == 0.005
+    finest, *others = (call["epsilon"] for call in bench.calls)
+    assert finest == 0.005
     assert others and set(others) == {None}
 
 
