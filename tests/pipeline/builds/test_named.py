@@ -134,18 +134,14 @@ def _statistics(*, num_scenes: int, scene_digest: str) -> Statistics:
 OWN = {"scenes.materials.source": "object"}
 
 
-def test_one_word_asks_for_them() -> None:
-    build = named_build("smoke", changes=OWN)
-    assert build.mesh_settings.own_materials.keep
-    record = build.as_json()
+def test_one_word_asks_for_own_materials_and_their_numbers_count_in_the_digest() -> None:
+    plain = named_build("smoke", changes=OWN)
+    assert plain.mesh_settings.own_materials.keep
+    record = plain.as_json()
     assert record["assets"]["own_materials"]["keep"] is True
     assert record["scenes"]["materials"]["source"] == "object"
     again = from_record(BuildSettings, record)
-    assert again.digest == build.digest and again.mesh_settings == build.mesh_settings
-
-
-def test_sizes_and_shares_count_in_the_digest() -> None:
-    plain = named_build("smoke", changes=OWN)
+    assert again.digest == plain.digest and again.mesh_settings == plain.mesh_settings
     for name, value in (
         ("assets.own_materials.texels", 64),
         ("assets.own_materials.if_lost", "reject"),

@@ -82,13 +82,15 @@ def test_nothing_is_loaded_from_elsewhere() -> None:
     assert all(link.startswith("data:image/png;base64,") for link in links)
 
 
-def test_counts_are_those_of_the_rows() -> None:
+def test_counts_are_those_of_the_rows_and_equal_rows_give_equal_pages() -> None:
     tags = quality_page([row("a"), row("b")], [failure()])
     text = text_of(tags)
     assert "2 objects accepted, 0 of them repaired" in text
     assert "2 watertight; 1 rejected" in text
     assert "CC0-1.0 (2)" in text
     assert tags.tags.count("tr") == 2 + 3
+    twice = [encode_quality_page([row()], [], {}, budget=9, target="x") for _ in range(2)]
+    assert twice[0] == twice[1]
 
 
 def test_a_page_without_objects_or_without_failures() -> None:
@@ -103,11 +105,6 @@ def test_a_page_without_objects_or_without_failures() -> None:
     tags = quality_page([row(str(k), method="meshoptimizer") for k in range(3)], [])
     assert tags.tags.count("img") == 1
     assert "Rejected" not in " ".join(tags.text)
-
-
-def test_equal_rows_give_equal_pages() -> None:
-    twice = [encode_quality_page([row()], [], {}, budget=9, target="x") for _ in range(2)]
-    assert twice[0] == twice[1]
 
 
 def card(
@@ -261,7 +258,7 @@ def test_any_values_can_be_drawn() -> None:
     assert len(drawn.getcolors(1 << 24) or []) > 20
 
 
-def test_bars_hold_every_value() -> None:
+def test_bars_hold_every_value_and_names_from_outside_are_labels() -> None:
     """Heights of the bars add up to the values, and whole numbers have a bar each."""
     with drawing():
         _, (axes, other) = panels(2)
@@ -271,9 +268,6 @@ def test_bars_hold_every_value() -> None:
     assert heights == [1, 2, 0, 0, 1]
     total = sum(patch.get_height() for patch in other.patches)  # type: ignore[attr-defined]
     assert total == 1000
-
-
-def test_names_from_outside_are_labels() -> None:
     assert short_label("a\n b\x07\u202e") == "a b"
     assert len(short_label("x" * 99)) == 26
     names = ["$\\frac{$", "高 \ud800", "", "x" * 99]

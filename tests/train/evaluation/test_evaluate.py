@@ -192,16 +192,13 @@ def test_another_scenes_triangles_and_what_swapping_costs_are_told(dataset: Data
     assert record(rows[:1], {})["swapped scenes"] is None
 
 
-def test_worst_median_and_excursions_are_found() -> None:
+def test_worst_median_and_excursions_are_found_and_plotted(tmp_path: Path) -> None:
     rows = [row(number, excursion=("lights", 16.0 + number % 3)) for number in range(30)]
     rows.append(row(40, excursion=("fov_deg", 90.0)))
     chosen = worst_and_median(rows)
     assert [view.key for view in chosen["worst"]] == [f"{number:09d}" for number in range(8)]
     assert f"{15:09d}" in [view.key for view in chosen["median"]]
     assert [view.key for view in worst_of_each_excursion(rows)] == [f"{40:09d}", f"{0:09d}"]
-
-
-def test_excursions_are_plotted_where_there_are_any(tmp_path: Path) -> None:
     assert plot_excursions(tmp_path / "none.png", [row(0)]) == 0
     assert not (tmp_path / "none.png").exists()
     rows = [row(k, excursion=(axis, 10.0**k)) for axis in ("a", "b", "c", "d") for k in range(3)]

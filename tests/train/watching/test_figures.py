@@ -194,7 +194,7 @@ def package(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     return package
 
 
-def test_rows_and_sheets_of_a_run_are_logged_offline(
+def test_rows_and_sheets_of_a_run_are_logged_offline_or_as_the_user_says(
     dataset: Dataset, package: MagicMock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("WANDB_MODE", raising=False)
@@ -214,11 +214,6 @@ def test_rows_and_sheets_of_a_run_are_logged_offline(
     assert any(row.get("validation", "")[0:1] == ("picture",) for row in logged)
     board.define_metric.assert_called_once_with("*", step_metric="step")
     board.finish.assert_called_once_with()
-
-
-def test_a_mode_of_the_users_own_is_obeyed(
-    package: MagicMock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setenv("WANDB_MODE", "online")
     BiasesBoard("light", tmp_path, {})
     assert package.init.call_args.kwargs["mode"] == "online"
