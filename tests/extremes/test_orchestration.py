@@ -176,8 +176,8 @@ def test_batches_may_exceed_the_split_and_stand_in_distant_epochs(tmp_path: Path
     assert keys(five, 5, 2, first=first) == [[*map(sample_key, range(5))]] * 2
     order = OrderSettings(seed=2**63, window=2)
     windows = windows_from(3, lambda shard: 7, order, 3 * first)
-    batch = next(batches_from(windows, 3 * first, 64))
-    assert [place.position for place in batch] == list(range(3 * first, 3 * first + 64))
+    far = next(batches_from(windows, 3 * first, 64))
+    assert [place.position for place in far] == list(range(3 * first, 3 * first + 64))
 
 
 SCENES = 600

@@ -48,9 +48,9 @@ def test_floors_licences_and_mistakes_of_a_build() -> None:
     assert added.renders.targets_db == {**plain.targets_db, "psnr_linear_db": 33.0}
     assert from_record(BuildSettings, linear.as_json()) == linear
     assert len({each.digest for each in (named_build("smoke"), linear, added)}) == 3
-    plain = named_build("smoke").allowed_licences
-    more = named_build("smoke", allow_licences=("ZZ-1.0", "AA-1.0", plain[0])).allowed_licences
-    assert more == tuple(sorted({*plain, "ZZ-1.0", "AA-1.0"}))
+    usual = named_build("smoke").allowed_licences
+    more = named_build("smoke", allow_licences=("ZZ-1.0", "AA-1.0", usual[0])).allowed_licences
+    assert more == tuple(sorted({*usual, "ZZ-1.0", "AA-1.0"}))
     with pytest.raises(TrilightError, match=r"'smok' is unknown; did you mean smoke\? Expected"):
         named_build("smok")
     with pytest.raises(TrilightError, match=r"scenes\.lights\.number"):

@@ -92,8 +92,8 @@ def test_rows_are_sorted_complete_and_come_back_as_they_were() -> None:
         "changes": "cleaned, remeshed and given new materials",
     }
     for text in ['a "quoted" name', "a;b,c", "line\nbreak", "élan 高", "a=1", ""]:
-        (read,) = cells(encode_attribution([row(title=text)]))
-        assert read["title"] == text
+        (again,) = cells(encode_attribution([row(title=text)]))
+        assert again["title"] == text
     assert encode_attribution([]).count(b"\n") == 1
 
 

@@ -143,8 +143,8 @@ def test_light_is_seen_from_its_side_past_emitters_and_not_through_roofs() -> No
     assert Sight(covered).facts(_camera([0, 0, 1.0]), 30.0, 16).lit == 0.0
     # Below the roof the light of an even sky still comes from the sides, and of black none does.
     for around, lit in ((constant(1.0), 1.0), (constant(0.0), 0.0)):
-        below = Sight(dataclasses.replace(covered, environment=around))
-        assert below.facts(_camera([0, 0, 1.0]), 30.0, 16).lit == lit
+        under = Sight(dataclasses.replace(covered, environment=around))
+        assert under.facts(_camera([0, 0, 1.0]), 30.0, 16).lit == lit
     # From right above the emitter the view goes through it to the floor.
     facts = Sight(tiny_scene()).facts(_camera([0, 0, 2.01]), 5.0, 16)
     assert facts.lit == 1.0

@@ -176,13 +176,13 @@ def test_a_summary_shows_the_bad_ones_and_the_noise() -> None:
 def test_another_scenes_triangles_and_what_swapping_costs_are_told(dataset: Dataset) -> None:
     judging = contest(dataset)
     rows, samples = judged_views(judging, lambda: None), list(judging.samples())
-    assert [row.swapped_psnr_log_db is None for row in rows] == [True] * 2 + [False] * 4
+    assert [view.swapped_psnr_log_db is None for view in rows] == [True] * 2 + [False] * 4
     before, judged = samples[1], judged_scene(samples[2], judging.resolution)
     seen = before.scene.with_cameras(samples[2].scene.c2w, samples[2].scene.fov_deg)
     mixed = training_scene(dataclasses.replace(samples[2], scene=seen), judging.resolution)
     shown = predict(judging.network, mixed)
-    for row, picture, target in zip(rows[4:], shown, judged.target_VRR3, strict=True):
-        assert row.swapped_psnr_log_db == psnr_log_db(picture, target)
+    for view, picture, target in zip(rows[4:], shown, judged.target_VRR3, strict=True):
+        assert view.swapped_psnr_log_db == psnr_log_db(picture, target)
     swapped = [None, 28.0, 20.0, 34.0]
     rows = [row(0, swapped_psnr_log_db=value) for value in swapped]
     loss = record(rows, {})["swapped scenes"]

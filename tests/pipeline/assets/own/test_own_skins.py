@@ -110,8 +110,8 @@ def test_constants_are_exact_and_metals_have_no_diffuse_part(tmp_path: Path) -> 
     asset = _plain(tmp_path / "a.glb", [0.9, 0.5, 0.1], metallicFactor=1.0, roughnessFactor=0.2)
     skin = asset.levels[0].skin
     assert skin is not None and not skin.textures[0].texels.any()
-    base = np.array([0.9, 0.5, 0.1])
-    assert np.allclose(skin.textures[1].texels[0, 0], base + (1 - base) / 21, atol=1e-6)
+    metal = np.array([0.9, 0.5, 0.1])
+    assert np.allclose(skin.textures[1].texels[0, 0], metal + (1 - metal) / 21, atol=1e-6)
 
 
 def test_metal_is_blue_and_roughness_green(tmp_path: Path) -> None:
