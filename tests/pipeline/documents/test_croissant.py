@@ -60,7 +60,7 @@ def test_it_is_json_whatever_the_licences_are_called(tmp_path: Path, licence: st
     assert document["license"] == [licence]
 
 
-def test_odd_licences_and_no_shards_are_valid_too(tmp_path: Path) -> None:
+def test_a_dataset_without_shards_is_valid_too(tmp_path: Path) -> None:
     manifest = dataclasses.replace(five_scenes(tmp_path / "a").manifest, shards=())
     path = tmp_path / "croissant.json"
     path.write_bytes(encode_croissant(manifest, rights_of([])))
