@@ -181,20 +181,10 @@ REFUSED: dict[str, tuple[Callable[[], Scene], str]] = {
 }
 
 
-def test_json_that_readers_would_refuse_is_not_written() -> None:
+def test_what_readers_would_refuse_or_no_scene_may_be_is_not_written(tmp_path: Path) -> None:
     for name, (make, message) in REFUSED.items():
         with case(name), pytest.raises(TrilightError, match=message):
             described_files(make(), "a")
-
-
-UNLAWFUL: dict[str, dict[str, object]] = {
-    "too far": {"vertex_positions": np.full((7, 3), FARTHER, np.float32)},
-    "fov 0": {"fov_deg": np.array([0, 40], np.float32)},
-    "sum over 1": {"materials": tiny_scene().materials + np.float32(0.5)},
-}
-
-
-def test_what_no_scene_may_be_is_not_written(tmp_path: Path) -> None:
     for name, changes in UNLAWFUL.items():
         scene = dataclasses.replace(tiny_scene(), **changes)  # type: ignore[arg-type]
         with case(name):
@@ -203,6 +193,13 @@ def test_what_no_scene_may_be_is_not_written(tmp_path: Path) -> None:
             with pytest.raises(TrilightError):
                 described_files(scene, "a")
             assert not list(tmp_path.iterdir())
+
+
+UNLAWFUL: dict[str, dict[str, object]] = {
+    "too far": {"vertex_positions": np.full((7, 3), FARTHER, np.float32)},
+    "fov 0": {"fov_deg": np.array([0, 40], np.float32)},
+    "sum over 1": {"materials": tiny_scene().materials + np.float32(0.5)},
+}
 
 
 FINITE = np.arange(0x7C00, dtype=np.uint16).view(np.float16)
@@ -238,22 +235,17 @@ PICTURES: dict[str, Callable[[int], NDArray[np.float32]]] = {
     "smallest": lambda resolution: _constant(resolution, SMALLEST),
 }
 RESOLUTIONS = (1, 8, 9, 33, 72)
-every_picture = pytest.mark.parametrize("make", PICTURES.values(), ids=PICTURES.keys())
 
 
-@every_picture
-def test_without_loss_every_half_float_comes_back(
+@pytest.mark.parametrize("make", PICTURES.values(), ids=PICTURES.keys())
+def test_every_half_float_comes_back_or_keeps_the_law(
     make: Callable[[int], NDArray[np.float32]],
 ) -> None:
+    """DWA turns the brightest half floats into infinity and zeros below 0: neither gets out."""
     for resolution in RESOLUTIONS:
         picture = make(resolution)
         back = decode_exr(pack_picture(picture, 40.0, "lossless"))
         np.testing.assert_array_equal(back, picture, err_msg=f"{resolution} pixels")
-
-
-@every_picture
-def test_compact_keeps_the_law_or_loses_nothing(make: Callable[[int], NDArray[np.float32]]) -> None:
-    """DWA turns the brightest half floats into infinity and zeros below 0: neither gets out."""
     floors_db = (10.0, 45.0, 80.0, 90.0)
     cases = [*itertools.product(RESOLUTIONS, floors_db), (264, 45.0)]  # a chunk is 256 lines
     for resolution, floor_db in cases:
@@ -330,7 +322,9 @@ NUMBERS = {
 }  # fmt: skip
 
 
-def test_numbers_of_json_come_back_digit_by_digit(tmp_path: Path) -> None:
+def test_numbers_of_json_come_back_digit_by_digit_and_none_that_is_no_number(
+    tmp_path: Path,
+) -> None:
     """Of provenance, in samples and in USD, and of settings: also integers beyond 64 bits."""
     scene = tiny_scene(provenance=NUMBERS)
     sample = dataclasses.replace(tiny_sample(), scene=scene)
@@ -340,9 +334,6 @@ def test_numbers_of_json_come_back_digit_by_digit(tmp_path: Path) -> None:
         assert_usd_keeps_all(scene, tmp_path, suffix)
     build = named_build("smoke", seed=2**256 - 1)
     assert json.loads(json.dumps(build.as_json()))["seed"] == 2**256 - 1
-
-
-def test_json_holds_no_number_that_is_none() -> None:
     sample = dataclasses.replace(tiny_sample(), scene=tiny_scene(provenance={"value": math.nan}))
     with pytest.raises(ValueError, match="JSON compliant"):
         encode_sample(sample)

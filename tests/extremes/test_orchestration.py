@@ -161,7 +161,7 @@ def test_small_splits_are_shown_whole_in_every_epoch(
         )
 
 
-def test_a_batch_may_be_larger_than_the_split(tmp_path: Path) -> None:
+def test_batches_may_exceed_the_split_and_stand_in_distant_epochs(tmp_path: Path) -> None:
     """It then holds scenes of several epochs, each as often as there are epochs, one more or less;
     and a rank for every scene of it changes nothing."""
     write_toy_dataset(tmp_path, train=3, validation=1, per_shard=2, resolution=8)
@@ -170,18 +170,14 @@ def test_a_batch_may_be_larger_than_the_split(tmp_path: Path) -> None:
     counts = [(batch + other).count(key) for key in map(sample_key, range(3))]
     assert sorted(counts) == [5, 5, 6]
     assert keys(tmp_path, 8, 2, ranks=8) == [batch, other]
-
-
-def test_a_batch_in_a_distant_epoch_is_had_at_once(tmp_path: Path) -> None:
-    write_toy_dataset(tmp_path, train=5, validation=1, per_shard=2, resolution=8)
-    first = 10**12
-    assert (
-        keys(tmp_path, 5, 2, first=first) == [[*map(sample_key, range(5))]] * 2
-    )  # 5 x 10^12 begins an epoch
+    five, first = tmp_path / "five", 10**12  # 5 x 10^12 begins an epoch
+    five.mkdir()
+    write_toy_dataset(five, train=5, validation=1, per_shard=2, resolution=8)
+    assert keys(five, 5, 2, first=first) == [[*map(sample_key, range(5))]] * 2
     order = OrderSettings(seed=2**63, window=2)
     windows = windows_from(3, lambda shard: 7, order, 3 * first)
-    batch = next(batches_from(windows, 3 * first, 64))
-    assert [place.position for place in batch] == list(range(3 * first, 3 * first + 64))
+    far = next(batches_from(windows, 3 * first, 64))
+    assert [place.position for place in far] == list(range(3 * first, 3 * first + 64))
 
 
 SCENES = 600

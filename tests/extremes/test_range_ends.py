@@ -173,7 +173,7 @@ def _render(**changes: Any) -> RenderedView:
     return view
 
 
-def test_pictures_at_the_ends_of_depth() -> None:
+def test_pictures_at_the_ends_of_depth_samples_and_floors() -> None:
     """One edge sees emitters alone, which cameras do not: black. 1024 are as bright as 10, but for
     what 10 cut away."""
     assert _render(max_depth=1).radiance_rgb.max() == 0
@@ -182,9 +182,6 @@ def test_pictures_at_the_ends_of_depth() -> None:
         deep = _render(min_spp=128, max_spp=128, denoiser="off", **depths).radiance_rgb.mean()
         # the cut leaves out less than 0.8^10; 64 pixels of 128 samples have 3 % of noise, measured
         assert deep == pytest.approx(usual, rel=0.1), depths
-
-
-def test_pictures_at_the_ends_of_samples_and_floors() -> None:
     assert _render().spp == 8
     assert _render(max_spp=MAX_SPP).spp < MAX_SPP
     for floor_db, at_cap in ((np.nextafter(0, 1), False), (np.nextafter(100, 0), True)):

@@ -260,17 +260,6 @@ def test_no_number_is_without_a_range() -> None:
     assert undeclared == []
 
 
-def test_the_walk_sees_a_number_without_a_range() -> None:
-    @dataclasses.dataclass(frozen=True)
-    class Group:
-        pair: tuple[float, float] | None
-        fine: Annotated[int | None, Within(0, 1)]
-        words: dict[str, typing.Literal["a"]]
-
-    hints = typing.get_type_hints(Group, include_extras=True)
-    assert [all(_numbers(hint)) for hint in hints.values()] == [False, True, True]
-
-
 INTERNAL = {
     "StreamSettings": "made of TrainSettings",
     "OrderSettings": "made of StreamSettings",

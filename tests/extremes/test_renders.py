@@ -169,7 +169,7 @@ REASONS = {
 }  # fmt: skip
 
 
-def test_what_cannot_be_rendered_has_a_reason() -> None:
+def test_what_cannot_be_rendered_or_lit_has_a_reason() -> None:
     """With the bound on darkness that builds have; and each is rejected again for the same."""
     settings = dataclasses.replace(SETTINGS, min_mean_radiance=0.01)
     for name, (scene, reason) in REASONS.items():
@@ -179,23 +179,17 @@ def test_what_cannot_be_rendered_has_a_reason() -> None:
                 SceneRenderer(scene, settings).render_view(scene.c2w[0], 40.0, seed=0)
             messages.append(str(caught.value))
         assert messages[0] == messages[1], name
-
-
-def test_an_emitter_without_area_leaves_a_scene_unlit() -> None:
     scene = join([_floor(), _lamp()])
     scene.vertex_positions[-3:] = [[0.0, 0, 2], [0.1, 0, 2], [0.2, 0, 2]]
     with pytest.raises(Rejected, match="unlit_scene"):
         SceneRenderer(scene, SETTINGS)
 
 
-def test_a_camera_in_a_lit_room_or_object_is_a_picture() -> None:
+def test_cameras_in_rooms_on_faces_and_on_emitters_take_pictures() -> None:
     inside = join([CLOSED, light(np.array(LAMP) * 0.3 + [0, 0, 0.6], 5.0)], **INSIDE)
     picture = _render(inside).radiance_rgb
     assert np.isfinite(picture).all()
     assert picture.min() > 0
-
-
-def test_a_camera_on_a_face_a_vertex_or_an_emitter() -> None:
     for eye in ((0, 0, 0), (-1, -1, 0), (0, 0.1, 2)):
         scene = join([_floor(), _lamp()], eye=eye, target=(0.5, 0.4, -0.2))
         assert np.isfinite(_render(scene).radiance_rgb).all(), eye

@@ -85,7 +85,7 @@ FAR = [(0, LAST), (2**63, LAST), (2**64 + 1, 30), (2**200, 10**9 + 7)]
 """Seeds and indices."""
 
 
-def test_far_seeds_and_indices_are_seeds_and_indices(pool: list[PooledAsset]) -> None:
+def test_far_seeds_and_indices_are_seeds_and_indices_of_their_own(pool: list[PooledAsset]) -> None:
     """Beyond 32 and 64 bits; a sample's name holds indices of nine digits."""
     for number, build in enumerate(BUILDS):
         settings = named_build(build, changes={"scenes.num_views": 1}).scenes
@@ -94,9 +94,6 @@ def test_far_seeds_and_indices_are_seeds_and_indices(pool: list[PooledAsset]) ->
             scene = first_scene(settings, pool, seed=seed, scene_index=index)
             _require_laws(scene, settings.of_scene(index))
             assert scene.provenance["scene_index"] == index
-
-
-def test_far_seeds_and_indices_have_scenes_of_their_own(pool: list[PooledAsset]) -> None:
     settings = named_build("pretrain-256", changes={"scenes.num_views": 1}).scenes
     first, again = (
         [digest(first_scene(settings, pool, seed=seed, scene_index=index)) for seed, index in FAR]

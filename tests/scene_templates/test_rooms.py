@@ -69,15 +69,12 @@ def test_parts_are_flat_patches_of_128_faces_that_face_the_room(
             assert plane.height(np.zeros(3)) > 0.2
 
 
-def test_the_nominal_room_is_the_unit_cube() -> None:
+def test_the_nominal_room_is_the_unit_cube_and_a_quarter_spin_swaps_the_diagonals() -> None:
     for side in SIDES.values():
         positions = patch(side, STILL)
         assert np.array_equal(positions[:, side.axis], np.full(81, 0.5 * side.sign))
         for axis in {0, 1, 2} - {side.axis}:
             assert (positions[:, axis].min(), positions[:, axis].max()) == (-0.5, 0.5)
-
-
-def test_a_quarter_spin_keeps_the_outline_and_swaps_the_diagonals() -> None:
     plain = patch(SIDES["floor"], STILL)
     spun = patch(SIDES["floor"], dataclasses.replace(STILL, rotation_deg=(0, 0, 90)))
     order, spun_order = np.lexsort(plain.round(9).T), np.lexsort(spun.round(9).T)

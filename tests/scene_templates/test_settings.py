@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import json
-import math
 from typing import Any
 
 import pytest
@@ -45,62 +44,26 @@ CONTRADICTIONS: list[tuple[type, str, Any]] = [
     (SceneSettings, "families", ()),
     (SceneSettings, "families", (ONE_FAMILY_EACH[0], ONE_FAMILY_EACH[0])),
     (SceneSettings, "max_triangles", 531),  # the open box 512, 8 emitters, 3 objects of 4: 532
-    (SceneSettings, "num_views", 0),
-    (SceneSettings, "enough_error", -0.1),
     (SceneSettings, "centring", "middle"),
-    (SceneSettings, "fill_to", 0),
     (SceneSettings, "fill_to", 1537),
-    (SceneSettings, "fill_to", 1000.5),
     (Family, "template", "cave"),
-    (Family, "weight", 0.0),
     (Family, "num_objects", (3, 1)),
-    (Family, "num_objects", (-1, 1)),
-    (Family, "object_scale", (0.0, 1.0)),
-    (Family, "object_scale", (1.0, math.inf)),
-    (Family, "smooth_share", math.nan),
     (PlacementSettings, "orientation", "quaternion"),
-    (PlacementSettings, "resting_share", 1.01),
-    (LightSettings, "count", (0, 8)),
-    (LightSettings, "count", (1, 8.5)),
     (LightSettings, "total_emission", (5000.0, 2500.0)),
-    (LightSettings, "scale", (0.0, 1.0)),
-    (LightSettings, "distance", (math.nan, 1.0)),
-    (LightSettings, "spacing", -1.0),
-    (LightSettings, "num_inside", 0.5),
-    (LightSettings, "coloured_share", 2.0),
     (LightSettings, "orientation", "quaternion"),
-    (MaterialSettings, "albedo_sum", (0.9, 1.1)),
-    (MaterialSettings, "specular_ratio", (0.5, 1.5)),
-    (MaterialSettings, "roughness_clip", (0.01, 1.5)),
     (MaterialSettings, "roughness_bias", 0.07),
     (MaterialSettings, "roughness_log", (0.0, 1.0)),
     (CameraSettings, "fov_deg", (30.0, 180.0)),
-    (CameraSettings, "distance", (0.0, 1.0)),
-    (ViewLaws, "min_coverage", -0.1),
     (ViewLaws, "max_shell_back", 1.1),
-    (ViewLaws, "coverage_grid", 0),
-    (SharedRoom, "square_share", 1.01),
-    (SharedRoom, "tilt_deg", 45.0),
-    (SharedRoom, "scale", (0.0, 1.0)),
     (SharedRoom, "raise_z", (0.1, -0.1)),
-    (SideRanges, "scale", (0.0, 1.0)),
     (SideRanges, "shift_x", (0.25, -0.25)),
-    (SideRanges, "tilt_deg", -1.0),
     (SkyMapSettings, "families", ()),
-    (SkyMapSettings, "height", 0),
-    (SkyMapSettings, "height", 2048),
-    (SkyMapSettings, "mean_radiance", (-1.0, 1.0)),
-    (SkyMapSettings, "coloured_share", 2.0),
-    (SkyMapSettings, "sun_elevation_deg", (0.0, 91.0)),
     (SkyMapSettings, "sun_to_sky", (2.0, 1.0)),
     (SurfaceMapSettings, "families", ()),
     (SurfaceMapSettings, "size", 100),
-    (SurfaceMapSettings, "size", 4096),
-    (SurfaceMapSettings, "natural_share", 1.1),
     (SurfaceMapSettings, "albedo", (0.5, 0.1)),
-    (SurfaceMapSettings, "albedo", (0.0, 1.0)),
-    (SurfaceMapSettings, "roughness_clip", (0.0, 1.5)),
 ]
+"""Laws between numbers, and words; the ends of every range are those of tests/extremes."""
 
 
 def test_a_contradiction_is_one_line_that_names_its_field() -> None:

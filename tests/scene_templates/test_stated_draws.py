@@ -1,4 +1,4 @@
-"""Draws: named ones, rotations, strata, layouts by index, and exact operations alone."""
+"""Draws: named ones, rotations, layouts by index, and exact operations alone."""
 
 import ast
 import dataclasses
@@ -16,12 +16,8 @@ from scene_templates.layout_rand import scene_plan
 from scene_templates.rotations import rotated, rotation_xyz, uniform_rotation
 from scene_templates.settings import SceneSettings
 from scene_templates.stated_draws import StatedDraws
-from scene_templates.strata import Stratum, stratum_of
-from storage.errors import TrilightError
 from storage.seeds import rng_for
-from storage.settings.changes import changed
 from tests.conftest import ROOT
-from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS
 from tests.scene_templates.statistics import implausible, require_plausible, stated_table
 
@@ -41,16 +37,13 @@ def _drawn() -> StatedDraws:
     return draws
 
 
-def test_each_is_distributed_as_stated() -> None:
+def test_each_is_distributed_as_stated_and_another_statement_would_be_noticed() -> None:
     made = _drawn().made
     table = stated_table(made)
     require_plausible(table)
     # a colour has three numbers, a direction a height and an azimuth
     assert len(table) == 4 + 3 + 1 + 2
     assert not implausible({"nothing": 1.0})
-
-
-def test_another_statement_would_be_noticed() -> None:
     wrong = {"number": (-2.0, 6.0), "count": (3, 10), "it holds": 0.45, "word": ("a", "b")}
     for name, stated in wrong.items():
         made = _drawn().made
@@ -92,17 +85,14 @@ def test_parameters_are_plain_values() -> None:
     assert isinstance(colour, list) and len(colour) == 3
 
 
-def test_uniform_rotations_are_proper() -> None:
+def test_uniform_rotations_are_proper_and_follow_the_haar_measure() -> None:
     rng = np.random.default_rng(0)
     matrices = np.stack([uniform_rotation(rng) for _ in range(200)])
     gram = np.einsum("nij,nkj->nik", matrices, matrices)
     # A handful of float64 operations: a few units of 2e-16.
     assert np.abs(gram - np.eye(3)).max() < 1e-14
     assert np.abs(np.linalg.det(matrices) - 1).max() < 1e-14
-
-
-def test_uniform_rotations_follow_the_haar_measure() -> None:
-    """The turning angle has density (1 - cos a) / pi, hence the mean pi/2 + 2/pi."""
+    # The turning angle has density (1 - cos a) / pi, hence the mean pi/2 + 2/pi.
     rng = np.random.default_rng(1)
     matrices = np.stack([uniform_rotation(rng) for _ in range(20000)])
     angles = np.arccos(np.clip((np.trace(matrices, axis1=1, axis2=2) - 1) / 2, -1, 1))
@@ -117,53 +107,13 @@ def test_uniform_rotations_follow_the_haar_measure() -> None:
     assert np.abs(matrices.mean(axis=0)).max() < 5 * math.sqrt(1 / 3 / len(matrices))
 
 
-def test_euler_angles_turn_about_x_then_y_then_z() -> None:
+def test_rotations_turn_about_x_then_y_then_z_and_to_the_left() -> None:
     rng = np.random.default_rng(2)
     for angles in rng.uniform(-180, 180, size=(50, 3)):
         x, y, z = (rotation_xyz(np.where(np.arange(3) == axis, angles, 0)) for axis in range(3))
         assert np.abs(rotation_xyz(angles) - z @ y @ x).max() < 1e-14
-
-
-def test_a_quarter_turn_about_z_brings_x_to_y() -> None:
     turned = rotated(np.array([[1.0, 0, 0]]), rotation_xyz([0, 0, 90]))
     assert np.abs(turned - [[0, 1, 0]]).max() < 1e-15
-
-
-STRATA = (
-    Stratum(name="rare", weight=0.1),
-    Stratum(name="often", weight=0.6),
-    Stratum(name="some", weight=0.3),
-)
-
-
-@for_each("first", [0, 7, 1000, 999_999_900])
-def test_every_stretch_holds_each_share(first: int) -> None:
-    for length in (10, 40, 100):
-        found = Counter(stratum_of(STRATA, first + k).name for k in range(length))
-        for stratum in STRATA:
-            assert abs(found[stratum.name] - stratum.weight * length) < 2.5, (length, found)
-
-
-def test_weights_are_relative_and_history_changes_no_scene() -> None:
-    other = [
-        Stratum(name=one.name, weight=10 * one.weight, earlier_weights=(1.0,)) for one in STRATA
-    ]
-    for index in range(50):
-        assert stratum_of(STRATA, index).name == stratum_of(other, index).name
-
-
-@for_each(
-    ("strata", "message"),
-    [
-        ([{"name": "a", "weight": 1}, {"name": "a", "weight": 1}], "unique names"),
-        ([{"name": "a", "weight": 1, "families": ["tunnel"]}], "tunnel"),
-        ([{"name": "a", "weight": 1, "changes": [["lights.cuont", [1, 2]]]}], "cuont"),
-        ([{"name": "a", "weight": 0}], "weight"),
-    ],
-)
-def test_contradictions_are_named(strata: list[dict[str, object]], message: str) -> None:
-    with pytest.raises(TrilightError, match=message):
-        changed(named_build("smoke").scenes, {"strata": strata})
 
 
 def test_a_plan_depends_on_seed_and_index_alone() -> None:

@@ -230,17 +230,22 @@ def same(a: TriangleMesh, b: TriangleMesh) -> bool:
     return np.array_equal(a.positions, b.positions) and np.array_equal(a.faces, b.faces)
 
 
-def test_the_box_is_centred_and_its_longest_side_is_one() -> None:
+def test_cleaning_centres_fits_float32_forgets_order_and_twice_is_once() -> None:
     result = cleaned(knot())
     low, high = result.positions.min(axis=0), result.positions.max(axis=0)
     # Each end is rounded to the grid on its own.
     np.testing.assert_allclose(low + high, 0, atol=1 / GRID)
     assert (high - low).max() == 1
-
-
-def test_positions_survive_float32() -> None:
     positions = cleaned(knot()).positions
     assert np.array_equal(positions.astype(np.float32).astype(np.float64), positions)
+    mesh, rng = knot(), np.random.default_rng(1)
+    order = rng.permutation(len(mesh.positions))
+    faces = np.argsort(order)[mesh.faces][rng.permutation(len(mesh.faces))]
+    turned = np.take_along_axis(faces, (rng.integers(0, 3, (len(faces), 1)) + np.arange(3)) % 3, 1)
+    shuffled = TriangleMesh(positions=mesh.positions[order], faces=turned)
+    assert same(cleaned(shuffled), cleaned(mesh))
+    once = cleaned(sphere())
+    assert same(cleaned(once), once)
 
 
 @for_each(("scale", "offset"), itertools.product([1e-6, 0.37, 4.0, 1e7], [0.0, 12.3]))
@@ -248,15 +253,6 @@ def test_scale_and_offset_are_forgotten(scale: float, offset: float) -> None:
     mesh = knot()
     moved = TriangleMesh(positions=(mesh.positions + offset) * scale, faces=mesh.faces)
     assert same(cleaned(moved), cleaned(mesh))
-
-
-def test_order_of_vertices_and_faces_is_forgotten() -> None:
-    mesh, rng = knot(), np.random.default_rng(1)
-    order = rng.permutation(len(mesh.positions))
-    faces = np.argsort(order)[mesh.faces][rng.permutation(len(mesh.faces))]
-    turned = np.take_along_axis(faces, (rng.integers(0, 3, (len(faces), 1)) + np.arange(3)) % 3, 1)
-    shuffled = TriangleMesh(positions=mesh.positions[order], faces=turned)
-    assert same(cleaned(shuffled), cleaned(mesh))
 
 
 def test_a_quarter_turn_turns_the_result() -> None:
@@ -267,11 +263,6 @@ def test_a_quarter_turn_turns_the_result() -> None:
     assert as_rows(turned.positions, turned.faces) == as_rows(
         straight.positions @ turn.T, straight.faces
     )
-
-
-def test_cleaning_twice_changes_nothing() -> None:
-    once = cleaned(sphere())
-    assert same(cleaned(once), once)
 
 
 def test_soup_is_welded_and_what_is_no_triangle_is_dropped() -> None:

@@ -138,11 +138,10 @@ def test_wild_meshes_are_kept_from_native_code() -> None:
     assert safe_method(wheel, "meshoptimizer_sloppy") == "meshoptimizer_sloppy"
 
 
-def test_pymeshlab_has_what_we_use() -> None:
+def test_pymeshlab_has_what_we_use_and_a_missing_filter_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert missing_filters() == []
-
-
-def test_a_missing_filter_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pymeshlab, "filter_list", lambda: ["compute_scalar_by_something"])
     assert missing_filters() == list(REQUIRED_FILTERS)
 
@@ -234,21 +233,15 @@ def test_the_bound_is_kept_and_the_next_smaller_budget_breaks_it(path: Path) -> 
         assert smaller.record.quality.error_p99 > epsilon
 
 
-def test_a_looser_bound_takes_no_more_faces(path: Path) -> None:
+def test_looser_bounds_take_no_more_faces_and_what_cannot_be_met_takes_all(path: Path) -> None:
     sizes = [len(finest(path, epsilon).faces) for epsilon in (0.001, 0.003, 0.01, 0.03)]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[-1] < 0.2 * sizes[0]
-
-
-def test_what_cannot_be_met_takes_the_whole_budget(path: Path) -> None:
     level = finest(path, 1e-5)
     # Edges take two faces each: the collapse stops at most one short.
     assert BUDGET - 1 <= len(level.faces) <= BUDGET
     assert level.record.quality.error_p99 > 1e-5
-
-
-def test_epsilon_is_about_the_finest_level_only(path: Path) -> None:
-    """Coarser levels keep their budgets, and one that the finest already meets is left out."""
+    # Coarser levels keep their budgets, and one that the finest already meets is left out.
     levels = prepare(path, AssetSettings(epsilon=0.01)).levels
     assert [level.record.budget for level in levels] == [1400, 340, 240]
     assert 340 < len(levels[0].faces) <= 500

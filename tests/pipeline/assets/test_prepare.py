@@ -99,10 +99,7 @@ def test_flipped_faces_change_nothing(tmp_path: Path, asset: Asset) -> None:
 
 def test_formats_agree(tmp_path: Path) -> None:
     """The same single precision numbers in six formats give the same asset."""
-    mesh = knot(segments=40)
-    single = TriangleMesh(
-        positions=mesh.positions.astype(np.float32).astype(np.float64), faces=mesh.faces
-    )
+    single = _single(knot(segments=40))
     paths = [write(tmp_path / f"a{suffix}", single) for suffix, write in WRITERS.items()]
     tree, buffer = gltf_tree(single)
     paths.append(write_glb(tmp_path / "a.glb", tree, buffer))
@@ -172,30 +169,11 @@ def test_two_processes_write_the_same_bytes(tmp_path: Path, asset: Asset) -> Non
 
 
 NO_SETTINGS: list[dict[str, Any]] = [
-    {"budgets": ()},
-    {"budgets": (500, 500)},
-    {"budgets": (500, 700)},
-    {"budgets": (500, 3)},
-    {"profile": "fast"},
-    {"epsilon": 0.0},
+    {"budgets": ()}, {"budgets": (500, 500)}, {"budgets": (500, 700)}, {"profile": "fast"},
     {"epsilon": 0.04},
-    {"epsilon": float("nan")},
-    {"max_source_bytes": 0},
-    {"max_source_faces": 0},
-    {"max_instances": 0},
-]
-NO_GATES: list[dict[str, Any]] = [
-    {"max_error_p99": 0.0},
-    {"max_error_p99": 3.0},
-    {"max_error_p99": float("nan")},
-    {"max_outside": 0.0},
-    {"area_ratio": (1.1, 1.2)},
-    {"area_ratio": (0.0, 1.2)},
-    {"area_ratio": (0.8, 1.0)},
-    {"max_normal_error_deg": 91.0},
-    {"min_silhouette_iou": 1.1},
-    {"max_lost_area": -0.1},
-]
+]  # fmt: skip
+NO_GATES: list[dict[str, Any]] = [{"area_ratio": (1.1, 1.2)}, {"area_ratio": (0.8, 1.0)}]
+"""Laws between numbers, and words; the ends of every range are those of tests/extremes."""
 
 
 def test_settings_without_meaning_are_refused() -> None:

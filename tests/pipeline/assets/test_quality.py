@@ -122,14 +122,11 @@ def test_a_vertex_may_leave_the_box_by_one_percent(side: int, axis: int) -> None
         gate(BALL, pulled(0.011))
 
 
-def test_the_gate_counts_faces() -> None:
+def test_the_gate_counts_faces_that_do_not_collapse_on_the_grid() -> None:
     settings = GateSettings()
     with pytest.raises(Rejected, match=f"budget_missed: {len(BALL.faces)} faces"):
         check_level(BALL, MeasuredSource(BALL), len(BALL.faces) - 1, settings, 0.03)
-
-
-def test_faces_that_collapse_on_the_grid_do_not_count() -> None:
-    """The result is cleaned before it is counted: a needle is no triangle."""
+    # The result is cleaned before it is counted: a needle is no triangle.
     needle = np.array([[0, 0, 1], [5, 5, 5]])
     dirty = TriangleMesh(positions=BALL.positions, faces=np.concatenate([BALL.faces, needle]))
     mesh, _ = check_level(dirty, MeasuredSource(BALL), len(BALL.faces), GateSettings(), 0.03)
@@ -174,23 +171,17 @@ def test_parallel_squares_are_as_far_as_they_are(height: float) -> None:
     assert p99(square(), square(height)) == pytest.approx(expected, rel=1e-9)
 
 
-def test_what_only_one_of_them_has_counts_both_ways() -> None:
+def test_distances_count_both_ways_at_any_scale_as_in_the_slow_twin() -> None:
     small, large = square(), square(size=1.5)
     # From the large square, the farthest one percent lies near the corner sqrt(0.5) away.
     from_small = p99(small, large) * np.sqrt(2)
     from_large = p99(large, small) * np.sqrt(4.5)
     assert 0.5 < from_small < np.sqrt(0.5)
     assert from_large == pytest.approx(from_small, rel=1e-9)
-
-
-def test_scale_does_not_matter() -> None:
     mesh, other = knot(), knot(segments=40)
     error = p99(mesh, other)
     grown = [TriangleMesh(positions=m.positions * 8, faces=m.faces) for m in (mesh, other)]
     assert p99(*grown) == pytest.approx(error, rel=1e-12)
-
-
-def test_it_agrees_with_the_slow_twin() -> None:
     mesh, other = sphere(rings=5, columns=8), knot(segments=12, sides=4)
     fast = Surface(mesh, FEWER[:40]).deviation(other).there
     points = sample_surface(mesh, FEWER[:40]).positions
@@ -200,7 +191,7 @@ def test_it_agrees_with_the_slow_twin() -> None:
     np.testing.assert_allclose(fast, slow, atol=0.5 / 60)
 
 
-def test_samples_fall_on_faces_by_area() -> None:
+def test_samples_fall_on_faces_by_area_and_fill_them_evenly() -> None:
     mesh = knot()
     shares = np.linalg.norm(mesh.double_area_vectors, axis=1)
     upper = mesh.corners[:, :, 2].mean(axis=1) > 0
@@ -208,9 +199,6 @@ def test_samples_fall_on_faces_by_area() -> None:
     expected = shares[upper].sum() / shares.sum()
     # Stratified by area: the share is exact to the faces that the plane cuts, about one in fifty.
     assert (points[:, 2] > 0).mean() == pytest.approx(expected, abs=0.02)
-
-
-def test_samples_fill_a_face_evenly() -> None:
     triangle = TriangleMesh(positions=np.diag([1.0, 2.0, 3.0]), faces=np.array([[0, 1, 2]]))
     weights = sample_surface(triangle, FEWER).positions / [1, 2, 3]
     # Barycentric coordinates of even points: mean 1/3, variance 1/18, covariance -1/36. Of 4000
@@ -275,7 +263,7 @@ def test_edges(name: str, expected: tuple[int, int, int]) -> None:
     assert (edges.open, edges.nonmanifold, edges.most_faces) == expected
 
 
-def test_the_outline_of_a_half_is_half_an_outline() -> None:
+def test_outlines_are_halves_and_discs_as_counted_by_hand() -> None:
     whole = sheet(0.0)
     half = TriangleMesh(positions=whole.positions, faces=whole.faces[: len(whole.faces) // 2])
     agreement = intersection_over_union(silhouette(whole), silhouette(half))
@@ -283,9 +271,6 @@ def test_the_outline_of_a_half_is_half_an_outline() -> None:
     assert agreement == pytest.approx(0.5, abs=0.02)
     assert intersection_over_union(silhouette(half), silhouette(whole)) == agreement
     assert intersection_over_union(silhouette(whole), silhouette(whole)) == 1
-
-
-def test_the_outline_agrees_with_a_disc_counted_by_hand() -> None:
     ball = moved(sphere(61, 96), [0.5, 0.5 / 0.8, 0.5 / 0.6])
     hits = silhouette(ball).mean()
     # A disc of radius 0.5 in a bundle 1.8 wide; 64 x 64 rays count it to about one row in 35.
@@ -300,7 +285,7 @@ def with_grain(share: float) -> tuple[TriangleMesh, TriangleMesh]:
     return ball, joined(ball, moved(cube(), side, [0.7, 0, 0]))
 
 
-def test_a_small_part_that_vanishes_is_missed_by_the_distance_and_not_by_its_name() -> None:
+def test_a_part_that_vanishes_is_named_lost_and_one_that_is_coarser_is_not() -> None:
     ball, both = with_grain(0.005)
     quality = MeasuredSource(both).quality(ball)
     assert quality.error_p99 < 1e-6
@@ -308,16 +293,10 @@ def test_a_small_part_that_vanishes_is_missed_by_the_distance_and_not_by_its_nam
     # One point in 8192 more or less: the sample is stratified by area.
     assert quality.lost_area == pytest.approx(0.005 / 1.005, abs=3 / 8192)
     assert MeasuredSource(both).quality(both).lost_area == 0
-
-
-def test_a_part_that_is_merely_coarser_is_not_lost() -> None:
     ball, both = with_grain(0.02)
     box = joined(ball, moved(cube(), 0.095, [0.705, 0, 0]))
     assert 0 < MeasuredSource(both).quality(box).error_max
     assert MeasuredSource(both).quality(box).lost_area == 0
-
-
-def test_parts_hang_together_over_edges() -> None:
     three = cleaned(joined(knot(20, 6), moved(cube(), 1, 5), moved(cube(), 1, -5)))
     assert len(np.unique(label_parts(three))) == 3
     assert Parts(Surface(three, UNIFORM)).count == 3

@@ -118,13 +118,10 @@ def codes() -> set[str]:
     return found
 
 
-def test_the_list_is_read_from_the_sources() -> None:
+def test_every_code_is_read_from_the_sources_and_named_by_a_test() -> None:
     known = {"no_faces", "index_range", "parts_lost", "timeout_cpu", "crashed_signal", "exception"}
     assert known < codes()
     assert len(codes()) > 35
-
-
-def test_every_code_is_named_by_a_test() -> None:
     texts = [
         path.read_text()
         for folder in ("pipeline", "extremes")

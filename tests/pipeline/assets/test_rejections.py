@@ -147,27 +147,19 @@ RAW_FILES: dict[str, tuple[str, str, bytes]] = (
         "text as archive": ("unsupported_format", ".zip", b"v 0 0 0"),
     }
     | {
-        f"ply bomb {count} {element}": (
+        f"{form} ply bomb {count} {element}": (
             "header_size_mismatch",
             ".ply",
-            _ply(f"element {element} {count}\n{_XYZ if element == 'vertex' else _LIST}", bytes(64)),
+            _ply(f"element {element} {count}\n{_XYZ if element == 'vertex' else _LIST}", body)
+            .replace(b"binary_little_endian", form.encode()),
         )
-        for count in (2**31 - 1, 2**31, 10**18, -5)
+        for form, body, counts in (
+            ("binary_little_endian", bytes(64), ()), ("ascii", b"0 0 0\n" * 9, (11,)),
+        )
+        for count in (*counts, 2**31 - 1, 2**31, 10**18, -5)
         for element in ("vertex", "face")
     }
-    | {
-        f"ascii ply bomb {count} {element}": (
-            "header_size_mismatch",
-            ".ply",
-            _ply(
-                f"element {element} {count}\n{_XYZ if element == 'vertex' else _LIST}",
-                b"0 0 0\n" * 9,
-            ).replace(b"binary_little_endian", b"ascii"),
-        )
-        for count in (11, 2**31 - 1, 2**31, 10**18, -5)
-        for element in ("vertex", "face")
-    }
-)
+)  # fmt: skip
 
 
 @for_each("name", RAW_FILES)
@@ -210,15 +202,11 @@ def test_a_header_of_too_many_faces_is_enough(tmp_path: Path) -> None:
     assert by_hand.reason_of(path, AssetSettings(max_source_faces=80)) != "too_many_faces"
 
 
-def test_an_error_beyond_the_bound_is_stated(tmp_path: Path) -> None:
+def test_errors_beyond_the_bound_are_stated_and_their_levels_left_out(tmp_path: Path) -> None:
     path = by_hand.write_obj(tmp_path / "a.obj", by_hand.knot())
     settings = AssetSettings(budgets=(1000,), gate=GateSettings(max_error_p99=1e-4))
     with pytest.raises(Rejected, match=r"error_over_bound: p99 distance \d+\.\d+%"):
         by_hand.prepare(path, settings)
-
-
-def test_levels_beyond_the_bound_are_left_out(tmp_path: Path) -> None:
-    path = by_hand.write_obj(tmp_path / "a.obj", by_hand.knot())
     gate = GateSettings(max_error_p99=0.01)
     asset = by_hand.prepare(path, AssetSettings(budgets=(1400, 60), gate=gate))
     assert [level.record.budget for level in asset.levels] == [1400]

@@ -19,6 +19,7 @@ from pipeline.assets.store import AssetStore
 from pipeline.isolation import is_passing
 from storage.errors import TrilightError
 from tests.pipeline.assets.child_kit import (
+    CALLS,
     FIRST,
     LIMITS,
     SECOND,
@@ -50,21 +51,18 @@ def test_the_next_method_starts_in_a_new_child_where_one_crashed(bench: Bench) -
     assert [call["budgets"] for call in bench.calls] == 3 * [[1000, 500, 340]]
 
 
-def test_the_next_method_makes_only_what_the_first_one_missed(bench: Bench) -> None:
+def test_the_next_method_makes_only_what_the_first_one_missed_without_epsilon(bench: Bench) -> None:
     bench.set(**{f"{FIRST} misses": "900"})
     asset = made(bench)
     assert methods(asset) == [(1000, FIRST), (500, SECOND), (340, SECOND)]
     first, second = bench.calls
     assert second["budgets"] == [500, 340]
     assert first["pid"] != second["pid"]
-
-
-def test_epsilon_goes_with_the_finest_level(bench: Bench) -> None:
-    """A second method that only fills in coarser levels must not search for the smallest."""
-    bench.set(**{f"{FIRST} misses": "900"})
+    (bench.root / CALLS).unlink()
+    # A second method that only fills in coarser levels must not search for the smallest.
     made(bench, AssetSettings(budgets=(1000, 240, 200), epsilon=0.005))
-    first, *others = (call["epsilon"] for call in bench.calls)
-    assert first == 0.005
+    finest, *others = (call["epsilon"] for call in bench.calls)
+    assert finest == 0.005
     assert others and set(others) == {None}
 
 

@@ -170,7 +170,7 @@ def test_files_that_are_none_or_are_cut_off(tmp_path: Path) -> None:
     assert reason_of(tmp_path / "a.usdc", few) == "too_large_bytes"
 
 
-def test_layers_count_together(tmp_path: Path) -> None:
+def test_layers_count_together_and_few_bytes_may_hold_millions_of_polygons(tmp_path: Path) -> None:
     part = new_stage()
     usd_mesh(part, BOX)
     size = exported(part, tmp_path / "part.usda").stat().st_size
@@ -180,10 +180,6 @@ def test_layers_count_together(tmp_path: Path) -> None:
     whole = size + path.stat().st_size
     assert prepare(path, AssetSettings(max_source_bytes=whole)).levels
     assert reason_of(path, AssetSettings(max_source_bytes=whole - 1)) == "too_large_bytes"
-
-
-def test_few_bytes_that_hold_millions_of_polygons(tmp_path: Path) -> None:
-    stage = new_stage()
     made = usd_mesh(stage, BOX)
     counts, indices = np.full(2_000_000, 3, np.int32), np.arange(6_000_000, dtype=np.int32) % 3
     made.GetFaceVertexCountsAttr().Set(Vt.IntArray.FromNumpy(counts))

@@ -40,7 +40,7 @@ def test_what_is_named_changes_and_nothing_else(name: str) -> None:
     assert after.digest != before.digest
 
 
-def test_the_floors_that_are_asked_for_replace_those_of_the_build() -> None:
+def test_floors_licences_and_mistakes_of_a_build() -> None:
     plain = named_build("smoke").renders
     linear = named_build("smoke", noise_floor_linear_db=33.0)
     assert linear.renders.targets_db == {"psnr_linear_db": 33.0}
@@ -48,15 +48,9 @@ def test_the_floors_that_are_asked_for_replace_those_of_the_build() -> None:
     assert added.renders.targets_db == {**plain.targets_db, "psnr_linear_db": 33.0}
     assert from_record(BuildSettings, linear.as_json()) == linear
     assert len({each.digest for each in (named_build("smoke"), linear, added)}) == 3
-
-
-def test_licences_are_added_and_sorted() -> None:
-    plain = named_build("smoke").allowed_licences
-    more = named_build("smoke", allow_licences=("ZZ-1.0", "AA-1.0", plain[0])).allowed_licences
-    assert more == tuple(sorted({*plain, "ZZ-1.0", "AA-1.0"}))
-
-
-def test_mistakes_are_named() -> None:
+    usual = named_build("smoke").allowed_licences
+    more = named_build("smoke", allow_licences=("ZZ-1.0", "AA-1.0", usual[0])).allowed_licences
+    assert more == tuple(sorted({*usual, "ZZ-1.0", "AA-1.0"}))
     with pytest.raises(TrilightError, match=r"'smok' is unknown; did you mean smoke\? Expected"):
         named_build("smok")
     with pytest.raises(TrilightError, match=r"scenes\.lights\.number"):
@@ -140,18 +134,14 @@ def _statistics(*, num_scenes: int, scene_digest: str) -> Statistics:
 OWN = {"scenes.materials.source": "object"}
 
 
-def test_one_word_asks_for_them() -> None:
-    build = named_build("smoke", changes=OWN)
-    assert build.mesh_settings.own_materials.keep
-    record = build.as_json()
+def test_one_word_asks_for_own_materials_and_their_numbers_count_in_the_digest() -> None:
+    plain = named_build("smoke", changes=OWN)
+    assert plain.mesh_settings.own_materials.keep
+    record = plain.as_json()
     assert record["assets"]["own_materials"]["keep"] is True
     assert record["scenes"]["materials"]["source"] == "object"
     again = from_record(BuildSettings, record)
-    assert again.digest == build.digest and again.mesh_settings == build.mesh_settings
-
-
-def test_sizes_and_shares_count_in_the_digest() -> None:
-    plain = named_build("smoke", changes=OWN)
+    assert again.digest == plain.digest and again.mesh_settings == plain.mesh_settings
     for name, value in (
         ("assets.own_materials.texels", 64),
         ("assets.own_materials.if_lost", "reject"),

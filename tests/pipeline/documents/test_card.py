@@ -46,16 +46,27 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Distributions:
     return dataset_distributions(five_scenes(tmp_path_factory.mktemp("five")))
 
 
-def test_scenes_by_template_and_split(found: Distributions) -> None:
+def test_scenes_objects_surfaces_and_rejections_are_counted(found: Distributions) -> None:
     assert found.scenes == {("plane", "train"): 3, ("wall", "train"): 1, ("wall", "test"): 1}
     assert found.splits == ["train", "test"]
     assert found.templates == ["plane", "wall"]
-
-
-def test_uses_of_objects(found: Distributions) -> None:
     assert found.placements == {"a": 4, "b": 1, "c": 1}
     assert found.uses_per_object() == [4, 1, 1, 0]
     assert found.licences == {"CC-BY-4.0": (1, 1, 1), "CC0-1.0": (3, 2, 5)}
+    assert found.values["test"]["noise_floor_db"].tolist() == [44, 44]
+    assert found.views_at_cap == {"train": 2, "test": 0}
+    # The floor's triangles share two vertices; an object's have three each and two colours.
+    assert found.as_json()["surfaces"] == {
+        "shell": {"all": 5, "smooth": 5, "many_colours": 0, "textured": 0},
+        "object": {"all": 6, "smooth": 0, "many_colours": 6, "textured": 0},
+    }
+    assert list(found.rejections.items()) == [
+        (("scenes", "no_room"), {0: 1, 1: 1}),
+        (("objects", "no_faces"), {0: 1}),
+        (("renders", "black_view"), {0: 1}),
+    ]
+    floors = {"noise_floor_db": 40.0, "noise_floor_linear_db": None, "noise_floor_objects_db": None}
+    assert found.targets == {"max_triangles": 9, **floors, "min_spp": 64, "max_spp": 256}
 
 
 VALUES: list[tuple[str, Sequence[float]]] = [
@@ -97,19 +108,6 @@ def test_values(found: Distributions) -> None:
     assert {name for name, _ in VALUES} == set(QUANTITIES)
 
 
-def test_values_belong_to_their_split(found: Distributions) -> None:
-    assert found.values["test"]["noise_floor_db"].tolist() == [44, 44]
-    assert found.views_at_cap == {"train": 2, "test": 0}
-
-
-def test_surfaces(found: Distributions) -> None:
-    """The floor's triangles share two vertices; an object's have three each and two colours."""
-    assert found.as_json()["surfaces"] == {
-        "shell": {"all": 5, "smooth": 5, "many_colours": 0, "textured": 0},
-        "object": {"all": 6, "smooth": 0, "many_colours": 6, "textured": 0},
-    }
-
-
 def test_textures_and_skies(tmp_path: Path) -> None:
     """Two scenes of one look, one with a sky alone, and a plain one."""
     scenes = [
@@ -132,19 +130,6 @@ def test_textures_and_skies(tmp_path: Path) -> None:
     }
     assert maps.surfaces["shell", "textured"] == 2
     assert {"kind": "sky", "family": "sky 0", "scenes": 1} in maps.as_json()["maps"]
-
-
-def test_rejections_by_stage_reason_and_attempt(found: Distributions) -> None:
-    assert list(found.rejections.items()) == [
-        (("scenes", "no_room"), {0: 1, 1: 1}),
-        (("objects", "no_faces"), {0: 1}),
-        (("renders", "black_view"), {0: 1}),
-    ]
-
-
-def test_targets_are_those_of_the_settings(found: Distributions) -> None:
-    floors = {"noise_floor_db": 40.0, "noise_floor_linear_db": None, "noise_floor_objects_db": None}
-    assert found.targets == {"max_triangles": 9, **floors, "min_spp": 64, "max_spp": 256}
 
 
 def test_a_view_has_reached_its_targets_when_it_has_reached_all(found: Distributions) -> None:
@@ -184,7 +169,7 @@ def test_each_shard_is_reported(tmp_path: Path) -> None:
     assert names == ["test-000005.tar", "train-000000.tar", "train-000001.tar"]
 
 
-def test_a_bad_sample_is_one_clear_line(tmp_path: Path) -> None:
+def test_bad_samples_and_failures_are_one_clear_line(tmp_path: Path) -> None:
     plain, scene = sample(7, furnished([])), furnished(["a"])
     bad = [
         sample(7, furnished([]).with_provenance({})),
@@ -196,9 +181,6 @@ def test_a_bad_sample_is_one_clear_line(tmp_path: Path) -> None:
         dataset = write_dataset(folder, {"train-000000.tar": [made]})
         with pytest.raises(TrilightError, match="sample 000000007: .*trilight verify"):
             dataset_distributions(dataset)
-
-
-def test_bad_failures_are_one_clear_line(tmp_path: Path) -> None:
     five_scenes(tmp_path).folder.failures.write_bytes(b'{"stage": "objects"}\n')
     with pytest.raises(TrilightError, match="failures"):
         dataset_distributions(open_dataset(str(tmp_path)))
@@ -339,13 +321,10 @@ def test_text_from_outside_stays_text(tmp_path: Path) -> None:
         assert "\x1b" not in body and "\n# mine" not in body
 
 
-def test_one_line_stays_one_line_and_a_code_span_ends_where_it_should() -> None:
+def test_text_stays_in_its_line_its_code_span_and_its_yaml() -> None:
     for escape in (text, code):
         assert "\n" not in escape("a\nb\r\nc\u2028d")
     assert code("a`b|c") == "`a'b\\|c`"
-
-
-def test_yaml_comes_back_as_it_was() -> None:
     values = {
         "a": "yes: no # [", "b": ["1", "null"], "c": [{"d": "x", "e": ["y", "'"]}, {"d": "1e3"}],
         "f": [], "g": 3,

@@ -82,16 +82,18 @@ def test_nothing_is_loaded_from_elsewhere() -> None:
     assert all(link.startswith("data:image/png;base64,") for link in links)
 
 
-def test_counts_are_those_of_the_rows() -> None:
+def test_counts_are_those_of_the_rows_and_equal_rows_give_equal_pages() -> None:
     tags = quality_page([row("a"), row("b")], [failure()])
     text = text_of(tags)
     assert "2 objects accepted, 0 of them repaired" in text
     assert "2 watertight; 1 rejected" in text
     assert "CC0-1.0 (2)" in text
     assert tags.tags.count("tr") == 2 + 3
+    twice = [encode_quality_page([row()], [], {}, budget=9, target="x") for _ in range(2)]
+    assert twice[0] == twice[1]
 
 
-def test_a_page_without_objects() -> None:
+def test_a_page_without_objects_or_without_failures() -> None:
     for failures in ([], [failure("bad0"), failure("bad1")]):
         tags = quality_page([], failures)
         text = text_of(tags)
@@ -100,17 +102,9 @@ def test_a_page_without_objects() -> None:
         assert "Licences: none" in text
         assert "img" not in tags.tags
         assert ("Rejected" in text) == bool(failures)
-
-
-def test_a_page_without_failures_and_with_decimated_objects_only() -> None:
     tags = quality_page([row(str(k), method="meshoptimizer") for k in range(3)], [])
     assert tags.tags.count("img") == 1
     assert "Rejected" not in " ".join(tags.text)
-
-
-def test_equal_rows_give_equal_pages() -> None:
-    twice = [encode_quality_page([row()], [], {}, budget=9, target="x") for _ in range(2)]
-    assert twice[0] == twice[1]
 
 
 def card(
@@ -132,7 +126,7 @@ def buttons(markup: str) -> list[tuple[str, str, str]]:
     return re.findall(r'name="([^"]*)" value="([^"]*)" data-words="([^"]*)"', markup)
 
 
-def test_each_choice_has_a_button_and_what_selects_it() -> None:
+def test_each_choice_has_a_button_and_no_choice_has_none() -> None:
     words = {value: words for _, value, words in buttons(gallery_controls(CARDS)) if words}
     assert words == {
         "train": "--split train",
@@ -144,6 +138,13 @@ def test_each_choice_has_a_button_and_what_selects_it() -> None:
     }
     values = [value for name, value, _ in buttons(gallery_controls(CARDS)) if name == "order"]
     assert values == ["", "0", "1"]
+    # Such as those of scene files: no command selects them, and none claims to.
+    markup = gallery_controls([card("train", name) for name in ("", "plane", "room")])
+    layouts = [value for name, value, _ in buttons(markup) if name == "layout"]
+    assert layouts == ["", "plane", "room"]
+    for cards in ([], [card("train", "plane")]):
+        assert buttons(gallery_controls(cards)) == []
+        assert len(card_attributes(cards)) == len(cards)
 
 
 def test_each_card_bears_its_choices_and_ranks_and_equals_stay() -> None:
@@ -152,19 +153,6 @@ def test_each_card_bears_its_choices_and_ranks_and_equals_stay() -> None:
     assert [json.loads(each["data-ranks"]) for each in attributes] == [[2, 0], [0, 2], [1, 1]]
     same = card_attributes([card("train", "plane", floor=float("inf"))] * 3)
     assert [json.loads(each["data-ranks"])[0] for each in same] == [0, 1, 2]
-
-
-def test_scenes_of_no_layout_are_no_choice() -> None:
-    """Such as those of scene files: no command selects them, and none claims to."""
-    markup = gallery_controls([card("train", name) for name in ("", "plane", "room")])
-    layouts = [value for name, value, _ in buttons(markup) if name == "layout"]
-    assert layouts == ["", "plane", "room"]
-
-
-def test_no_choice_no_button() -> None:
-    for cards in ([], [card("train", "plane")]):
-        assert buttons(gallery_controls(cards)) == []
-        assert len(card_attributes(cards)) == len(cards)
 
 
 def test_names_from_outside_stay_text() -> None:
@@ -193,23 +181,18 @@ def test_what_a_card_knows() -> None:
     assert card_facts(made, "test").choices["views"] == "at the cap"
 
 
-def test_text_is_escaped_once() -> None:
+def test_text_is_escaped_once_and_attributes_cells_and_titles_cannot_be_left() -> None:
     assert escape("<&'\">") == "&lt;&amp;&#x27;&quot;&gt;"
     assert escape(escape("<")) == "&lt;"
     assert joined(["<", Markup("<br>")]) == "&lt;\n<br>"
-
-
-def test_attributes_cannot_be_left() -> None:
     tags = read(element("p", HARM, id=HARM, class_="a").encode())
     assert (tags.tags, tags.names, tags.ids) == (["p"], {"id", "class"}, {HARM})
     assert read(image("data:,", HARM).encode()).tags == ["img"]
-
-
-def test_cells_and_titles_are_text() -> None:
     tags = read(page(HARM, table((HARM, "n"), [(HARM, 1), ("b", 2)], numbers=1)))
     assert tags.tags.count("td") == 4
     assert "".join(tags.text).count(HARM) == 3
     assert not {"script", "iframe"} & set(tags.tags)
+    assert b"?" in page("x", "\ud800")
 
 
 def test_only_the_script_of_a_page_runs() -> None:
@@ -226,32 +209,17 @@ def test_only_the_last_columns_are_numbers() -> None:
     assert table((), []) == "<table></table>"
 
 
-def test_addresses_become_links() -> None:
+def test_addresses_become_links_and_all_else_stays_text() -> None:
     for url in ["https://example.org/a?b=c&d", "http://localhost:80/x", "HTTPS://E.org"]:
         tags = read(outside_link(url).encode())
         assert (tags.tags, tags.links, "".join(tags.text)) == (["a"], [url], url)
-
-
-def test_other_addresses_stay_text() -> None:
     for url in [
-        "",
-        "javascript:alert(1)",
-        " https://example.org",
-        "java\nscript:alert(1)",
-        "data:text/html,x",
-        "//example.org",
-        "https://",
-        "https://me:secret@example.org",
-        "https://[broken",
-        "https://e.org/\u202egro",
-        HARM,
-    ]:
+        "", "javascript:alert(1)", " https://example.org", "java\nscript:alert(1)",
+        "data:text/html,x", "//example.org", "https://", "https://me:secret@example.org",
+        "https://[broken", "https://e.org/\u202egro", HARM,
+    ]:  # fmt: skip
         tags = read(outside_link(url).encode())
         assert (tags.tags, "".join(tags.text)) == ([], url)
-
-
-def test_a_lone_surrogate_is_no_error() -> None:
-    assert b"?" in page("x", "\ud800")
 
 
 def test_equal_pictures_give_equal_addresses() -> None:
@@ -290,7 +258,7 @@ def test_any_values_can_be_drawn() -> None:
     assert len(drawn.getcolors(1 << 24) or []) > 20
 
 
-def test_bars_hold_every_value() -> None:
+def test_bars_hold_every_value_and_names_from_outside_are_labels() -> None:
     """Heights of the bars add up to the values, and whole numbers have a bar each."""
     with drawing():
         _, (axes, other) = panels(2)
@@ -300,9 +268,6 @@ def test_bars_hold_every_value() -> None:
     assert heights == [1, 2, 0, 0, 1]
     total = sum(patch.get_height() for patch in other.patches)  # type: ignore[attr-defined]
     assert total == 1000
-
-
-def test_names_from_outside_are_labels() -> None:
     assert short_label("a\n b\x07\u202e") == "a b"
     assert len(short_label("x" * 99)) == 26
     names = ["$\\frac{$", "高 \ud800", "", "x" * 99]

@@ -51,9 +51,9 @@ def pages(report: Path) -> dict[Path, Tags]:
 def hostile(root: Path) -> Dataset:
     """Return a dataset whose every text from outside is markup."""
     rights = {"licence": HARM, "attribution": HARM, "source_url": "javascript:alert(3)"}
-    scene = furnished([HARM], HARM, **rights)
     shell = SceneObject(name=HARM, kind="shell")
-    scene = furnished([HARM], HARM, **rights).with_provenance({**scene.provenance, HARM: [HARM]})
+    scene = furnished([HARM], HARM, **rights)
+    scene = scene.with_provenance({**scene.provenance, HARM: [HARM]})
     object.__setattr__(scene, "objects", (shell, *scene.objects[1:]))
     failures = [
         Failure(stage="scenes", item="000000000", reason=HARM, message=HARM),
@@ -130,7 +130,7 @@ def test_neighbours_follow_the_gallery(five: dict[str, Tags]) -> None:
     assert pages_only == ["000000001.html", "000000003.html"]
 
 
-def test_the_numbers_are_on_the_page(five: dict[str, Tags]) -> None:
+def test_the_numbers_of_a_dataset_and_of_a_scene_are_on_their_pages(five: dict[str, Tags]) -> None:
     text = text_of(five["report"])
     assert "scenes 5 (4 train, 1 test)" in text
     assert "views 10, 2 of each scene" in text
@@ -144,9 +144,6 @@ def test_the_numbers_are_on_the_page(five: dict[str, Tags]) -> None:
     assert "scenes no_room 2 1 1 0 0" in text
     assert "CC-BY-4.0 1 1 1 CC0-1.0 3 2 5" in text
     assert "2 cameras stand in for rejected ones" in text
-
-
-def test_a_scene_has_its_facts(five: dict[str, Tags]) -> None:
     tags = five["000000001"]
     text = text_of(tags)
     assert "train, template wall, 7 triangles" in text
@@ -157,15 +154,12 @@ def test_a_scene_has_its_facts(five: dict[str, Tags]) -> None:
     assert tags.tags.count("figure") == 2 + 2 * 5  # pictures, and passes of both views
     assert tags.tags.count("i") == 4 + 1 + 2 + 2  # colours of ids, then of materials
     assert "no_room" not in text_of(five["000000000"])
-
-
-def test_swatches_show_the_albedo(five: dict[str, Tags]) -> None:
     # linear 0.6 is 0.7977 in sRGB, 203 of 255
     assert "background: #cb0000" in five["000000000"].styles
 
 
 @pytest.mark.usefixtures("bare_reports")
-def test_one_scene_has_neither_neighbours_nor_rejections(tmp_path: Path) -> None:
+def test_one_scene_or_none_at_all(tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path, {"validation-000002.tar": [sample(9, furnished([]))]})
     shown = pages(report_of(dataset))
     assert shown[tmp_path / "report" / "000000009.html"].links[0] == "../report.html#gallery"
@@ -173,11 +167,8 @@ def test_one_scene_has_neither_neighbours_nor_rejections(tmp_path: Path) -> None
     assert "1 of 1 scenes" in text_of(shown[tmp_path / "report.html"])
     nothing = rejections_section(dataset_distributions(dataset))
     assert "Nothing was rejected" in nothing
-
-
-def test_no_scenes_at_all(tmp_path: Path) -> None:
-    shown = pages(report_of(write_dataset(tmp_path, {})))
-    assert "scenes 0 (none)" in text_of(shown[tmp_path / "report.html"])
+    shown = pages(report_of(write_dataset(tmp_path / "none", {})))
+    assert "scenes 0 (none)" in text_of(shown[tmp_path / "none" / "report.html"])
 
 
 @pytest.mark.usefixtures("bare_reports")
@@ -225,7 +216,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return dataset
 
 
-def test_the_report_counts_maps(mapped: Dataset) -> None:
+def test_the_report_and_the_card_count_maps_and_scenes_show_them(mapped: Dataset) -> None:
     page = read(mapped.folder.report.read_bytes())
     text = text_of(page)
     assert "scenes textured 2 66.7% scenes below a sky 1 33.3%" in text
@@ -233,27 +224,21 @@ def test_the_report_counts_maps(mapped: Dataset) -> None:
     assert "texture colours 0 2 texture roughness 2" in text and "sky sky 0 1" in text
     assert "mean radiance of a sky 1 0.250 0.250 0.250 0.250" in text
     assert "#maps" in page.links
+    found = dataset_distributions(mapped)
+    card = encode_card(mapped.folder, mapped.manifest, found, rights_of(found.objects)).decode()
+    assert "2 of 3 scenes, 4 maps of 2 families, 2 to 6 texels wide" in card
+    assert "1 of 3 scenes, 1 families, mean radiance 0.25; half of the light" in card
+    text = text_of(read((mapped.folder.report_pages / "000000000.html").read_bytes()))
+    assert "colours 0 (diffuse) roughness sky 0 (environment, seen)" in text
+    assert "sky 0 (environment, seen): mean radiance 0.25, brightest texel 1 times that" in text
+    plain = text_of(read((mapped.folder.report_pages / "000000002.html").read_bytes()))
+    assert "Textures and environment" not in plain
 
 
 def test_a_plain_dataset_has_no_such_section(dataset: Dataset, five: dict[str, Tags]) -> None:
     found = dataset_distributions(dataset)
     assert (maps_section(found), maps_in_words(found)) == ("", {})
     assert "#maps" not in five["report"].links
-
-
-def test_the_card_says_how_many(mapped: Dataset) -> None:
-    found = dataset_distributions(mapped)
-    card = encode_card(mapped.folder, mapped.manifest, found, rights_of(found.objects)).decode()
-    assert "2 of 3 scenes, 4 maps of 2 families, 2 to 6 texels wide" in card
-    assert "1 of 3 scenes, 1 families, mean radiance 0.25; half of the light" in card
-
-
-def test_a_scene_shows_its_maps(mapped: Dataset) -> None:
-    text = text_of(read((mapped.folder.report_pages / "000000000.html").read_bytes()))
-    assert "colours 0 (diffuse) roughness sky 0 (environment, seen)" in text
-    assert "sky 0 (environment, seen): mean radiance 0.25, brightest texel 1 times that" in text
-    plain = text_of(read((mapped.folder.report_pages / "000000002.html").read_bytes()))
-    assert "Textures and environment" not in plain
 
 
 def test_a_texture_is_shown_as_it_lies() -> None:

@@ -63,7 +63,7 @@ def looking_away() -> Scene:
     return tiny_scene(c2w=np.stack([scene.c2w[0], away]).astype(np.float32))
 
 
-def test_colours_belong_to_the_values() -> None:
+def test_colours_and_captions_say_the_value() -> None:
     scene = furnished(["a"])
     shown = figures(passes_section(sample(0, scene)))
     names = ["depth_axis_m", "shading_normal", "object", "material_diffuse", "material_roughness"]
@@ -85,11 +85,6 @@ def test_colours_belong_to_the_values() -> None:
         assert np.array_equal(colours, id_colours(ids))
         assert {tuple(colour) for colour in albedo[ids == 2]} <= {(203, 0, 0), (124, 170, 0)}
         assert np.array_equal(rough[met], np.round(40 + 215 * roughness[met]))
-
-
-def test_captions_say_range_and_unit() -> None:
-    scene = furnished(["a"])
-    shown = figures(passes_section(sample(0, scene)))
     depth_m = view_passes(scene, ["depth_axis_m"], view=1, resolution=SIZE)["depth_axis_m"]
     near, far = (choose(depth_m[np.isfinite(depth_m)]) for choose in (np.min, np.max))
     assert f": {near:.2f} to {far:.2f} m, near is bright" in shown["view 1, depth"][1]
@@ -155,23 +150,17 @@ def test_the_report_names_the_stored_passes(tmp_path: Path) -> None:
     assert not commands(report())
 
 
-def test_near_is_bright_in_proportion() -> None:
+def test_near_is_bright_and_every_id_has_its_own_colour() -> None:
     depth_m = np.array([[2.0, 3.0], [4.0, np.inf]])
     assert depth_greys(depth_m).tolist() == [[255, 148], [40, 0]]
     # metres do not matter, only the range
     assert np.array_equal(depth_greys(depth_m * 1000), depth_greys(depth_m))
     assert depth_greys(np.array([[3.0, np.inf]])).tolist() == [[255, 0]]
     assert depth_greys(np.full((2, 2), np.inf)).tolist() == [[0, 0], [0, 0]]
-
-
-def test_every_id_has_its_own_colour() -> None:
     ids = np.append(np.arange(-1, 2**16), 2**24 - 2)
     assert len(np.unique(id_colours(ids), axis=0)) == len(ids)
     assert not id_colours(-1).any()
     first = [[128, 0, 0], [0, 128, 0], [128, 128, 0], [0, 0, 128]]
     assert id_colours(range(4)).tolist() == first
-
-
-def test_a_range_is_of_what_is_finite() -> None:
     assert finite_range(np.array([np.nan, 3, 1, np.inf])) == (1, 3)
     assert finite_range(np.array([np.nan])) is None

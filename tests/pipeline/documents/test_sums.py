@@ -19,7 +19,6 @@ from pipeline.documents.sums import SUMS, published_files, renew_sums, stale_sum
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import ShardEntry
 from storage.errors import TrilightError
-from storage.records.objects import LockedObject
 from tests.pipeline.documents.dataset_by_hand import five_scenes
 from tests.pipeline.documents.rows_by_hand import row
 
@@ -79,9 +78,10 @@ def cells(data: bytes) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(data.decode(), newline="")))
 
 
-def test_rows_are_sorted_and_complete() -> None:
+def test_rows_are_sorted_complete_and_come_back_as_they_were() -> None:
     read = cells(encode_attribution([row("b"), row("a", attribution="somebody, and others")]))
     assert [entry["uid"] for entry in read] == ["a", "b"]
+    assert list(read[0])[:4] == ["uid", "title", "licence", "licence_source"]
     assert read[0] == {
         "uid": "a",
         "title": "Ball",
@@ -91,42 +91,18 @@ def test_rows_are_sorted_and_complete() -> None:
         "source_url": "https://example.org/ball",
         "changes": "cleaned, remeshed and given new materials",
     }
+    for text in ['a "quoted" name', "a;b,c", "line\nbreak", "élan 高", "a=1", ""]:
+        (again,) = cells(encode_attribution([row(title=text)]))
+        assert again["title"] == text
+    assert encode_attribution([]).count(b"\n") == 1
 
 
 def test_formulas_are_made_inert() -> None:
-    fields = ["uid", "title", "licence", "attribution", "source_url"]
+    fields = ["uid", "title", "licence", "licence_source", "attribution", "source_url"]
     for field, start in itertools.product(fields, ["=", "+", "-", "@", "\t", "\r"]):
         formula = f'{start}HYPERLINK("https://example.org/?"&A1)'
         (read,) = cells(encode_attribution([row(**{field: formula})]))
         assert read[field] == "'" + formula
-
-
-def test_other_text_comes_back_as_it_was() -> None:
-    for text in ['a "quoted" name', "a;b,c", "line\nbreak", "élan 高", "a=1", ""]:
-        (read,) = cells(encode_attribution([row(title=text)]))
-        assert read["title"] == text
-
-
-def test_no_objects_give_the_heading_alone() -> None:
-    assert encode_attribution([]).count(b"\n") == 1
-
-
-def test_the_source_of_a_licence_is_published() -> None:
-    entry = LockedObject(
-        uid="a",
-        asset_sha256="0" * 64,
-        split="train",
-        licence="CC-BY-4.0",
-        licence_source="=Objaverse 1.0, published 2019-05-03",
-        title="A",
-        attribution="Ada",
-        source_url="https://v/a",
-    )
-    (row,) = csv.DictReader(io.StringIO(encode_attribution([entry]).decode()))
-    assert list(row)[:4] == ["uid", "title", "licence", "licence_source"]
-    # the quote keeps a spreadsheet from taking it for a formula
-    assert row["licence_source"] == "'=Objaverse 1.0, published 2019-05-03"
-    assert (row["licence"], row["attribution"]) == ("CC-BY-4.0", "Ada")
 
 
 @dataclasses.dataclass
@@ -165,10 +141,13 @@ def chosen_of(max_scenes: int, **counts: int) -> list[Chosen]:
     return choose_scenes(cast(Dataset, Listed(counts)), max_scenes)
 
 
-def test_all_where_there_are_few() -> None:
+def test_all_are_chosen_where_there_are_few_and_exactly_as_many_as_asked_for() -> None:
     chosen = chosen_of(48, test=3, train=5)
     assert [entry.split for entry in chosen] == ["train"] * 5 + ["test"] * 3
     assert [int(entry.key) for entry in chosen] == [3, 4, 5, 6, 7, 0, 1, 2]
+    for count in range(12):
+        keys = [entry.key for entry in chosen_of(count, train=4, validation=4, test=4)]
+        assert len(keys) == len(set(keys)) == count
 
 
 def test_small_splits_are_seen() -> None:
@@ -180,12 +159,6 @@ def test_small_splits_are_seen() -> None:
     gaps = [after - before for before, after in itertools.pairwise(train)]
     assert (train[0], train[-1]) == (0, 3999)
     assert max(gaps) - min(gaps) <= 1
-
-
-def test_exactly_as_many_as_asked_for() -> None:
-    for count in range(12):
-        keys = [entry.key for entry in chosen_of(count, train=4, validation=4, test=4)]
-        assert len(keys) == len(set(keys)) == count
 
 
 def test_only_shards_of_chosen_scenes_are_opened() -> None:

@@ -238,16 +238,13 @@ def test_the_printed_command_does_what_submitting_does(cluster: Path) -> None:
     assert (cluster / "asked").read_text() == printed
 
 
-def test_what_an_executor_has_no_use_for_is_named() -> None:
+def test_what_an_executor_is_and_has_no_use_for() -> None:
     with pytest.raises(TrilightError, match="--workers is 2; expected none with --runner dask"):
         find_executor("dask", "tcp://127.0.0.1:1", 2)
     with pytest.raises(TrilightError, match="--address is tcp://a:1; expected .* --runner dask"):
         find_executor("slurm", "tcp://a:1", None)
     with pytest.raises(TrilightError, match="--runner is 'thread'; .*threads"):
         find_executor("thread", None, None)
-
-
-def test_every_executor_is_a_module_with_the_same_function() -> None:
     homes = (
         *("executors.threads", "executors.slurm", "executors.kubernetes"),
         *("flows.on_prefect", "flows.on_dask"),

@@ -136,16 +136,13 @@ class Cancelled(BaseException):
     """As Prefect raises it for a SIGTERM."""
 
 
-def test_what_is_cancelled_is_told_once_and_saves(tmp_path: Path) -> None:
+def test_what_is_cancelled_saves_and_status_and_lines_are_passed_on(tmp_path: Path) -> None:
     def cancel(line: str) -> None:
         raise Cancelled
 
     with pytest.raises(Cancelled):
         run_to_end([sys.executable, "-c", SAVES, str(tmp_path / "saved")], cancel)
     assert (tmp_path / "saved").read_text() == "1"
-
-
-def test_status_and_lines_are_passed_on() -> None:
     lines: list[str] = []
     program = "import os, sys; print('a'); print(os.getpgid(0) == os.getpid()); sys.exit(3)"
     assert run_to_end([sys.executable, "-c", program], lines.append) == (3, "True")

@@ -61,16 +61,13 @@ class Server:
         return [SimpleNamespace(status=status) for status in ("ONLINE", "OFFLINE", "ONLINE")]
 
 
-def test_the_deployment_of_make_serve_comes_first() -> None:
+def test_the_deployment_of_make_serve_comes_first_then_the_only_one_or_one_that_is_named() -> None:
     served = Server(["cluster", "local"])
     run = submit(served, "generate-scenes", None, {"scenes": 3})  # type: ignore[arg-type]
     assert (run.deployment, run.pool) == ("generate-scenes/local", "pool of local")
     assert served.asked == [(served.deployments[1].id, {"scenes": 3})]
     assert run.page.endswith(f"/runs/flow-run/{run.id}")
     assert workers_online(served, run.pool) == 2  # type: ignore[arg-type]
-
-
-def test_the_only_deployment_and_one_that_is_named() -> None:
     for deployments, wanted in ((["cluster"], None), (["a", "b"], "b")):
         run = submit(Server(deployments), "generate-scenes", wanted, {})  # type: ignore[arg-type]
         assert run.deployment == f"generate-scenes/{deployments[-1]}"
@@ -110,7 +107,7 @@ def test_parameters_are_what_the_flow_takes() -> None:
     assert checked["changes"].renders.max_spp == 64
 
 
-def test_a_run_is_looked_at_until_it_has_ended() -> None:
+def test_a_run_is_looked_at_until_it_has_ended_and_one_that_failed_is_no_success() -> None:
     served = Server(["local"], (Scheduled(), Running(), Completed(message="all there")))
     table = [{"what": "scenes in shards", "value": "3 of 4"}]
     served.artifacts = [
@@ -125,9 +122,6 @@ def test_a_run_is_looked_at_until_it_has_ended() -> None:
     assert seen[-1].percent == 75.0
     assert seen[-1].tables == {"progress": [("scenes in shards", "3 of 4")]}
     assert len(slept) == 2
-
-
-def test_a_run_that_failed_is_no_success() -> None:
     served = Server(["local"], (Failed(message="no space"),))
     (last,) = looks(served, uuid4())  # type: ignore[arg-type]
     assert (last.is_final, last.is_completed, last.message) == (True, False, "no space")
@@ -192,8 +186,8 @@ def test_own_names_and_addresses_are_answered(host: str) -> None:
 @for_each(
     "host",
     ["evil.example", f"evil.example:{PORT}", "localhost.evil.example", "127.0.0.1.evil.example",
-     "me@evil.example", "127.0.0.1@evil.example", "2130706433", "0x7f.1", "server.", "",
-     "[", "a b"],
+     "me@evil.example", "127.0.0.1@evil.example", "2130706433", "0x7f.1", "server.", "", "[",
+     "a b"],
 )  # fmt: skip
 def test_other_names_are_refused(host: str) -> None:
     """A page may let its own name point to 127.0.0.1: its origin is then this very host."""

@@ -61,35 +61,25 @@ def _refused(child: IsolatedChild, function: object, *args: object) -> None:
 
 
 @needs_landlock
-def test_inputs_are_read_and_outputs_written(child: IsolatedChild, place: Path) -> None:
+def test_inputs_are_read_outputs_written_and_nothing_outside(
+    child: IsolatedChild, place: Path
+) -> None:
     assert child.call(called.read, place / "in" / "file") == "in"
     child.call(called.write, place / "out" / "new")
     child.call(called.replace, place / "out" / "file", place / "out" / "new")
     assert (place / "out" / "file").read_text() == "written"
-
-
-@needs_landlock
-def test_a_file_outside_is_not_read(child: IsolatedChild, place: Path) -> None:
     outside = [place / name for name in ("outside/file", "in/link", "in/../outside/file")]
     secrets = Path(f"/proc/{os.getpid()}/environ")  # of another process
     assert child.call(called.refused_paths, [*outside, secrets], False) == [*outside, secrets]
-
-
-@needs_landlock
-def test_nothing_is_written_outside_of_the_output(child: IsolatedChild, place: Path) -> None:
     paths = [place / name for name in ("in/file", "in/new", "outside/file", "new")]
     assert child.call(called.refused_paths, paths, True) == paths
     assert (place / "in" / "file").read_text() == "in"
 
 
 @needs_seccomp
-def test_nothing_is_connected_to(child: IsolatedChild) -> None:
+def test_nothing_is_connected_to_and_no_program_started(child: IsolatedChild) -> None:
     families = [int(each) for each in (socket.AF_INET, socket.AF_INET6, socket.AF_UNIX)]
     assert child.call(called.refused_sockets, families) == families
-
-
-@needs_seccomp
-def test_no_program_is_started(child: IsolatedChild) -> None:
     _refused(child, called.start_program)
 
 
@@ -257,17 +247,17 @@ def test_every_end_has_tries_and_only_two_are_verdicts() -> None:
     assert not is_passing("degenerate")
 
 
-def test_a_kill_while_a_child_is_set_up_is_tried_again(tmp_path: Path) -> None:
+def test_kills_while_a_child_is_set_up_are_tried_again_and_end_the_run_at_last(
+    tmp_path: Path,
+) -> None:
     with closing(child_with(called.set_up_dying, str(tmp_path), signal.SIGKILL, 2)) as plain_child:
         assert plain_child.call(called.double, 4) == 8
     assert len(list(tmp_path.iterdir())) == 3
-
-
-def test_kills_of_every_set_up_end_the_run(tmp_path: Path) -> None:
-    plain_child = child_with(called.set_up_dying, str(tmp_path), signal.SIGKILL, 99)
+    (tmp_path / "again").mkdir()
+    plain_child = child_with(called.set_up_dying, str(tmp_path / "again"), signal.SIGKILL, 99)
     with pytest.raises(EnvironmentFailure, match="cannot be set up.*SIGKILL.*doctor"):
         plain_child.call(called.double, 4)
-    assert len(list(tmp_path.iterdir())) == 3
+    assert len(list((tmp_path / "again").iterdir())) == 3
 
 
 def test_a_set_up_that_cannot_succeed_is_tried_once_at_each_call(tmp_path: Path) -> None:

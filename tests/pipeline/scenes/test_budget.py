@@ -19,7 +19,6 @@ from storage.licences import share_alike_camp
 from storage.records.asset import Asset, Level, LevelRecord
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
-from tests.pipeline.scenes.draw_kit import drawn_within
 from tests.pipeline.scenes.small_pool import QUALITY, SOURCE, first_scene, small_pool, with_error
 
 Rungs = list[tuple[int, float]]
@@ -112,7 +111,7 @@ def test_the_worst_error_is_the_least_that_the_budget_allows() -> None:
     assert better > 100  # else any choice would do
 
 
-def test_without_an_error_that_is_enough_everything_goes_as_fine_as_it_fits() -> None:
+def test_levels_go_as_fine_as_they_fit_and_what_is_left_goes_on() -> None:
     assets = [_asset([(12, 0.03), (300, 0.002)]), _asset([(20, 0.001), (400, 0.0005)])]
     for total, expected in ((32, [12, 20]), (319, [12, 20]), (320, [300, 20]), (700, [300, 400])):
         levels = levels_within(assets, total, 0.0)
@@ -120,27 +119,23 @@ def test_without_an_error_that_is_enough_everything_goes_as_fine_as_it_fits() ->
     # The second is near enough as it is, and the first when it is finer.
     assert [len(level.faces) for level in levels_within(assets, 700, 0.005)] == [300, 20]
     assert [len(level.faces) for level in levels_within(assets, 700, 0.5)] == [12, 20]
-
-
-def test_what_a_small_object_leaves_goes_to_a_large_one() -> None:
     small, large = _asset([(12, 0.0)]), _asset([(100, 0.03), (500, 0.02), (900, 0.01)])
     for assets in ([small, large], [large, small]):
         counts = [len(level.faces) for level in levels_within(assets, 1000, 0.0)]
         assert sorted(counts) == [12, 900]
-
-
-def test_the_first_of_equals_is_refined_first() -> None:
     assets = [_asset([(10, 0.01), (60, 0.0)])] * 3
     counts = [len(level.faces) for level in levels_within(assets, 130, 0.0)]
     assert counts == [60, 60, 10]
 
 
-def test_too_little_is_rejected_with_the_numbers() -> None:
+def test_too_little_room_is_rejected_with_the_numbers() -> None:
     with pytest.raises(Rejected, match="1 objects need 300 triangles at least.*has 200"):
         levels_within([_asset([(300, 0.1), (600, 0.0)])], 200, 0.0)
     with pytest.raises(Rejected, match="3 objects of at least 50 .* into the 149") as caught:
-        drawn_within(np.random.default_rng(0), "ab", [50, 80], 3, 149)
+        drawn_rows(np.random.default_rng(0), FitTable.of([50, 80]), 3, 149)
     assert caught.value.reason == "over_budget"
+    with pytest.raises(Rejected, match="do not fit"):
+        drawn_rows(np.random.default_rng(0), FitTable.of([5, 5], ["a", "b"]), 3, 14)
 
 
 LICENCES = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC0-1.0", "cc-by-sa-4.0", "GPL-3.0-only")
@@ -159,7 +154,7 @@ def _scenes(licences: Sequence[str], count: int) -> list[Scene]:
     return [first_scene(SETTINGS, pool, seed=5, scene_index=index) for index in range(count)]
 
 
-def test_no_scene_mixes_two_share_alike_licences() -> None:
+def test_no_scene_mixes_two_share_alike_licences_and_one_changes_none() -> None:
     camps = Counter[frozenset[str]]()
     for scene in _scenes(LICENCES, 30):
         uids = {entry.uid for entry in scene.objects if entry.kind == "object"}
@@ -167,18 +162,10 @@ def test_no_scene_mixes_two_share_alike_licences() -> None:
         camps[frozenset(filter(None, map(share_alike_camp, met)))] += 1
     assert max(len(met) for met in camps) == 1
     assert len(camps) == 4  # each of the three licences, and none: the draw reaches them all
-
-
-def test_scenes_do_not_change_where_at_most_one_licence_is_share_alike() -> None:
-    """Frozen sets stay what they are: a rule that does not bind takes no number."""
+    # Frozen sets stay what they are: a rule that does not bind takes no number.
     usual = [scene_digest(scene) for scene in _scenes(["CC0-1.0"] * 5, 6)]
     one = [scene_digest(scene) for scene in _scenes(["CC-BY-SA-4.0", *["MIT"] * 4], 6)]
     assert one == usual
-
-
-def test_a_scene_without_room_for_any_camp_is_rejected() -> None:
-    with pytest.raises(Rejected, match="do not fit"):
-        drawn_within(np.random.default_rng(0), "ab", [5, 5], 3, 14, ["a", "b"])
 
 
 def _slow_twin(

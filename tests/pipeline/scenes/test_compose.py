@@ -89,7 +89,9 @@ def test_no_build_exceeds_its_budget(pool: list[PooledAsset]) -> None:
     _require_within_budget(pool, sorted(with_maps_or_many_triangles), scenes=16)
 
 
-def test_every_scene_keeps_the_laws_of_the_record(scenes: list[Scene]) -> None:
+def test_scenes_keep_the_laws_of_the_record_emitters_objects_and_normals(
+    scenes: list[Scene],
+) -> None:
     for scene in scenes:
         scene.check()
         assert scene.num_views == SETTINGS.num_views
@@ -105,9 +107,6 @@ def test_every_scene_keeps_the_laws_of_the_record(scenes: list[Scene]) -> None:
         }
         kinds = [entry.kind for entry in scene.objects]
         assert kinds == sorted(kinds, key=("shell", "object", "emitter").index)
-
-
-def test_emitters_add_up_and_have_rows_of_their_own(scenes: list[Scene]) -> None:
     for scene in scenes:
         emits = scene.triangle_emits
         rows = scene.material_index[emits]
@@ -118,9 +117,6 @@ def test_emitters_add_up_and_have_rows_of_their_own(scenes: list[Scene]) -> None
         assert (material[:, 7:] == material[:, 7:8]).all()
         assert (material[:, :6] == 0).all()
         assert len(set(scene.object_index[emits].tolist())) == len(rows)
-
-
-def test_objects_stay_in_the_room(scenes: list[Scene]) -> None:
     for scene in scenes:
         planes = planes_of(scene)
         for row in rows_of(scene, "object"):
@@ -128,9 +124,6 @@ def test_objects_stay_in_the_room(scenes: list[Scene]) -> None:
             heights = points @ planes[:, :3].T + planes[:, 3]
             assert heights.min() > -TOUCH
             assert np.abs(points).max() < 1.2  # beside the room by half a radius at most
-
-
-def test_shading_normals_face_the_side_of_their_triangle(scenes: list[Scene]) -> None:
     for scene in scenes:
         corners = scene.vertex_positions[scene.faces].astype(np.float64)
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -156,23 +156,17 @@ MEASURED: dict[str, Callable[[Scene], float]] = {
 }
 
 
-def test_scenes_have_the_value_that_they_name(strange: list[Scene]) -> None:
+def test_scenes_have_the_value_number_and_distance_that_they_name(strange: list[Scene]) -> None:
     """Those of other axes have the median."""
     for axis, measured in MEASURED.items():
         for scene in strange:
             assert abs(measured(scene) / _value(scene, axis) - 1) < ROUNDING, axis
-
-
-def test_objects_are_subdivided_to_the_stated_number(strange: list[Scene]) -> None:
     for scene in strange:
         most = _value(scene, "triangles")
         assert scene.num_triangles <= most
         if scene.provenance["excursion"]["axis"] == "triangles":
             assert scene.num_triangles >= 0.97 * most
-
-
-def test_cameras_stand_at_the_stated_distance(strange: list[Scene]) -> None:
-    """From a point within 0.2 per axis of the origin."""
+    # From a point within 0.2 per axis of the origin.
     for scene in strange:
         c2w = scene.c2w[0].astype(np.float64)
         target = c2w[:3, 3] - _value(scene, "distance") * c2w[:3, 2]

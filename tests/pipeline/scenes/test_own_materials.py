@@ -81,7 +81,7 @@ def test_own_materials_change_no_other_draw() -> None:
                 assert np.array_equal(before, own.materials[own.material_index[mine]])
 
 
-def test_textures_have_the_rights_of_their_objects() -> None:
+def test_textures_have_the_rights_and_the_means_of_their_objects() -> None:
     scene = first_scene(OWN, _pool(), seed=0, scene_index=1)
     owners = {entry.uid: entry for entry in scene.objects if entry.uid}
     assert scene.textures
@@ -92,6 +92,17 @@ def test_textures_have_the_rights_of_their_objects() -> None:
             owner.attribution,
             owner.source_url,
         )
+    both = changed(OWN, {"textures.share": 1.0, "textures.surfaces.size": 8})
+    drawn = first_scene(both, _pool(), seed=0, scene_index=1)
+    names = {texture.source.name for texture in drawn.textures}
+    assert any(name.startswith("made/") for name in names)
+    assert any(not name.startswith("made/") for name in names)
+    assert {texture.sha256 for texture in scene.textures} <= {t.sha256 for t in drawn.textures}
+    assert scene.material_textures is not None
+    row = int(np.flatnonzero(scene.material_textures[:, 0] >= 0)[0])
+    texture = scene.textures[scene.material_textures[row, 0]]
+    assert np.array_equal(scene.materials[row, :3], texture.mean)
+    assert texture_values(texture, np.zeros(2)).shape == (3,)
 
 
 def test_as_many_objects_keep_their_own_as_stated() -> None:
@@ -108,36 +119,14 @@ def test_as_many_objects_keep_their_own_as_stated() -> None:
     require_plausible({"own": share(found, 0.3)})
 
 
-def test_drawn_textures_do_not_cover_own_ones() -> None:
-    both = changed(OWN, {"textures.share": 1.0, "textures.surfaces.size": 8})
-    scene = first_scene(both, _pool(), seed=0, scene_index=1)
-    names = {texture.source.name for texture in scene.textures}
-    assert any(name.startswith("made/") for name in names)
-    assert any(not name.startswith("made/") for name in names)
-    own = first_scene(OWN, _pool(), seed=0, scene_index=1)
-    assert {texture.sha256 for texture in own.textures} <= {t.sha256 for t in scene.textures}
-
-
 def test_subdivision_moves_no_colour() -> None:
     level = _skinned(small_pool()[1].asset.levels[0])
     assert level.skin is not None
     positions = level.positions
-    piece = object_piece(
-        SceneObject(name="box", kind="object"),
-        positions,
-        level.faces,
-        LOOK,
-        np.random.default_rng(0),
-        30.0,
-    )
-    (skin,) = own_skins(
-        [pooled("a", [trimesh.creation.box()])],
-        [level],
-        OWN.materials,
-        seed=0,
-        scene_index=0,
-        attempt=0,
-    )
+    box, rng = SceneObject(name="box", kind="object"), np.random.default_rng(0)
+    piece = object_piece(box, positions, level.faces, LOOK, rng, 30.0)
+    entries, name = [pooled("a", [trimesh.creation.box()])], {"seed": 0, "scene_index": 0}
+    (skin,) = own_skins(entries, [level], OWN.materials, **name, attempt=0)
     assert skin is not None
     whole = dressed(piece, positions, level.faces, skin)
     more = subdivided(whole, 100)
@@ -155,15 +144,6 @@ def test_subdivision_moves_no_colour() -> None:
             if off < 1e-6 and weights[0].min() > -1e-6:
                 matches.append(np.abs(weights[0] @ its_uv - found).max())
         assert min(matches) < 1e-5  # float32 positions
-
-
-def test_means_stand_for_the_textures() -> None:
-    scene = first_scene(OWN, _pool(), seed=0, scene_index=1)
-    assert scene.material_textures is not None
-    row = int(np.flatnonzero(scene.material_textures[:, 0] >= 0)[0])
-    texture = scene.textures[scene.material_textures[row, 0]]
-    assert np.array_equal(scene.materials[row, :3], texture.mean)
-    assert texture_values(texture, np.zeros(2)).shape == (3,)
 
 
 GLOWS = changed(OWN, {"materials.own_emission": 0.5})
@@ -275,14 +255,10 @@ def test_an_emissive_triangle_is_the_same_lamp_to_the_last_bit() -> None:
     assert own.entry.kind == "emitter" and own.entry.uid == "made/screen"
 
 
-def test_no_part_outshines_the_brightest_lamp() -> None:
+def test_no_part_outshines_the_brightest_lamp_and_what_emits_stays_in_its_place() -> None:
     lamp = _lamp(QUAD[FACES[0]] * 10, (3.0, 2.0, 1.0))
     _, (own,) = with_own_light([_object([[7, 0, 0], [0, 0, 0]])], [lamp], share=1.0)
     assert own.materials[0, EMISSION] == pytest.approx([3, 0, 0])
-
-
-def test_an_object_all_of_which_emits_stays_in_its_place() -> None:
-    lamp = _lamp(QUAD[FACES[0]] * 10, (3.0, 2.0, 1.0))
     pieces, more = with_own_light([_object([[1, 0, 0], [0, 1, 0]])], [lamp], share=0.1)
     assert [piece.entry.kind for piece in pieces] == ["emitter"] and not more
     assert len(pieces[0].materials) == 2 and pieces[0].skin is None

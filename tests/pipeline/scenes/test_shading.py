@@ -35,23 +35,17 @@ def _by_corner(mesh: ShadedMesh) -> NDArray[np.float32]:
     return mesh.normals[mesh.faces]
 
 
-def test_shading_moves_no_triangle() -> None:
+def test_shading_moves_no_triangle_and_flat_normals_are_the_geometric_ones() -> None:
     for positions, faces in _shapes():
         for mesh in (flat_shaded(positions, faces), smooth_shaded(positions, faces, 30.0)):
             assert np.array_equal(mesh.positions[mesh.faces], positions[faces])
             assert np.abs(np.linalg.norm(mesh.normals, axis=1) - 1).max() < ROUNDING
             assert set(mesh.faces.ravel().tolist()) == set(range(len(mesh.positions)))
-
-
-def test_flat_normals_are_the_geometric_ones() -> None:
     for positions, faces in _shapes():
         mesh = flat_shaded(positions, faces)
         geometric = face_normals(positions, faces)
         assert np.abs(_by_corner(mesh) - geometric[:, None]).max() < ROUNDING
         assert len(mesh.positions) == 3 * len(faces)
-
-
-def test_smoothing_at_angle_zero_is_flat_but_for_coplanar_faces() -> None:
     for positions, faces in _shapes():
         smooth = _by_corner(smooth_shaded(positions, faces, 0.0))
         flat = _by_corner(flat_shaded(positions, faces))

@@ -92,26 +92,19 @@ def test_brackets_in_the_name_of_a_folder_are_no_archive(tmp_path: Path, packed:
     assert opened.files == [opened.path, *([] if packed else [folder / "lib.usda"])]
 
 
-def test_the_stage_is_compared_with_the_folder_at_last(
+def test_the_user_may_name_the_folder_and_the_stage_is_compared_with_it_at_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A second lock, should USD learn a way to name files that its own list of names lacks."""
-    (tmp_path / "secret.usda").write_text(f'{HEAD}def "A" {{}}')
-    folder = tmp_path / "inner"
-    folder.mkdir()
-    (folder / "a.usda").write_text(f'{HEAD}def "A" (references = @../secret.usda@</A>) {{}}')
-    monkeypatch.setattr(OpenedUsd, "_open_all", lambda self: None)
-    with pytest.raises(TrilightError, match="uses 'secret.usda' of another folder"):
-        prims_of(folder / "a.usda")
-
-
-def test_the_user_may_name_the_folder(tmp_path: Path) -> None:
     (tmp_path / "shared.usda").write_text(f'{HEAD}def "A" {{}}')
     folder = tmp_path / "inner"
     folder.mkdir()
     (folder / "a.usda").write_text(f'{HEAD}def "A" (references = @../shared.usda@</A>) {{}}')
     stage = OpenedUsd(folder / "a.usda", tmp_path).compose()
     assert len(list(stage.Traverse())) == 1
+    monkeypatch.setattr(OpenedUsd, "_open_all", lambda self: None)
+    with pytest.raises(TrilightError, match="uses 'shared.usda' of another folder"):
+        prims_of(folder / "a.usda")
 
 
 def test_what_is_missing_is_noted(tmp_path: Path) -> None:
@@ -229,15 +222,12 @@ def stage_of(prototype: str, count: int) -> Usd.Stage:
     return stage
 
 
-def test_instances_stand_in_their_order() -> None:
+def test_instances_stand_in_their_order_and_too_many_are_refused_before_their_places_are_computed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     lost: list[str] = []
     found = placed.placed_prims(stage_of("/many/mesh", 3), Usd.TimeCode.Default(), lost)
     assert [each.to_world[0, 3] for each in found] == [0, 1, 2]
-
-
-def test_too_many_instances_are_refused_before_their_places_are_computed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
     monkeypatch.setattr(placed, "MAX_PLACED", 4)
     with pytest.raises(TrilightError, match="/many: 5 instances; expected at most 4"):
         placed.placed_prims(stage_of("/many/mesh", 5), Usd.TimeCode.Default(), [])

@@ -95,7 +95,7 @@ def test_a_lobe_has_its_closed_form(sharpness: float) -> None:
     np.testing.assert_allclose(found, expected, rtol=2e-3)
 
 
-def test_a_pane_has_the_solid_angle_of_a_rectangle() -> None:
+def test_panes_have_the_solid_angle_of_rectangles_and_stand_upright() -> None:
     """4 asin(a b / sqrt((1 + a^2)(1 + b^2))), half of it below a bar of half its width."""
     texels = SkyTexels(256)
     for seed in range(3):
@@ -110,15 +110,9 @@ def test_a_pane_has_the_solid_angle_of_a_rectangle() -> None:
         # of each pane, a quarter is clear
         assert float(texels.flux(barred)) == pytest.approx(expected / 4, rel=0.08)
         assert (texels.pane(towards, half)[(texels.directions @ towards) < 0] == 0).all()
-
-
-def test_panes_without_a_roll_stand_upright() -> None:
     pane = SkyTexels(64).pane(np.array([1.0, 0.0, 0.0]), (0.8, 0.2))
     rows, columns = np.nonzero(pane > 0.5)
     assert np.ptp(columns) > 2 * np.ptp(rows)
-
-
-def test_a_shape_between_all_texels_becomes_a_spot() -> None:
     texels, towards = SkyTexels(4), _unit(3)
     nothing = np.zeros((4, 8))
     np.testing.assert_array_equal(texels.of_unit_flux(nothing, towards), texels.spot(towards))
@@ -193,7 +187,7 @@ def test_colours_are_positive_with_a_mean_of_1_and_no_jump() -> None:
     assert (np.diff(found[:, 0]) > -0.003).all(), "warmer is redder"
 
 
-def test_families_brightness_and_colours_are_as_stated() -> None:
+def test_ours_are_drawn_with_brightness_and_colours_as_stated() -> None:
     settings = SkyMapSettings(height=1, coloured_share=0.4, mean_radiance=(1.0, 3.0))
     found = [draw_sky(rng_for(seed, "sky"), settings) for seed in range(400)]
     coloured = [sky.parameters["coloured lights"] == (True,) for sky in found]
@@ -204,9 +198,6 @@ def test_families_brightness_and_colours_are_as_stated() -> None:
             "mean": uniform([float(sky.radiance_rgb.mean()) for sky in found], 1.0, 3.0),
         }
     )
-
-
-def test_all_of_ours_are_drawn_by_default() -> None:
     assert SkyMapSettings().families == OUR_SKIES == tuple(SKIES)
 
 

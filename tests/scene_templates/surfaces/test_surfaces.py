@@ -24,17 +24,13 @@ def test_the_first_row_is_the_top_and_the_first_column_the_left() -> None:
     assert texels.v.ravel().tolist() == [0.875, 0.625, 0.375, 0.125]
 
 
-def test_noise_has_mean_0_and_the_stated_deviation() -> None:
+def test_noise_has_the_stated_deviation_and_prefers_no_direction() -> None:
     found = np.stack([Texels(64).noise(rng_for(seed, "noise"), (8, 8)) for seed in range(200)])
     # 64 cells in each of 200 fields: the mean of 12,800 numbers of deviation 0.4, five times over
     assert abs(found.mean()) < 5 * 0.4 / np.sqrt(12800)
     assert 0.35 < found.std() < 0.45
     assert np.abs(found).max() < 2
-
-
-def test_noise_prefers_no_direction() -> None:
-    """Slopes along u, v and both diagonals have the same mean square, by the same covariance."""
-    found = np.stack([Texels(64).noise(rng_for(seed, "noise"), (8, 8)) for seed in range(200)])
+    # Slopes along u, v and both diagonals have the same mean square, by the same covariance.
     along = [np.square(found - np.roll(found, 1, axis)).mean() for axis in (1, 2)]
     # 12,800 independent cells: a mean square is known to about 1 %
     assert along[0] == pytest.approx(along[1], rel=0.05)
@@ -88,21 +84,15 @@ RED = finish((0.8, 0.1, 0.0), specular_share=0.25, roughness=0.6, metal=False)
 GOLD = finish((0.9, 0.7, 0.3), specular_share=0.9, roughness=0.2, metal=True)
 
 
-def test_the_specular_lobe_is_grey_but_for_metal() -> None:
+def test_finishes_are_grey_but_for_metal_mixed_by_area_and_toned() -> None:
     # products of two or three numbers, rounded to float64
     np.testing.assert_allclose(RED.diffuse_rgb, [0.6, 0.075, 0.0], rtol=1e-15)
     np.testing.assert_allclose(RED.specular_rgb, [0.25, 0.25, 0.25], rtol=1e-15)
     np.testing.assert_allclose(GOLD.diffuse_rgb, [0.09, 0.07, 0.03], rtol=1e-14)
     np.testing.assert_allclose(GOLD.specular_rgb, [0.81, 0.63, 0.27], rtol=1e-15)
-
-
-def test_nothing_reflects_more_than_it_receives() -> None:
     white = finish((1.0, 1.0, 2.0), specular_share=1.0, roughness=0.5, metal=False)
     assert (white.diffuse_rgb + white.specular_rgb).max() < 1
     assert white.specular_rgb.max() == MOST_ALBEDO
-
-
-def test_covering_is_a_mean_of_areas() -> None:
     half = RED.covered(GOLD, np.array([[0.0, 1.0], [0.5, 0.5]]))
     np.testing.assert_array_equal(half.diffuse_rgb[0, 0], RED.diffuse_rgb)
     np.testing.assert_allclose(half.specular_rgb[0, 1], GOLD.specular_rgb, rtol=1e-15)
@@ -111,18 +101,12 @@ def test_covering_is_a_mean_of_areas() -> None:
     )
     # GGX widths 0.36 and 0.04 have the mean 0.2
     assert half.roughness[1, 1] == pytest.approx(0.2**0.5, rel=1e-15)
-
-
-def test_tones_darken_one_lobe_or_both() -> None:
     toned, dimmed = RED.toned(0.5), RED.dimmed(0.5)
     np.testing.assert_array_equal(toned.specular_rgb, RED.specular_rgb)
     np.testing.assert_array_equal(dimmed.specular_rgb, RED.specular_rgb / 2)
     np.testing.assert_array_equal(toned.diffuse_rgb, dimmed.diffuse_rgb)
     np.testing.assert_array_equal(RED.toned(7.0).diffuse_rgb, RED.diffuse_rgb)
     np.testing.assert_array_equal(RED.toned(-1.0).diffuse_rgb, np.zeros(3))
-
-
-def test_a_constant_finish_is_a_constant_map() -> None:
     maps = surface_maps("one", RED.rougher(0.7), size=4, roughness_clip=(0.05, 0.9), parameters={})
     assert maps.diffuse_rgb.shape == (4, 4, 3) and maps.roughness.shape == (4, 4, 1)
     assert (maps.roughness == np.float32(0.9)).all()
@@ -143,15 +127,12 @@ def _shares(family: str, seed: int, first: str, second: str) -> float:
     return float((mean - ends[0][channel]) / (ends[1][channel] - ends[0][channel]))
 
 
-def test_a_checker_is_half_and_half() -> None:
+def test_checkers_are_half_and_half_and_bands_have_their_share() -> None:
     for seed in range(5):
         # edges fall on texel borders or are split evenly between both sides
         assert _shares("checker", seed, "light square", "dark square") == pytest.approx(
             0.5, abs=0.002
         )
-
-
-def test_bands_have_their_share() -> None:
     for seed in range(8):
         settings = SurfaceMapSettings(families=("stripes",), size=256, natural_share=0.0)
         maps = draw_surface(rng_for(seed, "laid"), settings)
@@ -212,7 +193,7 @@ def test_a_level_is_exceeded_by_its_share(share: float) -> None:
     assert (noise > exceeded_by(noise, share)).mean() == pytest.approx(share, abs=2 / 4096)
 
 
-def test_families_are_equally_likely_and_natural_as_often_as_stated() -> None:
+def test_ours_are_drawn_equally_often_and_natural_ones_as_often_as_stated() -> None:
     settings = SurfaceMapSettings(size=1, natural_share=0.4)
     found = [draw_surface(rng_for(seed, "surface"), settings) for seed in range(400)]
     natural = [maps.parameters["natural colours"] == (True,) for maps in found]
@@ -223,9 +204,6 @@ def test_families_are_equally_likely_and_natural_as_often_as_stated() -> None:
             "natural": share(natural, 0.4),
         }
     )
-
-
-def test_all_of_ours_are_drawn_by_default() -> None:
     assert SurfaceMapSettings().families == OUR_SURFACES == tuple(SURFACES)
     assert len(OUR_SURFACES) >= 10
 

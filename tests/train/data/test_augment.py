@@ -149,21 +149,19 @@ def test_mixed_lights_and_their_pictures_are_as_much_stronger() -> None:
     np.testing.assert_allclose(after[2:], before[2:] * factors[:, None], rtol=1e-4)
 
 
-def test_mirroring_twice_is_nothing() -> None:
+def test_mirroring_twice_is_nothing_and_the_original_is_left_alone() -> None:
     scene = training_scene(toy_sample(2), 16)
     again = mirrored(mirrored(scene))
     assert torch.equal(again.target_VRR3, scene.target_VRR3)
     for name, value in tensors_of(scene.tensors).items():
         assert torch.equal(getattr(again.tensors, name), value), name
-
-
-def test_the_original_is_left_alone() -> None:
-    scene = training_scene(toy_sample(2), 16)
     copies = {name: value.clone() for name, value in tensors_of(scene.tensors).items()}
     target = scene.target_VRR3.clone()
     augmented(scene, EVERYTHING, rng_for(1, "augment"))
     assert torch.equal(scene.target_VRR3, target)
     assert all(torch.equal(getattr(scene.tensors, name), copies[name]) for name in copies)
+    same = augmented(scene, AugmentationSettings(), rng_for(1, "augment"))
+    assert same is scene
 
 
 def test_uniform_rotations_favour_no_direction_and_the_recipe_favours_none_at_all() -> None:
@@ -182,12 +180,6 @@ def test_uniform_rotations_favour_no_direction_and_the_recipe_favours_none_at_al
         torch.testing.assert_close(turned @ turned.T, torch.eye(3).double())
         assert turned.det().item() == pytest.approx(1)
     assert torch.equal(rotation_rand("none", rng), torch.eye(3).double())
-
-
-def test_what_is_left_out_changes_nothing() -> None:
-    scene = training_scene(toy_sample(2), 16)
-    same = augmented(scene, AugmentationSettings(), rng_for(1, "augment"))
-    assert same is scene
 
 
 ORDER = np.array([2, 0, 1])

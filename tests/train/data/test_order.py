@@ -164,7 +164,9 @@ class _Shards(ShardSet):
         return _Shard(self.names[number], self.closed)
 
 
-def test_each_is_open_from_its_first_sample_to_its_last() -> None:
+def test_shards_are_open_from_their_first_sample_to_their_last_and_errors_come_to_who_reads() -> (
+    None
+):
     shards = _Shards()
     with OpenShards(shards) as opened:
         opened.plan([0, 0, 1])
@@ -179,9 +181,6 @@ def test_each_is_open_from_its_first_sample_to_its_last() -> None:
         assert opened.read(0).name == "a"
         assert sorted(shards.opened) == ["a", "a", "b", "c"]
     assert sorted(shards.closed) == ["a", "a", "b", "c"]
-
-
-def test_an_error_comes_to_whoever_reads() -> None:
     with OpenShards(_Shards()) as opened:
         opened.plan([3, 0])
         assert opened.read(0).name == "a"

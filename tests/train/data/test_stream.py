@@ -149,9 +149,14 @@ def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) ->
     assert not same(visits[0], visits[1]), "every visit draws its own views and symmetries"
 
 
-def test_ranks_that_cannot_share_equally_are_refused(data: Dataset) -> None:
+def test_views_are_drawn_without_repetition_and_equal_shares(data: Dataset) -> None:
     with pytest.raises(TrilightError, match="not divisible by 4 ranks"):
         take(data, SETTINGS, 1, world_size=4)
+    settings = StreamSettings(seed=0, window=1, batch_size=7, resolution=8, views_per_scene=2)
+    for scene in take(data, settings, 1)[0]:
+        poses = scene.tensors.c2w_V44.numpy()
+        assert poses.shape[0] == 2
+        assert abs(poses[0] - poses[1]).max() > 0
 
 
 def test_a_bug_in_the_thread_is_not_swallowed() -> None:
@@ -163,14 +168,6 @@ def test_a_bug_in_the_thread_is_not_swallowed() -> None:
     assert next(items) == 1
     with pytest.raises(RuntimeError, match="a bug"):
         next(items)
-
-
-def test_views_are_drawn_without_repetition(data: Dataset) -> None:
-    settings = StreamSettings(seed=0, window=1, batch_size=7, resolution=8, views_per_scene=2)
-    for scene in take(data, settings, 1)[0]:
-        poses = scene.tensors.c2w_V44.numpy()
-        assert poses.shape[0] == 2
-        assert abs(poses[0] - poses[1]).max() > 0
 
 
 def test_albedo_is_that_of_the_scene_after_its_symmetries(data: Dataset) -> None:
@@ -219,10 +216,20 @@ def test_a_bad_target_is_refused_by_name(bad: float) -> None:
         dataclasses.replace(sample, lights_rgb=lights).check()
 
 
-def test_targets_are_log10_of_one_plus_radiance() -> None:
+def test_a_view_takes_its_target_and_noise_along_and_targets_are_logarithms() -> None:
     sample = toy_sample(4, resolution=16)
     target = training_scene(sample, 16).target_VRR3.numpy()
     np.testing.assert_allclose(10.0**target - 1, sample.radiance_rgb, atol=1e-6)  # float32 log
+    floors = (dataclasses.replace(sample.views[0], noise_floor_db=40.0), sample.views[1])
+    scene = training_scene(dataclasses.replace(sample, views=floors), 16)
+    torch.testing.assert_close(scene.noise_V, torch.tensor([1e-2, 1e-5]))
+    assert with_views(scene, np.array([1])).noise_V.tolist() == scene.noise_V[1:].tolist()
+    most = sample.scene.num_triangles
+    assert training_scene(sample, 16, most_triangles=most).tensors.num_triangles == most
+    with pytest.raises(TrilightError, match=f"{most} triangles; the run takes at most {most - 1}"):
+        training_scene(sample, 16, most_triangles=most - 1)
+    with pytest.raises(TrilightError, match=r"not kept apart, which light_mix needs.*per_light"):
+        training_scene(sample, 16, lights_apart=True)
 
 
 def cost(num_triangles: int) -> float:
@@ -245,24 +252,6 @@ def test_buckets_hold_each_scene_once_and_waste_little(most: int) -> None:
         lengths += own
     assert sorted(lengths) == sorted(scene.tensors.num_triangles for scene in scenes)
     assert 1 < len(batches) < len(scenes)
-
-
-def test_a_view_takes_its_target_and_its_noise_along() -> None:
-    sample = toy_sample(4, resolution=16)
-    floors = (dataclasses.replace(sample.views[0], noise_floor_db=40.0), sample.views[1])
-    scene = training_scene(dataclasses.replace(sample, views=floors), 16)
-    torch.testing.assert_close(scene.noise_V, torch.tensor([1e-2, 1e-5]))
-    assert with_views(scene, np.array([1])).noise_V.tolist() == scene.noise_V[1:].tolist()
-
-
-def test_what_a_run_does_not_take_is_refused() -> None:
-    sample = toy_sample(4, resolution=16)
-    most = sample.scene.num_triangles
-    assert training_scene(sample, 16, most_triangles=most).tensors.num_triangles == most
-    with pytest.raises(TrilightError, match=f"{most} triangles; the run takes at most {most - 1}"):
-        training_scene(sample, 16, most_triangles=most - 1)
-    with pytest.raises(TrilightError, match=r"not kept apart, which light_mix needs.*per_light"):
-        training_scene(sample, 16, lights_apart=True)
 
 
 @for_each("profile", PROFILES)

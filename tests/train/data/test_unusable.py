@@ -60,10 +60,15 @@ def spoil_sample(dataset: Dataset, suffixes: tuple[str, ...] = ("0.exr", "1.exr"
     )
 
 
-def test_the_first_damage_ends_the_run_and_is_named(dataset: Dataset) -> None:
+def test_the_first_damage_ends_the_run_or_is_replaced_whatever_the_ranks(dataset: Dataset) -> None:
     spoil_sample(dataset)
     with pytest.raises(TrilightError, match=rf"train-000001\.tar: sample {BAD_KEY}: .*OpenEXR"):
         keys(dataset, Unusable(0))
+    spoil_sample(dataset)
+    whole = keys(dataset, Unusable(1))
+    shares = [keys(dataset, Unusable(1), rank=r, world_size=2) for r in range(2)]
+    for batch, first, second in zip(whole, *shares, strict=True):
+        assert sorted(batch) == sorted([*first, *second])
 
 
 def test_a_sample_is_replaced_by_the_next_of_its_shard(dataset: Dataset) -> None:
@@ -101,14 +106,6 @@ def test_a_shard_is_replaced_and_counts_with_its_samples(dataset: Dataset) -> No
     assert "train-000001.tar" in unusable.messages[0] and "sha256" in unusable.messages[0]
     with pytest.raises(TrilightError, match="2 samples are unusable; expected at most 1"):
         keys(dataset, Unusable(1))
-
-
-def test_what_replaces_does_not_depend_on_the_ranks(dataset: Dataset) -> None:
-    spoil_sample(dataset)
-    whole = keys(dataset, Unusable(1))
-    shares = [keys(dataset, Unusable(1), rank=r, world_size=2) for r in range(2)]
-    for batch, first, second in zip(whole, *shares, strict=True):
-        assert sorted(batch) == sorted([*first, *second])
 
 
 def test_a_list_with_an_unreadable_shard_goes_on_without_it(dataset: Dataset) -> None:

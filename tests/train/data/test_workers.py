@@ -229,12 +229,9 @@ def test_a_card_gets_copies_beside_its_kernels(
         assert batch.target_BVRR3.device == CARD and batch.target_BVRR3.dtype == torch.float32
 
 
-def test_rows_of_targets_cover_all_that_a_picture_may_hold() -> None:
+def test_rows_of_targets_cover_all_pictures_but_those_of_another_resolution(tmp_path: Path) -> None:
     halves = np.arange(0x7C00, dtype=np.uint16).view(np.float16).astype(np.float32)
     assert np.array_equal(stored_levels().numpy(), log10_radiance(halves).astype(np.float32))
-
-
-def test_a_scene_of_another_resolution_has_no_rows(tmp_path: Path) -> None:
     data = write_toy_dataset(tmp_path, train=6, validation=1, per_shard=3, resolution=32)
     with steps(data, looked_up=False) as found:
         assert all(batch.levels_BL is None for batch in next(found).batches)

@@ -69,7 +69,7 @@ def contest(dataset: Dataset, lpips: Lpips | None = None) -> Contest:
     )
 
 
-def test_hdr_flip_is_the_packages_and_sees_errors() -> None:
+def test_hdr_flip_is_the_packages_and_what_cannot_be_measured_is_no_number() -> None:
     rng = rng_for(0, "flip")
     target = rng.uniform(0, 4, (24, 24, 3)).astype(np.float32)
     worse = np.maximum(target + rng.normal(0, 0.5, target.shape), 0)
@@ -78,9 +78,6 @@ def test_hdr_flip_is_the_packages_and_sees_errors() -> None:
     assert hdr_flip(target, target) == 0
     assert 0.05 < float(expected) < 1
     assert hdr_flip(worse, np.zeros_like(target)) is None
-
-
-def test_what_cannot_be_measured_is_not_a_number() -> None:
     picture = rng_for(0, "picture").uniform(0, 2, (16, 16, 3))
     hits = np.ones((16, 16), bool)
     without = picture_scores(picture, picture, hits, None)
@@ -176,19 +173,16 @@ def test_a_summary_shows_the_bad_ones_and_the_noise() -> None:
     assert summary(partly)["lpips"]["median"] is None, "never a median of another set"
 
 
-def test_another_scenes_triangles_through_the_same_cameras(dataset: Dataset) -> None:
+def test_another_scenes_triangles_and_what_swapping_costs_are_told(dataset: Dataset) -> None:
     judging = contest(dataset)
     rows, samples = judged_views(judging, lambda: None), list(judging.samples())
-    assert [row.swapped_psnr_log_db is None for row in rows] == [True] * 2 + [False] * 4
+    assert [view.swapped_psnr_log_db is None for view in rows] == [True] * 2 + [False] * 4
     before, judged = samples[1], judged_scene(samples[2], judging.resolution)
     seen = before.scene.with_cameras(samples[2].scene.c2w, samples[2].scene.fov_deg)
     mixed = training_scene(dataclasses.replace(samples[2], scene=seen), judging.resolution)
     shown = predict(judging.network, mixed)
-    for row, picture, target in zip(rows[4:], shown, judged.target_VRR3, strict=True):
-        assert row.swapped_psnr_log_db == psnr_log_db(picture, target)
-
-
-def test_what_swapping_costs_is_told_view_by_view() -> None:
+    for view, picture, target in zip(rows[4:], shown, judged.target_VRR3, strict=True):
+        assert view.swapped_psnr_log_db == psnr_log_db(picture, target)
     swapped = [None, 28.0, 20.0, 34.0]
     rows = [row(0, swapped_psnr_log_db=value) for value in swapped]
     loss = record(rows, {})["swapped scenes"]
@@ -198,16 +192,13 @@ def test_what_swapping_costs_is_told_view_by_view() -> None:
     assert record(rows[:1], {})["swapped scenes"] is None
 
 
-def test_worst_median_and_excursions_are_found() -> None:
+def test_worst_median_and_excursions_are_found_and_plotted(tmp_path: Path) -> None:
     rows = [row(number, excursion=("lights", 16.0 + number % 3)) for number in range(30)]
     rows.append(row(40, excursion=("fov_deg", 90.0)))
     chosen = worst_and_median(rows)
     assert [view.key for view in chosen["worst"]] == [f"{number:09d}" for number in range(8)]
     assert f"{15:09d}" in [view.key for view in chosen["median"]]
     assert [view.key for view in worst_of_each_excursion(rows)] == [f"{40:09d}", f"{0:09d}"]
-
-
-def test_excursions_are_plotted_where_there_are_any(tmp_path: Path) -> None:
     assert plot_excursions(tmp_path / "none.png", [row(0)]) == 0
     assert not (tmp_path / "none.png").exists()
     rows = [row(k, excursion=(axis, 10.0**k)) for axis in ("a", "b", "c", "d") for k in range(3)]
@@ -216,11 +207,16 @@ def test_excursions_are_plotted_where_there_are_any(tmp_path: Path) -> None:
         assert min(picture.size) > 400
 
 
-def test_the_page_prints_na_and_escapes_what_comes_from_outside() -> None:
+def test_the_page_prints_na_escapes_text_and_puts_the_benchmark_beside_the_paper() -> None:
     page = markdown(record([row(0, template="a|b<c>")], {"data": "x_y"}))
     assert "a\\|b\\<c\\>" in page and "x\\_y" in page
     (line,) = [line for line in page.splitlines() if line.startswith("| lpips (lower")]
     assert line.endswith("| n/a |")
+    assert record([row(0)], {"build": "smoke"})["published"] is None
+    page = markdown(record([row(0)], {"build": BENCHMARK}))
+    assert BENCHMARK in JUDGING_BUILDS
+    assert "| psnr_linear_db | 29.77 | 30.00 |" in page and "| lpips | 0.0551 | n/a |" in page
+    assert "400 scenes" in page and "256 x 256" in page
 
 
 def test_many_lights_are_judged_in_one_pass_and_in_groups(dataset: Dataset) -> None:
@@ -316,11 +312,3 @@ def test_the_command_shows_the_path_tracer_in_the_networks_time(
     assert found["path tracer"]["network_further_s"] > 0 and "and the path tracer" in told
     with Image.open(out / "worst.png") as sheet:
         assert sheet.width > 1500, "five pictures a view, two views a line"
-
-
-def test_the_benchmark_stands_beside_the_paper() -> None:
-    assert record([row(0)], {"build": "smoke"})["published"] is None
-    page = markdown(record([row(0)], {"build": BENCHMARK}))
-    assert BENCHMARK in JUDGING_BUILDS
-    assert "| psnr_linear_db | 29.77 | 30.00 |" in page and "| lpips | 0.0551 | n/a |" in page
-    assert "400 scenes" in page and "256 x 256" in page

@@ -103,7 +103,7 @@ def test_a_lead_is_sure_where_scenes_agree_on_it() -> None:
     assert not lead([view_score(0.07)] * 24, rival, [6] * 4).is_sure
 
 
-def test_scores_are_those_of_storage() -> None:
+def test_scores_are_those_of_storage_and_a_summary_shows_the_bad_ones() -> None:
     rng = rng_for(0, "scores")
     a, b = rng.uniform(0, 3, (2, 9, 9, 3))
     hits = rng.random((9, 9)) < 0.5
@@ -112,9 +112,6 @@ def test_scores_are_those_of_storage() -> None:
     assert score.psnr_linear_db == psnr_linear_db(a, b)
     assert score.object_psnr_log_db == object_psnr_log_db(a, b, hits)
     assert score.log_l1 == pytest.approx(np.abs(log10_radiance(a) - log10_radiance(b)).mean())
-
-
-def test_a_summary_shows_the_bad_ones() -> None:
     views = [view_score(float(value), float(value)) for value in range(101)]
     summary = summarise(views)
     assert summary["log_l1"] == 50.0
@@ -141,11 +138,18 @@ def test_no_fixed_picture_has_less_l1_error_than_the_median() -> None:
     assert all(error(median) <= error(rival) + 1e-9 for rival in rivals)
 
 
-def test_the_error_picture_is_black_without_error_and_white_at_its_limit() -> None:
+def test_error_and_noise_pictures_are_black_where_nothing_shows_and_white_at_their_limit() -> None:
     target = np.full((2, 2, 3), 0.5)
     assert error_picture(target, target).max() == 0
     wrong = (1.5 * 10**ERROR_WHITE) - 1
     assert error_picture(np.full((2, 2, 3), wrong), target).min() == 255
+
+    def view(error: float) -> SheetView:
+        return sheet_view(target, np.full_like(target, 1.5 * 10**error - 1))
+
+    assert noise_picture(view(0.0099)).max() == 0
+    assert 0 < noise_picture(view(0.02)).mean() < 255
+    assert noise_picture(view(0.0101 * NOISE_WHITE)).min() == 255
 
 
 def sheet_view(target: NDArray, predicted: NDArray) -> SheetView:
@@ -162,17 +166,6 @@ def test_the_sheet_shows_every_view(tmp_path: Path) -> None:
         pixels = np.asarray(sheet.convert("RGB"))
     assert pixels.shape[1] > 1000
     assert (pixels == 0).all(axis=-1).any(), "the black prediction of the first view"
-
-
-def test_the_noise_picture_is_black_at_the_noise_and_white_at_its_limit() -> None:
-    target = np.full((2, 2, 3), 0.5)
-
-    def view(error: float) -> SheetView:
-        return sheet_view(target, np.full_like(target, 1.5 * 10**error - 1))
-
-    assert noise_picture(view(0.0099)).max() == 0
-    assert 0 < noise_picture(view(0.02)).mean() < 255
-    assert noise_picture(view(0.0101 * NOISE_WHITE)).min() == 255
 
 
 def test_floors_of_metrics_without_a_measurement_are_of_drawn_noise() -> None:

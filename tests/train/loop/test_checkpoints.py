@@ -259,13 +259,10 @@ def test_a_loaded_state_goes_on_to_the_bit(tmp_path: Path, steps: int) -> None:
     assert equal_weights(state, loaded)
 
 
-def test_equal_states_give_equal_bytes(tmp_path: Path) -> None:
+def test_equal_states_give_equal_bytes_and_skipped_steps_are_no_updates(tmp_path: Path) -> None:
     for name in ("a", "b"):
         save(tmp_path / name, stepped())
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-
-
-def test_skipped_steps_do_not_count_as_updates(tmp_path: Path) -> None:
     state = stepped(2)
     state.step, state.skipped_steps = 5, 3
     save(tmp_path / "c", state)

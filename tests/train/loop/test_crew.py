@@ -27,7 +27,9 @@ from train.loop.interrupts import deferred_interrupts
 from train.progress import TrainProgress
 
 
-def test_without_torchrun_a_process_is_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_torchrun_a_process_is_alone_and_no_missing_device_is_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delenv("WORLD_SIZE", raising=False)
     with join_crew("cpu") as crew:
         assert (crew.rank, crew.world_size, crew.is_first) == (0, 1, True)
@@ -35,6 +37,12 @@ def test_without_torchrun_a_process_is_alone(monkeypatch: pytest.MonkeyPatch) ->
         assert crew.any(True) and not crew.any(False)
         assert crew.gather_text("å") == ["å"]
         assert (crew.share.rank, crew.share.world_size) == (0, 1)
+    assert choose_device("cpu").type == "cpu"
+    with pytest.raises(TrilightError, match="device 'tpu'; expected cpu or cuda"):
+        choose_device("tpu")
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    with pytest.raises(TrilightError, match="process 2 of this machine finds 2 cards"):
+        choose_device("cuda", 2)
 
 
 @for_each(("local_rank", "order"), [(0, "made waited"), (1, "waited made")])
@@ -51,15 +59,6 @@ def test_the_first_process_of_each_machine_makes_a_thing_before_the_others(
     crew = Crew(device=torch.device("cpu"), rank=8, world_size=16, local_rank=local_rank)
     assert crew.once_a_machine(made) == 7
     assert done == order.split()
-
-
-def test_a_device_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert choose_device("cpu").type == "cpu"
-    with pytest.raises(TrilightError, match="device 'tpu'; expected cpu or cuda"):
-        choose_device("tpu")
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    with pytest.raises(TrilightError, match="process 2 of this machine finds 2 cards"):
-        choose_device("cuda", 2)
 
 
 NEVER_S = 60
@@ -134,7 +133,7 @@ def full() -> None:
     raise TrilightError("the disk is full")
 
 
-def test_one_piece_of_work_after_another() -> None:
+def test_work_is_done_in_order_and_its_errors_come_at_the_next_call() -> None:
     goes_on, done = threading.Event(), list[str]()
 
     def first() -> None:
@@ -148,9 +147,6 @@ def test_one_piece_of_work_after_another() -> None:
         background.begin(lambda: done.append("second"))
         assert done[0] == "first"
     assert done == ["first", "second"]
-
-
-def test_an_error_is_raised_at_the_next_call_or_at_the_end_and_hides_no_other() -> None:
     background = Background()
     background.begin(full)
     with pytest.raises(TrilightError, match="the disk is full"):

@@ -185,7 +185,7 @@ def rates(settings: TrainSettings) -> list[float]:
     return [learning_rate(step, settings) for step in range(settings.num_steps)]
 
 
-def test_a_cosine_rises_to_its_peak_and_falls_to_its_end_once() -> None:
+def test_a_cosine_and_a_wsd_rate_rise_once_and_fall_at_the_end() -> None:
     settings = tiny_run(num_steps=100, warmup_steps=10, final_rate_share=0.1)
     found = rates(settings)
     assert 0 < found[0] < found[9] < settings.learning_rate
@@ -195,9 +195,6 @@ def test_a_cosine_rises_to_its_peak_and_falls_to_its_end_once() -> None:
     assert found[10:] == sorted(set(found[10:]), reverse=True)
     assert learning_rate(500, settings) == found[99], "no restart after the end"
     assert decay_begins(settings) is None
-
-
-def test_a_wsd_rate_rises_stays_and_falls_at_the_end() -> None:
     settings = tiny_run(schedule="wsd", num_steps=100, warmup_steps=10, final_rate_share=0.1)
     found, peak = rates(settings), settings.learning_rate
     assert decay_begins(settings) == 80

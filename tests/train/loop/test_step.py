@@ -164,7 +164,7 @@ def test_a_step_asks_no_generator() -> None:
     assert np.array_equal(np.random.get_state(legacy=True)[1], before[1])  # type: ignore[index] # noqa: NPY002
 
 
-def test_the_report_says_how_bright_the_pictures_are() -> None:
+def test_the_report_says_how_bright_and_how_long_before_clipping() -> None:
     batch = make_batch(scenes(2))
     state = new_state(tiny_run())
     report = step(state, [batch])
@@ -177,10 +177,6 @@ def test_the_report_says_how_bright_the_pictures_are() -> None:
             {"weight": torch.zeros_like(last.weight), "bias": torch.full((192,), mean / 2)}
         )
     assert step(state, [batch]).brightness == pytest.approx(0.5, rel=1e-4)  # float32 sums
-
-
-def test_a_long_gradient_is_shortened() -> None:
-    batch = make_batch(scenes(2))
     lengths = []
     for clip in (1e-3, 1e9):
         state = new_state(tiny_run())

@@ -90,7 +90,7 @@ def pictures(name: str, count: int = 2) -> Tensor:
     return torch.from_numpy(rng.random((count, 3, RESOLUTION, RESOLUTION))).float()
 
 
-def test_it_is_the_published_formula() -> None:
+def test_the_distance_is_the_published_formula_symmetric_and_zero_for_equals() -> None:
     weights = small_weights()
     a, b = pictures("a"), pictures("b")
     ours = Lpips(*weights)(a, b)
@@ -98,17 +98,13 @@ def test_it_is_the_published_formula() -> None:
     # float32 against float64 through thirteen convolutions
     np.testing.assert_allclose(ours.numpy(), expected, rtol=1e-5)
     assert min(expected) > 0.01
-
-
-def test_equal_pictures_are_at_no_distance_and_the_order_does_not_matter() -> None:
     lpips = Lpips(*small_weights())
-    a, b = pictures("a"), pictures("b")
     assert torch.equal(lpips(a, a), torch.zeros(2))
     torch.testing.assert_close(lpips(a, b), lpips(b, a), rtol=0, atol=0)
     assert (lpips(a, b) > 0).all()
 
 
-def test_its_gradient_is_that_of_its_values() -> None:
+def test_gradients_are_those_of_the_values_and_finite_without_any_feature() -> None:
     lpips = Lpips(*small_weights()).double()
     a, b = pictures("a", 1).double().requires_grad_(), pictures("b", 1).double()
     lpips(a, b).sum().backward()
@@ -119,17 +115,11 @@ def test_its_gradient_is_that_of_its_values() -> None:
     # central differences; a ReLU that a step of 1e-6 crosses costs about as much
     assert change == pytest.approx((a.grad * step).sum().item(), rel=1e-4)
     assert not any(weight.requires_grad for weight in lpips.parameters())
-
-
-def test_pictures_without_any_feature_have_a_finite_gradient() -> None:
     vgg16, linear = small_weights()
     vgg16 = {name: -tensor.abs() for name, tensor in vgg16.items()}
     black = torch.full((1, 3, RESOLUTION, RESOLUTION), 0.9, requires_grad=True)
     Lpips(vgg16, linear)(black, pictures("b", 1)).sum().backward()
     assert black.grad is not None and torch.isfinite(black.grad).all()
-
-
-def test_small_pictures_are_refused() -> None:
     with pytest.raises(TrilightError, match="pictures of 8 pixels; expected at least 16"):
         Lpips(*small_weights())(*torch.zeros(2, 1, 3, 8, 8))
 
@@ -221,7 +211,7 @@ def structure_by_scipy(x: np.ndarray, y: np.ndarray) -> float:
     return float(((2 * covariance + 0.03**2) / (variances + 0.03**2)).mean())
 
 
-def test_ms_ssim_multiplies_the_scales() -> None:
+def test_ms_ssim_multiplies_the_scales_and_has_a_gradient_even_at_its_opposite() -> None:
     """At 24 pixels there are two: structure at 24, all of SSIM at 12, each to its share."""
     a, b = noisy_pair(24)
     fine, coarse = (weight / sum(SCALE_WEIGHTS[:2]) for weight in SCALE_WEIGHTS[:2])
@@ -232,9 +222,6 @@ def test_ms_ssim_multiplies_the_scales() -> None:
         assert ours == pytest.approx(expected, rel=1e-9)  # float64 on both sides
         assert 0.1 < ours < 0.98
     torch.testing.assert_close(ms_ssim(a, a), torch.ones(2).double())
-
-
-def test_ms_ssim_has_a_finite_gradient_even_at_its_opposite() -> None:
     a, _ = noisy_pair(64)
     opposite = (1 - a).requires_grad_()
     ms_ssim(opposite, a).sum().backward()

@@ -42,7 +42,9 @@ from train.watching.spikes import LEAST_REMEMBERED, Spike, SpikeWatch, bound_of
 from train.watching.weights_and_biases import BiasesBoard, require_wandb
 
 
-def test_the_parts_add_up_to_the_time_that_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_parts_add_up_to_the_time_that_passed_and_end_with_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     now_s = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
     activity = Activity()
@@ -58,25 +60,18 @@ def test_the_parts_add_up_to_the_time_that_passed(monkeypatch: pytest.MonkeyPatc
     assert activity.taken() == dict.fromkeys(PARTS, 0.0) | taken
     now_s += 16
     assert activity.taken()["data"] == 16, "what goes on counts up to now, and once"
-
-
-def test_a_part_ends_with_an_error() -> None:
-    activity = Activity()
     activity.begin("data")
     with pytest.raises(ValueError, match="x"), activity.during("saving"):
         raise ValueError("x")
     assert activity.now.part == "data"
 
 
-def test_a_process_stands_out_of_the_others_or_none_does() -> None:
+def test_a_process_stands_out_by_its_own_work_or_none_does() -> None:
     assert slowest([0.1, 0.1, 0.5, 0.12]) == 2
     assert slowest([0.5, 0.1]) == 0
     assert slowest([1.0, 1.2, 1.1]) is None, "less than half more is no news"
     assert slowest([0.001, 0.01]) is None, "milliseconds are no news"
     assert slowest([1.0]) is None
-
-
-def test_waiting_for_others_is_not_own_work() -> None:
     assert set(PARTS) - set(OWN_PARTS) == {"exchange", "validation", "saving"}
     assert own_seconds({**dict.fromkeys(PARTS, 0.0), "data": 3.0, "exchange": 9.0}, 2) == 1.5
 
@@ -176,13 +171,10 @@ def test_a_gradient_that_jumps_is_found_with_its_scenes_and_a_falling_loss_is_no
     assert 0.15 < spike.bound < 0.2
 
 
-def test_the_bound_is_median_and_deviations_in_a_case_by_hand() -> None:
+def test_a_bound_is_median_and_deviations_and_neither_a_breath_nor_infinity_spikes() -> None:
     values = [1.0, 2.0, 3.0, 4.0, 100.0] * 20
     assert bound_of(values, 2.0) == 3.0 + 2 * 1.4826 * 1.0
     assert bound_of(values[: LEAST_REMEMBERED - 1], 2.0) is None
-
-
-def test_what_hardly_moves_does_not_spike_at_a_breath_and_what_is_not_finite_never() -> None:
     watch = SpikeWatch(8.0)
     for step in range(100):
         assert watch.add(step, REPORT, []) == []
@@ -202,7 +194,7 @@ def package(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     return package
 
 
-def test_rows_and_sheets_of_a_run_are_logged_offline(
+def test_rows_and_sheets_of_a_run_are_logged_offline_or_as_the_user_says(
     dataset: Dataset, package: MagicMock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("WANDB_MODE", raising=False)
@@ -222,11 +214,6 @@ def test_rows_and_sheets_of_a_run_are_logged_offline(
     assert any(row.get("validation", "")[0:1] == ("picture",) for row in logged)
     board.define_metric.assert_called_once_with("*", step_metric="step")
     board.finish.assert_called_once_with()
-
-
-def test_a_mode_of_the_users_own_is_obeyed(
-    package: MagicMock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setenv("WANDB_MODE", "online")
     BiasesBoard("light", tmp_path, {})
     assert package.init.call_args.kwargs["mode"] == "online"

@@ -106,23 +106,19 @@ def test_an_mtl_does_not_lead_out_either(tmp_path: Path) -> None:
         assert kit.lost(path) == "texture_outside"
 
 
-def test_missing_pictures_and_libraries(tmp_path: Path) -> None:
+def test_pictures_mtl_files_and_coordinates_that_are_missing_or_make_no_sense(
+    tmp_path: Path,
+) -> None:
     assert kit.lost(kit.textured_gltf(tmp_path / "a.gltf", "gone.png")) == "texture_missing"
     path = kit.textured_obj(tmp_path / "o" / "a.obj", b"", mtl="map_Kd gone.png\n")
     assert kit.lost(path) == "texture_missing"
     (tmp_path / "o" / "a.mtl").unlink()
     assert kit.lost(path) == "texture_missing"
-
-
-def test_an_mtl_that_makes_no_sense(tmp_path: Path) -> None:
     for mtl in ("Kd red green\n", "Kd nan 0 0\n", "Kd 1 2\n"):
         path = kit.textured_obj(tmp_path / "o" / "a.obj", b"", mtl=mtl)
         assert kit.lost(path) == "materials_unreadable"
     path.write_text(path.read_text().replace("usemtl it is", "usemtl another"))
     assert kit.lost(path) == "materials_unreadable"
-
-
-def test_coordinates_that_are_absent_or_no_numbers(tmp_path: Path) -> None:
     picture = kit.picture_bytes(kit.CORNERS)
     assert kit.lost(kit.textured_glb(tmp_path / "a.glb", picture, None)) == "no_texture_coordinates"
     broken = np.where(kit.UV_UP == 1, np.inf, kit.UV_UP)
@@ -144,7 +140,7 @@ def test_materials_that_are_malformed(tmp_path: Path) -> None:
         assert kit.lost(write_glb(tmp_path / "a.glb", tree, buffer)) == "materials_unreadable"
 
 
-def test_folded_coordinates_show_one_colour(tmp_path: Path) -> None:
+def test_folded_coordinates_and_one_texel_are_constants(tmp_path: Path) -> None:
     """All corners at one place of a picture, as palettes are used: that colour everywhere."""
     folded = np.full((4, 2), [0.75, 0.25])
     asset = prepare_asset(
@@ -153,6 +149,11 @@ def test_folded_coordinates_show_one_colour(tmp_path: Path) -> None:
     skin = asset.levels[0].skin
     assert skin is not None and skin.textures[0].texels.shape == (1, 1, 3)
     assert np.allclose(skin.textures[0].texels[0, 0], [0, 1 - kit.F, 0], atol=1e-6)
+    data = kit.picture_bytes(np.array([[[10, 128, 200]]], np.uint8))
+    skin = prepare_asset(kit.textured_glb(tmp_path / "a.glb", data), kit.KEEP).levels[0].skin
+    assert skin is not None and [t.texels.shape[0] for t in skin.textures] == [1, 1, 1]
+    wanted = linear_from_srgb8()[[10, 128, 200]] * (1 - kit.F)
+    assert np.allclose(skin.textures[0].texels[0, 0], wanted, atol=1e-6)
 
 
 GREY = np.array([[40, 200], [120, 250]], np.uint8)
@@ -175,14 +176,6 @@ def test_forms_of_pictures(tmp_path: Path, form: str) -> None:
     for place, code in places.items():
         wanted = linear_from_srgb8()[code] * (1 - kit.F)
         assert np.abs(kit.seen_at(asset, *place) - wanted).max() < TOLERANCE, place
-
-
-def test_one_texel_is_a_constant(tmp_path: Path) -> None:
-    data = kit.picture_bytes(np.array([[[10, 128, 200]]], np.uint8))
-    skin = prepare_asset(kit.textured_glb(tmp_path / "a.glb", data), kit.KEEP).levels[0].skin
-    assert skin is not None and [t.texels.shape[0] for t in skin.textures] == [1, 1, 1]
-    wanted = linear_from_srgb8()[[10, 128, 200]] * (1 - kit.F)
-    assert np.allclose(skin.textures[0].texels[0, 0], wanted, atol=1e-6)
 
 
 def test_a_data_uri_holds_a_picture(tmp_path: Path) -> None:

@@ -97,7 +97,7 @@ def _plain(path: Path, base: list[float], **more: float) -> Asset:
     return prepare(write_glb(path, tree, buffer), KEEP)
 
 
-def test_one_colour_is_a_constant_and_exact(tmp_path: Path) -> None:
+def test_constants_are_exact_and_metals_have_no_diffuse_part(tmp_path: Path) -> None:
     base = [0.3, 0.62, 0.011]
     asset = _plain(tmp_path / "a.glb", base, metallicFactor=0.0, roughnessFactor=0.37)
     for level in asset.levels:
@@ -107,14 +107,11 @@ def test_one_colour_is_a_constant_and_exact(tmp_path: Path) -> None:
         assert np.array_equal(diffuse.texels[0, 0], (np.array(base) * (1 - F)).astype(np.float32))
         assert np.array_equal(specular.texels[0, 0], np.full(3, F, np.float32))
         assert roughness.texels[0, 0, 0] == np.float32(0.37)
-
-
-def test_a_metal_has_no_diffuse_part(tmp_path: Path) -> None:
     asset = _plain(tmp_path / "a.glb", [0.9, 0.5, 0.1], metallicFactor=1.0, roughnessFactor=0.2)
     skin = asset.levels[0].skin
     assert skin is not None and not skin.textures[0].texels.any()
-    base = np.array([0.9, 0.5, 0.1])
-    assert np.allclose(skin.textures[1].texels[0, 0], base + (1 - base) / 21, atol=1e-6)
+    metal = np.array([0.9, 0.5, 0.1])
+    assert np.allclose(skin.textures[1].texels[0, 0], metal + (1 - metal) / 21, atol=1e-6)
 
 
 def test_metal_is_blue_and_roughness_green(tmp_path: Path) -> None:
@@ -203,7 +200,7 @@ def test_a_skin_survives_the_file_of_its_asset(tmp_path: Path) -> None:
     assert [t.sha256 for t in ours.textures] == [t.sha256 for t in theirs.textures]
 
 
-def test_two_materials_of_one_file_meet_in_one_atlas(tmp_path: Path) -> None:
+def test_two_materials_meet_in_one_atlas_and_none_says_so(tmp_path: Path) -> None:
     """And the faces of a part without any get what glTF says of them."""
     path = tmp_path / "o" / "a.obj"
     textured_obj(path, b"", mtl="Kd 1 0 0\nillum 1\nnewmtl other\nKd 0 0 1\nillum 1\n")
@@ -212,6 +209,8 @@ def test_two_materials_of_one_file_meet_in_one_atlas(tmp_path: Path) -> None:
     assert np.allclose(seen_at(asset, 0.25, -0.25), [1, 0, 0], atol=STORED)
     assert np.allclose(seen_at(asset, -0.25, 0.25), [0, 0, 1], atol=STORED)
     assert np.allclose(seen_at(asset, -0.25, 0.25, 1), 0)
+    asset = prepare(write_obj(tmp_path / "a.obj", SQUARE), KEEP)
+    assert asset.materials is not None and asset.materials.reason == "no_materials"
 
 
 def test_what_nothing_here_can_show_is_named(tmp_path: Path) -> None:
@@ -263,11 +262,6 @@ def test_a_level_that_lies_nowhere_near_its_source_is_told(tmp_path: Path) -> No
     assert maker.skinned(level).skin is not None
     with pytest.raises(Rejected, match="colours_missed"):
         maker.skinned(dataclasses.replace(level, positions=0.8 * level.positions))
-
-
-def test_a_file_that_has_no_materials_says_so(tmp_path: Path) -> None:
-    asset = prepare(write_obj(tmp_path / "a.obj", SQUARE), KEEP)
-    assert asset.materials is not None and asset.materials.reason == "no_materials"
 
 
 GLOW = AssetSettings(own_materials=dataclasses.replace(OWN, emission=True))
