@@ -214,14 +214,6 @@ def test_a_scene_without_textures_has_no_coordinates_and_a_sky_changes_no_pass()
     assert np.isnan(view_passes(tiny_scene(), ["uv"], resolution=RESOLUTION)["uv"]).all()
 
 
-def test_coordinates_go_through_a_file() -> None:
-    scene = textured_scene()
-    names = ["uv", "material_diffuse"]
-    found = decode_passes_exr(passes_exr(scene, names, view=0, resolution=RESOLUTION), RESOLUTION)
-    for name, values in view_passes(scene, names, resolution=RESOLUTION).items():
-        np.testing.assert_array_equal(found[name], values.astype(np.float32))
-
-
 def test_files_of_plain_scenes_have_no_coordinates_and_no_nan() -> None:
     """Not even at hits, where other programs would spread it; asked for, they are NaN as ever."""
     names = ["uv", "shading_normal"]
