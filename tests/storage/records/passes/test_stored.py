@@ -149,13 +149,6 @@ def test_verify_compares_with_the_scene() -> None:
     assert "not a readable OpenEXR" in faults(cut, "object", "depth_axis_m")[0]
 
 
-def test_wrong_views_and_names_are_named() -> None:
-    with pytest.raises(TrilightError, match="view is 2; expected 0 to 1"):
-        tiny_sample().view_passes(["object"], view=2)
-    with pytest.raises(TrilightError, match="sample 000000000: view 0: there is no pass 'x'"):
-        tiny_sample().view_passes(["x"])
-
-
 RESOLUTION = 24
 COLUMNS = ("material_diffuse", "material_specular", "material_roughness", "material_emission")
 
