@@ -13,7 +13,7 @@ from model.config import SIZES, ModelConfig, base, hits_smoke, smoke
 from model.costs import Workload, costs, flops
 from model.precision import set_precision
 from model.renderformer import RenderFormer, count_parameters
-from model.scene_tensors import SceneBatch, batch_scenes
+from model.scene_tensors import batch_scenes
 from model.width_scales import WidthScale, scale_start, width_scales
 from storage.errors import TrilightError
 from tests.for_each import for_each
@@ -27,19 +27,6 @@ def test_base_has_the_published_parameters_but_for_the_texture_encoder() -> None
         got = count_parameters(RenderFormer(base()))
     # the published count is known to 5,000; the six frozen frequencies are not counted here
     assert abs(got - (205_170_000 - 768 * (13 * 32 * 32 - 10))) < 5_000
-
-
-def test_base_takes_a_batch_on_the_meta_device() -> None:
-    with torch.device("meta"):
-        batch = SceneBatch(
-            triangles_BT33=torch.zeros(2, 1536, 3, 3),
-            normals_BT33=torch.zeros(2, 1536, 3, 3),
-            material_BTM=torch.zeros(2, 1536, 10),
-            c2w_BV44=torch.zeros(2, 4, 4, 4),
-            fov_deg_BV=torch.zeros(2, 4),
-            is_triangle_BT=torch.ones(2, 1536, dtype=torch.bool),
-        )
-        assert RenderFormer(base())(batch, 256).shape == (2, 4, 256, 256, 3)
 
 
 @for_each(

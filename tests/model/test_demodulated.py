@@ -9,7 +9,7 @@ from torch.nn.functional import interpolate
 
 from model.config import ModelConfig
 from model.demodulated import composed, with_albedo
-from model.image_head import DptHead, Enlarged, Fusion, build_head
+from model.image_head import DptHead, Enlarged, Fusion
 from model.neural_renderer import NeuralRenderer
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
@@ -142,15 +142,6 @@ def test_a_renderer_shows_what_the_network_computes() -> None:
     shown = NeuralRenderer(model).render(scene, RESOLUTION)[0]
     expected = radiance(picture(model, scene).double()).numpy()
     np.testing.assert_allclose(shown, expected, rtol=1e-5, atol=1e-6)  # rounded to float32
-
-
-@for_each("head", ["linear", "dpt"])
-@for_each("per_side", [1, 2, 3, 8])
-def test_heads_return_eight_pixels_per_bundle(head: str, per_side: int) -> None:
-    config = tiny_config(head)
-    built = build_head(config)
-    taps = [torch.randn(2, per_side**2, config.width) for _ in built.taps]
-    assert built(taps).shape == (2, 3, 8 * per_side, 8 * per_side)
 
 
 @for_each("small", [(1, 1), (1, 4), (3, 5), (16, 16)])

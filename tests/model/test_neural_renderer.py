@@ -112,21 +112,6 @@ def test_groups_give_what_a_linear_network_gives_at_once(
     np.testing.assert_allclose(picture(most), at_once, rtol=1e-6)
 
 
-def test_the_picture_of_groups_is_the_sum_of_theirs() -> None:
-    """Float64 sums of the very same pictures, rounded once to float32: 1e-6 relative."""
-    scene, renderer = many_lights(20), NeuralRenderer(network())
-    prepared = renderer.prepare(scene)
-    assert len(prepared.groups) == 3
-    alone = [
-        renderer.view(dataclasses.replace(prepared, groups=(group,)), scene.c2w[0], 40.0, 16)
-        for group in prepared.groups
-    ]
-    assert min(picture.max() for picture in alone) > 0
-    together = renderer.view(prepared, scene.c2w[0], 40.0, 16)
-    np.testing.assert_allclose(together, np.sum(alone, axis=0), rtol=1e-6)
-    assert "20 emitting triangles are rendered in 3 groups" in prepared.notes[0]
-
-
 def test_extremes_give_finite_pictures() -> None:
     model = awake(smoke(), torch.float32)
     with torch.no_grad():

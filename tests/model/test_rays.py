@@ -9,7 +9,6 @@ from model.positions import (
     TriangleRotary,
     encode_normals,
     encoded_normal_width,
-    register_position,
     rotate,
     to_camera,
 )
@@ -117,17 +116,6 @@ def test_normal_encoding_of_known_numbers() -> None:
     assert len(encoded) == encoded_normal_width(3)
     # sin(x + pi / 2) for cos(x), in float64
     torch.testing.assert_close(encoded, expected, rtol=0, atol=1e-14)
-
-
-def test_registers_stand_at_the_mean_vertex_of_the_triangles_that_exist() -> None:
-    triangles = torch.zeros(1, 3, 3, 3, dtype=torch.float64)
-    triangles[0, 0], triangles[0, 1] = 1.0, 4.0
-    triangles[0, 2] = 1e3
-    mask = torch.tensor([[True, True, False]])
-    position = register_position(triangles, mask)
-    assert position.shape == (1, 1, 3, 3)
-    assert torch.all(position == 2.5)
-    assert torch.all(register_position(triangles[:, :2], None) == 2.5)
 
 
 def test_camera_space_is_the_inverse_pose() -> None:

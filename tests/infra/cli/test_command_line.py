@@ -18,7 +18,6 @@ from infra.cli.words import kind_of as kind_of_field
 from infra.setup.command_line_page import every_command
 from infra.setup.generated_pages import PAGES
 from pipeline.shards.expression import TEXTS, condition, kind_of
-from storage.records.passes.declared import MOTION, declared_passes
 from storage.records.quantities import QUANTITIES
 from storage.settings.described import option_of
 from tests.command_line import trilight
@@ -222,16 +221,6 @@ def test_a_signal_in_the_middle_of_a_write_is_answered(name: str, number: int) -
     program = INTERRUPTED_WRITE.replace("NUMBER", str(number)).replace("NAME", name)
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (run.returncode, run.stderr) == (130, "interrupted\n")
-
-
-def test_the_page_of_passes_names_every_pass() -> None:
-    for each_page in PAGES.values():
-        assert each_page().startswith("# ") and "\n| --- |" in each_page()
-    page = PAGES["passes"]()
-    for each in declared_passes():
-        (row,) = [line for line in page.split("\n") if line.startswith(f"| `{each.name}` |")]
-        assert f"| {each.means} |" in row
-        assert each.name == MOTION or f"`{each.exr_channels[0]}`" in row
 
 
 def test_the_page_of_quantities_names_what_a_condition_can_ask() -> None:

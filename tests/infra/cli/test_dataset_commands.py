@@ -15,7 +15,6 @@ from infra.run_record import is_run, run_facts
 from storage.dataset.asked import write_asked
 from storage.dataset.dataset import open_dataset
 from storage.dataset.scene_logs import log_scene
-from storage.dataset.shard import scan_members
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.sample import PartFloor
@@ -113,23 +112,6 @@ def test_an_empty_dataset_and_a_cut_shard_are_one_sentence(tmp_path: Path) -> No
     said = _refused(tmp_path / "my set")
     assert said.startswith(f"{name}: 2000 bytes; expected ")
     assert said.endswith(f"run `trilight verify '{tmp_path}/my set' --repair`.")
-
-
-@pytest.mark.parametrize("suffix", ["json", "scene", "0.exr"])
-def test_wrong_bytes_are_one_sentence_with_what_mends_it(suffix: str, tmp_path: Path) -> None:
-    """Of the same length, in the middle of each kind of member."""
-    dataset = five_scenes(tmp_path)
-    shard = dataset.manifest.shards[0]
-    path = dataset.folder.shard(shard.name)
-    with path.open("rb") as stream:
-        members = scan_members(stream, shard.name)
-        found = next(member for member in members if member.suffix.startswith(suffix))
-    offset, num_bytes = found.offset, found.num_bytes
-    data = bytearray(path.read_bytes())
-    data[offset : offset + num_bytes] = bytes(255 - byte for byte in data[offset:][:num_bytes])
-    path.write_bytes(data)
-    assert f"{shard.name}: " in _refused(tmp_path)
-    assert "--repair`." in _refused(tmp_path)
 
 
 def shards(*arguments: str | Path) -> str:

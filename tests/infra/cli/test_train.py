@@ -368,11 +368,3 @@ def test_licences_are_allowed_beside_those_of_a_file(tmp_path: Path) -> None:
         found = with_shared(order, Shared(settings=_file(tmp_path, text)))
         settings = named_build("smoke", allow_licences=found.allow_licences, changes=found.changes)
         assert settings.allowed_licences == tuple(sorted({*others, "CC-BY-NC-4.0"}))
-
-
-def test_an_order_without_shared_settings_stays_as_it_is_and_is_checked() -> None:
-    order = DatasetOrder(resolution=64, seed=3, changes={"renders.max_spp": 128})
-    assert with_shared(order, Shared()) == order
-    ended = trilight(["generate", "smoke", "--resolution", "20"])
-    assert "resolution is 20; expected a multiple of 8" in ended.mistake
-    assert ended.stdout == "", "before any work is announced"

@@ -209,16 +209,3 @@ def test_a_stage_that_moves_is_drawn_frame_by_frame_by_both_engines(tmp_path: Pa
     printed = trilight([str(word) for word in words]).output
     assert "6, of which 6 were there already" in printed
     assert "agreement" in printed and "flicker" in printed
-
-
-def test_a_shard_is_a_row_of_scenes_each_from_its_camera(tmp_path: Path) -> None:
-    shard, network = tmp_path / "train-000000.tar", write_network(tmp_path / "model.safetensors")
-    keys = ["000000003", "000000007"]
-    write_shard(shard, [(key, encode_sample(tiny_sample(key=key))) for key in keys])
-    arguments = ("--engine", "neural", "--checkpoint", network, "--view", "1")
-    found = render(shard, "--out", tmp_path / "all", *arguments)
-    assert len(found["pictures"]) == 2
-    alone = render(f"{shard}::{keys[1]}", "--out", tmp_path / "one.exr", *arguments)
-    assert alone["scene_sha256"] == found["pictures"][1]["scene_sha256"]
-    one, second = (tmp_path / name for name in ("one.exr", "all/000001.exr"))
-    np.testing.assert_array_equal(decode_exr(one.read_bytes()), decode_exr(second.read_bytes()))

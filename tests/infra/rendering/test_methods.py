@@ -16,7 +16,6 @@ from infra.rendering.comparison import Frame, flicker
 from infra.rendering.methods import (
     direct_light_method,
     network_method,
-    timed_method,
     traced_network,
     untrained_network,
 )
@@ -60,12 +59,6 @@ def test_the_smallest_layers_show_what_large_ones_show() -> None:
     unfiltered = dataclasses.replace(hits_smoke(), filter_width=0)
     large = shown(network_method(untrained_network(unfiltered), PX))
     np.testing.assert_allclose(small, large, rtol=1e-3, atol=1e-4)  # sums in another order
-
-
-def test_a_first_view_costs_more_than_a_further_one() -> None:
-    found = timed_method(network_method(traced_network(), PX), SCENE)
-    assert 0 < found.further_s < found.first_s
-    assert found.radiance_rgb.shape == (PX, PX, 3)
 
 
 def frame(name: str, key: str | None, error: float) -> Frame:

@@ -14,7 +14,7 @@ from prefect.utilities.schema_tools import ValidationError, validate
 
 from tests.conftest import ROOT
 from tests.for_each import case
-from tests.infra.setup.manifests_kit import IMAGES, MANIFESTS, containers, documents, job_template
+from tests.infra.setup.manifests_kit import IMAGES, MANIFESTS, documents, job_template
 
 _SERVES = {"Deployment"}
 
@@ -234,18 +234,3 @@ def _prepared(kind: str, template: Any, values: dict[str, Any]) -> str:
     made = asyncio.run(configuration.from_template_and_values(template, values, client=None))
     made.prepare_for_flow_run(FlowRun(id=uuid.UUID(int=1), flow_id=uuid.UUID(int=2), name="x"))
     return str(made.model_dump_json())
-
-
-def test_prefect_takes_thejob_template() -> None:
-    """Its worker makes a job of it for each flow run, and refuses one that lacks anything."""
-    worker = pytest.importorskip("prefect_kubernetes.worker", reason="make setup-all")
-    kind = worker.KubernetesWorkerJobConfiguration
-    made = asyncio.run(kind.from_template_and_values(job_template(), {}, client=None))
-    made.prepare_for_flow_run(FlowRun(flow_id=uuid.uuid4(), name="x"))
-    (container,) = made.job_manifest["spec"]["template"]["spec"]["containers"]
-    ours = containers()[-1][2]
-    kept = ("image", "imagePullPolicy", "envFrom", "workingDir", "resources", "volumeMounts")
-    assert {name: container[name] for name in kept} == {name: ours[name] for name in kept}
-    assert container["args"] == ["prefect", "flow-run", "execute"]
-    assert {"name": "HOME", "value": "/tmp"} in container["env"]
-    assert made.job_manifest["metadata"]["generateName"] == "x-"

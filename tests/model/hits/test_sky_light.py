@@ -136,14 +136,6 @@ def test_a_sky_joins_the_unit_and_what_triangles_receive() -> None:
     assert dark.mean_3[1] == pytest.approx(0.03 * dark.mean_3[0], rel=1e-5)
 
 
-def test_a_scene_without_lamps_is_lit_by_its_sky() -> None:
-    inputs = traced(corner(radiance=0.0, sky=smooth()))
-    met = inputs.pixels[..., 0] == 1
-    assert np.median(direct(inputs)[met]) > 0.05
-    assert inputs.gathered.max() > 0.01
-    assert inputs.pixels[..., Channel.MIRRORED].max() > 0.01
-
-
 def test_scene_and_sky_turned_together_look_the_same() -> None:
     """The noise too turns with them, but where a ray meets a rim."""
     rotation = uniform_rotation(np.random.default_rng(2))

@@ -21,7 +21,6 @@ from storage.dataset.shard import (
     write_shard,
     write_tar,
 )
-from storage.dataset.statistics import dataset_statistics
 from storage.dataset.training_data import open_training_data
 from storage.digests import sha256_of_file
 from storage.errors import TrilightError
@@ -286,14 +285,6 @@ def test_every_reader_finds_the_maps(dataset: Dataset) -> None:
         found = [looks(opened.sample(row)) for row in (3, 2, 0)]
         assert found == [expected[row] for row in (3, 2, 0)]
         opened.close()
-
-
-def test_the_scene_digest_tells_textures_apart(tmp_path: Path) -> None:
-    digests = set()
-    for row, sample in enumerate([textured_sample(), textured_sample(seed=1), tiny_sample()]):
-        made = write_dataset(tmp_path / str(row), {TRAIN: [sample]})
-        digests.add(dataset_statistics(made).scene_digest)
-    assert len(digests) == 3
 
 
 def test_a_map_twice_or_behind_its_sample_is_refused(tmp_path: Path) -> None:

@@ -168,15 +168,6 @@ def test_a_ray_in_the_plane_of_its_triangle_stands_for_its_middle() -> None:
     np.testing.assert_allclose(hit.position, [[1 / 3, -1 / 3, 0]])
 
 
-def test_one_pixel_is_that_of_the_picture() -> None:
-    scene = _many_triangles()
-    picture = first_hits(scene, resolution=RESOLUTION)
-    for pixel in ((0, 0), (10, 12), (23, 5)):
-        one = first_hits(scene, resolution=RESOLUTION, pixel=pixel)
-        for name in ("triangle", "object", "depth_m", "position", "shading_normal", "material"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(picture, name)[pixel], name)
-
-
 def test_what_is_not_there_is_named() -> None:
     with pytest.raises(TrilightError, match="view is 2; expected 0 to 1"):
         first_hits(tiny_scene(), view=2)

@@ -7,12 +7,11 @@ import pytest
 
 from storage.conventions import latlong_direction, latlong_uv, srgb8
 from storage.records.environment import Environment
-from storage.records.lookup import environment_values, texture_values, textured_rows
+from storage.records.lookup import environment_values, texture_values
 from storage.records.map_facts import SkyFacts, sky_facts, texture_families, textured_objects
-from storage.records.material import DIFFUSE, ROUGHNESS
 from storage.records.texture import MapSource, Texture
 from tests.for_each import for_each
-from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
+from tests.scenes_by_hand import FLOOR, tiny_scene
 from tests.textured_by_hand import colour_texture, number_texture, sky, textured_scene
 
 SIX = {"+X": (1, 0, 0), "-X": (-1, 0, 0), "+Y": (0, 1, 0), "-Y": (0, -1, 0), "+Z": (0, 0, 1),
@@ -128,18 +127,6 @@ def test_mean_greatest_and_constant() -> None:
         assert (texture.greatest == linear.max(axis=(0, 1))).all()
         assert texture.constant is None
     assert Texture(texels=np.full((3, 2, 1), 255, np.uint8)).constant == np.ones(1)
-
-
-def test_rows_of_materials_take_what_is_textured() -> None:
-    scene = textured_scene()
-    uv = np.random.default_rng(1).normal(size=(8, 2)) * 3
-    index = np.array([FLOOR, LIGHT] * 4)
-    rows = textured_rows(scene, index, uv)
-    assert (rows[1::2] == scene.materials[LIGHT]).all()
-    for row, place in zip(rows[::2], uv[::2], strict=True):
-        assert (row[DIFFUSE] == texture_values(scene.textures[0], place).astype(np.float32)).all()
-        assert row[ROUGHNESS] == np.float32(texture_values(scene.textures[1], place)[0])
-        assert (row[3:6] == scene.materials[FLOOR, 3:6]).all()
 
 
 def test_far_coordinates_lose_no_digits() -> None:

@@ -3,7 +3,6 @@
 import dataclasses
 import io
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 
 from storage.conventions import HALF_FLOAT_MAX
 from storage.dataset.manifest import Manifest
-from storage.dataset.shard import write_shard
 from storage.dataset.verify import check_sample
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_exr
@@ -97,16 +95,6 @@ def test_a_sample_with_lights_comes_back() -> None:
     with pytest.raises(TrilightError, match="1.lights.exr.*missing"):
         decode_sample(sample.key, members)
     assert decode_sample("000000000", encode_sample(tiny_sample())).lights_rgb is None
-
-
-def test_stock_webdataset_reads_the_names(tmp_path: Path) -> None:
-    import webdataset
-
-    sample = _lit_sample()
-    write_shard(tmp_path / "train-000000.tar", [(sample.key, encode_sample(sample))])
-    (read,) = webdataset.WebDataset(str(tmp_path / "train-000000.tar"), shardshuffle=False)
-    assert read["__key__"] == sample.key
-    assert {"0.exr", "0.lights.exr", "1.exr", "1.lights.exr"} <= set(read)
 
 
 def test_verify_demands_the_sum_of_lights() -> None:

@@ -59,10 +59,6 @@ def test_albedo_that_sums_to_one_in_float32_is_legal() -> None:
     tiny_scene(materials=materials).check()
 
 
-def test_emitting_triangles_are_those_with_an_emitting_material() -> None:
-    assert tiny_scene().triangle_emits.tolist() == [False, False, True]
-
-
 def test_a_sky_is_light_enough_unless_it_is_black() -> None:
     """Without an emitter, a scene is lit by its environment or not at all."""
     plain = tiny_scene()

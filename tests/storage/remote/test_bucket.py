@@ -39,10 +39,6 @@ emulator: Any = pytest.importorskip(
 )
 
 
-pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
-pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
-
-
 def place(text: str) -> RemoteUrl:
     url = remote_url.parse_url(text, what="out")
     assert isinstance(url, RemoteUrl)

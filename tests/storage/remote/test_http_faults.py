@@ -3,7 +3,6 @@
 From a server of the tests, and from a real one, which is made to fail, stall and die meanwhile.
 """
 
-import io
 import os
 import shutil
 import signal
@@ -17,9 +16,7 @@ from pathlib import Path
 import pytest
 
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.shard import scan_members
 from storage.dataset.shard_places import listed_shards
-from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.remote import tries
 from storage.remote import url as remote_url
@@ -179,15 +176,6 @@ def test_a_server_that_stalls_after_a_few_bytes_is_left(
     assert server.gets()[PATH] == TRIES
 
 
-def test_a_file_that_takes_too_long_altogether_is_left(
-    server: Site, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    patience(monkeypatch, file_s=0.5, least_bytes_per_s=1.0)
-    server.always[PATH] = Fault(trickle=(10, 0.02))
-    with pytest.raises(TrilightError, match="it did not come within 0 s"):
-        read(server.url)
-
-
 def test_a_slow_steady_link_is_waited_for(
     server: Site, local: Dataset, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -258,7 +246,6 @@ http {{
   server {{
     listen 127.0.0.1:{port}; root {root};
     location / {{
-      if (-f {here}/down) {{ return 500; }}
       if (-f {here}/slow) {{ set $limit_rate 4000; }}
     }}
   }}
@@ -317,15 +304,6 @@ def start_reading(url: str) -> tuple[threading.Thread, list[dict[str, bytes]]]:
     return thread, found
 
 
-def test_errors_are_outlived(nginx: Nginx, local: Dataset) -> None:
-    (nginx.here / "down").touch()
-    thread, found = start_reading(nginx.url)
-    until(lambda: ["GET", "/manifest.json", "500"] in [row[:3] for row in nginx.requests()])
-    (nginx.here / "down").unlink()
-    thread.join()
-    assert found == expected(local)
-
-
 def test_a_server_that_dies_and_comes_back_goes_on_where_it_was(
     nginx: Nginx, local: Dataset, cache: Path
 ) -> None:
@@ -340,19 +318,3 @@ def test_a_server_that_dies_and_comes_back_goes_on_where_it_was(
     last = [row for row in nginx.requests() if row[1] == f"/{SHARD}"][-1]
     assert last[2] == "206" and last[3].startswith("bytes=") and last[3] != "bytes=0-"
     assert int(last[4]) < local.shards_of("train")[0].num_bytes
-
-
-def test_changed_and_missing_shards_are_named(nginx: Nginx, local: Dataset) -> None:
-    assert verify_dataset(nginx.url, fast=True).problems == []
-    assert verify_dataset(nginx.url).problems == []
-    path = local.folder.root / SHARD
-    content = bytearray(path.read_bytes())
-    first = next(scan_members(io.BytesIO(content), SHARD))
-    content[first.offset + first.num_bytes // 2] ^= 1
-    path.write_bytes(content)
-    (local.folder.root / "test-000005.tar").unlink()
-    assert verify_dataset(nginx.url, fast=True).bad_shards == ["test-000005.tar"]
-    found = verify_dataset(nginx.url)
-    assert found.bad_shards == ["test-000005.tar", SHARD]
-    assert any("sha256" in line and SHARD in line for line in found.problems)
-    assert "test-000005.tar: missing" in found.problems

@@ -149,13 +149,6 @@ def test_verify_compares_with_the_scene() -> None:
     assert "not a readable OpenEXR" in faults(cut, "object", "depth_axis_m")[0]
 
 
-def test_wrong_views_and_names_are_named() -> None:
-    with pytest.raises(TrilightError, match="view is 2; expected 0 to 1"):
-        tiny_sample().view_passes(["object"], view=2)
-    with pytest.raises(TrilightError, match="sample 000000000: view 0: there is no pass 'x'"):
-        tiny_sample().view_passes(["x"])
-
-
 RESOLUTION = 24
 COLUMNS = ("material_diffuse", "material_specular", "material_roughness", "material_emission")
 
@@ -212,14 +205,6 @@ def test_a_scene_without_textures_has_no_coordinates_and_a_sky_changes_no_pass()
     for name, values in plain.items():
         np.testing.assert_array_equal(lit[name], values)
     assert np.isnan(view_passes(tiny_scene(), ["uv"], resolution=RESOLUTION)["uv"]).all()
-
-
-def test_coordinates_go_through_a_file() -> None:
-    scene = textured_scene()
-    names = ["uv", "material_diffuse"]
-    found = decode_passes_exr(passes_exr(scene, names, view=0, resolution=RESOLUTION), RESOLUTION)
-    for name, values in view_passes(scene, names, resolution=RESOLUTION).items():
-        np.testing.assert_array_equal(found[name], values.astype(np.float32))
 
 
 def test_files_of_plain_scenes_have_no_coordinates_and_no_nan() -> None:
