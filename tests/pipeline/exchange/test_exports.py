@@ -56,7 +56,7 @@ def samples(dataset: Path, split: str) -> list[Sample]:
 
 
 def test_nerfstudio(dataset: Path) -> None:
-    """The form that its documentation states; test_opened_in_nerfstudio.py opens it there."""
+    """The form that its documentation states; the next test opens it there."""
     out = exported(dataset, "nerfstudio", "--scene", "1")
     assert [path.name for path in out.iterdir() if path.is_dir()] == ["000000001"]
     folder = out / "000000001"
@@ -85,6 +85,37 @@ def test_nerfstudio(dataset: Path) -> None:
     assert frame["w"] == frame["h"] == SIZE
     picture = np.asarray(Image.open(folder / frame["file_path"]))
     np.testing.assert_array_equal(picture, preview_srgb8(made.radiance_rgb[1]))
+
+
+def test_its_rays_and_our_depth_lead_to_our_points(dataset: Path) -> None:
+    """Opened by nerfstudio itself, which is not among the project's packages.
+
+    `pip install --no-deps nerfstudio==1.1.5` with jaxtyping, opencv-python-headless and viser.
+    """
+    parsers: Any = pytest.importorskip("nerfstudio.data.dataparsers.nerfstudio_dataparser")
+    depths: Any = pytest.importorskip("nerfstudio.data.datasets.depth_dataset")
+    folder = exported(dataset, "nerfstudio", "--scene", "1") / "000000001"
+    _, made = samples(dataset, "train")
+    parser = parsers.NerfstudioDataParserConfig(
+        data=folder,
+        orientation_method="none",
+        center_method="none",
+        auto_scale_poses=False,
+        eval_mode="all",
+    ).setup()
+    found = parser.get_dataparser_outputs(split="train")
+    assert len(found.image_filenames) == made.scene.num_views
+    opened = depths.DepthDataset(found)
+    for view in range(made.scene.num_views):
+        rays = found.cameras.generate_rays(camera_indices=view)
+        depth = opened[view]["depth_image"] * rays.metadata["directions_norm"]
+        points = (rays.origins + rays.directions * depth).numpy()
+        seen = made.view_passes(["position_m", "hit"], view=view)
+        hit = seen["hit"]
+        assert 0 < hit.mean() <= 1
+        # found: 0.7 micrometres, its and our float32
+        np.testing.assert_allclose(points[hit], seen["position_m"][hit], atol=1e-5)
+        assert (opened[view]["depth_image"].numpy()[..., 0][~hit] == 0).all()
 
 
 def test_coco(dataset: Path) -> None:

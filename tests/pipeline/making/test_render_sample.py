@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.builds.named import BUILDS, named_build
+from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.making import render_sample as module
 from pipeline.making import view_progress
@@ -33,8 +33,6 @@ from storage.records.sample import decode_sample, encode_sample, sample_key
 from storage.records.scene import Scene
 from storage.seeds import seed_for
 from storage.settings.changes import json_or_word
-from storage.settings.described import from_record
-from tests.for_each import for_each
 from tests.pipeline.making.test_publication import ENVIRONMENT, _locked
 from tests.pipeline.scenes.small_pool import small_pool
 from tests.scenes_by_hand import tiny_sample, tiny_scene
@@ -160,15 +158,6 @@ def finished(root: Path, settings: BuildSettings) -> Publication:
         stage_scene(folder, index, made, [], settings.storage.profile)
     publication.add_shard(pack_shard(publication.folder, name, indices))
     return publication
-
-
-@for_each("name", BUILDS)
-def test_what_stores_none_has_the_record_from_before_there_were_any(name: str) -> None:
-    """Every build's: settings stand in shards and digests."""
-    settings = named_build(name)
-    record = settings.as_json()
-    assert record["storage"] == {"profile": settings.storage.profile}
-    assert from_record(BuildSettings, record).as_json() == record
 
 
 def test_what_stores_some_says_so_in_the_order_of_the_table() -> None:

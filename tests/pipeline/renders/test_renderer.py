@@ -54,15 +54,6 @@ def digest(view: RenderedView) -> str:
     return hashlib.sha256(view.radiance_rgb.tobytes() + view.hits.tobytes()).hexdigest()
 
 
-def test_a_view_is_finite_lit_and_black_outside() -> None:
-    view = render_view(simple_scene(), CHEAP)
-    assert view.radiance_rgb.dtype == np.float32 and view.radiance_rgb.shape == (32, 32, 3)
-    assert np.isfinite(view.radiance_rgb).all() and (view.radiance_rgb >= 0).all()
-    assert view.hits.any() and not view.hits.all()
-    assert view.radiance_rgb[view.hits].min() > 0
-    np.testing.assert_array_equal(view.radiance_rgb[0], 0)
-
-
 def test_the_same_bits_for_any_number_of_threads_and_in_any_process() -> None:
     scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
     settings = dataclasses.replace(CHEAP, min_spp=128, max_spp=128, aux_spp=64)

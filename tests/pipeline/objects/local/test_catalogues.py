@@ -86,7 +86,6 @@ GOOD = {"uid": "a", "path": "a.obj"}
         ([1, 2], "objects.jsonl:2: got a list"),
         ({"path": "a.obj"}, "objects.jsonl:2: field 'uid' is missing"),
         ({"uid": "b"}, "objects.jsonl:2: field 'path' is missing"),
-        ({"uid": 7, "path": "a.obj"}, "objects.jsonl:2: field 'uid' is a int"),
         ({"uid": "b", "path": "a.obj", "licence": None}, "field 'licence' is a NoneType"),
         ({"uid": " ", "path": "a.obj"}, "not blank"),
         ({"uid": "b\n", "path": "a.obj"}, "printable"),
@@ -114,6 +113,10 @@ def test_mistakes_in_a_catalogue_are_placed(tmp_path: Path, row: Any, message: s
 def test_a_catalogue_that_is_no_text(tmp_path: Path) -> None:
     (tmp_path / "objects.jsonl").write_bytes(b'\xff\xfe{"uid": "a"}')
     with pytest.raises(TrilightError, match="UTF-8"):
+        listed(tmp_path)
+    (tmp_path / "objects.jsonl").unlink()
+    (tmp_path / "objects.csv").write_bytes("uid,path\ngrö,a.obj".encode("latin-1"))
+    with pytest.raises(TrilightError, match=r"objects\.csv: cannot be read.*UTF-8"):
         listed(tmp_path)
 
 
@@ -175,7 +178,6 @@ def test_the_real_catalogue_as_a_table(tmp_path: Path, shared: Path) -> None:
     "text, message",
     [
         ("uid;path\na;b", "objects.csv:1: the columns are 'uid;path'; expected uid and path"),
-        ("uid,title\na,b", "objects.csv:1: the columns"),
         ("uid,path,path\na,b,c", "objects.csv:1: .*each name once"),
         ("uid,path\na", "objects.csv:2: has 1 cells; expected 2"),
         ('uid,path\n"a\n\nb",c.obj\nd', "objects.csv:2: uid is"),
@@ -186,7 +188,6 @@ def test_the_real_catalogue_as_a_table(tmp_path: Path, shared: Path) -> None:
         ("uid,path\na,b.obj\na,c.obj", "objects.csv:3: uid 'a' is already used in line 2"),
         ("uid,path\n,b.obj", "objects.csv:2: field 'uid' is missing"),
         ("uid,path\na, ", "objects.csv:2: field 'path' is missing"),
-        ("uid,path\na,../b.obj", "objects.csv:2: path .* leads out"),
         ("uid,path\na,b\x00c", "objects.csv:2: path is"),
         ("uid,path\n", "holds no object"),
     ],
@@ -197,12 +198,6 @@ def test_mistakes_in_a_table_are_placed(tmp_path: Path, text: str, message: str)
         listed(tmp_path)
     assert "expected" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_table_that_is_no_text(tmp_path: Path) -> None:
-    (tmp_path / "objects.csv").write_bytes("uid,path\ngrö,a.obj".encode("latin-1"))
-    with pytest.raises(TrilightError, match=r"objects\.csv: cannot be read.*UTF-8"):
-        listed(tmp_path)
 
 
 def test_two_catalogues_in_one_folder(tmp_path: Path) -> None:

@@ -226,9 +226,6 @@ def test_a_licence_beside_a_catalogue_is_refused(site: Site) -> None:
         find(site.url, licence="MIT")
 
 
-pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
-
-
 def always(path: str, fault: Fault) -> Callable[[Site], None]:
     return lambda site: site.always.update({path: fault})
 
