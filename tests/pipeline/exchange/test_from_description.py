@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from pipeline.exchange.description import DescribedObject
-from pipeline.exchange.from_description import placed, scene_from_description
+from pipeline.exchange.from_description import scene_from_description
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_json import read_description
 from storage.errors import TrilightError
@@ -118,24 +118,6 @@ def test_examples_have_the_materials_and_kinds_of_their_files(
         if material.get("rand_tri_diffuse_seed") is None:
             assert len(rows) == 1
             assert np.allclose(found[:, DIFFUSE], material["diffuse"])
-
-
-def test_normalising_fits_a_sphere_of_diameter_one() -> None:
-    transform = {"rotation": [0, 0, 0], "translation": [0, 0, 0], "scale": [1, 1, 1]}
-    description = described(*TRANSFORM, normalize=True, **transform)
-    mesh = loaded(trimesh.Trimesh([[5, 5, 5], [7, 5, 5], [5, 8, 5]], [[0, 1, 2]], process=False))
-    points = placed(mesh, description.objects[0])
-    np.testing.assert_allclose(points.mean(axis=0), 0, atol=1e-7)  # float32 around 0
-    assert np.linalg.norm(points, axis=1).max() == pytest.approx(0.5, abs=1e-7)
-
-
-def test_scale_is_along_the_worlds_axes_after_the_rotation() -> None:
-    description = described(
-        *TRANSFORM, rotation=[0, 0, 90], scale=[10, 1, 1], translation=[0, 0, 0]
-    )
-    mesh = loaded(trimesh.Trimesh([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2]], process=False))
-    points = placed(mesh, description.objects[0])
-    np.testing.assert_allclose(points, [[0, 1, 0], [-10, 0, 0], [0, 0, 1]], atol=1e-6)
 
 
 def test_a_mirroring_scale_keeps_the_outside_outside() -> None:

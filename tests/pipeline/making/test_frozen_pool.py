@@ -324,8 +324,6 @@ def test_without_own_ones_a_scene_is_what_it_was(
     )
     assert [t.sha256 for t in first.textures] == [t.sha256 for t in second.textures]
     assert "maps" not in second.provenance
-    record = dataclasses.asdict(settings.scenes)
-    assert record["skies"]["own_share"] == 1.0
 
 
 def test_documents_name_them_and_a_stranger_in_a_scene_is_a_fault(accepted: AcceptedMaps) -> None:

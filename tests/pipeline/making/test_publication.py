@@ -28,7 +28,7 @@ from storage.errors import TrilightError
 from storage.records.objects import Failure, LockedObject, read_failures
 from storage.records.sample import Sample, sample_key
 from tests.for_each import for_each
-from tests.pipeline.documents.dataset_by_hand import edit_manifest
+from tests.pipeline.documents.dataset_by_hand import edit_manifest, locked
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 ENVIRONMENT = {"mitsuba_variant": "llvm_ad_rgb", "libraries": {"mitsuba": "3.9.1"}}
@@ -46,16 +46,7 @@ def _begin(root: Path, build: BuildSettings, scenes: int = 4, **environment: str
 
 
 def _locked() -> LockedObject:
-    return LockedObject(
-        uid="a",
-        asset_sha256="0" * 64,
-        split="train",
-        licence="CC0-1.0",
-        licence_source="tests",
-        title="A",
-        attribution="",
-        source_url="",
-    )
+    return locked("a")
 
 
 def _sample(index: int) -> Sample:
