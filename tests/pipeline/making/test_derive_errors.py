@@ -20,8 +20,13 @@ from storage.dataset.manifest import write_manifest
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.pipeline.making.derive_kit import TEST_OBJECT, TRAIN_OBJECT, finished, scenes
-from tests.pipeline.making.test_derive_dataset import shards_made
+from tests.pipeline.making.test_derive_dataset import (
+    TEST_OBJECT,
+    TRAIN_OBJECT,
+    finished,
+    scenes,
+    shards_made,
+)
 from tests.pipeline.making.test_publication import ENVIRONMENT, _build
 
 MERGE = Derive(operation="merge")

@@ -47,7 +47,7 @@ from storage.seeds import rng_for
 from tests.infra.child_here import ChildHere
 from tests.pipeline.documents.dataset_by_hand import locked
 from tests.pipeline.making.frozen_kit import SOURCE, asked, begun, build, frozen, prepared
-from tests.pipeline.objects.maps.map_files import exr, noise, png, sun_map
+from tests.pipeline.objects.maps.test_maps import exr, noise, png, sun_map
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import tiny_sample
 

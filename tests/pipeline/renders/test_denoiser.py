@@ -23,7 +23,7 @@ from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tiles import TileChoice
 from pipeline.renders.tracer import Chosen, Features
-from tests.pipeline.renders.sampling import camera_of, printed_by, render_view
+from tests.pipeline.renders.sampling import camera_of, render_view
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 
 
@@ -42,15 +42,6 @@ def test_noise_goes_and_edges_stay() -> None:
     for quality in ("high", "fast"):
         picture = denoise(noisy, features, quality)
         assert np.abs(picture - clean).mean() < 0.25 * np.abs(noisy - clean).mean()
-
-
-def test_the_denoiser_brings_no_torch() -> None:
-    code = (
-        "import sys; from pipeline.renders.denoiser import load_oidn; load_oidn(); "
-        "print('torch' in sys.modules)"
-    )
-    said = printed_by(code)
-    assert said == "False"
 
 
 def test_what_has_no_light_stays_black_and_no_other_light_is_lost() -> None:

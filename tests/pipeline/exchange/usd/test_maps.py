@@ -44,7 +44,7 @@ def test_an_environment_comes_back_bit_for_bit(tmp_path: Path, suffix: str) -> N
         assert_usd_keeps_all(tiny_scene(environment=each), folder, suffix)
 
 
-def test_scenes_of_a_shard_keep_their_skies(tmp_path: Path) -> None:
+def test_scenes_of_a_shard_keep_their_skies_and_textures(tmp_path: Path) -> None:
     scenes = [tiny_scene(environment=sky) for sky in (smooth(), None, smooth(is_seen=True))]
     path = tmp_path / "many.usdc"
     write_usd_shard(path, ((f"k{row}", scene) for row, scene in enumerate(scenes)))
@@ -55,6 +55,11 @@ def test_scenes_of_a_shard_keep_their_skies(tmp_path: Path) -> None:
         if scene.environment is not None:
             assert _sky(found).sha256 == scene.environment.sha256
             assert _sky(found).is_seen == scene.environment.is_seen
+    scenes = [textured_scene(seed) for seed in (0, 1, 0)]
+    write_usd_shard(path, ((f"k{row}", scene) for row, scene in enumerate(scenes)))
+    assert len(list(tmp_path.glob("texture-*.png"))) == 2  # one content, one file
+    for row, scene in enumerate(scenes):
+        assert encode_scene(read_usd(path, f"k{row}", None, "").scene) == encode_scene(scene)
 
 
 def test_other_programs_find_each_pole_where_we_have_it(tmp_path: Path) -> None:
@@ -199,15 +204,6 @@ def test_equal_scenes_have_equal_files(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         write_usd(tmp_path / name / "s.usdz", textured_scene(environment=sky()))
     assert (tmp_path / "a/s.usdz").read_bytes() == (tmp_path / "b/s.usdz").read_bytes()
-
-
-def test_scenes_of_a_shard_keep_their_textures(tmp_path: Path) -> None:
-    scenes = [textured_scene(seed) for seed in (0, 1, 0)]
-    path = tmp_path / "many.usdc"
-    write_usd_shard(path, ((f"k{row}", scene) for row, scene in enumerate(scenes)))
-    assert len(list(tmp_path.glob("texture-*.png"))) == 2  # one content, one file
-    for row, scene in enumerate(scenes):
-        assert encode_scene(read_usd(path, f"k{row}", None, "").scene) == encode_scene(scene)
 
 
 def test_one_colour_is_no_texture(tmp_path: Path) -> None:
