@@ -111,20 +111,16 @@ def test_scenes_are_rounded_up_to_whole_shards(tmp_path: Path) -> None:
     assert (publication.done.shards, publication.done.shards_asked) == (0, 2)
 
 
-def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
+def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Path) -> None:
     _dataset(tmp_path)
     other = named_build("smoke", resolution=32, seed=3)
     other = dataclasses.replace(other, scenes=_build().scenes)
     with pytest.raises(TrilightError, match=r"renders.resolution was 16, now 32 \(and 1 more\)"):
         _begin(tmp_path, other)
-
-
-def test_another_environment_is_refused_unless_accepted(tmp_path: Path) -> None:
-    _dataset(tmp_path)
     with pytest.raises(TrilightError, match="mitsuba_variant was 'llvm_ad_rgb', now 'scalar_rgb'"):
         _begin(tmp_path, _build(), mitsuba_variant="scalar_rgb")
-    other = {**ENVIRONMENT, "mitsuba_variant": "scalar_rgb"}
-    begin(DatasetFolder(tmp_path), _build(), other, 4, accept_environment=True)
+    elsewhere = {**ENVIRONMENT, "mitsuba_variant": "scalar_rgb"}
+    begin(DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True)
 
 
 def test_a_shard_that_missed_the_manifest_is_found(tmp_path: Path) -> None:

@@ -43,13 +43,6 @@ def test_passwords_of_a_catalogue_are_not_published(tmp_path: Path) -> None:
     assert (record.source_url, record.attribution) == ("https://host/a?id=7",) * 2
 
 
-def test_an_empty_catalogue_holds_no_object(tmp_path: Path) -> None:
-    touch(tmp_path, "a.obj")
-    (tmp_path / "objects.jsonl").write_text("\n")
-    with pytest.raises(TrilightError, match=r"holds no object.*objects\.jsonl"):
-        listed(tmp_path)
-
-
 def test_a_catalogue_rules_its_folder(tmp_path: Path) -> None:
     touch(tmp_path, "files/one.obj", "files/two.obj", "unlisted.obj")
     write_catalogue(
@@ -110,7 +103,10 @@ def test_mistakes_in_a_catalogue_are_placed(tmp_path: Path, row: Any, message: s
     str(caught.value).encode()
 
 
-def test_a_catalogue_that_is_no_text(tmp_path: Path) -> None:
+def test_a_catalogue_that_is_empty_or_no_text(tmp_path: Path) -> None:
+    (tmp_path / "objects.jsonl").write_text("\n")
+    with pytest.raises(TrilightError, match=r"holds no object.*objects\.jsonl"):
+        listed(tmp_path)
     (tmp_path / "objects.jsonl").write_bytes(b'\xff\xfe{"uid": "a"}')
     with pytest.raises(TrilightError, match="UTF-8"):
         listed(tmp_path)
