@@ -28,18 +28,6 @@ def test_the_example_scenes_hold_no_unknown_field(shared: Path, name: str) -> No
     assert len(described.cameras) == 1
 
 
-def test_values_are_those_of_the_file() -> None:
-    described = read_description(changed(), "a.json")
-    (box,), (camera,) = described.objects, described.cameras
-    assert box.transform.translation == (0, 0, 0.5)
-    assert box.transform.scale == (1, 2, 1)
-    assert box.transform.rotation_deg == (0, 90, 0)
-    assert box.material.diffuse == (0.5, 0.4, 0.3)
-    assert not box.material.emits
-    assert box.remesh_faces is None
-    assert camera.fov_deg == 40
-
-
 def test_what_may_be_missing_has_the_published_default() -> None:
     scene = json.loads(changed())
     del scene["objects"]["box"]["transform"]["normalize"]

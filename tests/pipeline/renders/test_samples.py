@@ -17,7 +17,6 @@ from pipeline.renders.tracer import Chosen
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB, psnr_linear_db, psnr_log_db
-from storage.settings.described import from_record, settings_record
 from tests.oracle.plugin_tracer import HostSum
 
 CAMERA = Camera(c2w=np.eye(4), fov_deg=40.0, resolution=8)
@@ -126,16 +125,6 @@ def test_one_target_is_enough_and_one_is_needed() -> None:
     assert linear.targets_db == {"psnr_linear_db": 35.0}
     both = one_picture(**common, noise_floor_db=44.0, noise_floor_objects_db=43.0)
     assert both.targets_db == {"psnr_log_db": 44.0, "object_psnr_log_db": 43.0}
-
-
-def test_a_record_holds_later_targets_only_where_they_are_set() -> None:
-    """Else the digest of every build and of every picture would have changed with them."""
-    plain = RenderSettings(**GOOD)
-    assert not {*settings_record(plain)} & {*FLOORS[1:]}
-    for settings in (plain, RenderSettings(**GOOD, noise_floor_linear_db=30.0)):
-        assert from_record(RenderSettings, settings_record(settings)) == settings
-    more = settings_record(RenderSettings(**GOOD, noise_floor_linear_db=30.0))
-    assert more == settings_record(plain) | {"noise_floor_linear_db": 30.0}
 
 
 def log_goal(target_db: float, step: int, max_spp: int) -> Goal:

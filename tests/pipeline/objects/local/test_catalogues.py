@@ -1,7 +1,5 @@
 """Catalogues of both kinds: what a row says, and every mistake in one, by its line."""
 
-import csv
-import io
 import itertools
 import json
 from pathlib import Path
@@ -146,28 +144,6 @@ def test_a_table_says_what_lines_say(tmp_path: Path, encoding: str, ending: str)
     assert (one.title, one.licence, one.licence_source) == ("one", "MIT", " letter")
     assert one.path == str(tmp_path / f"a{ending}b.obj")
     assert (groe.uid, groe.title, groe.licence) == ("grö", "grö", "LicenseRef-unknown")
-
-
-def test_the_real_catalogue_as_a_table(tmp_path: Path, shared: Path) -> None:
-    text = (shared / "objects" / "objects.jsonl").read_text()
-    rows = [json.loads(line) for line in text.splitlines()]
-    stream = io.StringIO(newline="")
-    writer = csv.DictWriter(stream, sorted({key for row in rows for key in row}))
-    writer.writeheader()
-    writer.writerows(rows)
-    write_csv(tmp_path, stream.getvalue())
-    (tmp_path / "lines").mkdir()
-    (tmp_path / "lines" / "objects.jsonl").write_text(text)
-    allowed = [*ALLOWED, "LicenseRef-Stanford-3D-Scanning-Repository"]
-    table, lines = (
-        [
-            {**vars(record), "path": Path(record.path).name, "licence_source": ""}
-            for record in listed(folder, allowed_licences=allowed)
-        ]
-        for folder in (tmp_path, tmp_path / "lines")
-    )
-    assert len(table) == 148
-    assert table == lines
 
 
 @for_each(
