@@ -27,7 +27,7 @@ from tests.pipeline.documents.dataset_by_hand import (
     sample,
     write_dataset,
 )
-from tests.pipeline.making.derive_kit import finished, scenes
+from tests.pipeline.making.test_derive_dataset import finished, scenes
 from tests.pipeline.making.test_publication import begin_tiny, make_tiny_shard
 
 pytestmark = pytest.mark.usefixtures("bare_reports")

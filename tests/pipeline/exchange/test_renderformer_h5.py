@@ -303,13 +303,6 @@ def test_corners_have_the_colours_of_their_cells(tmp_path: Path) -> None:
             assert row[:3] == pytest.approx([level] * 3, abs=0.005)  # 8 bits
 
 
-def test_plain_scenes_are_written_as_before(tmp_path: Path) -> None:
-    scene = textured_scene()
-    plain = dataclasses.replace(scene, uv=None, textures=(), material_textures=None)
-    write_renderformer_h5(tmp_path / "a.h5", plain)
-    assert not read_renderformer_h5(tmp_path / "a.h5").scene.textures
-
-
 def write_v2(path: Path, lit: bool = True, **more: Any) -> None:
     scene = tiny_scene()
     light = np.zeros((3, 3), np.float16)
@@ -355,16 +348,13 @@ def test_its_environment_has_our_axes(tmp_path: Path, processed: bool) -> None:
         assert environment_values(sky, direction) == pytest.approx(COLOURS[name]), name
 
 
-def test_a_turned_environment_is_said(tmp_path: Path) -> None:
+def test_a_turned_environment_is_said_and_another_shape_refused(tmp_path: Path) -> None:
     more: dict[str, Any] = {
         "env_map": six_poles().radiance_rgb,
         "env_map_rotation": np.array([0, 0, 90], "f4"),
     }
     write_v2(tmp_path / "a.h5", **more)
     assert any("rotation of the" in text for text in read_renderformer_h5(tmp_path / "a.h5").lost)
-
-
-def test_a_map_of_another_shape_is_refused(tmp_path: Path) -> None:
     write_v2(tmp_path / "a.h5", env_map=np.ones((4, 8), np.float32))
     with pytest.raises(TrilightError, match=r"env_map: has shape \[4, 8\]; expected"):
         read_renderformer_h5(tmp_path / "a.h5")

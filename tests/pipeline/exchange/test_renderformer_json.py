@@ -28,18 +28,6 @@ def test_the_example_scenes_hold_no_unknown_field(shared: Path, name: str) -> No
     assert len(described.cameras) == 1
 
 
-def test_values_are_those_of_the_file() -> None:
-    described = read_description(changed(), "a.json")
-    (box,), (camera,) = described.objects, described.cameras
-    assert box.transform.translation == (0, 0, 0.5)
-    assert box.transform.scale == (1, 2, 1)
-    assert box.transform.rotation_deg == (0, 90, 0)
-    assert box.material.diffuse == (0.5, 0.4, 0.3)
-    assert not box.material.emits
-    assert box.remesh_faces is None
-    assert camera.fov_deg == 40
-
-
 def test_what_may_be_missing_has_the_published_default() -> None:
     scene = json.loads(changed())
     del scene["objects"]["box"]["transform"]["normalize"]
@@ -78,13 +66,11 @@ REFUSED = [
     (changed(objects={str(i): 1 for i in range(8193)}), "8193 objects; expected 1 to 8192"),
     (changed(objects={"a\nb": OBJECT}), "expected a printable name"),
     (changed(cameras=[]), "cameras is []; expected a list of 1 to 1000"),
-    (changed(cameras=[1]), "cameras[0] is 1; expected a JSON object"),
     (changed(scene_name=...), "scene_name is missing"),
     (changed(*BOX, mesh_path="a\0b"), "objects.box.mesh_path is 'a\\x00b'; expected printable"),
     (changed(*BOX, remesh_target_face_num=2), "is 2; expected a whole number from 4"),
     (changed(*TRANSFORM, normalize="yes"), "transform.normalize is yes; expected true or false"),
     (changed(*TRANSFORM, scale=2), "objects.box.transform.scale is 2; expected a list of three"),
-    (changed(*TRANSFORM, rotation=[0, "90", 0]), "transform.rotation[1] is 90; expected a number"),
     (changed(*TRANSFORM, translation=[1e9, 0, 0]), "translation[0] is 1000000000.0; expected a nu"),
     (changed(*TRANSFORM, translation=[10**400, 0, 0]), "translation[0] is 1000000"),
     (changed(*MATERIAL, diffuse=[0.5, 0.5, 1.5]), "diffuse[2] is 1.5; expected a number from 0 to"),

@@ -18,7 +18,7 @@ from tests.conftest import ROOT
 from tests.for_each import with_folders
 from tests.scenes_by_hand import tiny_sample
 
-SHAPE = (3, 3, 3)
+SHAPE, MANY = (3, 3, 3), (1_000_000, 3, 3)
 
 
 @pytest.fixture
@@ -33,34 +33,14 @@ def _soft_link(file: Any) -> None:
     file["triangles"] = h5py.SoftLink("/hidden")
 
 
-def _external_link(file: Any) -> None:
-    file["triangles"] = h5py.ExternalLink("other.h5", "/triangles")
-
-
-def _external_bytes(file: Any) -> None:
-    file.create_dataset("triangles", SHAPE, "<f4", external=[("secret.bin", 0, 108)])
+def _made(*shape_and_type: Any, **options: Any) -> Callable[[Any], None]:
+    return lambda file: file.create_dataset("triangles", *shape_and_type, **options)
 
 
 def _virtual(file: Any) -> None:
     layout = h5py.VirtualLayout(shape=SHAPE, dtype="<f4")
     layout[:] = h5py.VirtualSource("other.h5", "triangles", shape=SHAPE)
     file.create_virtual_dataset("triangles", layout)
-
-
-def _nothing_stored(file: Any) -> None:
-    file.create_dataset("triangles", (1_000_000, 3, 3), "<f4", chunks=(1000, 3, 3))
-
-
-def _contiguous_but_empty(file: Any) -> None:
-    file.create_dataset("triangles", (1_000_000, 3, 3), "<f4")
-
-
-def _too_long(file: Any) -> None:
-    file.create_dataset("triangles", (1 << 40, 3, 3), "<f4", chunks=(1000, 3, 3))
-
-
-def _huge_chunk(file: Any) -> None:
-    file.create_dataset("triangles", (1_000_000, 3, 3), "<f8", chunks=(1_000_000, 3, 3))
 
 
 def _filter_of_a_plug_in(file: Any) -> None:
@@ -106,14 +86,14 @@ TEXT = np.array([[["a" * 8] * 3] * 3] * 3, dtype=h5py.string_dtype())
 HOSTILE: dict[str, tuple[Callable[[Any], None], str]] = {
     "missing": (lambda file: None, "missing"),
     "soft link": (_soft_link, "is a link"),
-    "external link": (_external_link, "is a link"),
-    "external bytes": (_external_bytes, "elsewhere"),
+    "external link": (_of(h5py.ExternalLink("other.h5", "/triangles")), "is a link"),
+    "external bytes": (_made(SHAPE, "<f4", external=[("secret.bin", 0, 108)]), "elsewhere"),
     "virtual": (_virtual, "elsewhere"),
     "group": (lambda file: file.create_group("triangles"), "no array"),
-    "no chunk stored": (_nothing_stored, "chunk at .* is missing"),
-    "nothing stored": (_contiguous_but_empty, "other bytes"),
-    "too long": (_too_long, "at most 1000000"),
-    "huge chunk": (_huge_chunk, "would take"),
+    "no chunk stored": (_made(MANY, "<f4", chunks=(1000, 3, 3)), "chunk at .* is missing"),
+    "nothing stored": (_made(MANY, "<f4"), "other bytes"),
+    "too long": (_made((1 << 40, 3, 3), "<f4", chunks=(1000, 3, 3)), "at most 1000000"),
+    "huge chunk": (_made(MANY, "<f8", chunks=MANY), "would take"),
     "plug-in": (_filter_of_a_plug_in, "filters .32015"),
     "chunk too small": (_raw_chunk(b"x\x9c\x03\x00\x00\x00\x00\x01"), "other bytes"),
     "chunk is no zlib": (_raw_chunk(b"nonsense" * 20), "damaged"),

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -16,7 +15,6 @@ from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles, build_scene
 from pipeline.exchange.scene_folder import find_scene_files
-from pipeline.isolation import Reach
 from pipeline.making import render_children
 from pipeline.making.accept_scene_files import (
     accept_scene_files,
@@ -35,23 +33,12 @@ from storage.records.scene import Scene
 CAMERA = {"position": [0, -2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}
 
 
-class Here:
-    """Stands in for a child: what is asked of it is done in this process."""
-
-    def __init__(self, confined_to: Reach) -> None:
-        self.confined_to = confined_to
-
-    def call(self, function: Callable[..., Any], *args: Any) -> Any:
-        return function(*args)
-
-    def close(self) -> None:
-        """Nothing was started."""
-
-
 @pytest.fixture
 def no_child(monkeypatch: pytest.MonkeyPatch) -> None:
     """Accept files without a child, of which each costs seconds."""
-    monkeypatch.setattr("pipeline.making.accept_scene_files.asset_child", Here)
+    here = SimpleNamespace(call=lambda function, *args: function(*args), close=lambda: None)
+    child = "pipeline.making.accept_scene_files.asset_child"
+    monkeypatch.setattr(child, lambda confined_to: here)
 
 
 @pytest.fixture

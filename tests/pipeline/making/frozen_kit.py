@@ -38,6 +38,11 @@ def build() -> BuildSettings:
 _pool = functools.cache(small_pool)
 
 
+def _record(uid: str, **stated: str) -> ObjectRecord:
+    plain = {"title": "", "licence": "MIT", "attribution": "", "source_url": "", "path": ""}
+    return ObjectRecord(uid=uid, licence_source="tests", **plain | stated)
+
+
 def prepared(number: int) -> PreparedAsset:
     """Put an object of its own geometry into the store; return it as the mesh stage would."""
     asset, uid = _pool()[number % 5].asset, f"object {number:05d}"
@@ -46,15 +51,8 @@ def prepared(number: int) -> PreparedAsset:
     path = asset_store().asset_path(name[:32])
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
-    record = ObjectRecord(
-        uid=uid,
-        title=f"\N{GREEK SMALL LETTER ALPHA} {number}",
-        licence=LICENCES[number % len(LICENCES)],
-        licence_source="tests",
-        attribution="",
-        source_url="",
-        path="",
-    )
+    title = f"\N{GREEK SMALL LETTER ALPHA} {number}"
+    record = _record(uid, title=title, licence=LICENCES[number % len(LICENCES)])
     return PreparedAsset(
         record=record, path=path, asset_sha256=sha256_hex(data), geometry_sha256=name
     )
@@ -128,10 +126,5 @@ def object_records(folder: Path, count: int = 30, suffix: str = ".ply") -> list[
         path = folder / f"object {number:05d}{suffix}"
         if not path.exists():
             path.write_text(str(number))
-        records.append(
-            ObjectRecord(
-                uid=path.stem, title="", licence="MIT", licence_source="tests",
-                attribution="", source_url="", path=str(path),
-            )
-        )  # fmt: skip
+        records.append(_record(path.stem, path=str(path)))
     return records

@@ -1,7 +1,8 @@
-"""merge, select and reshard: what goes in comes out, once, under known names, with its maps."""
+"""merge, select and reshard of finished datasets: what goes in comes out, once, with its maps."""
 
 import dataclasses
 import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -15,14 +16,25 @@ from storage.dataset import layout
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import index_shard
+from storage.dataset.manifest import Manifest, index_shard, write_manifest
 from storage.dataset.shard import contents_of, write_shard
 from storage.dataset.staging import read_staged_scene, stage_scene
 from storage.dataset.verify import verify_dataset
-from storage.records.objects import Failure, read_failures, read_objects_lock
+from storage.digests import sha256_hex
+from storage.records.objects import (
+    Failure,
+    LockedObject,
+    encode_objects_lock,
+    read_failures,
+    read_objects_lock,
+    write_failures,
+    write_objects_lock,
+)
+from storage.records.profiles import Profile
 from storage.records.sample import Sample, encode_sample, sample_key
+from storage.records.scene import Scene
 from tests.for_each import for_each
-from tests.pipeline.making.derive_kit import finished, lit, scenes
+from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample
 from tests.textured_by_hand import (
     colour_texture,
     number_texture,
@@ -30,6 +42,66 @@ from tests.textured_by_hand import (
     textured_sample,
     textured_scene,
 )
+
+SETTINGS = {
+    "build": "smoke",
+    "renders": {"noise_floor_db": 40.0, "max_spp": 256, "resolution": 16},
+    "scenes": {"max_triangles": 9},
+    "splits": {"scenes_per_shard": 2},
+}
+TRAIN_OBJECT = dataclasses.replace(locked("a"), asset_sha256="a" * 64)
+TEST_OBJECT = dataclasses.replace(locked("c", "CC-BY-4.0", split="test"), asset_sha256="c" * 64)
+
+
+def lit(index: int, salt: int, uids: Sequence[str], template: str = "plane") -> Sample:
+    """Return a sample whose scene no other (index, salt) has; floors rise with the index."""
+    scene: Scene = furnished(uids, template)
+    scene.materials[0, 0] = 0.3 + 0.001 * index + 0.1 * salt
+    return sample(index, scene, noise_floor_db=36.0 + index)
+
+
+def scenes(salt: int, *, train: str = "a", test: str = "c") -> dict[str, list[Sample]]:
+    """Return four scenes for training in two shards, and two for testing."""
+    return {
+        "train-000000.tar": [lit(0, salt, [train]), lit(1, salt, [], "wall")],
+        "train-000001.tar": [lit(2, salt, [train], "wall"), lit(3, salt, [train])],
+        "test-000002.tar": [lit(4, salt, [test], "wall"), lit(5, salt, [test])],
+    }
+
+
+def finished(
+    root: Path,
+    shards: Mapping[str, Sequence[Sample]],
+    *,
+    objects: Sequence[LockedObject] = (TRAIN_OBJECT, TEST_OBJECT, locked("unused", "MIT")),
+    failures: Sequence[Failure] = (),
+    seed: int = 0,
+    profiles: Sequence[Profile] = (),
+    **changes: object,
+) -> Path:
+    """Write a finished dataset; `changes` replace fields of its manifest.
+
+    Shards are packed by `profiles`, one for each, or all without loss.
+    """
+    folder = DatasetFolder(root)
+    for row, (name, of_shard) in enumerate(shards.items()):
+        profile = profiles[row] if profiles else "lossless"
+        members = [(entry.key, encode_sample(entry, profile)) for entry in of_shard]
+        write_shard(folder.shard(name), members)
+    write_objects_lock(folder.objects_lock, objects)
+    write_failures(folder.failures, failures)
+    manifest = Manifest(
+        build="smoke",
+        settings={**SETTINGS, "seed": seed},
+        environment={"mitsuba_variant": "none"},
+        num_scenes=2 * len(shards),
+        num_views=2,
+        objects_lock_sha256=sha256_hex(encode_objects_lock(objects)),
+        shards=tuple(index_shard(folder.shard(name)) for name in shards),
+    )
+    write_manifest(folder.manifest, dataclasses.replace(manifest, **changes))  # type: ignore[arg-type]
+    return root
+
 
 MERGE = Derive(operation="merge")
 
@@ -289,9 +361,9 @@ def test_staged_scenes_bring_their_maps_into_the_shard(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path)
     samples = [textured_sample(sample_key(index), index // 2) for index in range(3)]
     staged = folder.staged_shard("train-000000.tar")
-    for index, sample in enumerate(samples):
-        stage_scene(staged, index, sample, [], "compact")
-        assert read_staged_scene(staged, index).members == encode_sample(sample, "compact")
+    for index, each in enumerate(samples):
+        stage_scene(staged, index, each, [], "compact")
+        assert read_staged_scene(staged, index).members == encode_sample(each, "compact")
     packed = pack_shard(folder, "train-000000.tar", range(3))
     with folder.shard(packed.name).open("rb") as stream:
         assert len(contents_of(stream, packed.name).maps) == 4

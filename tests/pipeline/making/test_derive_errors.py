@@ -20,8 +20,13 @@ from storage.dataset.manifest import write_manifest
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.pipeline.making.derive_kit import TEST_OBJECT, TRAIN_OBJECT, finished, scenes
-from tests.pipeline.making.test_derive_dataset import shards_made
+from tests.pipeline.making.test_derive_dataset import (
+    TEST_OBJECT,
+    TRAIN_OBJECT,
+    finished,
+    scenes,
+    shards_made,
+)
 from tests.pipeline.making.test_publication import ENVIRONMENT, _build
 
 MERGE = Derive(operation="merge")
@@ -44,29 +49,19 @@ def changed_settings(root: Path, group: str, **values: Any) -> Path:
     return root
 
 
-def test_a_leak_between_splits_is_named_by_uid(tmp_path: Path) -> None:
-    """Prepared with another budget, the object has another digest, but the same name."""
+@for_each("uid, sha256", [("c", "1" * 64), ("x", TEST_OBJECT.asset_sha256)])
+def test_a_leak_between_splits_is_named(tmp_path: Path, uid: str, sha256: str) -> None:
+    """Of the same name with another budget; of the same file, which catalogues call otherwise."""
     a = finished(tmp_path / "a", scenes(0))
     other = [
-        dataclasses.replace(TRAIN_OBJECT, uid="c", asset_sha256="1" * 64),
-        dataclasses.replace(TEST_OBJECT, uid="d", asset_sha256="2" * 64),
-    ]
-    b = finished(tmp_path / "b", scenes(1, train="c", test="d"), objects=other)
-    assert verify_dataset(b).problems == []
-    message = refused(tmp_path / "c", MERGE, a, b)
-    assert "object 'c' is in test of" in message and "and in train of" in message
-    assert "trilight shards select" in message
-
-
-def test_a_leak_between_splits_is_named_by_asset(tmp_path: Path) -> None:
-    """Two catalogues may call the same file otherwise."""
-    a = finished(tmp_path / "a", scenes(0))
-    other = [
-        dataclasses.replace(TRAIN_OBJECT, uid="x", asset_sha256=TEST_OBJECT.asset_sha256),
+        dataclasses.replace(TRAIN_OBJECT, uid=uid, asset_sha256=sha256),
         dataclasses.replace(TEST_OBJECT, uid="y", asset_sha256="2" * 64),
     ]
-    b = finished(tmp_path / "b", scenes(1, train="x", test="y"), objects=other)
-    assert "object 'x' is in test of" in refused(tmp_path / "c", MERGE, a, b)
+    b = finished(tmp_path / "b", scenes(1, train=uid, test="y"), objects=other)
+    assert verify_dataset(b).problems == []
+    message = refused(tmp_path / "c", MERGE, a, b)
+    assert f"object '{uid}' is in test of" in message and "and in train of" in message
+    assert "trilight shards select" in message
     train_only = tmp_path / "train"
     derive = Derive(operation="select", selection=Selection(split="train"))
     shards_made(train_only, derive, a)
@@ -93,10 +88,6 @@ def test_what_does_not_fit_together_is_named(
 ) -> None:
     a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1))
     assert name in refused(tmp_path / "c", MERGE, a, changed_settings(b, group, **values))
-
-
-def test_numbers_of_views_must_be_the_same(tmp_path: Path) -> None:
-    a = finished(tmp_path / "a", scenes(0))
     other = finished(tmp_path / "other", scenes(1), num_views=3)
     assert "number of views is 3; expected 2" in refused(tmp_path / "c", MERGE, a, other)
 

@@ -47,7 +47,7 @@ from storage.seeds import rng_for
 from tests.infra.child_here import ChildHere
 from tests.pipeline.documents.dataset_by_hand import locked
 from tests.pipeline.making.frozen_kit import SOURCE, asked, begun, build, frozen, prepared
-from tests.pipeline.objects.maps.map_files import exr, noise, png, sun_map
+from tests.pipeline.objects.maps.test_maps import exr, noise, png, sun_map
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import tiny_sample
 
@@ -324,8 +324,6 @@ def test_without_own_ones_a_scene_is_what_it_was(
     )
     assert [t.sha256 for t in first.textures] == [t.sha256 for t in second.textures]
     assert "maps" not in second.provenance
-    record = dataclasses.asdict(settings.scenes)
-    assert record["skies"]["own_share"] == 1.0
 
 
 def test_documents_name_them_and_a_stranger_in_a_scene_is_a_fault(accepted: AcceptedMaps) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.builds.named import BUILDS, named_build
+from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.making import render_sample as module
 from pipeline.making import view_progress
@@ -33,8 +33,6 @@ from storage.records.sample import decode_sample, encode_sample, sample_key
 from storage.records.scene import Scene
 from storage.seeds import seed_for
 from storage.settings.changes import json_or_word
-from storage.settings.described import from_record
-from tests.for_each import for_each
 from tests.pipeline.making.test_publication import ENVIRONMENT, _locked
 from tests.pipeline.scenes.small_pool import small_pool
 from tests.scenes_by_hand import tiny_sample, tiny_scene
@@ -162,15 +160,6 @@ def finished(root: Path, settings: BuildSettings) -> Publication:
     return publication
 
 
-@for_each("name", BUILDS)
-def test_what_stores_none_has_the_record_from_before_there_were_any(name: str) -> None:
-    """Every build's: settings stand in shards and digests."""
-    settings = named_build(name)
-    record = settings.as_json()
-    assert record["storage"] == {"profile": settings.storage.profile}
-    assert from_record(BuildSettings, record).as_json() == record
-
-
 def test_what_stores_some_says_so_in_the_order_of_the_table() -> None:
     assert build(**ASKED).as_json()["storage"]["passes"] == list(NAMES)
     assert build(**ASKED).digest == build(**{"storage.passes": list(NAMES)}).digest
@@ -238,7 +227,7 @@ def test_a_view_counts_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert told == [2.25, 2.5, 2.75, 3.0]
 
 
-def test_quick_passes_are_told_once(tmp_path: Path) -> None:
+def test_quick_passes_are_told_once_and_to_nobody(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path)
     progress = ViewProgress(folder, 5)
     assert progress.view(0, _steps()) is DONE
@@ -246,10 +235,6 @@ def test_quick_passes_are_told_once(tmp_path: Path) -> None:
     assert _told(folder) == ["0.250"]
     progress.end()
     assert _told(folder) == []
-
-
-def test_where_nobody_looks_nothing_is_written(tmp_path: Path) -> None:
-    progress = ViewProgress(None, 5)
-    assert progress.view(0, _steps()) is DONE
-    progress.end()
-    assert not list(tmp_path.iterdir())
+    nobody = ViewProgress(None, 5)
+    assert nobody.view(0, _steps()) is DONE
+    nobody.end()

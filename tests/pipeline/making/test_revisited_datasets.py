@@ -5,6 +5,7 @@ One dataset is made by a real child; the others are made in this process, which 
 
 import dataclasses
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -225,10 +226,7 @@ def test_scenes_of_files_have_no_layout_to_draw_from(
 
 def test_a_damaged_source_is_named(source: Dataset, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
-    copy.mkdir()
-    for path in source.folder.root.iterdir():
-        if path.is_file():
-            (copy / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(source.folder.root, copy)
     shard = copy / source.manifest.shards[0].name
     data = bytearray(shard.read_bytes())
     data[len(data) // 2] ^= 1

@@ -1,12 +1,15 @@
-"""Our side and plain Mitsuba's, as experiments render them: the product's own pictures."""
+"""Pictures of experiments: our side and plain Mitsuba's, and coarser meshes beside their source."""
 
 import numpy as np
 import pytest
+import trimesh
 
 from infra.bench.workloads.judged_pictures import shrunk
+from infra.bench.workloads.mesh_pictures import picture_db
 from infra.bench.workloads.plain_mitsuba import render_levels
 from infra.bench.workloads.shots import fixed_samples, shots
 from infra.rendering.raw_references import raw_reference
+from pipeline.assets.mesh import TriangleMesh
 from pipeline.renders.load_tracer import load_tracer
 from storage.metrics import psnr_log_db
 from tests.pipeline.renders.sampling import camera_of
@@ -43,3 +46,21 @@ def test_plain_mitsuba_comes_to_the_same_picture() -> None:
     # With three seeds 57 to 59, 60 to 62, and 68 to 69 dB; light off by half a percent is at 60.
     assert errors[0] < errors[2]
     assert errors[0] > 50 and errors[1] > 53 and errors[2] > 62
+
+
+def _ball(subdivisions: int) -> TriangleMesh:
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.5)
+    return TriangleMesh(
+        positions=np.asarray(mesh.vertices, np.float64), faces=np.asarray(mesh.faces, np.int64)
+    )
+
+
+def test_a_finer_ball_looks_more_like_its_source() -> None:
+    """20480 triangles as the source, then 80, 320, 1280 and itself."""
+    meshes = [_ball(5), _ball(1), _ball(2), _ball(3), _ball(5)]
+    coarse, middle, fine, same, other_samples = picture_db(meshes, fixed_samples(32, 64))
+    # a quarter of the distance with every step, 12 dB at most; a third of that is asked for
+    assert coarse + 4 < middle and middle + 4 < fine
+    assert same == 100.0  # equal meshes, equal random numbers, equal bits
+    # denoised twice with other samples: far from equal, and far from another shape
+    assert coarse < other_samples < 100

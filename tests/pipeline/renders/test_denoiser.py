@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import denoiser, variant_probe
-from pipeline.renders.denoiser import denoise, load_oidn, set_denoiser_device, set_denoiser_threads
+from pipeline.renders.denoiser import denoise, load_oidn, set_denoiser_device
 from pipeline.renders.kept_light import (
     LEAST_PASSES,
     Pictures,
@@ -23,7 +23,7 @@ from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tiles import TileChoice
 from pipeline.renders.tracer import Chosen, Features
-from tests.pipeline.renders.sampling import camera_of, printed_by, render_view
+from tests.pipeline.renders.sampling import camera_of, render_view
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 
 
@@ -42,24 +42,6 @@ def test_noise_goes_and_edges_stay() -> None:
     for quality in ("high", "fast"):
         picture = denoise(noisy, features, quality)
         assert np.abs(picture - clean).mean() < 0.25 * np.abs(noisy - clean).mean()
-
-
-def test_threads_change_no_bit() -> None:
-    _, noisy, features = _noisy_step()
-    pictures = []
-    for threads in (1, 2):
-        set_denoiser_threads(threads)
-        pictures.append(denoise(noisy, features, "high"))
-    np.testing.assert_array_equal(pictures[0], pictures[1])
-
-
-def test_the_denoiser_brings_no_torch() -> None:
-    code = (
-        "import sys; from pipeline.renders.denoiser import load_oidn; load_oidn(); "
-        "print('torch' in sys.modules)"
-    )
-    said = printed_by(code)
-    assert said == "False"
 
 
 def test_what_has_no_light_stays_black_and_no_other_light_is_lost() -> None:

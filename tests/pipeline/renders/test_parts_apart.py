@@ -23,7 +23,6 @@ from storage.records.lights import MAX_LIGHTS, rounded_to_half, sum_of_lights
 from storage.records.parts import part_names, sum_of_parts
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
-from storage.settings.described import settings_record
 from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.renders.guided_scenes import mirrors
 from tests.pipeline.renders.sampling import (
@@ -164,12 +163,6 @@ def test_too_many_pictures_are_rejected() -> None:
     SceneRenderer(scene, _with(SETTINGS, per_light=True))
     with pytest.raises(Rejected, match=f"too_many_lights.*{count} emitters apart; at most 32"):
         SceneRenderer(scene, _with(SETTINGS, per_light=True, split=True))
-
-
-def test_settings_that_ask_for_nothing_are_those_of_before() -> None:
-    """Their record is part of digests, which must stay."""
-    assert not {"split", "split_lobes"} & set(settings_record(_with(SETTINGS)))
-    assert settings_record(SETTINGS)["split"] is True
 
 
 @pytest.mark.parametrize(("kind", "per_light"), [({}, True), (KINDS[0], False), (KINDS[2], True)])

@@ -54,15 +54,6 @@ def digest(view: RenderedView) -> str:
     return hashlib.sha256(view.radiance_rgb.tobytes() + view.hits.tobytes()).hexdigest()
 
 
-def test_a_view_is_finite_lit_and_black_outside() -> None:
-    view = render_view(simple_scene(), CHEAP)
-    assert view.radiance_rgb.dtype == np.float32 and view.radiance_rgb.shape == (32, 32, 3)
-    assert np.isfinite(view.radiance_rgb).all() and (view.radiance_rgb >= 0).all()
-    assert view.hits.any() and not view.hits.all()
-    assert view.radiance_rgb[view.hits].min() > 0
-    np.testing.assert_array_equal(view.radiance_rgb[0], 0)
-
-
 def test_the_same_bits_for_any_number_of_threads_and_in_any_process() -> None:
     scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
     settings = dataclasses.replace(CHEAP, min_spp=128, max_spp=128, aux_spp=64)
@@ -200,6 +191,13 @@ def test_pictures_without_right_light_are_rejected() -> None:
             render_view(simple_scene(radiance=radiance), CHEAP)
     with pytest.raises(Rejected, match="no_surfaces"):
         SceneRenderer(join([light([[0, 0, 1], [1, 0, 1], [0, 1, 1]], 1.0)]), CHEAP)
+    empty = SceneObject(name="nothing", kind="emitter")
+    no_triangles = dataclasses.replace(lit_scene(), objects=(*lit_scene().objects, empty))
+    with pytest.raises(Rejected, match="unlit_scene"):
+        SceneRenderer(no_triangles, SETTINGS)
+    scene.vertex_positions[-3:] = [[0, 0, 1], [1, 0, 1], [2, 0, 1]]
+    with pytest.raises(Rejected, match="unlit_scene"):  # its lamp has no area
+        SceneRenderer(scene, CHEAP)
 
 
 SETTINGS = RenderSettings(
@@ -334,11 +332,3 @@ def test_one_light_alone_is_the_picture_but_for_its_rounding() -> None:
     apart = render_view(scene, SETTINGS)
     np.testing.assert_array_equal(apart.radiance_rgb, rounded_to_half(together.radiance_rgb))
     assert apart.noise_floor_db == together.noise_floor_db
-
-
-def test_an_emitter_without_triangles_is_rejected() -> None:
-    scene = lit_scene()
-    empty = SceneObject(name="nothing", kind="emitter")
-    more = dataclasses.replace(scene, objects=(*scene.objects, empty))
-    with pytest.raises(Rejected, match="unlit_scene"):
-        SceneRenderer(more, SETTINGS)

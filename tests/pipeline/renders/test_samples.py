@@ -17,7 +17,6 @@ from pipeline.renders.tracer import Chosen
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB, psnr_linear_db, psnr_log_db
-from storage.settings.described import from_record, settings_record
 from tests.oracle.plugin_tracer import HostSum
 
 CAMERA = Camera(c2w=np.eye(4), fov_deg=40.0, resolution=8)
@@ -128,16 +127,6 @@ def test_one_target_is_enough_and_one_is_needed() -> None:
     assert both.targets_db == {"psnr_log_db": 44.0, "object_psnr_log_db": 43.0}
 
 
-def test_a_record_holds_later_targets_only_where_they_are_set() -> None:
-    """Else the digest of every build and of every picture would have changed with them."""
-    plain = RenderSettings(**GOOD)
-    assert not {*settings_record(plain)} & {*FLOORS[1:]}
-    for settings in (plain, RenderSettings(**GOOD, noise_floor_linear_db=30.0)):
-        assert from_record(RenderSettings, settings_record(settings)) == settings
-    more = settings_record(RenderSettings(**GOOD, noise_floor_linear_db=30.0))
-    assert more == settings_record(plain) | {"noise_floor_linear_db": 30.0}
-
-
 def log_goal(target_db: float, step: int, max_spp: int) -> Goal:
     return Goal(targets_db={"psnr_log_db": target_db}, step=step, max_spp=max_spp)
 
@@ -192,14 +181,10 @@ TWICE = [
 ]
 
 
-def test_only_targets_that_are_missed_leave_a_gap() -> None:
-    floors_db = TWICE[-1][1]
-    targets_db = {"psnr_log_db": 42.0, "psnr_linear_db": 35.0}
-    assert gaps_db(targets_db, floors_db) == {"psnr_linear_db": 4.0}
-    assert gaps_db({"psnr_log_db": 41.0}, floors_db) == {}
-
-
 def test_the_target_that_needs_most_samples_governs() -> None:
+    missed = {"psnr_log_db": 42.0, "psnr_linear_db": 35.0}
+    assert gaps_db(missed, TWICE[-1][1]) == {"psnr_linear_db": 4.0}
+    assert gaps_db({"psnr_log_db": 41.0}, TWICE[-1][1]) == {}
     # 2 dB a doubling of the log floor, 1 dB of both others
     both = Goal(targets_db={"psnr_log_db": 45.0, "psnr_linear_db": 33.0}, step=128, max_spp=8192)
     assert expected_spp(TWICE, both) == 1024  # two doublings: the gap of 3 dB takes 1.5
@@ -291,17 +276,13 @@ def test_raw_halves_state_the_error_of_one() -> None:
     assert measure_floor(halves[0], halves[1], EVERYWHERE).log_db == pytest.approx(exact, abs=0.4)
 
 
-def test_halves_may_change_places() -> None:
-    rng = np.random.default_rng(3)
-    a, b = half(rng), half(rng)
-    assert measure_floor(a, b, EVERYWHERE) == measure_floor(b, a, EVERYWHERE)
-
-
 def test_pictures_without_error_or_without_geometry_state_the_cap() -> None:
     calm = Half(raw_rgb=truth(), denoised_rgb=truth())
     assert measure_floor(calm, calm, EVERYWHERE).log_db == MAX_DB
     rng = np.random.default_rng(4)
-    assert measure_floor(half(rng), half(rng), ~EVERYWHERE).object_log_db == MAX_DB
+    a, b = half(rng), half(rng)
+    assert measure_floor(a, b, ~EVERYWHERE).object_log_db == MAX_DB
+    assert measure_floor(a, b, EVERYWHERE) == measure_floor(b, a, EVERYWHERE)
 
 
 def test_an_empty_background_earns_nothing() -> None:

@@ -26,7 +26,8 @@ from tests.pipeline.renders.sampling import (
     render_blocks,
     render_passes,
 )
-from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
+from tests.pipeline.renders.scene_kit import join, light, material, quad
+from tests.pipeline.renders.test_twin_tracers import furniture
 from tests.sky_maps import as_sky, constant, night, one_sun, six_poles, smooth
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -42,16 +43,7 @@ SKIES: dict[str, Callable[[], Environment]] = {
 
 
 def open_scene(sky: Environment | None, num_lights: int = 2) -> Scene:
-    """Things on a floor, nothing smoother than roughness 0.3: the noise has no long tail."""
-    s = 0.5
-    floor = [[-s, -s, -s], [s, -s, -s], [s, s, -s], [-s, s, -s]]
-    wall = [[-s, s, -s], [s, s, -s], [s, s, s], [-s, s, s]]
-    parts = [
-        quad(floor, material(diffuse=[0.2, 0.5, 0.4], specular=0.4, roughness=0.4)),
-        quad(wall, material(diffuse=[0.7, 0.3, 0.3], specular=0.2, roughness=0.9)),
-        sphere([-0.15, 0.1, -0.2], 0.25, material(diffuse=0.1, specular=0.8, roughness=0.3), 8),
-        box([0.25, -0.1, -0.3], 0.3, material(diffuse=[0.1, 0.2, 0.8]), turn=0.4),
-    ]
+    parts = furniture()
     lamps = [[[0.2, -0.9, 0.9], [0.4, -0.9, 1.0], [0.2, -0.7, 0.8]],
              [[-0.9, -0.5, 0.6], [-0.9, -0.3, 0.6], [-0.8, -0.4, 0.8]]]  # fmt: skip
     parts += [light(lamp, [6.0, 8.0, 7.0], diffuse=1.0) for lamp in lamps[:num_lights]]

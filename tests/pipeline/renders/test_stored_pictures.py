@@ -155,15 +155,12 @@ def test_the_picture_is_the_stored_one_within_noise(name: str) -> None:
         pytest.fail(f"largest |z| {np.abs(z).max():.1f}, mean {z.mean():.3f}")
 
 
-def test_a_picture_one_percent_brighter_is_found() -> None:
+def test_a_picture_one_percent_brighter_and_one_wrong_pixel_are_found() -> None:
     """Against the stored picture itself, so that only the change can be seen."""
     for name in scenes():
         stored = load(name)
         brighter = z_values(1.01 * stored.mean_rgb, stored, BLOCK[name])
         assert mean_p(brighter) < SIGNIFICANCE, name
-
-
-def test_one_wrong_pixel_is_found() -> None:
     stored = load("diffuse")
     wrong = stored.mean_rgb.copy()
     wrong[30, 20] *= 1.5

@@ -17,7 +17,7 @@ from pipeline.renders.settings import RenderSettings
 from pipeline.scenes.own_materials import own_skins
 from pipeline.scenes.pieces import dressed, emitter_piece, joined, object_piece
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.layout import Emitter, SurfaceLook
+from scene_templates.layout import Emitter
 from scene_templates.materials import MaterialSettings
 from storage.conventions import look_at_c2w
 from storage.errors import Rejected, TrilightError
@@ -49,7 +49,7 @@ from tests.pipeline.renders.sampling import (
     scores,
 )
 from tests.pipeline.renders.scene_kit import Part, furnace, join, light, material, quad, sphere
-from tests.pipeline.scenes.small_pool import small_pool
+from tests.pipeline.scenes.small_pool import LOOK, small_pool
 from tests.sky_maps import constant, one_sun
 from trilight import render
 
@@ -302,16 +302,6 @@ def test_maps_that_break_a_law_never_reach_a_kernel(value: float) -> None:
     for scene, name in ((below, "environment.radiance_rgb"), (wrong, "textures")):
         with pytest.raises(TrilightError, match=name):
             render(scene, resolution=16, max_spp=8)
-
-
-LOOK = SurfaceLook(
-    diffuse_scale=1.0,
-    diffuse_rgb=(0.1, 0.2, 0.3),
-    specular_rgb=(0, 0, 0),
-    roughness=0.5,
-    smooth=False,
-    colours="one",
-)
 
 
 @pytest.mark.parametrize("kind", ["glb", "obj"])

@@ -1,20 +1,29 @@
-"""A set for others' code: the published loader reads each HDF5 as what our own network reads."""
+"""Exports: each opens in the library that it is for; the published loader reads what ours reads."""
 
 import csv
+import dataclasses
+import json
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from model.scene_tensors import scene_tensors
+from pipeline.exchange.exports.export import FORMS
 from pipeline.exchange.exports.scenes import MOST_NOTES, PARTS, _told, picture_name
 from pipeline.exchange.open_scene import load_source, scene_source
+from storage.conventions import in_camera, preview_srgb8
+from storage.dataset.dataset import open_dataset
 from storage.records.exr import decode_exr
 from storage.records.material import EMISSION
-from storage.records.sample import Sample
+from storage.records.sample import PartFloor, Sample
 from tests.command_line import trilight
+from tests.for_each import for_each
+from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
 from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
 
 PX = 16
@@ -23,7 +32,7 @@ KEYS = ("000000000", "000000001")
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def benchmark(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("set")
     write_toy_dataset(root / "toy", train=2, validation=1, per_shard=2, resolution=PX)
     words = ["export", str(root / "toy"), "--form", "benchmark", "--split", "train"]
@@ -69,9 +78,9 @@ def first_triangle(eye: NDArray, rays: NDArray, triangles: NDArray) -> NDArray[n
 
 
 @pytest.mark.parametrize("key", KEYS)
-def test_the_published_loader_reads_what_our_network_reads(exported: Path, key: str) -> None:
+def test_the_published_loader_reads_what_our_network_reads(benchmark: Path, key: str) -> None:
     sample = toy_sample(int(key), resolution=PX)
-    scene, found = sample.scene, loaded_as_published(exported / f"h5/{key}.h5")
+    scene, found = sample.scene, loaded_as_published(benchmark / f"h5/{key}.h5")
     count = scene.num_triangles
     assert {name: array.shape for name, array in found.items()} == {
         "triangles": (count, 3, 3), "vn": (count, 3, 3), "texture": (count, 13, 32, 32),
@@ -96,9 +105,9 @@ def test_the_published_loader_reads_what_our_network_reads(exported: Path, key: 
 
 
 @pytest.mark.parametrize("key", KEYS)
-def test_published_rays_meet_the_triangles_of_our_pictures(exported: Path, key: str) -> None:
+def test_published_rays_meet_the_triangles_of_our_pictures(benchmark: Path, key: str) -> None:
     sample = toy_sample(int(key), resolution=PX)
-    found = loaded_as_published(exported / f"h5/{key}.h5")
+    found = loaded_as_published(benchmark / f"h5/{key}.h5")
     solid = np.where(sample.scene.triangle_emits[:, None, None], np.nan, found["triangles"])
     for view in range(VIEWS):
         eye, rays = rays_as_published(
@@ -110,24 +119,24 @@ def test_published_rays_meet_the_triangles_of_our_pictures(exported: Path, key: 
         assert len(np.unique(met)) > 3
 
 
-def test_names_pair_and_targets_are_bit_for_bit(exported: Path) -> None:
-    rows = list(csv.DictReader((exported / "views.csv").open()))
+def test_names_pair_and_targets_are_bit_for_bit(benchmark: Path) -> None:
+    rows = list(csv.DictReader((benchmark / "views.csv").open()))
     assert [(row["scene"], row["view"]) for row in rows] == [
         (key, str(view)) for key in KEYS for view in range(VIEWS)
     ]
     for row in rows:
         sample = toy_sample(int(row["scene"]), resolution=PX)
         assert row["split"] == "train" and row["noise_floor_db"] == "100.000"
-        target = exported / row["target"]
+        target = benchmark / row["target"]
         assert target.name == picture_name(row["scene"], int(row["view"]))
         # the published inference drops the suffix of the HDF5 file and adds _view_N.exr
         assert target.name == f"{Path(row['h5']).stem}_view_{row['view']}.exr"
         half = sample.radiance_rgb[int(row["view"])].astype(np.float16)
         np.testing.assert_array_equal(decode_exr(target.read_bytes()), half)
         for form in ("h5", "json", "usd"):
-            assert _same_scene(exported / row[form], sample), form
-    with h5py.File(exported / rows[0]["h5"]) as file:
-        picture = decode_exr((exported / rows[0]["target"]).read_bytes())
+            assert _same_scene(benchmark / row[form], sample), form
+    with h5py.File(benchmark / rows[0]["h5"]) as file:
+        picture = decode_exr((benchmark / rows[0]["target"]).read_bytes())
         np.testing.assert_array_equal(file["img"][0, ..., :3], picture)
 
 
@@ -145,3 +154,231 @@ def test_many_losses_are_counted_once_each_is_told() -> None:
     told = _told("json", [str(number) for number in range(MOST_NOTES + 3)])
     assert len(told) == MOST_NOTES + 1 and told[-1] == "json loses 3 more things of this kind"
     assert set(PARTS) == {"h5", "json", "usd", "exr"}
+
+
+SIZE = 16
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    scenes = {"train-000000.tar": [0, 1], "test-000001.tar": [2]}
+    shards = {
+        name: [_by_lobe(sample(i, furnished(["a"]))) for i in rows] for name, rows in scenes.items()
+    }
+    write_dataset(tmp_path / "data", shards, objects=[locked("a", "CC-BY-4.0")])
+    (tmp_path / "data/attribution.csv").write_text("uid\na\n")
+    return tmp_path / "data"
+
+
+def _by_lobe(whole: Sample) -> Sample:
+    """Return a sample whose light is three quarters diffuse and a quarter specular."""
+    light = (np.round(whole.radiance_rgb * 4) * 4).astype(np.float32)  # quarters are half floats
+    floor = PartFloor(noise_floor_db=40.0, noise_floor_linear_db=30.0, object_noise_floor_db=39.0)
+    views = [
+        dataclasses.replace(v, parts={"diffuse": floor, "specular": floor}) for v in whole.views
+    ]
+    parts = {"diffuse": light * np.float32(0.75), "specular": light * np.float32(0.25)}
+    return dataclasses.replace(whole, radiance_rgb=light, parts_rgb=parts, views=tuple(views))
+
+
+def exported(dataset: Path, form: str, *words: str) -> Path:
+    out = dataset.parent / form
+    result = trilight(["export", str(dataset), "--form", form, "--out", str(out), *words, "--json"])
+    assert result.exit_code == 0, result.exception
+    assert (out / "attribution.csv").read_text() == "uid\na\n"
+    return out
+
+
+def samples(dataset: Path, split: str) -> list[Sample]:
+    return list(open_dataset(str(dataset)).samples(split))
+
+
+def test_nerfstudio(dataset: Path) -> None:
+    """The form that its documentation states; the next test opens it there."""
+    out = exported(dataset, "nerfstudio", "--scene", "1")
+    assert [path.name for path in out.iterdir() if path.is_dir()] == ["000000001"]
+    folder = out / "000000001"
+    _, made = samples(dataset, "train")
+    transforms: dict[str, Any] = json.loads((folder / "transforms.json").read_text())
+    assert transforms["camera_model"] == "OPENCV"
+    seen = made.view_passes(["position_m", "hit"], view=1)
+    frame = transforms["frames"][1]
+    pose, depth = np.array(frame["transform_matrix"]), np.load(folder / frame["depth_file_path"])
+    assert depth.dtype == np.float32 and (depth[~seen["hit"]] == 0).all()
+    # the point of a pixel, as nerfstudio finds it: focal lengths, centre, and depth in 0.001 m
+    row, column = np.indices((SIZE, SIZE)) + 0.5
+    local = np.stack(
+        [
+            (column - frame["cx"]) / frame["fl_x"],
+            -(row - frame["cy"]) / frame["fl_y"],
+            np.full((SIZE, SIZE), -1),
+        ],
+        axis=-1,
+    )
+    points = (0.001 * depth[..., None] * local) @ pose[:3, :3].T + pose[:3, 3]
+    hit = seen["hit"]
+    assert 0 < hit.mean() <= 1
+    np.testing.assert_allclose(points[hit], seen["position_m"][hit], atol=1e-5)
+    assert (in_camera(points[hit], pose)[:, 2] < 0).all()
+    assert frame["w"] == frame["h"] == SIZE
+    picture = np.asarray(Image.open(folder / frame["file_path"]))
+    np.testing.assert_array_equal(picture, preview_srgb8(made.radiance_rgb[1]))
+
+
+def test_its_rays_and_our_depth_lead_to_our_points(dataset: Path) -> None:
+    """Opened by nerfstudio itself, which is not among the project's packages.
+
+    `pip install --no-deps nerfstudio==1.1.5` with jaxtyping, opencv-python-headless and viser.
+    """
+    parsers: Any = pytest.importorskip("nerfstudio.data.dataparsers.nerfstudio_dataparser")
+    depths: Any = pytest.importorskip("nerfstudio.data.datasets.depth_dataset")
+    folder = exported(dataset, "nerfstudio", "--scene", "1") / "000000001"
+    _, made = samples(dataset, "train")
+    parser = parsers.NerfstudioDataParserConfig(
+        data=folder,
+        orientation_method="none",
+        center_method="none",
+        auto_scale_poses=False,
+        eval_mode="all",
+    ).setup()
+    found = parser.get_dataparser_outputs(split="train")
+    assert len(found.image_filenames) == made.scene.num_views
+    opened = depths.DepthDataset(found)
+    for view in range(made.scene.num_views):
+        rays = found.cameras.generate_rays(camera_indices=view)
+        depth = opened[view]["depth_image"] * rays.metadata["directions_norm"]
+        points = (rays.origins + rays.directions * depth).numpy()
+        seen = made.view_passes(["position_m", "hit"], view=view)
+        hit = seen["hit"]
+        assert 0 < hit.mean() <= 1
+        # found: 0.7 micrometres, its and our float32
+        np.testing.assert_allclose(points[hit], seen["position_m"][hit], atol=1e-5)
+        assert (opened[view]["depth_image"].numpy()[..., 0][~hit] == 0).all()
+
+
+def test_coco(dataset: Path) -> None:
+    from pycocotools.coco import COCO
+
+    out = exported(dataset, "coco")
+    assert sorted(path.name for path in (out / "annotations").iterdir()) == [
+        *("instances_test.json", "instances_train.json")
+    ]
+    coco = COCO(str(out / "annotations/instances_train.json"))
+    assert [each["name"] for each in coco.loadCats(coco.getCatIds())] == ["object", "shell"]
+    assert len(coco.getImgIds()) == 4
+    found = 0
+    for image in coco.loadImgs(coco.getImgIds()):
+        key, view, _ = image["file_name"].split(".")
+        (made,) = (each for each in samples(dataset, "train") if each.key == key)
+        picture = np.asarray(Image.open(out / "train" / image["file_name"]))
+        np.testing.assert_array_equal(picture, preview_srgb8(made.radiance_rgb[int(view)]))
+        ids = made.view_passes(["object"], view=int(view))["object"]
+        annotations = coco.loadAnns(coco.getAnnIds(imgIds=image["id"]))
+        rows = [entry.name for entry in made.scene.objects]
+        shown = {rows.index(each["object_name"]) for each in annotations}
+        assert shown == set(np.unique(ids[ids >= 0]).tolist())
+        for each in annotations:
+            row = rows.index(each["object_name"])
+            mask = coco.annToMask(each).astype(bool)
+            np.testing.assert_array_equal(mask, ids == row)
+            x, y, width, height = each["bbox"]
+            assert mask[y : y + height, x : x + width].sum() == each["area"] == mask.sum()
+            assert mask[y].any() and mask[y + height - 1].any() and mask[:, x].any()
+            assert mask[:, x + width - 1].any()
+            assert coco.loadCats(each["category_id"])[0]["name"] == made.scene.objects[row].kind
+            found += 1
+    assert found >= 4
+
+
+def test_huggingface(dataset: Path, tmp_path: Path) -> None:
+    from datasets import load_dataset
+
+    out = exported(dataset, "huggingface")
+    loaded = load_dataset(str(out), cache_dir=str(tmp_path / "cache"))
+    assert {split: rows.num_rows for split, rows in loaded.items()} == {"train": 4, "test": 2}
+    made = {each.key: each for each in samples(dataset, "train")}
+    for row in loaded["train"]:
+        one, view = made[row["scene"]], row["view"]
+        np.testing.assert_array_equal(
+            np.asarray(row["image"]), preview_srgb8(one.radiance_rgb[view])
+        )
+        seen = one.view_passes(["depth_axis_m", "object", "triangle"], view=view)
+        for column, name in (("depth", "depth_axis_m"), ("object", "object")):
+            values = np.asarray(row[column])
+            assert values.dtype == seen[name].dtype
+            np.testing.assert_array_equal(values, seen[name])
+        np.testing.assert_array_equal(np.asarray(row["triangle"]), seen["triangle"])
+        np.testing.assert_array_equal(np.array(row["c2w"], np.float32), one.scene.c2w[view])
+        assert row["objects"] == [entry.name for entry in one.scene.objects]
+
+
+def test_hypersim(dataset: Path) -> None:
+    """As its README states it: https://github.com/apple/ml-hypersim."""
+    out = exported(dataset, "hypersim", "--scene", "1") / "000000001"
+    _, made = samples(dataset, "train")
+    assert made.parts_rgb is not None
+
+    def read(name: str) -> Any:
+        with h5py.File(out / name) as file:
+            return file["dataset"][...]
+
+    final = {
+        name: read(f"images/scene_cam_00_final_hdf5/frame.0001.{name}.hdf5")
+        for name in ("color", "diffuse_illumination", "diffuse_reflectance", "residual")
+    }
+    np.testing.assert_array_equal(final["color"], made.radiance_rgb[1])
+    product = final["diffuse_reflectance"] * final["diffuse_illumination"]
+    np.testing.assert_allclose(product + final["residual"], final["color"], rtol=1e-6, atol=1e-6)
+    reflects = final["diffuse_reflectance"] > 0
+    assert reflects.any()
+    np.testing.assert_allclose(product[reflects], made.parts_rgb["diffuse"][1][reflects], rtol=1e-6)
+    geometry = "images/scene_cam_00_geometry_hdf5/frame.0001"
+    position, depth = read(f"{geometry}.position.hdf5"), read(f"{geometry}.depth_meters.hdf5")
+    eyes = read("_detail/cam_00/camera_keyframe_positions.hdf5")
+    hit = np.isfinite(depth)
+    distance = np.linalg.norm(position - eyes[1], axis=-1)
+    np.testing.assert_allclose(distance[hit], depth[hit], rtol=1e-5)
+    assert hit.any() and ((read(f"{geometry}.render_entity_id.hdf5") >= 0) == hit).all()
+    turn = read("_detail/cam_00/camera_keyframe_orientations.hdf5")[1]
+    world = read(f"{geometry}.normal_cam.hdf5") @ turn.T
+    np.testing.assert_allclose(world[hit], read(f"{geometry}.normal_world.hdf5")[hit], atol=1e-6)
+
+
+def test_hypersim_needs_the_lobes_apart(tmp_path: Path) -> None:
+    shards = {"train-000000.tar": [sample(0, furnished(["a"]))]}
+    write_dataset(tmp_path / "data", shards, objects=[locked("a", "CC-BY-4.0")])
+    words = ["export", str(tmp_path / "data"), "--form", "hypersim", "--out", str(tmp_path / "x")]
+    refused = str(trilight(words).exception)
+    assert "keeps all light together; expected diffuse and specular light apart" in refused
+    assert "--set renders.split_lobes=true" in refused
+
+
+@for_each("form", FORMS)
+def test_the_same_dataset_gives_the_same_bytes(dataset: Path, form: str) -> None:
+    first = _files(exported(dataset, form, "--split", "test"))
+    (dataset.parent / form).rename(dataset.parent / f"first {form}")
+    assert _files(exported(dataset, form, "--split", "test")) == first
+    assert not any("000000000" in name for name in first)
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def test_mistakes(dataset: Path, tmp_path: Path) -> None:
+    def refused(*words: str) -> str:
+        result = trilight(["export", str(dataset), *words])
+        assert result.exit_code != 0 and "\n" not in str(result.exception)
+        return str(result.exception)
+
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/x").touch()
+    full = ("--out", str(tmp_path / "full"))
+    assert "is not empty; expected a new folder" in refused("--form", "coco", *full)
+    new = ("--out", str(tmp_path / "new"))
+    assert "no scene in split validation" in refused(
+        "--form", "coco", "--split", "validation", *new
+    )
+    other = trilight(["export", str(tmp_path / "full"), "--form", "coco", *new])
+    assert "no manifest.json" in str(other.exception)

@@ -1,6 +1,7 @@
-"""glTF as a scene: places, colours at corners, the rule for Fresnel, and what is lost."""
+"""glTF as a scene: places, colours at corners, Fresnel, what is lost; GLB as it is written."""
 
 import base64
+import dataclasses
 import io
 import json
 import struct
@@ -9,16 +10,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.exchange.convert import convert_scene
+from pipeline.exchange.convert import convert_scene, write_scene
 from pipeline.exchange.gltf.read import GltfScene, read_gltf
+from pipeline.exchange.gltf.write import encode_scene_glb
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
+from storage.records.lookup import texture_values
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.records.scene import Scene
 from tests.for_each import for_each
 from tests.pipeline.exchange.exchange_kit import row_at
+from tests.scenes_by_hand import FLOOR, tiny_scene
+from tests.textured_by_hand import colour_texture, corner_uv, number_texture, sky, textured_scene
 
 POSITIONS = np.array([[-1, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]], np.float32)
 """A floor in glTF's axes: +Y up. In ours, the corners are (-1, -1), (1, -1), (1, 1), (-1, 1)."""
@@ -108,16 +116,7 @@ def test_every_texel_lies_where_gltf_puts_it(tmp_path: Path) -> None:
         assert found[3:7] == pytest.approx([F, F, F, 0.5], abs=1e-6)
     assert scene.vertex_normals == pytest.approx(np.tile([0, 0, 1], (4, 1)), abs=1e-6)
     assert scene.objects[0].attribution == "A. Maker"
-
-
-def test_a_glb_is_read_as_a_gltf(tmp_path: Path) -> None:
-    text = json.dumps(quad()).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON")
-    (tmp_path / "a.glb").write_bytes(head + text)
-    found = load_source(scene_source(str(tmp_path / "a.glb")))
-    for (x, y), colour in CORNERS.items():
-        assert row_at(found.scene, x, y)[:3] == pytest.approx(diffuse_of(colour), abs=CODED)
+    found = load_source(scene_source(str(tmp_path / "a.gltf")))
     assert any("no light" in note for note in found.notes)
 
 
@@ -243,18 +242,17 @@ def test_pictures_elsewhere_are_refused(tmp_path: Path, uri: str) -> None:
         read(tmp_path, pictures=[uri])
 
 
-def test_a_mesh_without_coordinates_takes_the_mean(tmp_path: Path) -> None:
+def test_a_mesh_without_coordinates_takes_the_mean_and_one_texel_is_a_constant(
+    tmp_path: Path,
+) -> None:
     found = read(tmp_path, uv=None)
     assert any("without texture coordinates" in text for text in found.lost)
     assert not found.scene.textures
     mean = linear_from_srgb8()[PICTURE].mean(axis=(0, 1)) * (1 - F)
     assert found.scene.materials[0, :3] == pytest.approx(mean, abs=1e-5)
-
-
-def test_one_texel_is_a_constant(tmp_path: Path) -> None:
-    found = read(tmp_path, pictures=[png(PICTURE[:1, 1:])])
-    assert not found.scene.textures
-    assert found.scene.materials[0, :3] == pytest.approx(diffuse_of(GREEN), abs=1e-6)
+    one = read(tmp_path, pictures=[png(PICTURE[:1, 1:])]).scene
+    assert not one.textures
+    assert one.materials[0, :3] == pytest.approx(diffuse_of(GREEN), abs=1e-6)
 
 
 @for_each("value", [float("nan"), "red", -1, 2])
@@ -284,3 +282,99 @@ def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:
 def test_a_broken_tree_is_one_sentence(tmp_path: Path, damage: dict[str, Any]) -> None:
     with pytest.raises(TrilightError, match=r"^a\.gltf: "):
         read(tmp_path, **damage)
+
+
+def there_and_back(folder: Path, scene: Scene) -> Scene:
+    write_scene(folder / "a.glb", scene)
+    return read_gltf(folder / "a.glb", "CC0-1.0").scene
+
+
+@for_each("specular", [(0.2, 0.2, 0.2), (0, 0, 0), (0.4, 0.1, 0.3), (0.9, 0.5, 0.1)])
+def test_a_scene_comes_back(tmp_path: Path, specular: tuple[float, float, float]) -> None:
+    materials = tiny_scene().materials.copy()
+    materials[FLOOR, DIFFUSE], materials[FLOOR, SPECULAR] = (0.1, 0.05, 0.3), specular
+    scene = tiny_scene(materials=materials)
+    found = there_and_back(tmp_path, scene)
+    assert found.num_triangles == scene.num_triangles
+    for name in ("c2w", "fov_deg"):
+        np.testing.assert_allclose(getattr(found, name), getattr(scene, name), atol=1e-6)
+    mine, theirs = (each.vertex_positions[each.faces] for each in (scene, found))
+    np.testing.assert_allclose(theirs, mine, atol=1e-6)
+    mine, theirs = (each.vertex_normals[each.faces] for each in (scene, found))
+    np.testing.assert_allclose(theirs, mine, atol=1e-6)
+    rows = found.materials[found.material_index]
+    np.testing.assert_allclose(rows, scene.materials[scene.material_index], rtol=1e-5, atol=1e-5)
+    assert [entry.name for entry in found.objects] == ["floor", "light"]
+    assert [entry.kind for entry in found.objects] == ["object", "emitter"]
+
+
+def _looked_up(scene: Scene, column: int) -> NDArray[np.float64]:
+    """Return what the texture of a column says in the middle of the first triangle."""
+    assert scene.uv is not None and scene.material_textures is not None
+    middle = scene.uv.reshape(-1, 3, 2)[0].mean(axis=0)
+    row = scene.material_textures[scene.material_index[0], column]
+    return texture_values(scene.textures[row], middle)
+
+
+def test_textures_come_back_to_their_eight_bits(tmp_path: Path) -> None:
+    scene = textured_scene(4)
+    found = there_and_back(tmp_path, scene)
+    for column, most in ((0, 0.01), (2, 0.003)):
+        wanted, got = (_looked_up(each, column) for each in (scene, found))
+        np.testing.assert_allclose(got, wanted, atol=most)
+    assert found.materials[found.material_index[2], EMISSION].tolist() == [100, 100, 100]
+
+
+def test_two_textured_albedos_of_different_widths_are_one_grid(tmp_path: Path) -> None:
+    glossy = dataclasses.replace(colour_texture(1), texels=colour_texture(1).texels[::2] // 4)
+    rough = number_texture()
+    wide = dataclasses.replace(colour_texture(2), texels=colour_texture(2).texels // 2)
+    index = np.full((2, 3), -1, np.int32)
+    index[FLOOR] = [0, 1, 2]
+    scene = textured_scene(0, wide, glossy, rough, material_textures=index)
+    found = there_and_back(tmp_path, scene)
+    row = found.material_index[0]
+    kept = scene.materials[FLOOR]
+    assert found.materials[row, ROUGHNESS] == pytest.approx(rough.mean[0], abs=0.01)
+    assert found.materials[row, SPECULAR] == pytest.approx(glossy.mean, abs=0.01), kept
+
+
+def test_what_a_glb_loses_is_said(tmp_path: Path) -> None:
+    lost = " ".join(write_scene(tmp_path / "a.glb", textured_scene(environment=sky())))
+    for word in ("environment", "8 bits", "floors and walls", "provenance"):
+        assert word in lost
+    dark = tiny_scene(
+        materials=np.where(np.arange(10) >= 7, 0, tiny_scene().materials).astype(np.float32),
+        objects=tuple(dataclasses.replace(e, kind="object") for e in tiny_scene().objects),
+        environment=sky(),
+    )
+    with pytest.raises(TrilightError, match="only light is its environment"):
+        write_scene(tmp_path / "b.glb", dark)
+
+
+def test_a_stranger_reads_it(tmp_path: Path) -> None:
+    """trimesh, which knows nothing of ours, sees the triangles with +Y up."""
+    (tmp_path / "a.glb").write_bytes(encode_scene_glb(textured_scene()))
+    seen: Any = trimesh.load_scene(tmp_path / "a.glb").to_geometry()
+    assert len(seen.faces) == 3
+    assert seen.bounds[1][1] == pytest.approx(2) and seen.bounds[0][1] == pytest.approx(0)
+
+
+def test_the_file_keeps_the_laws_of_its_format() -> None:
+    data = encode_scene_glb(textured_scene())
+    magic, version, length, head = struct.unpack("<4sIII", data[:16])
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    tree = json.loads(data[20 : 20 + head])
+    (size,) = struct.unpack("<I", data[20 + head : 24 + head])
+    assert tree["buffers"] == [{"byteLength": size}] or size - tree["buffers"][0]["byteLength"] < 4
+    for view in tree["bufferViews"]:
+        assert view["byteOffset"] % 4 == 0
+        assert view["byteOffset"] + view["byteLength"] <= tree["buffers"][0]["byteLength"]
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            points = tree["accessors"][primitive["attributes"]["POSITION"]]
+            assert len(points["min"]) == len(points["max"]) == 3
+    for material in tree["materials"]:
+        assert max(material.get("emissiveFactor", [0])) <= 1
+        assert max(material["pbrMetallicRoughness"].get("baseColorFactor", [0])) <= 1
+    assert corner_uv(textured_scene()).shape[1] == 2

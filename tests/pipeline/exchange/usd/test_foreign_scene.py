@@ -69,6 +69,11 @@ def test_lights_have_their_area_and_radiance(
     # sums of up to 128 areas in single precision
     assert facing(corners) == pytest.approx(area_vector, abs=1e-6)
     assert rows[:, EMISSION] == pytest.approx(np.tile(radiance, (len(rows), 1)), rel=1e-5)
+    if name == "sphere":
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(cross, axis=1).sum() / 2
+        assert area == pytest.approx(4 * math.pi * 0.01, rel=1e-5)
+        assert (np.einsum("ti,ti->t", cross, corners.mean(axis=1)) > 0).all()
 
 
 @pytest.mark.parametrize(("kelvin", "redder"), [(None, 1.0), (3000.0, 6.5)])
@@ -88,14 +93,6 @@ def test_a_stated_temperature_tints_a_light(
     assert (red == blue == 20) == (kelvin is None)
 
 
-def test_a_sphere_has_the_area_of_a_sphere(stage: UsdScene) -> None:
-    corners, _ = object_of(stage.scene, "sphere")
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert np.linalg.norm(cross, axis=1).sum() / 2 == pytest.approx(4 * math.pi * 0.01, rel=1e-5)
-    outward = np.einsum("ti,ti->t", cross, corners.mean(axis=1))
-    assert (outward > 0).all()
-
-
 def test_instances_stand_where_they_are_placed_and_mirrors_keep_their_outside(
     stage: UsdScene,
 ) -> None:
@@ -112,15 +109,6 @@ def test_what_is_lost_is_said(stage: UsdScene) -> None:
     assert stage.scene.environment is not None, "its DomeLight is kept"
     for words in ("/W/rect: emits to one side", "does not glow"):
         assert any(words in text for text in stage.lost), words
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_our_own_files_are_exact(tmp_path: Path, suffix: str) -> None:
-    write_usd(tmp_path / f"a{suffix}", tiny_scene())
-    found = read(tmp_path / f"a{suffix}")
-    assert found.exact and found.lost == ()
-    assert encode_scene(found.scene) == encode_scene(tiny_scene())
-    assert usd_keys(tmp_path / f"a{suffix}") == [""]
 
 
 def test_our_own_files_read_as_a_stranger_does_hold_the_same_light(tmp_path: Path) -> None:
@@ -142,6 +130,7 @@ def test_our_own_files_read_as_a_stranger_does_hold_the_same_light(tmp_path: Pat
 
 def test_what_was_moved_is_moved(tmp_path: Path) -> None:
     write_usd(tmp_path / "a.usda", tiny_scene())
+    assert usd_keys(tmp_path / "a.usda") == [""] and read(tmp_path / "a.usda").lost == ()
     stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
     UsdGeom.Xformable(stage.GetPrimAtPath("/Scene/Objects/floor")).AddTranslateOp().Set((1, 2, 3))
     stage.GetRootLayer().Export(str(tmp_path / "b.usda"))
@@ -213,17 +202,6 @@ def test_meshes_that_contradict_themselves(
     stage.GetPrimAtPath("/W/Grid").GetAttribute(attribute).Set(value)
     stage.GetRootLayer().Save()
     with pytest.raises(TrilightError, match=f"^stage.usda: /W/Grid: {message}"):
-        read(path)
-
-
-def test_a_texture_outside_is_refused_and_a_missing_one_noted(tmp_path: Path) -> None:
-    folder = tmp_path / "inner"
-    folder.mkdir()
-    path = write_stage(folder)
-    (folder / "tex.png").unlink()
-    assert any("texture './tex.png': missing" in text for text in read(path).lost)
-    path.write_text(path.read_text().replace("./tex.png", "../tex.png"))
-    with pytest.raises(TrilightError, match="outside of its folder"):
         read(path)
 
 

@@ -1,7 +1,5 @@
 """Catalogues of both kinds: what a row says, and every mistake in one, by its line."""
 
-import csv
-import io
 import itertools
 import json
 from pathlib import Path
@@ -43,13 +41,6 @@ def test_passwords_of_a_catalogue_are_not_published(tmp_path: Path) -> None:
     assert (record.source_url, record.attribution) == ("https://host/a?id=7",) * 2
 
 
-def test_an_empty_catalogue_holds_no_object(tmp_path: Path) -> None:
-    touch(tmp_path, "a.obj")
-    (tmp_path / "objects.jsonl").write_text("\n")
-    with pytest.raises(TrilightError, match=r"holds no object.*objects\.jsonl"):
-        listed(tmp_path)
-
-
 def test_a_catalogue_rules_its_folder(tmp_path: Path) -> None:
     touch(tmp_path, "files/one.obj", "files/two.obj", "unlisted.obj")
     write_catalogue(
@@ -86,7 +77,6 @@ GOOD = {"uid": "a", "path": "a.obj"}
         ([1, 2], "objects.jsonl:2: got a list"),
         ({"path": "a.obj"}, "objects.jsonl:2: field 'uid' is missing"),
         ({"uid": "b"}, "objects.jsonl:2: field 'path' is missing"),
-        ({"uid": 7, "path": "a.obj"}, "objects.jsonl:2: field 'uid' is a int"),
         ({"uid": "b", "path": "a.obj", "licence": None}, "field 'licence' is a NoneType"),
         ({"uid": " ", "path": "a.obj"}, "not blank"),
         ({"uid": "b\n", "path": "a.obj"}, "printable"),
@@ -111,9 +101,16 @@ def test_mistakes_in_a_catalogue_are_placed(tmp_path: Path, row: Any, message: s
     str(caught.value).encode()
 
 
-def test_a_catalogue_that_is_no_text(tmp_path: Path) -> None:
+def test_a_catalogue_that_is_empty_or_no_text(tmp_path: Path) -> None:
+    (tmp_path / "objects.jsonl").write_text("\n")
+    with pytest.raises(TrilightError, match=r"holds no object.*objects\.jsonl"):
+        listed(tmp_path)
     (tmp_path / "objects.jsonl").write_bytes(b'\xff\xfe{"uid": "a"}')
     with pytest.raises(TrilightError, match="UTF-8"):
+        listed(tmp_path)
+    (tmp_path / "objects.jsonl").unlink()
+    (tmp_path / "objects.csv").write_bytes("uid,path\ngrö,a.obj".encode("latin-1"))
+    with pytest.raises(TrilightError, match=r"objects\.csv: cannot be read.*UTF-8"):
         listed(tmp_path)
 
 
@@ -149,33 +146,10 @@ def test_a_table_says_what_lines_say(tmp_path: Path, encoding: str, ending: str)
     assert (groe.uid, groe.title, groe.licence) == ("grö", "grö", "LicenseRef-unknown")
 
 
-def test_the_real_catalogue_as_a_table(tmp_path: Path, shared: Path) -> None:
-    text = (shared / "objects" / "objects.jsonl").read_text()
-    rows = [json.loads(line) for line in text.splitlines()]
-    stream = io.StringIO(newline="")
-    writer = csv.DictWriter(stream, sorted({key for row in rows for key in row}))
-    writer.writeheader()
-    writer.writerows(rows)
-    write_csv(tmp_path, stream.getvalue())
-    (tmp_path / "lines").mkdir()
-    (tmp_path / "lines" / "objects.jsonl").write_text(text)
-    allowed = [*ALLOWED, "LicenseRef-Stanford-3D-Scanning-Repository"]
-    table, lines = (
-        [
-            {**vars(record), "path": Path(record.path).name, "licence_source": ""}
-            for record in listed(folder, allowed_licences=allowed)
-        ]
-        for folder in (tmp_path, tmp_path / "lines")
-    )
-    assert len(table) == 148
-    assert table == lines
-
-
 @for_each(
     "text, message",
     [
         ("uid;path\na;b", "objects.csv:1: the columns are 'uid;path'; expected uid and path"),
-        ("uid,title\na,b", "objects.csv:1: the columns"),
         ("uid,path,path\na,b,c", "objects.csv:1: .*each name once"),
         ("uid,path\na", "objects.csv:2: has 1 cells; expected 2"),
         ('uid,path\n"a\n\nb",c.obj\nd', "objects.csv:2: uid is"),
@@ -186,7 +160,6 @@ def test_the_real_catalogue_as_a_table(tmp_path: Path, shared: Path) -> None:
         ("uid,path\na,b.obj\na,c.obj", "objects.csv:3: uid 'a' is already used in line 2"),
         ("uid,path\n,b.obj", "objects.csv:2: field 'uid' is missing"),
         ("uid,path\na, ", "objects.csv:2: field 'path' is missing"),
-        ("uid,path\na,../b.obj", "objects.csv:2: path .* leads out"),
         ("uid,path\na,b\x00c", "objects.csv:2: path is"),
         ("uid,path\n", "holds no object"),
     ],
@@ -197,12 +170,6 @@ def test_mistakes_in_a_table_are_placed(tmp_path: Path, text: str, message: str)
         listed(tmp_path)
     assert "expected" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_table_that_is_no_text(tmp_path: Path) -> None:
-    (tmp_path / "objects.csv").write_bytes("uid,path\ngrö,a.obj".encode("latin-1"))
-    with pytest.raises(TrilightError, match=r"objects\.csv: cannot be read.*UTF-8"):
-        listed(tmp_path)
 
 
 def test_two_catalogues_in_one_folder(tmp_path: Path) -> None:

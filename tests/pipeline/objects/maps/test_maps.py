@@ -1,11 +1,13 @@
 """Textures and maps from outside: names, licences, resampling, formats; what is wrong says so."""
 
+import io
 import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.maps.listing import FoundMaps, find_maps
@@ -16,9 +18,52 @@ from pipeline.objects.maps.rgbe import rgbe_radiance
 from pipeline.objects.maps.texture_set import texture_set
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected, TrilightError
+from storage.records.exr import encode_channels
 from storage.records.objects import SKY, TEXTURE
 from tests.for_each import for_each
-from tests.pipeline.objects.maps.map_files import exr, hdr, noise, png, sun_map
+
+
+def png(path: Path, texels: NDArray[np.uint8]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(texels).save(path)
+    return path
+
+
+def noise(seed: int, height: int = 4, width: int = 4) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3)).astype(np.uint8)
+
+
+def exr(path: Path, radiance: NDArray[np.float32]) -> Path:
+    path.write_bytes(encode_channels({"RGB": np.ascontiguousarray(radiance, np.float32)}))
+    return path
+
+
+def sun_map(seed: int = 0, rows: int = 8) -> NDArray[np.float32]:
+    radiance = np.random.default_rng(seed).random((rows, 2 * rows, 3)).astype(np.float32)
+    radiance[rows // 3, rows] = 1e6
+    return radiance
+
+
+def hdr(texels: NDArray[np.uint8], *, runs: bool, header: str = "") -> bytes:
+    """Return a Radiance picture of mantissas and exponents [H, W, 4]."""
+    rows, columns = texels.shape[:2]
+    out = io.BytesIO()
+    out.write(f"#?RADIANCE\n{header}FORMAT=32-bit_rle_rgbe\n\n-Y {rows} +X {columns}\n".encode())
+    for row in texels:
+        if not runs:
+            out.write(row.tobytes())
+            continue
+        out.write(bytes([2, 2, columns >> 8, columns & 255]))
+        for channel in range(4):
+            at = 0
+            while at < columns:
+                values = row[at : at + 127, channel]
+                if (values == values[0]).all():
+                    out.write(bytes([128 + len(values), values[0]]))
+                else:
+                    out.write(bytes([len(values)]) + values.tobytes())
+                at += len(values)
+    return out.getvalue()
 
 
 def _find(folder: Path, kind: str = TEXTURE, licence: str | None = None) -> FoundMaps:
@@ -157,13 +202,8 @@ def test_what_is_wrong_with_a_map_is_said() -> None:
     with pytest.raises(Rejected) as found:
         usable_map(-np.ones((4, 8, 3), np.float32), 16)
     assert found.value.reason == "negative_radiance"
-
-
-def test_slightly_negative_values_become_black() -> None:
-    radiance = np.ones((4, 8, 3), np.float32)
-    radiance[2, 3, 1] = -1e-3
-    found = usable_map(radiance, 16)
-    assert found.min() == 0 and (found == np.maximum(radiance, 0)).all()
+    slightly = wrong(value=-1e-3)
+    np.testing.assert_array_equal(usable_map(slightly, 16), np.maximum(slightly, 0))
 
 
 def _texels(rows: int, columns: int) -> np.ndarray:
@@ -219,25 +259,19 @@ def _flat(value: float, channels: int = 1) -> NDArray[np.float32]:
     return np.full((4, 4, channels), value, np.float32)
 
 
-def test_a_base_colour_alone_is_a_dielectric() -> None:
+def test_a_base_colour_is_a_dielectric_or_a_metal_or_leaves_no_room_for_gloss() -> None:
     made = texture_set({"base": _flat(128 / 255, 3)}, 8)
     linear = linear_from_srgb8()[128]
     specular = 0.04 + 0.96 / 21
     np.testing.assert_allclose(made.specular_rgb, specular, rtol=1e-6)  # float32
     np.testing.assert_allclose(made.diffuse_rgb, linear * (1 - specular), rtol=1e-6)
     assert made.roughness is None
-
-
-def test_a_metal_has_its_colour_in_the_lobe() -> None:
-    made = texture_set({"base": _flat(1.0, 3), "metallic": _flat(1.0)}, 8)
-    assert made.diffuse_rgb.max() == 0
-    np.testing.assert_allclose(made.specular_rgb, 1.0, rtol=1e-6)
-
-
-def test_a_specular_map_gives_way_where_both_are_over_one() -> None:
-    made = texture_set({"base": _flat(1.0, 3), "specular": _flat(0.5)}, 8)
-    assert made.diffuse_rgb.min() == 1 and made.specular_rgb.max() == 0
-    assert made.specular_rgb.shape == (4, 4, 3)
+    metal = texture_set({"base": _flat(1.0, 3), "metallic": _flat(1.0)}, 8)
+    assert metal.diffuse_rgb.max() == 0
+    np.testing.assert_allclose(metal.specular_rgb, 1.0, rtol=1e-6)
+    white = texture_set({"base": _flat(1.0, 3), "specular": _flat(0.5)}, 8)
+    assert white.diffuse_rgb.min() == 1 and white.specular_rgb.max() == 0
+    assert white.specular_rgb.shape == (4, 4, 3)
 
 
 def test_means_are_of_linear_values_and_of_widths() -> None:

@@ -1,6 +1,8 @@
 """Objaverse through its real package: which objects, with which rights; mistakes; broken links."""
 
 import gzip
+import hashlib
+import json
 import socket
 import sys
 import urllib.request
@@ -11,19 +13,89 @@ from typing import Any
 import pytest
 
 from pipeline.objects.objaverse import package as objaverse_package
+from pipeline.objects.sources import FoundObjects
 from storage.errors import TrilightError
 from tests.http_server import Fault, Site
-from tests.pipeline.objects.objaverse.objaverse_kit import (
-    FREE,
-    IN_ORDER,
-    UID,
-    find,
-    found_names,
-    glb,
-    packed,
-    reasons,
-    uid_of,
-)
+from tests.pipeline.objects import find_kit
+
+HOST = "https://huggingface.co/datasets/allenai/objaverse/resolve/main"
+
+
+def uid_of(name: str) -> str:
+    return hashlib.md5(name.encode(), usedforsecurity=False).hexdigest()
+
+
+NAMES = ("a", "b", "c", "d", "paid", "mute")
+UID = {name: uid_of(name) for name in NAMES}
+NAME = {uid: name for name, uid in UID.items()}
+IN_ORDER = [NAME[uid] for uid in sorted(NAME)]
+FREE = [name for name in IN_ORDER if name not in ("paid", "mute")]
+
+
+def glb(name: str) -> str:
+    return f"/glbs/000-00{NAMES.index(name) % 3}/{UID[name]}.glb"
+
+
+def annotation(name: str) -> dict[str, Any]:
+    return {
+        "uid": UID[name],
+        "name": f"The {name}\n",
+        "license": {"paid": "by-nc", "b": "by-sa", "c": "cc0"}.get(name, "by"),
+        "user": {"displayName": "Ada", "username": "ada1", "profileUrl": "https://p/ada"},
+        "viewerUrl": f"https://v/{name}",
+        "publishedAt": "2019-05-03T01:02:03.456",
+    }
+
+
+def packed(value: object) -> bytes:
+    return gzip.compress(json.dumps(value).encode())
+
+
+def fill_site(site: Site) -> None:
+    """Serve the metadata and the objects."""
+    site.files["/object-paths.json.gz"] = packed({UID[name]: glb(name)[1:] for name in NAMES})
+    for number in range(3):
+        rows = {UID[name]: annotation(name) for name in NAMES if NAMES.index(name) % 3 == number}
+        rows.pop(UID["mute"], None)
+        site.files[f"/metadata/000-00{number}.json.gz"] = packed(rows)
+    site.files["/lvis-annotations.json.gz"] = packed(
+        {"chair": [UID[name] for name in ("d", "paid", "a", "mute")], "sofa_bed": [UID["b"]],
+         "vase": [UID["c"], UID["a"]]}
+    )  # fmt: skip
+    for name in NAMES:
+        site.files[glb(name)] = f"glTF {name}".encode()
+
+
+def find(text: str, **options: Any) -> FoundObjects:
+    return find_kit.find(f"objaverse:{text}", **options)
+
+
+def found_names(found: FoundObjects) -> list[str]:
+    return [NAME[record.uid.removeprefix("objaverse/")] for record in found.records]
+
+
+def reasons(found: FoundObjects) -> dict[str, str]:
+    return {
+        NAME.get(one.item.removeprefix("objaverse/"), one.item): one.reason
+        for one in found.failures
+    }
+
+
+@pytest.fixture
+def place(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Send the real package to the small Objaverse; returns where it keeps its files."""
+    objaverse = pytest.importorskip("objaverse", reason="needs the package objaverse (setup-all)")
+    fill_site(site)
+    real = urllib.request.urlretrieve
+
+    def retrieve(url: str, *args: Any) -> Any:
+        assert url.startswith(HOST)
+        return real(url.replace(HOST, site.url), *args)
+
+    monkeypatch.setattr(urllib.request, "urlretrieve", retrieve)
+    folder = tmp_path / "hf-objaverse-v1"
+    monkeypatch.setattr(objaverse, "_VERSIONED_PATH", str(folder))
+    return folder
 
 
 def test_uids_come_with_their_rights(site: Site, place: Path) -> None:

@@ -118,6 +118,8 @@ def test_a_csv_catalogue_and_two_of_them(site: Site) -> None:
     site.put("a.obj")
     (record,) = find(site.url).records
     assert (record.licence, record.licence_source) == ("MIT", "objects.csv")
+    with pytest.raises(TrilightError, match="--licence is 'MIT', but objects.csv states"):
+        find(site.url, licence="MIT")
     site.put("objects.jsonl", "{}")
     with pytest.raises(TrilightError, match=r"objects\.jsonl and objects\.csv.*Remove one"):
         find(site.url)
@@ -218,15 +220,6 @@ def test_credentials_do_not_follow_to_another_server(site: Site) -> None:
         assert other.requests
         assert not any("Authorization" in request.headers for request in other.requests)
         assert not any("s3cret" in request.path for request in other.requests)
-
-
-def test_a_licence_beside_a_catalogue_is_refused(site: Site) -> None:
-    site.put("objects.jsonl", '{"uid": "a", "path": "a.obj"}')
-    with pytest.raises(TrilightError, match="--licence is 'MIT', but objects.jsonl states"):
-        find(site.url, licence="MIT")
-
-
-pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
 
 
 def always(path: str, fault: Fault) -> Callable[[Site], None]:

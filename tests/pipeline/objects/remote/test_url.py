@@ -9,10 +9,11 @@ import pytest
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.remote import source as remote_source
-from pipeline.objects.sources import FoundObjects, find_objects, list_objects
+from pipeline.objects.sources import list_objects
 from storage.errors import TrilightError
 from storage.remote.url import PACKAGES, RemoteUrl, open_driver, parse_url
 from tests.for_each import for_each
+from tests.pipeline.objects.find_kit import find
 
 
 @for_each(
@@ -78,7 +79,7 @@ def test_credentials_are_kept_apart() -> None:
 )
 def test_other_urls_are_refused(tmp_path: Path, source: str, message: str) -> None:
     with pytest.raises(TrilightError, match=message) as caught:
-        find_objects(source, work_dir=tmp_path, allowed_licences=DEFAULT_ALLOWED)
+        find(source, work_dir=tmp_path)
     assert "expected" in str(caught.value)
     assert "s3cret" not in str(caught.value)
     assert "ada" not in str(caught.value)
@@ -118,36 +119,28 @@ class _Bucket:
         callback.relative_update(len(self.files[address]))
 
 
-def test_a_bucket_is_listed_at_once(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = (
-        "set/a?b#c%20.obj",
-        "set/x/d.obj",
-        "settee/e.obj",
-        "set/.f.obj",
-        "set/x/",
-        "set//g.obj",
-    )
-    bucket = _Bucket({f"bucket/{name}": name.encode() for name in names})
-    monkeypatch.setattr("pipeline.objects.remote.folder.open_driver", lambda url: bucket)
+@pytest.fixture
+def bucket(monkeypatch: pytest.MonkeyPatch) -> _Bucket:
+    """The bucket that any address leads to."""
+    made = _Bucket({f"bucket/{name}.obj": name.encode() for name in "abc"})
+    monkeypatch.setattr("pipeline.objects.remote.folder.open_driver", lambda url: made)
+    return made
 
-    def find() -> FoundObjects:
-        source = "s3://bucket/set/"
-        return find_objects(source, work_dir=cache, allowed_licences=DEFAULT_ALLOWED)
 
-    found = find()
+def test_a_bucket_is_listed_at_once(bucket: _Bucket, cache: Path) -> None:
+    names = ("a?b#c%20.obj", "x/d.obj", ".f.obj", "x/", "/g.obj")
+    bucket.files = {f"bucket/set/{name}": name.encode() for name in names}
+    bucket.files["bucket/settee/e.obj"] = b"e"
+    found = find("s3://bucket/set/", work_dir=cache)
     assert [record.uid for record in found.records] == ["a?b#c%20", "x/d"]
     assert [failure.reason for failure in found.failures] == ["unsafe_name"]
-    assert Path(found.records[0].path).read_text() == "set/a?b#c%20.obj"
+    assert Path(found.records[0].path).read_text() == "a?b#c%20.obj"
     assert found.records[1].source_url == "s3://bucket/set/x/d.obj"
-    assert find() == found
+    assert find("s3://bucket/set/", work_dir=cache) == found
     assert sorted(bucket.fetched) == ["bucket/set/a?b#c%20.obj", "bucket/set/x/d.obj"]
 
 
-def test_what_is_not_wanted_stays_on_the_server(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bucket = _Bucket({f"bucket/{name}.obj": name.encode() for name in "abc"})
-    monkeypatch.setattr("pipeline.objects.remote.folder.open_driver", lambda url: bucket)
+def test_what_is_not_wanted_stays_on_the_server(bucket: _Bucket, cache: Path) -> None:
     listed = list_objects("s3://bucket", work_dir=cache, allowed_licences=DEFAULT_ALLOWED)
     assert bucket.fetched == []
     found = listed.found(lambda uid: uid == "b")
@@ -157,10 +150,10 @@ def test_what_is_not_wanted_stays_on_the_server(
 
 
 def test_a_transfer_that_grows_too_large_is_ended(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
+    bucket: _Bucket, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The server does not say how large it is, and has no end."""
-    bucket = _Bucket({"bucket/a.obj": b"a", "bucket/b.obj": b"b"})
+    del bucket.files["bucket/c.obj"]
     chunks: list[int] = []
 
     def get_file(address: str, path: str, callback: Any) -> None:
@@ -172,8 +165,7 @@ def test_a_transfer_that_grows_too_large_is_ended(
     bucket.sizes = False
     monkeypatch.setattr(bucket, "get_file", get_file)
     monkeypatch.setattr(remote_source, "MAX_BYTES", 1000)
-    monkeypatch.setattr("pipeline.objects.remote.folder.open_driver", lambda url: bucket)
-    found = find_objects("gs://bucket", work_dir=cache, allowed_licences=DEFAULT_ALLOWED)
+    found = find("gs://bucket", work_dir=cache)
     assert [record.uid for record in found.records] == ["a"]
     assert [one.reason for one in found.failures] == ["too_large_bytes"]
     assert len(chunks) == 1 + 11
