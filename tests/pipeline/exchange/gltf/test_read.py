@@ -116,8 +116,8 @@ def test_every_texel_lies_where_gltf_puts_it(tmp_path: Path) -> None:
         assert found[3:7] == pytest.approx([F, F, F, 0.5], abs=1e-6)
     assert scene.vertex_normals == pytest.approx(np.tile([0, 0, 1], (4, 1)), abs=1e-6)
     assert scene.objects[0].attribution == "A. Maker"
-    found = load_source(scene_source(str(tmp_path / "a.gltf")))
-    assert any("no light" in note for note in found.notes)
+    loaded = load_source(scene_source(str(tmp_path / "a.gltf")))
+    assert any("no light" in note for note in loaded.notes)
 
 
 def test_transforms_of_nodes_and_of_textures(tmp_path: Path) -> None:
