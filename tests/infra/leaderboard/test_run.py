@@ -3,12 +3,14 @@
 import csv
 import dataclasses
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from infra.leaderboard import contest as contest_module
 from infra.leaderboard import run as run_module
@@ -45,8 +47,6 @@ SHIPPED = {"network builtin:", "network builtin:tokens"}
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with a set, its targets as a folder of pictures, and published weights."""
-    import torch
-
     root = tmp_path_factory.mktemp("board")
     write_toy_dataset(root / "toy", train=3, validation=3, per_shard=3, resolution=PX)
     export_dataset(
@@ -118,10 +118,7 @@ def test_who_is_asked_for_stands_beside_those_who_never_lack(
 def test_nothing_is_judged_twice_and_what_changed_is_judged_again(
     short: LeaderboardOrder, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    for path in (root / "perfect").glob("*.exr"):
-        (mine / path.name).write_bytes(path.read_bytes())
+    mine = shutil.copytree(root / "perfect", tmp_path / "mine")
     asked = dataclasses.replace(short, pictures=(mine,))
     before = board_of(asked)
     lines = (asked.out / "rows.jsonl").read_text().splitlines()
