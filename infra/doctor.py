@@ -19,7 +19,7 @@ from pipeline.isolation.seccomp import seccomp_works
 from pipeline.renders.facts import render_facts
 from pipeline.renders.variant import choose_variant
 from storage.cache import cache_folder
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, TrilightError
 from storage.installation import IMPORT_ROOT, module_name
 
 State = Literal["ok", "slower", "missing"]
@@ -101,7 +101,18 @@ def _renderer() -> Finding:
     )
     if finding.state == "missing":
         return finding
-    variant = choose_variant()
+    try:
+        variant = choose_variant()
+    except EnvironmentFailure:
+        raise
+    except TrilightError as error:
+        return Finding(
+            name="renderer",
+            state="missing",
+            found=str(error),
+            consequence="nothing can be rendered",
+            mend=f"{_APT} libllvm19",
+        )
     found = ", ".join(part for part in (found, variant.name, variant.libllvm) if part)
     return Finding(name="renderer", state="ok", found=found)
 

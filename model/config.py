@@ -41,6 +41,8 @@ class ModelConfig:
 
     PRESETS: ClassVar[Mapping[str, Callable[[], "ModelConfig"]]] = {}
     """The named sizes, by which a setting of this kind may be given (storage.settings.changes)."""
+    REMOVED: ClassVar = tuple(REMOVED)
+    """Settings of earlier versions."""
     width: Annotated[int, Within(2 * VERTEX_COORDINATES, 16_384)]
     """Width of every token."""
     num_heads: Annotated[int, Within(1, 512)]

@@ -4,8 +4,7 @@ The layers of both stages and the head may be rounded. Always float32, whatever 
 positions and rotary angles with their sines, the rotation itself, ray directions and their layer,
 normals and their octaves, materials, the learned tokens, and a head's last layers, whose rounding
 would be seen as bands. All of that is a hundredth of the work; rounding it too cost 7 dB on a
-trained network (study S68). `trilight model NAME --errors` measures
-what is left, layer by layer.
+trained network (study S68).
 
 Weights are rounded once, when the network is made ready, and not at every use (autocast): equally
 fast, half the memory. Training in few bits needs float32 weights and therefore uses autocast;

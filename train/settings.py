@@ -7,7 +7,7 @@ others are what the run means, and change by a decision that the run records (tr
 """
 
 from dataclasses import field
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from model.base_widths import BaseWidths
 from model.config import ModelConfig
@@ -61,6 +61,8 @@ class LossSettings:
     noise_half: Annotated[float, Within(0, 10)] = 0.0
     """Root mean square noise of log10(1 + radiance) at which a view has half the weight of a
     noiseless one; 0 gives all views the same weight."""
+    REMOVED: ClassVar = ("lpips_precision",)
+    """Settings of earlier versions."""
 
 
 Precision = Literal["float32", "bfloat16"]

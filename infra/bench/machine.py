@@ -2,6 +2,7 @@
 
 import os
 import platform
+import shutil
 import subprocess
 from importlib import metadata
 from pathlib import Path
@@ -44,6 +45,8 @@ def commit_text(root: Path = ROOT) -> str:
 
     Results are documents: a run that writes them resumes as the same commit.
     """
+    if shutil.which("git") is None:
+        return "unknown"  # an image has none
 
     def git(*words: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(

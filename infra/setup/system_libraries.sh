@@ -26,6 +26,6 @@ if command -v apt-get >/dev/null 2>&1 && $run true 2>/dev/null; then
     $run apt-get update -qq && $run env DEBIAN_FRONTEND=noninteractive \
         apt-get install -y -qq --no-install-recommends $missing >/dev/null && exit 0
 fi
-echo "Not installed:$missing. Meshes need OpenGL's library and a compiler, rendering needs libatomic,"
-echo "and is slow without LLVM; trilight doctor tells more."
+echo "Not installed:$missing. Meshes need OpenGL's library and a compiler, rendering needs libatomic"
+echo "and LLVM; trilight doctor tells more."
 echo "Ask an administrator for: apt-get install$missing"
