@@ -257,6 +257,14 @@ def test_every_half_float_comes_back_or_keeps_the_law(
             assert np.array_equal(back, picture) or keeps_law(picture, back, floor_db)
 
 
+def test_rounding_to_half_floats_is_the_only_loss() -> None:
+    """Values between two half floats go to the nearer: 2^-11 of the value, or half of 6e-8."""
+    exponents = np.random.default_rng(0).uniform(-9, 4.8, (64, 64, 3))
+    picture = (10.0**exponents).astype(np.float32)
+    back = decode_exr(encode_exr(picture))
+    assert (np.abs(back - picture) <= np.maximum(picture * 2.0**-11, SMALLEST / 2)).all()
+
+
 @pytest.mark.parametrize("emission", [65504.0, SMALLEST])
 def test_the_ends_of_half_floats_go_through_hdf5(tmp_path: Path, emission: float) -> None:
     scene = tiny_scene()

@@ -261,3 +261,9 @@ def test_a_run_that_recovers_goes_on_and_counts(
     assert [int(match[1]) for match in named if match] == [*range(2, 11), *range(12, 21)]
     losses = {row["step"]: row["loss"] for row in read_rows(result.folder.metrics) if "loss" in row}
     assert losses[4] is None and losses[12] > 0, "a row without a finite step has no loss"
+
+
+def test_an_empty_training_split_is_named(tmp_path: Path) -> None:
+    dataset = write_toy_dataset(tmp_path / "data", resolution=8, train=0, validation=1)
+    with pytest.raises(TrilightError, match="the train split holds no scene"):
+        trained(tiny_run(resolution=8), dataset, tmp_path / "out")

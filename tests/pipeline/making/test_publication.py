@@ -308,3 +308,12 @@ def test_a_manifest_that_names_a_file_elsewhere_is_refused(tmp_path: Path, name:
     root = edit_manifest(open_dataset(str(tmp_path)), shards=[{**shards[0], "name": name}])
     with pytest.raises(TrilightError, match="shard name"):
         open_dataset(str(root))
+
+
+def test_two_workers_are_kept_apart(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path)
+    with folder.locked():
+        with pytest.raises(TrilightError, match="another process"), folder.locked():
+            pass
+    with folder.locked():
+        pass
