@@ -127,7 +127,7 @@ def test_the_number_of_threads_changes_nothing(
 ) -> None:
     before = threading.active_count()
     assert same_batches(take(data, SETTINGS, WHOLE, workers=workers), whole)
-    assert threading.active_count() == before, "closing the stream ends its threads"
+    assert threading.active_count() <= before, "closing the stream ends its threads"
 
 
 def test_a_list_of_the_same_shards_gives_the_same_batches(
