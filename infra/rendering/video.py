@@ -60,7 +60,7 @@ def _mp4(frames: Sequence[Path], fps: int) -> bytes:
             if track is None:
                 track = container.add_stream("libx264", Fraction(fps), options={"crf": _CRF})
                 track.width, track.height, track.pix_fmt = *picture.size, "yuv420p"
-                track.codec_context.thread_count = 1  # by more, bytes have differed on a busy machine
+                track.codec_context.thread_count = 1  # more once gave other bytes
                 track.codec_context.colorspace = _BT709  # players guess by size where none is told
                 track.codec_context.color_primaries = _BT709
                 track.codec_context.color_trc = _SRGB
