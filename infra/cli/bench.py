@@ -52,6 +52,8 @@ def bench(measured: BenchCommand, options: BenchOptions) -> None:
             "repository and run the command there."
         ) from error
     if not measured.names:
+        if measured.show:
+            raise TrilightError("bench --show: no experiment is named; `trilight bench` lists them.")
         _list_experiments()
         return
     if len(measured.names) > 1:

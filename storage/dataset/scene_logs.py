@@ -69,12 +69,6 @@ def log_scene(
         raise write_error(path, error) from error
 
 
-def read_scene_logs(folder: DatasetFolder) -> Iterator[SceneLog]:
-    """Yield the rows of a dataset's logs; rows that a kill has cut are left out."""
-    for path in sorted(folder.logs.rglob("*.jsonl")):
-        yield from decode_scene_log(path.read_text())
-
-
 def log_name(shard: str) -> str:
     """Return the name of a shard's log, relative to the dataset."""
     return f"logs/{shard}.jsonl"

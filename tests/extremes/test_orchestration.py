@@ -27,7 +27,7 @@ from pipeline.making.run import ShardJob, TaskOutcome
 from pipeline.making.tasks import Piece
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.scene_logs import read_scene_logs
+from storage.dataset.scene_logs import decode_scene_log
 from storage.dataset.training_data import open_training_data
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
@@ -254,7 +254,8 @@ def test_nothing_grows_and_nothing_stays_behind(tmp_path: Path) -> None:
             process.wait()
     assert process.returncode == 0
     # what was prepared before the first scene would hide growth in the first tenth
-    finished = sorted(log.finished_unix_s for log in read_scene_logs(DatasetFolder(out)))
+    texts = [path.read_text() for path in DatasetFolder(out).logs.rglob("*.jsonl")]
+    finished = sorted(log.finished_unix_s for text in texts for log in decode_scene_log(text))
     lives = defaultdict[int, list[float]](list)
     for unix_s, resident_mb, _ in looks:
         for number, megabytes in resident_mb.items() if unix_s <= finished[-1] else ():
