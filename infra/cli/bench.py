@@ -53,7 +53,7 @@ def bench(measured: BenchCommand, options: BenchOptions) -> None:
         ) from error
     if not measured.names:
         if measured.show:
-            raise TrilightError("bench --show: no experiment is named; `trilight bench` lists them.")
+            raise TrilightError("bench --show names no experiment; `trilight bench` lists them.")
         _list_experiments()
         return
     if len(measured.names) > 1:
