@@ -51,15 +51,12 @@ def bench(measured: BenchCommand, options: BenchOptions) -> None:
             "bench: an installed Trilight has no experiments; expected a checkout. Clone the "
             "repository and run the command there."
         ) from error
-    if not measured.names:
-        if measured.show:
-            raise TrilightError("bench --show names no experiment; `trilight bench` lists them.")
+    if not measured.names and not measured.show:
         _list_experiments()
         return
-    if len(measured.names) > 1:
-        raise TrilightError(
-            f"bench: {len(measured.names)} experiments are named; expected one at a time."
-        )
+    if len(measured.names) != 1:
+        number = len(measured.names)
+        raise TrilightError(f"bench: {number} experiments named; expected one of `trilight bench`.")
     experiment = experiment_of(measured.names[0])
     scale = QUICK if measured.quick else FULL
     out = measured.out or results_path(experiment.name, scale)
