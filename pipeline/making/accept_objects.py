@@ -2,7 +2,7 @@
 
 import shutil
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import replace
 from operator import attrgetter
 
@@ -14,7 +14,12 @@ from pipeline.making.freeze_objects import (
     frozen_objects,
     require_same,
 )
-from pipeline.making.object_batches import ObjectWork, PrepareResult, prepare_in_batches
+from pipeline.making.object_batches import (
+    ObjectWork,
+    PrepareResult,
+    cut_objects,
+    prepare_in_batches,
+)
 from pipeline.objects.listing import Fetched
 from pipeline.objects.sources import ListedObjects
 from storage.dataset.layout import DatasetFolder
@@ -68,11 +73,14 @@ def accept_objects(order: AskedObjects, listed: ListedObjects | None = None) -> 
     maps = _same_maps(accept_maps(order.own, settings, workers=order.workers), order, frozen)
     wanted = listed.allowed
     if frozen is not None:
-        wanted = [record for record in wanted if record.uid in frozen]
+        wanted = _batches_of(frozen, wanted)
         announce_objects(folder, len(wanted))
     prepared, rejected = _prepare(listed, wanted, order, again=not shared)
     lost = [failure for failure in rejected if failure.stage == "objects"]
     listed.require_some(len(wanted) - len(lost), [*listed.refused, *lost])
+    if frozen is not None:
+        prepared = [one for one in prepared if one.record.uid in frozen]
+        rejected = [failure for failure in rejected if failure.item in frozen]
     accepted = freeze_objects(order, prepared, [*listed.refused, *rejected], listed.num_found, maps)
     shutil.rmtree(folder.staged_batches, ignore_errors=True)
     return accepted
@@ -88,6 +96,13 @@ def _same_maps(
     of_maps = {uid: entry for uid, entry in frozen.items() if entry.kind != OBJECT}
     require_same(safe_url(order.source), of_maps, [entry for entry, _ in kept])
     return replace(maps, rows=kept)
+
+
+def _batches_of(frozen: Container[str], records: list[ObjectRecord]) -> list[ObjectRecord]:
+    """Return those that share a batch with a frozen object: the batch may be prepared already."""
+    batches = cut_objects(sorted(records, key=attrgetter("uid")))
+    held = [batch for batch in batches if any(record.uid in frozen for record in batch)]
+    return [record for batch in held for record in batch]
 
 
 def _prepare(

@@ -1,7 +1,8 @@
 """Batches of objects: the mesh stage as work like scenes, shared by all workers, never done twice.
 
-A batch is some dozens of objects that follow each other in the order of their uids. Workers claim
-batches as they claim scenes, in a bucket through the bucket; a kill loses the batches in hand. The
+A batch is some dozens of objects that follow each other in the order of their uids. Where it ends
+is said by their uids alone: an object more changes one batch. Workers claim batches as they claim
+scenes, in a bucket through the bucket; a kill loses the batches in hand. The
 result of a batch is a small file whose name follows from all that it depends on. It lies beside the
 dataset for its other workers, and in the user's cache for later datasets. A worker that finds it
 there prepares none of its objects.
@@ -34,7 +35,7 @@ from storage.records.objects import Failure, ObjectRecord
 _CACHE = "object-batches"
 """Folder of the user's cache with results for later datasets."""
 _NUM_OBJECTS = 32
-"""Objects of a batch: a minute of one core where nothing is known yet."""
+"""Objects of a batch, in the mean: a minute of one core where nothing is known yet."""
 _WHOLE = (".off", ".ply", ".stl", ".usdz")
 """Suffixes of files that name no other ones; what lies beside the others counts too."""
 _LAYERS = (".usd", ".usda", ".usdc")
@@ -191,9 +192,14 @@ class ObjectBatch:
 
 
 def cut_objects(records: Sequence[ObjectRecord]) -> list[list[ObjectRecord]]:
-    """Cut records, sorted by uid, into batches."""
-    firsts = range(0, len(records), _NUM_OBJECTS)
-    return [list(records[first : first + _NUM_OBJECTS]) for first in firsts]
+    """Cut records, sorted by uid, into batches, at places that the uids alone decide."""
+    batches: list[list[ObjectRecord]] = []
+    for record in records:
+        is_first = int(sha256_hex(record.uid.encode())[:8], 16) % _NUM_OBJECTS == 0
+        if not batches or is_first or len(batches[-1]) == 2 * _NUM_OBJECTS:
+            batches.append([])
+        batches[-1].append(record)
+    return batches
 
 
 def prepare_in_batches(
