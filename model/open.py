@@ -125,8 +125,8 @@ def find_network(place: str | Path, *finders: Finder) -> FoundNetwork:
         return FoundNetwork(
             path=weights,
             trained=trained_range(metadata) or TrainedRange(),
-            any_width=decode_config(metadata[CONFIG_KEY]).view_stage == "hits",
-            open=lambda: from_tensors(*read_tensors(weights)),
+            any_width=decode_config(metadata[CONFIG_KEY], str(weights)).view_stage == "hits",
+            open=lambda: from_tensors(*read_tensors(weights), str(weights)),
         )
     return FoundNetwork(
         path=weights,

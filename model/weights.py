@@ -116,14 +116,16 @@ def decode_weights(data: bytes) -> RenderFormer:
     return from_tensors(tensors, header.get("__metadata__", {}))
 
 
-def from_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> RenderFormer:
-    """Return the network of our tensors; raises as `decode_weights`."""
+def from_tensors(
+    tensors: Mapping[str, Tensor], metadata: Mapping[str, str], source: str = "network"
+) -> RenderFormer:
+    """Return the network of our tensors; raises as `decode_weights`, with `source` first."""
     if CONFIG_KEY not in metadata:
         raise TrilightError(
             f"weights: the file has no {CONFIG_KEY} entry; expected a model.safetensors as "
             "`trilight train` writes it."
         )
-    return network_of(decode_config(metadata[CONFIG_KEY]), tensors)
+    return network_of(decode_config(metadata[CONFIG_KEY], source), tensors)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -240,17 +242,19 @@ def encode_config(config: ModelConfig) -> str:
     return json.dumps(fields, sort_keys=True)
 
 
-def decode_config(text: str) -> ModelConfig:
-    """Return the configuration of its JSON.
+def decode_config(text: str, source: str = "network") -> ModelConfig:
+    """Return the configuration of its JSON; `source` stands first in a refusal.
 
     Raises:
         TrilightError: it is none, or uses what was removed.
     """
     try:
-        fields = without_removed(json.loads(text), REMOVED, "network: model")
+        fields = without_removed(json.loads(text), REMOVED, f"{source}: model")
         lists = {name: tuple(value) for name, value in fields.items() if isinstance(value, list)}
         return ModelConfig(**fields | lists)
     except TrilightError:
         raise
     except (TypeError, ValueError, AttributeError) as error:
-        raise TrilightError(f"model config: not readable ({error}).") from error
+        raise TrilightError(
+            f"{source}: its model configuration is not readable ({error})."
+        ) from error

@@ -98,7 +98,7 @@ def beginning(
         checkpoint = read_checkpoint(branch)
         crew.any(False)  # a barrier: the first process soon writes what was just looked for
     if settings.from_weights:
-        config = decode_config(checkpoint.header["model"])
+        config = decode_config(checkpoint.header["model"], str(branch or folder.root))
         settings = dataclasses.replace(settings, model=config)
     going = going_on(checkpoint.header, settings, data_digest, start.decisions)
     return Beginning(settings=going.settings, checkpoint=checkpoint, going=going, branch=branch)

@@ -82,7 +82,9 @@ def going_on(
             values and both ways on. A decision that no run can take, or one of execution.
     """
     step = header["step"]
-    before = from_record(TrainSettings, known_settings(header["settings"], "resume"))
+    before = from_record(
+        TrainSettings, known_settings(header["settings"], f"checkpoint of step {step}")
+    )
     old, past = settings_record(before), events_of(header.get("history", ()))
     named = {name: value for name, value in decisions.items() if name != DATA}
     _require_meaning(named)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.timed_views import Show, TimedViews, timed_views
 from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.preview import PreviewRenderer, PreviewSettings
 from pipeline.renders.renderer import finished
@@ -172,13 +171,3 @@ def untrained_network(config: "ModelConfig") -> "NeuralRenderer":
         model.decoder.head.query.weight.zero_()
         model.decoder.head.last.bias[-6:] = -30.0  # softplus of what would be learned: nothing
     return NeuralRenderer(model)
-
-
-def timed_method(method: Method, scene: Scene) -> TimedViews:
-    """Return a scene's first view with its times."""
-
-    def load() -> Show:
-        view = method(scene)
-        return lambda: view(scene.c2w[0], float(scene.fov_deg[0]))
-
-    return timed_views(load)

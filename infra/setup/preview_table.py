@@ -79,6 +79,8 @@ def main() -> None:
             try:
                 scene = child.call(held_out_scene, index)
             except Rejected:
+                if index in PROBES:
+                    raise
                 continue
             errors[index] = {px: _errors_of(renderer, child, scene, px) for px in WIDTHS}
             costs[index] = {px: _costs_of(renderer, child, scene, px) for px in WIDTHS}

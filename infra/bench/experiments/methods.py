@@ -22,12 +22,11 @@ from infra.rendering.methods import (
     network_name,
     sampled_method,
     samples_name,
-    timed_method,
     traced_network,
     warm_up_denoiser,
 )
 from infra.rendering.raw_references import RawReference, first_camera, true_error_db
-from infra.timed_views import TimedViews
+from infra.timed_views import Show, TimedViews, timed_views
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.noise_floor import clamped_radiance
@@ -102,6 +101,16 @@ def _set_up(context: BenchContext) -> tuple[Mapping[int, Mapping[str, Method]], 
         for px in WIDTHS
     }
     return methods, context.render_child(held_out_build(), BENCHMARK, threads=1)
+
+
+def timed_method(method: Method, scene: Scene) -> TimedViews:
+    """Return a scene's first view with its times."""
+
+    def load() -> Show:
+        view = method(scene)
+        return lambda: view(scene.c2w[0], float(scene.fov_deg[0]))
+
+    return timed_views(load)
 
 
 def timed_samples(scene: Scene, px: int) -> list[TimedViews]:
