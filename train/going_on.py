@@ -82,9 +82,7 @@ def going_on(
             values and both ways on. A decision that no run can take, or one of execution.
     """
     step = header["step"]
-    before = from_record(
-        TrainSettings, known_settings(header["settings"], f"checkpoint of step {step}")
-    )
+    before = from_record(TrainSettings, known_settings(header["settings"], "checkpoint"))
     old, past = settings_record(before), events_of(header.get("history", ()))
     named = {name: value for name, value in decisions.items() if name != DATA}
     _require_meaning(named)

@@ -101,8 +101,7 @@ def _same_maps(
 def _batches_of(frozen: Container[str], records: list[ObjectRecord]) -> list[ObjectRecord]:
     """Return those that share a batch with a frozen object: the batch may be prepared already."""
     batches = cut_objects(sorted(records, key=attrgetter("uid")))
-    held = [batch for batch in batches if any(record.uid in frozen for record in batch)]
-    return [record for batch in held for record in batch]
+    return [one for batch in batches if any(r.uid in frozen for r in batch) for one in batch]
 
 
 def _prepare(

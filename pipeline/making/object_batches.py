@@ -1,11 +1,10 @@
 """Batches of objects: the mesh stage as work like scenes, shared by all workers, never done twice.
 
-A batch is some dozens of objects that follow each other in the order of their uids. Where it ends
-is said by their uids alone: an object more changes one batch. Workers claim batches as they claim
-scenes, in a bucket through the bucket; a kill loses the batches in hand. The
-result of a batch is a small file whose name follows from all that it depends on. It lies beside the
-dataset for its other workers, and in the user's cache for later datasets. A worker that finds it
-there prepares none of its objects.
+A batch is some dozens of objects that follow each other in the order of their uids, which alone say
+where it ends: an object more changes one batch. Workers claim batches as they claim scenes, in a
+bucket through the bucket; a kill loses the batches in hand. The result of a batch is a small file
+whose name follows from all that it depends on. It lies beside the dataset for its other workers,
+and in the user's cache for later ones. A worker that finds it there prepares none of its objects.
 """
 
 import contextlib

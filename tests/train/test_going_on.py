@@ -69,7 +69,9 @@ def test_removed_settings_stand_in_checkpoints_where_they_stood() -> None:
 def test_runs_that_use_what_was_removed_are_refused(group: str, name: str, value: Any) -> None:
     begun = header()
     begun["settings"][group][name] = value
-    message = f"^checkpoint of step 8: {group}.{name} is {value!r}: removed since, and commit {LAST_COMMIT} is"
+    message = (
+        f"^checkpoint: {group}.{name} is {value!r}: removed since, and commit {LAST_COMMIT} is"
+    )
     with pytest.raises(TrilightError, match=message):
         going_on(begun, tiny_run(), DIGEST, {})
 

@@ -1,6 +1,7 @@
 """All methods to a picture, from pure networks to the path tracer: cost against true error."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from infra.rendering.methods import (
     warm_up_denoiser,
 )
 from infra.rendering.raw_references import RawReference, first_camera, true_error_db
-from infra.timed_views import Show, TimedViews, timed_views
+from infra.timed_views import TimedViews, timed_views
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.noise_floor import clamped_radiance
@@ -105,12 +106,8 @@ def _set_up(context: BenchContext) -> tuple[Mapping[int, Mapping[str, Method]], 
 
 def timed_method(method: Method, scene: Scene) -> TimedViews:
     """Return a scene's first view with its times."""
-
-    def load() -> Show:
-        view = method(scene)
-        return lambda: view(scene.c2w[0], float(scene.fov_deg[0]))
-
-    return timed_views(load)
+    camera = scene.c2w[0], float(scene.fov_deg[0])
+    return timed_views(lambda: partial(method(scene), *camera))
 
 
 def timed_samples(scene: Scene, px: int) -> list[TimedViews]:
