@@ -5,7 +5,7 @@ from embreex.mesh_construction import TriangleMesh as EmbreeMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from pipeline.assets.mesh import TriangleMesh
+from pipeline.foreign.mesh import TriangleMesh
 
 RADIUS = 0.9
 """Of a sphere around the unit box, whose corners are sqrt(3)/2 away from its centre."""

@@ -11,15 +11,15 @@ from pipeline.assets.cleaning.guards import check_clean, check_raw
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.decimation.smallest import smallest_passing
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.own.levels import with_own_materials
 from pipeline.assets.quality.gate import check_level
 from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.quality.triangles import count_edges
-from pipeline.assets.reading.load import load_mesh
-from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
+from pipeline.foreign.load import load_mesh
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
 
@@ -37,7 +37,7 @@ def prepare_asset(path: Path, settings: AssetSettings, method: str) -> AssetAtte
 
     What it does not do: close holes, or remove inner parts.
     """
-    source = read_source(path, settings)
+    source = read_source(path, settings.read_limits)
     raw = load_mesh(source)
     check_raw(raw, source.kind, settings)
     cleaned = clean(normalise(raw))

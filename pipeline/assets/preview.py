@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import clean, normalise
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.outside_rays import first_faces
 from pipeline.assets.own.nearest import barycentric
-from pipeline.assets.reading.load import load_mesh
-from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings
+from pipeline.foreign.load import load_mesh
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.source_file import read_source
 from storage.conventions import srgb8
 from storage.records.asset import Level
 from storage.records.lookup import texture_values
@@ -32,7 +32,7 @@ def preview_source(path: Path, settings: AssetSettings, width_px: int) -> NDArra
 
     Raises Rejected as `prepare_asset`.
     """
-    mesh, _ = orient_outward(clean(normalise(load_mesh(read_source(path, settings)))))
+    mesh, _ = orient_outward(clean(normalise(load_mesh(read_source(path, settings.read_limits)))))
     return preview(mesh, width_px)
 
 

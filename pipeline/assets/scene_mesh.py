@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from pipeline.assets.cleaning.clean import clean, normalise
 from pipeline.assets.cleaning.guards import check_raw
 from pipeline.assets.decimation.by_name import decimate, safe_method
-from pipeline.assets.mesh import TriangleMesh
-from pipeline.assets.reading.load import load_mesh
-from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.recipe import methods_of
 from pipeline.assets.settings import AssetSettings
+from pipeline.foreign.load import load_mesh
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected
 
 
@@ -49,7 +49,7 @@ def load_scene_mesh(path: Path, settings: AssetSettings, remesh_faces: int | Non
         Rejected: the reason codes of reading, of `check_raw`, and `remesh_failed`.
         TrilightError: remeshing without pymeshlab.
     """
-    source = read_source(path, settings)
+    source = read_source(path, settings.read_limits)
     raw = load_mesh(source)
     check_raw(raw, source.kind, settings)
     if not np.isfinite(raw.positions).all():

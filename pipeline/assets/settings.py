@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
+from pipeline.foreign.limits import ReadLimits
 from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -94,14 +95,26 @@ class AssetSettings:
     level is the smallest mesh that keeps it, instead of all that its budget allows."""
     gate: GateSettings = dataclasses.field(default_factory=GateSettings)
     """What a level must keep; one that does not is made by the next method, or left out."""
-    max_source_bytes: Annotated[int, Within(1, 10_000_000_000, unit="bytes")] = 200_000_000
+    max_source_bytes: Annotated[int, Within(1, 10_000_000_000, unit="bytes")] = ReadLimits.max_bytes
     """Largest accepted source, with the buffers that it names."""
-    max_source_faces: Annotated[int, Within(1, 100_000_000, unit="triangles")] = 1_500_000
+    max_source_faces: Annotated[int, Within(1, 100_000_000, unit="triangles")] = (
+        ReadLimits.max_faces
+    )
     """Most triangles of an accepted source, instances counted."""
-    max_instances: Annotated[int, Within(1, 1_000_000, unit="nodes")] = 10_000
+    max_instances: Annotated[int, Within(1, 1_000_000, unit="nodes")] = ReadLimits.max_instances
     """Most nodes of a glTF scene that place a mesh."""
     own_materials: OwnMaterialSettings = dataclasses.field(default_factory=OwnMaterialSettings)
     """What becomes of the materials that files have."""
+
+    @property
+    def read_limits(self) -> ReadLimits:
+        """What is refused of a file before it is a mesh."""
+        return ReadLimits(
+            max_bytes=self.max_source_bytes,
+            max_faces=self.max_source_faces,
+            max_instances=self.max_instances,
+            with_materials=self.own_materials.keep,
+        )
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.assets.attempt import AssetAttempt
-from pipeline.assets.reading.source_file import needs_child, read_source
 from pipeline.assets.recipe import library_versions, methods_of
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.store import AssetStore
+from pipeline.foreign.source_file import needs_child, read_source
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
 from storage.digests import sha256_hex
 from storage.errors import Rejected
@@ -137,7 +137,7 @@ def source_digest(source: Path, settings: AssetSettings) -> tuple[str, str]:
         Rejected: as `read_source`.
         OSError: it cannot be read.
     """
-    found = read_source(source, settings)
+    found = read_source(source, settings.read_limits)
     return found.kind, found.sha256
 
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import clean, normalise
 from pipeline.assets.decimation.by_name import decimate, safe_method
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.recipe import methods_of
+from pipeline.foreign.mesh import TriangleMesh
 from pipeline.scenes.pieces import ScenePiece, joined
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, face_normals, flat_shaded, smooth_shaded

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalise
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.recipe import RECIPE, library_versions
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset
 from pipeline.documents.attribution import encode_attribution
 from pipeline.documents.quality_page import Pair, encode_quality_page
+from pipeline.foreign.mesh import TriangleMesh
 from pipeline.isolation import ChildFailed, call_with_retries, reach
 from pipeline.making.prepare_isolated import asset_child, prepare_isolated
 from pipeline.objects.glb import encode_glb

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings
 from pipeline.builds.named import BUILDS, named_build
+from pipeline.foreign.mesh import TriangleMesh
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings

@@ -16,11 +16,11 @@ import pytest
 from PIL import Image
 
 from pipeline.assets.prepare import prepare_asset
-from pipeline.assets.reading.load import load_mesh
-from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.exchange.open_scene import load_source, scene_source, source_keys
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
+from pipeline.foreign.load import load_mesh
+from pipeline.foreign.source_file import read_source
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from storage.errors import Rejected, TrilightError
 from tests.for_each import with_folders
@@ -53,7 +53,7 @@ class Outcome:
 def smaller_limits() -> None:
     """Prepare a child."""
     from pipeline.exchange import pictures
-    from pipeline.usd import composition, placed
+    from pipeline.foreign.usd import composition, placed
 
     composition.MAX_PRIMS, composition.MAX_COMPOSITION_S = 2000, 0.3
     placed.MAX_PLACED, pictures.MAX_PIXELS = 2000, 1 << 20
@@ -140,7 +140,7 @@ HARMLESS = ("place NaN", "intensity", "radius", "time codes", "place 1e300")
 
 def object_outcome(path: str) -> tuple[float, str]:
     """Return the farthest coordinate of an object and all that a user would read."""
-    source = read_source(Path(path), SETTINGS)
+    source = read_source(Path(path), SETTINGS.read_limits)
     farthest = float(np.abs(load_mesh(source).positions).max())
     attempt = prepare_asset(Path(path), SETTINGS, "meshoptimizer")
     materials = attempt.asset.materials

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.bench.workloads.remeshing import cleaned, raw_mesh
-from pipeline.assets.mesh import TriangleMesh
+from pipeline.foreign.mesh import TriangleMesh
 from pipeline.renders.settings import RenderSettings
 from storage.conventions import look_at_c2w
 from storage.metrics import psnr_log_db

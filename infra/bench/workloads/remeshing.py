@@ -5,10 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.assets.settings import AssetSettings
-
 if TYPE_CHECKING:
-    from pipeline.assets.mesh import TriangleMesh
+    from pipeline.foreign.mesh import TriangleMesh
 
 REFERENCE = "reference recipe"
 """Isotropic remeshing at 0.5 % of the diagonal, then quadric collapse, of the file as it is: the
@@ -25,10 +23,11 @@ METHODS: Mapping[str, str] = {
 def raw_mesh(path: Path) -> "TriangleMesh":
     """Return the mesh of a file in nominal size, neither cleaned nor oriented; raises Rejected."""
     from pipeline.assets.cleaning.clean import normalise
-    from pipeline.assets.reading.load import load_mesh
-    from pipeline.assets.reading.source_file import read_source
+    from pipeline.foreign.limits import ReadLimits
+    from pipeline.foreign.load import load_mesh
+    from pipeline.foreign.source_file import read_source
 
-    return normalise(load_mesh(read_source(path, AssetSettings())))
+    return normalise(load_mesh(read_source(path, ReadLimits())))
 
 
 def cleaned(raw: "TriangleMesh") -> "TriangleMesh":
@@ -79,7 +78,7 @@ def _reference(positions, faces, budget: int):  # type: ignore[no-untyped-def]
     import numpy as np
     import pymeshlab
 
-    from pipeline.assets.mesh import TriangleMesh
+    from pipeline.foreign.mesh import TriangleMesh
 
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(positions, faces.astype(np.int32)))

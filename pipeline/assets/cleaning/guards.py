@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings
+from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 
 EXTENT_RANGE = (1e-9, 1e9)

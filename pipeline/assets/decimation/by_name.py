@@ -7,8 +7,8 @@ import numpy as np
 
 from pipeline.assets.cleaning.clean import clean
 from pipeline.assets.decimation import meshopt
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.triangles import count_edges
+from pipeline.foreign.mesh import TriangleMesh
 
 _DETOUR = 8
 """Sources with more than this many times the budget, and a quarter, are first simplified to it by

@@ -7,7 +7,7 @@ free placement, at a twentieth of its time.
 import meshoptimizer
 import numpy as np
 
-from pipeline.assets.mesh import TriangleMesh
+from pipeline.foreign.mesh import TriangleMesh
 
 _ANY_ERROR = 1e9
 """The budget decides and the gate judges; the library's own bound would stop it half-way."""

@@ -7,7 +7,7 @@ would depend on history. It may crash or hang: these functions run in child proc
 import numpy as np
 import pymeshlab
 
-from pipeline.assets.mesh import TriangleMesh
+from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 
 REQUIRED_FILTERS = (

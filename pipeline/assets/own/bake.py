@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.own.nearest import NearestPlaces
 from pipeline.assets.own.source_surface import SourceSurface
 from pipeline.assets.own.tiles import FLAT, Atlas, atlas, cells_of, tile_weights, turned
 from pipeline.assets.settings import OwnMaterialSettings
+from pipeline.foreign.mesh import TriangleMesh
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.records.texture import Texture
 

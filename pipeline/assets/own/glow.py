@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.own.nearest import NearestPlaces
 from pipeline.assets.own.source_surface import SourceSurface
+from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 
 _STEPS = 8

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.own.skin import SkinMaker, skin_maker
-from pipeline.assets.reading.source_file import SourceFile
 from pipeline.assets.settings import AssetSettings
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.source_file import SourceFile
 from storage.errors import Rejected
 from storage.records.asset import Level
 from storage.records.skin import OwnMaterials

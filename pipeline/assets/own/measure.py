@@ -4,11 +4,11 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.own.bake import DIFFUSE, Baked
 from pipeline.assets.own.nearest import NearestPlaces, barycentric
 from pipeline.assets.own.source_surface import SourceSurface
 from pipeline.assets.quality.distance import sample_surface
+from pipeline.foreign.mesh import TriangleMesh
 from storage.records.lookup import texture_values
 from storage.records.skin import SkinQuality
 from storage.seeds import rng_for

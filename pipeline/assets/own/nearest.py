@@ -12,7 +12,7 @@ from embreex.mesh_construction import TriangleMesh as EmbreeMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from pipeline.assets.mesh import TriangleMesh
+from pipeline.foreign.mesh import TriangleMesh
 
 _BEHIND = 1e-4
 """Rays start so far behind the place, in the unit box: single precision would miss what is at it.

@@ -7,22 +7,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.own.bake import bake
 from pipeline.assets.own.glow import level_emission
-from pipeline.assets.own.gltf_materials import GltfMaterials, bare_gltf, data_uri_bytes
 from pipeline.assets.own.measure import skin_quality
 from pipeline.assets.own.nearest import NearestPlaces
-from pipeline.assets.own.obj_materials import bare_obj, obj_materials
-from pipeline.assets.own.parts import TexturedParts, load_parts
-from pipeline.assets.own.picture import Decoder
-from pipeline.assets.own.ply_colours import ply_parts
-from pipeline.assets.own.source_material import SourceMaterial
 from pipeline.assets.own.source_surface import SourceSurface, source_surface
-from pipeline.assets.own.usd_materials import usd_parts
-from pipeline.assets.reading.gltf_tree import read_tree
-from pipeline.assets.reading.source_file import SourceFile
 from pipeline.assets.settings import OwnMaterialSettings
+from pipeline.foreign.gltf_materials import GltfMaterials, bare_gltf, data_uri_bytes
+from pipeline.foreign.gltf_tree import read_tree
+from pipeline.foreign.material import SourceMaterial
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.obj_materials import bare_obj, obj_materials
+from pipeline.foreign.parts import TexturedParts, load_parts
+from pipeline.foreign.picture import Decoder
+from pipeline.foreign.ply_colours import ply_parts
+from pipeline.foreign.source_file import SourceFile
+from pipeline.foreign.usd.object_materials import usd_parts
 from storage.errors import Rejected
 from storage.records.asset import Level
 from storage.records.packed_maps import pack_texture

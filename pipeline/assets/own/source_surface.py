@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import cell_keys, normalise
-from pipeline.assets.mesh import TriangleMesh
-from pipeline.assets.own.parts import TexturedParts
-from pipeline.assets.own.source_material import Seen, Slot, SourceMaterial, columns
+from pipeline.foreign.material import Seen, Slot, SourceMaterial, columns
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.parts import TexturedParts
 from storage.errors import Rejected
 
 _LEAST_FOUND = 0.999

@@ -11,7 +11,7 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.mesh import TriangleMesh
+from pipeline.foreign.mesh import TriangleMesh
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

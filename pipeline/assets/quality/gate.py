@@ -3,9 +3,9 @@
 import numpy as np
 
 from pipeline.assets.cleaning.clean import clean
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.settings import GateSettings
+from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 from storage.records.asset import LevelQuality
 

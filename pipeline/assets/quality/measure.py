@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.distance import Deviation, Surface
 from pipeline.assets.quality.parts import Parts
 from pipeline.assets.quality.silhouette import intersection_over_union, silhouette
@@ -11,6 +10,7 @@ from pipeline.assets.quality.triangles import (
     count_edges,
     smallest_angles_deg,
 )
+from pipeline.foreign.mesh import TriangleMesh
 from storage.records.asset import LevelQuality
 from storage.seeds import rng_for
 

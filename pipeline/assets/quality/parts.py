@@ -4,8 +4,8 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.distance import Surface
+from pipeline.foreign.mesh import TriangleMesh
 
 _OWN_SIZE = 0.25
 """A part is lost when the result is farther from most of its points than this share of its size."""

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.outside_rays import first_faces, outside_rays
+from pipeline.foreign.mesh import TriangleMesh
 
 _DIRECTIONS = 8
 _RAYS_PER_SIDE = 64

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.assets.mesh import TriangleMesh
+from pipeline.foreign.mesh import TriangleMesh
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 """A glTF file: its checked JSON, and the arrays and pictures that its buffers hold.
 
-The JSON of a stranger is checked first (pipeline.assets.reading.gltf_tree): compressed, sparse and
+The JSON of a stranger is checked first (pipeline.foreign.gltf_tree): compressed, sparse and
 quantised geometry, skins and morphed meshes are refused there by name.
 """
 
@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.reading.gltf_tree import read_tree
-from pipeline.assets.reading.source_file import read_source
-from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.pictures import MAX_BYTES
+from pipeline.foreign.gltf_tree import read_tree
+from pipeline.foreign.limits import ReadLimits
+from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
 
 _DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32,
@@ -35,7 +35,7 @@ class GltfDocument:
         self.name = path.name
         self._folder = path.parent.resolve()
         try:
-            source = read_source(path, AssetSettings())
+            source = read_source(path, ReadLimits())
             self.tree = read_tree(source.data, f".{source.kind}")
         except Rejected as error:
             raise TrilightError(f"{path.name}: {error}") from error

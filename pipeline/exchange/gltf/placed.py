@@ -26,7 +26,7 @@ class PlacedNode:
 def placed_nodes(tree: dict[str, Any]) -> Iterator[PlacedNode]:
     """Yield the nodes of the default scene, parents before children.
 
-    The tree has no circle: pipeline.assets.reading.gltf_tree has looked.
+    The tree has no circle: pipeline.foreign.gltf_tree has looked.
 
     Raises:
         TrilightError: a place that is not finite.

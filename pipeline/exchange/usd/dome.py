@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
 from pipeline.exchange.usd.names import MAP_TEXTS, SKY_ROWS, SKY_VISIBLE, VISIBLE_TO_CAMERA
-from pipeline.usd.stage import OpenedUsd
-from pipeline.usd.texture_nodes import asset_bytes
+from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.exr import MAX_RESOLUTION, decode_exr, encode_channels

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.usd.placed import Placed
+from pipeline.foreign.usd.placed import Placed
 from storage.conventions import look_at_c2w
 
 _FOV_DEG = 40.0

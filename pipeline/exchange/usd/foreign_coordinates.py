@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.usd.foreign_meshes import MeshToShade
-from pipeline.usd.texture_nodes import UvChart, chart_corners
+from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 
 
 def coordinates(chart: UvChart, surface: MeshToShade, time: Any) -> NDArray[np.float64] | None:

@@ -17,8 +17,8 @@ from pipeline.exchange.linear_maps import (
 from pipeline.exchange.usd.foreign_coordinates import coordinates
 from pipeline.exchange.usd.foreign_meshes import MeshToShade
 from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
-from pipeline.usd.shaders import StatedInputs
-from pipeline.usd.stage import OpenedUsd
+from pipeline.foreign.usd.shaders import StatedInputs
+from pipeline.foreign.usd.stage import OpenedUsd
 from storage.records.texture import MapSource, Texture
 
 

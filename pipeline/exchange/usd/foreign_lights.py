@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.usd.placed import Placed
+from pipeline.foreign.usd.placed import Placed
 
 _DISK_CORNERS = 24
 

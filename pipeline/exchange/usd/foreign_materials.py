@@ -18,9 +18,9 @@ from pipeline.exchange.usd.foreign_inputs import ShaderInputs, worn_textures
 from pipeline.exchange.usd.foreign_meshes import MeshToShade
 from pipeline.exchange.usd.foreign_skins import CHANNELS, skinned
 from pipeline.exchange.usd.names import added_column
-from pipeline.usd.polygons import primvar_corners
-from pipeline.usd.shaders import surface_shader, without_place
-from pipeline.usd.stage import OpenedUsd
+from pipeline.foreign.usd.polygons import primvar_corners
+from pipeline.foreign.usd.shaders import surface_shader, without_place
+from pipeline.foreign.usd.stage import OpenedUsd
 from storage.records.material import (
     DIFFUSE,
     EMISSION,

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.polygons import as_array, mesh_polygons, mesh_triangles, moved, per_corner
 from pipeline.scenes.shading import smooth_shaded
-from pipeline.usd.placed import Placed
-from pipeline.usd.polygons import as_array, mesh_polygons, mesh_triangles, moved, per_corner
 
 SMOOTH_ANGLE_DEG = 30.0
 """Edges up to this angle are smooth where a subdivision surface states no normals."""

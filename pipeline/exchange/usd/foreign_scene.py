@@ -21,9 +21,9 @@ from pipeline.exchange.usd.foreign_lights import light_triangles, radiance
 from pipeline.exchange.usd.foreign_materials import dressing
 from pipeline.exchange.usd.foreign_meshes import MeshToShade, TriangleSoup, read_mesh
 from pipeline.exchange.usd.names import OBJECT_TEXTS
+from pipeline.foreign.usd.placed import Placed, placed_prims
+from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.scenes.shading import flat_shaded
-from pipeline.usd.placed import Placed, placed_prims
-from pipeline.usd.stage import OpenedUsd
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import EMISSION, ROUGHNESS, default_rows

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES, Pixels, decoded_pixels, is_encoded
 from pipeline.exchange.wrapping import Wrap
-from pipeline.usd.stage import OpenedUsd
-from pipeline.usd.texture_nodes import TextureNode, UvChart, asset_bytes
+from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart, asset_bytes
 from storage.records.texture import MapSource, Texture
 
 _STEPS = 8

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.exchange.usd.foreign_scene import scene_of_stage
 from pipeline.exchange.usd.read_ours import is_marked, read_exact, scene_keys
-from pipeline.usd.stage import OpenedUsd, quietly
+from pipeline.foreign.usd.stage import OpenedUsd, quietly
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 
@@ -36,7 +36,7 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
     """Return the keys of the scenes of a file; one empty key where it has one scene.
 
     Raises:
-        TrilightError: the file is unusable (pipeline.usd.stage).
+        TrilightError: the file is unusable (pipeline.foreign.usd.stage).
     """
     return quietly(path, lambda: _keys(OpenedUsd(path, folder)))
 

@@ -13,8 +13,8 @@ from pipeline.exchange.usd.exact_layer import children_of, numbered, require, re
 from pipeline.exchange.usd.texture_files import decoded_texture
 from pipeline.exchange.usd.write_materials import material_tables
 from pipeline.exchange.usd.write_textures import SHADERS, Used, material_links
-from pipeline.usd.stage import OpenedUsd
-from pipeline.usd.texture_nodes import asset_bytes
+from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.records.material import PUBLISHED_COLUMNS, declared_column, default_rows, laid_out
 from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
 

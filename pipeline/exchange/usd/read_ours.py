@@ -28,7 +28,7 @@ from pipeline.exchange.usd.read_our_materials import materials_as_written
 from pipeline.exchange.usd.write import ENVIRONMENT, camera_attributes
 from pipeline.exchange.usd.write_meshes import MESH, SUBSET, object_attributes
 from pipeline.exchange.usd.write_textures import ST
-from pipeline.usd.stage import OpenedUsd
+from pipeline.foreign.usd.stage import OpenedUsd
 from storage.conventions import require_readable
 from storage.errors import TrilightError
 from storage.records.environment import Environment

@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.assets.cleaning.clean import clean, normalise
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings
+from pipeline.foreign.mesh import TriangleMesh
 from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
 from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
 from storage.errors import Rejected

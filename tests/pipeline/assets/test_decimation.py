@@ -14,10 +14,10 @@ from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.decimation.pymeshlab_filters import REQUIRED_FILTERS
 from pipeline.assets.decimation.smallest import smallest_passing
 from pipeline.assets.environment import missing_filters
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.distance import Surface
 from pipeline.assets.recipe import methods_of
 from pipeline.assets.settings import AssetSettings, GateSettings
+from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 from storage.records.asset import Level, LevelQuality
 from tests.for_each import for_each

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import prepare_assets
 from pipeline.assets.store import AssetStore
+from pipeline.foreign.mesh import TriangleMesh
 from pipeline.isolation import IsolatedChild
 from pipeline.making.prepare_isolated import asset_child
 from storage.records.asset import Asset, decode_asset

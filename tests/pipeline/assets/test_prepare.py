@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import GRID
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.distance import Surface
-from pipeline.assets.reading.load import load_mesh
-from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings, GateSettings
+from pipeline.foreign.load import load_mesh
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.source_file import read_source
 from pipeline.objects.sources import find_objects
 from storage.errors import TrilightError
 from storage.records.asset import Asset, encode_asset
@@ -116,7 +116,7 @@ def test_nodes_place_meshes_where_they_say(tmp_path: Path) -> None:
         {"mesh": 0, "translation": [10, 0, 0]},
         {"mesh": 0, "translation": [-10, 0, 0], "scale": [-1, 1, 1]},
     ]
-    source = read_source(write_glb(tmp_path / "two.glb", tree, buffer), SETTINGS)
+    source = read_source(write_glb(tmp_path / "two.glb", tree, buffer), SETTINGS.read_limits)
     mesh = load_mesh(source)
     assert len(mesh.faces) == 2 * 80
     # 2 x (10 + 1) to either side; the numbers of the file are single precision.
@@ -186,7 +186,7 @@ def test_settings_without_meaning_are_refused() -> None:
 def test_what_the_parent_needs_loads_no_mesh_library() -> None:
     code = (
         "import sys, pipeline.assets.settings, pipeline.assets.recipe, pipeline.assets.stage,"
-        "pipeline.assets.store, pipeline.assets.reading.source_file;"
+        "pipeline.assets.store, pipeline.foreign.source_file;"
         "print(*sys.modules)"
     )
     result = subprocess.run(

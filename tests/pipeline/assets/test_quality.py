@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.distance import Surface, sample_surface
 from pipeline.assets.quality.gate import check_level
 from pipeline.assets.quality.measure import MeasuredSource
@@ -15,6 +14,7 @@ from pipeline.assets.quality.parts import Parts, label_parts
 from pipeline.assets.quality.silhouette import intersection_over_union, silhouette
 from pipeline.assets.quality.triangles import area_variation, count_edges, smallest_angles_deg
 from pipeline.assets.settings import GateSettings
+from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 from storage.records.asset import LevelQuality
 from tests.for_each import for_each

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings, GateSettings
+from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 from tests.for_each import for_each
 from tests.pipeline.assets import meshes_by_hand as by_hand

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from pipeline.assets import stage
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.assets.stage import _rising, prepare_assets
 from pipeline.assets.store import AssetStore
+from pipeline.foreign.mesh import TriangleMesh
 from pipeline.isolation import is_passing
 from storage.errors import TrilightError
 from tests.pipeline.assets.child_kit import (

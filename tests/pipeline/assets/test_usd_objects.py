@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from pipeline.assets.mesh import TriangleMesh
-from pipeline.assets.reading.load import load_mesh
-from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings
+from pipeline.foreign.load import load_mesh
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.source_file import read_source
 from storage.records.asset import decode_asset
 from tests.for_each import for_each
 from tests.pipeline.assets.child_kit import Bench, run
@@ -43,7 +43,7 @@ BOX = moved(cube(), scale=[1.0, 0.5, 0.25])
 
 
 def loaded(stage: Usd.Stage, path: Path) -> TriangleMesh:
-    return load_mesh(read_source(exported(stage, path), SETTINGS))
+    return load_mesh(read_source(exported(stage, path), SETTINGS.read_limits))
 
 
 def rows_of(mesh: TriangleMesh) -> set[tuple[tuple[float, ...], ...]]:

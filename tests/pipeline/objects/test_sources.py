@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.assets.reading.source_file import SUFFIXES as READABLE
+from pipeline.foreign.source_file import SUFFIXES as READABLE
 from pipeline.objects.generated import FAMILIES
 from pipeline.objects.licences import DEFAULT_ALLOWED, USER_PROVIDED, refuse_licences
 from pipeline.objects.listing import SUFFIXES

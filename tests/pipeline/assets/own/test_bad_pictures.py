@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.assets.own.picture import Picture
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
+from pipeline.foreign.picture import Picture
 from storage.conventions import linear_from_srgb8
 from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import geometry, prepare, reason_of, write_glb, write_ply

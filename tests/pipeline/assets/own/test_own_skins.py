@@ -11,11 +11,11 @@ from pxr import Gf, Sdf, Usd, UsdShade
 
 from pipeline.assets.cleaning.clean import clean, normalise
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.own.skin import skin_maker
-from pipeline.assets.reading.load import load_mesh
-from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
+from pipeline.foreign.load import load_mesh
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.source_file import read_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected
 from storage.records.asset import Asset, decode_asset, encode_asset
@@ -255,7 +255,7 @@ def test_a_level_that_lies_nowhere_near_its_source_is_told(tmp_path: Path) -> No
     ball = sphere(rings=9, columns=16)
     uv = ball.positions[:, [0, 2]]
     path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS), uv, ball)
-    source = read_source(path, KEEP)
+    source = read_source(path, KEEP.read_limits)
     mesh, _ = orient_outward(clean(normalise(load_mesh(source))))
     maker, _ = skin_maker(source, mesh, dataclasses.replace(OWN, max_colour_error=1.0))
     level = prepare(path, KEEP).levels[0]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
+from pipeline.foreign.mesh import TriangleMesh
 from storage.records.asset import Asset
 from storage.records.lookup import texture_values
 from tests.pipeline.assets.meshes_by_hand import gltf_tree, prepare, write_glb

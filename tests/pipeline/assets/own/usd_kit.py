@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils
 
-from pipeline.assets.mesh import TriangleMesh
+from pipeline.foreign.mesh import TriangleMesh
 from tests.pipeline.assets.own.textured_kit import SQUARE, UV_UP
 
 Change = Callable[[Usd.Stage], object]

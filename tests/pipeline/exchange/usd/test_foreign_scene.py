@@ -11,8 +11,8 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
 from pipeline.exchange.usd.read import UsdScene, read_usd, usd_keys
 from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
+from pipeline.foreign.usd.polygons import triangulated
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
-from pipeline.usd.polygons import triangulated
 from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.scene import Scene

@@ -5,8 +5,8 @@ import io
 import numpy as np
 import trimesh
 
-from pipeline.assets.mesh import TriangleMesh
-from pipeline.assets.reading.source_file import SourceFile
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.source_file import SourceFile
 from storage.errors import Rejected
 
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.mesh import TriangleMesh
-from pipeline.assets.reading.usd_stage import UsdStage
-from pipeline.assets.settings import AssetSettings
-from pipeline.usd.placed import Placed
-from pipeline.usd.polygons import mesh_polygons, mesh_triangles, moved, primvar_corners
-from pipeline.usd.texture_nodes import UvChart, chart_corners
+from pipeline.foreign.limits import ReadLimits
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.usd.object_stage import UsdStage
+from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.polygons import mesh_polygons, mesh_triangles, moved, primvar_corners
+from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 from storage.errors import Rejected
 
 _MAX_OFFSET = 1e5
@@ -58,19 +58,19 @@ class PlacedPart:
         return np.clip(found.astype(np.float64), 0, 1)
 
 
-def placed_parts(stage: UsdStage, settings: AssetSettings) -> tuple[PlacedPart, ...]:
+def placed_parts(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedPart, ...]:
     """Return the meshes of a stage that have triangles.
 
     Raises:
         Rejected: no_faces, too_many_faces, offset_precision.
         TrilightError: arrays of a mesh contradict each other, or are not finite.
     """
-    parts, left, farthest = list[PlacedPart](), settings.max_source_faces, 0.0
+    parts, left, farthest = list[PlacedPart](), limits.max_faces, 0.0
     for number, each in enumerate(stage.meshes):
         found = mesh_polygons(each.prim, stage.time)
         left -= int(np.maximum(found.counts - 2, 0).sum())
         if left < 0:
-            raise Rejected("too_many_faces", f"expected <= {settings.max_source_faces} faces")
+            raise Rejected("too_many_faces", f"expected <= {limits.max_faces} faces")
         corners, polygons = mesh_triangles(each.prim, found, each.to_world, stage.time)
         if len(corners):
             scale = np.linalg.norm(each.to_world[:3, :3], 2)

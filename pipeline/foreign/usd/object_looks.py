@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.reading.material_files import MaterialFiles
-from pipeline.assets.reading.usd_stage import UsdStage
-from pipeline.usd.placed import Placed
-from pipeline.usd.polygons import as_array
-from pipeline.usd.shaders import StatedInputs, surface_shader, without_place
-from pipeline.usd.stage import OutsideFile
-from pipeline.usd.texture_nodes import TextureNode, asset_bytes
+from pipeline.foreign.material_files import MaterialFiles
+from pipeline.foreign.usd.object_stage import UsdStage
+from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.polygons import as_array
+from pipeline.foreign.usd.shaders import StatedInputs, surface_shader, without_place
+from pipeline.foreign.usd.stage import OutsideFile
+from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes
 from storage.errors import Rejected, TrilightError
 
 COLOURS = ("diffuseColor", "specularColor", "emissiveColor")

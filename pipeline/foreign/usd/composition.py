@@ -26,7 +26,7 @@ def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
     """Compose all prims below a root layer, payloads too, and return USD's errors.
 
     Args:
-        root: the layer; every file it names must have been checked (pipeline.usd.stage).
+        root: the layer; every file it names must have been checked (pipeline.foreign.usd.stage).
         context: resolver context of the stage that will be opened.
         name: of the file, for messages.
 

@@ -1,8 +1,8 @@
 """A USD file as an object: opened within bounds, with what is seen of it, and refused by name.
 
 USD resolves what a file names by itself, so it is given a path; every file that it may open is
-checked first (pipeline.usd.stage). What would give a plausible but wrong mesh is refused: a missing
-reference, solids that are no meshes, bones.
+checked first (pipeline.foreign.usd.stage). What would give a plausible but wrong mesh is refused: a
+missing reference, solids that are no meshes, bones.
 """
 
 from collections.abc import Callable
@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pipeline.assets.settings import AssetSettings
-from pipeline.usd.placed import Placed, placed_prims
-from pipeline.usd.stage import OpenedUsd, OutsideFile, quietly
+from pipeline.foreign.limits import ReadLimits
+from pipeline.foreign.usd.placed import Placed, placed_prims
+from pipeline.foreign.usd.stage import OpenedUsd, OutsideFile, quietly
 from storage.errors import Rejected, TrilightError
 
 _SOLIDS = ("Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane", "NurbsPatch", "TetMesh")
@@ -35,14 +35,14 @@ class UsdStage:
     """The first of a stage that moves."""
 
 
-def open_stage(path: Path, settings: AssetSettings) -> UsdStage:
+def open_stage(path: Path, limits: ReadLimits) -> UsdStage:
     """Return the stage of a file.
 
     Raises:
         Rejected: external_uri, load_error, missing_file, too_many_instances,
             unsupported_primitive, skinned_mesh.
     """
-    return refusing(path, lambda: _opened(path, settings))
+    return refusing(path, lambda: _opened(path, limits))
 
 
 def refusing(path: Path, read: Callable[[], Read]) -> Read:
@@ -58,16 +58,16 @@ def refusing(path: Path, read: Callable[[], Read]) -> Read:
         raise Rejected(reason, f"{error!s:.300}") from error
 
 
-def _opened(path: Path, settings: AssetSettings) -> UsdStage:
+def _opened(path: Path, limits: ReadLimits) -> UsdStage:
     from pxr import Usd
 
-    opened = OpenedUsd(path, max_file_bytes=settings.max_source_bytes)
+    opened = OpenedUsd(path, max_file_bytes=limits.max_bytes)
     stage, time = opened.compose(), Usd.TimeCode.EarliestTime()
     if opened.unresolved:
         raise Rejected("missing_file", f"{opened.unresolved[0]}; an object needs all of its parts")
     placed = placed_prims(stage, time, opened.lost, ("Mesh", *_SOLIDS))
-    if len(placed) > settings.max_instances:
-        raise Rejected("too_many_instances", f"{len(placed)} meshes; <= {settings.max_instances}")
+    if len(placed) > limits.max_instances:
+        raise Rejected("too_many_instances", f"{len(placed)} meshes; <= {limits.max_instances}")
     for each in placed:
         kind, where = each.prim.GetTypeName(), str(each.prim.GetPath())
         if kind != "Mesh":

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.parts import TexturedParts, dumped, load_parts
-from pipeline.assets.own.source_material import SourceMaterial
+from pipeline.foreign.material import SourceMaterial
+from pipeline.foreign.parts import TexturedParts, dumped, load_parts
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected
 

@@ -10,14 +10,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.parts import MOST_UV_SETS, TexturedParts
-from pipeline.assets.own.picture import Picture, has_colours
-from pipeline.assets.own.source_material import RGB, WHITE, Slot, SourceMaterial
-from pipeline.assets.reading.material_files import MaterialFiles
-from pipeline.assets.reading.usd_looks import Binding, StatedMaterial
-from pipeline.assets.reading.usd_meshes import PlacedPart
-from pipeline.assets.reading.usd_source import UsdSource
-from pipeline.usd.texture_nodes import TextureNode, UvChart
+from pipeline.foreign.material import RGB, WHITE, Slot, SourceMaterial
+from pipeline.foreign.material_files import MaterialFiles
+from pipeline.foreign.parts import MOST_UV_SETS, TexturedParts
+from pipeline.foreign.picture import Picture, has_colours
+from pipeline.foreign.usd.object_looks import Binding, StatedMaterial
+from pipeline.foreign.usd.object_meshes import PlacedPart
+from pipeline.foreign.usd.object_source import UsdSource
+from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart
 from storage.errors import Rejected
 
 _CHANNELS = {"rgb": 0, "r": 0, "g": 1, "b": 2, "a": 3}

@@ -8,8 +8,8 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.usd.polygons import primvar_corners
-from pipeline.usd.stage import OpenedUsd, file_and_member
+from pipeline.foreign.usd.polygons import primvar_corners
+from pipeline.foreign.usd.stage import OpenedUsd, file_and_member
 from storage.errors import TrilightError
 
 _MOST_NODES = 8

@@ -5,28 +5,28 @@ from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
-from pipeline.assets.mesh import TriangleMesh
-from pipeline.assets.reading.usd_looks import StageLooks, stage_looks
-from pipeline.assets.reading.usd_meshes import PlacedPart, joined, placed_parts
-from pipeline.assets.reading.usd_stage import UsdStage, open_stage, refusing
-from pipeline.assets.settings import AssetSettings
+from pipeline.foreign.limits import ReadLimits
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.usd.object_looks import StageLooks, stage_looks
+from pipeline.foreign.usd.object_meshes import PlacedPart, joined, placed_parts
+from pipeline.foreign.usd.object_stage import UsdStage, open_stage, refusing
 from storage.errors import Rejected
 
 
 class UsdSource:
-    """What a USD file holds. The materials are looked at where settings keep them."""
+    """What a USD file holds. The materials are looked at where limits keep them."""
 
-    def __init__(self, path: Path, settings: AssetSettings) -> None:
+    def __init__(self, path: Path, limits: ReadLimits) -> None:
         """Open the file and those that it names.
 
         Raises:
             Rejected: as `open_stage`, or too_large_bytes for all layers together.
         """
-        self._path, self._settings = path, settings
-        self.stage: UsdStage = open_stage(path, settings)
-        self._digest, left = _digest(self.stage.opened.files, settings.max_source_bytes)
+        self._path, self._limits = path, limits
+        self.stage: UsdStage = open_stage(path, limits)
+        self._digest, left = _digest(self.stage.opened.files, limits.max_bytes)
         self._looks: StageLooks | Rejected | None = None
-        if settings.own_materials.keep:
+        if limits.with_materials:
             try:
                 self._looks = refusing(path, lambda: stage_looks(self.stage, left))
             except Rejected as why:
@@ -45,7 +45,7 @@ class UsdSource:
     @cached_property
     def parts(self) -> tuple[PlacedPart, ...]:
         """Its meshes; raises Rejected as `placed_parts`, or load_error."""
-        return refusing(self._path, lambda: placed_parts(self.stage, self._settings))
+        return refusing(self._path, lambda: placed_parts(self.stage, self._limits))
 
     @cached_property
     def mesh(self) -> TriangleMesh:

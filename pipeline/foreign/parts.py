@@ -13,8 +13,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from pipeline.assets.mesh import TriangleMesh
-from pipeline.assets.own.source_material import SourceMaterial
+from pipeline.foreign.material import SourceMaterial
+from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 
 MOST_UV_SETS = 4

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.usd.stage import OpenedUsd
-from pipeline.usd.texture_nodes import TextureNode, texture_node
+from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.texture_nodes import TextureNode, texture_node
 
 PREVIEW = "UsdPreviewSurface"
 NAMES: Mapping[str, Mapping[str, str]] = {

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.picture import Picture
+from pipeline.foreign.picture import Picture
 from storage.records.fresnel import constant_albedos
 
 RGB = tuple[float, float, float]

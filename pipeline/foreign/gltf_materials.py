@@ -15,10 +15,10 @@ from urllib.parse import unquote_to_bytes
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.parts import MOST_UV_SETS
-from pipeline.assets.own.picture import Picture, Wrap
-from pipeline.assets.own.source_material import Slot, SourceMaterial
-from pipeline.assets.reading.material_files import MaterialFiles
+from pipeline.foreign.material import Slot, SourceMaterial
+from pipeline.foreign.material_files import MaterialFiles
+from pipeline.foreign.parts import MOST_UV_SETS
+from pipeline.foreign.picture import Picture, Wrap
 from storage.errors import Rejected
 
 _WRAPS: Mapping[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}

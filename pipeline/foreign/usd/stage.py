@@ -5,7 +5,7 @@ be known beforehand, so every file that any layer names for composition, used or
 the path that USD's own resolver gives, is refused outside of the folder, and is opened here first:
 the closure of all names holds every file that composition can ask for. When the stage stands, its
 layers are compared with the folder once more, before anything of it is used.
-`pipeline.usd.composition` bounds the size of the stage. The bytes are still parsed by
+`pipeline.foreign.usd.composition` bounds the size of the stage. The bytes are still parsed by
 native code, so untrusted files are opened in a child process with limits (pipeline.isolation).
 `quietly` turns USD's own errors into one line that names the file and no folder of this machine.
 """
@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
-from pipeline.usd.composition import composition_errors
+from pipeline.foreign.usd.composition import composition_errors
 from storage.errors import TrilightError
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")

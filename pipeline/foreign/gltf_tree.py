@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from pipeline.assets.settings import AssetSettings
+from pipeline.foreign.limits import ReadLimits
 from storage.errors import Rejected
 
 _MAX_JSON_BYTES = 64_000_000
@@ -42,20 +42,20 @@ def read_tree(data: bytes, suffix: str) -> dict[str, Any]:
     return tree
 
 
-def check_tree(tree: dict[str, Any], settings: AssetSettings) -> None:
+def check_tree(tree: dict[str, Any], limits: ReadLimits) -> None:
     """Raise Rejected for a tree that would load wrongly, or as more than the limits."""
     try:
         _check_extensions(tree)
         faces = [
-            sum(_count_faces(tree, primitive, settings) for primitive in mesh["primitives"])
+            sum(_count_faces(tree, primitive, limits) for primitive in mesh["primitives"])
             for mesh in tree.get("meshes", ())
         ]
-        placed = _placed_meshes(tree, settings.max_instances)
+        placed = _placed_meshes(tree, limits.max_instances)
         total = sum(faces[mesh] for mesh in placed)
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
         raise Rejected("load_error", f"the glTF tree is malformed ({error!r:.120})") from error
-    if total > settings.max_source_faces:
-        raise Rejected("too_many_faces", f"{total} faces; expected <= {settings.max_source_faces}")
+    if total > limits.max_faces:
+        raise Rejected("too_many_faces", f"{total} faces; expected <= {limits.max_faces}")
 
 
 def _check_extensions(tree: dict[str, Any]) -> None:
@@ -98,7 +98,7 @@ def buffer_paths(tree: dict[str, Any], folder: Path) -> dict[str, Path]:
     return paths
 
 
-def _count_faces(tree: dict[str, Any], primitive: dict[str, Any], settings: AssetSettings) -> int:
+def _count_faces(tree: dict[str, Any], primitive: dict[str, Any], limits: ReadLimits) -> int:
     mode = primitive.get("mode", _TRIANGLES)
     if mode in _POINTS_AND_LINES:
         return 0
@@ -110,7 +110,7 @@ def _count_faces(tree: dict[str, Any], primitive: dict[str, Any], settings: Asse
     for accessor in (position, corners):
         if "bufferView" not in accessor or "sparse" in accessor:
             raise Rejected("unsupported_accessor", "geometry is compressed or sparse")
-        if accessor["count"] > 3 * settings.max_source_faces:
+        if accessor["count"] > 3 * limits.max_faces:
             raise Rejected("too_many_faces", f"an accessor counts {accessor['count']} items")
     if position["componentType"] != _FLOAT:
         raise Rejected("unsupported_accessor", "positions are quantised")

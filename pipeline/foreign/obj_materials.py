@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.picture import Picture
-from pipeline.assets.own.source_material import RGB, WHITE, Slot, SourceMaterial
-from pipeline.assets.reading.material_files import MaterialFiles, libraries_of, map_words
+from pipeline.foreign.material import RGB, WHITE, Slot, SourceMaterial
+from pipeline.foreign.material_files import MaterialFiles, libraries_of, map_words
+from pipeline.foreign.picture import Picture
 from storage.errors import Rejected
 
 _F0_OF_KS = 0.08

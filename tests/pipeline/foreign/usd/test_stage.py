@@ -8,10 +8,10 @@ import pytest
 from pxr import Usd, UsdGeom
 
 from pipeline.exchange.usd.write import write_usd
-from pipeline.usd import composition, placed
-from pipeline.usd import stage as opening
-from pipeline.usd.stage import OpenedUsd, quietly
-from pipeline.usd.texture_nodes import asset_bytes
+from pipeline.foreign.usd import composition, placed
+from pipeline.foreign.usd import stage as opening
+from pipeline.foreign.usd.stage import OpenedUsd, quietly
+from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_scene

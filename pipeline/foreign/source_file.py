@@ -11,15 +11,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.assets.reading.gltf_tree import buffer_paths, check_tree, read_tree
-from pipeline.assets.reading.headers import check_header
-from pipeline.assets.reading.material_files import MaterialFiles, gltf_files, obj_files
-from pipeline.assets.settings import AssetSettings
-from pipeline.usd.stage import SUFFIXES as USD_SUFFIXES
+from pipeline.foreign.gltf_tree import buffer_paths, check_tree, read_tree
+from pipeline.foreign.headers import check_header
+from pipeline.foreign.limits import ReadLimits
+from pipeline.foreign.material_files import MaterialFiles, gltf_files, obj_files
+from pipeline.foreign.usd.stage import SUFFIXES as USD_SUFFIXES
 from storage.errors import Rejected
 
 if TYPE_CHECKING:
-    from pipeline.assets.reading.usd_source import UsdSource
+    from pipeline.foreign.usd.object_source import UsdSource
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", *USD_SUFFIXES)
 """Formats that we read. The suffix decides: a file that lies about it is refused or fails to load,
@@ -50,7 +50,7 @@ def needs_child(path: Path) -> bool:
     return path.suffix.lower() in USD_SUFFIXES
 
 
-def read_source(path: Path, settings: AssetSettings) -> SourceFile:
+def read_source(path: Path, limits: ReadLimits) -> SourceFile:
     """Return a source after the checks that need no mesh library.
 
     Where `needs_child`, it may only run in one.
@@ -64,23 +64,23 @@ def read_source(path: Path, settings: AssetSettings) -> SourceFile:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise Rejected("unsupported_format", f"suffix {suffix!r}; expected one of {SUFFIXES}")
-    data = _read_regular(path, settings.max_source_bytes)
+    data = _read_regular(path, limits.max_bytes)
     if needs_child(path):
-        return _usd_file(path, settings)
-    check_header(data, suffix, settings.max_source_faces)
+        return _usd_file(path, limits)
+    check_header(data, suffix, limits.max_faces)
     buffers: dict[str, bytes] = {}
-    materials, keep = MaterialFiles(), settings.own_materials.keep
+    materials, keep = MaterialFiles(), limits.with_materials
     if suffix in (".glb", ".gltf"):
         tree = read_tree(data, suffix)
-        check_tree(tree, settings)
-        left = settings.max_source_bytes - len(data)
+        check_tree(tree, limits)
+        left = limits.max_bytes - len(data)
         for uri, target in buffer_paths(tree, path.parent).items():
             buffers[uri] = _read_regular(target, left)
             left -= len(buffers[uri])
         if keep:
             materials = gltf_files(tree, path.parent, left, _read_regular)
     elif suffix == ".obj" and keep:
-        left = settings.max_source_bytes - len(data)
+        left = limits.max_bytes - len(data)
         materials = obj_files(data, path.parent, left, _read_regular)
     digest = hashlib.sha256(data)
     for files in (buffers, materials.data):
@@ -95,10 +95,10 @@ def read_source(path: Path, settings: AssetSettings) -> SourceFile:
     )
 
 
-def _usd_file(path: Path, settings: AssetSettings) -> SourceFile:
-    from pipeline.assets.reading.usd_source import UsdSource
+def _usd_file(path: Path, limits: ReadLimits) -> SourceFile:
+    from pipeline.foreign.usd.object_source import UsdSource
 
-    usd = UsdSource(path, settings)
+    usd = UsdSource(path, limits)
     kind = path.suffix.lower()[1:]
     return SourceFile(kind=kind, data=b"", buffers={}, sha256=usd.sha256, usd=usd)
 
