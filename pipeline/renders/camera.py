@@ -1,6 +1,6 @@
 """`Camera`: one pinhole and its pixel grid, which is all that a tracer knows of a view."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,3 +16,9 @@ class Camera:
     """Full field of view, equal in width and height."""
     resolution: int
     """Width and height in pixels."""
+
+    def scaled(self, factor: float) -> "Camera":
+        """Return the camera that sees the same of a scene that is so many times as large."""
+        c2w = self.c2w.copy()
+        c2w[:3, 3] *= factor
+        return replace(self, c2w=c2w)

@@ -53,10 +53,11 @@ _GOLDEN = 1.1673039782614187
 class VectorTracer:
     """A scene on the LLVM or CUDA backend; see `Tracer` for the meaning of its methods."""
 
-    def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
+    def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int, scale: float = 1) -> None:
+        """Load a scene that is `scale` times as large as cameras take it for."""
         surfaces, emitters = split_triangles(scene)
         order = np.concatenate([surfaces, emitters])
-        self._record, self._emitters = scene, emitters
+        self._record, self._emitters, self._scale = scene, emitters, scale
         seen, sky = _load(scene, surfaces), shining_sky(scene)
         self._scene = KernelScene(
             surfaces=seen,
@@ -107,6 +108,9 @@ class VectorTracer:
     def pass_sum(self, camera: Camera) -> "_DeviceSum":
         return _DeviceSum(self, camera)
 
+    def _film(self, camera: Camera) -> Film:
+        return Film(camera.scaled(self._scale))
+
     def _one_pass(self, camera: Camera, pixels: Any, *, seed: int, spp: int) -> list[Any]:
         """Return the means of some pixels (Color3f) of each part.
 
@@ -125,7 +129,7 @@ class VectorTracer:
     ) -> list[Any]:
         """Return the camera paths' share of the light (Color3f), beside so many light paths."""
         sampler = _sampler(pixels, seed, spp)
-        film, beside = Film(camera), dr.opaque(mi.Float, light_paths)
+        film, beside = self._film(camera), dr.opaque(mi.Float, light_paths)
         ray = film.rays(*_jittered(camera, pixels, sampler, spp))
         traced = trace(self._scene, film, self._parts, beside, sampler, ray)
         dr.eval(traced)  # all parts in one kernel
@@ -140,13 +144,13 @@ class VectorTracer:
         to = mi.Point2f(u[2], u[3])
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(seed_for(seed, "light paths"), count)
-        film, parts = Film(camera), self._parts
+        film, parts = self._film(camera), self._parts
         trace_light(self._scene, film, parts, beside, emitter, to, sampler, splats)
         share = dr.opaque(mi.Float64, light_paths / count)
         return parts.of_indirect([mi.Color3f(total.picture() * share) for total in splats])
 
     def features(self, camera: Camera, *, spp: int) -> Features:
-        ray = Film(camera).rays(*_on_a_grid(camera, spp))
+        ray = self._film(camera).rays(*_on_a_grid(camera, spp))
         hit = self._scene.surfaces.ray_intersect_preliminary(ray, coherent=True)
         active = hit.is_valid()
         normal, lobes = self._scene.table.shading(hit.prim_index, hit.prim_uv, active)
@@ -163,7 +167,7 @@ class VectorTracer:
         )
 
     def hits(self, camera: Camera) -> NDArray[np.bool_]:
-        ray = Film(camera).rays(*_on_a_grid(camera, 1))
+        ray = self._film(camera).rays(*_on_a_grid(camera, 1))
         found = self._scene.surfaces.ray_intersect_preliminary(ray, coherent=True).is_valid()
         return read_back(found).reshape(camera.resolution, camera.resolution)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.builds.named import BUILDS, named_build
+from pipeline.renders.load_tracer import choose_tracing_scale
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
@@ -73,6 +74,7 @@ def _require_within_budget(pool: list[PooledAsset], names: Iterable[str], scenes
             with contextlib.suppress(Rejected):
                 scene = compose_scene(settings, pool, seed=2, scene_index=index, attempt=0)
                 fullest = max(fullest, scene.num_triangles / most)
+                assert choose_tracing_scale(scene) == 1, "no preset's pictures change by a size"
         # A level of the small pool is a quarter of the next finer one: little is ever left.
         assert 0.75 < fullest <= 1, (name, fullest)
 
