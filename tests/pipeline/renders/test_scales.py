@@ -29,7 +29,7 @@ def resized(scene: Scene, factor: float) -> Scene:
 def scene_of_a_metre(index: int) -> Scene:
     scene = sampled_like_scene(np.random.default_rng(index), num_views=1)
     seen = scene.vertex_positions[scene.faces[~scene.triangle_emits]].reshape(-1, 3)
-    return resized(scene, 1 / np.linalg.norm(np.ptp(seen, axis=0)))
+    return resized(scene, 1 / float(np.linalg.norm(np.ptp(seen, axis=0))))
 
 
 @pytest.mark.usefixtures("llvm")
