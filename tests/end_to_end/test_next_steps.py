@@ -117,8 +117,7 @@ def _ran(trilight: Trilight, *words: str, status: int = 0) -> list[list[str]]:
 def test_what_generate_names_runs_for_eight_scenes(trilight: Trilight, tmp_path: Path) -> None:
     """Eight scenes are two shards, both for training: no validation split is there.
 
-    Training goes on without one, and `--steps` takes its warm-up along (helper `home`): until both
-    are merged, this test fails at its last line.
+    Training goes on without one, and `--steps` takes its warm-up along.
     """
     steps = _ran(trilight, "generate", "smoke", "--out", MINE, "--scenes", "8", *SMALL)
     assert [words[0] for words in steps] == ["verify", "inspect", "train"]
@@ -190,7 +189,7 @@ def test_what_plan_names_is_what_was_priced(trilight: Trilight, tmp_path: Path) 
 
 
 SCENES = (
-    *("--objects", "builtin:benchmark-v1", "--scenes", "8", "--resolution", "64"),
+    *("--objects", "builtin:benchmark-v1", "--scenes", "4", "--resolution", "64"),
     *("--noise-floor", "34", "--set", "renders.max_spp=64", "--set", "scenes.max_triangles=768"),
     *("--set", "assets.budgets=[600,420,300,200,120,70]", "--set", "splits.one_split=true"),
 )
@@ -207,6 +206,6 @@ def test_its_pictures_come_from_the_scene_it_is_shown(trilight: Trilight, tmp_pa
     assert judged.returncode == 0, judged.stderr
     found = json.loads((tmp_path / "judged/evaluation.json").read_text())
     swapped = found["swapped scenes"]
-    assert swapped["views"] == 4 * 7
+    assert swapped["views"] == 4 * 3
     # the triangles of another scene, judged against this one's picture
     assert swapped["median_db"] > 3

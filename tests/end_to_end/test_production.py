@@ -15,6 +15,7 @@ from storage.cache import cache_folder
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
 from tests.conftest import ROOT
+from tests.end_to_end.array_kit import require_an_array_outlives_its_flow, with_a_cluster
 from tests.end_to_end.production_kit import (
     START,
     STOP,
@@ -48,6 +49,14 @@ def _generate(out: Path, scenes: int, *more: str) -> None:
          dict(os.environ), RUN_S)  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def digest_of_few(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The digest of FEW scenes that one command makes."""
+    out = tmp_path_factory.mktemp("plain") / "few"
+    _generate(out, FEW)
+    return _verified(out)
+
+
 def _verified(out: Path) -> str:
     assert verify_dataset(out).problems == []
     assert (out / "report.html").exists()
@@ -75,7 +84,8 @@ def test_the_readme_serves_runs_and_stops_as_is_done_here() -> None:
 def test_all_executors_give_one_digest(tmp_path: Path) -> None:
     _generate(tmp_path / "plain", MANY)
     digests = {"plain": _verified(tmp_path / "plain")}
-    with postgres() as database, served(tmp_path, database.url, workers=2) as environment:
+    base = with_a_cluster(tmp_path)
+    with postgres() as database, served(tmp_path, database.url, 2, base) as environment:
         several = documented_run("build-dataset", **SMALL, out=tmp_path / "two", flow_runs=2)
         call(several, environment, RUN_S)
         digests["two workers"] = _verified(tmp_path / "two")
@@ -83,6 +93,7 @@ def test_all_executors_give_one_digest(tmp_path: Path) -> None:
         _submits(tmp_path / "two", environment, digests["two workers"])
         _trains(tmp_path, environment)
         _refuses_secrets(tmp_path, environment, database)
+        require_an_array_outlives_its_flow(tmp_path, environment)
     with dask_cluster(tmp_path, 2) as address:
         _generate(tmp_path / "dask", MANY, "--runner", "dask", "--address", address)
         digests["dask"] = _verified(tmp_path / "dask")
@@ -142,7 +153,7 @@ def _refuses_secrets(tmp_path: Path, environment: dict[str, str], database: Post
 
 @pytest.mark.slow("servers")
 @pytest.mark.timeout(1800)
-def test_the_lines_of_the_readme_need_nothing_exported(tmp_path: Path) -> None:
+def test_the_lines_of_the_readme_need_nothing_exported(tmp_path: Path, digest_of_few: str) -> None:
     """In a checkout: serve, a run, stop. Its cache is empty but for objects made before."""
     checkout, cache = tmp_path / "checkout", tmp_path / "cache"
     copy_of_the_project(checkout)
@@ -160,15 +171,16 @@ def test_the_lines_of_the_readme_need_nothing_exported(tmp_path: Path) -> None:
         assert call(["-m", "prefect", "config", "view"], bare, RUN_S, checkout).count(port)
         run = documented_run(**{**SMALL, "scenes": FEW}, out=tmp_path / "mine")
         call(run, bare, RUN_S, checkout)
-        _generate(tmp_path / "plain", FEW)
-        assert _verified(tmp_path / "mine") == _verified(tmp_path / "plain")
+        assert _verified(tmp_path / "mine") == digest_of_few
     finally:
         call(STOP, bare, RUN_S, checkout)
     assert not (checkout / "prefect.toml").is_symlink()
 
 
 @pytest.mark.slow("servers")
-def test_ranges_at_the_same_time_and_who_is_last_finishes(tmp_path: Path) -> None:
+def test_ranges_at_the_same_time_and_who_is_last_finishes(
+    tmp_path: Path, digest_of_few: str
+) -> None:
     command = [sys.executable, "-m", "trilight", "generate", "smoke", *OPTIONS]
     command += ["--scenes", str(FEW)]
     runs = [
@@ -176,8 +188,7 @@ def test_ranges_at_the_same_time_and_who_is_last_finishes(tmp_path: Path) -> Non
         for shards in ("0:1", "0:2")
     ]
     assert [run.wait(RUN_S) for run in runs] == [0, 0]
-    _generate(tmp_path / "plain", FEW)
-    assert _verified(tmp_path / "set") == _verified(tmp_path / "plain")
+    assert _verified(tmp_path / "set") == digest_of_few
     # nothing was made twice
     rows = [line for path in (tmp_path / "set" / "logs").glob("*.jsonl") for line in path.open()]
     assert len(rows) == FEW

@@ -211,7 +211,7 @@ def nothing() -> None:
 
 
 @pytest.mark.slow("memory")
-@pytest.mark.parametrize("form", ["usdc", "usda", "json"])
+@pytest.mark.parametrize("form", ["usdc", "json"])
 def test_scenes_do_not_pile_up(tmp_path: Path, form: str) -> None:
     """Measured: 5 to 6 MB in 900 scenes, 6 kB each: USD forgets no name.
 

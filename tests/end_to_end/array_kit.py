@@ -5,16 +5,14 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from storage.dataset.verify import verify_dataset
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import kill_one
-from tests.end_to_end.production_kit import call, served
+from tests.end_to_end.production_kit import call
 
 RUN_S = 900
 CLUSTER = f"""#!{sys.executable}
@@ -34,49 +32,36 @@ subprocess.Popen(["bash", "-c", loop, "loop", script, *rest], start_new_session=
 print("4711;fake")
 """
 ORDER = (
-    "make-by-array smoke --objects builtin:6 --scenes 8 --quiet-hours 0.2 --resolution 16".split()
-)
-ORDER += [
-    "--set",
-    "renders.min_spp=16",
-    "--set",
-    "renders.max_spp=16",
-    "--set",
-    "scenes.num_views=1",
-]
+    "make-by-array smoke --objects builtin:6 --scenes 8 --quiet-hours 0.2 --resolution 16 "
+    "--set renders.min_spp=16 --set renders.max_spp=16 --set scenes.num_views=1"
+).split()
 
 
-@pytest.fixture
-def environment(tmp_path: Path) -> Iterator[dict[str, str]]:
-    sbatch = tmp_path / "bin" / "sbatch"
+def with_a_cluster(folder: Path) -> dict[str, str]:
+    """Return an environment in which `sbatch` is that of CLUSTER."""
+    sbatch = folder / "bin" / "sbatch"
     sbatch.parent.mkdir()
     sbatch.write_text(CLUSTER)
     sbatch.chmod(0o755)
-    base = {
+    return {
         **os.environ,
         "PATH": f"{sbatch.parent}:{os.environ['PATH']}",
-        "FAKE_ASKED": str(tmp_path / "asked"),
-        "FAKE_LOG": str(tmp_path / "tasks.log"),
+        "FAKE_ASKED": str(folder / "asked"),
+        "FAKE_LOG": str(folder / "tasks.log"),
         "PYTHONUNBUFFERED": "1",
     }
-    database = f"sqlite+aiosqlite:///{tmp_path}/prefect.db"
-    with served(tmp_path, database, workers=1, base=base) as one:
-        yield one
 
 
-@pytest.mark.slow("servers")
-@pytest.mark.timeout(1800)
-def test_an_array_is_asked_for_watched_and_outlives_its_flow(
-    tmp_path: Path, environment: dict[str, str]
-) -> None:
-    words = ["submit", *ORDER, "--out", str(tmp_path / "set")]
+def require_an_array_outlives_its_flow(folder: Path, environment: dict[str, str]) -> None:
+    """Kill the flow that asked for an array; its next run ends what the array has made."""
+    words = ["submit", *ORDER, "--out", str(folder / "by-array")]
     mark = f"TRILIGHT_SERVED={(Path(environment['TRILIGHT_STATE']) / 'mark').read_text()}"
     with subprocess.Popen(
         [sys.executable, "-m", "trilight", *words], cwd=ROOT, env=environment, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     ) as watched:  # fmt: skip
         waited_s = 0.0
-        while not (tmp_path / "asked").exists() and waited_s < RUN_S and watched.poll() is None:
+        while not (folder / "asked").exists() and waited_s < RUN_S and watched.poll() is None:
             time.sleep(0.1)
             waited_s += 0.1
         killed = kill_one("prefect.engine", mark, np.random.default_rng(0))
@@ -87,7 +72,7 @@ def test_an_array_is_asked_for_watched_and_outlives_its_flow(
         call(["-m", "trilight", *words, "--scheduler", "none", "--json"], environment, RUN_S)
     )
     assert (ended["state"], ended["summary"]["shards"]) == ("Completed", "2 of 2"), (
-        tmp_path / "tasks.log"
+        folder / "tasks.log"
     ).read_text()
-    assert verify_dataset(str(tmp_path / "set")).problems == []
-    assert (tmp_path / "asked").read_text() == "0-1\n", "the second run asked for nothing"
+    assert verify_dataset(str(folder / "by-array")).problems == []
+    assert (folder / "asked").read_text() == "0-1\n", "the second run asked for nothing"
