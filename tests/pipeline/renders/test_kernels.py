@@ -1,8 +1,6 @@
-"""What is paid once: loading a scene, compiling a kernel; hundreds of scenes leave nothing."""
+"""What is paid once: loading a scene, compiling a kernel. (Memory: tests/extremes.)"""
 
-import contextlib
 import dataclasses
-import os
 from collections.abc import Callable, Iterator
 
 import drjit as dr
@@ -10,14 +8,12 @@ import numpy as np
 import pytest
 
 from pipeline.builds.named import named_build
-from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders import vector_tracer
 from pipeline.renders.camera import Camera
-from pipeline.renders.renderer import SceneRenderer, set_threads
+from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.variant import Variant, activate
 from pipeline.renders.vector_tracer import VectorTracer
 from storage.records.scene import Scene
 from tests.pipeline.renders.guided_scenes import lit_by_a_mirror, mirrors
@@ -154,45 +150,3 @@ def _counted(way: str, read: Callable[..., object], reads: list[str]) -> Callabl
         return read(*arguments, **named)
 
     return counted
-
-
-LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=600, calls_per_child=250)
-"""A child is replaced on the way."""
-
-NUM_SCENES = 500
-
-
-def set_up(variant: Variant) -> None:
-    activate(variant)
-    set_threads(2)
-
-
-def render_one(index: int) -> tuple[float, int]:
-    """Return the mean of a scene's picture and this process' resident bytes."""
-    scene = sampled_like_scene(np.random.default_rng(index), num_views=1)
-    view = SceneRenderer(scene, SETTINGS).render_view(scene.c2w[0], float(scene.fov_deg[0]), 0)
-    return float(view.radiance_rgb.mean()), _resident_bytes()
-
-
-def _resident_bytes() -> int:
-    with open("/proc/self/statm") as stream:
-        return int(stream.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
-@pytest.mark.slow("memory")
-def test_hundreds_of_scenes_leave_nothing_behind(variant: Variant) -> None:
-    parents, children, means = [], [], []
-    child = IsolatedChild(limits=LIMITS, setup=set_up, setup_args=(variant,))
-    with contextlib.closing(child):
-        for index in range(NUM_SCENES):
-            mean, resident = child.call(render_one, index)
-            means.append(mean)
-            children.append(resident)
-            parents.append(_resident_bytes())
-    assert np.isfinite(means).all() and min(means) >= 0
-    # The parent passes numbers on: a leak of one picture (12 kB) each would be 11 MB of some 200.
-    assert parents[-1] < 1.03 * parents[100]
-    # A child grows by 2 % while its first hundred scenes bring arrays of other sizes; a leak of one
-    # scene's arrays (some 100 kB) each would be 15 MB, a tenth.
-    for first in range(0, NUM_SCENES, LIMITS.calls_per_child):
-        assert children[first + LIMITS.calls_per_child - 1] < 1.05 * children[first + 100]
