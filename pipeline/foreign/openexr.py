@@ -9,7 +9,7 @@
 
 import io
 import math
-import re
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -107,55 +107,52 @@ def _parts(data: bytes, *, header_only: bool) -> Sequence[Any]:
             io.BytesIO(data), separate_channels=True, header_only=header_only, num_threads=0
         )
     except Exception as error:  # the library fails in many ways
-        why = re.sub(r'"?<python_buffer>"?', "it", f"{error!s:.160}").replace("\n", " ")
-        raise Rejected(
-            "load_error", f"it is cut off, damaged or no OpenEXR file ({why}); write it again"
-        ) from error
+        raise _cut_off() from error
     parts: Sequence[Any] = file.parts
     return parts
 
 
 def _cut_off() -> Rejected:
-    return Rejected("load_error", "it is cut off or damaged: pixels are missing; write it again")
+    return Rejected("load_error", "it is cut off or damaged; write it again")
 
 
 def _chosen(headers: Sequence[Mapping[str, Any]]) -> _Choice:
     """Return which channels are the picture; layers and further views give way to bare names."""
-    candidates = [_Choice(part, *group) for part, group in _groups(headers)]
-    bare = [choice for choice in candidates if _layer(headers, choice) == ""]
+    choices = list(_choices(headers))
+    bare = [choice for choice in choices if _layer(headers, choice) == ""]
     if bare:
         return bare[0]
-    main = [choice for choice in candidates if _is_main(headers, choice)]
-    for among in (main, candidates):
+    main = [choice for choice in choices if _is_main(headers, choice)]
+    colors = [choice for choice in choices if choice.letters[0] != "Y"]
+    for among in (main, colors, choices):
         if len(among) == 1:
             return among[0]
+    layers = _listed(_layer(headers, choice) for choice in choices)
     names = [str(channel.name) for header in headers for channel in header["channels"]]
-    layers = " and ".join(repr(_layer(headers, choice)) for choice in candidates[:4])
     raise Rejected(
         "load_error",
-        f"its layers {layers:.80} are {len(candidates)} pictures; write one of them alone"
-        if candidates
+        f"its layers {layers} are pictures each; write one of them alone"
+        if choices
         else f"its channels are {', '.join(names):.80}; expected R, G and B, or Y",
     )
 
 
-def _groups(
-    headers: Sequence[Mapping[str, Any]],
-) -> Iterator[tuple[int, tuple[tuple[str, ...], tuple[str, ...]]]]:
-    """Yield the letters and names of all that may be a picture, by part; colors before greys."""
-    layers: dict[tuple[int, str], dict[str, str]] = {}
+def _choices(headers: Sequence[Mapping[str, Any]]) -> Iterator[_Choice]:
+    """Yield all that may be a picture, colors before greys."""
+    layers: dict[tuple[int, str], dict[str, str]] = defaultdict(dict)
     for part, header in enumerate(headers):
         for channel in header["channels"]:
             layer, _, letter = str(channel.name).rpartition(".")
-            layers.setdefault((part, layer), {})[letter.upper()] = str(channel.name)
-    for wanted in (_COLOR, _CHROMA, None):
+            layers[part, layer][letter.upper()] = str(channel.name)
+    for wanted in (_COLOR, _CHROMA, _GREY, None):
         for (part, _), names in layers.items():
-            letters = wanted or tuple(sorted(set(names) - {"A"}))
-            is_one = wanted is not None or (len(letters) == 1 and letters[0] not in ("Z", "ID"))
-            if set(letters) <= set(names) and is_one:
-                called = tuple(names[letter] for letter in letters)
-                alpha = (names["A"],) if "A" in names else ()
-                yield part, ((*(wanted or _GREY), *("A" for _ in alpha)), (*called, *alpha))
+            letters = wanted or tuple(set(names) - {"A"})  # one channel of any name is grey
+            if letters == ("Z",) or (letters == _GREY and "X" in names):
+                continue  # depth, or CIE XYZ
+            if set(letters) <= set(names) and len(letters) == len(wanted or _GREY):
+                alpha = ("A",) if "A" in names else ()
+                called = tuple(names[letter] for letter in (*letters, *alpha))
+                yield _Choice(part, (*(wanted or _GREY), *alpha), called)
 
 
 def _layer(headers: Sequence[Mapping[str, Any]], choice: _Choice) -> str:
