@@ -18,8 +18,13 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from pipeline.foreign.linear_picture import LinearPicture
-from pipeline.foreign.primaries import REC709, are_rec709, as_rec709, luminance_weights
+from pipeline.foreign.linear_picture import (
+    REC709,
+    LinearPicture,
+    are_rec709,
+    as_rec709,
+    luminance_weights,
+)
 from storage.errors import Rejected
 
 MAGIC = b"\x76\x2f\x31\x01"

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.linear_picture import LinearPicture
-from pipeline.foreign.primaries import are_rec709, as_rec709
+from pipeline.foreign.linear_picture import LinearPicture, are_rec709, as_rec709
 from storage.errors import Rejected
 
 MAGIC = b"#?"

@@ -15,8 +15,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.foreign.light_pictures import read_linear_picture
-from pipeline.foreign.linear_picture import LinearPicture
-from pipeline.foreign.primaries import REC709, luminance_weights, rec709_from
+from pipeline.foreign.linear_picture import (
+    REC709,
+    LinearPicture,
+    luminance_weights,
+    rec709_from,
+)
 from storage.errors import Rejected
 from tests.for_each import for_each
 
