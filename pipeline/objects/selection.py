@@ -29,6 +29,9 @@ _MOST_HEAD, _MOST_TAIL = 1 << 14, 1 << 20
 _MESH = re.compile(r".*-[0-9a-f]{8}\.(?:ply|glb)")
 """How `assets` calls its meshes."""
 
+_UNREAD = frozenset(
+    "fbx dae blend 3ds 3mf ma mb max abc x3d wrl ifc step stp iges skp vrm zip 7z rar".split()
+)
 _USD = ("usd", "usda", "usdc", "usdz")
 
 _MODELS = ("models", "models_fine", "models_reconst", "models_cad", "models_eval")
@@ -82,6 +85,16 @@ def _is_output(folder: str, inside: Mapping[str, set[str]]) -> bool:
         )
         for marks in _OUTPUTS
     )
+
+
+def say_unread(names: Sequence[str], objects: Sequence[str]) -> None:
+    """Name files of other formats for objects, and archives, that no object file stands beside."""
+    stems = {_stem(name) for name in objects}
+    stems |= {stem for name in names if (stem := _stem(name)).startswith(".")}  # hidden
+    others = sorted(n for n in names if _suffix(n) in _UNREAD and _stem(n) not in stems)
+    if others:
+        shown = f"{printable(others[0])}{_and_more(len(others) - 1)}"
+        say_once(f"left out as formats that are not read: {shown}; convert or unpack them")
 
 
 def drop_scenes(root: Path, names: Sequence[str]) -> list[str]:

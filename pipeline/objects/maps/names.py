@@ -12,9 +12,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 _WORDS: Mapping[str, str] = {
-    "base": r"base[-_ ]?(?:colou?r|map)|albedo(?:[-_ ]?transparency)?|alb|diffuse|diff|dif|"
-    r"colou?r|col|bc|basecolou?r[-_ ]opacity|b-o",
-    "specular": r"specular|spec|refl|reflection",
+    "base": r"base[-_ ]?(?:colou?r|map)|albedo(?:[-_ ]?transparency)?|alb|diff|dif|"
+    r"diffuse(?:[-_ ]?colou?r)?|colou?r|col|bc|basecolou?r[-_ ]opacity|b-o",
+    "specular": r"specular(?:[-_ ]?colou?r)?|spec|refl|reflection",
     "roughness": r"roughness|rough|rgh",
     "metallic": r"metallic|metalness|metal",
     "gloss": r"gloss|glossiness|smoothness",
@@ -67,6 +67,7 @@ _LATER = (".webp", ".exr")
 _BETWEEN = "[-_. ]+"
 _SIZE = r"\d{1,2}k(?:[-_](?:jpe?g|png|tiff?|exr))?|\d{3,5}(?:x\d{3,5})?(?:px)?|(?:hi|low)[-_]?res"
 _TAIL = (
+    rf"(?:{_BETWEEN}(?:srgb|raw|linear|acescg))?"
     rf"(?P<kind>(?:{_BETWEEN}(?:var)?\d{{1,2}})?)"
     rf"(?P<tail>(?:{_BETWEEN}(?:{_SIZE}))*(?:{_BETWEEN}(?:metalness|specular|lod\d))?)"
 )

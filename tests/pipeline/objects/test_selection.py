@@ -55,6 +55,17 @@ def test_the_named_folder_may_be_an_output_and_scenes_of_ours_are_no_objects(
     assert drop_scenes(tmp_path, sorted(p.name for p in tmp_path.iterdir())) == ["theirs.usda"]
 
 
+def test_other_formats_without_a_twin_are_named_once(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    say_once.cache_clear()
+    for name in ("a.obj", "a.fbx", "b.fbx", "c.zip", "d.txt"):
+        (tmp_path / name).write_bytes(b"x")
+    assert [row.uid for row in list_folder(tmp_path, None).records] == ["a"]
+    (said,) = caplog.messages
+    assert "not read: b.fbx and 1 more" in said
+
+
 @for_each(
     "names, kept",
     [

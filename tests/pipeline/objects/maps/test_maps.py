@@ -65,6 +65,7 @@ def _find(folder: Path, kind: str = TEXTURE, licence: str | None = None) -> Foun
             Plate_COL_2K_METALNESS            Plate_2K_METALNESS       base
             Wood_Base_Color                   Wood                     base
             Wood_Normal_OpenGL                Wood                     normal
+            Wood_Roughness_Raw_2k             Wood_2k                  roughness
             Wood_Mixed_AO                     Wood                     occlusion
             wood_0045_color_4k                wood_0045_4k             base
             vckndbi_4K_Albedo                 vckndbi_4K               base
