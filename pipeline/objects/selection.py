@@ -7,9 +7,9 @@ an object that collections keep beside it (for collisions, with less detail, in 
 import functools
 import logging
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from storage.remote.safe_url import printable
 
@@ -34,17 +34,20 @@ _UNREAD = frozenset(
 )
 _USD = ("usd", "usda", "usdc", "usdz")
 
-_MODELS = ("models", "models_fine", "models_reconst", "models_cad", "models_eval")
-"""Folders of the BOP datasets, whose files of one name are one object."""
-
-_SIZES = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf")
-"""Folders of the YCB objects: one object in several ways."""
+_TWINS = (
+    (re.compile(r"(?<![^/])normalized_model\.obj$"), "raw_model.obj"),  # 3D-FUTURE
+    (re.compile(r"(?<![^/])models_\w+/(obj_\d+\.ply)$"), r"models/\1"),  # BOP
+    (re.compile(r"(?<![^/])nontextured\.(?:ply|stl)$"), "textured.obj"),  # YCB
+    (re.compile(r"(?<![^/])(?:google_64k|google_512k|poisson|tsdf)/(?:non)?textured\.\w+$"),
+     "google_16k/textured.obj"),
+)  # fmt: skip
+"""Files of one object by the file that is taken instead where it is there."""
 
 _COLLISION = re.compile(
     r"(?i)(?:(?P<of>.*?)[-_. ])?(?:coll?ision|collider|coll|vhacd|coacd|"
     r"convex[-_]?(?:hull|decomp\w*))(?:[-_ ]?(?:geometry|mesh|hull|model))?(?:[-_.]?\d+)?|UCX_.*"
 )
-_LOD = re.compile(r"(?i)(?P<of>.*?)(?:[-_. ]|(?<=[a-z0-9]))lod[-_]?(?P<level>\d{1,2})(?P<rest>\D*)")
+_LOD = re.compile(r"(?i)(?P<of>.*?(?:[-_. ]|[a-z0-9]))lod[-_]?(?P<level>\d{1,2})(?P<rest>\D*)")
 
 log = logging.getLogger("trilight.objects")
 
@@ -68,7 +71,7 @@ def drop_outputs(names: Iterable[str]) -> list[str]:
     for name in names:
         inside[_folder(name)].add(name.rpartition("/")[2])
     ours = {folder for folder in inside if folder and _is_output(folder, inside)}
-    kept = [name for name in names if not any(above in ours for above in _folders(name))]
+    kept = [name for name in names if ours.isdisjoint(map(str, PurePosixPath(name).parents))]
     if len(kept) < len(names):
         shown = ", ".join(printable(folder) for folder in sorted(ours)[:3])
         say_once(f"left out as outputs of Trilight: {shown}{_and_more(len(ours) - 3)}")
@@ -154,46 +157,22 @@ def _collisions(names: Sequence[str]) -> Iterator[str]:
 
 def _levels(names: Sequence[str]) -> Iterator[str]:
     """Yield all but the finest of files whose names differ in a number after LOD."""
-    finest: dict[tuple[str, ...], tuple[int, str]] = {}
-    for name in sorted(names):
-        match = _LOD.fullmatch(_stem(name))
-        if match is None:
-            continue
-        key = (_folder(name), match["of"], match["rest"], _suffix(name))
-        level = int(match["level"])
-        if key not in finest:
-            finest[key] = level, name
-        elif level < finest[key][0]:
-            yield finest[key][1]
-            finest[key] = level, name
-        else:
-            yield name
+    levels: dict[str, list[tuple[int, str]]] = defaultdict(list)
+    for name in names:
+        if match := _LOD.fullmatch(name):
+            levels[f"{match['of']}/{match['rest']}".lower()].append((int(match["level"]), name))
+    for files in levels.values():
+        yield from (name for _, name in sorted(files)[1:])
 
 
 def _twins(names: Sequence[str]) -> Iterator[str]:
-    """Yield further files of one object in the layouts of 3D-FUTURE, YCB and the BOP datasets."""
+    """Yield further files of one object in the layouts of known collections."""
     there = set(names)
-    inside = Counter(_folder(name) for name in names)
     for name in names:
-        folder, file = _folder(name), name.rpartition("/")[2]
-        above, _, last = folder.rpartition("/")
-        stem = f"{above}/" if above else ""
-        if file == "normalized_model.obj" and f"{folder}/raw_model.obj".lstrip("/") in there:
-            yield name
-        elif file in ("nontextured.ply", "nontextured.stl") and f"{folder}/textured.obj" in there:
-            yield name
-        elif last in _MODELS[1:] and re.fullmatch(r"obj_\d+\.ply", file):
-            better = _MODELS[: _MODELS.index(last)]
-            if any(f"{stem}{other}/{file}" in there for other in better):
+        for pattern, better in _TWINS:
+            other = pattern.sub(better, name)
+            if other != name and other in there:
                 yield name
-        elif last in _SIZES[1:] and file in ("textured.obj", "nontextured.ply", "nontextured.stl"):
-            if any(inside[f"{stem}{other}"] for other in _SIZES[: _SIZES.index(last)]):
-                yield name
-
-
-def _folders(name: str) -> Iterator[str]:
-    parts = name.split("/")
-    return ("/".join(parts[:depth]) for depth in range(1, len(parts)))
 
 
 def _folder(name: str) -> str:
