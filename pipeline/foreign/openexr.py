@@ -33,6 +33,8 @@ MAGIC = b"\x76\x2f\x31\x01"
 _MAX_BYTES = 3 << 30
 """Maximum bytes of the pixels of all parts: the library reads them all."""
 
+_TILED, _MANY_PARTS = 0x200, 0x1000
+
 _GREY, _CHROMA, _COLOR = ("Y",), ("BY", "RY", "Y"), ("R", "G", "B")
 _MAIN_LAYERS = ("combined", "beauty", "rgba", "rgb", "color", "colour", "c")
 """Last words of the names of layers that are the picture itself."""
@@ -80,6 +82,7 @@ def read_openexr(data: bytes, max_pixels: int, *, is_color: bool = True) -> Line
         Rejected: load_error or too_many_pixels.
     """
     headers = _headers(data)
+    _require_whole(data)
     choice = _chosen(headers)
     header = headers[choice.part]
     window = _picture_window(header)
@@ -115,6 +118,30 @@ def _parts(data: bytes, *, header_only: bool) -> Sequence[Any]:
         raise _cut_off() from error
     parts: Sequence[Any] = file.parts
     return parts
+
+
+def _require_whole(data: bytes) -> None:
+    """Raise Rejected where chunks of a file of one part are missing or lie beyond its end.
+
+    The library prints much about such files.
+    """
+    flags, at = int.from_bytes(data[4:8], "little"), 8
+    if flags & _MANY_PARTS:
+        return
+    while data[at : at + 1] not in (
+        b"",
+        b"\0",
+    ):  # the attributes: name, type and size, which the library has read
+        at = data.index(0, data.index(0, at) + 1) + 1
+        at += 4 + int.from_bytes(data[at : at + 4], "little")
+    at, first, last = at + 1, len(data), 0
+    while at < first:  # the table ends where the first chunk begins
+        offset = int.from_bytes(data[at : at + 8], "little")
+        at, first, last = at + 8, min(first, offset), max(last, offset)
+    head = 20 if flags & _TILED else 8  # ends in the size of what follows
+    size = int.from_bytes(data[last + head - 4 : last + head], "little")
+    if first < at or last + head + size > len(data):
+        raise _cut_off()
 
 
 def _cut_off() -> Rejected:

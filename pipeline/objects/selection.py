@@ -19,8 +19,13 @@ _OUTPUTS = (
     ("manifest.json", "logs/asked.json"),
     ("settings.json", "metrics.jsonl"),
     ("leaderboard.md", "pairs.csv"),
+    ("transforms.json", "images/0.png", "depths/0.npy"),
 )
-"""What is in folders of `assets`, of datasets, finished or not, of training and of leaderboards."""
+"""What is in folders of assets, datasets (finished or not), training, leaderboards, nerfstudio."""
+
+_OF_SCENE = re.compile(r"(?P<in>(?:.*/)?)(?:objects|templates/backgrounds)/(?P<scene>[^/]+)")
+_MESH_OF_SCENE = re.compile(r"\d+_.*_\d+\.obj")
+"""Folders beside a RenderFormer scene `SCENE.json`, and how `convert` and `export` call meshes."""
 
 _SCENE = b"trilight:sceneSha256"
 """What every USD file of a scene of ours holds."""
@@ -82,6 +87,9 @@ def _is_output(folder: str, inside: Mapping[str, set[str]]) -> bool:
     meshes = inside.get(f"{folder}/meshes", set())
     if "assets.json" in inside[folder] and meshes and all(map(_MESH.fullmatch, meshes)):
         return True  # `assets` that was broken off
+    scene = _OF_SCENE.fullmatch(folder)
+    if scene and f"{scene['scene']}.json" in inside.get(scene["in"].rstrip("/"), ()):
+        return all(map(_MESH_OF_SCENE.fullmatch, inside[folder]))
     return any(
         all(
             mark.rpartition("/")[2] in inside.get(_folder(f"{folder}/{mark}"), ()) for mark in marks
