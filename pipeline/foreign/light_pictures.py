@@ -2,6 +2,7 @@
 
 from pipeline.foreign import openexr, radiance_hdr
 from pipeline.foreign.linear_picture import LinearPicture
+from storage.errors import Rejected
 
 
 def read_linear_picture(
@@ -17,8 +18,11 @@ def read_linear_picture(
     Raises:
         Rejected: not_hdr, load_error or too_many_pixels.
     """
-    if data.startswith(openexr.MAGIC):
-        return openexr.read_openexr(data, max_pixels, is_color=is_color)
-    if data.startswith(radiance_hdr.MAGIC):
-        return radiance_hdr.read_radiance_hdr(data, max_pixels, is_color=is_color)
+    try:
+        if data.startswith(openexr.MAGIC):
+            return openexr.read_openexr(data, max_pixels, is_color=is_color)
+        if data.startswith(radiance_hdr.MAGIC):
+            return radiance_hdr.read_radiance_hdr(data, max_pixels, is_color=is_color)
+    except (ValueError, LookupError, ArithmeticError) as error:  # names that are no UTF-8, ...
+        raise Rejected("load_error", "it is damaged; write it again") from error
     return None

@@ -132,7 +132,7 @@ def _require_whole(data: bytes) -> None:
         b"",
         b"\0",
     ):  # the attributes: name, type and size, which the library has read
-        at = data.index(0, data.index(0, at) + 1) + 1
+        at = data.find(0, data.find(0, at) + 1) + 1 or len(data)
         at += 4 + int.from_bytes(data[at : at + 4], "little")
     at, first, last = at + 1, len(data), 0
     while at < first:  # the table ends where the first chunk begins
