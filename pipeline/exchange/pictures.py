@@ -8,8 +8,9 @@ import io
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.errors import TrilightError
-from storage.records.exr import channel_names, decode_channels, window_size
+from pipeline.foreign.light_pictures import read_linear_picture
+from storage.conventions import linear_from_srgb8
+from storage.errors import Rejected, TrilightError
 
 MAX_BYTES = 256 << 20
 MAX_PIXELS = 64 << 20
@@ -18,19 +19,45 @@ MAX_PIXELS = 64 << 20
 Pixels = NDArray[np.uint8] | NDArray[np.float32]
 """[H, W, C] encoded as the file has them, the top row first; uint8 and C of 1 to 4, or float32."""
 
-_EXR_MAGIC = b"\x76\x2f\x31\x01"
-_CHANNELS = {("Y",): "Y", ("B", "G", "R"): "RGB", ("A", "B", "G", "R"): "RGBA"}
 
-
-def decoded_pixels(data: bytes, name: str) -> Pixels | None:
+def decoded_pixels(
+    data: bytes, name: str, lost: list[str] | None = None, *, is_color: bool = True
+) -> Pixels | None:
     """Return a picture, or None where the bytes are none.
 
-    16-bit pictures become float32 from 0 to 1, OpenEXR is float32 as it is.
+    16-bit pictures become float32 from 0 to 1; OpenEXR and Radiance are linear float32.
+
+    Args:
+        data: the file.
+        name: what messages call it.
+        lost: gets a sentence for what is not read of it.
+        is_color: whether its numbers are colors, so that its primaries count.
 
     Raises:
-        TrilightError: it has more pixels than MAX_PIXELS; `name` stands for it.
+        TrilightError: it has more pixels than MAX_PIXELS.
     """
-    return _exr(data, name) if data.startswith(_EXR_MAGIC) else _plain(data, name)
+    try:
+        picture = read_linear_picture(data, MAX_PIXELS, is_color=is_color)
+    except Rejected as error:
+        if error.reason == "too_many_pixels":
+            raise TrilightError(f"{name}: {error.message}.") from error
+        if lost is not None:
+            lost.append(f"{name!r:.100}: {error.message}")
+        return None
+    if picture is None:
+        return _plain(data, name)
+    if lost is not None:
+        lost += [f"{name!r:.100}: {sentence}" for sentence in picture.unread]
+    return picture.values
+
+
+def linear_rgb(pixels: Pixels) -> NDArray[np.float32]:
+    """Return the linear colors [H, W, 3] of a picture without alpha; 8 bits are sRGB."""
+    rgb = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
+    if rgb.dtype == np.uint8:
+        decoded: NDArray[np.float32] = linear_from_srgb8()[rgb]
+        return decoded
+    return np.asarray(rgb, np.float32)
 
 
 def is_encoded(pixels: Pixels) -> bool:
@@ -55,24 +82,6 @@ def _plain(data: bytes, name: str) -> Pixels | None:
     except (OSError, SyntaxError, ValueError, LookupError):
         return None  # PIL says so in all of these ways
     return values if values.ndim == 3 else values[..., None]
-
-
-def _exr(data: bytes, name: str) -> Pixels | None:
-    def check(header: object) -> None:
-        height, width = window_size(header)  # type: ignore[arg-type]
-        _require_size(width, height, name)
-
-    try:
-        key = _CHANNELS.get(tuple(sorted(channel_names(data))))
-        if key is None:
-            return None
-        separate = tuple("RGBA" if key == "RGBA" else key)
-        found = decode_channels(data, separate, check, separate=True)
-    except TrilightError as error:
-        if name in str(error):
-            raise
-        return None
-    return np.stack([found[letter].astype(np.float32) for letter in separate], axis=-1)
 
 
 def _require_size(width: int, height: int, name: str) -> None:

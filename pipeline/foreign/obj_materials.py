@@ -131,7 +131,7 @@ class _Reader:
         clamp = options.get("-clamp") == ["on"]
         picture = Picture(
             values=self._values[name],
-            is_srgb=is_srgb,
+            is_srgb=is_srgb and self._values[name].dtype != np.float16,  # floats are linear
             wrap=("clamp", "clamp") if clamp else ("repeat", "repeat"),
         )
         return Slot(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipeline.foreign.light_pictures import read_linear_picture
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected
 
@@ -43,24 +44,31 @@ class Decoder:
 def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
     """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 of greys of 16 bits.
 
-    Palettes, greys, transparency and CMYK become RGBA; colours of 16 bits are read to 8.
+    Palettes, greys, transparency and CMYK become RGBA; colours of 16 bits are read to 8. OpenEXR
+    and Radiance are float16, cut to [0, 1].
 
     Raises:
         Rejected: texture_too_large or texture_unreadable.
     """
     try:
+        if (linear := read_linear_picture(data, max_pixels)) is not None:
+            return np.ascontiguousarray(_unit_values(linear.values)[::-1])
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # ours is stricter
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
                 if image.width * image.height > max_pixels:
                     raise Rejected(
                         "texture_too_large",
-                        f"{name!r:.80} is {image.width} x {image.height}; at most {max_pixels} "
+                        f"{image.width} x {image.height}; at most {max_pixels} "
                         "pixels are left. Make it smaller, or raise own_materials.max_pixels",
                     )
                 return np.ascontiguousarray(_values(image)[::-1])
-    except (Rejected, MemoryError):
+    except MemoryError:
         raise
+    except Rejected as error:
+        large = error.reason in ("texture_too_large", "too_many_pixels")
+        reason = "texture_too_large" if large else "texture_unreadable"
+        raise Rejected(reason, f"{name!r:.80}: {error.message}") from error
     except Image.DecompressionBombError as error:
         raise Rejected("texture_too_large", f"{name!r:.80}: {error!s:.120}") from error
     except Exception as error:  # decoders of other people's files fail in every way
@@ -83,6 +91,18 @@ def has_colours(data: bytes) -> bool:
         return False
 
 
+def _unit_values(values: NDArray[np.float32]) -> NDArray[np.float16]:
+    """Return RGBA [H, W, 4] of linear values [H, W, 1 to 4]."""
+    if not np.isfinite(values).all():
+        raise Rejected("texture_unreadable", "some of its values are no finite numbers")
+    count = values.shape[2]
+    rgba = np.ones((*values.shape[:2], 4), np.float16)
+    rgba[..., :3] = np.clip(values[..., :3] if count >= 3 else values[..., :1], 0, 1)
+    if count in (2, 4):
+        rgba[..., 3] = np.clip(values[..., -1], 0, 1)
+    return rgba
+
+
 def _values(image: Image.Image) -> NDArray:
     if image.mode.startswith("I"):
         grey = np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
@@ -95,7 +115,7 @@ class Picture:
     """Values in [0, 1] over texture coordinates, u to the right and v up."""
 
     values: NDArray
-    """[H, W, 4] as `decoded` returns them."""
+    """[H, W, 4] as `decoded` returns them, or linear float32."""
     is_srgb: bool
     """Whether red, green and blue are sRGB-encoded; alpha never is."""
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
@@ -128,8 +148,9 @@ class Picture:
         """Return linear values of texels [..., 4] of the picture or of a level."""
         if texels.dtype == np.float32:
             return texels
-        if texels.dtype == np.uint16:
-            deep: NDArray[np.float32] = np.divide(texels, 65535, dtype=np.float32)
+        if texels.dtype in (np.uint16, np.float16):
+            most = 65535 if texels.dtype == np.uint16 else 1
+            deep: NDArray[np.float32] = np.divide(texels, most, dtype=np.float32)
             if self.is_srgb:
                 deep[..., :3] = _from_srgb(deep[..., :3])
             return deep

@@ -23,6 +23,7 @@ from storage.dataset.splits import split_of_object
 from storage.digests import sha256_hex
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import SKY, TEXTURE, Failure, LockedObject
+from storage.remote.safe_url import printable
 
 log = logging.getLogger("trilight.maps")
 
@@ -107,6 +108,7 @@ def accept_maps(asked: MapFolders, settings: BuildSettings, *, workers: int) -> 
         )
         outcomes = _prepared(kind, found.maps, settings, workers)
         usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
+        failures += [_unread(locked, path) for locked, path in usable if _notes(path).exists()]
         lost = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
         failures += [*found.failures, *lost]
         if not usable:
@@ -146,6 +148,16 @@ def _prepared(
         pool.close()
 
 
+def _notes(prepared: Path) -> Path:
+    """Return the file beside a prepared one that says what is not read; absent where all is."""
+    return prepared.with_suffix(".txt")
+
+
+def _unread(locked: LockedObject, path: Path) -> Failure:
+    message = _notes(path).read_text("utf-8")
+    return Failure(stage="objects", item=locked.uid, reason="not_read", message=message)
+
+
 def _nothing() -> None:
     """Set up a child that needs nothing."""
 
@@ -156,11 +168,14 @@ def _outcome(asked: MapFiles, child: IsolatedChild) -> Path:
     path = cache_folder("maps") / name[:2] / f"{name}.safetensors"
     if not path.exists():
         try:
-            data = call_with_retries(child, prepare_map, asked)
+            data, unread = call_with_retries(child, prepare_map, asked)
         except ChildFailed as failure:
             raise Rejected(failure.reason, failure.message) from failure
         if outcome_name(asked) != name:
             raise Rejected("unreadable_file", "it changed while it was being prepared")
+        if unread:
+            message = printable(f"it is used without {'; '.join(unread)}")
+            write_atomically(_notes(path), message.encode())
         write_atomically(path, data)
     return path
 

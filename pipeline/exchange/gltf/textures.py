@@ -92,7 +92,8 @@ def _picture(
         return None
     image = texture["source"]
     data = document.picture_bytes(image)
-    pixels = None if data is None else decoded_pixels(data, f"{document.name}: image {image}")
+    name = f"{document.name}: image {image}"
+    pixels = decoded_pixels(data, name, lost) if data else None
     if pixels is None:
         lost.append(f"image {image}: missing or not readable as a picture")
         return None

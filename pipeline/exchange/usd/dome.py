@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.pictures import MAX_BYTES
+from pipeline.exchange.pictures import MAX_BYTES, decoded_pixels, linear_rgb
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
 from pipeline.exchange.usd.names import MAP_TEXTS, SKY_ROWS, SKY_VISIBLE, VISIBLE_TO_CAMERA
 from pipeline.foreign.usd.stage import OpenedUsd
@@ -151,8 +151,8 @@ def _picture(light: Any, time: Any, opened: OpenedUsd) -> NDArray[np.float64] | 
     if data is None:
         opened.lost.append(f"{place}: map {asset.path!r:.100} is missing")
         return None
-    try:
-        return decode_exr(data).astype(np.float64)
-    except TrilightError as error:
-        opened.lost.append(f"{place}: map {asset.path!r:.100} is not read ({error})")
+    pixels = decoded_pixels(data, asset.path, opened.lost)
+    if pixels is None:
+        opened.lost.append(f"{place}: map {asset.path!r:.100} is not read; its light was left out")
         return None
+    return linear_rgb(pixels).astype(np.float64)

@@ -91,7 +91,8 @@ def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
         TrilightError: it is too large.
     """
     data = None if node.resolved is None else asset_bytes(node.resolved, MAX_BYTES)
-    pixels = None if data is None else decoded_pixels(data, Path(node.named).name)
+    name, is_color = Path(node.named).name, node.colour_space != "raw"
+    pixels = decoded_pixels(data, name, opened.lost, is_color=is_color) if data else None
     if pixels is None:
         opened.lost.append(
             f"texture {node.named!r:.100}: missing or not readable as a picture"

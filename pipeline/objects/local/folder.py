@@ -6,6 +6,7 @@ from pathlib import Path
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
 from pipeline.objects.listing import SUFFIXES, Listing, assign_uids, failure, is_object_file
 from pipeline.objects.local.catalogue import only_catalogue, read_catalogue
+from pipeline.objects.selection import drop_copies, drop_outputs, drop_scenes, say_unread
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
 from storage.remote.safe_url import printable
@@ -46,7 +47,10 @@ def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
         TrilightError: a folder cannot be read.
     """
     root = Path(os.path.realpath(folder))
-    uids, failures = assign_uids(_object_files(root))
+    names = drop_outputs(walk_files(root))
+    files = [name for name in names if is_object_file(name)]
+    say_unread(names, files)
+    uids, failures = assign_uids(drop_copies(drop_scenes(root, files)))
     records = []
     for name, uid in uids.items():
         # Not Path.resolve: links that go round in a circle make it raise.
@@ -76,8 +80,14 @@ def file_record(
     )
 
 
-def _object_files(root: Path) -> list[str]:
-    """Return the paths of the object files relative to `root`, with / between their parts."""
+def walk_files(root: Path) -> list[str]:
+    """Return the paths of all files relative to `root`, with / between their parts.
+
+    Hidden folders and linked ones are not entered.
+
+    Raises:
+        TrilightError: a folder cannot be read.
+    """
 
     def stop(error: OSError) -> None:
         raise TrilightError(
@@ -85,9 +95,9 @@ def _object_files(root: Path) -> list[str]:
             "readable folder. Mend its permissions or move it away."
         )
 
-    found = []
+    names: list[str] = []
     for place, folders, files in os.walk(root, onerror=stop):
         folders[:] = [name for name in folders if not name.startswith(".")]
         inner = Path(place).relative_to(root)
-        found += [(inner / name).as_posix() for name in files if is_object_file(name)]
-    return found
+        names += [(inner / name).as_posix() for name in files]
+    return names

@@ -19,13 +19,21 @@ from pipeline.objects.licences import (
 )
 from pipeline.objects.listing import failure
 from pipeline.objects.local.catalogue import read_catalogue
-from pipeline.objects.maps.names import NO_TEXTURE, PICTURES, named_part, sets_of
+from pipeline.objects.local.folder import walk_files
+from pipeline.objects.maps.names import PICTURES, group_textures
+from pipeline.objects.selection import drop_outputs
 from storage.errors import TrilightError
 from storage.records.objects import SKY, TEXTURE, Failure, ObjectRecord
 from storage.remote.safe_url import printable
 
-SUFFIXES = {TEXTURE: PICTURES, SKY: (".exr", ".hdr")}
+SUFFIXES = {TEXTURE: PICTURES, SKY: (".exr", ".hdr", ".pic")}
 """Of the files of each kind, compared in lower case."""
+
+_UNREAD = {
+    TEXTURE: "hdr psd psb dds ktx ktx2 tx jp2 j2k avif heic jxl gif svg sbsar zip 7z rar".split(),
+    SKY: "png jpg jpeg tif tiff webp tga bmp psd dds ktx ktx2 tx jxl avif heic zip 7z rar".split(),
+}
+"""Suffixes of pictures, and of archives that may hold some, that are not read as such."""
 
 PLURALS = {TEXTURE: "textures", SKY: "skies"}
 """What folders and catalogues of each kind are called."""
@@ -49,7 +57,7 @@ class FoundMaps:
     """Those with an allowed licence, sorted by uid."""
     failures: tuple[Failure, ...]
     """The other files, of the stage `objects`: licence_refused, no_base_colour, map_not_used,
-    name_clash, link_outside."""
+    unknown_map, unread_format, name_clash, link_outside."""
 
 
 def find_maps(
@@ -105,63 +113,77 @@ def _only_catalogue(root: Path, plural: str) -> Path | None:
 
 
 def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[FoundMap]:
-    """Return records with their files; those beside a base colour that belong to it come too.
+    """Return records with their files; those beside a base color that belong to it come too.
 
     Links out of the folder do not.
     """
-    sets: dict[Path, dict[str, dict[str, Path]]] = {}
-    found = []
-    for record in records:
-        path = Path(record.path)
-        files = {"base" if kind == TEXTURE else "map": path}
-        if kind == TEXTURE and path.parent.is_dir():
-            if path.parent not in sets:
-                sets[path.parent] = sets_of(path.parent)
-            beside = sets[path.parent].get(named_part(path.stem)[0], {})
-            files = {
-                part: at
-                for part, at in beside.items()
-                if part not in NO_TEXTURE and _is_below(root, at)
-            } | files
-        found.append(FoundMap(record=record, files=files))
-    return found
+    if kind == SKY:
+        return [FoundMap(record=row, files={"map": Path(row.path)}) for row in records]
+    textures: dict[str, dict[str, str]] = {}
+    for folder in sorted({Path(row.path).parent for row in records}):
+        if folder.is_dir():
+            inner = folder.relative_to(root)
+            names = [(inner / name).as_posix() for name in os.listdir(folder)]
+            for files in group_textures(_pictures(names))[0].values():
+                textures[files["base"]] = files
+    maps = []
+    for row in records:
+        base = Path(row.path)
+        files = textures.get(base.relative_to(root).as_posix(), {})
+        beside = {part: root / name for part, name in files.items() if _is_below(root, root / name)}
+        maps.append(FoundMap(record=row, files={**beside, "base": base}))
+    return maps
 
 
 def _scanned(
     kind: str, root: Path, stated: StatedLicence, failures: list[Failure]
 ) -> list[ObjectRecord]:
     """Return a record of each set of textures, or of each map, and add what is no part of one."""
-    names = _files(root, SUFFIXES[kind])
-    parts = {name: _named(kind, name.rpartition(".")[0]) for name in names}
-    begun = {stem for stem, part in parts.values() if part == "base"}
+    every = [name for name in drop_outputs(walk_files(root)) if not _is_hidden(name)]
+    names = sorted(name for name in every if name.lower().endswith(SUFFIXES[kind]))
+    outside = {name for name in names if not _is_below(root, root / name)}
+    names = [name for name in names if name not in outside]
+    unused = {
+        name: ("unread_format", f"expected {' '.join(SUFFIXES[kind])}; convert or unpack it")
+        for name in every
+        if name.lower().rpartition(".")[2] in _UNREAD[kind]
+    }
+    message = "it is a link out of the folder; copy the file into it"
+    unused |= dict.fromkeys(sorted(outside), ("link_outside", message))
+    bases = {name.rpartition(".")[0]: name for name in reversed(names)}
+    if kind == TEXTURE:
+        textures, left = group_textures(names)
+        bases, unused = {stem: files["base"] for stem, files in textures.items()}, unused | left
+    else:
+        message = "another file of the same name is taken; rename one of them"
+        twins = [name for name in names if bases[name.rpartition(".")[0]] != name]
+        unused |= dict.fromkeys(twins, ("name_clash", message))
+    failures += [
+        failure(f"{kind}:{printable(name)}", reason, printable(message))
+        for name, (reason, message) in unused.items()
+    ]
     records: dict[str, ObjectRecord] = {}
-    for name, (stem, part) in parts.items():
-        uid, item = f"{kind}:{printable(stem)}", f"{kind}:{printable(name)}"
-        if not _is_below(root, root / name):
-            message = "it is a link out of the folder; copy the file into it"
-            failures.append(failure(item, "link_outside", message))
-        elif part in NO_TEXTURE:
-            message = f"it is a map of {part}; expected colours, metallic and roughness"
-            failures.append(failure(item, "map_not_used", message))
-        elif part != "base":
-            if stem not in begun:
-                message = f"it is the {part} of {stem}, which has no base colour; add or rename it"
-                failures.append(failure(item, "no_base_colour", printable(message)))
-        elif uid in records:
+    for stem, name in bases.items():
+        uid = f"{kind}:{printable(stem)}"
+        if uid in records:
             message = "another file of the same name is taken; rename one of them"
-            failures.append(failure(item, "name_clash", message))
+            failures.append(failure(f"{kind}:{printable(name)}", "name_clash", message))
         else:
             records[uid] = _record(uid, root / name, stated)
     return list(records.values())
 
 
+def _pictures(names: Sequence[str]) -> list[str]:
+    return [n for n in names if n.lower().endswith(PICTURES) and not _is_hidden(n)]
+
+
+def _is_hidden(name: str) -> bool:
+    return name.rpartition("/")[2].startswith(".")
+
+
 def _is_below(root: Path, path: Path) -> bool:
     """Return whether a file is in a folder, wherever links lead; for links in a circle too."""
     return Path(os.path.realpath(path)).is_relative_to(root)
-
-
-def _named(kind: str, stem: str) -> tuple[str, str]:
-    return named_part(stem) if kind == TEXTURE else (stem, "base")
 
 
 def _record(uid: str, path: Path, stated: StatedLicence) -> ObjectRecord:
@@ -174,24 +196,3 @@ def _record(uid: str, path: Path, stated: StatedLicence) -> ObjectRecord:
         attribution="",
         source_url="",
     )
-
-
-def _files(root: Path, suffixes: tuple[str, ...]) -> list[str]:
-    """Return the paths of the files with a suffix relative to `root`, none of them hidden."""
-
-    def stop(error: OSError) -> None:
-        raise TrilightError(
-            f"{printable(str(error.filename))}: cannot be read ({error.strerror}); expected a "
-            "readable folder. Mend its permissions or move it away."
-        )
-
-    found: list[str] = []
-    for place, folders, files in os.walk(root, onerror=stop):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        inner = Path(place).relative_to(root)
-        found += [
-            (inner / name).as_posix()
-            for name in files
-            if name.lower().endswith(suffixes) and not name.startswith(".")
-        ]
-    return sorted(found)

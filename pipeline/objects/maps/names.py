@@ -1,61 +1,235 @@
-"""Which file of a folder is which part of a texture, by the last word of its name."""
+"""Which file of a folder is which part of which texture, by the words of its name.
+
+The words are those of the large collections (ambientCG, Poly Haven, FreePBR, Poliigon, cgbookcase,
+ShareTextures, 3DTextures, TextureCan, Quixel, MatSynth) and of exports (Substance, Sketchfab, glTF,
+Unreal). A name without such a word is a color in a folder of such names alone; beside files whose
+names have one, it is a color only where they belong to it, and otherwise it is unknown.
+"""
 
 import re
-from collections.abc import Mapping
-from pathlib import Path
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 _WORDS: Mapping[str, str] = {
-    "base": r"base[-_ ]?colou?r|albedo|diffuse|diff|colou?r|col",
-    "specular": r"specular|spec",
-    "roughness": r"roughness|rough",
+    "base": r"base[-_ ]?(?:colou?r|map)|albedo(?:[-_ ]?transparency)?|alb|diff|dif|"
+    r"diffuse(?:[-_ ]?colou?r)?|colou?r|col|bc|basecolou?r[-_ ]opacity|b-o",
+    "specular": r"specular(?:[-_ ]?colou?r)?|spec|refl|reflection",
+    "roughness": r"roughness|rough|rgh",
     "metallic": r"metallic|metalness|metal",
-    "normal": r"normal(?:[-_ ]?(?:gl|dx))?|nor(?:[-_ ]?(?:gl|dx))?|nrm|bump",
-    "height": r"height|displacement|disp",
-    "occlusion": r"ambient[-_ ]?occlusion|ao|arm|orm",
-    "opacity": r"opacity|alpha|mask",
-    "gloss": r"gloss|glossiness",
-    "emission": r"emission|emissive",
+    "gloss": r"gloss|glossiness|smoothness",
+    "orm": r"orm|arm|ao[-_ ]?r[-_ ]?m|occlusion[-_ ]?roughness[-_ ]?metal(?:lic|ness)|"
+    r"metal(?:lic|ness)?[-_ ]?rough(?:ness)?",
+    "rma": r"rma|rmo|rmao",
+    "mra": r"mra|mro|mrao",
+    "ord": r"ord|ordp",
+    "normal": r"(?:(?:world|ws|bent|detail)[-_ ]?)?(?:normals?|norm|nor|nrm|nmap|nrml)"
+    r"(?:[-_ ]?map)?(?:[-_ ]?(?:gl|dx|ogl|opengl|directx|directx[-_ ]?9|d3d|ue|unity|16|8|[+-]?y))*"
+    r"|bump(?:[-_ ]?map)?(?:16)?",
+    "height": r"(?:height|displacement|displace|displ|disp|parallax|depth)(?:[-_ ]?map)?(?:16)?",
+    "occlusion": r"(?:mixed[-_ ]?)?(?:ambient[-_ ]?occ(?:lusion)?|occlusion|occ|ao)(?:[-_ ]?map)?",
+    "opacity": r"opacity|alpha|alpha[-_ ]?mask(?:ed)?|mask|transparency|cutout",
+    "emission": r"emission|emissive|emit|emissi(?:on|ve)[-_ ]?colou?r|glow",
+    "other": r"(?:ca|conca|conve)vity|curvature|curv|thickness|translucen(?:cy|t)|transmission|"
+    r"subsurface|sss|scatter(?:ing)?|fuzz|sheen(?:[-_ ]?colou?r)?|anisotrop\w*|clear[-_ ]?coat\w*|"
+    r"ior|id|id[-_ ]?map|mask[-_ ]?map|detail(?:[-_ ]?map)?|spec(?:ular)?[-_ ]?"
+    r"(?:level|f0|ior|gloss\w*|smoothness)|metal(?:lic|ness)[-_ ]?smoothness|diffuse[-_ ]?"
+    r"roughness|rough[-_ ]?ao",
+    "preview": r"preview|thumb|thumbnail|thumbs|render|rendering",
 }
-"""Last words of names by the part that they stand for: those of the large libraries."""
+"""Words of names by the part that they stand for."""
 
-READ = ("base", "specular", "roughness", "metallic")
+_PACKED: Mapping[str, Mapping[str, int]] = {
+    "orm": {"roughness": 1, "metallic": 2},
+    "rma": {"roughness": 0, "metallic": 1},
+    "mra": {"metallic": 0, "roughness": 1},
+    "ord": {"roughness": 1},
+}
+"""Channels of pictures that hold several parts, by the letters that name them."""
+
+TEXTURE_PARTS = ("base", "specular", "roughness", "metallic")
 """Parts that a texture is made of."""
 
-NO_TEXTURE = tuple(part for part in _WORDS if part not in READ)
-"""Parts that no material here has."""
+_READ = (*TEXTURE_PARTS, "gloss", *_PACKED)
 
-_NAME = re.compile(
-    "(?i)(?P<set>.+)[-_. ](?:"
-    + "|".join(f"(?P<{part}>{words})" for part, words in _WORDS.items())
-    + r")(?P<size>[-_. ]\d+k)?"
+_LETTERS = {"b": "base", "c": "base", "d": "base", "n": "normal", "r": "roughness", "h": "height"}
+_UNCLEAR = ("a", "e", "g", "m", "o", "s")
+"""Last letters of names that mean one thing here and another there."""
+
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".tga", ".webp", ".exr")
+"""Suffixes of pictures, in lower case; of two pictures of one part, the earlier is taken."""
+
+_PLAIN = re.compile("(?i)metal|mask|alpha|depth|glow|emit|thickness|id")
+"""Words that are also whole names of colors."""
+
+_LATER = (".webp", ".exr")
+
+_BETWEEN = "[-_. ]+"
+_SIZE = r"\d{1,2}k(?:[-_](?:jpe?g|png|tiff?|exr))?|\d{3,5}(?:x\d{3,5})?(?:px)?|(?:hi|low)[-_]?res"
+_TAIL = (
+    rf"(?:{_BETWEEN}(?:srgb|raw|linear|acescg))?"
+    rf"(?P<kind>(?:{_BETWEEN}(?:var)?\d{{1,2}})?)"
+    rf"(?P<tail>(?:{_BETWEEN}(?:{_SIZE}))*(?:{_BETWEEN}(?:metalness|specular|lod\d))?)"
+)
+_PARTS = "|".join(f"(?P<{part}>{words})" for part, words in _WORDS.items())
+_NAME = re.compile(rf"(?i)(?:(?P<set>.+?){_BETWEEN})?(?:{_PARTS}){_TAIL}")
+_LETTER = re.compile(rf"(?i)(?P<set>.+?){_BETWEEN}(?P<letter>[a-z]){_TAIL}")
+_FOLDERS = re.compile(
+    r"(?i)(?:(?P<base>base[-_ ]?colou?rs?|albedos?|diffuse)|(?P<roughness>roughness)|(?P<metallic>"
+    r"metallic|metalness)|(?P<gloss>gloss|glossiness)|(?P<normal>normals?)|(?P<height>heights?|"
+    r"displacement)|(?P<occlusion>ao|ambient[-_ ]?occlusion)|(?P<opacity>opacity))"
+)
+"""Folders of one part each, whose files have the names of textures."""
+_CAMEL = re.compile(
+    "(?<=[a-z0-9])(?=(?:Roughness|Normal|Albedo|BaseColou?r|Metallic|Metalness|Specular|Diffuse|"
+    "Displacement|Height|AmbientOcclusion|Glossiness|Opacity|Emissive)(?![a-z]))"
 )
 
 
-def named_part(stem: str) -> tuple[str, str]:
-    """Return the name of the set that a file belongs to, and its part; a bare name is a base.
+@dataclass(frozen=True)
+class _Named:
+    """What the name of a file says."""
 
-    `oak_floor_rough_4k` is part "roughness" of the set `oak_floor_4k`.
+    key: str
+    """Name of the set: equal for all files of one, with their folder."""
+    stem: str
+    """Name of the texture where the file is its color: the set, and which of its colors."""
+    part: str
+    kind: str = ""
+    """Which of several colors of a set it is, or goes with."""
+
+
+def packed_channels(part: str) -> Mapping[str, int]:
+    """Return the channels of a picture by the parts that they are; none of other parts."""
+    return _PACKED.get(part, {})
+
+
+def named_part(stem: str) -> tuple[str, str]:
+    """Return the texture that a file belongs to, and its part; a name without one is a base.
+
+    `oak_floor_rough_4k` is part "roughness" of `oak_floor_4k`.
 
     Args:
         stem: the name without its suffix, perhaps with folders before it.
     """
-    folder, slash, name = stem.rpartition("/")
-    match = _NAME.fullmatch(name)
-    if match is None:
-        return stem, "base"
-    part = next(part for part in _WORDS if match[part])
-    return f"{folder}{slash}{match['set']}{match['size'] or ''}", part
+    named = _named(stem)
+    return (stem, "base") if named is None else (named.stem, named.part)
 
 
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".tga")
-"""Suffixes of pictures, in lower case."""
+def group_textures(
+    names: Sequence[str],
+) -> tuple[dict[str, dict[str, str]], dict[str, tuple[str, str]]]:
+    """Return the files of textures by texture and part, and why the other files are not used.
+
+    Args:
+        names: paths of pictures, with / between their parts.
+
+    Returns:
+        Names by part of the textures, each with a part "base", by their names in order; reason and
+        message by name of file.
+    """
+    names = sorted(names, key=lambda name: (name.lower().endswith(_LATER), name))
+    stems = {name: name.rpartition(".")[0] for name in names}
+    named = {name: entry for name in names if (entry := _named(stems[name])) is not None}
+    _add_letters(stems, named)
+    bare = _Bare(stems, named)
+    parts: dict[tuple[str, str], dict[str, str]] = defaultdict(dict)
+    bases: dict[tuple[str, str], tuple[str, str]] = {}
+    unused: dict[str, tuple[str, str]] = {}
+    for name in (*named, *bare.colors):
+        entry = named.get(name) or _Named(bare.colors[name], bare.colors[name], "base")
+        at = entry.key, entry.kind
+        if entry.part not in _READ:
+            message = f"it is a map of {entry.part}; expected colors, metallic and roughness"
+            unused[name] = ("map_not_used", message)
+        elif (at in bases) if entry.part == "base" else (entry.part in parts[at]):
+            unused[name] = ("name_clash", "another file of the same name is taken; rename one")
+        elif entry.part == "base":
+            bases[at] = entry.stem, name
+        else:
+            parts[at][entry.part] = name
+    for name in bare.unknown:
+        message = "its name says no part, beside names that do; end it in _color, or move it away"
+        unused[name] = ("unknown_map", message)
+    _drop_packed(parts.values(), unused)
+    textures, used = {}, set()
+    for (key, kind), (stem, name) in sorted(bases.items(), key=lambda item: item[1]):
+        textures[stem] = {**parts.get((key, ""), {}), **parts.get((key, kind), {}), "base": name}
+        used |= {(key, ""), (key, kind)}
+    for at, rest in parts.items():
+        for part, name in rest.items() if at not in used else ():
+            message = (
+                f"it is the {part} of {''.join(at)}, which has no base color; add or rename it"
+            )
+            unused[name] = ("no_base_colour", message)
+    return textures, unused
 
 
-def sets_of(folder: Path) -> dict[str, dict[str, Path]]:
-    """Return the pictures of a folder by set and part; of two of one part, the first by name."""
-    found: dict[str, dict[str, Path]] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in PICTURES and not path.name.startswith("."):
-            name, part = named_part(path.stem)
-            found.setdefault(name, {}).setdefault(part, path)
-    return found
+class _Bare:
+    """Files whose names say no part: those that are colors all the same, and the others."""
+
+    def __init__(self, stems: Mapping[str, str], named: Mapping[str, _Named]) -> None:
+        """Judge each by what is beside it."""
+        with_color = {entry.key for entry in named.values() if entry.part == "base"}
+        keys = {entry.key for entry in named.values()}
+        folders = {stems[name].rpartition("/")[0] for name in named}
+        self.colors: dict[str, str] = {}
+        """Stems by name."""
+        self.unknown: list[str] = []
+        for name, stem in stems.items():
+            if name in named:
+                continue
+            is_alone = stem.rpartition("/")[0] not in folders and not name.lower().endswith(".exr")
+            if is_alone or (stem in keys and stem not in with_color):
+                self.colors[name] = stem
+            else:
+                self.unknown.append(name)
+
+
+def _named(path: str) -> _Named | None:
+    folder, slash, name = path.rpartition("/")
+    inner = f"{folder}{slash}"
+    match = _NAME.fullmatch(_CAMEL.sub("_", name))
+    if match is not None:
+        part = next(part for part in _WORDS if match[part])
+        if match["set"] is not None:
+            key = f"{inner}{match['set']}{match['tail']}"
+            stem = f"{inner}{match['set']}{match['kind']}{match['tail']}"
+            return _Named(key, stem, part, match["kind"])
+        if part not in ("other", "preview") and not _PLAIN.fullmatch(match[part]):
+            # `oak/color.png`: the folder is the set
+            return _Named(f"{inner}{match['tail']}", path, part, match["kind"])
+    above, slash, last = folder.rpartition("/")
+    within = _FOLDERS.fullmatch(last)
+    if within is not None:
+        part = next(part for part, word in within.groupdict().items() if word)
+        return _Named(f"{above}{slash}{name}", path, part)
+    return None
+
+
+def _add_letters(stems: Mapping[str, str], named: dict[str, _Named]) -> None:
+    """Add files whose names end in a letter, where letters of one set say a color and more."""
+    letters: dict[str, dict[str, tuple[str, str]]] = defaultdict(dict)
+    for name, stem in stems.items():
+        match = _LETTER.fullmatch(stem) if name not in named else None
+        if match is not None:
+            key = f"{match['set']}{match['tail']}"
+            letters[key][name] = match["letter"].lower(), f"{match['set']}{match['tail']}"
+    others = {entry.key for entry in named.values()}
+    for key, files in letters.items():
+        said = {letter for letter, _ in files.values()}
+        is_set = said <= {*_LETTERS, *_UNCLEAR} and len(said & {"b", "c", "d"}) == 1
+        if is_set and ("n" in said or key in others):
+            for name, (letter, stem) in files.items():
+                named[name] = _Named(key, stem, _LETTERS.get(letter, "other"))
+
+
+def _drop_packed(parts: Iterable[dict[str, str]], unused: dict[str, tuple[str, str]]) -> None:
+    """Leave out pictures of several parts that are there as pictures of their own."""
+    for files in parts:
+        for part in [part for part in files if part in _PACKED]:
+            if all(other in files for other in _PACKED[part]):
+                message = "its channels are here as pictures of their own"
+                unused[files.pop(part)] = ("map_not_used", message)
+        if "roughness" in files and "gloss" in files:
+            unused[files.pop("gloss")] = ("map_not_used", "there is a map of roughness")

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
+from pipeline.foreign.light_pictures import read_linear_picture
+from pipeline.objects.maps.names import TEXTURE_PARTS, packed_channels
 from pipeline.objects.maps.picture import picture_values
 from pipeline.objects.maps.radiance import usable_map
-from pipeline.objects.maps.rgbe import rgbe_radiance
 from pipeline.objects.maps.texture_set import texture_set
 from storage.digests import canonical_json, sha256_hex
-from storage.errors import Rejected, TrilightError
-from storage.records.exr import channel_names, decode_channels
+from storage.errors import Rejected
 from storage.records.objects import SKY
 from storage.records.safe_read import read_safetensors
 from storage.records.texture import content_digest
@@ -29,7 +29,7 @@ MOST_BYTES = 1 << 30
 MOST_ROWS = 4096
 """Most rows of a map, and half of its most columns."""
 
-_RECIPE = 1
+_RECIPE = 2
 """To be raised when what is made of a file changes."""
 
 _MOST_HEADER = 1 << 12
@@ -78,50 +78,64 @@ def outcome_name(asked: MapFiles) -> str:
     return sha256_hex(canonical_json(parts))[:32]
 
 
-def prepare_map(asked: MapFiles) -> bytes:
-    """Return the file of a texture or map; only children come here.
+def prepare_map(asked: MapFiles) -> tuple[bytes, tuple[str, ...]]:
+    """Return the file of a texture or map, and what is not read; only children come here.
 
     Raises:
         Rejected: the reason, and what the user can do; see `usable_map`, `texture_set` and the
             readers.
     """
     if asked.kind == SKY:
-        path = asked.files["map"]
-        radiance = _radiance(_read(path), path.suffix.lower())
-        content, arrays = (
-            content_digest("radiance", np.ascontiguousarray(radiance)),
-            {"radiance": np.ascontiguousarray(usable_map(radiance, asked.size))},
-        )
-        return PreparedMap(content_sha256=content, arrays=arrays).encoded()
-    made = texture_set(
-        {part: _named(part, path) for part, path in sorted(asked.files.items())}, asked.size
-    )
+        return _prepare_sky(_read(asked.files["map"]), asked.size)
+    pictures: dict[str, NDArray[np.float32]] = {}
+    unread: list[str] = []
+    for part, path in sorted(asked.files.items()):
+        values, notes = _picture_of(part, path)
+        unread += [f"{note} of its {part}" for note in notes]
+        if packed_channels(part) and values.shape[2] < 3:
+            unread.append(f"its {part}, which is grey: it has no channels")
+        pictures[part] = values
+    made = texture_set(unpack_parts(pictures), asked.size)
     maps = {"diffuse": made.diffuse_rgb, "specular": made.specular_rgb}
     if made.roughness is not None:
         maps["roughness"] = made.roughness
-    return PreparedMap(content_sha256=made.content_sha256, arrays=maps).encoded()
+    prepared = PreparedMap(content_sha256=made.content_sha256, arrays=maps)
+    return prepared.encoded(), tuple(unread)
 
 
-def _named(part: str, path: Path) -> NDArray[np.float32]:
-    """Return the values of a picture; a rejection says which part it was."""
+def _prepare_sky(data: bytes, rows: int) -> tuple[bytes, tuple[str, ...]]:
+    picture = read_linear_picture(data, 2 * MOST_ROWS * MOST_ROWS)
+    if picture is None:
+        raise Rejected("not_hdr", "it is neither an OpenEXR nor a Radiance file; write it again")
+    grey = picture.values.shape[2] < 3
+    radiance = np.ascontiguousarray(picture.values[..., [0, 0, 0] if grey else [0, 1, 2]])
+    prepared = PreparedMap(
+        content_sha256=content_digest("radiance", radiance),
+        arrays={"radiance": np.ascontiguousarray(usable_map(radiance, rows))},
+    )
+    return prepared.encoded(), picture.unread
+
+
+def unpack_parts(
+    pictures: Mapping[str, NDArray[np.float32]],
+) -> Mapping[str, NDArray[np.float32]]:
+    """Return the parts that a texture is made of; those of pictures of their own come first."""
+    parts = dict(pictures)
+    for name, values in pictures.items():
+        for part, channel in packed_channels(name).items():
+            if part not in parts and values.shape[2] == 3:
+                parts[part] = values[..., channel : channel + 1]
+    if "gloss" in parts and "roughness" not in parts:
+        parts["roughness"] = 1 - parts["gloss"]
+    return {part: values for part, values in parts.items() if part in TEXTURE_PARTS}
+
+
+def _picture_of(part: str, path: Path) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """Return the values of a picture, and what of it is not read; a rejection says which part."""
     try:
-        return picture_values(_read(path))
+        return picture_values(_read(path), is_color=part == "base")
     except Rejected as rejection:
         raise Rejected(rejection.reason, f"{part}: {rejection.message}") from rejection
-
-
-def _radiance(data: bytes, suffix: str) -> NDArray[np.float32]:
-    if suffix == ".hdr":
-        return rgbe_radiance(data, MOST_ROWS)
-    try:
-        names = channel_names(data)
-        channels = decode_channels(data, names, lambda header: None, separate=True)
-    except TrilightError as error:
-        raise Rejected("load_error", f"{error} Scale or write it anew.") from error
-    for wanted in ("RGB", "YYY"):
-        if set(wanted) <= set(names):
-            return np.stack([channels[name] for name in wanted], axis=-1).astype(np.float32)
-    raise Rejected("load_error", f"its channels are {', '.join(names)[:80]}; expected R, G and B")
 
 
 def _read(path: Path) -> bytes:

@@ -18,6 +18,7 @@ from pipeline.objects.local.catalogue import CATALOGUE_NAMES, only_catalogue, re
 from pipeline.objects.local.folder import file_record
 from pipeline.objects.remote.files import RemoteFiles
 from pipeline.objects.remote.folder import RemoteFolder
+from pipeline.objects.selection import drop_copies, drop_outputs, say_unread
 from storage.cache import cache_folder
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -85,7 +86,10 @@ def _uncatalogued(
             f"objects {folder.url.shown!r}: {catalogue} is listed but cannot be fetched; expected "
             "a readable catalogue. Check your access to it."
         )
-    uids, failures = assign_uids(name for name in names if is_object_file(name))
+    names = drop_outputs(names)
+    objects = [name for name in names if is_object_file(name)]
+    say_unread(names, objects)
+    uids, failures = assign_uids(drop_copies(objects))
     records = []
     for name, uid in uids.items():
         try:

@@ -12,6 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 from pipeline.exchange.usd.read import UsdScene, read_usd
 from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
 from scene_templates.rotations import uniform_rotation
+from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.exr import encode_channels
@@ -21,6 +22,7 @@ from storage.records.scene_file import encode_scene, scene_digest
 from storage.records.texture import MapSource, Texture
 from tests.for_each import with_folders
 from tests.pipeline.exchange.exchange_kit import assert_usd_keeps_all
+from tests.pipeline.foreign.test_light_pictures import radiance_hdr
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.sky_maps import COLOURS, POLES, one_sun, six_poles, smooth
 from tests.textured_by_hand import number_texture, sky, textured_scene
@@ -142,6 +144,19 @@ def test_a_map_that_cannot_be_read_is_said(tmp_path: Path, asset: str, said: str
     found = _read(path)
     assert found.scene.environment is None
     assert any(said in text for text in found.lost)
+
+
+def test_a_dome_shows_pictures_of_radiance_and_of_8_bits(tmp_path: Path) -> None:
+    texels = np.full((2, 4, 4), (64, 128, 32, 130), np.uint8)
+    (tmp_path / "a.hdr").write_bytes(radiance_hdr(texels, header="EXPOSURE=2\n"))
+    Image.fromarray(np.full((2, 4, 3), 188, np.uint8)).save(tmp_path / "a.png")
+    for name, value in (("a.hdr", [0.5, 1, 0.25]), ("a.png", linear_from_srgb8()[[188] * 3])):
+        stage = _foreign(tmp_path / "a.usda")
+        light = UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment"))
+        light.GetTextureFileAttr().Set(Sdf.AssetPath(f"./{name}"))
+        stage.Save()
+        radiance = _sky(_read(tmp_path / "a.usda").scene).radiance_rgb
+        np.testing.assert_allclose(radiance, np.broadcast_to(value, (2, 4, 3)), rtol=1e-6)
 
 
 def test_a_map_that_was_changed_is_read_as_it_is_now(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Textures and maps from outside: names, licences, resampling, formats; what is wrong says so."""
 
-import io
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +9,10 @@ from PIL import Image
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.maps.listing import FoundMaps, find_maps
-from pipeline.objects.maps.names import named_part
+from pipeline.objects.maps.names import group_textures, named_part
+from pipeline.objects.maps.prepared import MapFiles, decode_prepared, prepare_map
 from pipeline.objects.maps.radiance import usable_map
 from pipeline.objects.maps.resample import area_means, flux, solid_angle_means
-from pipeline.objects.maps.rgbe import rgbe_radiance
 from pipeline.objects.maps.texture_set import texture_set
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected, TrilightError
@@ -44,55 +42,58 @@ def sun_map(seed: int = 0, rows: int = 8) -> NDArray[np.float32]:
     return radiance
 
 
-def hdr(texels: NDArray[np.uint8], *, runs: bool, header: str = "") -> bytes:
-    """Return a Radiance picture of mantissas and exponents [H, W, 4]."""
-    rows, columns = texels.shape[:2]
-    out = io.BytesIO()
-    out.write(f"#?RADIANCE\n{header}FORMAT=32-bit_rle_rgbe\n\n-Y {rows} +X {columns}\n".encode())
-    for row in texels:
-        if not runs:
-            out.write(row.tobytes())
-            continue
-        out.write(bytes([2, 2, columns >> 8, columns & 255]))
-        for channel in range(4):
-            at = 0
-            while at < columns:
-                values = row[at : at + 127, channel]
-                if (values == values[0]).all():
-                    out.write(bytes([128 + len(values), values[0]]))
-                else:
-                    out.write(bytes([len(values)]) + values.tobytes())
-                at += len(values)
-    return out.getvalue()
-
-
 def _find(folder: Path, kind: str = TEXTURE, licence: str | None = None) -> FoundMaps:
     return find_maps(kind, str(folder), licence=licence, allowed_licences=DEFAULT_ALLOWED)
 
 
 @for_each(
-    "stem, part",
+    "stem, texture, part",
     [
-        ("wood_floor_diff_4k", ("wood_floor_4k", "base")),
-        ("Bricks076_1K_Color", ("Bricks076_1K", "base")),
-        ("a/oak-baseColor", ("a/oak", "base")),
-        ("oak_Roughness", ("oak", "roughness")),
-        ("oak_nor_gl_2k", ("oak_2k", "normal")),
-        ("oak_metalness", ("oak", "metallic")),
-        ("oak", ("oak", "base")),
-        ("color", ("color", "base")),
+        tuple(row.split())
+        for row in """
+            wood_floor_diff_4k                wood_floor_4k            base
+            Bricks076_1K_Color                Bricks076_1K             base
+            Bricks076_1K-JPG_NormalGL         Bricks076_1K-JPG         normal
+            a/oak-baseColor                   a/oak                    base
+            oak_Roughness                     oak                      roughness
+            oak_nor_gl_2k                     oak_2k                   normal
+            oak_arm_1k                        oak_1k                   orm
+            worn-planks-normal-ogl            worn-planks              normal
+            WoodFloor_COL_VAR1_3K             WoodFloor_VAR1_3K        base
+            WoodFloor_NRM16_3K                WoodFloor_3K             normal
+            Plate_METALNESS_2K_METALNESS      Plate_2K_METALNESS       metallic
+            Plate_COL_2K_METALNESS            Plate_2K_METALNESS       base
+            Wood_Base_Color                   Wood                     base
+            Wood_Normal_OpenGL                Wood                     normal
+            Wood_Roughness_Raw_2k             Wood_2k                  roughness
+            Wood_Mixed_AO                     Wood                     occlusion
+            wood_0045_color_4k                wood_0045_4k             base
+            vckndbi_4K_Albedo                 vckndbi_4K               base
+            vckndbi_Preview                   vckndbi                  preview
+            mat_metallicRoughness             mat                      orm
+            mat_specularf0                    mat                      other
+            tiles_color_2048x2048             tiles_2048x2048          base
+            x_BaseColor.1001                  x.1001                   base
+            OakRoughness                      Oak                      roughness
+            oak_metalness                     oak                      metallic
+            oak                               oak                      base
+            metal                             metal                    base
+            color                             color                    base
+            roughness/oak                     roughness/oak            roughness
+        """.strip().split("\n")
     ],
 )
-def test_the_last_word_of_a_name_is_its_part(stem: str, part: tuple[str, str]) -> None:
-    assert named_part(stem) == part
+def test_the_words_of_a_name_are_its_part(stem: str, texture: str, part: str) -> None:
+    assert named_part(stem) == (texture, part)
 
 
 def test_sets_are_found_and_the_rest_is_said(tmp_path: Path) -> None:
     for name in ("oak.png", "oak_roughness.png", "deep/tin_col.jpg", "deep/tin_metal.png"):
         png(tmp_path / name, noise(1))
-    for name in ("oak_normal.png", "steel_rough.png", "oak_color.png", ".hidden.png"):
+    for name in ("oak_normal.png", "steel_rough.png", "Oak076.png", ".hidden.png"):
         png(tmp_path / name, noise(1))
-    (tmp_path / "readme.txt").write_text("no picture")
+    for name in ("readme.txt", "oak.zip", "deep/tin.psd"):
+        (tmp_path / name).write_text("no picture")
     found = _find(tmp_path)
     files = {one.record.uid: sorted(one.files) for one in found.maps}
     assert files == {
@@ -102,9 +103,59 @@ def test_sets_are_found_and_the_rest_is_said(tmp_path: Path) -> None:
     assert {failure.item: failure.reason for failure in found.failures} == {
         "texture:oak_normal.png": "map_not_used",
         "texture:steel_rough.png": "no_base_colour",
-        "texture:oak_color.png": "name_clash",
+        "texture:Oak076.png": "unknown_map",
+        "texture:oak.zip": "unread_format",
+        "texture:deep/tin.psd": "unread_format",
     }
     assert {one.record.licence for one in found.maps} == {"LicenseRef-user-provided"}
+
+
+@for_each(
+    "names, textures, unused",
+    [
+        ("a.png b.jpg sky.exr", {"a": "a.png", "b": "b.jpg"}, "sky.exr:unknown_map"),
+        ("T_W_D.png T_W_N.png T_W_ORM.png T_W_M.png", {"T_W": "T_W_D.png T_W_ORM.png"},
+         "T_W_M.png:map_not_used T_W_N.png:map_not_used"),
+        ("w_a.png w_b.png w_c.png", {"w_a": "w_a.png", "w_b": "w_b.png", "w_c": "w_c.png"}, ""),
+        ("f_col_1.png f_col_2.png f_rough.png f_rough_2.png f_arm.png f_metal.png",
+         {"f_1": "f_col_1.png f_metal.png f_rough.png",
+          "f_2": "f_col_2.png f_metal.png f_rough_2.png"}, "f_arm.png:map_not_used"),
+        ("x/basecolor.png x/diffuse.png x/roughness.png x/normal.png",
+         {"x/basecolor": "x/basecolor.png x/roughness.png"},
+         "x/diffuse.png:name_clash x/normal.png:map_not_used"),
+        ("albedo/o.png roughness/o.png", {"albedo/o": "albedo/o.png roughness/o.png"}, ""),
+        ("o_diff.exr o_diff.png o_rough.exr o.png", {"o": "o_diff.png o_rough.exr"},
+         "o.png:unknown_map o_diff.exr:name_clash"),
+    ],
+)  # fmt: skip
+def test_folders_of_the_large_collections(
+    names: str, textures: dict[str, str], unused: str
+) -> None:
+    sets, left = group_textures(names.split())
+    assert {stem: " ".join(sorted(files.values())) for stem, files in sets.items()} == textures
+    assert " ".join(f"{name}:{reason}" for name, (reason, _) in sorted(left.items())) == unused
+
+
+def test_packed_pictures_gloss_and_floats_are_parts(tmp_path: Path) -> None:
+    packed = np.broadcast_to(np.array([10, 51, 204], np.uint8), (4, 4, 3))
+    color = np.full((4, 4, 3), 188, np.uint8)
+    linear = linear_from_srgb8()[color]
+
+    def roughness(**files: Path) -> float:
+        base = png(tmp_path / "b.png", color)
+        data, _ = prepare_map(MapFiles(kind=TEXTURE, files={"base": base, **files}, size=4))
+        return float(decode_prepared(data, "a").arrays["roughness"].mean())
+
+    assert roughness(orm=png(tmp_path / "p.png", packed)) == pytest.approx(0.2)
+    assert roughness(gloss=png(tmp_path / "g.png", packed[..., 1])) == pytest.approx(0.8)
+    floats = exr(tmp_path / "r.exr", np.full((4, 4, 3), 0.07, np.float32))
+    assert roughness(roughness=floats) == pytest.approx(0.07)
+    twins = [png(tmp_path / "b.png", color), exr(tmp_path / "b.exr", linear)]
+    prepared = [
+        prepare_map(MapFiles(kind=TEXTURE, files={"base": path}, size=4))[0] for path in twins
+    ]
+    eight, half = (decode_prepared(data, "a").arrays["diffuse"] for data in prepared)
+    np.testing.assert_allclose(eight, half, rtol=1e-5)
 
 
 def test_a_catalogue_states_licences_and_silence_is_refused(tmp_path: Path) -> None:
@@ -204,55 +255,6 @@ def test_what_is_wrong_with_a_map_is_said() -> None:
     assert found.value.reason == "negative_radiance"
     slightly = wrong(value=-1e-3)
     np.testing.assert_array_equal(usable_map(slightly, 16), np.maximum(slightly, 0))
-
-
-def _texels(rows: int, columns: int) -> np.ndarray:
-    texels = np.random.default_rng(1).integers(2, 256, (rows, columns, 4)).astype(np.uint8)
-    texels[..., 3] = 120 + texels[..., 3] % 30
-    texels[0, : columns // 2] = (7, 9, 11, 130)  # a run
-    texels[1, 1] = (200, 100, 50, 0)  # an exponent of 0 is black
-    return texels
-
-
-@for_each("runs, columns", itertools.product([True, False], [8, 300]))
-def test_values_are_mantissa_times_a_power_of_two(runs: bool, columns: int) -> None:
-    texels = _texels(3, columns)
-    found = rgbe_radiance(hdr(texels, runs=runs), 200)
-    expected = texels[..., :3] / 256 * 2.0 ** (texels[..., 3:].astype(int) - 128)
-    expected[texels[..., 3] == 0] = 0
-    assert found.dtype == np.float32
-    np.testing.assert_array_equal(found, expected)  # powers of two: exact
-
-
-def test_damaged_and_foreign_files_are_refused_with_a_reason() -> None:
-    whole = hdr(_texels(4, 16), runs=True)
-    cases = {
-        "not_hdr": [
-            b"",
-            b"P6 4 4",
-            hdr(_texels(2, 16), runs=True, header="EXPOSURE=2.0\n"),
-            whole.replace(b"32-bit_rle_rgbe", b"32-bit_rle_xyze"),
-            whole.replace(b"-Y 4", b"+Y 4"),
-        ],
-        "too_many_pixels": [
-            whole.replace(b"-Y 4", b"-Y 99999"),
-            whole.replace(b"+X 16", b"+X 99999"),
-            whole.replace(b"-Y 4", b"-Y 0"),
-        ],
-        "load_error": [
-            whole[:-5],
-            whole.replace(b"-Y 4", b"-Y 40"),
-            whole.replace(b"+X 16", b"+X 17"),
-            whole[: whole.index(b"+X 16") + 6 + 4] + b"\xff" * 400,
-            whole[: whole.index(b"+X 16") + 6 + 4] + b"\x00" * 400,
-            hdr(np.full((2, 4, 4), 1, np.uint8), runs=False),
-        ],
-    }
-    for reason, files in cases.items():
-        for number, data in enumerate(files):
-            with pytest.raises(Rejected) as found:
-                rgbe_radiance(data, 100)
-            assert found.value.reason == reason, (reason, number)
 
 
 def _flat(value: float, channels: int = 1) -> NDArray[np.float32]:

@@ -1,0 +1,28 @@
+"""Pictures of floats, OpenEXR or Radiance, told by their first bytes."""
+
+from pipeline.foreign import openexr, radiance_hdr
+from pipeline.foreign.linear_picture import LinearPicture
+from storage.errors import Rejected
+
+
+def read_linear_picture(
+    data: bytes, max_pixels: int, *, is_color: bool = True
+) -> LinearPicture | None:
+    """Return the picture of a file in linear Rec.709, or None where it is of another format.
+
+    Args:
+        data: the file.
+        max_pixels: most pixels; known before memory is taken.
+        is_color: whether its numbers are colors, so that its primaries count.
+
+    Raises:
+        Rejected: not_hdr, load_error or too_many_pixels.
+    """
+    try:
+        if data.startswith(openexr.MAGIC):
+            return openexr.read_openexr(data, max_pixels, is_color=is_color)
+        if data.startswith(radiance_hdr.MAGIC):
+            return radiance_hdr.read_radiance_hdr(data, max_pixels, is_color=is_color)
+    except (ValueError, LookupError, ArithmeticError) as error:  # names that are no UTF-8, ...
+        raise Rejected("load_error", "it is damaged; write it again") from error
+    return None

@@ -1,0 +1,81 @@
+"""Pictures of floats in the primaries of Rec.709, which all stored light has.
+
+The white of a picture becomes white: its white point is adapted by Bradford's matrix, so that grey
+stays grey.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import Rejected
+
+REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+"""CIE x and y of red, green, blue and white."""
+
+_BRADFORD = np.array(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+)
+_SAME = 1e-3
+"""Primaries that differ by less are the same: files round them to three or four digits."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LinearPicture:
+    """A picture of floats, whichever format it has."""
+
+    values: NDArray[np.float32]
+    """[H, W, C], the top row first: grey, grey and alpha, RGB or RGBA. Alpha is not divided out."""
+    unread: tuple[str, ...] = ()
+    """What of the file is not read, in short sentences."""
+
+
+def are_rec709(primaries: Sequence[float]) -> bool:
+    """Return whether primaries [8] are those of Rec.709, but for rounding."""
+    return bool(np.allclose(primaries, REC709, rtol=0, atol=_SAME))
+
+
+def luminance_weights(primaries: Sequence[float]) -> NDArray[np.float64]:
+    """Return the luminance [3] of red, green and blue, 1 in all; raises Rejected `load_error`."""
+    weights: NDArray[np.float64] = _to_xyz(primaries)[1]
+    return weights
+
+
+def rec709_from(primaries: Sequence[float]) -> NDArray[np.float64]:
+    """Return the matrix [3, 3] from colors of primaries [8] to those of Rec.709.
+
+    Raises:
+        Rejected: load_error: the primaries span no colors.
+    """
+    source, target = _to_xyz(primaries), _to_xyz(REC709)
+    cones = [_BRADFORD @ matrix.sum(axis=1) for matrix in (source, target)]
+    adapted = np.linalg.inv(_BRADFORD) @ np.diag(cones[1] / cones[0]) @ _BRADFORD
+    result: NDArray[np.float64] = np.linalg.inv(target) @ adapted @ source
+    return result
+
+
+def as_rec709(rgb: NDArray[np.float32], primaries: Sequence[float]) -> NDArray[np.float32]:
+    """Return colors [H, W, 3] in Rec.709; those that it cannot show become the nearest by channel.
+
+    Colors that were negative before stay so.
+
+    Raises:
+        Rejected: as `rec709_from`.
+    """
+    matrix = rec709_from(primaries).astype(np.float32)
+    moved: NDArray[np.float32] = rgb @ matrix.T
+    return np.where((rgb >= 0).all(axis=-1, keepdims=True), np.maximum(moved, 0), moved)
+
+
+def _to_xyz(primaries: Sequence[float]) -> NDArray[np.float64]:
+    points = np.asarray(primaries, np.float64).reshape(4, 2)
+    with np.errstate(all="ignore"):
+        x, y = points.T
+        xyz = np.stack([x / y, np.ones(4), (1 - x - y) / y])
+        if np.isfinite(xyz).all() and abs(np.linalg.det(xyz[:, :3])) > 1e-9:
+            matrix: NDArray[np.float64] = xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3])
+            if np.isfinite(matrix).all() and (_BRADFORD @ matrix.sum(axis=1) > 0).all():
+                return matrix
+    raise Rejected("load_error", f"its primaries are {points.tolist()}; expected four of a color")

@@ -1,0 +1,337 @@
+"""OpenEXR pictures of strangers: what of a file is its picture, in linear Rec.709.
+
+- The display window is the picture: what lies outside is cropped, and what is not stored is black.
+  An environment map (attribute `envmap`) fills its data window, as its text says.
+- Its colors are R, G and B, or luminance and chroma, or one channel alone: of the whole file, or
+  of its one layer or part that has some. Everything else is named.
+- Chromaticities, or the id of a color space, say what its colors are.
+"""
+
+import io
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from pipeline.foreign.linear_picture import (
+    REC709,
+    LinearPicture,
+    are_rec709,
+    as_rec709,
+    luminance_weights,
+)
+from storage.errors import Rejected
+
+MAGIC = b"\x76\x2f\x31\x01"
+"""First bytes of a file."""
+
+_MAX_BYTES = 3 << 30
+"""Maximum bytes of the pixels of all parts: the library reads them all."""
+
+_TILED, _MANY_PARTS = 0x200, 0x1000
+
+_GREY, _CHROMA, _COLOR = ("Y",), ("BY", "RY", "Y"), ("R", "G", "B")
+_MAIN_LAYERS = ("combined", "beauty", "rgba", "rgb", "color", "colour", "c")
+"""Last words of the names of layers that are the picture itself."""
+
+_SPACES = {"acescg": "lin_ap1_scene", "lin_ap1": "lin_ap1_scene"} | {
+    "aces2065-1": "lin_ap0_scene",
+    "lin_ap0": "lin_ap0_scene",
+}
+_LINEAR = ("", "unknown", "data", "linear", "scene_linear", "lin_srgb", "lin_rec709", "raw")
+"""Names of OpenImageIO for color spaces, in lower case, beside the ids of OpenEXR."""
+
+_USED = frozenset(
+    "channels compression dataWindow displayWindow lineOrder tiles type name view multiView "
+    "chunkCount version envmap chromaticities colorInteropID acesImageContainerFlag "
+    "oiio:ColorSpace".split()
+)
+_SAYS_NOTHING = frozenset(
+    "screenWindowCenter screenWindowWidth preview owner comments capDate utcOffset longitude "
+    "latitude altitude focus expTime aperture isoSpeed keyCode timeCode framesPerSecond xDensity "
+    "wrapmodes software Software worldToCamera worldToNDC dwaCompressionLevel DateTime".split()
+)
+"""Attributes that say nothing of the values of pixels."""
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """The channels of a part that are the picture."""
+
+    part: int
+    letters: tuple[str, ...]
+    """What they are: R, G and B; Y; BY, RY and Y; perhaps A behind them."""
+    names: tuple[str, ...]
+    """What they are called."""
+
+
+def read_openexr(data: bytes, max_pixels: int, *, is_color: bool = True) -> LinearPicture:
+    """Return the picture of an OpenEXR file.
+
+    Args:
+        data: the file.
+        max_pixels: most pixels of the picture; known before memory is taken.
+        is_color: whether its numbers are colors, so that its primaries count.
+
+    Raises:
+        Rejected: load_error or too_many_pixels.
+    """
+    headers = _headers(data)
+    _require_whole(data)
+    choice = _chosen(headers)
+    header = headers[choice.part]
+    window = _picture_window(header)
+    _require_size(headers, window, max_pixels)
+    planes = _planes(data, headers, choice)
+    values = np.stack(
+        [_in_window(planes[letter], header, window) for letter in choice.letters], axis=-1
+    )
+    primaries = _primaries(header)
+    if set(_CHROMA) <= set(choice.letters):
+        values = _from_chroma(values, primaries)
+    if is_color and values.shape[-1] >= 3 and not are_rec709(primaries):
+        values[..., :3] = as_rec709(values[..., :3], primaries)
+    return LinearPicture(values=values, unread=tuple(_unread(headers, choice)))
+
+
+def _headers(data: bytes) -> list[Mapping[str, Any]]:
+    headers = [part.header for part in _parts(data, header_only=True)]
+    for header in headers:
+        if header.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile):
+            raise Rejected("load_error", "it is deep (many samples a pixel); flatten it")
+    if not headers:
+        raise _cut_off()
+    return headers
+
+
+def _parts(data: bytes, *, header_only: bool) -> Sequence[Any]:
+    try:
+        file = OpenEXR.File(
+            io.BytesIO(data), separate_channels=True, header_only=header_only, num_threads=0
+        )
+    except Exception as error:  # the library fails in many ways
+        raise _cut_off() from error
+    parts: Sequence[Any] = file.parts
+    return parts
+
+
+def _require_whole(data: bytes) -> None:
+    """Raise Rejected where chunks of a file of one part are missing or lie beyond its end.
+
+    The library prints much about such files.
+    """
+    flags, at = int.from_bytes(data[4:8], "little"), 8
+    if flags & _MANY_PARTS:
+        return
+    while data[at : at + 1] not in (
+        b"",
+        b"\0",
+    ):  # the attributes: name, type and size, which the library has read
+        at = data.find(0, data.find(0, at) + 1) + 1 or len(data)
+        at += 4 + int.from_bytes(data[at : at + 4], "little")
+    at, first, last = at + 1, len(data), 0
+    while at < first:  # the table ends where the first chunk begins
+        offset = int.from_bytes(data[at : at + 8], "little")
+        at, first, last = at + 8, min(first, offset), max(last, offset)
+    head = 20 if flags & _TILED else 8  # ends in the size of what follows
+    size = int.from_bytes(data[last + head - 4 : last + head], "little")
+    if first < at or last + head + size > len(data):
+        raise _cut_off()
+
+
+def _cut_off() -> Rejected:
+    return Rejected("load_error", "it is cut off or damaged; write it again")
+
+
+def _chosen(headers: Sequence[Mapping[str, Any]]) -> _Choice:
+    """Return which channels are the picture; layers and further views give way to bare names."""
+    choices = list(_choices(headers))
+    bare = [choice for choice in choices if _layer(headers, choice) == ""]
+    if bare:
+        return bare[0]
+    main = [choice for choice in choices if _is_main(headers, choice)]
+    colors = [choice for choice in choices if choice.letters[0] != "Y"]
+    for among in (main, colors, choices):
+        if len(among) == 1:
+            return among[0]
+    layers = _listed(_layer(headers, choice) for choice in choices)
+    names = [str(channel.name) for header in headers for channel in header["channels"]]
+    raise Rejected(
+        "load_error",
+        f"its layers {layers} are pictures each; write one of them alone"
+        if choices
+        else f"its channels are {', '.join(names):.80}; expected R, G and B, or Y",
+    )
+
+
+def _choices(headers: Sequence[Mapping[str, Any]]) -> Iterator[_Choice]:
+    """Yield all that may be a picture, colors before greys."""
+    layers: dict[tuple[int, str], dict[str, str]] = defaultdict(dict)
+    for part, header in enumerate(headers):
+        for channel in header["channels"]:
+            layer, _, letter = str(channel.name).rpartition(".")
+            layers[part, layer][letter.upper()] = str(channel.name)
+    for wanted in (_COLOR, _CHROMA, _GREY, None):
+        for (part, _), names in layers.items():
+            letters = wanted or tuple(set(names) - {"A"})  # one channel of any name is grey
+            if letters == ("Z",) or (letters == _GREY and "X" in names):
+                continue  # depth, or CIE XYZ
+            if set(letters) <= set(names) and len(letters) == len(wanted or _GREY):
+                alpha = ("A",) if "A" in names else ()
+                called = tuple(names[letter] for letter in (*letters, *alpha))
+                yield _Choice(part, (*(wanted or _GREY), *alpha), called)
+
+
+def _layer(headers: Sequence[Mapping[str, Any]], choice: _Choice) -> str:
+    """Return the layer of channels, or the view that they are of, or "" where there is none."""
+    layer, header = choice.names[0].rpartition(".")[0], headers[choice.part]
+    first_view = next((h["view"] for h in headers if "view" in h), "")
+    return layer or (header.get("view", "") if header.get("view") != first_view else "")
+
+
+def _is_main(headers: Sequence[Mapping[str, Any]], choice: _Choice) -> bool:
+    layer = _layer(headers, choice)
+    views = headers[choice.part].get("multiView") or [""]
+    return layer.rpartition(".")[2].lower() in _MAIN_LAYERS or layer == views[0]
+
+
+def _box(header: Mapping[str, Any], name: str) -> tuple[int, int, int, int]:
+    """Return left, top, width and height of a window."""
+    (left, top), (right, bottom) = np.asarray(header[name]).tolist()
+    return left, top, right - left + 1, bottom - top + 1
+
+
+def _picture_window(header: Mapping[str, Any]) -> tuple[int, int, int, int]:
+    if header.get("envmap") == OpenEXR.ENVMAP_CUBE:
+        raise Rejected("load_error", "it is a cube map; convert it to latitude-longitude")
+    return _box(header, "dataWindow" if "envmap" in header else "displayWindow")
+
+
+def _require_size(
+    headers: Sequence[Mapping[str, Any]], window: tuple[int, int, int, int], max_pixels: int
+) -> None:
+    _, _, width, height = window
+    if not 0 < width * height <= max_pixels:
+        raise Rejected(
+            "too_many_pixels",
+            f"{width} x {height}; expected at most {max_pixels} pixels: scale it down",
+        )
+    stored = sum(
+        4 * len(header["channels"]) * math.prod(_box(header, "dataWindow")[2:])
+        for header in headers
+    )
+    if stored > _MAX_BYTES:
+        raise Rejected(
+            "too_many_pixels",
+            f"its channels take {stored} bytes; expected at most {_MAX_BYTES}: write fewer layers",
+        )
+
+
+def _planes(
+    data: bytes, headers: Sequence[Mapping[str, Any]], choice: _Choice
+) -> dict[str, NDArray[np.float32]]:
+    """Return the channels of a choice over its data window [H, W], by their letters."""
+    parts = _parts(data, header_only=False)
+    if len(parts) != len(headers):  # the library leaves parts out that it cannot read
+        raise _cut_off()
+    channels = parts[choice.part].channels
+    planes = {}
+    for letter, name in zip(choice.letters, choice.names, strict=True):
+        channel = channels[name]
+        if not isinstance(channel.pixels, np.ndarray):
+            raise _cut_off()
+        plane = channel.pixels.astype(np.float32)
+        left, top, width, height = _box(headers[choice.part], "dataWindow")
+        across = _stretch(plane.T, left, width, channel.xSampling)
+        planes[letter] = _stretch(across.T, top, height, channel.ySampling)
+    return planes
+
+
+def _stretch(
+    plane: NDArray[np.float32], first: int, count: int, sampling: int
+) -> NDArray[np.float32]:
+    """Return rows for `count` coordinates from `first` on, of rows for multiples of `sampling`."""
+    if sampling == 1:
+        return plane
+    at = np.arange(first, first + count) / sampling - math.ceil(first / sampling)
+    low = np.clip(np.floor(at).astype(np.int64), 0, len(plane) - 1)
+    high = np.minimum(low + 1, len(plane) - 1)
+    weight = np.clip(at - low, 0, 1)[:, None].astype(np.float32)
+    return (1 - weight) * plane[low] + weight * plane[high]
+
+
+def _in_window(
+    plane: NDArray[np.float32], header: Mapping[str, Any], window: tuple[int, int, int, int]
+) -> NDArray[np.float32]:
+    """Return a plane of the data window over a window, 0 where nothing is stored."""
+    left, top, width, height = window
+    if (at := _box(header, "dataWindow")) == window:
+        return plane
+    right, down = at[0] - left, at[1] - top
+    rows = slice(max(0, down), min(height, down + at[3]))
+    columns = slice(max(0, right), min(width, right + at[2]))
+    result = np.zeros((height, width), np.float32)
+    if rows.start < rows.stop and columns.start < columns.stop:
+        inside = plane[rows.start - down : rows.stop - down]
+        result[rows, columns] = inside[:, columns.start - right : columns.stop - right]
+    return result
+
+
+def _from_chroma(values: NDArray[np.float32], primaries: Sequence[float]) -> NDArray[np.float32]:
+    """Return RGB, and alpha where it is there, of BY, RY and Y."""
+    by, ry, y = np.moveaxis(values[..., :3], -1, 0)
+    weights = luminance_weights(primaries).astype(np.float32)
+    red, blue = (ry + 1) * y, (by + 1) * y
+    green = (y - weights[0] * red - weights[2] * blue) / weights[1]
+    return np.concatenate([np.stack([red, green, blue], axis=-1), values[..., 3:]], axis=-1)
+
+
+def _primaries(header: Mapping[str, Any]) -> Sequence[float]:
+    """Return what primaries [8] a header says its colors have.
+
+    Raises:
+        Rejected: load_error: the color space that it names is not linear.
+    """
+    if "chromaticities" in header:
+        return tuple(float(value) for value in header["chromaticities"])
+    named = str(header.get("colorInteropID") or "")
+    if not named and header.get("acesImageContainerFlag") == 1:
+        named = "lin_ap0_scene"
+    named = named or _SPACES.get(str(header.get("oiio:ColorSpace", "")).lower(), "")
+    known = OpenEXR.colorInteropIDToChromaticities(named) if named else None
+    if known is None and named.lower() not in _LINEAR:
+        raise Rejected(
+            "load_error", f"its color space is {named!r:.40}; write it in linear Rec.709"
+        )
+    return REC709 if known is None else tuple(float(value) for value in known)
+
+
+def _unread(headers: Sequence[Mapping[str, Any]], choice: _Choice) -> Iterator[str]:
+    others = [
+        name
+        for part, header in enumerate(headers)
+        for name in (str(channel.name) for channel in header["channels"])
+        if part != choice.part or name not in choice.names
+    ]
+    if others:
+        yield f"channels {_listed(others)}"
+    header = headers[choice.part]
+    space = str(header.get("oiio:ColorSpace", "")).lower()
+    if space not in (*_LINEAR, *_SPACES) and "lin_rec709" not in space:
+        yield f"color space {header['oiio:ColorSpace']!r:.40} of OpenImageIO"
+    odd = {name for name in header if name not in _USED | _SAYS_NOTHING}
+    if header.get("pixelAspectRatio", 1.0) == 1.0:
+        odd -= {"pixelAspectRatio"}
+    if odd:
+        yield f"header attributes {_listed(sorted(odd))}"
+
+
+def _listed(names: Iterable[str]) -> str:
+    shown = [f"{name!r:.40}" for name in names]
+    more = f" and {len(shown) - 6} more" if len(shown) > 6 else ""
+    return ", ".join(shown[:6]) + more

@@ -1,0 +1,199 @@
+"""What of a folder's files is not brought by its user as an object, a picture or a map.
+
+Two kinds are left out, each with one printed note: what Trilight wrote there itself, and copies of
+an object that collections keep beside it (for collisions, with less detail, in another file).
+"""
+
+import functools
+import logging
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+
+from storage.remote.safe_url import printable
+
+_OUTPUTS = (
+    ("assets.json", "objects.jsonl"),
+    ("manifest.json", "objects.lock.jsonl"),
+    ("manifest.json", "logs/asked.json"),
+    ("settings.json", "metrics.jsonl"),
+    ("leaderboard.md", "pairs.csv"),
+    ("transforms.json", "images/0.png", "depths/0.npy"),
+)
+"""What is in folders of assets, datasets (finished or not), training, leaderboards, nerfstudio."""
+
+_OF_SCENE = re.compile(r"(?P<in>(?:.*/)?)(?:objects|templates/backgrounds)/(?P<scene>[^/]+)")
+_MESH_OF_SCENE = re.compile(r"\d+_.*_\d+\.obj")
+"""Folders beside a RenderFormer scene `SCENE.json`, and how `convert` and `export` call meshes."""
+
+_SCENE = b"trilight:sceneSha256"
+"""What every USD file of a scene of ours holds."""
+_MOST_HEAD, _MOST_TAIL = 1 << 14, 1 << 20
+
+_MESH = re.compile(r".*-[0-9a-f]{8}\.(?:ply|glb)")
+"""How `assets` calls its meshes."""
+
+_UNREAD = frozenset(
+    "fbx dae blend 3ds 3mf ma mb max abc x3d wrl ifc step stp iges skp vrm zip 7z rar".split()
+)
+_USD = ("usd", "usda", "usdc", "usdz")
+
+_TWINS = (
+    (re.compile(r"(?<![^/])normalized_model\.obj$"), "raw_model.obj"),  # 3D-FUTURE
+    (re.compile(r"(?<![^/])models_\w+/(obj_\d+\.ply)$"), r"models/\1"),  # BOP
+    (re.compile(r"(?<![^/])nontextured\.(?:ply|stl)$"), "textured.obj"),  # YCB
+    (re.compile(r"(?<![^/])(?:google_64k|google_512k|poisson|tsdf)/(?:non)?textured\.\w+$"),
+     "google_16k/textured.obj"),
+)  # fmt: skip
+"""Files of one object by the file that is taken instead where it is there."""
+
+_COLLISION = re.compile(
+    r"(?i)(?:(?P<of>.*?)[-_. ])?(?:coll?ision|collider|coll|vhacd|coacd|"
+    r"convex[-_]?(?:hull|decomp\w*))(?:[-_ ]?(?:geometry|mesh|hull|model))?(?:[-_.]?\d+)?|UCX_.*"
+)
+_LOD = re.compile(r"(?i)(?P<of>.*?(?:[-_. ]|[a-z0-9]))lod[-_]?(?P<level>\d{1,2})(?P<rest>\D*)")
+
+log = logging.getLogger("trilight.objects")
+
+
+@functools.cache
+def say_once(message: str) -> None:
+    """Log a warning, once in a process."""
+    log.warning("%s", message)
+
+
+def drop_outputs(names: Iterable[str]) -> list[str]:
+    """Return files of a folder without those in folders that Trilight wrote; one note names these.
+
+    The folder itself may be one: its user named it.
+
+    Args:
+        names: of all files, with / between their parts.
+    """
+    names = list(names)
+    inside: dict[str, set[str]] = defaultdict(set)
+    for name in names:
+        inside[_folder(name)].add(name.rpartition("/")[2])
+    ours = {folder for folder in inside if folder and _is_output(folder, inside)}
+    kept = [name for name in names if ours.isdisjoint(map(str, PurePosixPath(name).parents))]
+    if len(kept) < len(names):
+        shown = ", ".join(printable(folder) for folder in sorted(ours)[:3])
+        say_once(f"left out as outputs of Trilight: {shown}{_and_more(len(ours) - 3)}")
+    return kept
+
+
+def _is_output(folder: str, inside: Mapping[str, set[str]]) -> bool:
+    meshes = inside.get(f"{folder}/meshes", set())
+    if "assets.json" in inside[folder] and meshes and all(map(_MESH.fullmatch, meshes)):
+        return True  # `assets` that was broken off
+    scene = _OF_SCENE.fullmatch(folder)
+    if scene and f"{scene['scene']}.json" in inside.get(scene["in"].rstrip("/"), ()):
+        return all(map(_MESH_OF_SCENE.fullmatch, inside[folder]))
+    return any(
+        all(
+            mark.rpartition("/")[2] in inside.get(_folder(f"{folder}/{mark}"), ()) for mark in marks
+        )
+        for marks in _OUTPUTS
+    )
+
+
+def say_unread(names: Sequence[str], objects: Sequence[str]) -> None:
+    """Name files of other formats for objects, and archives, that no object file stands beside."""
+    stems = {_stem(name) for name in objects}
+    stems |= {stem for name in names if (stem := _stem(name)).startswith(".")}  # hidden
+    others = sorted(n for n in names if _suffix(n) in _UNREAD and _stem(n) not in stems)
+    if others:
+        shown = f"{printable(others[0])}{_and_more(len(others) - 1)}"
+        say_once(f"left out as formats that are not read: {shown}; convert or unpack them")
+
+
+def drop_scenes(root: Path, names: Sequence[str]) -> list[str]:
+    """Return object files without USD files of whole scenes that Trilight wrote."""
+    scenes = [name for name in names if _suffix(name) in _USD and _is_scene(root / name)]
+    if scenes:
+        shown = f"{printable(scenes[0])}{_and_more(len(scenes) - 1)}"
+        say_once(f"left out as scenes that Trilight wrote: {shown}")
+    return [name for name in names if name not in set(scenes)]
+
+
+def _is_scene(path: Path) -> bool:
+    """Return whether a text begins, or a crate ends, with what our scenes say of themselves."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_MOST_HEAD)
+            file.seek(max(0, path.stat().st_size - _MOST_TAIL))
+            return _SCENE in head or (not head.startswith(b"#usda") and _SCENE in file.read())
+    except OSError:
+        return False  # the mesh stage says why
+
+
+def drop_copies(names: Sequence[str]) -> list[str]:
+    """Return object files without copies of objects that are there; one note counts them.
+
+    Args:
+        names: of object files, with / between their parts.
+    """
+    rules: dict[str, Callable[[Sequence[str]], Iterator[str]]] = {
+        "shapes for collisions": _collisions,
+        "lower levels of detail": _levels,
+        "other files of one object": _twins,
+    }
+    notes, dropped = [], set[str]()
+    for what, rule in rules.items():
+        copies = sorted(set(rule(names)) - dropped)
+        dropped.update(copies)
+        if copies:
+            notes.append(f"{len(copies)} {what} (such as {printable(copies[0])})")
+    if notes:
+        say_once(f"left out as copies of objects that are there: {'; '.join(notes)}")
+    return [name for name in names if name not in dropped]
+
+
+def _collisions(names: Sequence[str]) -> Iterator[str]:
+    """Yield shapes for collisions where others, to look at, are beside them."""
+    shapes = {name for name in names if _COLLISION.fullmatch(_stem(name))}
+    seen = {_folder(name) for name in names if name not in shapes}
+    for name in names:
+        folder = _folder(name)
+        above, _, last = folder.rpartition("/")
+        twin = re.sub(r"(?i)collisions?", "visual", last)
+        beside = {f"{above}/{each}".lstrip("/") for each in (twin, f"{twin}s")}
+        if (name in shapes and folder in seen) or (twin != last and beside & seen):
+            yield name
+
+
+def _levels(names: Sequence[str]) -> Iterator[str]:
+    """Yield all but the finest of files whose names differ in a number after LOD."""
+    levels: dict[str, list[tuple[int, str]]] = defaultdict(list)
+    for name in names:
+        if match := _LOD.fullmatch(name):
+            levels[f"{match['of']}/{match['rest']}".lower()].append((int(match["level"]), name))
+    for files in levels.values():
+        yield from (name for _, name in sorted(files)[1:])
+
+
+def _twins(names: Sequence[str]) -> Iterator[str]:
+    """Yield further files of one object in the layouts of known collections."""
+    there = set(names)
+    for name in names:
+        for pattern, better in _TWINS:
+            other = pattern.sub(better, name)
+            if other != name and other in there:
+                yield name
+
+
+def _folder(name: str) -> str:
+    return name.rpartition("/")[0]
+
+
+def _stem(name: str) -> str:
+    return name.rpartition("/")[2].rpartition(".")[0]
+
+
+def _suffix(name: str) -> str:
+    return name.rpartition(".")[2].lower()
+
+
+def _and_more(count: int) -> str:
+    return f" and {count} more" if count > 0 else ""
