@@ -5,5 +5,5 @@ Native code parses some of the bytes, so only children with limits come here (pi
 - `source_file`, `headers`, `limits`: one bounded read of a file and of those that it names.
 - `load`, `parts`: its triangles, and their materials.
 - `material`, `picture`: what a file says of a surface, and its pictures.
-- `gltf_*`, `obj_*`, `ply_*`, `usd`: the formats.
+- `gltf`, `obj_*`, `ply_*`, `usd`: the formats.
 """

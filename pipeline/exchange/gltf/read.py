@@ -5,10 +5,11 @@ Only children with limits come here (pipeline.isolation): a stranger's file is r
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.exchange.dressed import (
     DressedPiece,
@@ -18,20 +19,26 @@ from pipeline.exchange.dressed import (
     joined_arrays,
     scene_with_worn,
 )
-from pipeline.exchange.gltf.document import GltfDocument, extension
 from pipeline.exchange.gltf.materials import look_of
-from pipeline.exchange.gltf.meshes import GltfTriangles
-from pipeline.exchange.gltf.placed import PlacedNode, placed_nodes
+from pipeline.exchange.gltf.meshes import WorldTriangles
 from pipeline.exchange.gltf.seen_and_lit import camera_of, even_sky, light_triangles
+from pipeline.exchange.pictures import MAX_PIXELS
 from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all
-from storage.errors import TrilightError
-from storage.records.material import EMISSION, default_rows
+from pipeline.foreign.gltf.document import GltfDocument, refuse_malformed
+from pipeline.foreign.gltf.materials import DEFAULT, GltfMaterials
+from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nodes
+from pipeline.foreign.gltf.primitives import GltfPrimitive, read_primitives
+from pipeline.foreign.limits import ReadLimits
+from pipeline.foreign.material import SourceMaterial
+from pipeline.foreign.picture import decoded
+from pipeline.foreign.source_file import read_source
+from storage.errors import Rejected, TrilightError
 from storage.records.scene import ObjectKind, Scene, SceneObject
 from storage.records.texture import MapSource
 
 SUFFIXES = (".glb", ".gltf")
 MAX_OBJECTS = 1 << 16
-_POINTS_AND_LINES = (0, 1, 2, 3)
+_LIMITS = ReadLimits(max_bytes=1 << 30, with_materials=True)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,11 +62,12 @@ def read_gltf(path: Path, licence: str) -> GltfScene:
         TrilightError: the file is unusable, holds too much, or is none that a `Scene` can hold.
     """
     try:
-        return _Reading(document=GltfDocument(path), licence=licence).scene()
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        if isinstance(error, TrilightError):
-            raise
-        raise TrilightError(f"{path.name}: the glTF tree is malformed ({error!r:.120}).") from error
+        with refuse_malformed("load_error", "the glTF tree is"):
+            document = read_source(path, _LIMITS).gltf
+            assert document is not None
+            return _Reading(document=document, name=path.name, licence=licence).scene()
+    except Rejected as error:
+        raise TrilightError(f"{path.name}: {error}") from error
 
 
 @dataclass(kw_only=True, eq=False)
@@ -67,6 +75,7 @@ class _Reading:
     """One file on its way to a scene."""
 
     document: GltfDocument
+    name: str
     licence: str
     lost: list[str] = field(default_factory=list)
     names: set[str] = field(default_factory=set)
@@ -75,12 +84,13 @@ class _Reading:
         """Return what the file shows."""
         tree = self.document.tree
         nodes = list(placed_nodes(tree))
-        pieces = [piece for placed in nodes for piece in self._pieces(placed)]
+        shown = [placed for placed in nodes if placed.is_visible]
+        pieces = [piece for placed in shown for piece in self._pieces(placed)]
         if not pieces:
-            raise TrilightError(f"{self.document.name}: no triangle with an area is placed.")
+            raise TrilightError(f"{self.name}: no triangle with an area is placed.")
         points = np.concatenate([each.piece.mesh.positions for each in pieces])
         reach = float(np.linalg.norm(np.ptp(points, axis=0)))
-        pieces += [piece for placed in nodes for piece in self._lights(placed, reach)]
+        pieces += [piece for placed in shown for piece in self._lights(placed, reach)]
         arrays = joined_arrays(pieces)
         seen = [camera_of(tree, placed, self.lost) for placed in nodes if "camera" in placed.node]
         poses = [each for each in seen if each is not None]
@@ -94,63 +104,84 @@ class _Reading:
         if not any(each.piece.entry.kind == "emitter" for each in pieces):
             self.lost.append("no light: an even sky of radiance 1 lights it")
             sky = even_sky()
-        if tree.get("animations"):
-            self.lost.append("animations: everything stands as it does without them")
         scene = scene_with_worn(
             arrays,
             pieces,
             c2w=c2w,
             fov_deg=fov_deg,
-            provenance={"template": "gltf", "file": self.document.name},
+            provenance={"template": "gltf", "file": self.name},
             environment=sky,
         )
-        return GltfScene(scene=scene, lost=tuple(dict.fromkeys(self.lost)))
+        lost = dict.fromkeys([*self.document.unread, *self.lost])
+        return GltfScene(scene=scene, lost=tuple(lost))
 
     def _pieces(self, placed: PlacedNode) -> Iterator[DressedPiece]:
         if "mesh" not in placed.node:
             return
-        mesh = self.document.tree["meshes"][placed.node["mesh"]]
+        mesh = entry(self.document.tree, "meshes", placed.node["mesh"])
         name = str(placed.node.get("name") or mesh.get("name") or "object")
-        for primitive in mesh["primitives"]:
-            if primitive.get("mode", 4) in _POINTS_AND_LINES:
-                self.lost.append("points and lines")
-                continue
-            for kind, triangles in by_kind(self._triangles(placed, primitive)):
-                yield dressed(self._entry(name, kind), triangles)
+        primitives = read_primitives(self.document, placed.node)
+        for to_world in self.document.instances(placed):
+            for primitive in primitives:
+                for kind, triangles in by_kind(self._triangles(primitive, to_world)):
+                    yield dressed(self._entry(name, kind), triangles)
 
-    def _triangles(self, placed: PlacedNode, primitive: dict[str, Any]) -> DressedTriangles:
-        found = GltfTriangles(self.document, primitive, placed.to_world)
+    @cached_property
+    def _materials(self) -> GltfMaterials:
+        return GltfMaterials(self.document, self._decode, emission=True, notes=self.lost)
+
+    def _decode(self, data: bytes, name: str) -> NDArray:
+        try:
+            return decoded(data, name, MAX_PIXELS)
+        except Rejected as why:
+            if why.reason != "texture_too_large":
+                raise
+            raise TrilightError(
+                f"{self.name}: {name}: expected at most {MAX_PIXELS} pixels."
+            ) from why
+
+    def _material(self, number: int | None) -> SourceMaterial:
+        found = DEFAULT if number is None else self._materials.material(number)
+        self.lost += [f"{word} of materials" for word in found.lost if word != "emission"]
+        return found
+
+    def _triangles(
+        self, primitive: GltfPrimitive, to_world: NDArray[np.float64]
+    ) -> DressedTriangles:
+        found = WorldTriangles(primitive, to_world)
         if found.without_area:
             self.lost.append("triangles without an area")
-        if "COLOR_0" in primitive["attributes"]:
-            self.lost.append("colours of vertices")
-        number = primitive.get("material")
-        material = {} if number is None else self.document.tree["materials"][number]
+        number = primitive.material
+        row = {} if number is None else entry(self.document.tree, "materials", number)
         source = MapSource(
-            name=str(material.get("name", ""))[:200],
+            name=str(row.get("name", ""))[:200],
             licence=self.licence,
             attribution=self._attribution(),
         )
-        look = look_of(self.document, material, found.coordinates, source, self.lost)
-        count = len(found.positions)
-        rows = default_rows(count)
-        rows[:, EMISSION] = look.emission_rgb
-        uv = np.zeros((count, 3, 2), np.float32) if look.uv is None else look.uv
+        look = look_of(
+            self._material(number),
+            found.coordinates,
+            found.colors,
+            len(found.positions),
+            source,
+            self.lost,
+        )
         return DressedTriangles(
             positions=found.positions,
             normals=found.normals,
-            rows=rows,
-            uv=uv,
-            worn=np.zeros(count, np.int64),
-            wardrobe=(look.worn,),
+            rows=look.rows,
+            uv=look.uv,
+            worn=look.worn,
+            wardrobe=look.wardrobe,
         )
 
     def _lights(self, placed: PlacedNode, reach: float) -> Iterator[DressedPiece]:
         reference = extension(placed.node, "KHR_lights_punctual")
         if "light" not in reference:
             return
-        lights = extension(self.document.tree, "KHR_lights_punctual")["lights"]
-        found = light_triangles(lights[reference["light"]], placed, reach, self.lost)
+        lights = extension(self.document.tree, "KHR_lights_punctual")
+        light = entry(lights, "lights", reference["light"])
+        found = light_triangles(light, placed, reach, self.lost)
         if found is not None:
             yield dressed(self._entry(str(placed.node.get("name") or "light"), "emitter"), found)
 
@@ -159,7 +190,7 @@ class _Reading:
 
     def _entry(self, base: str, kind: ObjectKind) -> SceneObject:
         if len(self.names) >= MAX_OBJECTS:
-            raise TrilightError(f"{self.document.name}: more than {MAX_OBJECTS} objects.")
+            raise TrilightError(f"{self.name}: more than {MAX_OBJECTS} objects.")
         base, count = base[:200].replace("\0", "_"), 1
         name = base
         while name in self.names:

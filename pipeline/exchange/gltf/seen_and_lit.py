@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.dressed import PLAIN, DressedTriangles
-from pipeline.exchange.gltf.placed import PlacedNode
 from pipeline.exchange.usd.foreign_cameras import rigid_pose
+from pipeline.foreign.gltf.nodes import PlacedNode
 from storage.records.environment import Environment
 from storage.records.material import EMISSION, ROUGHNESS, default_rows
 from storage.records.texture import MapSource

@@ -1,0 +1,123 @@
+"""The triangles of a glTF primitive, in the axes of its node."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.foreign.gltf.check import FAN, POINTS_AND_LINES, STRIP, TRIANGLES
+from pipeline.foreign.gltf.document import GltfDocument, Rows
+from pipeline.foreign.gltf.nodes import entry
+from storage.errors import Rejected
+
+
+class GltfPrimitive:
+    """The triangles of a primitive; morph targets shape it as its weights say."""
+
+    def __init__(
+        self, document: GltfDocument, primitive: dict[str, Any], weights: Sequence[float]
+    ) -> None:
+        """Read positions and faces.
+
+        Raises:
+            Rejected: index_range where a corner is no vertex, or as `GltfDocument.values`.
+        """
+        self._document, self._primitive = document, primitive
+        self._weights = weights
+        attributes = primitive["attributes"]
+        count = document.count(attributes["POSITION"])
+        order = (
+            document.indices(primitive["indices"]) if "indices" in primitive else np.arange(count)
+        )
+        if order.size and order.max() >= count:
+            raise Rejected("index_range", f"a face names vertex {order.max()} of {count}")
+        self.faces = _faces(order, primitive.get("mode", TRIANGLES))
+        """[T, 3] rows of `positions`."""
+        self._rows: Rows = slice(None)
+        if count > self.faces.size:  # so that sharing a large accessor costs nothing
+            self._rows, faces = np.unique(self.faces, return_inverse=True)
+            self.faces = faces.reshape(-1, 3)
+        self.positions = self._shaped("POSITION", (3,))
+        """[V, 3]"""
+
+    @property
+    def material(self) -> int | None:
+        """Row of the file's materials; None is glTF's default material."""
+        number = self._primitive.get("material")
+        if number is not None:
+            entry(self._document.tree, "materials", number)
+        return number
+
+    def coordinates(self, number: int) -> NDArray[np.float64] | None:
+        """Return a set of texture coordinates [T, 3, 2], v up; None where there is none."""
+        name = f"TEXCOORD_{number}"
+        if name not in self._primitive["attributes"]:
+            return None
+        may_be_whole = "KHR_mesh_quantization" in self._document.tree.get("extensionsUsed", ())
+        uv = self._shaped(name, (2,), is_unit=None if may_be_whole else True)
+        return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)[self.faces]
+
+    @property
+    def colors(self) -> NDArray[np.float64] | None:
+        """Linear colors [T, 3, 3] of the corners; None where there are none."""
+        if "COLOR_0" not in self._primitive["attributes"]:
+            return None
+        return self._shaped("COLOR_0", (3, 4), is_unit=True)[self.faces, :3]
+
+    @property
+    def normals(self) -> NDArray[np.float64] | None:
+        """Normals [T, 3, 3] of the corners; None where there are none."""
+        if "NORMAL" not in self._primitive["attributes"]:
+            return None
+        return self._shaped("NORMAL", (3,))[self.faces]
+
+    def _shaped(
+        self, name: str, widths: tuple[int, ...], *, is_unit: bool | None = None
+    ) -> NDArray[np.float64]:
+        """Return an attribute [V, K] of the vertices, with what morph targets add to it."""
+        number = self._primitive["attributes"][name]
+        values = self._document.values(number, widths, self._rows, is_unit=is_unit)
+        targets = self._primitive.get("targets", ())
+        for weight, target in zip(self._weights, targets, strict=False):
+            if weight and name in target:
+                more = self._document.values(target[name], widths, self._rows, is_unit=is_unit)
+                values = values + float(weight) * more
+        return values
+
+
+def read_primitives(document: GltfDocument, node: dict[str, Any]) -> list[GltfPrimitive]:
+    """Return what has triangles of the mesh of a node."""
+    mesh = entry(document.tree, "meshes", node["mesh"])
+    weights = node.get("weights", mesh.get("weights", ()))
+    return [
+        GltfPrimitive(document, primitive, list(weights))
+        for primitive in mesh["primitives"]
+        if primitive.get("mode", TRIANGLES) not in POINTS_AND_LINES
+        and "POSITION" in primitive["attributes"]
+    ]
+
+
+def place_points(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points [N, 3] where a matrix [4, 4] puts them."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.einsum("ij,vj->vi", to_world[:3, :3], points) + to_world[:3, 3]
+
+
+def is_mirrored(to_world: NDArray[np.float64]) -> bool:
+    """Return whether a matrix [4, 4] turns faces around."""
+    return bool(np.linalg.det(to_world[:3, :3]) < 0)
+
+
+def _faces(order: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
+    if mode == TRIANGLES:
+        if len(order) % 3:
+            raise ValueError(f"{len(order)} corners make no whole triangles")
+        return order.reshape(-1, 3)
+    if mode == FAN:
+        first = np.broadcast_to(order[:1], (max(len(order) - 2, 0),))
+        return np.stack([order[1:-1], order[2:], first], axis=1)
+    assert mode == STRIP, mode
+    windows = np.stack([order[:-2], order[1:-1], order[2:]], axis=1)
+    windows[1::2] = windows[1::2][:, [1, 0, 2]]
+    return windows
