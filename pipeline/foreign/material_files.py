@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from storage.errors import Rejected
@@ -37,6 +38,14 @@ class MaterialFiles:
         raise self.refused.get(
             name, Rejected("texture_missing", f"{name!r:.80} is not beside the object")
         )
+
+
+def gltf_files(tree: Mapping[str, Any], folder: Path, left: int, read: ReadFile) -> MaterialFiles:
+    """Return the pictures that a glTF names; `left` is the bound of bytes for all together."""
+    images = tree.get("images", ())
+    uris = [entry.get("uri") for entry in images if isinstance(entry, dict)]
+    named = [uri for uri in uris if isinstance(uri, str) and not uri.startswith("data:")]
+    return _read_all(named, folder, left, read, is_uri=True)
 
 
 def obj_files(data: bytes, folder: Path, left: int, read: ReadFile) -> MaterialFiles:

@@ -1,7 +1,7 @@
 """The triangles of a file with their materials: the same ones that `reading.load` gives.
 
 The mesh library is shown a file without any picture: what it would decode itself, it would decode
-without limits. Materials come to it as bare names.
+without limits. Materials come to it as bare names, and coordinates as custom attributes.
 """
 
 import io
@@ -60,7 +60,7 @@ def load_parts(
     rows = {name: row for row, name in enumerate(materials)}
     start, found = 0, []
     for part in dumped(data, kind, files):
-        found.append(_part(part, start, rows.get(_material_name(part), len(rows))))
+        found.append(_part(part, start, rows.get(_material_name(part), len(rows)), kind))
         start += len(part.vertices)
     if not found:
         raise Rejected("materials_unreadable", "the file holds no triangles")
@@ -70,6 +70,7 @@ def load_parts(
         material=joined["material"],
         materials=(*materials.values(), default),
         uv=joined["uv"],
+        colour=None if (joined["colour"] == 1).all() else joined["colour"],
     )
 
 
@@ -96,21 +97,49 @@ def dumped(data: bytes, kind: str, files: Mapping[str, bytes]) -> list[trimesh.T
         ) from error
 
 
-def _part(part: trimesh.Trimesh, start: int, material: int) -> dict[str, NDArray]:
+def _part(part: trimesh.Trimesh, start: int, material: int, kind: str) -> dict[str, NDArray]:
     faces = np.asarray(part.faces, np.int64)
     positions = np.asarray(part.vertices, np.float64)
+    if kind in ("glb", "gltf"):
+        positions = np.stack([positions[:, 0], -positions[:, 2], positions[:, 1]], axis=1)
     sets = np.full((len(positions), MOST_UV_SETS, 2), np.nan)
-    uv: Any = getattr(part.visual, "uv", None)
-    if uv is not None and np.ndim(uv) == 2 and len(uv) == len(positions):
-        sets[:, 0] = np.asarray(uv, np.float64)[:, :2]
+    for number, values in _coordinates(part).items():
+        if len(values) == len(positions) and values.ndim == 2 and values.shape[1] == 2:
+            sets[:, number] = values
+    colour = np.ones((len(positions), 3))
+    tint: Any = part.vertex_attributes.get("_TRILIGHT_COLOUR")
+    if tint is not None and np.ndim(tint) == 2 and len(tint) == len(positions):
+        colour[:] = _unit(np.asarray(tint))[:, :3]
     return {
         "positions": positions,
         "faces": faces + start,
         "material": np.full(len(faces), material),
         "uv": sets[faces].transpose(0, 2, 1, 3),
+        "colour": colour[faces],
     }
 
 
 def _material_name(part: trimesh.Trimesh) -> str:
     material = getattr(part.visual, "material", None)
     return str(getattr(material, "name", ""))
+
+
+def _coordinates(part: trimesh.Trimesh) -> dict[int, NDArray[np.float64]]:
+    """Return the sets of coordinates by number, v up."""
+    found: dict[int, NDArray[np.float64]] = {}
+    for number in range(MOST_UV_SETS):
+        values: Any = part.vertex_attributes.get(f"_TRILIGHT_UV_{number}")
+        if values is not None and np.ndim(values) == 2:
+            unit = _unit(np.asarray(values))
+            found[number] = np.stack([unit[:, 0], 1 - unit[:, 1]], axis=1)
+    plain = getattr(part.visual, "uv", None)
+    if not found and plain is not None:
+        found[0] = np.asarray(plain, np.float64)[:, :2]
+    return found
+
+
+def _unit(values: NDArray) -> NDArray[np.float64]:
+    """Return numbers as they are, and normalised integers as shares of their greatest value."""
+    if np.issubdtype(values.dtype, np.integer):
+        return values.astype(np.float64) / np.iinfo(values.dtype).max
+    return values.astype(np.float64)

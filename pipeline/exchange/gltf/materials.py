@@ -75,7 +75,8 @@ def look_of(
         wardrobe = [_textures(material, found.maps, tint, source) for tint in tints]
         return GltfLook(rows=rows, uv=found.uv, worn=worn, wardrobe=wardrobe)
     values = _columns(material, found.maps, np.asarray(tints)[None])[0, worn]
-    rows[:, DIFFUSE], rows[:, SPECULAR], rows[:, ROUGHNESS] = np.split(values, (3, 6), axis=1)
+    rows[:, DIFFUSE], rows[:, SPECULAR] = values[:, :3], values[:, 3:6]
+    rows[:, ROUGHNESS] = values[:, 6]
     return GltfLook(
         rows=rows,
         uv=np.zeros((count, 3, 2), np.float32),

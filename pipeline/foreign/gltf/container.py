@@ -19,7 +19,7 @@ def read_container(data: bytes, suffix: str) -> tuple[dict[str, Any], bytes | No
     """Return the JSON of a .gltf or .glb, and the binary chunk of the latter.
 
     Raises:
-        Rejected: load_error, header_size_mismatch where the file is cut off, unsupported_format
+        Rejected: load_error, cut_off, unsupported_format
             of another version than 2, too_large_bytes.
     """
     text, binary = _chunks(data) if suffix == ".glb" else (data, None)
@@ -59,9 +59,7 @@ def _split(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _cut_off(wanted: int, got: int) -> Rejected:
-    return Rejected(
-        "header_size_mismatch", f"the file is cut off: it states {wanted} bytes and has {got}"
-    )
+    return Rejected("cut_off", f"the file is cut off: it states {wanted} bytes and has {got}")
 
 
 def _parse_json(text: bytes) -> dict[str, Any]:
@@ -73,9 +71,9 @@ def _parse_json(text: bytes) -> dict[str, Any]:
     try:
         tree = json.loads(plain)
     except json.JSONDecodeError as error:
-        is_cut = error.pos >= len(plain.rstrip()) or error.msg.startswith("Unterminated")
-        message = "the file is cut off: its JSON ends early" if is_cut and plain else str(error)
-        raise Rejected("load_error", f"the glTF JSON cannot be read ({message})") from error
+        if plain and (error.pos >= len(plain.rstrip()) or error.msg.startswith("Unterminated")):
+            raise Rejected("cut_off", "the file is cut off: its JSON ends early") from error
+        raise Rejected("load_error", f"the glTF JSON cannot be read ({error})") from error
     except (ValueError, RecursionError) as error:
         raise Rejected("load_error", f"the glTF JSON cannot be read ({error!s:.120})") from error
     if not isinstance(tree, dict):

@@ -20,7 +20,7 @@ from pipeline.foreign.gltf.nodes import INSTANCING, PlacedNode, entry, extension
 from pipeline.foreign.gltf.unread import unread_parts
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles
-from storage.errors import Rejected
+from storage.errors import Rejected, TrilightError
 
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -38,6 +38,8 @@ def refuse_malformed(reason: str, subject: str) -> Iterator[None]:
     """Turn what Python says of a tree that keeps no law of its format into Rejected."""
     try:
         yield
+    except TrilightError:
+        raise
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise Rejected(reason, f"{subject} malformed ({error!r:.120})") from error
 
@@ -70,7 +72,7 @@ class GltfDocument:
             is_unit: whether integers are fractions; as the accessor says by default.
 
         Raises:
-            Rejected: header_size_mismatch, unsupported_accessor, load_error.
+            Rejected: cut_off, unsupported_accessor, load_error.
         """
         stated, whole = self._stated(index), self._elements(index)
         if whole.shape[1] not in widths:
@@ -173,7 +175,7 @@ class GltfDocument:
         data = self.binary if uri is None else self._embedded.get(uri) or self.buffers.get(uri)
         if data is None or len(data) < int(buffer["byteLength"]) - _PADDING:
             raise Rejected(
-                "header_size_mismatch",
+                "cut_off",
                 f"a buffer is cut off: it states {buffer['byteLength']} bytes and has "
                 f"{0 if data is None else len(data)}",
             )
@@ -241,5 +243,6 @@ def _read_pictures(
             left -= len(data[uri])
         except Rejected as why:
             reason = _PICTURE_REASONS.get(why.reason, why.reason)
-            refused[uri] = Rejected(reason, f"{uri!r:.80}: {why.message}")
+            name = "" if why.reason == "external_uri" else f"{uri!r:.80}: "
+            refused[uri] = Rejected(reason, f"{name}{why.message}")
     return MaterialFiles(data=data, refused=refused)

@@ -24,7 +24,7 @@ def gltf_mesh(document: GltfDocument) -> TriangleMesh:
     """Return the triangles of a file in metres, +Z up.
 
     Raises:
-        Rejected: load_error, index_range, no_faces, header_size_mismatch, unsupported_accessor.
+        Rejected: load_error, index_range, no_faces, cut_off, unsupported_accessor.
     """
     with refuse_malformed("load_error", "the glTF tree is"):
         return _joined(_parts(document))
