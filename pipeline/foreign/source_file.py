@@ -58,9 +58,9 @@ def read_source(path: Path, limits: ReadLimits) -> SourceFile:
 
     Raises:
         Rejected: missing_file, unsupported_format, too_large_bytes, archive_refused,
-            header_size_mismatch, cut_off, too_many_faces, unsupported_primitive, compressed_geometry,
-            unsupported_extension, skinned_mesh, scene_cycle, too_many_instances, external_uri,
-            load_error.
+            header_size_mismatch, cut_off, too_many_faces, unsupported_primitive, load_error,
+            unsupported_extension, compressed_geometry, skinned_mesh, scene_cycle,
+            too_many_instances, external_uri.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:

@@ -192,6 +192,8 @@ class GltfMaterials:
         """Return factors within [0, `most`]; the default, with a note, where they are none."""
         try:
             found = _finite(row.get(name, default), len(default))
+            if most > 1 and max(found) > most and self._notes is None:
+                raise ValueError(f"{max(found):g}; expected at most {most:g}")
         except (TypeError, ValueError) as error:
             if self._notes is None:
                 raise ValueError(f"{name}: {error}") from error

@@ -68,17 +68,14 @@ def is_known(name: str) -> bool:
 
 
 def unread_parts(tree: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what no code reads; only what a scene shows can be beside it."""
+    """Return what no code reads; a file that is malformed is refused elsewhere."""
     extensions: dict[str, str] = {}
     others: dict[str, None] = {}
     for kind, row in _rows(tree):
         for name in row.get("extensions", ()):
             if extensions.get(name, "the file") == "the file":
                 extensions[name] = kind
-        if "extras" in row:
-            others[f"extras of {kind}"] = None
-        known = {*_KEYS[kind].split(), "extensions", "extras"} if kind in _KEYS else set(row)
-        others |= {f"key {key!r:.60} of {kind}": None for key in row if key not in known}
+        others |= dict.fromkeys(_of_row(kind, row))
     for name in tree.get("extensionsUsed", ()):
         extensions.setdefault(name, "the file")
     silent = _READ | _CHANGES_NOTHING | _NAMED_ELSEWHERE
@@ -87,7 +84,7 @@ def unread_parts(tree: Mapping[str, Any]) -> tuple[str, ...]:
         for name, kind in extensions.items()
         if name not in silent
     ]
-    return (*named, *others, *dict.fromkeys(_of_core(tree)))
+    return (*named, *others)
 
 
 def _rows(tree: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -107,20 +104,26 @@ def _rows(tree: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
             waiting += [(kind, each) for each in value if isinstance(each, (dict, list))]
 
 
-def _of_core(tree: Mapping[str, Any]) -> Iterator[str]:
-    if tree.get("animations"):
-        yield "animations: everything stands as it does without them"
-    others = len(tree.get("scenes", ())) - 1
-    if others > 0:
-        yield f"{others} of {others + 1} scenes: the default one is read"
-    for mesh in tree.get("meshes", ()):
-        for primitive in mesh["primitives"]:
-            if primitive.get("mode", 4) < 4:
-                yield "points and lines"
-            elif "POSITION" not in primitive["attributes"]:
-                yield "primitives without positions"
-            for name in primitive["attributes"]:
-                if not name.startswith(_ATTRIBUTES):
-                    yield f"attribute {name!r:.60} of meshes"
-    if any("occlusionTexture" in row for row in tree.get("materials", ())):
+def _of_row(kind: str, row: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is not read of one object of the tree, but for its extensions."""
+    if "extras" in row:
+        yield f"extras of {kind}"
+    if kind in _KEYS:
+        known = {*_KEYS[kind].split(), "extensions", "extras"}
+        yield from (f"key {key!r:.60} of {kind}" for key in row if key not in known)
+    if kind == "the file":
+        if row.get("animations"):
+            yield "animations: everything stands as it does without them"
+        others = len(row.get("scenes", ())) - 1
+        if others > 0:
+            yield f"{others} of {others + 1} scenes: the default one is read"
+    if kind == "materials" and "occlusionTexture" in row:
         yield "occlusion maps of materials: light is traced"
+    if kind == "primitives":
+        if row.get("mode", 4) in (0, 1, 2, 3):
+            yield "points and lines"
+        elif "POSITION" not in row.get("attributes", ()):
+            yield "primitives without positions"
+        for name in row.get("attributes", ()):
+            if not name.startswith(_ATTRIBUTES):
+                yield f"attribute {name!r:.60} of meshes"

@@ -77,8 +77,8 @@ class GltfWriter:
         buffer: dict[str, Any] = {"byteLength": len(self.data)}
         self.tree["buffers"] = [buffer]
         if form == "data":
-            text = base64.b64encode(self.data).decode()
-            buffer["uri"] = f"data:application/vnd.odd+x;charset=x;base64,{text}"
+            packed = base64.b64encode(self.data).decode()
+            buffer["uri"] = f"data:application/vnd.odd+x;charset=x;base64,{packed}"
         elif form == "bin":
             (folder / "some name.bin").write_bytes(bytes(self.data) + b"beyond")
             buffer["uri"] = "some%20name.bin"

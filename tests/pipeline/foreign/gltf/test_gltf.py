@@ -59,7 +59,8 @@ def scene_surface(found: GltfScene) -> NDArray[np.float64]:
     scene = found.scene
     corners = scene.vertex_positions[scene.faces].astype(np.float64)
     uv = np.zeros((len(corners), 3, 2)) if scene.uv is None else scene.uv.reshape(-1, 3, 2)
-    return ordered(corners, textured_rows(scene, scene.material_index, uv.mean(axis=1))[:, :3])
+    rows = textured_rows(scene, scene.material_index, uv.mean(axis=1)).astype(np.float64)
+    return ordered(corners, rows[:, :3])
 
 
 def ordered(corners: NDArray[np.float64], colors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -131,7 +132,7 @@ def written(dialect: dict[str, Any], folder: Path) -> tuple[Path, NDArray[np.flo
         primitive["mode"] = dialect["mode"]
     base = np.array([0.5, 0.25, 1])
     metal = {"metallicFactor": 0, "baseColorFactor": [*base, 1]}
-    unlit = {"extensions": {"KHR_materials_unlit": {}}} if dialect["unlit"] else {}
+    unlit: dict[str, Any] = {"extensions": {"KHR_materials_unlit": {}}} if dialect["unlit"] else {}
     file.add("materials", {"pbrMetallicRoughness": metal, **unlit})
     file.add("meshes", {"primitives": [primitive]})
     diffuse = base * (1 if dialect["unlit"] else 1 - 0.04 - 0.96 / 21)
