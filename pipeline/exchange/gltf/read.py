@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,13 @@ from pipeline.exchange.dressed import (
 )
 from pipeline.exchange.gltf.materials import look_of
 from pipeline.exchange.gltf.meshes import WorldTriangles
-from pipeline.exchange.gltf.seen_and_lit import camera_of, even_sky, light_triangles
+from pipeline.exchange.gltf.seen_and_lit import (
+    DIRECTIONAL,
+    camera_of,
+    even_sky,
+    light_triangles,
+    sky_with_suns,
+)
 from pipeline.exchange.pictures import MAX_PIXELS
 from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all
 from pipeline.foreign.gltf.document import GltfDocument, refuse_malformed
@@ -100,8 +107,8 @@ class _Reading:
         else:
             self.lost.append("no camera: one was added that sees everything")
             c2w, fov_deg = camera_that_sees_all(points)
-        sky = None
-        if not any(each.piece.entry.kind == "emitter" for each in pieces):
+        sky = sky_with_suns([each for placed in shown for each in self._suns(placed)], self.lost)
+        if sky is None and not any(each.piece.entry.kind == "emitter" for each in pieces):
             self.lost.append("no light: an even sky of radiance 1 lights it")
             sky = even_sky()
         scene = scene_with_worn(
@@ -175,15 +182,27 @@ class _Reading:
             wardrobe=look.wardrobe,
         )
 
-    def _lights(self, placed: PlacedNode, reach: float) -> Iterator[DressedPiece]:
+    def _light(self, placed: PlacedNode) -> dict[str, Any] | None:
+        """Return the JSON of the light of a node; None where it has none."""
         reference = extension(placed.node, "KHR_lights_punctual")
         if "light" not in reference:
-            return
-        lights = extension(self.document.tree, "KHR_lights_punctual")
-        light = entry(lights, "lights", reference["light"])
-        found = light_triangles(light, placed, reach, self.lost)
-        if found is not None:
-            yield dressed(self._entry(str(placed.node.get("name") or "light"), "emitter"), found)
+            return None
+        return entry(
+            extension(self.document.tree, "KHR_lights_punctual"), "lights", reference["light"]
+        )
+
+    def _lights(self, placed: PlacedNode, reach: float) -> Iterator[DressedPiece]:
+        light = self._light(placed)
+        if light is not None and light.get("type") != DIRECTIONAL:
+            found = light_triangles(light, placed, reach, self.lost)
+            name = str(placed.node.get("name") or "light")
+            if found is not None:
+                yield dressed(self._entry(name, "emitter"), found)
+
+    def _suns(self, placed: PlacedNode) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
+        light = self._light(placed)
+        if light is not None and light.get("type") == DIRECTIONAL:
+            yield light, placed.to_world
 
     def _attribution(self) -> str:
         return str(self.document.tree.get("asset", {}).get("copyright", ""))[:1000]

@@ -20,7 +20,7 @@ from pipeline.exchange.gltf.write import encode_scene_glb
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
-from storage.records.lookup import texture_values
+from storage.records.lookup import environment_values, texture_values
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
 from tests.for_each import for_each
@@ -201,6 +201,22 @@ def test_cameras_lights_and_emission(tmp_path: Path) -> None:
     assert (outward > 0).all() and len(own) == 8
     seen = np.linalg.norm(cross, axis=1).sum() / 8
     assert rows[-1, 7] * seen == pytest.approx(3.0, rel=1e-5)  # candela, on average
+
+
+def test_a_directional_light_is_a_sun_of_as_many_lux(tmp_path: Path) -> None:
+    light = {"type": "directional", "intensity": 7.0, "color": [1, 0.5, 0]}
+    tree = quad(extensions={"KHR_lights_punctual": {"lights": [light]}})
+    turned = {"rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]}  # its -z looks down glTF's -y
+    tree["nodes"].append({**turned, "extensions": {"KHR_lights_punctual": {"light": 0}}})
+    tree["scenes"][0]["nodes"] = [0, 1]
+    sky = read_gltf(write_gltf(tmp_path, tree), "CC0-1.0").scene.environment
+    assert sky is not None
+    rng = np.random.default_rng(0)
+    near = rng.normal(size=(200_000, 3)) * [0.02, 0.02, 0] + [0, 0, 1]
+    density = np.exp(-np.square(near[:, :2]).sum(axis=1) / 2 / 0.02**2) / (2 * np.pi * 0.02**2)
+    weight = (1 + np.square(near[:, :2]).sum(axis=1)) ** -2.0  # of the plane's area, seen from 0
+    irradiance = (environment_values(sky, near) * (weight / density)[:, None]).mean(axis=0)
+    assert irradiance == pytest.approx([7, 3.5, 0], rel=0.1)
 
 
 def test_what_is_lost_is_said_once(tmp_path: Path) -> None:
