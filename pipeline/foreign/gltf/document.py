@@ -209,7 +209,9 @@ def open_gltf(
     for uri in _file_uris(tree, "buffers"):
         buffers[uri] = read(local_path(uri, folder), left)
         left -= len(buffers[uri])
-    pictures = _read_pictures(tree, folder, left, read) if limits.with_materials else None
+    pictures = None
+    if limits.with_materials and isinstance(tree.get("images", []), list):
+        pictures = _read_pictures(tree, folder, left, read)
     return GltfDocument(
         tree=tree,
         binary=binary,

@@ -82,7 +82,8 @@ class GltfPrimitive:
         for weight, target in zip(self._weights, targets, strict=False):
             if weight and name in target:
                 more = self._document.values(target[name], widths, self._rows, is_unit=is_unit)
-                values = values + float(weight) * more
+                with np.errstate(invalid="ignore", over="ignore"):
+                    values = values + float(weight) * more
         return values
 
 
