@@ -15,6 +15,9 @@ RGB = tuple[float, float, float]
 
 WHITE: RGB = (1.0, 1.0, 1.0)
 
+MOST_UV_SETS = 4
+"""Sets of texture coordinates of a mesh that are looked at."""
+
 LEAST_ROUGHNESS = 0.01
 """As of drawn materials (scene_templates.materials)."""
 

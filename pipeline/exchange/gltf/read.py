@@ -34,7 +34,7 @@ from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all
 from pipeline.foreign.gltf.document import GltfDocument, refuse_malformed
 from pipeline.foreign.gltf.materials import DEFAULT, GltfMaterials
 from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nodes
-from pipeline.foreign.gltf.primitives import GltfPrimitive, read_primitives
+from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.picture import decoded
@@ -127,11 +127,9 @@ class _Reading:
             return
         mesh = entry(self.document.tree, "meshes", placed.node["mesh"])
         name = str(placed.node.get("name") or mesh.get("name") or "object")
-        primitives = read_primitives(self.document, placed.node)
-        for to_world in self.document.instances(placed):
-            for primitive in primitives:
-                for kind, triangles in by_kind(self._triangles(primitive, to_world)):
-                    yield dressed(self._entry(name, kind), triangles)
+        for primitive in placed_primitives(self.document, placed):
+            for kind, triangles in by_kind(self._triangles(primitive)):
+                yield dressed(self._entry(name, kind), triangles)
 
     @cached_property
     def _materials(self) -> GltfMaterials:
@@ -152,13 +150,11 @@ class _Reading:
         self.lost += [f"{word} of materials" for word in found.lost if word != "emission"]
         return found
 
-    def _triangles(
-        self, primitive: GltfPrimitive, to_world: NDArray[np.float64]
-    ) -> DressedTriangles:
-        found = WorldTriangles(primitive, to_world)
+    def _triangles(self, primitive: PlacedPrimitive) -> DressedTriangles:
+        found = WorldTriangles(primitive)
         if found.without_area:
             self.lost.append("triangles without an area")
-        number = primitive.material
+        number = primitive.primitive.material
         row = {} if number is None else entry(self.document.tree, "materials", number)
         source = MapSource(
             name=str(row.get("name", ""))[:200],

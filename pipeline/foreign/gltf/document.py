@@ -1,6 +1,6 @@
 """`GltfDocument`: a glTF's checked JSON, and the arrays and pictures that its buffers hold."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +19,7 @@ from pipeline.foreign.gltf.container import (
 from pipeline.foreign.gltf.nodes import INSTANCING, PlacedNode, entry, extension, transforms
 from pipeline.foreign.gltf.unread import unread_parts
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.material_files import MaterialFiles
+from pipeline.foreign.material_files import MaterialFiles, ReadFile, gltf_files
 from storage.errors import Rejected, TrilightError
 
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -29,7 +29,6 @@ _PADDING = 3
 _MOST_REPLACED = 1 << 23
 """Most values of a sparse accessor, which are copied."""
 
-ReadFile = Callable[[Path, int], bytes]
 Rows = NDArray[np.int64] | slice
 
 
@@ -204,47 +203,18 @@ def open_gltf(
     with refuse_malformed("load_error", "the glTF tree is"):
         check_tree(tree, limits)
         unread = unread_parts(tree)
+        uris = [row["uri"] for row in tree.get("buffers", ()) if "uri" in row]
+        named = {uri: local_path(uri, folder) for uri in uris if not is_data_uri(uri)}
     buffers: dict[str, bytes] = {}
     left = limits.max_bytes - len(data)
-    for uri in _file_uris(tree, "buffers"):
-        buffers[uri] = read(local_path(uri, folder), left)
+    for uri, path in named.items():
+        buffers[uri] = read(path, left)
         left -= len(buffers[uri])
-    pictures = None
-    if limits.with_materials and isinstance(tree.get("images", []), list):
-        pictures = _read_pictures(tree, folder, left, read)
+    has_pictures = limits.with_materials and isinstance(tree.get("images"), list)
     return GltfDocument(
         tree=tree,
         binary=binary,
         buffers=buffers,
-        pictures=pictures or MaterialFiles(),
+        pictures=gltf_files(tree, folder, left, read) if has_pictures else MaterialFiles(),
         unread=unread,
     )
-
-
-def _file_uris(tree: Mapping[str, Any], kind: str) -> list[str]:
-    """Return the URIs of a list of the tree that name files, each once."""
-    uris = [each.get("uri") for each in tree.get(kind, ()) if isinstance(each, dict)]
-    return list(dict.fromkeys(uri for uri in uris if isinstance(uri, str) and not is_data_uri(uri)))
-
-
-_PICTURE_REASONS = {
-    "too_large_bytes": "texture_too_large",
-    "missing_file": "texture_missing",
-    "external_uri": "texture_outside",
-}
-
-
-def _read_pictures(
-    tree: Mapping[str, Any], folder: Path, left: int, read: ReadFile
-) -> MaterialFiles:
-    """Return the pictures that a glTF names; one that is missing ends no object."""
-    data, refused = dict[str, bytes](), dict[str, Rejected]()
-    for uri in _file_uris(tree, "images"):
-        try:
-            data[uri] = read(local_path(uri, folder), left)
-            left -= len(data[uri])
-        except Rejected as why:
-            reason = _PICTURE_REASONS.get(why.reason, why.reason)
-            name = "" if why.reason == "external_uri" else f"{uri!r:.80}: "
-            refused[uri] = Rejected(reason, f"{name}{why.message}")
-    return MaterialFiles(data=data, refused=refused)

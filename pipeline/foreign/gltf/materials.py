@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.gltf.document import GltfDocument
 from pipeline.foreign.gltf.nodes import entry, extension
-from pipeline.foreign.material import RGB, Slot, SourceMaterial
-from pipeline.foreign.parts import MOST_UV_SETS
+from pipeline.foreign.material import MOST_UV_SETS, RGB, Slot, SourceMaterial
 from pipeline.foreign.picture import Picture, Wrap
 from storage.errors import Rejected
 

@@ -1,6 +1,6 @@
 """The triangles of a glTF primitive, in the axes of its node."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.gltf.check import FAN, POINTS_AND_LINES, STRIP, TRIANGLES
 from pipeline.foreign.gltf.document import GltfDocument, Rows
-from pipeline.foreign.gltf.nodes import entry
+from pipeline.foreign.gltf.nodes import PlacedNode, entry
 from storage.errors import Rejected
 
 
@@ -87,27 +87,53 @@ class GltfPrimitive:
         return values
 
 
-def read_primitives(document: GltfDocument, node: dict[str, Any]) -> list[GltfPrimitive]:
-    """Return what has triangles of the mesh of a node."""
-    mesh = entry(document.tree, "meshes", node["mesh"])
-    weights = node.get("weights", mesh.get("weights", ()))
-    return [
+class PlacedPrimitive:
+    """A primitive in one of its places; a mirrored one has its corners in the other order."""
+
+    def __init__(self, primitive: GltfPrimitive, to_world: NDArray[np.float64]) -> None:
+        """Place its vertices by a matrix [4, 4]."""
+        self.primitive = primitive
+        turn = to_world[:3, :3]
+        with np.errstate(invalid="ignore", over="ignore"):
+            self._step = -1 if np.linalg.det(turn) < 0 else 1
+            world = np.einsum("ij,vj->vi", turn, primitive.positions) + to_world[:3, 3]
+            self._cofactors = np.cross(turn[[1, 2, 0]], turn[[2, 0, 1]]) * self._step
+        self.positions: NDArray[np.float64] = world
+        """[V, 3]"""
+        self.faces = primitive.faces[:, :: self._step]
+        """[T, 3] rows of `positions`."""
+
+    @property
+    def colors(self) -> NDArray[np.float64] | None:
+        """Linear colors [T, 3, 3] of the corners; None where there are none."""
+        return self._turned(self.primitive.colors)
+
+    @property
+    def normals(self) -> NDArray[np.float64] | None:
+        """Normals [T, 3, 3] of the corners, of any length; None where there are none."""
+        found = self._turned(self.primitive.normals)
+        return None if found is None else np.einsum("ij,tcj->tci", self._cofactors, found)
+
+    def coordinates(self, number: int) -> NDArray[np.float64] | None:
+        """Return a set of texture coordinates [T, 3, 2], v up; None where there is none."""
+        return self._turned(self.primitive.coordinates(number))
+
+    def _turned(self, of_corners: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        return None if of_corners is None else of_corners[:, :: self._step]
+
+
+def placed_primitives(document: GltfDocument, place: PlacedNode) -> Iterator[PlacedPrimitive]:
+    """Yield what has triangles of the mesh of a node, in each of its places."""
+    mesh = entry(document.tree, "meshes", place.node["mesh"])
+    weights = place.node.get("weights", mesh.get("weights", ()))
+    primitives = [
         GltfPrimitive(document, primitive, list(weights))
         for primitive in mesh["primitives"]
         if primitive.get("mode", TRIANGLES) not in POINTS_AND_LINES
         and "POSITION" in primitive["attributes"]
     ]
-
-
-def place_points(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points [N, 3] where a matrix [4, 4] puts them."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        return np.einsum("ij,vj->vi", to_world[:3, :3], points) + to_world[:3, 3]
-
-
-def is_mirrored(to_world: NDArray[np.float64]) -> bool:
-    """Return whether a matrix [4, 4] turns faces around."""
-    return bool(np.linalg.det(to_world[:3, :3]) < 0)
+    for to_world in document.instances(place):
+        yield from (PlacedPrimitive(primitive, to_world) for primitive in primitives)
 
 
 def _faces(order: NDArray[np.int64], mode: int) -> NDArray[np.int64]:

@@ -4,49 +4,20 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 _READ = frozenset(
-    {
-        "EXT_mesh_gpu_instancing",
-        "EXT_texture_webp",
-        "KHR_lights_punctual",
-        "KHR_materials_emissive_strength",
-        "KHR_materials_ior",
-        "KHR_materials_pbrSpecularGlossiness",
-        "KHR_materials_specular",
-        "KHR_materials_unlit",
-        "KHR_mesh_quantization",
-        "KHR_node_visibility",
-        "KHR_texture_transform",
-    }
+    "EXT_mesh_gpu_instancing EXT_texture_webp KHR_lights_punctual KHR_materials_emissive_strength "
+    "KHR_materials_ior KHR_materials_pbrSpecularGlossiness KHR_materials_specular "
+    "KHR_materials_unlit KHR_mesh_quantization KHR_node_visibility KHR_texture_transform".split()
 )
 _CHANGES_NOTHING = frozenset(
-    {
-        "CESIUM_primitive_outline",
-        "EXT_instance_features",
-        "EXT_mesh_features",
-        "EXT_mesh_manifold",
-        "EXT_structural_metadata",
-        "FB_geometry_metadata",
-        "GODOT_single_root",
-        "KHR_animation_pointer",
-        "KHR_node_hoverability",
-        "KHR_node_selectability",
-        "KHR_xmp",
-        "KHR_xmp_json_ld",
-        "MSFT_lod",
-    }
+    "CESIUM_primitive_outline EXT_instance_features EXT_mesh_features EXT_mesh_manifold "
+    "EXT_structural_metadata FB_geometry_metadata GODOT_single_root KHR_animation_pointer "
+    "KHR_node_hoverability KHR_node_selectability KHR_xmp KHR_xmp_json_ld MSFT_lod".split()
 )
-"""Metadata, and coarser copies of what the scene shows."""
-
+"""Metadata, ways to animate, and coarser copies of what the scene shows."""
 _NAMED_ELSEWHERE = frozenset(
-    {
-        "EXT_meshopt_compression",
-        "KHR_draco_mesh_compression",
-        "KHR_meshopt_compression",
-        *(
-            f"KHR_materials_{name}"
-            for name in ("anisotropy", "clearcoat", "iridescence", "sheen", "transmission")
-        ),
-    }
+    "EXT_meshopt_compression KHR_draco_mesh_compression KHR_meshopt_compression "
+    "KHR_materials_anisotropy KHR_materials_clearcoat KHR_materials_iridescence "
+    "KHR_materials_sheen KHR_materials_transmission".split()
 )
 """Compression beside plain data, which is read; and what `SourceMaterial.lost` names."""
 
