@@ -15,12 +15,16 @@ _SURFACE_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_t
 """A file may require these: they change how a surface looks, which is named where it is lost."""
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 _UNPACK = "unpack it first, for example with gltf-transform"
+_LISTS = ("scenes", "nodes", "meshes", "accessors", "bufferViews", "buffers")
 POINTS_AND_LINES = (0, 1, 2, 3)
 TRIANGLES, STRIP, FAN = 4, 5, 6
 
 
 def check_tree(tree: dict[str, Any], limits: ReadLimits) -> None:
     """Raise Rejected for a tree that would load wrongly, or as more than the limits."""
+    for kind in _LISTS:
+        if not isinstance(tree.get(kind, []), list):
+            raise ValueError(f"{kind} is no list")
     _check_extensions(tree)
     faces: dict[int, int] = {}
     placed = total = 0

@@ -34,7 +34,11 @@ _KEYS: Mapping[str, str] = {
 }
 """The keys of glTF 2.0 by the list that they are in."""
 
-_ATTRIBUTES = ("POSITION", "NORMAL", "TANGENT", "COLOR_0", "TEXCOORD_", "JOINTS_", "WEIGHTS_")
+_ATTRIBUTES: Mapping[str, tuple[str, ...]] = {
+    "primitives": ("POSITION", "NORMAL", "TANGENT", "COLOR_0", "TEXCOORD_", "JOINTS_", "WEIGHTS_"),
+    "nodes, EXT_mesh_gpu_instancing": ("TRANSLATION", "ROTATION", "SCALE"),
+}
+"""How the attributes begin that are read, or that only skins have."""
 
 
 def is_known(name: str) -> bool:
@@ -86,19 +90,18 @@ def _of_row(kind: str, row: Mapping[str, Any]) -> Iterator[str]:
     if kind in _KEYS:
         known = {*_KEYS[kind].split(), "extensions", "extras"}
         yield from (f"key {key!r:.60} of {kind}" for key in row if key not in known)
-    if kind == "the file":
-        if row.get("animations"):
-            yield "animations: everything stands as it does without them"
-        others = len(row.get("scenes", ())) - 1
-        if others > 0:
-            yield f"{others} of {others + 1} scenes: the default one is read"
-    if kind == "materials" and "occlusionTexture" in row:
-        yield "occlusion maps of materials: light is traced"
+    if kind in _ATTRIBUTES:
+        names = row.get("attributes", ())
+        others = (name for name in names if not name.startswith(_ATTRIBUTES[kind]))
+        yield from (f"attribute {name!r:.60} of {kind}" for name in others)
     if kind == "primitives":
         if row.get("mode", 4) in (0, 1, 2, 3):
             yield "points and lines"
         elif "POSITION" not in row.get("attributes", ()):
             yield "primitives without positions"
-        for name in row.get("attributes", ()):
-            if not name.startswith(_ATTRIBUTES):
-                yield f"attribute {name!r:.60} of meshes"
+    if kind == "materials" and "occlusionTexture" in row:
+        yield "occlusion maps of materials: light is traced"
+    if kind == "the file" and row.get("animations"):
+        yield "animations: everything stands as it does without them"
+    if kind == "the file" and len(row.get("scenes", ())) > 1:
+        yield f"{len(row['scenes']) - 1} of {len(row['scenes'])} scenes: the default one is read"
