@@ -27,8 +27,11 @@ from storage.records.texture import MapSource
 _STRIP = 256
 """Rows of a map whose columns are computed at a time."""
 
-_MOST_TINTS = {True: 32, False: 256}
-"""Most colors of vertices that are materials of their own, with and without textures."""
+_MOST_TINTS = 256
+"""Most colors of vertices that are materials of their own; more become a texture."""
+
+_MOST_TINTED = 1 << 25
+"""Most texels of all textures of a mesh that differ in the color of its vertices alone."""
 
 _ROUGH = ("roughness", "glossiness")
 
@@ -66,8 +69,12 @@ def look_of(
         lost: receives what cannot be carried over.
     """
     found = sample_slots(material, coordinates, lost)
-    tints, worn = _tints(colors, count, lost, is_textured=found.uv is not None)
-    if found.uv is None and len(tints) > _MOST_TINTS[False]:
+    most = _MOST_TINTED
+    if found.uv is not None:
+        texels = max(values[..., 0].size for values in found.maps.values())
+        most = min(max(_MOST_TINTED // texels, 1), _MOST_TINTS)
+    tints, worn = _tints(colors, count, most, lost)
+    if found.uv is None and len(tints) > _MOST_TINTS:
         found, tints, worn = _with_palette(found, tints, worn)
     rows = default_rows(count)
     rows[:, EMISSION] = _emission(material, lost)
@@ -134,9 +141,9 @@ def _reduced(values: NDArray[np.float32]) -> Map:
 
 
 def _tints(
-    colors: NDArray[np.float64] | None, count: int, lost: list[str], *, is_textured: bool
+    colors: NDArray[np.float64] | None, count: int, most: int, lost: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the colors [K, 3] of triangles, and the one [T] of each."""
+    """Return at most `most` colors [K, 3] of triangles, and the one [T] of each."""
     if colors is None or not count:
         return np.ones((1, 3)), np.zeros(count, np.int64)
     if np.ptp(colors, axis=1).max() > 1 / 255:
@@ -145,7 +152,7 @@ def _tints(
     tints, worn = _grouped(plain, np.round(plain * 1e6).astype(np.int64))
     coded = srgb8(plain).astype(np.int64)
     shift = 0
-    while len(tints) > (_MOST_TINTS[True] if is_textured else 1 << 22):
+    while len(tints) > most:
         tints, worn = _grouped(plain, coded >> shift)
         shift += 1
     if shift:
