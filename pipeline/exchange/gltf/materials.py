@@ -5,13 +5,13 @@ glTF reflects more at grazing angles, by Schlick's curve; ours reflects its mean
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.dressed import PLAIN, Worn
-from pipeline.exchange.gltf.textures import SLOTS, Coordinates, Sampled, sample_slots
+from pipeline.exchange.dressed import PLAIN, DressedTriangles, Worn
+from pipeline.exchange.gltf.meshes import WorldTriangles
+from pipeline.exchange.gltf.textures import SLOTS, Sampled, sample_slots
 from pipeline.exchange.linear_maps import (
     Map,
     colour_textures,
@@ -36,59 +36,41 @@ _MOST_TINTED = 1 << 25
 _ROUGH = ("roughness", "glossiness")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GltfLook:
-    """A material over the T triangles of one mesh."""
-
-    rows: NDArray[np.float32]
-    """[T, 10 or more] material columns."""
-    uv: NDArray[np.float32]
-    """[T, 3, 2] where textures are looked up."""
-    worn: NDArray[np.int64]
-    """[T] row of `wardrobe`."""
-    wardrobe: Sequence[Worn]
-    """Textures that a triangle may have."""
-
-
-def look_of(
-    material: SourceMaterial,
-    coordinates: Coordinates,
-    colors: NDArray[np.float64] | None,
-    count: int,
-    source: MapSource,
-    lost: list[str],
-) -> GltfLook:
-    """Return what a material comes to on a mesh of `count` triangles.
+def dress_triangles(
+    material: SourceMaterial, found: WorldTriangles, source: MapSource, lost: list[str]
+) -> DressedTriangles:
+    """Return triangles with what a material comes to on them.
 
     Args:
         material: as the file says.
-        coordinates: of the mesh.
-        colors: [T, 3, 3] linear colors of the corners, or None.
-        count: number of triangles, T.
+        found: the triangles, with coordinates and colors.
         source: name and rights of the textures.
         lost: receives what cannot be carried over.
     """
-    found = sample_slots(material, coordinates, lost)
-    most = _MOST_TINTED
-    if found.uv is not None:
-        texels = max(values[..., 0].size for values in found.maps.values())
+    count, most = len(found.positions), _MOST_TINTED
+    shown = sample_slots(material, found.coordinates, lost)
+    if shown.uv is not None:
+        texels = max(values[..., 0].size for values in shown.maps.values())
         most = min(max(_MOST_TINTED // texels, 1), _MOST_TINTS)
-    tints, worn = _tints(colors, count, most, lost)
-    if found.uv is None and len(tints) > _MOST_TINTS:
-        found, tints, worn = _with_palette(found, tints, worn)
+    tints, worn = _tints(found.colors, count, most, lost)
+    if shown.uv is None and len(tints) > _MOST_TINTS:
+        shown, tints, worn = _with_palette(shown, tints, worn)
     rows = default_rows(count)
     rows[:, EMISSION] = _emission(material, lost)
-    if found.uv is not None:
-        wardrobe = [_textures(material, found.maps, tint, source) for tint in tints]
-        return GltfLook(rows=rows, uv=found.uv, worn=worn, wardrobe=wardrobe)
-    values = _columns(material, found.maps, np.asarray(tints)[None])[0, worn]
-    rows[:, DIFFUSE], rows[:, SPECULAR] = values[:, :3], values[:, 3:6]
-    rows[:, ROUGHNESS] = values[:, 6]
-    return GltfLook(
+    wardrobe: Sequence[Worn] = (PLAIN,)
+    if shown.uv is not None:
+        wardrobe = [_textures(material, shown.maps, tint, source) for tint in tints]
+    else:
+        values = _columns(material, shown.maps, np.asarray(tints)[None])[0, worn]
+        rows[:, DIFFUSE], rows[:, SPECULAR] = values[:, :3], values[:, 3:6]
+        rows[:, ROUGHNESS] = values[:, 6]
+    return DressedTriangles(
+        positions=found.positions,
+        normals=found.normals,
         rows=rows,
-        uv=np.zeros((count, 3, 2), np.float32),
-        worn=np.zeros(count, np.int64),
-        wardrobe=(PLAIN,),
+        uv=np.zeros((count, 3, 2), np.float32) if shown.uv is None else shown.uv,
+        worn=worn % len(wardrobe),
+        wardrobe=wardrobe,
     )
 
 

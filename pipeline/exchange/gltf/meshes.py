@@ -7,6 +7,7 @@ from pipeline.foreign.gltf.primitives import PlacedPrimitive
 from storage.errors import Rejected
 
 _SMALLEST_DOUBLE_AREA = 1e-12
+"""In square metres; of a mesh below a metre, in squares of its size."""
 
 
 class WorldTriangles:
@@ -21,7 +22,8 @@ class WorldTriangles:
         wide = corners.astype(np.float32).astype(np.float64)
         cross = np.cross(wide[:, 1] - wide[:, 0], wide[:, 2] - wide[:, 0])
         length = np.linalg.norm(cross, axis=1, keepdims=True)
-        self._kept = length[:, 0] > _SMALLEST_DOUBLE_AREA
+        size = min(float(np.ptp(wide.reshape(-1, 3), axis=0).max()), 1.0) if wide.size else 1.0
+        self._kept = length[:, 0] > _SMALLEST_DOUBLE_AREA * size**2
         self.without_area = int((~self._kept).sum())
         self.positions = wide[self._kept].astype(np.float32)
         """[T, 3, 3]"""

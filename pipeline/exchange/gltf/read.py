@@ -20,7 +20,7 @@ from pipeline.exchange.dressed import (
     joined_arrays,
     scene_with_worn,
 )
-from pipeline.exchange.gltf.materials import look_of
+from pipeline.exchange.gltf.materials import dress_triangles
 from pipeline.exchange.gltf.meshes import WorldTriangles
 from pipeline.exchange.gltf.seen_and_lit import (
     DIRECTIONAL,
@@ -85,7 +85,7 @@ class _Reading:
     name: str
     licence: str
     lost: list[str] = field(default_factory=list)
-    names: set[str] = field(default_factory=set)
+    names: dict[str, int] = field(default_factory=dict)
 
     def scene(self) -> GltfScene:
         """Return what the file shows."""
@@ -161,22 +161,7 @@ class _Reading:
             licence=self.licence,
             attribution=self._attribution(),
         )
-        look = look_of(
-            self._material(number),
-            found.coordinates,
-            found.colors,
-            len(found.positions),
-            source,
-            self.lost,
-        )
-        return DressedTriangles(
-            positions=found.positions,
-            normals=found.normals,
-            rows=look.rows,
-            uv=look.uv,
-            worn=look.worn,
-            wardrobe=look.wardrobe,
-        )
+        return dress_triangles(self._material(number), found, source, self.lost)
 
     def _light(self, placed: PlacedNode) -> dict[str, Any] | None:
         """Return the JSON of the light of a node; None where it has none."""
@@ -206,12 +191,14 @@ class _Reading:
     def _entry(self, base: str, kind: ObjectKind) -> SceneObject:
         if len(self.names) >= MAX_OBJECTS:
             raise TrilightError(f"{self.name}: more than {MAX_OBJECTS} objects.")
-        base, count = base[:200].replace("\0", "_"), 1
-        name = base
-        while name in self.names:
+        base = base[:200].replace("\0", "_")
+        count = self.names.get(base, 0) + 1
+        name = base if count == 1 else f"{base}.{count}"
+        while count > 1 and name in self.names:
             count += 1
             name = f"{base}.{count}"
-        self.names.add(name)
+        self.names[base] = count
+        self.names.setdefault(name, 1)
         return SceneObject(
             name=name, kind=kind, licence=self.licence, attribution=self._attribution()
         )
