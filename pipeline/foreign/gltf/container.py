@@ -15,7 +15,7 @@ _HEADER = struct.Struct("<4sII")
 _CHUNK = struct.Struct("<I4s")
 
 
-def read_container(data: bytes, suffix: str) -> tuple[dict[str, Any], bytes | None]:
+def read_container(data: bytes, suffix: str) -> tuple[dict[str, Any], memoryview | None]:
     """Return the JSON of a .gltf or .glb, and the binary chunk of the latter.
 
     Raises:
@@ -30,7 +30,7 @@ def read_container(data: bytes, suffix: str) -> tuple[dict[str, Any], bytes | No
     return tree, binary
 
 
-def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
+def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
     if data[:4] != b"glTF":
         raise Rejected("load_error", "the file is no GLB: it does not begin with glTF")
     if len(data) < _HEADER.size:
@@ -40,13 +40,13 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
         raise _other_version(str(version))
     if length > len(data):
         raise _cut_off(length, len(data))
-    chunks = list(_split(data[:length]))
+    chunks = list(_split(memoryview(data)[:length]))
     if not chunks or chunks[0][0] != b"JSON":
         raise Rejected("load_error", "the first chunk of the GLB is no JSON")
-    return chunks[0][1], next((body for kind, body in chunks[1:] if kind == b"BIN\0"), None)
+    return bytes(chunks[0][1]), next((body for kind, body in chunks[1:] if kind == b"BIN\0"), None)
 
 
-def _split(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+def _split(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
     """Yield kind and bytes of each chunk; kinds that nobody knows are legal."""
     start = _HEADER.size
     while start + _CHUNK.size <= len(data):

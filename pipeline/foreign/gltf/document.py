@@ -49,7 +49,7 @@ class GltfDocument:
 
     tree: dict[str, Any]
     """Its JSON."""
-    binary: bytes | None
+    binary: memoryview | None
     """The binary chunk of a GLB."""
     buffers: Mapping[str, bytes]
     """Files that its buffers name, by URI."""
@@ -168,10 +168,11 @@ class GltfDocument:
     def _view(self, index: Any) -> memoryview:
         view = entry(self.tree, "bufferViews", index)
         buffer = entry(self.tree, "buffers", view["buffer"])
-        uri = buffer.get("uri")
-        if uri is not None and is_data_uri(uri) and uri not in self._embedded:
-            self._embedded[uri] = data_uri_bytes(uri)
-        data = self.binary if uri is None else self._embedded.get(uri) or self.buffers.get(uri)
+        uri, data = buffer.get("uri"), self.binary
+        if uri is not None:
+            if is_data_uri(uri) and uri not in self._embedded:
+                self._embedded[uri] = data_uri_bytes(uri)
+            data = memoryview(self._embedded[uri] if is_data_uri(uri) else self.buffers[uri])
         if data is None or len(data) < int(buffer["byteLength"]) - _PADDING:
             raise Rejected(
                 "cut_off",
