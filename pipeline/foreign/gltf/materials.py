@@ -196,7 +196,7 @@ class GltfMaterials:
         except (TypeError, ValueError) as error:
             if self._notes is None:
                 raise ValueError(f"{name}: {error}") from error
-            self._notes.append(f"{name}: {error}; {default} taken")
+            self._notes.append(f"{name}: {error}; {[*default]} taken")
             return list(default)
         clamped = [min(max(value, 0.0), most) for value in found]
         if self._notes is not None and clamped != found:

@@ -77,6 +77,7 @@ def ordered(corners: NDArray[np.float64], colors: NDArray[np.float64]) -> NDArra
 
 
 QUATERNIONS = [(0, 0, 0, 1), (0, 0, HALF, HALF), (0.5, 0.5, 0.5, 0.5), (0, 1, 0, 0)]
+MODELS = ["", "KHR_materials_unlit", "KHR_materials_pbrSpecularGlossiness"]
 numbers = st.integers(-40, 40)
 
 
@@ -109,7 +110,7 @@ def dialects(draw: st.DrawFn) -> dict[str, Any]:
         "alpha": draw(st.booleans()),
         "color layout": draw(st.sampled_from(["plain", "strided", "sparse", "zeros"])),
         "flat": draw(st.booleans()),
-        "unlit": draw(st.booleans()),
+        "model": draw(st.sampled_from(MODELS)),
         "places": draw(st.lists(placements(), min_size=1, max_size=3)),
         "instances": draw(st.sampled_from([None, "f4", "i1"])),
         "beside": draw(st.sampled_from([None, "camera", "light"])),
@@ -132,10 +133,12 @@ def written(dialect: dict[str, Any], folder: Path) -> tuple[Path, NDArray[np.flo
         primitive["mode"] = dialect["mode"]
     base = np.array([0.5, 0.25, 1])
     metal = {"metallicFactor": 0, "baseColorFactor": [*base, 1]}
-    unlit: dict[str, Any] = {"extensions": {"KHR_materials_unlit": {}}} if dialect["unlit"] else {}
-    file.add("materials", {"pbrMetallicRoughness": metal, **unlit})
+    glossy = {"diffuseFactor": [*base, 1], "specularFactor": [0, 0, 0]}
+    more = {"KHR_materials_unlit": {}, "KHR_materials_pbrSpecularGlossiness": glossy}
+    model = {name: each for name, each in more.items() if name == dialect["model"]}
+    file.add("materials", {"pbrMetallicRoughness": metal, "extensions": model})
     file.add("meshes", {"primitives": [primitive]})
-    diffuse = base * (1 if dialect["unlit"] else 1 - 0.04 - 0.96 / 21)
+    diffuse = base * (1 if model else 1 - 0.04 - 0.96 / 21)
     corners, shades = [], []
     triangles = spans(order.tolist(), dialect["mode"] or 4)
     for matrix, three in itertools.product(with_nodes(file, dialect), triangles):
