@@ -155,10 +155,11 @@ class GltfMaterials:
         uv_set = int(moved.get("texCoord", info.get("texCoord", 0)))
         if not 0 <= uv_set < MOST_UV_SETS:
             raise Rejected("no_texture_coordinates", f"a texture lies on TEXCOORD_{uv_set}")
+        values = self._picture(source)
         return Slot(
             picture=Picture(
-                values=self._picture(source),
-                is_srgb=is_srgb,
+                values=values,
+                is_srgb=is_srgb and values.dtype != np.float16,  # floats are linear
                 wrap=wrap,
                 is_nearest=sampler.get("magFilter") == _NEAREST,
             ),

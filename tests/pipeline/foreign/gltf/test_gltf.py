@@ -189,8 +189,8 @@ def with_nodes(file: GltfWriter, dialect: dict[str, Any]) -> list[NDArray[np.flo
         file.add("cameras", {"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1}})
         last["camera"] = 0
     elif dialect["beside"] == "light":
-        light = {"KHR_lights_punctual": {"lights": [{"type": "point", "intensity": 0}]}}
-        file.tree["extensions"] = light
+        lights = {"lights": [{"type": "point", "intensity": 0}]}
+        file.tree["extensions"] = {"KHR_lights_punctual": lights}
         last["extensions"]["KHR_lights_punctual"] = {"light": 0}
     if dialect["scenes"] != "none":
         file.tree["scenes"] = [{"nodes": [0]}]
@@ -208,9 +208,8 @@ def with_nodes(file: GltfWriter, dialect: dict[str, Any]) -> list[NDArray[np.flo
             "ROTATION": file.accessor(turns, code, normalized=code == "i1"),
         }
     }
-    turns = turns / np.linalg.norm(turns, axis=1, keepdims=True)
-    pairs = zip(moves, turns, strict=True)
-    return [place @ matrix_of(move, turn, (1, 1, 1)) for move, turn in pairs]
+    units = turns / np.linalg.norm(turns, axis=1, keepdims=True)
+    return [place @ matrix_of(*pair, (1, 1, 1)) for pair in zip(moves, units, strict=True)]
 
 
 def spans(order: list[int], mode: int) -> list[list[int]]:
@@ -255,11 +254,6 @@ def test_many_colors_of_vertices_are_a_texture_of_a_scene(tmp_path: Path) -> Non
     np.testing.assert_allclose(scene_surface(scene), surface(path), atol=0.01)
 
 
-def files_of(shared: Path) -> list[Path]:
-    cases = sorted((shared / "cases").glob("*/in/*.gl[bt]*"))
-    return [*cases, *sorted((shared / "objects").rglob("*.gl[bt]*"))]
-
-
 def assert_same_surfaces(path: Path) -> None:
     with case(path.name):
         seen = scene_surface(read_gltf(path, "CC0-1.0"))
@@ -267,15 +261,13 @@ def assert_same_surfaces(path: Path) -> None:
 
 
 def test_objects_and_scenes_of_the_cases_are_the_same(shared: Path) -> None:
-    files = files_of(shared)
-    assert len(files) > 100
-    for path in files[:6]:
+    for path in (shared / "cases").glob("*/in/*.gl[bt]*"):
         assert_same_surfaces(path)
 
 
 @pytest.mark.slow("references")
 def test_objects_and_scenes_of_all_shared_files_are_the_same(shared: Path) -> None:
-    for path in files_of(shared):
+    for path in (shared / "objects").rglob("*.gl[bt]*"):
         assert_same_surfaces(path)
 
 
