@@ -6,5 +6,5 @@ Native code parses some of the bytes, so only children with limits come here (pi
 - `load`, `parts`: its triangles, and their materials.
 - `material`, `picture`: what a file says of a surface, and its pictures.
 - `light_pictures`, `openexr`, `radiance_hdr`, `linear_picture`: pictures of floats.
-- `gltf_*`, `obj_*`, `ply_*`, `usd`: the formats.
+- `gltf`, `obj_*`, `ply_*`, `usd`: the formats.
 """

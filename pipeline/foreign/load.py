@@ -1,10 +1,11 @@
-"""From bytes to triangles: trimesh reads every format, and its silent failures become reasons."""
+"""From bytes to triangles: trimesh reads most formats, and its silent failures become reasons."""
 
 import io
 
 import numpy as np
 import trimesh
 
+from pipeline.foreign.gltf.objects import gltf_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import SourceFile
 from storage.errors import Rejected
@@ -23,11 +24,12 @@ def load_mesh(source: SourceFile) -> TriangleMesh:
     """
     if source.usd is not None:
         return source.usd.mesh
+    if source.gltf is not None:
+        return gltf_mesh(source.gltf)
     try:
         scene = trimesh.load_scene(
             io.BytesIO(source.data),
             file_type=source.kind,
-            resolver=dict(source.buffers),
             process=False,
             skip_materials=True,
         )
@@ -42,8 +44,6 @@ def load_mesh(source: SourceFile) -> TriangleMesh:
     if len(mesh.faces) == 0:
         raise Rejected("no_faces", "the file holds no triangles, or no node places them")
     positions = np.asarray(mesh.vertices, np.float64)
-    if source.kind in ("glb", "gltf"):
-        positions = np.stack([positions[:, 0], -positions[:, 2], positions[:, 1]], axis=1)
     return TriangleMesh(positions=positions, faces=np.asarray(mesh.faces, np.int64))
 
 

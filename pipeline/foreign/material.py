@@ -15,6 +15,9 @@ RGB = tuple[float, float, float]
 
 WHITE: RGB = (1.0, 1.0, 1.0)
 
+MOST_UV_SETS = 4
+"""Sets of texture coordinates of a mesh that are looked at."""
+
 LEAST_ROUGHNESS = 0.01
 """As of drawn materials (scene_templates.materials)."""
 
@@ -95,7 +98,9 @@ class Seen:
     glossiness: NDArray[np.float32] | None
 
 
-def columns(material: SourceMaterial, seen: Seen, count: int) -> NDArray[np.float64]:
+def columns(
+    material: SourceMaterial, seen: Seen, count: int, *, least_roughness: float = LEAST_ROUGHNESS
+) -> NDArray[np.float64]:
     """Return diffuse rgb, specular rgb and roughness [N, 7] of `count` places."""
 
     def times(factor: object, found: NDArray[np.float32] | None, part: slice) -> NDArray:
@@ -117,4 +122,4 @@ def columns(material: SourceMaterial, seen: Seen, count: int) -> NDArray[np.floa
     # what reflects nothing head-on is meant to have no lobe at all
     grazing = np.where(dielectric.max(axis=1, keepdims=True) > 0, np.clip(strength, 0, 1), 0)
     diffuse, specular = constant_albedos(base, metal, dielectric, grazing)
-    return np.concatenate([diffuse, specular, np.clip(rough, LEAST_ROUGHNESS, 1)], axis=1)
+    return np.concatenate([diffuse, specular, np.clip(rough, least_roughness, 1)], axis=1)

@@ -13,12 +13,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from pipeline.foreign.material import SourceMaterial
+from pipeline.foreign.material import MOST_UV_SETS, SourceMaterial
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
-
-MOST_UV_SETS = 4
-"""Sets of texture coordinates of a mesh that are looked at."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

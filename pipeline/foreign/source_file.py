@@ -6,15 +6,14 @@ so that no file can make it open another one. USD alone is given paths, which it
 
 import hashlib
 import stat
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.foreign.gltf_tree import buffer_paths, check_tree, read_tree
+from pipeline.foreign.gltf.document import GltfDocument, open_gltf
 from pipeline.foreign.headers import check_header
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.material_files import MaterialFiles, gltf_files, obj_files
+from pipeline.foreign.material_files import MaterialFiles, obj_files
 from pipeline.foreign.usd.stage import SUFFIXES as USD_SUFFIXES
 from storage.errors import Rejected
 
@@ -34,8 +33,6 @@ class SourceFile:
     """Suffix without the dot, in lower case."""
     data: bytes
     """The file."""
-    buffers: Mapping[str, bytes]
-    """Buffers of a glTF by the URI that names them; empty for other formats."""
     sha256: str
     """Digest of the file and of its buffers in the order of their names; and of the files of its
     materials, where those are kept."""
@@ -43,6 +40,10 @@ class SourceFile:
     """Files that its materials name; empty where nobody keeps them. USD has its own."""
     usd: "UsdSource | None" = None
     """What a USD file holds; `data` is empty then."""
+    gltf: GltfDocument | None = None
+    """What a glTF holds."""
+    unread: tuple[str, ...] = ()
+    """What the file says and no code reads, as short sentences, each once."""
 
 
 def needs_child(path: Path) -> bool:
@@ -57,9 +58,9 @@ def read_source(path: Path, limits: ReadLimits) -> SourceFile:
 
     Raises:
         Rejected: missing_file, unsupported_format, too_large_bytes, archive_refused,
-            header_size_mismatch, too_many_faces, unsupported_primitive, unsupported_extension,
-            unsupported_accessor, compressed_geometry, skinned_mesh, morphed_mesh, scene_cycle,
-            too_many_instances, external_uri, load_error.
+            header_size_mismatch, cut_off, too_many_faces, unsupported_primitive, load_error,
+            unsupported_extension, compressed_geometry, skinned_mesh, scene_cycle,
+            too_many_instances, external_uri.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -68,30 +69,26 @@ def read_source(path: Path, limits: ReadLimits) -> SourceFile:
     if needs_child(path):
         return _usd_file(path, limits)
     check_header(data, suffix, limits.max_faces)
-    buffers: dict[str, bytes] = {}
+    gltf: GltfDocument | None = None
     materials, keep = MaterialFiles(), limits.with_materials
     if suffix in (".glb", ".gltf"):
-        tree = read_tree(data, suffix)
-        check_tree(tree, limits)
-        left = limits.max_bytes - len(data)
-        for uri, target in buffer_paths(tree, path.parent).items():
-            buffers[uri] = _read_regular(target, left)
-            left -= len(buffers[uri])
-        if keep:
-            materials = gltf_files(tree, path.parent, left, _read_regular)
+        gltf = open_gltf(data, suffix, path.parent, limits, _read_regular)
+        materials = gltf.pictures
     elif suffix == ".obj" and keep:
         left = limits.max_bytes - len(data)
         materials = obj_files(data, path.parent, left, _read_regular)
     digest = hashlib.sha256(data)
+    buffers = {} if gltf is None else gltf.buffers
     for files in (buffers, materials.data):
         for uri in sorted(files):
             digest.update(files[uri])
     return SourceFile(
         kind=suffix[1:],
         data=data,
-        buffers=buffers,
         sha256=digest.hexdigest(),
         materials=materials,
+        gltf=gltf,
+        unread=() if gltf is None else gltf.unread,
     )
 
 
@@ -100,7 +97,7 @@ def _usd_file(path: Path, limits: ReadLimits) -> SourceFile:
 
     usd = UsdSource(path, limits)
     kind = path.suffix.lower()[1:]
-    return SourceFile(kind=kind, data=b"", buffers={}, sha256=usd.sha256, usd=usd)
+    return SourceFile(kind=kind, data=b"", sha256=usd.sha256, usd=usd)
 
 
 def _read_regular(path: Path, max_bytes: int) -> bytes:

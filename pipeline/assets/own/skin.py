@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +12,8 @@ from pipeline.assets.own.measure import skin_quality
 from pipeline.assets.own.nearest import NearestPlaces
 from pipeline.assets.own.source_surface import SourceSurface, source_surface
 from pipeline.assets.settings import OwnMaterialSettings
-from pipeline.foreign.gltf_materials import GltfMaterials, bare_gltf, data_uri_bytes
-from pipeline.foreign.gltf_tree import read_tree
+from pipeline.foreign.gltf.materials import GltfMaterials
+from pipeline.foreign.gltf.objects import gltf_parts
 from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.obj_materials import bare_obj, obj_materials
@@ -102,33 +101,12 @@ def _parts(
 ) -> TexturedParts:
     if source.usd is not None:
         return usd_parts(source.usd, decode, emission=emission)
+    if source.gltf is not None:
+        return gltf_parts(source.gltf, GltfMaterials(source.gltf, decode, emission=emission))
     if source.kind == "obj":
         materials = obj_materials(source.data, source.materials, decode, emission=emission)
         data, files = bare_obj(source.data)
         return load_parts(data, source.kind, files, materials, SourceMaterial())
     if source.kind == "ply":
         return ply_parts(source.data)
-    if source.kind not in ("glb", "gltf"):
-        raise Rejected("no_materials", f"a .{source.kind} file has no materials that are read")
-    tree = read_tree(source.data, f".{source.kind}")
-    if not tree.get("materials"):
-        raise Rejected("no_materials", "the glTF has no materials")
-    reader = GltfMaterials(
-        tree,
-        lambda row: _buffer(source, tree, row),
-        source.materials,
-        decode,
-        emission=emission,
-    )
-    data = bare_gltf(source.data, tree, f".{source.kind}")
-    default = SourceMaterial(metallic=1.0)  # what glTF says of a mesh without a material
-    return load_parts(data, source.kind, source.buffers, reader.by_name(), default)
-
-
-def _buffer(source: SourceFile, tree: dict[str, Any], row: int) -> bytes:
-    uri = tree["buffers"][row].get("uri")
-    if uri is None:  # the second chunk of a GLB
-        start = 20 + int.from_bytes(source.data[12:16], "little")
-        length = int.from_bytes(source.data[start : start + 4], "little")
-        return source.data[start + 8 : start + 8 + length]
-    return data_uri_bytes(uri) if uri.startswith("data:") else source.buffers[uri]
+    raise Rejected("no_materials", f"a .{source.kind} file has no materials that are read")

@@ -1,19 +1,17 @@
-"""glTF's metal-rough materials as ours: two albedos without a Fresnel term, and a roughness.
+"""Materials of a glTF over a mesh of a scene: textures and rows, by the law that objects follow.
 
 glTF reflects more at grazing angles, by Schlick's curve; ours reflects its mean everywhere
-(storage.records.fresnel).
+(pipeline.foreign.material).
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.dressed import Worn
-from pipeline.exchange.gltf.document import GltfDocument, extension
-from pipeline.exchange.gltf.textures import Coordinates, sampled
+from pipeline.exchange.dressed import PLAIN, DressedTriangles, Worn
+from pipeline.exchange.gltf.meshes import WorldTriangles
+from pipeline.exchange.gltf.textures import SLOTS, Sampled, sample_slots
 from pipeline.exchange.linear_maps import (
     Map,
     colour_textures,
@@ -21,142 +19,158 @@ from pipeline.exchange.linear_maps import (
     number_texture,
     on_one_grid,
 )
-from storage.records.fresnel import constant_albedos
+from pipeline.foreign.material import Seen, SourceMaterial, columns
+from storage.conventions import srgb8
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.texture import MapSource
 
-_ENCODED = frozenset({"base", "tint"})
-_UNDERSTOOD = {"KHR_materials_specular", "KHR_materials_ior", "KHR_materials_emissive_strength"}
-_MOST_EMISSION = 1e9
+_STRIP = 256
+"""Rows of a map whose columns are computed at a time."""
+
+_MOST_TINTS = 256
+"""Most colors of vertices that are materials of their own; more become a texture."""
+
+_MOST_TINTED = 1 << 25
+"""Most texels of all textures of a mesh that differ in the color of its vertices alone."""
+
+_ROUGH = ("roughness", "glossiness")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GltfLook:
-    """A material over one mesh."""
-
-    worn: Worn
-    """Its textures, constants too."""
-    emission_rgb: NDArray[np.float64]
-    """[3] radiance."""
-    uv: NDArray[np.float32] | None
-    """[T, 3, 2] where textures are looked up; None where all are constants."""
-
-
-def look_of(
-    document: GltfDocument,
-    material: dict[str, Any],
-    coordinates: Coordinates,
-    source: MapSource,
-    lost: list[str],
-) -> GltfLook:
-    """Return what a material of a file comes to on a mesh.
+def dress_triangles(
+    material: SourceMaterial, found: WorldTriangles, source: MapSource, lost: list[str]
+) -> DressedTriangles:
+    """Return triangles with what a material comes to on them.
 
     Args:
-        document: the file.
-        material: its JSON; empty for glTF's default material.
-        coordinates: of the mesh.
+        material: as the file says.
+        found: the triangles, with coordinates and colors.
         source: name and rights of the textures.
         lost: receives what cannot be carried over.
-
-    Raises:
-        TrilightError: a picture is outside of the folder, on the network, or too large.
     """
-    surface = material.get("pbrMetallicRoughness", {})
-    gloss = extension(material, "KHR_materials_specular")
-    stated = {
-        "base": surface.get("baseColorTexture"),
-        "rough": surface.get("metallicRoughnessTexture"),
-        "strength": gloss.get("specularTexture"),
-        "tint": gloss.get("specularColorTexture"),
-    }
-    infos = {name: info for name, info in stated.items() if info is not None}
-    found = sampled(document, infos, _ENCODED, coordinates, lost)
-    _note_losses(material, lost)
-    maps = _inputs(material, found.maps, lost)
-    diffuse, specular = _albedos(maps, _head_on(material, lost))
-    colours = colour_textures(diffuse, specular, source)
-    roughness = number_texture(maps["roughness"], source)
-    return GltfLook(
-        worn=(*colours, roughness), emission_rgb=_emission(document, material, lost), uv=found.uv
+    count, most = len(found.positions), _MOST_TINTED
+    shown = sample_slots(material, found.coordinates, lost)
+    if shown.uv is not None:
+        texels = max(values[..., 0].size for values in shown.maps.values())
+        most = min(max(_MOST_TINTED // texels, 1), _MOST_TINTS)
+    tints, worn = _tints(found.colors, count, most, lost)
+    if shown.uv is None and len(tints) > _MOST_TINTS:
+        shown, tints, worn = _with_palette(shown, tints, worn)
+    rows = default_rows(count)
+    rows[:, EMISSION] = _emission(material, lost)
+    wardrobe: Sequence[Worn] = (PLAIN,)
+    if shown.uv is not None:
+        wardrobe = [_textures(material, shown.maps, tint, source) for tint in tints]
+    else:
+        values = _columns(material, shown.maps, np.asarray(tints)[None])[0, worn]
+        rows[:, DIFFUSE], rows[:, SPECULAR] = values[:, :3], values[:, 3:6]
+        rows[:, ROUGHNESS] = values[:, 6]
+    return DressedTriangles(
+        positions=found.positions,
+        normals=found.normals,
+        rows=rows,
+        uv=np.zeros((count, 3, 2), np.float32) if shown.uv is None else shown.uv,
+        worn=worn % len(wardrobe),
+        wardrobe=wardrobe,
     )
 
 
-def _inputs(
-    material: dict[str, Any], textures: Mapping[str, Map], lost: list[str]
-) -> dict[str, Map]:
-    """Return base, metal, roughness, strength and tint, each its factor times its texture."""
-    surface = material.get("pbrMetallicRoughness", {})
-    gloss = extension(material, "KHR_materials_specular")
-    base = _factor(surface, "baseColorFactor", (1, 1, 1, 1), lost)[:3]
-    found = {
-        "base": (base, "base", slice(0, 3)),
-        "metal": (_factor(surface, "metallicFactor", 1, lost), "rough", slice(2, 3)),
-        "roughness": (_factor(surface, "roughnessFactor", 1, lost), "rough", slice(1, 2)),
-        "strength": (_factor(gloss, "specularFactor", 1, lost), "strength", slice(3, 4)),
-        "tint": (_factor(gloss, "specularColorFactor", (1, 1, 1), lost, 1e3), "tint", slice(0, 3)),
-    }
-    return {
-        name: constant_map(factor) * textures[use][..., part]
-        if use in textures
-        else constant_map(factor)
-        for name, (factor, use, part) in found.items()
-    }
-
-
-def _albedos(maps: Mapping[str, Map], head_on: float) -> tuple[Map, Map]:
-    base, metal, strength, tint = on_one_grid(
-        *(maps[name] for name in ("base", "metal", "strength", "tint"))
+def _textures(
+    material: SourceMaterial, maps: Mapping[str, Map], tint: NDArray[np.float64], source: MapSource
+) -> Worn:
+    """Return the textures of a material whose base color is multiplied by a tint [3]."""
+    colored = {name: values for name, values in maps.items() if name not in _ROUGH}
+    rough = {name: values for name, values in maps.items() if name in _ROUGH}
+    values = _columns(material, colored, tint[None, None])
+    roughness = _columns(material, rough, np.ones((1, 1, 3)))[..., 6:]
+    diffuse, specular = colour_textures(
+        _reduced(values[..., :3]), _reduced(values[..., 3:6]), source
     )
-    f0 = np.minimum(head_on * tint, 1) * strength
-    diffuse, specular = constant_albedos(base, metal, f0, strength)
-    return diffuse.astype(np.float32), specular.astype(np.float32)
+    return diffuse, specular, number_texture(_reduced(roughness), source)
 
 
-def _head_on(material: dict[str, Any], lost: list[str]) -> float:
-    ior = float(_factor(extension(material, "KHR_materials_ior"), "ior", 1.5, lost, 1e3))
-    return float(np.square((ior - 1) / (ior + 1))) if ior > 0 else 1.0
+def _columns(
+    material: SourceMaterial, maps: Mapping[str, Map], tint: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Return the columns [H, W, 7] of a material whose base is multiplied by a tint [., ., 3]."""
+    names = list(maps)
+    shown = dict(zip(names, on_one_grid(*maps.values()), strict=True)) if names else {}
+    height, width = np.broadcast_shapes(
+        tint.shape[:2], *(map_.shape[:2] for map_ in shown.values())
+    )
+    found = np.zeros((height, width, 7), np.float32)
+    for first in range(0, height, _STRIP):
+        size = min(_STRIP, height - first)
+        seen = {
+            name: _places(map_[first : first + size] if len(map_) > 1 else map_, size, width)
+            for name, map_ in shown.items()
+        }
+        colors = _places(tint, size, width)
+        seen["base"] = seen["base"][:, :3] * colors if "base" in seen else colors
+        known = Seen(**{name: seen.get(name) for name in SLOTS})
+        rows = columns(material, known, size * width, least_roughness=0)
+        found[first : first + size] = rows.reshape(size, width, 7)
+    return found
 
 
-def _emission(
-    document: GltfDocument, material: dict[str, Any], lost: list[str]
-) -> NDArray[np.float64]:
-    """Return the radiance of a material; of a texture its mean, since ours is never textured."""
-    factor = _factor(material, "emissiveFactor", (0, 0, 0), lost)
-    more = extension(material, "KHR_materials_emissive_strength")
-    radiance = factor * _factor(more, "emissiveStrength", 1, lost, _MOST_EMISSION)
-    if radiance.any() and (info := material.get("emissiveTexture")) is not None:
-        found = sampled(document, {"base": info}, _ENCODED, lambda number: None, [])
-        if "base" in found.maps:
-            radiance = radiance * found.maps["base"].mean(axis=(0, 1))[:3]
-            lost.append("textures of emission: their means were taken")
-    return np.asarray(radiance, np.float64)
+def _places(values: NDArray, height: int, width: int) -> NDArray:
+    """Return the values [N, C] of a map at each texel of a grid."""
+    return np.broadcast_to(values, (height, width, values.shape[2])).reshape(-1, values.shape[2])
 
 
-def _factor(
-    entry: Mapping[str, Any], name: str, default: Any, lost: list[str], most: float = 1.0
-) -> NDArray[np.float64]:
-    """Return a number or colour in [0, `most`]; the default, with a note, where it is none."""
-    wanted = np.asarray(default, np.float64)
-    try:
-        found = np.asarray(entry.get(name, default), np.float64)
-    except (TypeError, ValueError):
-        found = np.full(wanted.shape, np.nan)
-    if found.shape != wanted.shape or not np.isfinite(found).all():
-        lost.append(f"{name}: no finite number of its kind; {default} taken")
-        return wanted
-    if found.min() < 0 or found.max() > most:
-        lost.append(f"{name}: clamped to [0, {most:g}]")
-    return np.clip(found, 0, most)
+def _reduced(values: NDArray[np.float32]) -> Map:
+    """Return a map of one texel where all are equal."""
+    return values[:1, :1] if (values == values[0, 0]).all() else values
 
 
-def _note_losses(material: dict[str, Any], lost: list[str]) -> None:
-    if "normalTexture" in material:
-        lost.append("normal maps")
-    if "occlusionTexture" in material:
-        lost.append("occlusion maps: light is traced")
-    if material.get("alphaMode", "OPAQUE") != "OPAQUE":
-        lost.append(f"transparency (alphaMode {material['alphaMode']!r:.20}): drawn solid")
-    lost += [
-        f"extension {name!r:.60} of materials"
-        for name in material.get("extensions", {})
-        if name not in _UNDERSTOOD
-    ]
+def _tints(
+    colors: NDArray[np.float64] | None, count: int, most: int, lost: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return at most `most` colors [K, 3] of triangles, and the one [T] of each."""
+    if colors is None or not count:
+        return np.ones((1, 3)), np.zeros(count, np.int64)
+    if np.ptp(colors, axis=1).max() > 1 / 255:
+        lost.append("colors of vertices: the mean of each triangle")
+    plain = np.clip(np.nan_to_num(colors.mean(axis=1)), 0, 1)
+    tints, worn = _grouped(plain, np.round(plain * 1e6).astype(np.int64))
+    coded = srgb8(plain).astype(np.int64)
+    shift = 0
+    while len(tints) > most:
+        tints, worn = _grouped(plain, coded >> shift)
+        shift += 1
+    if shift:
+        lost.append("colors of vertices over textures: rounded to a few")
+    return tints, worn
+
+
+def _grouped(
+    colors: NDArray[np.float64], codes: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the mean color [K, 3] of equal codes [T, 3], and the group [T] of each."""
+    keys = codes @ np.array([1 << 42, 1 << 21, 1])
+    _, worn, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    sums = [np.bincount(worn, colors[:, channel]) for channel in range(3)]
+    return np.stack(sums, axis=1) / counts[:, None], worn.astype(np.int64)
+
+
+def _with_palette(
+    found: Sampled, tints: NDArray[np.float64], worn: NDArray[np.int64]
+) -> tuple[Sampled, NDArray[np.float64], NDArray[np.int64]]:
+    """Return many colors as a texture of a texel each, looked up in the middles of texels."""
+    side = int(np.ceil(np.sqrt(len(tints))))
+    texels = np.ones((side * side, 4), np.float32)
+    texels[: len(tints), :3] = tints
+    base = found.maps.get("base", constant_map([1, 1, 1, 1])) * texels.reshape(side, side, 4)
+    centers = (np.stack([worn % side, worn // side], axis=1) + 0.5) / side
+    uv = np.repeat(centers[:, None], 3, axis=1).astype(np.float32)
+    sampled = Sampled(maps={**found.maps, "base": base}, uv=uv)
+    return sampled, np.ones((1, 3)), np.zeros(len(worn), np.int64)
+
+
+def _emission(material: SourceMaterial, lost: list[str]) -> NDArray[np.float64]:
+    """Return the radiance [3] of a material; of a texture its mean."""
+    radiance: NDArray[np.float64] = np.array(material.emission_rgb)
+    if material.emission is not None:
+        picture = material.emission.picture
+        lost.append("textures of emission: their means were taken")
+        radiance = radiance * picture.linear(picture.values).mean(axis=(0, 1))[:3]
+    return radiance

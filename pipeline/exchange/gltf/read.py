@@ -5,10 +5,12 @@ Only children with limits come here (pipeline.isolation): a stranger's file is r
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.exchange.dressed import (
     DressedPiece,
@@ -18,20 +20,32 @@ from pipeline.exchange.dressed import (
     joined_arrays,
     scene_with_worn,
 )
-from pipeline.exchange.gltf.document import GltfDocument, extension
-from pipeline.exchange.gltf.materials import look_of
-from pipeline.exchange.gltf.meshes import GltfTriangles
-from pipeline.exchange.gltf.placed import PlacedNode, placed_nodes
-from pipeline.exchange.gltf.seen_and_lit import camera_of, even_sky, light_triangles
+from pipeline.exchange.gltf.materials import dress_triangles
+from pipeline.exchange.gltf.meshes import WorldTriangles
+from pipeline.exchange.gltf.seen_and_lit import (
+    DIRECTIONAL,
+    camera_of,
+    even_sky,
+    light_triangles,
+    sky_with_suns,
+)
+from pipeline.exchange.pictures import MAX_PIXELS
 from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all
-from storage.errors import TrilightError
-from storage.records.material import EMISSION, default_rows
+from pipeline.foreign.gltf.document import GltfDocument, refuse_malformed
+from pipeline.foreign.gltf.materials import DEFAULT, GltfMaterials
+from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nodes
+from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
+from pipeline.foreign.limits import ReadLimits
+from pipeline.foreign.material import SourceMaterial
+from pipeline.foreign.picture import decoded
+from pipeline.foreign.source_file import read_source
+from storage.errors import Rejected, TrilightError
 from storage.records.scene import ObjectKind, Scene, SceneObject
 from storage.records.texture import MapSource
 
 SUFFIXES = (".glb", ".gltf")
 MAX_OBJECTS = 1 << 16
-_POINTS_AND_LINES = (0, 1, 2, 3)
+_LIMITS = ReadLimits(max_bytes=1 << 30, with_materials=True)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,11 +69,12 @@ def read_gltf(path: Path, licence: str) -> GltfScene:
         TrilightError: the file is unusable, holds too much, or is none that a `Scene` can hold.
     """
     try:
-        return _Reading(document=GltfDocument(path), licence=licence).scene()
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        if isinstance(error, TrilightError):
-            raise
-        raise TrilightError(f"{path.name}: the glTF tree is malformed ({error!r:.120}).") from error
+        with refuse_malformed("load_error", "the glTF tree is"):
+            document = read_source(path, _LIMITS).gltf
+            assert document is not None
+            return _Reading(document=document, name=path.name, licence=licence).scene()
+    except Rejected as error:
+        raise TrilightError(f"{path.name}: {error}") from error
 
 
 @dataclass(kw_only=True, eq=False)
@@ -67,20 +82,22 @@ class _Reading:
     """One file on its way to a scene."""
 
     document: GltfDocument
+    name: str
     licence: str
     lost: list[str] = field(default_factory=list)
-    names: set[str] = field(default_factory=set)
+    names: dict[str, int] = field(default_factory=dict)
 
     def scene(self) -> GltfScene:
         """Return what the file shows."""
         tree = self.document.tree
         nodes = list(placed_nodes(tree))
-        pieces = [piece for placed in nodes for piece in self._pieces(placed)]
+        shown = [placed for placed in nodes if placed.is_visible]
+        pieces = [piece for placed in shown for piece in self._pieces(placed)]
         if not pieces:
-            raise TrilightError(f"{self.document.name}: no triangle with an area is placed.")
+            raise TrilightError(f"{self.name}: no triangle with an area is placed.")
         points = np.concatenate([each.piece.mesh.positions for each in pieces])
         reach = float(np.linalg.norm(np.ptp(points, axis=0)))
-        pieces += [piece for placed in nodes for piece in self._lights(placed, reach)]
+        pieces += [piece for placed in shown for piece in self._lights(placed, reach)]
         arrays = joined_arrays(pieces)
         seen = [camera_of(tree, placed, self.lost) for placed in nodes if "camera" in placed.node]
         poses = [each for each in seen if each is not None]
@@ -90,82 +107,98 @@ class _Reading:
         else:
             self.lost.append("no camera: one was added that sees everything")
             c2w, fov_deg = camera_that_sees_all(points)
-        sky = None
-        if not any(each.piece.entry.kind == "emitter" for each in pieces):
+        sky = sky_with_suns([each for placed in shown for each in self._suns(placed)], self.lost)
+        if sky is None and not any(each.piece.entry.kind == "emitter" for each in pieces):
             self.lost.append("no light: an even sky of radiance 1 lights it")
             sky = even_sky()
-        if tree.get("animations"):
-            self.lost.append("animations: everything stands as it does without them")
         scene = scene_with_worn(
             arrays,
             pieces,
             c2w=c2w,
             fov_deg=fov_deg,
-            provenance={"template": "gltf", "file": self.document.name},
+            provenance={"template": "gltf", "file": self.name},
             environment=sky,
         )
-        return GltfScene(scene=scene, lost=tuple(dict.fromkeys(self.lost)))
+        lost = dict.fromkeys([*self.document.unread, *self.lost])
+        return GltfScene(scene=scene, lost=tuple(lost))
 
     def _pieces(self, placed: PlacedNode) -> Iterator[DressedPiece]:
         if "mesh" not in placed.node:
             return
-        mesh = self.document.tree["meshes"][placed.node["mesh"]]
+        mesh = entry(self.document.tree, "meshes", placed.node["mesh"])
         name = str(placed.node.get("name") or mesh.get("name") or "object")
-        for primitive in mesh["primitives"]:
-            if primitive.get("mode", 4) in _POINTS_AND_LINES:
-                self.lost.append("points and lines")
-                continue
-            for kind, triangles in by_kind(self._triangles(placed, primitive)):
+        for primitive in placed_primitives(self.document, placed):
+            for kind, triangles in by_kind(self._triangles(primitive)):
                 yield dressed(self._entry(name, kind), triangles)
 
-    def _triangles(self, placed: PlacedNode, primitive: dict[str, Any]) -> DressedTriangles:
-        found = GltfTriangles(self.document, primitive, placed.to_world)
+    @cached_property
+    def _materials(self) -> GltfMaterials:
+        return GltfMaterials(self.document, self._decode, emission=True, notes=self.lost)
+
+    def _decode(self, data: bytes, name: str) -> NDArray:
+        try:
+            return decoded(data, name, MAX_PIXELS)
+        except Rejected as why:
+            if why.reason != "texture_too_large":
+                raise
+            raise TrilightError(
+                f"{self.name}: {name}: expected at most {MAX_PIXELS} pixels."
+            ) from why
+
+    def _material(self, number: int | None) -> SourceMaterial:
+        found = DEFAULT if number is None else self._materials.material(number)
+        self.lost += [f"{word} of materials" for word in found.lost if word != "emission"]
+        return found
+
+    def _triangles(self, primitive: PlacedPrimitive) -> DressedTriangles:
+        found = WorldTriangles(primitive)
         if found.without_area:
             self.lost.append("triangles without an area")
-        if "COLOR_0" in primitive["attributes"]:
-            self.lost.append("colours of vertices")
-        number = primitive.get("material")
-        material = {} if number is None else self.document.tree["materials"][number]
+        number = primitive.primitive.material
+        row = {} if number is None else entry(self.document.tree, "materials", number)
         source = MapSource(
-            name=str(material.get("name", ""))[:200],
+            name=str(row.get("name", ""))[:200],
             licence=self.licence,
             attribution=self._attribution(),
         )
-        look = look_of(self.document, material, found.coordinates, source, self.lost)
-        count = len(found.positions)
-        rows = default_rows(count)
-        rows[:, EMISSION] = look.emission_rgb
-        uv = np.zeros((count, 3, 2), np.float32) if look.uv is None else look.uv
-        return DressedTriangles(
-            positions=found.positions,
-            normals=found.normals,
-            rows=rows,
-            uv=uv,
-            worn=np.zeros(count, np.int64),
-            wardrobe=(look.worn,),
+        return dress_triangles(self._material(number), found, source, self.lost)
+
+    def _light(self, placed: PlacedNode) -> dict[str, Any] | None:
+        """Return the JSON of the light of a node; None where it has none."""
+        reference = extension(placed.node, "KHR_lights_punctual")
+        if "light" not in reference:
+            return None
+        return entry(
+            extension(self.document.tree, "KHR_lights_punctual"), "lights", reference["light"]
         )
 
     def _lights(self, placed: PlacedNode, reach: float) -> Iterator[DressedPiece]:
-        reference = extension(placed.node, "KHR_lights_punctual")
-        if "light" not in reference:
-            return
-        lights = extension(self.document.tree, "KHR_lights_punctual")["lights"]
-        found = light_triangles(lights[reference["light"]], placed, reach, self.lost)
-        if found is not None:
-            yield dressed(self._entry(str(placed.node.get("name") or "light"), "emitter"), found)
+        light = self._light(placed)
+        if light is not None and light.get("type") != DIRECTIONAL:
+            found = light_triangles(light, placed, reach, self.lost)
+            name = str(placed.node.get("name") or "light")
+            if found is not None:
+                yield dressed(self._entry(name, "emitter"), found)
+
+    def _suns(self, placed: PlacedNode) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
+        light = self._light(placed)
+        if light is not None and light.get("type") == DIRECTIONAL:
+            yield light, placed.to_world
 
     def _attribution(self) -> str:
         return str(self.document.tree.get("asset", {}).get("copyright", ""))[:1000]
 
     def _entry(self, base: str, kind: ObjectKind) -> SceneObject:
         if len(self.names) >= MAX_OBJECTS:
-            raise TrilightError(f"{self.document.name}: more than {MAX_OBJECTS} objects.")
-        base, count = base[:200].replace("\0", "_"), 1
-        name = base
-        while name in self.names:
+            raise TrilightError(f"{self.name}: more than {MAX_OBJECTS} objects.")
+        base = base[:200].replace("\0", "_")
+        count = self.names.get(base, 0) + 1
+        name = base if count == 1 else f"{base}.{count}"
+        while count > 1 and name in self.names:
             count += 1
             name = f"{base}.{count}"
-        self.names.add(name)
+        self.names[base] = count
+        self.names.setdefault(name, 1)
         return SceneObject(
             name=name, kind=kind, licence=self.licence, attribution=self._attribution()
         )

@@ -1,21 +1,30 @@
 """Cameras and lights of a glTF scene.
 
-Its lights are points without an area; ours are surfaces. A point becomes a small octahedron of as
-many candela, counted in the units of our radiance.
+Its lights are points without an area, or directions; ours are surfaces and skies. A point becomes a
+small octahedron of as many candela, and a direction a spot in the sky of as many lux, both counted
+in the units of our radiance.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.dressed import PLAIN, DressedTriangles
-from pipeline.exchange.gltf.placed import PlacedNode
 from pipeline.exchange.usd.foreign_cameras import rigid_pose
+from pipeline.foreign.gltf.nodes import PlacedNode
+from storage.conventions import latlong_direction, latlong_uv
 from storage.records.environment import Environment
 from storage.records.material import EMISSION, ROUGHNESS, default_rows
 from storage.records.texture import MapSource
+
+DIRECTIONAL = "directional"
+_SUN_ROWS = 256
+"""Rows of the sky that holds directional lights: a sun is 0.7 degrees wide."""
+
+_HALF_TEXEL = np.array([0.25, 0.5]) / _SUN_ROWS
 
 _SIZE = 0.01
 """Radius of a light as a share of the diagonal of the scene."""
@@ -54,6 +63,8 @@ def light_triangles(
     lost.append("lights without an area: small octahedra with their candela, in units of radiance")
     if kind == "spot":
         lost.append("cones of spot lights: they shine all around")
+    if "range" in light:
+        lost.append("ranges of lights: they reach everywhere")
     radius = max(_SIZE * reach, 1e-4)
     positions = (placed.to_world[:3, 3] + radius * _octahedron()).astype(np.float32)
     cross = np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0])
@@ -74,6 +85,48 @@ def light_triangles(
         worn=np.zeros(len(positions), np.int64),
         wardrobe=(PLAIN,),
     )
+
+
+def sky_with_suns(
+    suns: Sequence[tuple[dict[str, Any], NDArray[np.float64]]], lost: list[str]
+) -> Environment | None:
+    """Return a sky that is black but for directional lights; None where none of them shines.
+
+    Args:
+        suns: JSON of each, and the place [4, 4] of its node, along whose -z it shines.
+        lost: receives what cannot be carried over.
+    """
+    radiance = np.zeros((_SUN_ROWS, 2 * _SUN_ROWS, 3), np.float64)
+    turn = np.eye(3)
+    for number, (light, to_world) in enumerate(suns):
+        towards = to_world[:3, 2]
+        if not np.linalg.norm(towards) > 0:
+            continue
+        if number == 0:  # it lies in the middle of a texel at the map's equator
+            turn = _frame(towards) @ _frame(latlong_direction(0.5 + _HALF_TEXEL)).T
+        u, v = latlong_uv(towards @ turn)
+        row = min(int((1 - v) * _SUN_ROWS), _SUN_ROWS - 1)
+        angle = np.square(np.pi / _SUN_ROWS) * np.sin(np.pi * (row + 0.5) / _SUN_ROWS)
+        color = np.array(light.get("color", (1, 1, 1)), np.float64)
+        lux = color * float(light.get("intensity", 1))
+        radiance[row, int(u * 2 * _SUN_ROWS) % (2 * _SUN_ROWS)] += lux / angle
+    if not np.isfinite(radiance).all() or not (radiance > 0).any():
+        lost.extend(["lights that shine no light"] if suns else [])
+        return None
+    lost.append("directional lights: suns of 0.7 degrees with their lux, in units of radiance")
+    return Environment(
+        radiance_rgb=np.clip(radiance, 0, 1e9).astype(np.float32),
+        rotation=turn.astype(np.float32),
+        source=MapSource(name="directional lights"),
+    )
+
+
+def _frame(first: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a rotation [3, 3] whose first column is a direction."""
+    unit = first / np.linalg.norm(first)
+    second = np.cross(unit, np.eye(3)[np.abs(unit).argmin()])
+    second /= np.linalg.norm(second)
+    return np.stack([unit, second, np.cross(unit, second)], axis=1)
 
 
 def even_sky() -> Environment:

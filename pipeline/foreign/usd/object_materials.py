@@ -10,9 +10,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.material import RGB, WHITE, Slot, SourceMaterial
+from pipeline.foreign.material import MOST_UV_SETS, RGB, WHITE, Slot, SourceMaterial
 from pipeline.foreign.material_files import MaterialFiles
-from pipeline.foreign.parts import MOST_UV_SETS, TexturedParts
+from pipeline.foreign.parts import TexturedParts
 from pipeline.foreign.picture import Picture, has_colours
 from pipeline.foreign.usd.object_looks import Binding, StatedMaterial
 from pipeline.foreign.usd.object_meshes import PlacedPart

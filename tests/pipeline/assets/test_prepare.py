@@ -19,9 +19,7 @@ from pipeline.assets.cleaning.clean import GRID
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.quality.distance import Surface
 from pipeline.assets.settings import AssetSettings, GateSettings
-from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.source_file import read_source
 from pipeline.objects.sources import find_objects
 from storage.errors import TrilightError
 from storage.records.asset import Asset, encode_asset
@@ -38,7 +36,6 @@ from tests.pipeline.assets.meshes_by_hand import (
     moved,
     prepare,
     sphere,
-    volume,
     write_glb,
     write_obj,
 )
@@ -107,21 +104,6 @@ def test_formats_agree(tmp_path: Path) -> None:
     assert len({asset.geometry_sha256 for asset in assets}) == 1
     assert len({geometry(asset) for asset in assets}) == 1
     assert len({asset.source_sha256 for asset in assets}) == len(assets)
-
-
-def test_nodes_place_meshes_where_they_say(tmp_path: Path) -> None:
-    tree, buffer = gltf_tree(sphere(rings=5, columns=8))
-    tree["nodes"] = [
-        {"children": [1, 2], "scale": [2, 2, 2]},
-        {"mesh": 0, "translation": [10, 0, 0]},
-        {"mesh": 0, "translation": [-10, 0, 0], "scale": [-1, 1, 1]},
-    ]
-    source = read_source(write_glb(tmp_path / "two.glb", tree, buffer), SETTINGS.read_limits)
-    mesh = load_mesh(source)
-    assert len(mesh.faces) == 2 * 80
-    # 2 x (10 + 1) to either side; the numbers of the file are single precision.
-    np.testing.assert_allclose(np.ptp(mesh.positions[:, 0]), 44, rtol=1e-6)
-    assert volume(mesh) == pytest.approx(2 * 8 * volume(sphere(rings=5, columns=8)), rel=1e-5)
 
 
 def test_buffers_beside_a_gltf_are_read_and_counted(tmp_path: Path) -> None:

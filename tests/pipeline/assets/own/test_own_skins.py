@@ -222,25 +222,6 @@ def test_what_nothing_here_can_show_is_named(tmp_path: Path) -> None:
     assert asset.materials.lost == ("clearcoat", "emission", "transparency")
 
 
-def test_vertex_colours_tint_the_base(tmp_path: Path) -> None:
-    tree, buffer = textured_tree(picture_bytes(np.full((1, 1, 3), 255, np.uint8)))
-    data = np.array([[1, 0, 0, 1]] * 4, "<f4").tobytes()
-    view = {"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)}
-    tree["bufferViews"].append(view)
-    tree["accessors"].append(
-        {
-            "bufferView": len(tree["bufferViews"]) - 1,
-            "componentType": 5126,
-            "count": 4,
-            "type": "VEC4",
-        }
-    )
-    tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = len(tree["accessors"]) - 1
-    tree["buffers"][0]["byteLength"] = len(buffer) + len(data)
-    asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer + data), KEEP)
-    assert np.allclose(seen_at(asset, 0.1, 0.1), [1 - F, 0, 0], atol=1e-6)
-
-
 def test_a_level_over_its_bound_goes_without_or_is_refused(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8)
     path = textured_glb(tmp_path / "a.glb", picture_bytes(noise))

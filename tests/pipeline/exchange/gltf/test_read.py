@@ -20,7 +20,7 @@ from pipeline.exchange.gltf.write import encode_scene_glb
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
-from storage.records.lookup import texture_values
+from storage.records.lookup import environment_values, texture_values
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
 from tests.for_each import for_each
@@ -203,6 +203,22 @@ def test_cameras_lights_and_emission(tmp_path: Path) -> None:
     assert rows[-1, 7] * seen == pytest.approx(3.0, rel=1e-5)  # candela, on average
 
 
+def test_a_directional_light_is_a_sun_of_as_many_lux(tmp_path: Path) -> None:
+    light = {"type": "directional", "intensity": 7.0, "color": [1, 0.5, 0]}
+    tree = quad(extensions={"KHR_lights_punctual": {"lights": [light]}})
+    turned = {"rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]}  # its -z looks down glTF's -y
+    tree["nodes"].append({**turned, "extensions": {"KHR_lights_punctual": {"light": 0}}})
+    tree["scenes"][0]["nodes"] = [0, 1]
+    sky = read_gltf(write_gltf(tmp_path, tree), "CC0-1.0").scene.environment
+    assert sky is not None
+    rng = np.random.default_rng(0)
+    near = rng.normal(size=(200_000, 3)) * [0.02, 0.02, 0] + [0, 0, 1]
+    density = np.exp(-np.square(near[:, :2]).sum(axis=1) / 2 / 0.02**2) / (2 * np.pi * 0.02**2)
+    weight = (1 + np.square(near[:, :2]).sum(axis=1)) ** -2.0  # of the plane's area, seen from 0
+    irradiance = (environment_values(sky, near) * (weight / density)[:, None]).mean(axis=0)
+    assert irradiance == pytest.approx([7, 3.5, 0], rel=0.1)
+
+
 def test_what_is_lost_is_said_once(tmp_path: Path) -> None:
     material = {
         "normalTexture": {"index": 0},
@@ -214,7 +230,7 @@ def test_what_is_lost_is_said_once(tmp_path: Path) -> None:
     }
     found = read(tmp_path, material=material, animations=[{}])
     for words in (
-        "normal maps",
+        "normal map",
         "occlusion",
         "transparency",
         "emission",
@@ -226,19 +242,19 @@ def test_what_is_lost_is_said_once(tmp_path: Path) -> None:
         scene_source(str(tmp_path / "a.gltf")), tmp_path / "a.usda", budget=None,
         done=lambda finished, total: None,
     )  # fmt: skip
-    assert any("normal maps" in note for note in files.notes)
+    assert any("normal map" in note for note in files.notes)
     assert not any("cannot hold textures" in note for note in files.notes)
 
 
 def test_a_missing_picture_leaves_the_factor(tmp_path: Path) -> None:
     found = read(tmp_path, pictures=["gone.png"])
-    assert any("image 0: missing" in text for text in found.lost)
+    assert any("left out: 'gone.png'" in text for text in found.lost)
     assert row_at(found.scene, 0.5, 0.5)[:3] == pytest.approx([1 - F] * 3, abs=1e-6)
 
 
 @pytest.mark.parametrize("uri", ["../a.png", "http://example.com/a.png", "/etc/hostname"])
 def test_pictures_elsewhere_are_refused(tmp_path: Path, uri: str) -> None:
-    with pytest.raises(TrilightError, match=r"a\.gltf: names .*(outside|expected a file)"):
+    with pytest.raises(TrilightError, match=r"a\.gltf: .*lies (outside|elsewhere)"):
         read(tmp_path, pictures=[uri])
 
 
@@ -265,7 +281,7 @@ def test_factors_that_are_no_albedo(tmp_path: Path, value: Any) -> None:
 def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     broken = UV.copy()
     broken[0, 0] = np.nan
-    with pytest.raises(TrilightError, match="TEXCOORD_0 holds no finite"):
+    with pytest.raises(TrilightError, match="TEXCOORD_0 is not finite"):
         read(tmp_path, uv=broken)
 
 

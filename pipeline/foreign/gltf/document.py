@@ -1,0 +1,221 @@
+"""`GltfDocument`: a glTF's checked JSON, and the arrays and pictures that its buffers hold."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.foreign.gltf.check import check_tree
+from pipeline.foreign.gltf.container import (
+    data_uri_bytes,
+    is_data_uri,
+    local_path,
+    read_container,
+)
+from pipeline.foreign.gltf.nodes import INSTANCING, PlacedNode, entry, extension, transforms
+from pipeline.foreign.gltf.unread import unread_parts
+from pipeline.foreign.limits import ReadLimits
+from pipeline.foreign.material_files import MaterialFiles, ReadFile, gltf_files
+from storage.errors import Rejected, TrilightError
+
+_DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_PADDING = 3
+"""Bytes by which a buffer may be shorter than stated: exporters count its padding."""
+_MOST_REPLACED = 1 << 23
+"""Most values of a sparse accessor, which are copied."""
+
+Rows = NDArray[np.int64] | slice
+
+
+@contextmanager
+def refuse_malformed(reason: str, subject: str) -> Iterator[None]:
+    """Turn what Python says of a tree that keeps no law of its format into Rejected."""
+    try:
+        yield
+    except TrilightError:
+        raise
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise Rejected(reason, f"{subject} malformed ({error!r:.120})") from error
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GltfDocument:
+    """One file with its buffers."""
+
+    tree: dict[str, Any]
+    """Its JSON."""
+    binary: memoryview | None
+    """The binary chunk of a GLB."""
+    buffers: Mapping[str, bytes]
+    """Files that its buffers name, by URI."""
+    pictures: MaterialFiles
+    """Files that its images name; empty where they are not kept."""
+    unread: tuple[str, ...]
+    """What it says and no code reads, as short sentences."""
+    _embedded: dict[str, bytes] = field(default_factory=dict)
+
+    def values(
+        self, index: Any, widths: tuple[int, ...], rows: Rows, *, is_unit: bool | None = None
+    ) -> NDArray[np.float64]:
+        """Return rows [N, K] of an accessor; integers as fractions where they are normalized.
+
+        Args:
+            index: its number.
+            widths: how many components K may be.
+            rows: which of its values.
+            is_unit: whether integers are fractions; as the accessor says by default.
+
+        Raises:
+            Rejected: cut_off, unsupported_accessor, load_error.
+        """
+        stated, whole = self._stated(index), self._elements(index)
+        if whole.shape[1] not in widths:
+            raise ValueError(f"accessor {index} has {whole.shape[1]} components")
+        if not isinstance(rows, slice) and rows.size and rows.max() >= len(whole):
+            raise ValueError(f"accessor {index} has {len(whole)} values, one for each vertex")
+        found = whole[rows].astype(np.float64)
+        if whole.dtype.kind in "ui" and (stated.get("normalized") if is_unit is None else is_unit):
+            found = np.maximum(found / np.iinfo(whole.dtype).max, -1)
+        return found
+
+    def indices(self, index: Any) -> NDArray[np.int64]:
+        """Return an accessor of vertices [N]."""
+        whole = self._elements(index)
+        if whole.shape[1] != 1 or whole.dtype.kind != "u":
+            raise ValueError(f"indices are of type {whole.dtype} x {whole.shape[1]}")
+        return whole[:, 0].astype(np.int64)
+
+    def count(self, index: Any) -> int:
+        """Return the number of values of an accessor."""
+        return int(self._stated(index)["count"])
+
+    def instances(self, place: PlacedNode) -> NDArray[np.float64]:
+        """Return the places [N, 4, 4] of the mesh of a node."""
+        attributes = extension(place.node, INSTANCING).get("attributes", {})
+        if not attributes:
+            return place.to_world[None]
+        count = self.count(next(iter(attributes.values())))
+        parts = [np.tile(row, (count, 1)) for row in ([0.0] * 3, [0.0, 0.0, 0.0, 1.0], [1.0] * 3)]
+        for row, name in enumerate(("TRANSLATION", "ROTATION", "SCALE")):
+            if name in attributes:
+                width = parts[row].shape[1]
+                parts[row] = self.values(
+                    attributes[name], (width,), slice(None), is_unit=name == "ROTATION" or None
+                )
+        return np.einsum("ij,njk->nik", place.to_world, transforms(*parts))
+
+    def picture_bytes(self, image: Mapping[str, Any]) -> bytes:
+        """Return the file of an image; raises Rejected where it is not there."""
+        if "bufferView" in image:
+            return bytes(self._view(image["bufferView"]))
+        uri = image["uri"]
+        return data_uri_bytes(uri) if is_data_uri(uri) else self.pictures.of(uri)
+
+    def _stated(self, index: Any) -> dict[str, Any]:
+        return entry(self.tree, "accessors", index)
+
+    def _elements(self, index: Any) -> NDArray:
+        """Return the values [N, K] of an accessor as they are stored; zeros where nothing is."""
+        stated = self._stated(index)
+        code, kind, count = stated["componentType"], stated["type"], int(stated["count"])
+        if code not in _DTYPES or kind not in _WIDTHS:
+            raise Rejected("unsupported_accessor", f"values of type {code!r:.20} {kind!r:.20}")
+        dtype, width = np.dtype(_DTYPES[code]), _WIDTHS[kind]
+        if "bufferView" in stated:
+            offset = int(stated.get("byteOffset", 0))
+            values = self._strided(stated["bufferView"], offset, dtype, width, count)
+        else:
+            values = np.broadcast_to(np.zeros(1, dtype), (count, width))
+        return self._with_replaced(values, stated["sparse"]) if "sparse" in stated else values
+
+    def _with_replaced(self, values: NDArray, sparse: Mapping[str, Any]) -> NDArray:
+        """Return values with those that a sparse accessor replaces."""
+        count, where, stated = int(sparse["count"]), sparse["indices"], sparse["values"]
+        dtype = np.dtype(_DTYPES[where["componentType"]])
+        offsets = [int(each.get("byteOffset", 0)) for each in (where, stated)]
+        rows = self._strided(where["bufferView"], offsets[0], dtype, 1, count)[:, 0]
+        if count and int(rows.max()) >= len(values):
+            raise ValueError(f"a sparse accessor replaces value {rows.max()} of {len(values)}")
+        if len(values) > _MOST_REPLACED:
+            raise Rejected("too_many_faces", f"a sparse accessor counts {len(values)} items")
+        found = values.copy()
+        found[rows.astype(np.int64)] = self._strided(
+            stated["bufferView"], offsets[1], values.dtype, values.shape[1], count
+        )
+        return found
+
+    def _strided(
+        self, view: Any, offset: int, dtype: np.dtype[Any], width: int, count: int
+    ) -> NDArray:
+        data, size = self._view(view), dtype.itemsize * width
+        step = int(entry(self.tree, "bufferViews", view).get("byteStride", 0)) or size
+        if count < 0 or offset < 0 or step < size:
+            raise ValueError(f"{count} values, byte offset {offset}, byte stride {step}")
+        if count and offset + (count - 1) * step + size > len(data):
+            raise Rejected(
+                "load_error",
+                f"{count} values take {offset + (count - 1) * step + size} bytes; their buffer "
+                f"view has {len(data)}",
+            )
+        return np.ndarray((count, width), dtype, data if count else b"", offset if count else 0,
+                          (step, dtype.itemsize))  # fmt: skip
+
+    def _view(self, index: Any) -> memoryview:
+        view = entry(self.tree, "bufferViews", index)
+        buffer = entry(self.tree, "buffers", view["buffer"])
+        uri, data = buffer.get("uri"), self.binary
+        if uri is not None:
+            if is_data_uri(uri) and uri not in self._embedded:
+                self._embedded[uri] = data_uri_bytes(uri)
+            data = memoryview(self._embedded[uri] if is_data_uri(uri) else self.buffers[uri])
+        if data is None or len(data) < int(buffer["byteLength"]) - _PADDING:
+            raise Rejected(
+                "cut_off",
+                f"a buffer is cut off: it states {buffer['byteLength']} bytes and has "
+                f"{0 if data is None else len(data)}",
+            )
+        start, length = int(view.get("byteOffset", 0)), int(view["byteLength"])
+        if start < 0 or length < 0 or start + length > len(data):
+            raise Rejected("load_error", f"buffer view {index} goes beyond its buffer")
+        return memoryview(data)[start : start + length]
+
+
+def open_gltf(
+    data: bytes, suffix: str, folder: Path, limits: ReadLimits, read: ReadFile
+) -> GltfDocument:
+    """Return a glTF with its buffers, and with its pictures where the limits say so.
+
+    Args:
+        data: the file.
+        suffix: of its name, `.glb` or `.gltf`.
+        folder: of the file; nothing outside of it is read.
+        limits: bound what is read.
+        read: reads a regular file of at most so many bytes.
+
+    Raises:
+        Rejected: as `read_container`, `check_tree`, and of a buffer external_uri or missing_file.
+    """
+    tree, binary = read_container(data, suffix)
+    with refuse_malformed("load_error", "the glTF tree is"):
+        check_tree(tree, limits)
+        unread = unread_parts(tree)
+        uris = [row["uri"] for row in tree.get("buffers", ()) if "uri" in row]
+        named = {uri: local_path(uri, folder) for uri in uris if not is_data_uri(uri)}
+    buffers: dict[str, bytes] = {}
+    left = limits.max_bytes - len(data)
+    for uri, path in named.items():
+        buffers[uri] = read(path, left)
+        left -= len(buffers[uri])
+    has_pictures = limits.with_materials and isinstance(tree.get("images"), list)
+    return GltfDocument(
+        tree=tree,
+        binary=binary,
+        buffers=buffers,
+        pictures=gltf_files(tree, folder, left, read) if has_pictures else MaterialFiles(),
+        unread=unread,
+    )

@@ -1,0 +1,242 @@
+"""Materials of a glTF as `SourceMaterial`, for objects and for scenes.
+
+A picture counts as its slot says: base and specular colors are sRGB-encoded, all else is linear.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.foreign.gltf.document import GltfDocument
+from pipeline.foreign.gltf.nodes import entry, extension
+from pipeline.foreign.material import MOST_UV_SETS, RGB, Slot, SourceMaterial
+from pipeline.foreign.picture import Picture, Wrap
+from storage.errors import Rejected
+
+DEFAULT = SourceMaterial(metallic=1.0)
+"""What glTF says of a mesh without a material."""
+
+_WRAPS: Mapping[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+_NEAREST = 9728
+_MOST_EMISSION = 1e9
+
+Decode = Callable[[bytes, str], NDArray]
+"""Returns the values of a picture's bytes; its name is for messages."""
+
+
+class GltfMaterials:
+    """Reads the materials of one glTF, each picture once."""
+
+    def __init__(
+        self,
+        document: GltfDocument,
+        decode: Decode,
+        *,
+        emission: bool = False,
+        notes: list[str] | None = None,
+    ) -> None:
+        """Read nothing yet.
+
+        Args:
+            document: the file.
+            decode: what makes values of the bytes of a picture.
+            emission: whether what emits is read too.
+            notes: receives what cannot be read, which is then left out; without it that is refused.
+        """
+        self._document, self._tree = document, document.tree
+        self._decode, self._emission, self._notes = decode, emission, notes
+        self._values: dict[int, NDArray] = {}
+        self._known: dict[int, SourceMaterial] = {}
+
+    def used(self) -> dict[int, SourceMaterial]:
+        """Return the materials that any mesh has, by number.
+
+        Raises:
+            Rejected: as reading a picture.
+        """
+        primitives = [row for mesh in self._tree.get("meshes", ()) for row in mesh["primitives"]]
+        named = {row["material"] for row in primitives if "material" in row}
+        return {number: self.material(number) for number in sorted(named)}
+
+    def material(self, number: int) -> SourceMaterial:
+        """Return one material; raises Rejected as reading a picture."""
+        if number not in self._known:
+            self._known[number] = self._read(number)
+        return self._known[number]
+
+    def _read(self, number: int) -> SourceMaterial:
+        row = entry(self._tree, "materials", number)
+        glossy = row.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+        if "KHR_materials_unlit" in row.get("extensions", {}):
+            return self._unlit(row)
+        found = self._metallic(row) if glossy is None else self._glossy(glossy)
+        return self._with_emission(dataclasses.replace(found, lost=_lost(row)), row)
+
+    def _unlit(self, row: Mapping[str, Any]) -> SourceMaterial:
+        """Return a diffuse surface of the base color: what shows it as it is in even light."""
+        metal = row.get("pbrMetallicRoughness", {})
+        return SourceMaterial(
+            base_rgb=self._rgb(metal, "baseColorFactor", 4),
+            base=self._slot(metal, "baseColorTexture", is_srgb=True),
+            specular_strength=0.0,
+            lost=("unlit", *_lost(row)),
+        )
+
+    def _metallic(self, row: Mapping[str, Any]) -> SourceMaterial:
+        metal = row.get("pbrMetallicRoughness", {})
+        specular = extension(row, "KHR_materials_specular")
+        ior = self._number(extension(row, "KHR_materials_ior"), "ior", 1.5, 1e3)
+        both = self._slot(metal, "metallicRoughnessTexture")
+        return SourceMaterial(
+            base_rgb=self._rgb(metal, "baseColorFactor", 4),
+            base=self._slot(metal, "baseColorTexture", is_srgb=True),
+            metallic=self._number(metal, "metallicFactor", 1),
+            roughness=self._number(metal, "roughnessFactor", 1),
+            metallic_map=None if both is None else dataclasses.replace(both, channel=2),
+            roughness_map=None if both is None else dataclasses.replace(both, channel=1),
+            f0=((ior - 1) / (ior + 1)) ** 2 if ior > 0 else 1.0,
+            specular_rgb=self._rgb(specular, "specularColorFactor", 3, 1e3),
+            specular_colour=self._slot(specular, "specularColorTexture", is_srgb=True),
+            specular_strength=self._number(specular, "specularFactor", 1),
+            specular_strength_map=self._slot(specular, "specularTexture"),
+        )
+
+    def _glossy(self, row: Mapping[str, Any]) -> SourceMaterial:
+        return SourceMaterial(
+            base_rgb=self._rgb(row, "diffuseFactor", 4),
+            base=self._slot(row, "diffuseTexture", is_srgb=True),
+            roughness=1 - self._number(row, "glossinessFactor", 1),
+            f0=1.0,
+            specular_rgb=self._rgb(row, "specularFactor", 3),
+            specular_colour=self._slot(row, "specularGlossinessTexture", is_srgb=True),
+            glossiness=self._slot(row, "specularGlossinessTexture"),
+        )
+
+    def _with_emission(self, found: SourceMaterial, row: Mapping[str, Any]) -> SourceMaterial:
+        """Return a material with what it emits, where that is read."""
+        if not self._emission:
+            return found
+        strength = extension(row, "KHR_materials_emissive_strength")
+        times = self._number(strength, "emissiveStrength", 1, _MOST_EMISSION)
+        red, green, blue = self._numbers(row, "emissiveFactor", (0.0,) * 3, _MOST_EMISSION)
+        if not any((red, green, blue)) or not times:
+            return found
+        return dataclasses.replace(
+            found,
+            emission_rgb=(red * times, green * times, blue * times),
+            emission=self._slot(row, "emissiveTexture", is_srgb=True),
+        )
+
+    def _slot(self, row: Mapping[str, Any], name: str, *, is_srgb: bool = False) -> Slot | None:
+        info = row.get(name)
+        if info is None:
+            return None
+        try:
+            return self._texture(info, is_srgb=is_srgb)
+        except Rejected as why:
+            if self._notes is None or why.reason in ("texture_outside", "texture_too_large"):
+                raise
+            self._notes.append(f"a texture is left out: {why.message}")
+            return None
+
+    def _texture(self, info: Mapping[str, Any], *, is_srgb: bool) -> Slot:
+        texture = entry(self._tree, "textures", info["index"])
+        source = extension(texture, "EXT_texture_webp").get("source", texture.get("source"))
+        if source is None:
+            forms = ", ".join(texture.get("extensions", ())) or "nothing"
+            raise Rejected("texture_unreadable", f"its picture is in no form read here: {forms}")
+        sampler = entry(self._tree, "samplers", texture["sampler"]) if "sampler" in texture else {}
+        wrap = _WRAPS[sampler.get("wrapS", 10497)], _WRAPS[sampler.get("wrapT", 10497)]
+        moved = extension(info, "KHR_texture_transform")
+        turn, shift = _moves(moved)
+        uv_set = int(moved.get("texCoord", info.get("texCoord", 0)))
+        if not 0 <= uv_set < MOST_UV_SETS:
+            raise Rejected("no_texture_coordinates", f"a texture lies on TEXCOORD_{uv_set}")
+        values = self._picture(source)
+        return Slot(
+            picture=Picture(
+                values=values,
+                is_srgb=is_srgb and values.dtype != np.float16,  # floats are linear
+                wrap=wrap,
+                is_nearest=sampler.get("magFilter") == _NEAREST,
+            ),
+            uv_set=uv_set,
+            turn=turn,
+            shift=shift,
+        )
+
+    def _picture(self, number: int) -> NDArray:
+        if number not in self._values:
+            image = entry(self._tree, "images", number)
+            name = str(image.get("uri", image.get("name", f"picture {number}")))
+            name = "an embedded picture" if name.startswith("data:") else name
+            self._values[number] = self._decode(self._document.picture_bytes(image), name)
+        return self._values[number]
+
+    def _rgb(self, row: Mapping[str, Any], name: str, count: int, most: float = 1.0) -> RGB:
+        red, green, blue = self._numbers(row, name, (1.0,) * count, most)[:3]
+        return red, green, blue
+
+    def _number(
+        self, row: Mapping[str, Any], name: str, default: float, most: float = 1.0
+    ) -> float:
+        one = {} if name not in row else {name: [row[name]]}
+        return self._numbers(one, name, (default,), most)[0]
+
+    def _numbers(
+        self, row: Mapping[str, Any], name: str, default: tuple[float, ...], most: float
+    ) -> list[float]:
+        """Return factors within [0, `most`]; the default, with a note, where they are none."""
+        try:
+            found = _finite(row.get(name, default), len(default))
+            if most > 1 and max(found) > most and self._notes is None:
+                raise ValueError(f"{max(found):g}; expected at most {most:g}")
+        except (TypeError, ValueError) as error:
+            if self._notes is None:
+                raise ValueError(f"{name}: {error}") from error
+            self._notes.append(f"{name}: {error}; {[*default]} taken")
+            return list(default)
+        clamped = [min(max(value, 0.0), most) for value in found]
+        if self._notes is not None and clamped != found:
+            self._notes.append(f"{name}: clamped to [0, {most:g}]")
+        return clamped
+
+
+def _lost(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what a material says beyond what is read of it."""
+    extensions = row.get("extensions", {})
+    found = {
+        "emission": any(row.get("emissiveFactor", ())),
+        "normal map": "normalTexture" in row,
+        "transparency": row.get("alphaMode", "OPAQUE") != "OPAQUE",
+        **{
+            word: f"KHR_materials_{word}" in extensions
+            for word in ("clearcoat", "transmission", "sheen", "anisotropy", "iridescence")
+        },
+    }
+    return tuple(word for word, is_there in found.items() if is_there)
+
+
+def _moves(moved: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the turn and shift of KHR_texture_transform for coordinates with v up.
+
+    The extension says (u, w)' = shift + R S (u, w) with w down, and w = 1 - v.
+    """
+    (angle,) = _finite([moved.get("rotation", 0)], 1)
+    scale = _finite(moved.get("scale", [1, 1]), 2)
+    cos, sin = np.cos(angle), np.sin(angle)
+    down = np.array([[cos, sin], [-sin, cos]]) @ np.diag(scale)
+    offset = np.array(_finite(moved.get("offset", [0, 0]), 2))
+    flip = np.diag([1.0, -1.0])
+    one = np.array([0.0, 1.0])
+    return flip @ down @ flip, flip @ (offset + down @ one) + one
+
+
+def _finite(values: Any, count: int) -> list[float]:
+    found = [float(value) for value in values]
+    if len(found) != count or not np.isfinite(found).all():
+        raise ValueError(f"{values!r:.60}; expected {count} finite numbers")
+    return found

@@ -1,0 +1,150 @@
+"""The triangles of a glTF primitive, in the axes of its node."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.foreign.gltf.check import FAN, POINTS_AND_LINES, STRIP, TRIANGLES
+from pipeline.foreign.gltf.document import GltfDocument, Rows
+from pipeline.foreign.gltf.nodes import PlacedNode, entry
+from storage.errors import Rejected
+
+
+class GltfPrimitive:
+    """The triangles of a primitive; morph targets shape it as its weights say."""
+
+    def __init__(
+        self, document: GltfDocument, primitive: dict[str, Any], weights: Sequence[float]
+    ) -> None:
+        """Read positions and faces.
+
+        Raises:
+            Rejected: index_range where a corner is no vertex, or as `GltfDocument.values`.
+        """
+        self._document, self._primitive = document, primitive
+        self._weights = weights
+        attributes = primitive["attributes"]
+        count = document.count(attributes["POSITION"])
+        order = (
+            document.indices(primitive["indices"]) if "indices" in primitive else np.arange(count)
+        )
+        if order.size and order.max() >= count:
+            raise Rejected("index_range", f"a face names vertex {order.max()} of {count}")
+        self.faces = _faces(order, primitive.get("mode", TRIANGLES))
+        """[T, 3] rows of `positions`."""
+        self._rows: Rows = slice(None)
+        if count > self.faces.size:  # so that sharing a large accessor costs nothing
+            self._rows, faces = np.unique(self.faces, return_inverse=True)
+            self.faces = faces.reshape(-1, 3)
+        self.positions = self._shaped("POSITION", (3,))
+        """[V, 3]"""
+
+    @property
+    def material(self) -> int | None:
+        """Row of the file's materials; None is glTF's default material."""
+        number = self._primitive.get("material")
+        if number is not None:
+            entry(self._document.tree, "materials", number)
+        return number
+
+    def coordinates(self, number: int) -> NDArray[np.float64] | None:
+        """Return a set of texture coordinates [T, 3, 2], v up; None where there is none."""
+        name = f"TEXCOORD_{number}"
+        if name not in self._primitive["attributes"]:
+            return None
+        may_be_whole = "KHR_mesh_quantization" in self._document.tree.get("extensionsUsed", ())
+        uv = self._shaped(name, (2,), is_unit=None if may_be_whole else True)
+        return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)[self.faces]
+
+    @property
+    def colors(self) -> NDArray[np.float64] | None:
+        """Linear colors [T, 3, 3] of the corners; None where there are none."""
+        if "COLOR_0" not in self._primitive["attributes"]:
+            return None
+        return self._shaped("COLOR_0", (3, 4), is_unit=True)[self.faces, :3]
+
+    @property
+    def normals(self) -> NDArray[np.float64] | None:
+        """Normals [T, 3, 3] of the corners; None where there are none."""
+        if "NORMAL" not in self._primitive["attributes"]:
+            return None
+        return self._shaped("NORMAL", (3,))[self.faces]
+
+    def _shaped(
+        self, name: str, widths: tuple[int, ...], *, is_unit: bool | None = None
+    ) -> NDArray[np.float64]:
+        """Return an attribute [V, K] of the vertices, with what morph targets add to it."""
+        number = self._primitive["attributes"][name]
+        values = self._document.values(number, widths, self._rows, is_unit=is_unit)
+        targets = self._primitive.get("targets", ())
+        for weight, target in zip(self._weights, targets, strict=False):
+            if weight and name in target:
+                more = self._document.values(target[name], widths, self._rows, is_unit=is_unit)
+                with np.errstate(invalid="ignore", over="ignore"):
+                    values = values + float(weight) * more
+        return values
+
+
+class PlacedPrimitive:
+    """A primitive in one of its places; a mirrored one has its corners in the other order."""
+
+    def __init__(self, primitive: GltfPrimitive, to_world: NDArray[np.float64]) -> None:
+        """Place its vertices by a matrix [4, 4]."""
+        self.primitive = primitive
+        turn = to_world[:3, :3]
+        with np.errstate(invalid="ignore", over="ignore"):
+            self._step = -1 if np.linalg.det(turn) < 0 else 1
+            world = np.einsum("ij,vj->vi", turn, primitive.positions) + to_world[:3, 3]
+            self._cofactors = np.cross(turn[[1, 2, 0]], turn[[2, 0, 1]]) * self._step
+        self.positions: NDArray[np.float64] = world
+        """[V, 3]"""
+        self.faces = primitive.faces[:, :: self._step]
+        """[T, 3] rows of `positions`."""
+
+    @property
+    def colors(self) -> NDArray[np.float64] | None:
+        """Linear colors [T, 3, 3] of the corners; None where there are none."""
+        return self._turned(self.primitive.colors)
+
+    @property
+    def normals(self) -> NDArray[np.float64] | None:
+        """Normals [T, 3, 3] of the corners, of any length; None where there are none."""
+        found = self._turned(self.primitive.normals)
+        return None if found is None else np.einsum("ij,tcj->tci", self._cofactors, found)
+
+    def coordinates(self, number: int) -> NDArray[np.float64] | None:
+        """Return a set of texture coordinates [T, 3, 2], v up; None where there is none."""
+        return self._turned(self.primitive.coordinates(number))
+
+    def _turned(self, of_corners: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        return None if of_corners is None else of_corners[:, :: self._step]
+
+
+def placed_primitives(document: GltfDocument, place: PlacedNode) -> Iterator[PlacedPrimitive]:
+    """Yield what has triangles of the mesh of a node, in each of its places."""
+    mesh = entry(document.tree, "meshes", place.node["mesh"])
+    weights = place.node.get("weights", mesh.get("weights", ()))
+    primitives = [
+        GltfPrimitive(document, primitive, list(weights))
+        for primitive in mesh["primitives"]
+        if primitive.get("mode", TRIANGLES) not in POINTS_AND_LINES
+        and "POSITION" in primitive["attributes"]
+    ]
+    for to_world in document.instances(place):
+        yield from (PlacedPrimitive(primitive, to_world) for primitive in primitives)
+
+
+def _faces(order: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
+    if mode == TRIANGLES:
+        if len(order) % 3:
+            raise ValueError(f"{len(order)} corners make no whole triangles")
+        return order.reshape(-1, 3)
+    if mode == FAN:
+        first = np.broadcast_to(order[:1], (max(len(order) - 2, 0),))
+        return np.stack([order[1:-1], order[2:], first], axis=1)
+    assert mode == STRIP, mode
+    windows = np.stack([order[:-2], order[1:-1], order[2:]], axis=1)
+    windows[1::2] = windows[1::2][:, [1, 0, 2]]
+    return windows
