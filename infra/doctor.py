@@ -20,7 +20,7 @@ from pipeline.renders.facts import render_facts
 from pipeline.renders.variant import choose_variant
 from storage.cache import cache_folder
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.installation import IMPORT_ROOT, module_name
+from storage.installation import IMPORT_ROOT, child_environment, module_name
 
 State = Literal["ok", "slower", "missing"]
 
@@ -256,6 +256,7 @@ def _probe(name: str, code: str, *, found: str, consequence: str, mend: str) -> 
         result = subprocess.run(
             [sys.executable, "-c", code],
             cwd=IMPORT_ROOT,
+            env=child_environment(),
             capture_output=True,
             text=True,
             timeout=_PROBE_S,

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from storage.cache import cache_folder, open_private, private_folder
 from storage.errors import TrilightError
-from storage.installation import IMPORT_ROOT
+from storage.installation import IMPORT_ROOT, child_environment
 
 TOLD_BY_ITS_STARTER = "TRILIGHT_TOLD_BY_ITS_STARTER"
 """In the environment of processes that get SIGTERM from who started them, and from nobody else."""
@@ -70,7 +70,7 @@ def prefect_server() -> Iterator[str]:
         port = _free_port()
         server = subprocess.Popen(
             [*SERVER, "--port", str(port), "--with-parent"],
-            env={**os.environ, PASSWORD: password, "PREFECT_UI_ENABLED": "false"},
+            env={**child_environment(), PASSWORD: password, "PREFECT_UI_ENABLED": "false"},
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,

@@ -28,6 +28,7 @@ from pipeline.isolation.inside import serve
 from pipeline.isolation.waiting import CallTime
 from storage.errors import EnvironmentFailure
 from storage.extensions import load_same, loaded_files
+from storage.installation import child_environment, order_installed_first
 
 _START_UP_S = 180.0
 _LAUNCHES = 3
@@ -217,7 +218,7 @@ def _launched(limits: ChildLimits) -> tuple[Any, Connection]:
             target=serve, args=(theirs, limits.memory_bytes, limits.cpu_s), daemon=True
         )
         try:
-            with _without_main():
+            with _without_main(), _apart_from_working_folder():
                 process.start()
         except (EOFError, OSError) as error:
             ours.close()
@@ -249,6 +250,26 @@ def _without_main() -> Iterator[None]:
             yield
         finally:
             sys.modules["__main__"] = program
+
+
+@contextlib.contextmanager
+def _apart_from_working_folder() -> Iterator[None]:
+    """Keep what lies in the working folder out of a child, and out of the servers that start it.
+
+    A file of the name of one of Python's modules would be run there, before anything confines it.
+    """
+    environment, paths = os.environ.copy(), sys.path
+    os.environ.update(child_environment())
+    sys.path = order_installed_first(paths)
+    try:
+        yield
+    finally:
+        sys.path = paths
+        for name in ("PYTHONSAFEPATH", "PYTHONPATH"):
+            if name in environment:
+                os.environ[name] = environment[name]
+            else:
+                del os.environ[name]
 
 
 def preload(modules: list[str]) -> None:
