@@ -23,9 +23,11 @@ MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n
 SMALL = ("--objects", "builtin:4", "--scenes", "1", "--resolution", "8", "--noise-floor", "10")
 GENERATE = command("generate", "smoke", *SMALL, "--set", "splits.scenes_per_shard=1", "--out")
 PROGRAM = """
-import os, random, selectors, signal, socket, struct, sys, tempfile, trilight
+import multiprocessing.forkserver, sys
+from pipeline.isolation import ChildLimits, IsolatedChild
 sys.path.insert(0, "")
-print(len(trilight.read_scene("scene.json").objects))
+limits = ChildLimits(memory_bytes=2 << 30, wall_s=99, calls_per_child=1)
+IsolatedChild(limits=limits, setup=int).call(print)
 """
 """A user's own, whose first import path is the working folder: the child's is not."""
 
