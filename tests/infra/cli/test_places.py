@@ -20,7 +20,7 @@ NAMES = """
 """Modules that Python, libraries or Trilight import somewhere."""
 TRAP = "import os; open(os.path.join(os.path.dirname({file!r}), 'RAN'), 'a').write({name!r} + ' ')"
 MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
-SMALL = ("--objects", "builtin:4", "--scenes", "1", "--resolution", "8", "--noise-floor", "10")
+SMALL = ("--objects", "builtin:4", "--scenes", "1", "--resolution", "64", "--noise-floor", "10")
 GENERATE = command("generate", "smoke", *SMALL, "--set", "splits.scenes_per_shard=1", "--out")
 PROGRAM = """
 import multiprocessing.forkserver, sys
@@ -58,6 +58,30 @@ def test_a_conversion_runs_nothing_of_the_folder(tmp_path: Path) -> None:
     _run(command("convert", "scene.json", "out.glb"), _trapped(tmp_path))
     _run([sys.executable, "-P", "-c", PROGRAM], tmp_path)
     assert not (tmp_path / "RAN").exists(), (tmp_path / "RAN").read_text()
+
+
+def test_what_a_shell_leaves_a_run_is_one_sentence_or_works(tmp_path: Path) -> None:
+    """Closed and full streams, a folder that is gone, names that are no text, few files."""
+    program = " ".join(command())
+    (tmp_path / "a").mkdir()
+    cases = {
+        f"{program} --version <&- >&- 2>&-": (0, ""),
+        f"{program} --version > /dev/full": (1, "what is printed cannot be written (No space"),
+        f"{program} verify none <&- >&-": (1, "none: no such"),
+        f"cd a; rmdir ../a; {program} doctor": (1, "the working folder cannot be used (No such"),
+        f"{program} verify $(printf '\\377')": (1, r"the name '\udcff' is no text in utf-8;"),
+        f"ulimit -n 9; {program} convert s.json s.glb": (1, "(Too many open files"),
+        f"ulimit -v 4000000; TMPDIR=$PWD/{'t' * 120} {program} convert s.json s.glb": (0, ""),
+    }
+    write_scene(tiny_scene(), tmp_path / "s.json")
+    (tmp_path / ("t" * 120)).mkdir()
+    for line, (status, said) in cases.items():
+        with case(line):
+            run = subprocess.run(
+                ["bash", "-c", line], cwd=tmp_path, capture_output=True, text=True, check=False
+            )
+            assert (run.returncode, run.stderr.count("\n")) == (status, status), run.stderr
+            assert said in run.stderr
 
 
 @pytest.mark.slow("commands")
