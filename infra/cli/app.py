@@ -50,7 +50,7 @@ def _require_usable_names() -> None:
     for name in names:
         if not name.isascii() and name != name.encode(errors="replace").decode():
             raise TrilightError(
-                f"the name {ascii(name)} is no text in {sys.getfilesystemencoding()}; expected "
+                f"the name {name!a} is no text in {sys.getfilesystemencoding()}; expected "
                 "names in UTF-8. Rename it, or set LC_ALL=C.UTF-8."
             )
 
