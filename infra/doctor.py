@@ -4,9 +4,11 @@ import contextlib
 import importlib.util
 import os
 import platform
+import resource
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
@@ -20,13 +22,20 @@ from pipeline.renders.facts import render_facts
 from pipeline.renders.variant import choose_variant
 from storage.cache import cache_folder
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.installation import IMPORT_ROOT, module_name
+from storage.installation import IMPORT_ROOT, child_environment, module_name
 
 State = Literal["ok", "slower", "missing"]
 
 _PROBE_S = 120
 _APT = "apt-get install"
 _MIN_FREE_BYTES = 5 << 30
+
+_LEAST_LIMITS = {
+    "open files (ulimit -n)": (resource.RLIMIT_NOFILE, 1, 64),
+    "KiB of address space (ulimit -v)": (resource.RLIMIT_AS, 1024, 2 << 30),
+    "KiB of a file (ulimit -f)": (resource.RLIMIT_FSIZE, 1024, 1 << 30),
+}
+"""Kind, unit and least value of what a run needs, by name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +97,32 @@ def _disk() -> Finding:
         consequence="a dataset of ten thousand scenes takes more",
         mend="choose another disk with --out",
     )
+
+
+def _limits() -> Finding:
+    """Look at what a shell, a scheduler or a service sets for what it starts."""
+    problems = [f"no temporary folder ({error})" for error in _temporary_problem()]
+    for name, (kind, unit, least) in _LEAST_LIMITS.items():
+        soft = resource.getrlimit(kind)[0]
+        if soft != resource.RLIM_INFINITY and soft < least:
+            problems.append(f"{soft // unit} {name}; expected at least {least // unit}")
+    if not problems:
+        return Finding(name="limits", state="ok", found="none that would stop a run")
+    return Finding(
+        name="limits",
+        state="missing",
+        found="; ".join(problems),
+        consequence="children cannot start, or are ended",
+        mend="raise the limit where it is set (ulimit -a lists them); TMPDIR=/a/writable/folder",
+    )
+
+
+def _temporary_problem() -> list[str]:
+    try:
+        with tempfile.TemporaryFile():
+            return []
+    except OSError as error:
+        return [str(error)]
 
 
 def _renderer() -> Finding:
@@ -256,6 +291,7 @@ def _probe(name: str, code: str, *, found: str, consequence: str, mend: str) -> 
         result = subprocess.run(
             [sys.executable, "-c", code],
             cwd=IMPORT_ROOT,
+            env=child_environment(),
             capture_output=True,
             text=True,
             timeout=_PROBE_S,
@@ -277,6 +313,7 @@ def _last_line(text: str, status: int) -> str:
 CHECKS: Mapping[str, Callable[[], Finding]] = {
     "machine": _machine,
     "disk": _disk,
+    "limits": _limits,
     "cache": _cache,
     "renderer": _renderer,
     "denoiser": _denoiser,

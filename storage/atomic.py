@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from storage.cache import cache_folder
 from storage.errors import EnvironmentFailure, TrilightError
 
 TEMPORARY_SUFFIX = ".part"
@@ -80,9 +81,12 @@ def write_error(path: Path, error: OSError) -> TrilightError:
             "the same command again."
         )
     kind = EnvironmentFailure if error.errno in _MAY_PASS else TrilightError
+    step = "choose"
+    with contextlib.suppress(TrilightError):  # there may be no cache
+        step = "set TRILIGHT_CACHE to" if path.is_relative_to(cache_folder("")) else step
     return kind(
         f"{path.parent}: cannot write {path.name} ({error.strerror}). What was finished is safe: "
-        "choose a writable folder or mend its permissions, and run the same command again."
+        f"{step} a writable folder or mend its permissions, and run the same command again."
     )
 
 

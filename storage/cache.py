@@ -11,7 +11,13 @@ from storage.errors import TrilightError
 def cache_folder(name: str) -> Path:
     """Return a folder of the user's cache: below TRILIGHT_CACHE, or ~/.cache/trilight."""
     root = os.environ.get("TRILIGHT_CACHE")
-    return (Path(root) if root else Path.home() / ".cache" / "trilight") / name
+    try:
+        return (Path(root) if root else Path.home() / ".cache" / "trilight") / name
+    except RuntimeError as error:  # neither HOME nor an entry of /etc/passwd
+        raise TrilightError(
+            f"user {os.getuid()} has no home directory; expected one for the cache. Set "
+            "TRILIGHT_CACHE to a folder of your own."
+        ) from error
 
 
 def private_folder(path: Path) -> Path:

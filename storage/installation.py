@@ -4,6 +4,9 @@ A wheel moves the packages into `trilight`, so that a user's own `model` or `tra
 (infra/setup/wheel_tree.py). Commands that name one of our modules take its name from here.
 """
 
+import os
+import site
+from collections.abc import Sequence
 from pathlib import Path
 
 _PREFIX = __name__.removesuffix("storage.installation")
@@ -18,3 +21,34 @@ IMPORT_ROOT = Path(__file__).parents[__name__.count(".")]
 def module_name(name: str) -> str:
     """Return the name under which a module such as `pipeline.assets.prepare` is imported here."""
     return f"{_PREFIX}{name}"
+
+
+def child_environment() -> dict[str, str]:
+    """Return this process's environment for a Python child, which finds our modules.
+
+    The child imports nothing from the working folder, for which an empty entry of PYTHONPATH
+    stands too.
+    """
+    paths = _named_paths()
+    if str(IMPORT_ROOT) not in [*paths, *site.getsitepackages(), site.getusersitepackages()]:
+        paths.append(str(IMPORT_ROOT))
+    return {**os.environ, "PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(paths)}
+
+
+def order_installed_first(paths: Sequence[str]) -> list[str]:
+    """Return import paths with the working folder last, where it hides nothing that is installed.
+
+    It keeps its place where it is named by PYTHONPATH, or holds our modules.
+    """
+    try:
+        folder = os.getcwd()
+    except FileNotFoundError:  # it was deleted
+        return list(paths)
+    if folder in [*_named_paths(), str(IMPORT_ROOT)]:
+        return list(paths)
+    return sorted(paths, key=lambda path: path in ("", folder))
+
+
+def _named_paths() -> list[str]:
+    named = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    return [os.path.abspath(path) for path in named if path]

@@ -14,7 +14,7 @@ World: metres, +Z up, right-handed; networks were trained on scenes within [-0.5
 are linear with Rec.709 primaries. `trilight.extend` serves extensions: templates, builds, runs.
 """
 
-from importlib import import_module, metadata
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from trilight.lazy import offered_names
@@ -67,7 +67,7 @@ __all__ = sorted(["__version__", *_HOME])  # noqa: PLE0605
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return metadata.version("trilight")
+        return import_module("importlib.metadata").version("trilight")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(_HOME[name]), name)

@@ -10,7 +10,7 @@ from cyclopts import CycloptsError
 
 from infra.cli.commands import app, complaint
 from infra.cli.extending import extended
-from infra.cli.leaving import leave
+from infra.cli.leaving import leave, open_missing_streams
 from storage.errors import TrilightError
 
 
@@ -20,12 +20,39 @@ def main() -> None:
     # twelve times slower; read when torch is imported, and a setting of the user's own wins
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     signal.signal(signal.SIGINT, _interrupted)
+    open_missing_streams()
     try:
+        _require_usable_names()
         app(extended(sys.argv[1:]))
+        sys.stdout.flush()
     except CycloptsError as mistake:
         leave(f"trilight: {complaint(mistake)}", 2)
     except TrilightError as mistake:
         leave(f"trilight: {mistake}", mistake.exit_status)
+    except OSError as error:
+        try:
+            os.write(sys.stdout.fileno(), b"\n")
+        except OSError:
+            said = f"what is printed cannot be written ({error.strerror}); choose another place"
+            leave(f"trilight: {said}. What was finished is safe.", 1)
+        raise
+
+
+def _require_usable_names() -> None:
+    """Refuse a working folder that is gone, and names that no file format can hold."""
+    try:
+        names = [os.getcwd(), *sys.argv[1:]]
+    except OSError as error:
+        raise TrilightError(
+            f"the working folder cannot be used ({error.strerror}); expected one that exists. "
+            "Change to another folder, and run the command again."
+        ) from error
+    for name in names:
+        if not name.isascii() and name != name.encode(errors="replace").decode():
+            raise TrilightError(
+                f"the name {name!a} is no text in {sys.getfilesystemencoding()}; expected "
+                "names in UTF-8. Rename it, or set LC_ALL=C.UTF-8."
+            )
 
 
 def _interrupted(signal_number: int, frame: FrameType | None) -> None:

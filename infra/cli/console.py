@@ -1,6 +1,7 @@
 """What people see: first words, tables, progress bars with rate and ETA, and what to do next."""
 
 import json
+import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
@@ -47,7 +48,8 @@ def next_step(*commands: Sequence[str]) -> None:
     """
     for row, words in enumerate(commands):
         lead = "     " if row else "\nNext:"
-        line = f"{lead} {shlex.join(['trilight', *words])}"
+        safe = [f"./{word}" if re.match("-[^-].*/", word) else word for word in words]
+        line = f"{lead} {shlex.join(['trilight', *safe])}"
         console.print(Text(line, style="bold"), soft_wrap=True)
 
 

@@ -13,16 +13,26 @@ _SHOW_CURSOR = "\x1b[?25h"
 _temporary: set[Path] = set()
 
 
+def open_missing_streams() -> None:
+    """Open /dev/null for each standard stream that was closed, whose number a file would get."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            stream = open(os.devnull, mode)
+            setattr(sys, name, stream)
+            setattr(sys, f"__{name}__", stream)
+
+
 def leave(message: str, status: int) -> NoReturn:
     """End at once: every child ends with its parent, and every file is whole or absent."""
     out, errors = sys.__stdout__ or sys.stdout, sys.__stderr__ or sys.stderr
     # A signal may arrive in the middle of a write, and Python refuses (RuntimeError) to write or
     # flush the same stream then: hence the descriptors, which no progress bar redraws either.
-    with contextlib.suppress(RuntimeError):
+    with contextlib.suppress(RuntimeError, OSError):
         sys.stdout.flush()
     if out.isatty():  # a progress bar hides the cursor, which stands behind it
         os.write(out.fileno(), f"{_SHOW_CURSOR}\n".encode())
-    os.write(errors.fileno(), f"{message}\n".encode())
+    with contextlib.suppress(OSError):
+        os.write(errors.fileno(), f"{message}\n".encode(errors="backslashreplace"))
     for folder in _temporary:
         shutil.rmtree(folder, ignore_errors=True)
     os._exit(status)

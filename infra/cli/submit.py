@@ -12,6 +12,7 @@ from infra.cli.options import Shown, command
 from infra.cli.submit_array import ARRAYS, ArrayAsked, submit_to_array
 from pipeline.executors.array_job import DatasetByArray
 from pipeline.executors.kubernetes_array import KubernetesOptions
+from pipeline.flows.prefect_server import load_prefect
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -62,7 +63,8 @@ def submit(
             f"machines are those of submit {', '.join(ARRAYS)}; leave them out."
         )
     first_words(f"Submitting {submission.flow} with the build {order.build}", silent=shown.json)
-    from pipeline.flows.submission import parameters  # reads the settings of Prefect now
+    load_prefect()
+    from pipeline.flows.submission import parameters
 
     given = parameters(with_shared(order, shared))
     ended = run_flow(submission.flow, given, runs, where=order.place, as_json=shown.json)
@@ -77,6 +79,7 @@ def submit(
 @command("build")
 def submit_by_array(order: DatasetByArray, shared: Shared, runs: FlowRuns, shown: Shown) -> None:
     first_words(f"Submitting {BY_ARRAY} with the build {order.build}", silent=shown.json)
+    load_prefect()
     from pipeline.flows.submission import parameters
 
     given = parameters(with_shared(order, shared))

@@ -19,6 +19,7 @@ from infra.run_record import tensorboard_command
 from infra.torch_library import require_torch
 from infra.train_order import TrainOrder
 from storage.errors import TrilightError
+from storage.installation import child_environment
 from storage.settings.described import option_words
 from train.progress import TrainProgress
 from train.runs import in_proportion, named_run
@@ -125,7 +126,7 @@ def _launch(order: TrainOrder, watched: WatchSettings, shown: Shown) -> NoReturn
             f"--processes is {order.processes} under torchrun, which sets their number; omit it."
         )
     words = [*order.command(), *option_words(watched), *option_words(shown)]
-    os.execv(words[0], words)
+    os.execve(words[0], words, child_environment())
 
 
 def _trained(

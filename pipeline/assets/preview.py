@@ -27,13 +27,16 @@ full ones above the second."""
 _SUPERSAMPLE = 2
 
 
-def preview_source(path: Path, settings: AssetSettings, width_px: int) -> NDArray[np.uint8]:
-    """Return a grey picture [W, W] of a source file as the stage cleans it.
+def preview_both(
+    path: str, settings: AssetSettings, level: Level, width_px: int
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return a grey picture [W, W] of a source file as the stage cleans it, and one of its level.
 
     Raises Rejected as `prepare_asset`.
     """
-    mesh, _ = orient_outward(clean(normalise(load_mesh(read_source(path, settings.read_limits)))))
-    return preview(mesh, width_px)
+    data = read_source(Path(path), settings.read_limits)
+    mesh, _ = orient_outward(clean(normalise(load_mesh(data))))
+    return preview(mesh, width_px), preview_level(level, width_px)
 
 
 def preview_level(level: Level, width_px: int) -> NDArray[np.uint8]:

@@ -9,7 +9,10 @@ served deployment, a team's server) that server is used instead.
 import contextlib
 import fcntl
 import http.client
+import io
+import json
 import os
+import re
 import secrets
 import socket
 import subprocess
@@ -19,10 +22,16 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from storage.cache import cache_folder, open_private, private_folder
 from storage.errors import TrilightError
-from storage.installation import IMPORT_ROOT
+from storage.installation import IMPORT_ROOT, child_environment
+from storage.remote.safe_url import safe_text
+
+if TYPE_CHECKING:
+    import httpx
+    from prefect.client.orchestration import SyncPrefectClient
 
 TOLD_BY_ITS_STARTER = "TRILIGHT_TOLD_BY_ITS_STARTER"
 """In the environment of processes that get SIGTERM from who started them, and from nobody else."""
@@ -53,15 +62,107 @@ def quiet_prefect() -> None:
         os.environ.setdefault(name, value)
 
 
+def load_prefect() -> None:
+    """Import Prefect, which reads environment, profile and files of the working folder then.
+
+    Raises:
+        TrilightError: a setting is refused.
+    """
+    own = [os.environ.get(name) for name in ("no_proxy", "NO_PROXY")]
+    os.environ["no_proxy"] = ",".join([*filter(None, own), "localhost", "127.0.0.1"])
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):  # where it prints what it raises too
+            from prefect.settings import get_current_settings
+
+            get_current_settings()
+    except (ValueError, OSError) as error:
+        fields: Any = getattr(error, "errors", lambda: ())()  # of pydantic, without the values
+        said = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in fields] or [str(error)]
+        raise TrilightError(
+            f"Prefect refuses its settings ({'; '.join(said)}); expected valid ones. Correct the "
+            "variables PREFECT_*, its profile, or prefect.toml, pyproject.toml or .env here."
+        ) from error
+
+
+@contextlib.contextmanager
+def name_prefect_failures(
+    next_step: str = "Run make serve, or mend PREFECT_API_URL",
+) -> Iterator[None]:
+    """Raise what a Prefect server fails to do in the block as one sentence, TrilightError."""
+    import httpx
+    from prefect.exceptions import PrefectException
+    from prefect.settings import get_current_settings
+
+    server = f"Prefect at {safe_text(get_current_settings().api.url or '')}"
+    try:
+        yield
+    except httpx.HTTPStatusError as refusal:
+        status = refusal.response.status_code
+        reason = (
+            "it wants a password. Set PREFECT_API_AUTH_STRING=USER:PASSWORD"
+            if status in (401, 403)
+            else f"it answers {status}: {_detail(refusal.response)}"
+        )
+        raise TrilightError(f"{server}: {reason}.") from refusal
+    except (httpx.TransportError, httpx.InvalidURL, PrefectException) as trouble:
+        said = re.sub(r"^\[Errno -?\d+\] ", "", safe_text(str(trouble))).rstrip(".")
+        raise TrilightError(f"{server}: {said or 'no answer'}. {next_step}.") from trouble
+
+
+@contextlib.contextmanager
+def prefect_client() -> Iterator["SyncPrefectClient"]:
+    """Provide a client of the server that is set, which answers as Prefect's does.
+
+    Raises:
+        TrilightError: it refuses or does not answer, or certificates cannot be read.
+    """
+    from prefect.client.orchestration import get_client
+
+    with name_prefect_failures():
+        try:
+            opened = get_client(sync_client=True)
+        except OSError as error:
+            raise TrilightError(
+                f"Prefect: the file of certificates cannot be read ({error.strerror}); expected "
+                "one in PEM. Correct or unset SSL_CERT_FILE and PREFECT_API_SSL_CERT_FILE."
+            ) from error
+        with opened as client:
+            try:
+                version = client.api_version()
+            except ValueError:
+                version = ""
+            if not isinstance(version, str) or not version[:1].isdigit():
+                raise TrilightError(
+                    f"{safe_text(str(client.api_url))} is no API of Prefect; expected one, such "
+                    "as http://127.0.0.1:4200/api. Run make serve, or mend PREFECT_API_URL."
+                )
+            yield client
+
+
+def _detail(response: "httpx.Response") -> str:
+    """Return what the server says is wrong: of a parameter, which, and why."""
+    try:
+        detail = response.json().get("detail", "")
+    except ValueError:
+        detail = response.text
+    text = detail if isinstance(detail, str) else json.dumps(detail)
+    return safe_text(text)[:500] or "no reason given"
+
+
 @contextlib.contextmanager
 def prefect_server() -> Iterator[str]:
     """Provide the URL of a Prefect API for the block, and set PREFECT_API_URL to it.
 
     Raises:
-        TrilightError: the private server does not start.
+        TrilightError: the server that is set does not answer, or the private one does not start;
+            or what the block raises because of it.
     """
     if given := os.environ.get("PREFECT_API_URL"):
-        yield given
+        load_prefect()
+        with prefect_client():
+            pass
+        with name_prefect_failures():
+            yield given
         return
     home = private_folder(Path(os.environ["PREFECT_HOME"]))
     password = new_password()
@@ -70,7 +171,7 @@ def prefect_server() -> Iterator[str]:
         port = _free_port()
         server = subprocess.Popen(
             [*SERVER, "--port", str(port), "--with-parent"],
-            env={**os.environ, PASSWORD: password, "PREFECT_UI_ENABLED": "false"},
+            env={**child_environment(), PASSWORD: password, "PREFECT_UI_ENABLED": "false"},
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
@@ -81,7 +182,11 @@ def prefect_server() -> Iterator[str]:
             wait_until_healthy(url, server, home / _LOG_NAME)
             fcntl.flock(lock, fcntl.LOCK_UN)
             os.environ |= {"PREFECT_API_URL": url, CLIENT_PASSWORD: password}
-            yield url
+            load_prefect()
+            with prefect_client():
+                pass
+            with name_prefect_failures(f"See {home / _LOG_NAME}; run the command again to go on"):
+                yield url
         finally:
             for variable in ("PREFECT_API_URL", CLIENT_PASSWORD):
                 os.environ.pop(variable, None)
@@ -97,15 +202,20 @@ def new_password() -> str:
 def wait_until_healthy(url: str, server: "subprocess.Popen[bytes]", log: Path) -> None:
     """Return when a server answers; raises TrilightError where it ends, or takes too long."""
     deadline = time.monotonic() + _START_UP_S
+    direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # it is on this machine
     while time.monotonic() < deadline and server.poll() is None:
         with contextlib.suppress(urllib.error.URLError, OSError, http.client.HTTPException):
-            with urllib.request.urlopen(f"{url}/health", timeout=2):
+            with direct.open(f"{url}/health", timeout=2):
                 if server.poll() is None:  # else it was somebody else who answered
                     return
         time.sleep(0.1)
+    load_prefect()  # which names a setting that the server refused
+    lines = log.read_text(errors="replace").splitlines() if log.exists() else []
+    said = safe_text(lines[-1]) if lines else "without a word"
+    what = "ended" if server.poll() is not None else f"did not answer within {_START_UP_S:.0f} s"
     raise TrilightError(
-        f"Prefect: the server did not start within {_START_UP_S:.0f} s, or ended; see {log}, and "
-        "try `trilight doctor`."
+        f"Prefect: the server did not start: it {what} ({said}); see {log}, and try "
+        "`trilight doctor`."
     )
 
 

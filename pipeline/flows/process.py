@@ -1,12 +1,12 @@
 """A program that a flow runs, told to end when the flow is: it may save, and then both are done."""
 
-import os
 import signal
 import subprocess
 from collections.abc import Callable, Sequence
 
 from pipeline.flows.prefect_server import TOLD_BY_ITS_STARTER
 from pipeline.isolation import die_with_parent
+from storage.installation import child_environment
 from storage.remote.safe_url import safe_text
 
 
@@ -32,7 +32,7 @@ def run_to_end(command: Sequence[str], say: Callable[[str], None]) -> tuple[int,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        env={**os.environ, TOLD_BY_ITS_STARTER: "1"},
+        env={**child_environment(), TOLD_BY_ITS_STARTER: "1"},
         start_new_session=True,
         preexec_fn=die_with_parent,
     ) as process:

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
 
-import httpx
-from prefect.client.orchestration import SyncPrefectClient, get_client
+from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas.filters import (
     ArtifactFilter,
     ArtifactFilterFlowRunId,
@@ -21,9 +20,9 @@ from prefect.client.schemas.filters import (
     FlowFilterName,
 )
 from prefect.client.schemas.objects import FlowRun, WorkerStatus
-from prefect.exceptions import PrefectException
 from prefect.settings import get_current_settings
 
+from pipeline.flows.prefect_server import prefect_client
 from storage.errors import TrilightError
 from storage.remote.safe_url import safe_text
 from storage.settings.described import described
@@ -73,28 +72,13 @@ def server() -> Iterator[SyncPrefectClient]:
     Raises:
         TrilightError: none is set, or it refuses, or does not answer.
     """
-    url = get_current_settings().api.url
-    if url is None:
+    if not get_current_settings().api.url:
         raise TrilightError(
             "submit: no Prefect server is set; expected one that serves Trilight's flows. Run make "
             "serve in the checkout, or set PREFECT_API_URL (and PREFECT_API_AUTH_STRING)."
         )
-    try:
-        with get_client(sync_client=True) as client:
-            yield client
-    except httpx.HTTPStatusError as refusal:
-        status = refusal.response.status_code
-        reason = (
-            "it wants a password. Set PREFECT_API_AUTH_STRING=USER:PASSWORD"
-            if status in (401, 403)
-            else f"it answers {status}: {_detail(refusal.response)}"
-        )
-        raise TrilightError(f"submit: Prefect at {safe_text(url)}: {reason}.") from refusal
-    except (httpx.TransportError, PrefectException) as trouble:
-        raise TrilightError(
-            f"submit: Prefect at {safe_text(url)}: {safe_text(str(trouble)) or 'no answer'}. Run "
-            "make serve, or mend PREFECT_API_URL."
-        ) from trouble
+    with prefect_client() as client:
+        yield client
 
 
 def parameters(order: Any) -> dict[str, Any]:
@@ -208,13 +192,3 @@ def _nested(changes: Mapping[str, Any]) -> dict[str, Any]:
             place = place.setdefault(group, {})
         place[last] = value
     return nested
-
-
-def _detail(response: httpx.Response) -> str:
-    """Return what the server says is wrong: of a parameter, which, and why."""
-    try:
-        detail = response.json().get("detail", "")
-    except ValueError:
-        detail = response.text
-    text = detail if isinstance(detail, str) else json.dumps(detail)
-    return safe_text(text)[:500] or "no reason given"

@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -28,11 +29,14 @@ from pipeline.isolation.inside import serve
 from pipeline.isolation.waiting import CallTime
 from storage.errors import EnvironmentFailure
 from storage.extensions import load_same, loaded_files
+from storage.installation import child_environment, order_installed_first
 
 _START_UP_S = 180.0
 _LAUNCHES = 3
 _MOST_BYTES = 16 << 30
 """Of one answer: more than any child on a processor may hold."""
+_LONGEST_FOLDER = 70
+"""Bytes: the name of a socket, which the fork server has there, must not be longer than 107."""
 _CRASHES = (signal.SIGABRT, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV, signal.SIGTRAP)
 """Signals by which native code ends itself. All others come from outside, SIGBUS too:
 a file that cannot be read or a disk that is full behind a memory map."""
@@ -217,7 +221,7 @@ def _launched(limits: ChildLimits) -> tuple[Any, Connection]:
             target=serve, args=(theirs, limits.memory_bytes, limits.cpu_s), daemon=True
         )
         try:
-            with _without_main():
+            with _without_main(), _apart_from_working_folder():
                 process.start()
         except (EOFError, OSError) as error:
             ours.close()
@@ -249,6 +253,29 @@ def _without_main() -> Iterator[None]:
             yield
         finally:
             sys.modules["__main__"] = program
+
+
+@contextlib.contextmanager
+def _apart_from_working_folder() -> Iterator[None]:
+    """Keep what lies in the working folder out of a child, and out of the servers that start it.
+
+    A file of the name of one of Python's modules would be run there, before anything confines it.
+    The socket of the fork server is below /tmp where TMPDIR is too long for one.
+    """
+    environment, paths, temporary = os.environ.copy(), sys.path, tempfile.tempdir
+    os.environ.update(child_environment())
+    sys.path = order_installed_first(paths)
+    if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_FOLDER:
+        tempfile.tempdir = "/tmp"
+    try:
+        yield
+    finally:
+        sys.path, tempfile.tempdir = paths, temporary
+        for name in ("PYTHONSAFEPATH", "PYTHONPATH"):
+            if name in environment:
+                os.environ[name] = environment[name]
+            else:
+                del os.environ[name]
 
 
 def preload(modules: list[str]) -> None:

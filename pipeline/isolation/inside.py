@@ -59,6 +59,9 @@ def serve(connection: Connection, memory_bytes: int, cpu_s: int | None) -> None:
     _die_with_owner()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    most = resource.getrlimit(resource.RLIMIT_AS)[1]
+    if most != resource.RLIM_INFINITY:  # of this shell, which no process can raise
+        memory_bytes = min(memory_bytes, most)
     resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
     file = connection.fileno()
     while True:

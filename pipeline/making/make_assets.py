@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalise
+from pipeline.assets.preview import preview_both
 from pipeline.assets.recipe import RECIPE, library_versions
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset
@@ -261,20 +262,10 @@ def _pairs(
                 path = prepared[i].record.path
                 child.may(reach(files=[Path(path)]))
                 with contextlib.suppress(ChildFailed):  # a picture less is no reason to stop
-                    pair = call_with_retries(
-                        child, _pair_in_child, path, settings, levels[i], rows[i]
+                    source, result = call_with_retries(
+                        child, preview_both, path, settings, levels[i], _WIDTH_PX
                     )
-                    pairs[name].append(pair)
+                    pairs[name].append(Pair(row=rows[i], source=source, result=result))
     finally:
         child.close()
     return pairs
-
-
-def _pair_in_child(path: str, settings: AssetSettings, level: Level, row: AssetRow) -> Pair:
-    from pipeline.assets.preview import preview_level, preview_source
-
-    return Pair(
-        row=row,
-        source=preview_source(Path(path), settings, _WIDTH_PX),
-        result=preview_level(level, _WIDTH_PX),
-    )

@@ -1,7 +1,6 @@
 """What the render stage runs on, for people and for logs; asked in a process of its own."""
 
 import json
-import os
 import subprocess
 import sys
 from importlib import metadata
@@ -9,7 +8,7 @@ from pathlib import Path
 
 from pipeline.renders.denoiser import open_device
 from pipeline.renders.variant import Variant, activate
-from storage.installation import IMPORT_ROOT
+from storage.installation import IMPORT_ROOT, child_environment
 
 _ASK_S = 120
 
@@ -21,7 +20,7 @@ def render_facts(variant: Variant) -> dict[str, str]:
     result = subprocess.run(
         [sys.executable, "-m", f"{__package__}.facts", json.dumps(vars(variant))],
         cwd=IMPORT_ROOT,
-        env=dict(os.environ),
+        env=child_environment(),
         capture_output=True,
         text=True,
         timeout=_ASK_S,

@@ -31,7 +31,7 @@ from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.installation import IMPORT_ROOT
+from storage.installation import IMPORT_ROOT, child_environment
 
 _PROBE_S = (180, 360)
 """Wall time of a probe, and of a second try where the first gave no answer: many may start at once,
@@ -192,7 +192,7 @@ def _probe(variant: Variant) -> _Probed:
 def _probe_within(variant: Variant, wall_s: float) -> _Probed:
     """Render a small picture in a child; an abort, a hang or a wrong picture is a problem."""
     with tempfile.TemporaryDirectory() as kernels:
-        environment = {**os.environ, "DRJIT_CACHE_DIR": kernels}
+        environment = {**child_environment(), "DRJIT_CACHE_DIR": kernels}
         if variant.libllvm:
             environment["DRJIT_LIBLLVM_PATH"] = variant.libllvm
         try:

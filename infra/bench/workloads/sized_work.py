@@ -17,7 +17,7 @@ from pathlib import Path
 from infra.bench.workloads.cost_scene import cost_scene
 from infra.bench.workloads.manifests import write_copies
 from storage.errors import TrilightError
-from storage.installation import IMPORT_ROOT
+from storage.installation import IMPORT_ROOT, child_environment
 
 _PX, _LIGHTS = 64, 4
 _SAMPLING_S = 0.05
@@ -57,8 +57,8 @@ def measure_work(name: str, size: int, folder: Path) -> dict[str, float]:
     """
     words = [sys.executable, "-c", _CODE, __name__, name, str(size), str(folder)]
     with subprocess.Popen(
-        words, cwd=IMPORT_ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        start_new_session=True,
+        words, cwd=IMPORT_ROOT, env=child_environment(), stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True, start_new_session=True,
     ) as process:  # fmt: skip
         peak, done = [0], threading.Event()
         watch = threading.Thread(target=_watch_memory, args=(process.pid, peak, done))

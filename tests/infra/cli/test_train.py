@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -224,11 +225,12 @@ def test_several_processes_are_launched_by_torchrun(monkeypatch: pytest.MonkeyPa
     """As one command line; under torchrun it would be twice as many."""
     seen: list[list[str]] = []
 
-    def replaced(program: str, words: list[str]) -> NoReturn:
+    def replaced(program: str, words: list[str], environment: Mapping[str, str]) -> NoReturn:
+        assert environment["PYTHONSAFEPATH"]
         seen.append(words)
         sys.exit(0)
 
-    monkeypatch.setattr(os, "execv", replaced)
+    monkeypatch.setattr(os, "execve", replaced)
     asked = ["train", "smoke", "--processes", "2", "--set", "seed=3", "--skip-unusable", "1"]
     assert trilight([*asked, "--json"]).exit_code == 0
     (words,) = seen

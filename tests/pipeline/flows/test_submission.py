@@ -21,12 +21,17 @@ from prefect.states import Completed, Failed, Running, Scheduled, State
 
 from pipeline.flows.dataset_flows import generate_scenes
 from pipeline.flows.guarded_server import Door
-from pipeline.flows.prefect_server import wait_until_healthy
+from pipeline.flows.prefect_server import (
+    name_prefect_failures,
+    prefect_server,
+    wait_until_healthy,
+)
 from pipeline.flows.submission import looks, parameters, server, submit, workers_online
 from pipeline.making.dataset_order import DatasetOrder
 from storage.cache import open_private, private_folder
 from storage.errors import TrilightError
-from tests.for_each import for_each
+from tests.for_each import case, for_each
+from tests.http_server import serve
 
 
 class Server:
@@ -131,15 +136,31 @@ def test_no_server_a_closed_port_and_a_password() -> None:
     with temporary_settings(restore_defaults={PREFECT_API_URL}):
         with pytest.raises(TrilightError, match="no Prefect server is set.*make serve"), server():
             pass
-    with temporary_settings({PREFECT_API_URL: "http://127.0.0.1:9/api"}):
-        with pytest.raises(TrilightError, match="make serve, or mend PREFECT_API_URL"):
-            with server() as client:
-                client.hello().raise_for_status()
-        request = httpx.Request("POST", "http://127.0.0.1:9/api")
-        refusal = httpx.Response(401, request=request)
-        with pytest.raises(TrilightError, match="it wants a password.*PREFECT_API_AUTH_STRING"):
-            with server():
-                refusal.raise_for_status()
+    request = httpx.Request("POST", "http://127.0.0.1:9/api")
+    with pytest.raises(TrilightError, match="it wants a password.*PREFECT_API_AUTH_STRING"):
+        with name_prefect_failures():
+            httpx.Response(401, request=request).raise_for_status()
+
+
+def test_what_is_no_prefect_is_said_in_one_sentence_by_every_runner(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """`submit` and `--runner prefect` alike; no proxy stands before one's own machine."""
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
+    with serve() as site:
+        site.put("api/admin/version", "<html>")
+        cases = {
+            "http://127.0.0.1:9/api": "^Prefect at .*: Connection refused. Run make serve, or mend",
+            "garbage": "^Prefect at garbage: .* missing an 'http://'",
+            f"{site.url}/api": "is no API of Prefect; expected one, such as",
+            f"{site.url}/x": "it answers 404",
+        }
+        for place, said in cases.items():
+            monkeypatch.setenv("PREFECT_API_URL", place)
+            for opened in (server, prefect_server):
+                with case((place, opened)), temporary_settings({PREFECT_API_URL: place}):
+                    with pytest.raises(TrilightError, match=said), opened():
+                        pass
 
 
 PORT = 4200
