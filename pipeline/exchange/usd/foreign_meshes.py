@@ -45,7 +45,7 @@ def read_mesh(placed: Placed, time: Any, lost: list[str]) -> TriangleSoup:
     from pxr import UsdGeom
 
     prim = placed.prim
-    mesh, found = UsdGeom.Mesh(prim), mesh_polygons(prim, time)
+    mesh, found = UsdGeom.Mesh(prim), mesh_polygons(placed, time)
     corners, polygons = mesh_triangles(prim, found, placed.to_world, time)
     indices = found.indices
     positions = moved(found.points, placed.to_world)[indices[corners]].astype(np.float32)
@@ -71,6 +71,9 @@ def _normals(
     cross = _cross(positions)
     flat = cross / np.linalg.norm(cross, axis=1, keepdims=True)
     stated = _stated_normals(mesh, time)
+    if placed.skin is not None and len(positions):
+        lost.append(f"{placed.prim.GetPath()}: posed by bones; its normals are those of its faces")
+        return _smooth(positions, indices, corners)
     if stated is None:
         if mesh.GetSubdivisionSchemeAttr().Get() == "none" or not len(positions):
             return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)

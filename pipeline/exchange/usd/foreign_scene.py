@@ -21,7 +21,7 @@ from pipeline.exchange.usd.foreign_lights import light_triangles, radiance
 from pipeline.exchange.usd.foreign_materials import dressing
 from pipeline.exchange.usd.foreign_meshes import MeshToShade, TriangleSoup, read_mesh
 from pipeline.exchange.usd.names import OBJECT_TEXTS
-from pipeline.foreign.usd.placed import Placed, placed_prims
+from pipeline.foreign.usd.placed import DOMES, Placed, placed_prims
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.scenes.shading import flat_shaded
 from storage.errors import TrilightError
@@ -46,7 +46,7 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
     names: set[str] = set()
     triangles = 0
     for each in placed:
-        if each.prim.GetTypeName() in ("Camera", "DomeLight"):
+        if each.prim.GetTypeName() in ("Camera", *DOMES):
             continue
         found = _pieces(each, time, opened, licence, names)
         triangles += sum(len(one.piece.mesh.faces) for one in found)
@@ -96,7 +96,7 @@ def _environment(
     placed: Sequence[Placed], time: Any, opened: OpenedUsd, licence: str
 ) -> Environment | None:
     """Return that of the first dome that can be read; others are noted."""
-    domes = [each for each in placed if each.prim.GetTypeName() == "DomeLight"]
+    domes = [each for each in placed if each.prim.GetTypeName() in DOMES]
     sky = None
     for each in domes:
         if sky is not None:
@@ -114,19 +114,20 @@ def _pieces(
         triangles = light_triangles(each, time, opened.lost)
         if triangles is None:
             return []
-        return _split(each, _of_light(prim, triangles, time), licence, names)
+        light = radiance(each, triangles, time, opened.lost)
+        return _split(each, _of_light(triangles, light), licence, names)
     soup = read_mesh(each, time, opened.lost)
     if not len(soup.positions):
         opened.lost.append(f"{prim.GetPath()}: no triangle with an area")
         return []
-    return _split(each, _of_mesh(prim, soup, time, opened, licence), licence, names)
+    return _split(each, _of_mesh(each, soup, time, opened, licence), licence, names)
 
 
-def _of_light(prim: Any, triangles: NDArray[np.float32], time: Any) -> DressedTriangles:
+def _of_light(triangles: NDArray[np.float32], light: NDArray[np.float32]) -> DressedTriangles:
     count = len(triangles)
     rows = default_rows(count)
     rows[:, ROUGHNESS] = 1
-    rows[:, EMISSION] = radiance(prim, triangles, time)
+    rows[:, EMISSION] = light
     corners = triangles.reshape(-1, 3)
     flat = flat_shaded(corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3))
     return DressedTriangles(
@@ -140,16 +141,17 @@ def _of_light(prim: Any, triangles: NDArray[np.float32], time: Any) -> DressedTr
 
 
 def _of_mesh(
-    prim: Any, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
+    placed: Placed, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
 ) -> DressedTriangles:
     from pxr import UsdGeom
 
+    prim = placed.prim
     indices = np.array(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr().Get(time), np.int64)
     surface = MeshToShade(prim=prim, soup=soup, indices=indices)
     found = dressing(surface, time, opened, licence)
     rows = found.rows
     if prim.HasAPI("MeshLightAPI"):
-        light = radiance(prim, soup.positions, time)
+        light = radiance(placed, soup.positions, time, opened.lost)
         mode = prim.GetAttribute("light:materialSyncMode").Get(time)
         glows = rows[:, EMISSION].any()
         tints = mode == "materialGlowTintsLight" and glows

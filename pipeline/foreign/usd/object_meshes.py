@@ -11,6 +11,7 @@ from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.usd.object_stage import UsdStage
 from pipeline.foreign.usd.placed import Placed
 from pipeline.foreign.usd.polygons import mesh_polygons, mesh_triangles, moved, primvar_corners
+from pipeline.foreign.usd.shaders import StatedMaterial, as_colors
 from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 from storage.errors import Rejected
 
@@ -53,9 +54,16 @@ class PlacedPart:
         found = primvar_corners(
             self.placed.prim, "displayColor", self.indices, self.corners, self.polygons, time
         )
-        if found is None or found.ndim != 3 or found.shape[2] != 3 or not np.isfinite(found).all():
-            return None
-        return np.clip(found.astype(np.float64), 0, 1)
+        wide = None if found is None or found.ndim != 3 else as_colors(found)
+        return None if wide is None else np.clip(wide, 0, 1)
+
+    def stated(
+        self, material: StatedMaterial, name: str, time: object
+    ) -> NDArray[np.float64] | None:
+        """Return what the primvar of an input is at corners [T, 3, 3]; None without one."""
+        return material.values(
+            name, self.placed.prim, self.indices, self.corners, self.polygons, time
+        )
 
 
 def placed_parts(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedPart, ...]:
@@ -67,7 +75,7 @@ def placed_parts(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedPart, ...]:
     """
     parts, left, farthest = list[PlacedPart](), limits.max_faces, 0.0
     for number, each in enumerate(stage.meshes):
-        found = mesh_polygons(each.prim, stage.time)
+        found = mesh_polygons(each, stage.time)
         left -= int(np.maximum(found.counts - 2, 0).sum())
         if left < 0:
             raise Rejected("too_many_faces", f"expected <= {limits.max_faces} faces")

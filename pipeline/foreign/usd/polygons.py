@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.usd.placed import Placed
 from storage.errors import TrilightError
 
 MAX_EAR_CORNERS = 2000
@@ -24,16 +25,20 @@ class MeshPolygons:
     indices: NDArray[np.int64]  # [sum of counts] rows of `points`
 
 
-def mesh_polygons(prim: Any, time: Any) -> MeshPolygons:
-    """Return the polygons of a mesh at a time.
+def mesh_polygons(placed: Placed, time: Any) -> MeshPolygons:
+    """Return the polygons of a mesh at a time, posed by its bones if it has any.
 
     Raises:
         TrilightError: its arrays contradict each other, or are not finite.
     """
     from pxr import UsdGeom
 
+    prim = placed.prim
     mesh = UsdGeom.Mesh(prim)
-    points = as_array(mesh.GetPointsAttr().Get(time), np.float64, (-1, 3))
+    stated = mesh.GetPointsAttr().Get(time)
+    points = as_array(stated, np.float64, (-1, 3))
+    if placed.skin is not None and len(points):
+        points = placed.skin.pose(prim, stated, time)
     counts = as_array(mesh.GetFaceVertexCountsAttr().Get(time), np.int64, (-1,))
     indices = as_array(mesh.GetFaceVertexIndicesAttr().Get(time), np.int64, (-1,))
     _check(prim, points, counts, indices)

@@ -80,12 +80,23 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
     Raises:
         TrilightError: its picture is outside of the folder, or on the network.
     """
-    attribute = shader.GetInput("file")
+    from pxr import UsdShade
+
+    stated = shader.GetInput("file")
+    sources = UsdShade.Utils.GetValueProducingAttributes(stated) if stated else []
+    attribute = sources[0] if sources else None
     asset = attribute.Get(time) if attribute else None
     named, resolved = "" if asset is None else asset.path, None
-    if named:
-        specs = attribute.GetAttr().GetPropertyStack(time)
+    if attribute and named:
+        specs = attribute.GetPropertyStack(time)
         resolved = opened.inside(specs[0].layer if specs else opened.root, named)
+    if "<UDIM>" in named:
+        opened.lost.append(f"{shader.GetPath()}: {named!r:.100} has UDIM tiles, which are not read")
+    for name in ("scale", "bias", "fallback"):
+        fed = shader.GetInput(name)
+        sources = UsdShade.Utils.GetValueProducingAttributes(fed) if fed else []
+        if sources and UsdShade.Output.IsOutput(sources[0]):
+            opened.lost.append(f"{shader.GetPath()}.{name}: a network that is not read")
     fallback = value_of(shader, "fallback", time, None)
     return TextureNode(
         named=named,
@@ -94,22 +105,22 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
         wrap=(_wrap(shader, "wrapS", time), _wrap(shader, "wrapT", time)),
         scale=np.array(value_of(shader, "scale", time, (1, 1, 1, 1)), np.float32),
         bias=np.array(value_of(shader, "bias", time, (0, 0, 0, 0)), np.float32),
-        chart=chart_of(shader, time),
+        chart=chart_of(shader, time, opened.lost),
         output=output if output in ("r", "g", "b", "a") else "rgb",
         fallback=None if fallback is None else np.array(fallback, np.float64),
     )
 
 
-def chart_of(shader: Any, time: Any) -> UvChart:
+def chart_of(shader: Any, time: Any, lost: list[str]) -> UvChart:
     """Return the coordinates of a texture's shader; `st` where it states none."""
     from pxr import UsdShade
 
-    st, moves = shader.GetInput("st"), list[Move]()
+    st, moves, primvar = shader.GetInput("st"), list[Move](), "st"
     for _ in range(_MOST_NODES):
-        source = st.GetConnectedSources()[0] if st and st.HasConnectedSource() else []
-        if not source:
+        sources = UsdShade.Utils.GetValueProducingAttributes(st) if st else []
+        if not sources or not UsdShade.Output.IsOutput(sources[0]):
             break
-        node = UsdShade.Shader(source[0].source.GetPrim())
+        node = UsdShade.Shader(sources[0].GetPrim())
         if node.GetIdAttr().Get() == "UsdTransform2d":
             moves.append(
                 Move(
@@ -120,12 +131,16 @@ def chart_of(shader: Any, time: Any) -> UvChart:
             )
             st = node.GetInput("in")
             continue
-        name = node.GetInput("varname")
-        stated = UsdShade.Utils.GetValueProducingAttributes(name) if name else []
-        if stated:
-            return UvChart(primvar=str(stated[0].Get(time)), moves=tuple(reversed(moves)))
+        primvar = stated_text(node, "varname", time) or primvar
+        if node.GetIdAttr().Get() != "UsdPrimvarReader_float2":
+            lost.append(f"{node.GetPath()}: not read; texture coordinates {primvar!r:.60} taken")
         break
-    return UvChart(primvar="st", moves=tuple(reversed(moves)))
+    return UvChart(primvar=primvar, moves=tuple(reversed(moves)))
+
+
+def stated_text(node: Any, name: str, time: Any) -> str:
+    """Return an input that holds a text, also one that its material hands on; else ""."""
+    return str(value_of(node, name, time, ""))
 
 
 def chart_corners(
@@ -172,9 +187,12 @@ def _require_size(size: int, max_bytes: int, name: str) -> None:
 
 
 def value_of(shader: Any, name: str, time: Any, default: Any) -> Any:
-    """Return an input of a shader, or the default where it is not stated."""
-    attribute = shader.GetInput(name)
-    value = attribute.Get(time) if attribute else None
+    """Return an input of a shader, or of its material; the default where it is not stated."""
+    from pxr import UsdShade
+
+    stated = shader.GetInput(name)
+    sources = UsdShade.Utils.GetValueProducingAttributes(stated) if stated else []
+    value = sources[0].Get(time) if sources else None
     return default if value is None else value
 
 

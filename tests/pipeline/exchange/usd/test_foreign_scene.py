@@ -59,7 +59,7 @@ def test_units_and_axes(stage: UsdScene) -> None:
         ("rect", [0, 0, -0.1], [20, 20, 20]),
         ("disk", [0, math.pi * 0.04, 0], [1, 0.5, 0.25]),
         ("lamp", [0, 0, 0.005], [7, 7, 7]),
-        ("sphere", [0, 0, 0], [3 / (4 * math.pi * 0.01)] * 3),
+        ("sphere", [0, 0, 0], [3 / (4 * math.pi * 10**2)] * 3),  # normalized: in centimetres
     ],
 )
 def test_lights_have_their_area_and_radiance(
