@@ -14,8 +14,7 @@ from pipeline.exchange.linear_maps import (
     on_one_grid,
     over_one,
 )
-from pipeline.exchange.usd.foreign_coordinates import coordinates
-from pipeline.exchange.usd.foreign_meshes import MeshToShade
+from pipeline.exchange.usd.foreign_meshes import TriangleSoup
 from pipeline.exchange.usd.foreign_skins import CHANNELS
 from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
 from pipeline.foreign.usd.shaders import StatedMaterial, finite_color, head_on
@@ -27,7 +26,7 @@ class ShaderInputs:
     """What a material is fed with, on one mesh."""
 
     def __init__(
-        self, stated: StatedMaterial, surface: MeshToShade, time: Any, opened: OpenedUsd
+        self, stated: StatedMaterial, surface: TriangleSoup, time: Any, opened: OpenedUsd
     ) -> None:
         """Remember it; nothing is read yet.
 
@@ -56,17 +55,15 @@ class ShaderInputs:
 
     def varying(self, name: str) -> NDArray[np.float32] | None:
         """Return the means [T, 3] over triangles of an input's primvar; None without one."""
-        soup, indices = self._surface.soup, self._surface.indices
-        prim = self._surface.prim
-        found = self.stated.values(name, prim, indices, soup.corners, soup.polygons, self._time)
+        found = self.stated.values(name, self._surface.cut, self._time)
         return None if found is None else found.mean(axis=1).astype(np.float32)
 
     def emission(self) -> NDArray[np.float32]:
         """Return the radiance [T, 3] of triangles: of a texture its mean over each."""
-        count = len(self._surface.soup.polygons)
+        count = len(self._surface.positions)
         texture, glow = self._texture("emissiveColor"), self.varying("emissiveColor")
         if texture is not None:
-            uv = coordinates(texture.chart, self._surface, self._time)
+            uv = self._surface.coordinates(texture.chart, self._time)
             if uv is None:
                 uv = np.broadcast_to(np.float64(0.5), (count, 3, 2))
             glow = texture.means(uv)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.usd.colors import linear_rec709
 from pipeline.foreign.usd.placed import Placed
 
 _DISK_CORNERS = 24
@@ -80,7 +81,7 @@ def light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float64]:
 
     light = UsdLux.LightAPI(prim)
     strength = light.GetIntensityAttr().Get(time) * 2.0 ** light.GetExposureAttr().Get(time)
-    color = np.array(light.GetColorAttr().Get(time), np.float64)
+    color = linear_rec709(light.GetColorAttr(), np.array(light.GetColorAttr().Get(time), float))
     kelvin = light.GetColorTemperatureAttr()
     # Blender switches it on for every light and states none; the default of USD would tint by 4 %
     if light.GetEnableColorTemperatureAttr().Get(time) and kelvin.HasAuthoredValue():

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.dressed import PLAIN, Worn
 from pipeline.exchange.usd.foreign_inputs import ShaderInputs, varied_columns, worn_textures
-from pipeline.exchange.usd.foreign_meshes import MeshToShade
+from pipeline.exchange.usd.foreign_meshes import TriangleSoup
 from pipeline.exchange.usd.foreign_skins import CHANNELS, skinned
 from pipeline.exchange.usd.names import added_column
-from pipeline.foreign.usd.polygons import primvar_corners
-from pipeline.foreign.usd.shaders import as_colors, bound_materials, read_material
+from pipeline.foreign.usd.shaders import bound_materials, colors_of, read_material
 from pipeline.foreign.usd.stage import OpenedUsd
 from storage.records.material import (
     DIFFUSE,
@@ -53,7 +52,7 @@ class Dressing:
     """Textures by material."""
 
 
-def dressing(surface: MeshToShade, time: Any, opened: OpenedUsd, licence: str) -> Dressing:
+def dressing(surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str) -> Dressing:
     """Return materials and textures of the triangles of a mesh.
 
     Args:
@@ -65,11 +64,11 @@ def dressing(surface: MeshToShade, time: Any, opened: OpenedUsd, licence: str) -
     Raises:
         TrilightError: a texture is outside of the folder, on the network, or too large.
     """
-    count = len(surface.soup.polygons)
+    count = len(surface.positions)
     rows, uv = default_rows(count), np.zeros((count, 3, 2), np.float32)
     wardrobe, worn = list[Worn](), np.zeros(count, np.int64)
     for bound, polygons in bound_materials(surface.prim, time):
-        chosen = np.isin(surface.soup.polygons, polygons) if polygons is not None else slice(None)
+        chosen = np.isin(surface.cut.polygons, polygons) if polygons is not None else slice(None)
         part = _shaded(bound, surface, time, opened, licence)
         rows[chosen], uv[chosen], worn[chosen] = part.rows[chosen], part.uv[chosen], len(wardrobe)
         wardrobe.append(part.worn)
@@ -81,7 +80,7 @@ def _limit(
     rows: NDArray[np.float32],
     worn: NDArray[np.int64],
     wardrobe: Sequence[Worn],
-    surface: MeshToShade,
+    surface: TriangleSoup,
     lost: list[str],
 ) -> None:
     """Lower diffuse albedos that, with the specular ones, would reflect more than they get."""
@@ -106,7 +105,7 @@ class _Shaded:
 
 
 def _shaded(
-    material: Any, surface: MeshToShade, time: Any, opened: OpenedUsd, licence: str
+    material: Any, surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
 ) -> _Shaded:
     """Return a material over the whole mesh; its display colour without one."""
     stated = read_material(material, time, opened) if material else None
@@ -114,7 +113,7 @@ def _shaded(
         opened.lost.append(
             f"{material.GetPath()}: no shader that is understood; display colour taken"
         )
-    count = len(surface.soup.polygons)
+    count = len(surface.positions)
     rows, nowhere = default_rows(count), np.zeros((count, 3, 2), np.float32)
     if stated is None:
         rows[:, DIFFUSE] = _display_colour(surface, time)
@@ -172,13 +171,9 @@ def _numbers(value: Any) -> NDArray[np.float64]:
         return np.zeros(0)
 
 
-def _display_colour(surface: MeshToShade, time: Any) -> NDArray[np.float32]:
-    rows = np.full((len(surface.soup.polygons), 3), _DEFAULT_DIFFUSE, np.float32)
-    soup = surface.soup
-    found = primvar_corners(
-        surface.prim, "displayColor", surface.indices, soup.corners, soup.polygons, time
-    )
-    colors = None if found is None or found.ndim != 3 else as_colors(found)
+def _display_colour(surface: TriangleSoup, time: Any) -> NDArray[np.float32]:
+    rows = np.full((len(surface.positions), 3), _DEFAULT_DIFFUSE, np.float32)
+    colors = colors_of(surface.cut, "displayColor", time)
     if colors is not None:
         rows = np.clip(colors.mean(axis=1), 0, 0.96).astype(np.float32)
     return rows

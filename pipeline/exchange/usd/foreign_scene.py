@@ -19,9 +19,10 @@ from pipeline.exchange.usd.dome import foreign_dome
 from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all, cameras
 from pipeline.exchange.usd.foreign_lights import light_triangles, radiance
 from pipeline.exchange.usd.foreign_materials import dressing
-from pipeline.exchange.usd.foreign_meshes import MeshToShade, TriangleSoup, read_mesh
+from pipeline.exchange.usd.foreign_meshes import TriangleSoup, read_mesh
 from pipeline.exchange.usd.names import OBJECT_TEXTS
 from pipeline.foreign.usd.placed import DOMES, Placed, placed_prims
+from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.scenes.shading import flat_shaded
 from storage.errors import TrilightError
@@ -58,9 +59,10 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
     sky = _environment(placed, time, opened, licence)
     is_lit = sky is not None and sky.radiance_rgb.any()
     if not is_lit and not any(one.piece.entry.kind == "emitter" for one in pieces):
+        unread = "; ".join(note for note in opened.lost if "Light" in note) or "there is none"
         raise TrilightError(
-            "no light that can be carried over; expected an emissive material, or a rectangle, "
-            "disk, sphere, mesh or dome light."
+            f"no light that can be carried over ({unread:.200}); expected an emissive material, or "
+            "a rectangle, disk, sphere, cylinder, mesh or dome light."
         )
     materials = sum(len(one.piece.materials) for one in pieces)
     if materials > MAX_ROWS:
@@ -110,7 +112,7 @@ def _pieces(
     each: Placed, time: Any, opened: OpenedUsd, licence: str, names: set[str]
 ) -> list[DressedPiece]:
     prim = each.prim
-    if prim.GetTypeName() != "Mesh":
+    if prim.GetTypeName() not in ("Mesh", *SOLIDS):
         triangles = light_triangles(each, time, opened.lost)
         if triangles is None:
             return []
@@ -143,12 +145,8 @@ def _of_light(triangles: NDArray[np.float32], light: NDArray[np.float32]) -> Dre
 def _of_mesh(
     placed: Placed, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
 ) -> DressedTriangles:
-    from pxr import UsdGeom
-
     prim = placed.prim
-    indices = np.array(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr().Get(time), np.int64)
-    surface = MeshToShade(prim=prim, soup=soup, indices=indices)
-    found = dressing(surface, time, opened, licence)
+    found = dressing(soup, time, opened, licence)
     rows = found.rows
     if prim.HasAPI("MeshLightAPI"):
         light = radiance(placed, soup.positions, time, opened.lost)

@@ -17,7 +17,7 @@ from pipeline.foreign.picture import Picture, has_colours
 from pipeline.foreign.usd.object_looks import Binding, lost_words
 from pipeline.foreign.usd.object_meshes import PlacedPart
 from pipeline.foreign.usd.object_source import UsdSource
-from pipeline.foreign.usd.shaders import StatedMaterial, head_on
+from pipeline.foreign.usd.shaders import StatedMaterial, colors_of, head_on
 from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart
 from storage.errors import Rejected
 
@@ -68,9 +68,9 @@ def usd_parts(source: UsdSource, decode: Decode, *, emission: bool = False) -> T
 
 
 def _rows(bindings: Sequence[Binding], part: PlacedPart, plain: int) -> NDArray[np.int64]:
-    found = np.full(len(part.corners), plain)
+    found = np.full(len(part.cut.corners), plain)
     for row, polygons in bindings:
-        chosen = slice(None) if polygons is None else np.isin(part.polygons, polygons)
+        chosen = slice(None) if polygons is None else np.isin(part.cut.polygons, polygons)
         found[chosen] = plain if row < 0 else row
     return found
 
@@ -79,8 +79,8 @@ def _colours(part: PlacedPart, is_plain: NDArray[np.bool_], time: object) -> NDA
     """Return what tints corners [T, 3, 3]: display colours, where there is no material."""
     found = np.ones((len(is_plain), 3, 3))
     if is_plain.any():
-        shown = part.display_colour(time)
-        found[is_plain] = _UNBOUND if shown is None else shown[is_plain]
+        shown = colors_of(part.cut, "displayColor", time)
+        found[is_plain] = _UNBOUND if shown is None else np.clip(shown[is_plain], 0, 1)
     return found
 
 
@@ -107,12 +107,12 @@ class _Varied:
             if row >= len(self._stated) or not self._stated[row].primvars:
                 continue
             stated, mine = self._stated[row], rows == row
-            base = part.stated(stated, "diffuseColor", self._time)
+            base = stated.values("diffuseColor", part.cut, self._time)
             if base is not None:
                 colours[mine] = np.clip(base, 0, 1)[mine]
             elif "diffuseColor" in stated.primvars:
                 colours[mine] = np.maximum(stated.constants["diffuseColor"], 0)
-            values = {name: part.stated(stated, name, self._time) for name in stated.primvars}
+            values = {name: stated.values(name, part.cut, self._time) for name in stated.primvars}
             values["diffuseColor"] = None
             glow = values.get("emissiveColor")
             if glow is not None:

@@ -2,7 +2,7 @@
 
 USD resolves what a file names by itself, so it is given a path; every file that it may open is
 checked first (pipeline.foreign.usd.stage). What would give a plausible but wrong mesh is refused: a
-missing reference, solids that are no meshes, bones that nothing poses.
+missing reference, surfaces that are no polygons, bones that nothing poses.
 """
 
 from collections.abc import Callable
@@ -13,10 +13,9 @@ from typing import Any, TypeVar
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.usd.placed import Placed, placed_prims
 from pipeline.foreign.usd.skins import UnposedMesh
+from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedUsd, OutsideFile, quietly
 from storage.errors import Rejected, TrilightError
-
-_SOLIDS = ("Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane", "NurbsPatch", "TetMesh")
 
 Read = TypeVar("Read")
 
@@ -65,11 +64,14 @@ def _opened(path: Path, limits: ReadLimits) -> UsdStage:
     stage, time = opened.compose(), Usd.TimeCode.EarliestTime()
     if opened.unresolved:
         raise Rejected("missing_file", f"{opened.unresolved[0]}; an object needs all of its parts")
-    placed = placed_prims(stage, time, opened.lost, ("Mesh", *_SOLIDS))
+    placed = placed_prims(stage, time, opened.lost, ("Mesh", *SOLIDS, "NurbsPatch"))
     if len(placed) > limits.max_instances:
         raise Rejected("too_many_instances", f"{len(placed)} meshes; <= {limits.max_instances}")
     for each in placed:
         kind, where = each.prim.GetTypeName(), str(each.prim.GetPath())
-        if kind != "Mesh":
+        if kind == "NurbsPatch":
             raise Rejected("unsupported_primitive", f"{where!r:.100} is a {kind}; make it a mesh")
+        scheme = each.prim.GetAttribute("subdivisionScheme")
+        if scheme and scheme.Get() != "none":
+            opened.lost.append(f"{where}: subdivision; its cage was read")
     return UsdStage(opened=opened, composed=stage, meshes=tuple(placed), time=time)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.usd.schemas import noted_schemas
 from pipeline.foreign.usd.skins import Skin, Skins
+from pipeline.foreign.usd.solids import SOLIDS
 from storage.errors import TrilightError
 
 MAX_PLACED = 100_000
@@ -23,7 +24,8 @@ MAX_NESTED = 150
 """Maximum nesting of prims, through prototypes too."""
 
 DOMES = ("DomeLight", "DomeLight_1")
-SCENE_KINDS = ("Mesh", "Camera", "RectLight", "DiskLight", "SphereLight", "CylinderLight", *DOMES)
+LAMPS = ("RectLight", "DiskLight", "SphereLight", "CylinderLight")
+SCENE_KINDS = ("Mesh", *SOLIDS, "Camera", *LAMPS, *DOMES)
 """Kinds of prims that a scene is made of."""
 
 

@@ -25,6 +25,8 @@ _SILENT = (
 _READ = (
     "MaterialBindingAPI",
     "SkelBindingAPI",
+    "ColorSpaceAPI",
+    "ColorSpaceDefinitionAPI",
     "VisibilityAPI",
     "CollectionAPI",
     "ShapingAPI",  # lights say themselves what of it counts for nothing

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.usd.polygons import as_array, primvar_corners
+from pipeline.foreign.usd.colors import linear_rec709
+from pipeline.foreign.usd.polygons import CutMesh, as_array
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.foreign.usd.texture_nodes import TextureNode, stated_text, texture_node, value_of
 
@@ -139,27 +140,16 @@ class StatedMaterial:
         """Whether its workflow is the specular one."""
         return bool(self.constants["useSpecularWorkflow"].any())
 
-    def values(
-        self,
-        name: str,
-        prim: Any,
-        indices: NDArray[np.int64],
-        corners: NDArray[np.int64],
-        polygons: NDArray[np.int64],
-        time: Any,
-    ) -> NDArray[np.float64] | None:
-        """Return what the primvar of an input is at corners [T, 3, 3]; None where there is none.
-
-        Arguments as of `primvar_corners`.
-        """
-        found = None
-        if name in self.primvars:
-            found = primvar_corners(prim, self.primvars[name], indices, corners, polygons, time)
-        return None if found is None else as_colors(found)
+    def values(self, name: str, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
+        """Return what the primvar of an input is at corners [T, 3, 3]; None where there is none."""
+        return colors_of(cut, self.primvars[name], time) if name in self.primvars else None
 
 
-def as_colors(found: NDArray) -> NDArray[np.float64] | None:
+def colors_of(cut: CutMesh, primvar: str, time: Any) -> NDArray[np.float64] | None:
     """Return numbers or colors at corners as colors [T, 3, 3]; None for anything else."""
+    found = cut.primvar(primvar, time)
+    if found is None:
+        return None
     wide = found[..., None] if found.ndim == 2 else found
     if wide.ndim != 3 or wide.shape[2] not in (1, 3, 4) or not np.isfinite(wide).all():
         return None
@@ -284,7 +274,9 @@ class _Reader:
             return self._finite(name, self._fallbacks[name])
         sources = self._sources(name)
         stated = sources[0].Get(self._time) if sources and not _is_output(sources[0]) else None
-        return self._finite(name, self._defaults[name] if stated is None else stated)
+        if stated is None:
+            return self._finite(name, self._defaults[name])
+        return self._finite(name, linear_rec709(sources[0], np.array(stated)))
 
     def weight(self) -> NDArray[np.float32]:
         """Return what the color of the base is multiplied with; textures are not."""

@@ -8,7 +8,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.usd.polygons import primvar_corners
+from pipeline.foreign.usd.polygons import CutMesh
 from pipeline.foreign.usd.stage import OpenedUsd, file_and_member
 from storage.errors import TrilightError
 
@@ -143,19 +143,12 @@ def stated_text(node: Any, name: str, time: Any) -> str:
     return str(value_of(node, name, time, ""))
 
 
-def chart_corners(
-    chart: UvChart,
-    prim: Any,
-    indices: NDArray[np.int64],
-    corners: NDArray[np.int64],
-    polygons: NDArray[np.int64],
-    time: Any,
-) -> NDArray[np.float64] | None:
+def chart_corners(chart: UvChart, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
     """Return the coordinates [T, 3, 2] of a chart, before its moves; not all need be finite.
 
-    None where the mesh has none, or not for every corner. Arguments as of `primvar_corners`.
+    None where the mesh has none, or not for every corner.
     """
-    found = primvar_corners(prim, chart.primvar, indices, corners, polygons, time)
+    found = cut.primvar(chart.primvar, time)
     if found is None or found.ndim != 3 or found.shape[2] < 2:
         return None
     return np.asarray(found[..., :2], np.float64)

@@ -137,7 +137,7 @@ REFUSED: dict[str, tuple[str, Callable[[Usd.Stage], object]]] = {
             or stage.GetPrimAtPath(MESH).GetAttribute("faceVertexIndices").Block()
         ),
     ),
-    "a solid": ("unsupported_primitive", lambda stage: UsdGeom.Cube.Define(stage, "/W/cube")),
+    "a patch": ("unsupported_primitive", lambda stage: UsdGeom.NurbsPatch.Define(stage, "/W/a")),
     "bones": ("skinned_mesh", _skinned),
     "a crowd": ("too_many_instances", _crowd),
     "points far from their origin": ("offset_precision", _far_points),
