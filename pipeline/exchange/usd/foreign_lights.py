@@ -102,6 +102,11 @@ def _note_losses(prim: Any, time: Any, lost: list[str]) -> None:
         is_map = "Dome" in str(prim.GetTypeName()) and name == "inputs:texture:file"
         if not is_map and attribute and attribute.Get(time) and attribute.Get(time).path:
             lost.append(f"{where}.{name}: has no place here")
+    lost += [
+        f"{where}.{name}: USD has read inputs:{name} alone since 21.02"
+        for name in ("intensity", "exposure", "color", "normalize", "radius", "width", "height")
+        if prim.HasAttribute(name) and prim.GetAttribute(name).HasAuthoredValue()
+    ]
     for relation in prim.GetRelationships():
         is_link = relation.GetName().startswith(("light:filters", "portals", "collection:"))
         if is_link and relation.HasAuthoredTargets():

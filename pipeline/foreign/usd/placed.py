@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.usd.schemas import noted_schemas
-from pipeline.foreign.usd.skins import Skin, Skins
+from pipeline.foreign.usd.skins import BoundSkin, BoundSkins
 from pipeline.foreign.usd.solids import SOLIDS
 from storage.errors import TrilightError
 
@@ -36,7 +36,7 @@ class Placed:
     prim: Any  # the USD prim; several places may share one
     to_world: NDArray[np.float64]  # [4, 4], for column vectors, into metres with +Z up
     metres: float = 1.0  # of a unit of the stage
-    skin: Skin | None = None  # what poses a mesh
+    skin: BoundSkin | None = None  # what poses a mesh
 
 
 def placed_prims(
@@ -54,7 +54,7 @@ def placed_prims(
 
     found: list[Placed] = []
     unread: Counter[str] = Counter()
-    metres, skins, visits = UsdGeom.GetStageMetersPerUnit(stage), Skins(time), 0
+    metres, skins, visits = UsdGeom.GetStageMetersPerUnit(stage), BoundSkins(time), 0
     if not (np.isfinite(metres) and metres > 0):
         raise TrilightError(f"metersPerUnit is {metres:g}; expected a number above 0.")
     for visit in _visited(stage, _base(stage, metres), time, lost):
@@ -63,7 +63,7 @@ def placed_prims(
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
         prim, to_world = visit.prim, visit.to_world
         kind = str(prim.GetTypeName())
-        unread.update(noted_schemas(prim, kinds))
+        unread.update(noted_schemas(prim, time, kinds))
         if kind == "SkelRoot":
             skins.take(prim, visit.predicate)
         if kind in kinds:

@@ -50,7 +50,7 @@ _OF_OTHERS = ("Physics", "Physx", "Semantics", "Render", "Hydra")
 """What schemas begin with that say how things move, what they mean, or how they are rendered."""
 
 
-def noted_schemas(prim: Any, kinds: Collection[str]) -> Iterator[str]:
+def noted_schemas(prim: Any, time: Any, kinds: Collection[str]) -> Iterator[str]:
     """Yield what a prim is or has that is not read, if only `kinds` are."""
     kind = str(prim.GetTypeName())
     if not (kind in kinds or kind in _SILENT or kind.startswith(_OF_OTHERS)):
@@ -63,8 +63,8 @@ def noted_schemas(prim: Any, kinds: Collection[str]) -> Iterator[str]:
         if not (is_read or is_own or name in _READ or name.startswith(_OF_OTHERS)):
             yield f"API schema {name}"
     mode = prim.GetAttribute("model:drawMode")
-    if mode and mode.HasAuthoredValue() and mode.Get() not in ("default", "inherited"):
+    if mode and mode.HasAuthoredValue() and mode.Get(time) not in ("default", "inherited"):
         yield f"model:drawMode {mode.Get()}"
     opacity = prim.GetAttribute("primvars:displayOpacity")
-    if opacity and any(value < 1 for value in opacity.Get() or ()):
+    if opacity and any(value < 1 for value in opacity.Get(time) or ()):
         yield "primvar displayOpacity"

@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 from pipeline.foreign.usd.colors import linear_rec709
 from pipeline.foreign.usd.polygons import CutMesh, as_array
 from pipeline.foreign.usd.stage import OpenedUsd
-from pipeline.foreign.usd.texture_nodes import TextureNode, stated_text, texture_node, value_of
+from pipeline.foreign.usd.texture_nodes import (
+    TextureNode,
+    is_output,
+    sources_of,
+    texture_node,
+    value_of,
+)
 
 PREVIEW = "UsdPreviewSurface"
 NAMES: Mapping[str, Mapping[str, str]] = {
@@ -111,7 +117,17 @@ _PARTS = (
 )
 """What inputs begin with that only say more of one of those above."""
 
-_READERS = ("UsdPrimvarReader_float", "UsdPrimvarReader_float3", "UsdPrimvarReader_vector")
+_READERS: Mapping[str, tuple[str, str]] = {
+    **{
+        f"UsdPrimvarReader_{kind}": ("varname", "fallback")
+        for kind in ("float", "float3", "float4", "int", "vector", "point", "normal")
+    },
+    **{
+        f"ND_geompropvalue_{kind}": ("geomprop", "default")
+        for kind in ("float", "color3", "color4", "vector3")
+    },
+}
+"""Nodes that read a primvar: their inputs for its name, and for what stands where there is none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -256,15 +272,16 @@ class _Reader:
         from pxr import UsdShade
 
         sources = self._sources(name)
-        if not sources or not _is_output(sources[0]):
+        if not sources or not is_output(sources[0]):
             return
         node = UsdShade.Shader(sources[0].GetPrim())
         if node.GetShaderId() == "UsdUVTexture":
             output = UsdShade.Output(sources[0]).GetBaseName()
             self.textures[name] = texture_node(node, output, self._time, self._opened)
         elif node.GetShaderId() in _READERS:
-            self.primvars[name] = stated_text(node, "varname", self._time)
-            self._fallbacks[name] = value_of(node, "fallback", self._time, 0.0)
+            primvar, fallback = _READERS[node.GetShaderId()]
+            self.primvars[name] = str(value_of(node, primvar, self._time, ""))
+            self._fallbacks[name] = value_of(node, fallback, self._time, 0.0)
         else:
             self._lose(name, f"{node.GetShaderId() or 'a network'} that is not read")
 
@@ -273,7 +290,7 @@ class _Reader:
         if name in self._fallbacks:
             return self._finite(name, self._fallbacks[name])
         sources = self._sources(name)
-        stated = sources[0].Get(self._time) if sources and not _is_output(sources[0]) else None
+        stated = sources[0].Get(self._time) if sources and not is_output(sources[0]) else None
         if stated is None:
             return self._finite(name, self._defaults[name])
         return self._finite(name, linear_rec709(sources[0], np.array(stated)))
@@ -282,32 +299,38 @@ class _Reader:
         """Return what the color of the base is multiplied with; textures are not."""
         found = np.ones(3, np.float32)
         for name in _WEIGHTS:
-            weight = self._shader.GetInput(name)
-            if not weight:
-                continue
-            value = None if weight.HasConnectedSource() else finite_color(weight.Get(self._time))
+            value = self._value(name, 1.0)
             if value is None or ("diffuseColor" in self.textures and (value != 1).any()):
                 self._opened.lost.append(f"{self._shader.GetPath()}.{name}: has no place here")
             else:
-                found = value
+                found = found * value
         return found
 
     def without_place(self) -> list[str]:
         """Return inputs that do something, and have no place here; unknown ones too."""
-        known = {*(self._names.get(name, name) for name in DEFAULTS), *_WEIGHTS}
+        read = {*(self._names.get(name, name) for name in DEFAULTS), *_WEIGHTS}
         found = []
         for each in self._shader.GetInputs():
-            name, is_fed = str(each.GetBaseName()), each.HasConnectedSource()
+            name = str(each.GetBaseName())
             if name in _NEUTRAL:
-                value = None if is_fed else finite_color(each.Get(self._time) or 0.0)
+                value = self._value(name, _NEUTRAL[name])
                 is_lost = value is None or (value != _NEUTRAL[name]).any()
-            elif name in known or name.startswith(_PARTS):
+            elif name in read or name.startswith(_PARTS):
                 is_lost = False
             else:
-                is_lost = is_fed or (name != "normal" and each.GetAttr().HasAuthoredValue())
+                is_lost = each.HasConnectedSource() or (
+                    name != "normal" and each.GetAttr().HasAuthoredValue()
+                )
             if is_lost:
                 found.append(name)
         return found
+
+    def _value(self, name: str, default: float) -> NDArray[np.float32] | None:
+        """Return what an input states [3]; None where that is a network, or no color."""
+        sources = self._sources(name)
+        if sources and is_output(sources[0]):
+            return None
+        return finite_color(value_of(self._shader, name, self._time, default))
 
     def _finite(self, name: str, stated: Any) -> NDArray[np.float32]:
         value = finite_color(stated)
@@ -317,10 +340,7 @@ class _Reader:
         return np.broadcast_to(value, 3).astype(np.float32)
 
     def _sources(self, name: str) -> Any:
-        from pxr import UsdShade
-
-        known = self._shader.GetInput(self._names.get(name, name))
-        return UsdShade.Utils.GetValueProducingAttributes(known) if known else []
+        return sources_of(self._shader, self._names.get(name, name))
 
     def _lose(self, name: str, why: str) -> None:
         called = self._names.get(name, name)
@@ -335,9 +355,3 @@ def finite_color(stated: Any) -> NDArray[np.float32] | None:
     if value.shape not in ((), (3,)) or not np.isfinite(value).all():
         return None
     return np.broadcast_to(value, 3).astype(np.float32)
-
-
-def _is_output(attribute: Any) -> bool:
-    from pxr import UsdShade
-
-    return bool(UsdShade.Output.IsOutput(attribute))

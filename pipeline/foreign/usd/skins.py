@@ -17,7 +17,7 @@ class UnposedMesh(TrilightError):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Skin:
+class BoundSkin:
     """What poses a mesh."""
 
     bones: Any  # the prim of the skeleton, in whose space the posed points are
@@ -51,7 +51,7 @@ class Skin:
         return np.einsum("pi,ij->pj", np.array(points, np.float64), move[:3, :3]) + move[3, :3]
 
 
-class Skins:
+class BoundSkins:
     """The skins of a stage."""
 
     def __init__(self, time: Any) -> None:
@@ -59,7 +59,7 @@ class Skins:
         from pxr import UsdSkel
 
         self._time, self._cache = time, UsdSkel.Cache()
-        self._bound: dict[Any, Skin] = {}
+        self._bound: dict[Any, BoundSkin] = {}
         self._roots: set[Any] = set()
 
     def take(self, prim: Any, predicate: Any) -> None:
@@ -74,11 +74,13 @@ class Skins:
         for found in self._cache.ComputeSkelBindings(root, predicate):
             skeleton = self._cache.GetSkelQuery(found.GetSkeleton())
             for target in found.GetSkinningTargets():
+                if not (target.HasJointInfluences() or target.HasBlendShapes()):
+                    continue
                 path = target.GetPrim().GetPath()
                 bones = found.GetSkeleton().GetPrim()
-                self._bound[path] = Skin(bones=bones, skeleton=skeleton, binding=target)
+                self._bound[path] = BoundSkin(bones=bones, skeleton=skeleton, binding=target)
 
-    def of(self, prim: Any) -> Skin | None:
+    def of(self, prim: Any) -> BoundSkin | None:
         """Return what poses a prim, or None.
 
         Raises:

@@ -80,10 +80,7 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
     Raises:
         TrilightError: its picture is outside of the folder, or on the network.
     """
-    from pxr import UsdShade
-
-    stated = shader.GetInput("file")
-    sources = UsdShade.Utils.GetValueProducingAttributes(stated) if stated else []
+    sources = sources_of(shader, "file")
     attribute = sources[0] if sources else None
     asset = attribute.Get(time) if attribute else None
     named, resolved = "" if asset is None else asset.path, None
@@ -93,9 +90,7 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
     if "<UDIM>" in named:
         opened.lost.append(f"{shader.GetPath()}: {named!r:.100} has UDIM tiles, which are not read")
     for name in ("scale", "bias", "fallback"):
-        fed = shader.GetInput(name)
-        sources = UsdShade.Utils.GetValueProducingAttributes(fed) if fed else []
-        if sources and UsdShade.Output.IsOutput(sources[0]):
+        if any(is_output(source) for source in sources_of(shader, name)):
             opened.lost.append(f"{shader.GetPath()}.{name}: a network that is not read")
     fallback = value_of(shader, "fallback", time, None)
     return TextureNode(
@@ -115,10 +110,9 @@ def chart_of(shader: Any, time: Any, lost: list[str]) -> UvChart:
     """Return the coordinates of a texture's shader; `st` where it states none."""
     from pxr import UsdShade
 
-    st, moves, primvar = shader.GetInput("st"), list[Move](), "st"
+    sources, moves, primvar = sources_of(shader, "st"), list[Move](), "st"
     for _ in range(_MOST_NODES):
-        sources = UsdShade.Utils.GetValueProducingAttributes(st) if st else []
-        if not sources or not UsdShade.Output.IsOutput(sources[0]):
+        if not sources or not is_output(sources[0]):
             break
         node = UsdShade.Shader(sources[0].GetPrim())
         if node.GetIdAttr().Get() == "UsdTransform2d":
@@ -129,18 +123,13 @@ def chart_of(shader: Any, time: Any, lost: list[str]) -> UvChart:
                     translation=_pair(value_of(node, "translation", time, (0, 0))),
                 )
             )
-            st = node.GetInput("in")
+            sources = sources_of(node, "in")
             continue
-        primvar = stated_text(node, "varname", time) or primvar
+        primvar = str(value_of(node, "varname", time, primvar))
         if node.GetIdAttr().Get() != "UsdPrimvarReader_float2":
             lost.append(f"{node.GetPath()}: not read; texture coordinates {primvar!r:.60} taken")
         break
     return UvChart(primvar=primvar, moves=tuple(reversed(moves)))
-
-
-def stated_text(node: Any, name: str, time: Any) -> str:
-    """Return an input that holds a text, also one that its material hands on; else ""."""
-    return str(value_of(node, name, time, ""))
 
 
 def chart_corners(chart: UvChart, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
@@ -179,12 +168,24 @@ def _require_size(size: int, max_bytes: int, name: str) -> None:
         raise TrilightError(f"{name}: {size} bytes; expected at most {max_bytes}.")
 
 
-def value_of(shader: Any, name: str, time: Any, default: Any) -> Any:
-    """Return an input of a shader, or of its material; the default where it is not stated."""
+def sources_of(shader: Any, name: str) -> Any:
+    """Return the attributes that give an input of a shader its value, its material's among them."""
     from pxr import UsdShade
 
     stated = shader.GetInput(name)
-    sources = UsdShade.Utils.GetValueProducingAttributes(stated) if stated else []
+    return UsdShade.Utils.GetValueProducingAttributes(stated) if stated else []
+
+
+def is_output(attribute: Any) -> bool:
+    """Return whether a value comes out of another node."""
+    from pxr import UsdShade
+
+    return bool(UsdShade.Output.IsOutput(attribute))
+
+
+def value_of(shader: Any, name: str, time: Any, default: Any) -> Any:
+    """Return an input of a shader, or of its material; the default where it is not stated."""
+    sources = sources_of(shader, name)
     value = sources[0].Get(time) if sources else None
     return default if value is None else value
 

@@ -195,7 +195,7 @@ def test_objects_and_scenes_are_what_the_library_computes(
     tmp_path_factory: pytest.TempPathFactory, trees: Any, y_up: bool, in_cm: bool
 ) -> None:
     stage = new_stage(y_up=y_up, unit=0.5 if in_cm else 1.0)
-    library = stage.DefinePrim("/lib")
+    library = stage.DefinePrim("/lib", "Xform")
     colored(solid(stage, "/lib/part"), "uniform")
     library.SetSpecifier(Sdf.SpecifierClass)
     for number, tree in enumerate(trees):
