@@ -4,47 +4,18 @@ from collections.abc import Collection, Iterator
 from typing import Any
 
 _SILENT = (
-    "",
-    "Xform",
-    "Scope",
-    "Camera",
-    "Material",
-    "Shader",
-    "NodeGraph",
-    "GeomSubset",
-    "PointInstancer",
-    "SkelRoot",
-    "Skeleton",
-    "SkelAnimation",
-    "BlendShape",
-    "Backdrop",
-    "SpatialAudio",
-)
+    "|Xform|Scope|Camera|Material|Shader|NodeGraph|GeomSubset|PointInstancer|SkelRoot|Skeleton|"
+    "SkelAnimation|BlendShape|Backdrop|SpatialAudio"
+).split("|")
 """Kinds of prims that are read, or that change neither a shape nor a color nor light."""
 
 _READ = (
-    "MaterialBindingAPI",
-    "SkelBindingAPI",
-    "ColorSpaceAPI",
-    "ColorSpaceDefinitionAPI",
-    "VisibilityAPI",
-    "CollectionAPI",
-    "ShapingAPI",  # lights say themselves what of it counts for nothing
-    "ShadowAPI",
-    "GeomModelAPI",
-    "ModelAPI",
-    "MotionAPI",
-    "LightListAPI",
-    "ListAPI",
-    "AssetPreviewsAPI",
-    "NodeGraphNodeAPI",
-    "SceneGraphPrimAPI",
-    "AccessibilityAPI",
-    "NodeDefAPI",
-    "MaterialXConfigAPI",
-    "CoordSysAPI",
-)
-"""Likewise for API schemas."""
+    "MaterialBindingAPI|SkelBindingAPI|ColorSpaceAPI|ColorSpaceDefinitionAPI|VisibilityAPI|"
+    "CollectionAPI|ShapingAPI|ShadowAPI|GeomModelAPI|ModelAPI|MotionAPI|LightListAPI|ListAPI|"
+    "AssetPreviewsAPI|NodeGraphNodeAPI|SceneGraphPrimAPI|AccessibilityAPI|NodeDefAPI|"
+    "MaterialXConfigAPI|CoordSysAPI"
+).split("|")
+"""Likewise for API schemas; what lights lose of theirs is said of each."""
 
 _OF_OTHERS = ("Physics", "Physx", "Semantics", "Render", "Hydra")
 """What schemas begin with that say how things move, what they mean, or how they are rendered."""

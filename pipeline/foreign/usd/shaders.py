@@ -74,47 +74,27 @@ _DEFAULTS: Mapping[str, Mapping[str, Any]] = {
 TEXTURED = ("diffuseColor", "specularColor", "emissiveColor", "metallic", "roughness", "ior")
 """Inputs that need not be constants."""
 
-_NEUTRAL: Mapping[str, Any] = {
-    "opacity": 1.0,
-    "clearcoat": 0.0,
-    "displacement": 0.0,
-    "occlusion": 1.0,
-    "diffuse_roughness": 0.0,
-    "specular": 1.0,
-    "specular_weight": 1.0,
-    "specular_color": 1.0,
-    "specular_anisotropy": 0.0,
-    "specular_roughness_anisotropy": 0.0,
-    "base_diffuse_roughness": 0.0,
-    "transmission_weight": 0.0,
-    "transmission": 0.0,
-    "coat_weight": 0.0,
-    "coat": 0.0,
-    "subsurface_weight": 0.0,
-    "subsurface": 0.0,
-    "fuzz_weight": 0.0,
-    "sheen": 0.0,
-    "thin_film_weight": 0.0,
-    "thin_film_thickness": 0.0,
-    "thin_walled": 0.0,
-    "geometry_thin_walled": 0.0,
-    "geometry_opacity": 1.0,
-}
+_NEUTRAL: Mapping[str, float] = {
+    **dict.fromkeys(
+        ("opacity", "occlusion", "specular", "specular_weight", "specular_color",
+         "geometry_opacity"),
+        1.0,
+    ),
+    **dict.fromkeys(
+        ("clearcoat", "displacement", "diffuse_roughness", "specular_anisotropy",
+         "specular_roughness_anisotropy", "base_diffuse_roughness", "transmission_weight",
+         "transmission", "coat_weight", "coat", "subsurface_weight", "subsurface", "fuzz_weight",
+         "sheen", "thin_film_weight", "thin_film_thickness", "thin_walled",
+         "geometry_thin_walled"),
+        0.0,
+    ),
+}  # fmt: skip
 """Inputs that have no place here, with the value at which they do nothing."""
 
 _WEIGHTS = ("base", "base_weight")
 """What the color of a base is multiplied with."""
 
-_PARTS = (
-    "clearcoat",
-    "coat_",
-    "opacity",
-    "transmission_",
-    "subsurface_",
-    "fuzz_",
-    "sheen_",
-    "thin_film_",
-)
+_PARTS = "clearcoat|coat_|opacity|transmission_|subsurface_|fuzz_|sheen_|thin_film_".split("|")
 """What inputs begin with that only say more of one of those above."""
 
 _READERS: Mapping[str, tuple[str, str]] = {
@@ -315,7 +295,7 @@ class _Reader:
             if name in _NEUTRAL:
                 value = self._value(name, _NEUTRAL[name])
                 is_lost = value is None or (value != _NEUTRAL[name]).any()
-            elif name in read or name.startswith(_PARTS):
+            elif name in read or name.startswith(tuple(_PARTS)):
                 is_lost = False
             else:
                 is_lost = each.HasConnectedSource() or (

@@ -93,17 +93,6 @@ def test_a_stated_temperature_tints_a_light(
     assert (red == blue == 20) == (kelvin is None)
 
 
-def test_instances_stand_where_they_are_placed_and_mirrors_keep_their_outside(
-    stage: UsdScene,
-) -> None:
-    for name, left in (("L", 0), ("L.2", 0.3), ("L.3", 0.6), ("L.4", -0.2)):
-        corners, _ = object_of(stage.scene, name)
-        assert facing(corners) == pytest.approx([0, -0.03, 0], abs=1e-7)
-        assert corners[..., 0].min() == pytest.approx(left, abs=1e-7)
-    names = [entry.name for entry in stage.scene.objects]
-    assert "hidden" not in names and "guide" not in names
-
-
 def test_what_is_lost_is_said(stage: UsdScene) -> None:
     assert not stage.exact
     assert stage.scene.environment is not None, "its DomeLight is kept"
