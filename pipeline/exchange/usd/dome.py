@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
-from pipeline.exchange.usd.foreign_lights import light_color
+from pipeline.exchange.usd.foreign_lights import read_light_color
 from pipeline.exchange.usd.names import MAP_TEXTS, SKY_ROWS, SKY_VISIBLE, VISIBLE_TO_CAMERA
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.foreign.usd.texture_nodes import asset_bytes
@@ -112,8 +112,8 @@ def foreign_dome(
     radiance = _picture(prim, time, opened)
     if radiance is None:
         return None
-    tinted = radiance * light_color(prim, time, opened.lost)
-    left, _, right = np.linalg.svd(to_world[:3, :3] @ _pole(prim))
+    tinted = radiance * read_light_color(prim, time, opened.lost)
+    left, _, right = np.linalg.svd(to_world[:3, :3] @ _turn_pole(prim))
     turn = left @ right
     if np.linalg.det(turn) < 0:
         opened.lost.append(f"{place}: a mirrored dome; its light was left out")
@@ -133,7 +133,7 @@ def foreign_dome(
     return sky
 
 
-def _pole(prim: Any) -> NDArray[np.float64]:
+def _turn_pole(prim: Any) -> NDArray[np.float64]:
     """Return what turns a dome, whose pole is +Y, to the axis that a DomeLight_1 states."""
     from pxr import UsdGeom
 

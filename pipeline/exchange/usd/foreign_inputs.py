@@ -17,7 +17,7 @@ from pipeline.exchange.linear_maps import (
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup
 from pipeline.exchange.usd.foreign_skins import CHANNELS
 from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
-from pipeline.foreign.usd.shaders import StatedMaterial, finite_color, head_on
+from pipeline.foreign.usd.shaders import StatedMaterial, parse_color, reflect_head_on
 from pipeline.foreign.usd.stage import OpenedUsd
 from storage.records.texture import MapSource, Texture
 
@@ -48,22 +48,22 @@ class ShaderInputs:
         """Return the value [3] of an input without a texture; a number stands in every channel."""
         node = self.stated.textures.get(name)
         if node is not None and node.fallback is not None and self._texture(name) is None:
-            value = finite_color(node.fallback[:3])
+            value = parse_color(node.fallback[:3])
             if value is not None:
                 return value
         return self.stated.constants[name]
 
-    def varying(self, name: str) -> NDArray[np.float32] | None:
+    def compute_varying(self, name: str) -> NDArray[np.float32] | None:
         """Return the means [T, 3] over triangles of an input's primvar; None without one."""
-        found = self.stated.values(name, self._surface.cut, self._time)
-        return None if found is None else found.mean(axis=1).astype(np.float32)
+        values = self.stated.read_values(name, self._surface.cut, self._time)
+        return None if values is None else values.mean(axis=1).astype(np.float32)
 
     def emission(self) -> NDArray[np.float32]:
         """Return the radiance [T, 3] of triangles: of a texture its mean over each."""
         count = len(self._surface.positions)
-        texture, glow = self._texture("emissiveColor"), self.varying("emissiveColor")
+        texture, glow = self._texture("emissiveColor"), self.compute_varying("emissiveColor")
         if texture is not None:
-            uv = self._surface.coordinates(texture.chart, self._time)
+            uv = self._surface.read_coordinates(texture.chart, self._time)
             if uv is None:
                 uv = np.broadcast_to(np.float64(0.5), (count, 3, 2))
             glow = texture.means(uv)
@@ -83,7 +83,7 @@ class ShaderInputs:
         return self._read[name]
 
 
-def varied_columns(
+def compute_varied(
     inputs: ShaderInputs, textures: Mapping[str, Texture]
 ) -> dict[str, NDArray[np.float32]]:
     """Return the columns [T, 3] or [T, 1] of triangles that primvars of the mesh change.
@@ -92,8 +92,8 @@ def varied_columns(
         inputs: of the material.
         textures: of inputs that have one; their means count.
     """
-    found = {name: inputs.varying(name) for name in CHANNELS}
-    varying = {name: each for name, each in found.items() if each is not None}
+    values = {name: inputs.compute_varying(name) for name in CHANNELS}
+    varying = {name: each for name, each in values.items() if each is not None}
 
     def of(name: str) -> NDArray[np.float32]:
         if name in varying:
@@ -107,7 +107,7 @@ def varied_columns(
     if varying.keys() - {"roughness"}:
         albedos = of("diffuseColor"), of("specularColor")
         if not inputs.stated.is_specular:
-            albedos = _shared(of("diffuseColor"), of("metallic"), head_on(of("ior")))
+            albedos = _split_albedos(of("diffuseColor"), of("metallic"), reflect_head_on(of("ior")))
         count = max(len(each) for each in varying.values())
         for name, albedo in zip(("diffuse", "specular"), albedos, strict=True):
             columns[name] = np.broadcast_to(np.clip(albedo, 0, 1), (count, 3))
@@ -160,18 +160,18 @@ def _metallic(
     ior = inputs.constant("ior")
     if "ior" in textures:
         ior = np.broadcast_to(textures["ior"].mean, 3)
-    dielectric = head_on(ior).astype(np.float32)
+    dielectric = reflect_head_on(ior).astype(np.float32)
     if not metal.greatest.any():
         return base, Texture(texels=constant_map(np.clip(dielectric, 0, 1)), source=source)
     colour, share = on_one_grid(linear_map(base), linear_map(metal))
-    diffuse, specular = _shared(colour, share, dielectric)
+    diffuse, specular = _split_albedos(colour, share, dielectric)
     specular = np.clip(specular, 0, 1)
     if is_constant(diffuse):
         return tuple(Texture(texels=each, source=source) for each in (diffuse, specular))  # type: ignore[return-value]
     return colour_textures(diffuse, specular, source)
 
 
-def _shared(
+def _split_albedos(
     base: NDArray[np.float32], metal: NDArray[np.float32], dielectric: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return what a surface that is metal by a share reflects diffusely, and head-on."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.usd.colors import linear_rec709
+from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.placed import Placed
 
 _DISK_CORNERS = 24
@@ -43,7 +43,7 @@ def light_triangles(placed: Placed, time: Any, lost: list[str]) -> NDArray[np.fl
         "RectLight": lambda: _square() * np.array([size("width"), size("height"), 1.0]),
         "DiskLight": lambda: _disk() * size("radius"),
         "SphereLight": lambda: _sphere() * size("radius"),
-        "CylinderLight": lambda: _tube() * [size("length"), size("radius"), size("radius")],
+        "CylinderLight": lambda: _build_tube() * [size("length"), size("radius"), size("radius")],
     }
     world = np.einsum("ij,tcj->tci", placed.to_world[:3, :3], shapes[kind]())
     world = world + placed.to_world[:3, 3]
@@ -67,7 +67,7 @@ def radiance(
         time: of the values.
         lost: receives what cannot be carried over.
     """
-    found = light_color(placed.prim, time, lost)
+    found = read_light_color(placed.prim, time, lost)
     if placed.prim.GetAttribute("inputs:normalize").Get(time):
         area = _area(triangles.astype(np.float64)) / placed.metres**2
         found = found / max(area, 1e-30)
@@ -75,13 +75,13 @@ def radiance(
     return np.where(np.isfinite(found), found, 0).astype(np.float32)
 
 
-def light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float64]:
+def read_light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float64]:
     """Return intensity x 2^exposure x color [3] of any light, tinted by its temperature."""
     from pxr import UsdLux
 
     light = UsdLux.LightAPI(prim)
     strength = light.GetIntensityAttr().Get(time) * 2.0 ** light.GetExposureAttr().Get(time)
-    color = linear_rec709(light.GetColorAttr(), np.array(light.GetColorAttr().Get(time), float))
+    color = convert_to_rec709(light.GetColorAttr(), np.array(light.GetColorAttr().Get(time), float))
     kelvin = light.GetColorTemperatureAttr()
     # Blender switches it on for every light and states none; the default of USD would tint by 4 %
     if light.GetEnableColorTemperatureAttr().Get(time) and kelvin.HasAuthoredValue():
@@ -137,7 +137,7 @@ def _disk() -> NDArray[np.float64]:
     return fan * math.sqrt(math.pi / _area(fan))
 
 
-def _tube() -> NDArray[np.float64]:
+def _build_tube() -> NDArray[np.float64]:
     """Return a tube of length 1 along X, of the area of a cylinder of radius 1 without its ends."""
     turn = 2 * math.pi * np.arange(_DISK_CORNERS) / _DISK_CORNERS
     low = np.stack([np.full_like(turn, -0.5), np.cos(turn), np.sin(turn)], axis=1)

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.dressed import PLAIN, Worn
-from pipeline.exchange.usd.foreign_inputs import ShaderInputs, varied_columns, worn_textures
+from pipeline.exchange.usd.foreign_inputs import ShaderInputs, compute_varied, worn_textures
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup
 from pipeline.exchange.usd.foreign_skins import CHANNELS, skinned
 from pipeline.exchange.usd.names import added_column
-from pipeline.foreign.usd.shaders import bound_materials, colors_of, read_material
+from pipeline.foreign.usd.shaders import read_bindings, read_colors, read_material
 from pipeline.foreign.usd.stage import OpenedUsd
 from storage.records.material import (
     DIFFUSE,
@@ -67,7 +67,7 @@ def dressing(surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str) 
     count = len(surface.positions)
     rows, uv = default_rows(count), np.zeros((count, 3, 2), np.float32)
     wardrobe, worn = list[Worn](), np.zeros(count, np.int64)
-    for bound, polygons in bound_materials(surface.prim, time):
+    for bound, polygons in read_bindings(surface.prim, time):
         chosen = np.isin(surface.cut.polygons, polygons) if polygons is not None else slice(None)
         part = _shaded(bound, surface, time, opened, licence)
         rows[chosen], uv[chosen], worn[chosen] = part.rows[chosen], part.uv[chosen], len(wardrobe)
@@ -130,7 +130,7 @@ def _shaded(
         name: texture if texture.constant is None else None
         for name, texture in zip(TEXTURED, worn, strict=True)
     }
-    for name, column in varied_columns(inputs, skin.textures).items():
+    for name, column in compute_varied(inputs, skin.textures).items():
         rows[:, _COLUMNS[name]], kept[name] = column, None
     _take_added_columns(rows, material, time, opened.lost)
     return _Shaded(
@@ -173,7 +173,7 @@ def _numbers(value: Any) -> NDArray[np.float64]:
 
 def _display_colour(surface: TriangleSoup, time: Any) -> NDArray[np.float32]:
     rows = np.full((len(surface.positions), 3), _DEFAULT_DIFFUSE, np.float32)
-    colors = colors_of(surface.cut, "displayColor", time)
+    colors = read_colors(surface.cut, "displayColor", time)
     if colors is not None:
         rows = np.clip(colors.mean(axis=1), 0, 0.96).astype(np.float32)
     return rows

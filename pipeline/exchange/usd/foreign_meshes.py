@@ -37,7 +37,7 @@ class TriangleSoup:
         """The mesh."""
         return self.cut.prim
 
-    def coordinates(self, chart: UvChart, time: Any) -> NDArray[np.float64] | None:
+    def read_coordinates(self, chart: UvChart, time: Any) -> NDArray[np.float64] | None:
         """Return texture coordinates [T, 3, 2]; None where not every corner has some."""
         uv = chart_corners(chart, self.cut, time)
         if uv is None or not np.isfinite(uv).all():
@@ -61,7 +61,7 @@ def read_mesh(placed: Placed, time: Any, lost: list[str]) -> TriangleSoup:
     solid = np.sqrt(np.square(cross).sum(axis=1)) > _SMALLEST_DOUBLE_AREA
     if not solid.all():
         lost.append(f"{cut.prim.GetPath()}: {int((~solid).sum())} triangles without an area")
-    cut, positions = cut.chosen(solid), positions[solid]
+    cut, positions = cut.select(solid), positions[solid]
     normals = _normals(found, cut, time, positions, lost)
     return TriangleSoup(positions=positions, normals=normals, cut=cut)
 

@@ -52,7 +52,7 @@ def skinned(
     if not names:
         return Skinned(textures={}, uv=None)
     chart = found[names[0]].chart
-    uv = surface.coordinates(chart, time)
+    uv = surface.read_coordinates(chart, time)
     if uv is None:
         lost.append(f"{where}: no coordinates {chart.primvar!r:.60}; means of textures taken")
         return Skinned(textures=_means(plain), uv=None)

@@ -108,7 +108,7 @@ def _frames(stage: Any) -> Iterator[str]:
     if len({t for layer in stage.GetUsedLayers() for t in layer.ListAllTimeSamples()}) < 2:
         return
     if not stage.HasAuthoredTimeCodeRange():
-        times = np.unique([code for prim in _prims(stage) for code in _samples(prim)])
+        times = np.unique([code for prim in _list_prims(stage) for code in _list_samples(prim)])
     else:
         first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
         if not last - first < MAX_FRAMES:  # not a number neither
@@ -122,14 +122,14 @@ def _frames(stage: Any) -> Iterator[str]:
         yield f"{time:g}"
 
 
-def _prims(stage: Any) -> Iterator[Any]:
+def _list_prims(stage: Any) -> Iterator[Any]:
     from pxr import Usd
 
     for root in (stage.GetPseudoRoot(), *stage.GetPrototypes()):
         yield from Usd.PrimRange.AllPrims(root)
 
 
-def _samples(prim: Any) -> Iterator[float]:
+def _list_samples(prim: Any) -> Iterator[float]:
     """Yield the time codes of a prim's samples: of the stage, whatever offsets its layers have."""
     for attribute in prim.GetAuthoredAttributes():
         yield from attribute.GetTimeSamples()

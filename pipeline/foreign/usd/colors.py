@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def linear_rec709(attribute: Any, stated: NDArray) -> NDArray:
+def convert_to_rec709(attribute: Any, stated: NDArray) -> NDArray:
     """Return the colors [..., 3 or 4] of an attribute, turned from the color space that USD states.
 
     Without one, and where they are called data, they stay as they are.

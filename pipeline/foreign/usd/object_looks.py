@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.usd.object_stage import UsdStage
 from pipeline.foreign.usd.placed import Placed
-from pipeline.foreign.usd.shaders import StatedMaterial, bound_materials, read_material
+from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
 from pipeline.foreign.usd.stage import OutsideFile
 from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes
 from storage.errors import Rejected, TrilightError
@@ -75,7 +75,7 @@ class _Reader:
         self.found: list[StatedMaterial] = []
 
     def bindings(self, placed: Placed) -> Iterator[Binding]:
-        for material, polygons in bound_materials(placed.prim, self._stage.time):
+        for material, polygons in read_bindings(placed.prim, self._stage.time):
             yield self._row(material), polygons
 
     def _row(self, material: Any) -> int:
@@ -89,17 +89,17 @@ class _Reader:
 
     def _stated(self, material: Any) -> StatedMaterial:
         lost = self._stage.opened.lost
-        found = read_material(material, self._stage.time, self._stage.opened)
-        if found is None:
+        stated = read_material(material, self._stage.time, self._stage.opened)
+        if stated is None:
             name = str(material.GetPath())
             raise TrilightError(f"{name!r:.100} has no shader that is understood")
-        textures = dict(found.textures)
+        textures = dict(stated.textures)
         if textures.pop("ior", None):
-            lost.append(f"{found.where}.ior: its texture is not read; 1.5 taken")
-        return dataclasses.replace(found, textures=textures)
+            lost.append(f"{stated.where}.ior: its texture is not read; 1.5 taken")
+        return dataclasses.replace(stated, textures=textures)
 
 
-def lost_words(stated: StatedMaterial) -> tuple[str, ...]:
+def name_losses(stated: StatedMaterial) -> tuple[str, ...]:
     """Return the words for what a material states and has no place for."""
     words = {
         word for name in stated.lost for start, word in _LOST.items() if name.startswith(start)

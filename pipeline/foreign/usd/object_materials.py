@@ -14,10 +14,10 @@ from pipeline.foreign.material import RGB, WHITE, Slot, SourceMaterial
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.parts import MOST_UV_SETS, TexturedParts
 from pipeline.foreign.picture import Picture, has_colours
-from pipeline.foreign.usd.object_looks import Binding, lost_words
+from pipeline.foreign.usd.object_looks import Binding, name_losses
 from pipeline.foreign.usd.object_meshes import PlacedPart
 from pipeline.foreign.usd.object_source import UsdSource
-from pipeline.foreign.usd.shaders import StatedMaterial, colors_of, head_on
+from pipeline.foreign.usd.shaders import StatedMaterial, read_colors, reflect_head_on
 from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart
 from storage.errors import Rejected
 
@@ -79,7 +79,7 @@ def _colours(part: PlacedPart, is_plain: NDArray[np.bool_], time: object) -> NDA
     """Return what tints corners [T, 3, 3]: display colours, where there is no material."""
     found = np.ones((len(is_plain), 3, 3))
     if is_plain.any():
-        shown = colors_of(part.cut, "displayColor", time)
+        shown = read_colors(part.cut, "displayColor", time)
         found[is_plain] = _UNBOUND if shown is None else np.clip(shown[is_plain], 0, 1)
     return found
 
@@ -107,16 +107,18 @@ class _Varied:
             if row >= len(self._stated) or not self._stated[row].primvars:
                 continue
             stated, mine = self._stated[row], rows == row
-            base = stated.values("diffuseColor", part.cut, self._time)
+            base = stated.read_values("diffuseColor", part.cut, self._time)
             if base is not None:
                 colours[mine] = np.clip(base, 0, 1)[mine]
             elif "diffuseColor" in stated.primvars:
                 colours[mine] = np.maximum(stated.constants["diffuseColor"], 0)
-            values = {name: stated.values(name, part.cut, self._time) for name in stated.primvars}
+            values = {
+                name: stated.read_values(name, part.cut, self._time) for name in stated.primvars
+            }
             values["diffuseColor"] = None
             glow = values.get("emissiveColor")
             if glow is not None:
-                values["emissiveColor"] = glow * _strength(stated) if self._emission else None
+                values["emissiveColor"] = glow * _read_strength(stated) if self._emission else None
             means = {name: each.mean(axis=1) for name, each in values.items() if each is not None}
             if means:
                 rows[mine] = self._made(int(row), {k: v[mine] for k, v in means.items()})
@@ -127,18 +129,18 @@ class _Varied:
         if len(np.unique(table, axis=0)) > _MOST_VARIED:
             table = np.broadcast_to(table.mean(axis=0), table.shape)
         distinct, index = np.unique(table, axis=0, return_inverse=True)
-        found = []
+        made = []
         for values in distinct:
             key = (row, values.tobytes())
             if key not in self._known:
                 self._known[key] = len(self._materials)
                 parts = dict(zip(means, np.split(values, len(means)), strict=True))
-                self._materials.append(_with_values(self._materials[row], parts))
-            found.append(self._known[key])
-        return np.array(found, np.int64)[index.reshape(-1)]
+                self._materials.append(_replace_values(self._materials[row], parts))
+            made.append(self._known[key])
+        return np.array(made, np.int64)[index.reshape(-1)]
 
 
-def _with_values(
+def _replace_values(
     material: SourceMaterial, values: Mapping[str, NDArray[np.float64]]
 ) -> SourceMaterial:
     """Return a material with other values [3] of inputs."""
@@ -147,14 +149,14 @@ def _with_values(
         return float(values[name][0]) if name in values else old
 
     specular, glow = values.get("specularColor"), values.get("emissiveColor")
-    f0 = float(head_on(values["ior"])[0]) if "ior" in values else material.f0
+    f0 = float(reflect_head_on(values["ior"])[0]) if "ior" in values else material.f0
     return dataclasses.replace(
         material,
         metallic=number("metallic", material.metallic),
         roughness=number("roughness", material.roughness),
         f0=f0,
-        specular_rgb=material.specular_rgb if specular is None else _nonnegative(specular),
-        emission_rgb=material.emission_rgb if glow is None else _nonnegative(glow),
+        specular_rgb=material.specular_rgb if specular is None else _drop_negative(specular),
+        emission_rgb=material.emission_rgb if glow is None else _drop_negative(glow),
     )
 
 
@@ -171,9 +173,9 @@ class _Reader:
     def material(self, stated: StatedMaterial) -> SourceMaterial:
         base = self._colour(stated, "diffuseColor")
         is_tint = base is not None or "diffuseColor" in stated.primvars
-        roughness, lost = self._number(stated, "roughness"), lost_words(stated)
+        roughness, lost = self._number(stated, "roughness"), name_losses(stated)
         glows = any(_glow(stated)) or "emissiveColor" in stated.primvars
-        found = SourceMaterial(
+        material = SourceMaterial(
             base_rgb=WHITE if is_tint else _rgb(stated, "diffuseColor"),
             base=base,
             roughness=1.0 if roughness is not None else _of(stated, "roughness"),
@@ -182,15 +184,15 @@ class _Reader:
         )
         if self._emission and any(_glow(stated)):
             picture = self._colour(stated, "emissiveColor")
-            found = dataclasses.replace(found, emission_rgb=_glow(stated), emission=picture)
+            material = dataclasses.replace(material, emission_rgb=_glow(stated), emission=picture)
         if stated.is_specular:
-            return self._specular(stated, found)
+            return self._specular(stated, material)
         metallic = self._number(stated, "metallic")
         return dataclasses.replace(
-            found,
+            material,
             metallic=1.0 if metallic is not None else _of(stated, "metallic"),
             metallic_map=metallic,
-            f0=float(head_on(stated.constants["ior"].astype(float))[0]),
+            f0=float(reflect_head_on(stated.constants["ior"].astype(float))[0]),
         )
 
     def _specular(self, stated: StatedMaterial, common: SourceMaterial) -> SourceMaterial:
@@ -265,24 +267,24 @@ def _moves(chart: UvChart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _rgb(stated: StatedMaterial, name: str) -> RGB:
-    return _nonnegative(stated.constants[name])
+    return _drop_negative(stated.constants[name])
 
 
-def _nonnegative(values: NDArray) -> RGB:
+def _drop_negative(values: NDArray) -> RGB:
     red, green, blue = np.maximum(values, 0).tolist()
     return red, green, blue
 
 
 def _glow(stated: StatedMaterial) -> RGB:
     """Return what times the picture, if there is one, a material emits."""
-    strength = _strength(stated)
+    strength = _read_strength(stated)
     if "emissiveColor" in stated.textures:
         return (strength, strength, strength)
     red, green, blue = (strength * value for value in _rgb(stated, "emissiveColor"))
     return red, green, blue
 
 
-def _strength(stated: StatedMaterial) -> float:
+def _read_strength(stated: StatedMaterial) -> float:
     return max(_of(stated, "strength"), 0.0) if stated.has_strength else 1.0
 
 

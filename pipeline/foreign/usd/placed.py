@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.usd.schemas import noted_schemas
+from pipeline.foreign.usd.schemas import list_unread
 from pipeline.foreign.usd.skins import BoundSkin, BoundSkins
 from pipeline.foreign.usd.solids import SOLIDS
 from storage.errors import TrilightError
@@ -63,13 +63,13 @@ def placed_prims(
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
         prim, to_world = visit.prim, visit.to_world
         kind = str(prim.GetTypeName())
-        unread.update(noted_schemas(prim, time, kinds))
+        unread.update(list_unread(prim, time, kinds))
         if kind == "SkelRoot":
             skins.take(prim, visit.predicate)
         if kind in kinds:
             if not np.isfinite(to_world).all():
                 raise TrilightError(f"{prim.GetPath()}: its place is not finite.")
-            skin = skins.of(prim)
+            skin = skins.find(prim)
             found.append(Placed(prim=prim, to_world=to_world, metres=metres, skin=skin))
     lost += [f"{count} x {kind}: not read" for kind, count in sorted(unread.items())]
     return found
@@ -121,7 +121,7 @@ def _visited(stage: Any, base: NDArray[np.float64], time: Any, lost: list[str]) 
         imageable = UsdGeom.Imageable(prim)
         if imageable and imageable.GetVisibilityAttr().Get(time) == UsdGeom.Tokens.invisible:
             continue
-        visit = _with_purpose(above, imageable, time)
+        visit = _take_purpose(above, imageable, time)
         visit = dataclasses.replace(visit, to_world=_moved(visit, time))
         is_shown = visit.purpose == "default" or (
             visit.purpose == "render" and visit.is_render_shown
@@ -138,7 +138,7 @@ def _children(above: _Visit) -> Iterator[_Visit]:
     return (dataclasses.replace(above, prim=child) for child in children)
 
 
-def _with_purpose(above: _Visit, imageable: Any, time: Any) -> _Visit:
+def _take_purpose(above: _Visit, imageable: Any, time: Any) -> _Visit:
     """Return a visit with the prim's own purpose, which its children have too, if it has one."""
     from pxr import UsdGeom
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.usd.colors import linear_rec709
+from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.placed import Placed
-from pipeline.foreign.usd.solids import SOLIDS, solid_polygons
+from pipeline.foreign.usd.solids import SOLIDS, build_solid
 from storage.errors import TrilightError
 
 MAX_EAR_CORNERS = 2000
@@ -43,7 +43,7 @@ class CutMesh:
     polygons: NDArray[np.int64]
     """[T] of the mesh"""
 
-    def chosen(self, part: NDArray[np.bool_]) -> "CutMesh":
+    def select(self, part: NDArray[np.bool_]) -> "CutMesh":
         """Return some of the triangles."""
         return dataclasses.replace(self, corners=self.corners[part], polygons=self.polygons[part])
 
@@ -65,7 +65,7 @@ class CutMesh:
             return None
         return values[where]
 
-    def primvar(self, name: str, time: Any) -> NDArray | None:
+    def read_primvar(self, name: str, time: Any) -> NDArray | None:
         """Return a primvar of the mesh, or of what is above it, at corners [T, 3, ...].
 
         None where it has none, or not for every corner.
@@ -80,7 +80,7 @@ class CutMesh:
             return None
         if str(self.prim.GetTypeName()) in SOLIDS and spread != "constant":
             return None  # their polygons are ours
-        return self.per_corner(linear_rec709(primvar.GetAttr(), values), spread)
+        return self.per_corner(convert_to_rec709(primvar.GetAttr(), values), spread)
 
 
 def mesh_polygons(placed: Placed, time: Any) -> MeshPolygons:
@@ -94,7 +94,7 @@ def mesh_polygons(placed: Placed, time: Any) -> MeshPolygons:
     prim = placed.prim
     holes = as_array(None, np.int64, (-1,))
     if prim.GetTypeName() in SOLIDS:
-        points, counts, indices, is_smooth = solid_polygons(prim, time)
+        points, counts, indices, is_smooth = build_solid(prim, time)
     else:
         mesh = UsdGeom.Mesh(prim)
         stated = mesh.GetPointsAttr().Get(time)
@@ -116,21 +116,21 @@ def mesh_polygons(placed: Placed, time: Any) -> MeshPolygons:
     )
 
 
-def cut_mesh(found: MeshPolygons) -> CutMesh:
+def cut_mesh(mesh: MeshPolygons) -> CutMesh:
     """Return the triangles of a mesh in its place, holes left out.
 
     A mirrored place turns windings round.
     """
     from pxr import UsdGeom
 
-    prim, to_world = found.placed.prim, found.placed.to_world
-    corners, polygons = triangulated(found.points, found.counts, found.indices)
-    kept = ~np.isin(polygons, found.holes)
+    prim, to_world = mesh.placed.prim, mesh.placed.to_world
+    corners, polygons = triangulated(mesh.points, mesh.counts, mesh.indices)
+    kept = ~np.isin(polygons, mesh.holes)
     corners, polygons = corners[kept], polygons[kept]
     mirrored = np.linalg.det(to_world[:3, :3]) < 0
     if mirrored != (UsdGeom.Gprim(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded):
         corners = corners[:, ::-1]
-    return CutMesh(prim=prim, indices=found.indices, corners=corners, polygons=polygons)
+    return CutMesh(prim=prim, indices=mesh.indices, corners=corners, polygons=polygons)
 
 
 def moved(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ _OF_OTHERS = ("Physics", "Physx", "Semantics", "Render", "Hydra")
 """What schemas begin with that say how things move, what they mean, or how they are rendered."""
 
 
-def noted_schemas(prim: Any, time: Any, kinds: Collection[str]) -> Iterator[str]:
+def list_unread(prim: Any, time: Any, kinds: Collection[str]) -> Iterator[str]:
     """Yield what a prim is or has that is not read, if only `kinds` are."""
     kind = str(prim.GetTypeName())
     if not (kind in kinds or kind in _SILENT or kind.startswith(_OF_OTHERS)):

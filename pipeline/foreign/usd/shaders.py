@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.usd.colors import linear_rec709
+from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.polygons import CutMesh, as_array
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.foreign.usd.texture_nodes import (
     TextureNode,
+    find_sources,
     is_output,
-    sources_of,
     texture_node,
     value_of,
 )
@@ -136,29 +136,29 @@ class StatedMaterial:
         """Whether its workflow is the specular one."""
         return bool(self.constants["useSpecularWorkflow"].any())
 
-    def values(self, name: str, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
+    def read_values(self, name: str, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
         """Return what the primvar of an input is at corners [T, 3, 3]; None where there is none."""
-        return colors_of(cut, self.primvars[name], time) if name in self.primvars else None
+        return read_colors(cut, self.primvars[name], time) if name in self.primvars else None
 
 
-def colors_of(cut: CutMesh, primvar: str, time: Any) -> NDArray[np.float64] | None:
+def read_colors(cut: CutMesh, primvar: str, time: Any) -> NDArray[np.float64] | None:
     """Return numbers or colors at corners as colors [T, 3, 3]; None for anything else."""
-    found = cut.primvar(primvar, time)
-    if found is None:
+    values = cut.read_primvar(primvar, time)
+    if values is None:
         return None
-    wide = found[..., None] if found.ndim == 2 else found
+    wide = values[..., None] if values.ndim == 2 else values
     if wide.ndim != 3 or wide.shape[2] not in (1, 3, 4) or not np.isfinite(wide).all():
         return None
     count = 3 if wide.shape[2] > 1 else 1
     return np.broadcast_to(wide[..., :count], (*wide.shape[:2], 3)).astype(np.float64)
 
 
-def head_on(ior: Any) -> Any:
+def reflect_head_on(ior: Any) -> Any:
     """Return the share that a dielectric of an index of refraction reflects head-on."""
     return np.square((ior - 1) / np.maximum(ior + 1, 1e-3))
 
 
-def bound_materials(prim: Any, time: Any) -> Iterator[tuple[Any, NDArray[np.int64] | None]]:
+def read_bindings(prim: Any, time: Any) -> Iterator[tuple[Any, NDArray[np.int64] | None]]:
     """Yield the material of a mesh, or None; then those of its subsets with their polygons.
 
     Of what is bound for rendering in full and for a preview, the first one counts that has a shader
@@ -166,23 +166,23 @@ def bound_materials(prim: Any, time: Any) -> Iterator[tuple[Any, NDArray[np.int6
     """
     from pxr import UsdShade
 
-    yield _bound_material(prim), None
+    yield _find_material(prim), None
     for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
-        bound = _bound_material(subset.GetPrim())
+        bound = _find_material(subset.GetPrim())
         if bound:
             yield bound, as_array(subset.GetIndicesAttr().Get(time), np.int64, (-1,))
 
 
-def _bound_material(prim: Any) -> Any:
+def _find_material(prim: Any) -> Any:
     from pxr import UsdShade
 
-    found = None
+    first = None
     for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
         material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)[0]
         if material and surface_shader(material):
             return material
-        found = found or material or None
-    return found
+        first = first or material or None
+    return first
 
 
 def surface_shader(material: Any) -> Any:
@@ -273,23 +273,23 @@ class _Reader:
         stated = sources[0].Get(self._time) if sources and not is_output(sources[0]) else None
         if stated is None:
             return self._finite(name, self._defaults[name])
-        return self._finite(name, linear_rec709(sources[0], np.array(stated)))
+        return self._finite(name, convert_to_rec709(sources[0], np.array(stated)))
 
     def weight(self) -> NDArray[np.float32]:
         """Return what the color of the base is multiplied with; textures are not."""
-        found = np.ones(3, np.float32)
+        product = np.ones(3, np.float32)
         for name in _WEIGHTS:
             value = self._value(name, 1.0)
             if value is None or ("diffuseColor" in self.textures and (value != 1).any()):
                 self._opened.lost.append(f"{self._shader.GetPath()}.{name}: has no place here")
             else:
-                found = found * value
-        return found
+                product = product * value
+        return product
 
     def without_place(self) -> list[str]:
         """Return inputs that do something, and have no place here; unknown ones too."""
         read = {*(self._names.get(name, name) for name in DEFAULTS), *_WEIGHTS}
-        found = []
+        names = []
         for each in self._shader.GetInputs():
             name = str(each.GetBaseName())
             if name in _NEUTRAL:
@@ -302,25 +302,25 @@ class _Reader:
                     name != "normal" and each.GetAttr().HasAuthoredValue()
                 )
             if is_lost:
-                found.append(name)
-        return found
+                names.append(name)
+        return names
 
     def _value(self, name: str, default: float) -> NDArray[np.float32] | None:
         """Return what an input states [3]; None where that is a network, or no color."""
         sources = self._sources(name)
         if sources and is_output(sources[0]):
             return None
-        return finite_color(value_of(self._shader, name, self._time, default))
+        return parse_color(value_of(self._shader, name, self._time, default))
 
     def _finite(self, name: str, stated: Any) -> NDArray[np.float32]:
-        value = finite_color(stated)
+        value = parse_color(stated)
         if value is None:
             self._lose(name, "no finite number or color")
             value = np.array(self._defaults[name], np.float32)
         return np.broadcast_to(value, 3).astype(np.float32)
 
     def _sources(self, name: str) -> Any:
-        return sources_of(self._shader, self._names.get(name, name))
+        return find_sources(self._shader, self._names.get(name, name))
 
     def _lose(self, name: str, why: str) -> None:
         called = self._names.get(name, name)
@@ -329,7 +329,7 @@ class _Reader:
         )
 
 
-def finite_color(stated: Any) -> NDArray[np.float32] | None:
+def parse_color(stated: Any) -> NDArray[np.float32] | None:
     """Return a number or color as a color [3]; None for anything else."""
     value = np.array(stated, np.float32)  # None becomes no number
     if value.shape not in ((), (3,)) or not np.isfinite(value).all():

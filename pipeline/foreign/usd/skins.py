@@ -71,16 +71,16 @@ class BoundSkins:
         self._roots.add(prim.GetPath())
         root = UsdSkel.Root(prim)
         self._cache.Populate(root, predicate)
-        for found in self._cache.ComputeSkelBindings(root, predicate):
-            skeleton = self._cache.GetSkelQuery(found.GetSkeleton())
-            for target in found.GetSkinningTargets():
+        for bound in self._cache.ComputeSkelBindings(root, predicate):
+            skeleton = self._cache.GetSkelQuery(bound.GetSkeleton())
+            for target in bound.GetSkinningTargets():
                 if not (target.HasJointInfluences() or target.HasBlendShapes()):
                     continue
                 path = target.GetPrim().GetPath()
-                bones = found.GetSkeleton().GetPrim()
+                bones = bound.GetSkeleton().GetPrim()
                 self._bound[path] = BoundSkin(bones=bones, skeleton=skeleton, binding=target)
 
-    def of(self, prim: Any) -> BoundSkin | None:
+    def find(self, prim: Any) -> BoundSkin | None:
         """Return what poses a prim, or None.
 
         Raises:

@@ -21,7 +21,7 @@ Polygons = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], bool
 """Points [P, 3], corners of each polygon [F], their points, and whether it is meant to be round."""
 
 
-def solid_polygons(prim: Any, time: Any) -> Polygons:
+def build_solid(prim: Any, time: Any) -> Polygons:
     """Return the polygons of a prim of SOLIDS at a time."""
     kind = str(prim.GetTypeName())
 
@@ -29,26 +29,26 @@ def solid_polygons(prim: Any, time: Any) -> Polygons:
         return float(prim.GetAttribute(name).Get(time))
 
     if kind == "TetMesh":
-        return _tetrahedra(prim, time)
+        return _read_tetrahedra(prim, time)
     if kind == "Cube":
         corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)])
         sides = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
-        return _polygons(corners * of("size") / 2, sides, is_smooth=False)
+        return _pack(corners * of("size") / 2, sides, is_smooth=False)
     axis = "Z" if kind == "Sphere" else str(prim.GetAttribute("axis").Get())
     if kind == "Plane":
         wide, long = of("width") / 2, of("length") / 2
         if axis != "Z":  # where Z comes from Y or Y from X
             wide, long = long, wide
         flat = np.array([[-wide, -long, 0], [wide, -long, 0], [wide, long, 0], [-wide, long, 0]])
-        return _polygons(flat[:, _AXES[axis]], [[0, 1, 2, 3]], is_smooth=False)
-    points, sides = _turned(_profile(kind, of))
-    return _polygons(points[:, _AXES[axis]], sides, is_smooth=True)
+        return _pack(flat[:, _AXES[axis]], [[0, 1, 2, 3]], is_smooth=False)
+    points, sides = _revolve(_build_profile(kind, of))
+    return _pack(points[:, _AXES[axis]], sides, is_smooth=True)
 
 
-def _profile(kind: str, of: Any) -> NDArray[np.float64]:
+def _build_profile(kind: str, of: Any) -> NDArray[np.float64]:
     """Return radii and heights [N, 2] along a solid of revolution, from below."""
     if kind == "Sphere":
-        return _arc(-np.pi / 2, np.pi / 2, _SIDES // 2) * of("radius")
+        return _build_arc(-np.pi / 2, np.pi / 2, _SIDES // 2) * of("radius")
     top = of("radiusTop" if kind.endswith("_1") else "radius")
     bottom = of("radiusBottom" if kind.endswith("_1") else "radius")
     half = of("height") / 2
@@ -56,7 +56,7 @@ def _profile(kind: str, of: Any) -> NDArray[np.float64]:
         tilt = np.arctan2(bottom - top, 2 * half)
         ends = [(-half, bottom, -np.pi / 2, tilt), (half, top, tilt, np.pi / 2)]
         return np.concatenate([
-            _arc(begin, end, _SIDES // 4) * radius / np.cos(tilt)
+            _build_arc(begin, end, _SIDES // 4) * radius / np.cos(tilt)
             + np.array([0, up - radius * np.tan(tilt)])
             for up, radius, begin, end in ends
         ])  # fmt: skip
@@ -64,12 +64,12 @@ def _profile(kind: str, of: Any) -> NDArray[np.float64]:
     return np.array([[0, -half], [bottom, -half], [edge, half], [0, half]])
 
 
-def _arc(begin: float, end: float, count: int) -> NDArray[np.float64]:
+def _build_arc(begin: float, end: float, count: int) -> NDArray[np.float64]:
     turn = np.linspace(begin, end, count + 1)
     return np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
 
-def _turned(profile: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[list[int]]]:
+def _revolve(profile: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[list[int]]]:
     """Return the surface that a profile makes around Z, facing out."""
     turn = 2 * np.pi * np.arange(_SIDES) / _SIDES
     around = np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -86,7 +86,7 @@ def _turned(profile: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[lis
     return np.concatenate(rings), [side for side in kept if len(side) > 2]
 
 
-def _tetrahedra(prim: Any, time: Any) -> Polygons:
+def _read_tetrahedra(prim: Any, time: Any) -> Polygons:
     from pxr import UsdGeom
 
     mesh = UsdGeom.TetMesh(prim)
@@ -98,7 +98,7 @@ def _tetrahedra(prim: Any, time: Any) -> Polygons:
     return points, np.full(len(sides), 3), sides.ravel(), False
 
 
-def _polygons(
+def _pack(
     points: NDArray[np.float64], sides: Sequence[Sequence[int]], *, is_smooth: bool
 ) -> Polygons:
     counts = np.array([len(side) for side in sides], np.int64)

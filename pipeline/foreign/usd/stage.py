@@ -90,19 +90,15 @@ class OpenedUsd:
         first = dict[tuple[str, str], str]()
         for note in dict.fromkeys(self.lost):
             where, _, text = note.partition(": ")
-            kind = (
-                where.rpartition(".")[2] if where.startswith("/") and "." in where else "",
-                text,
-            )
-            kind = kind if where.startswith("/") else (where, text)
+            kind = (where.partition(".")[2] if where.startswith("/") else where, text)
             kinds[kind] += 1
             first.setdefault(kind, note)
-        found = [
+        notes = [
             first[kind] if count == 1 else f"{first[kind]} ({count} such)"
             for kind, count in kinds.items()
         ]
-        more = len(found) - MAX_NOTES
-        return tuple(found if more <= 0 else [*found[:MAX_NOTES], f"and {more} more"])
+        more = len(notes) - MAX_NOTES
+        return tuple(notes if more <= 0 else [*notes[:MAX_NOTES], f"and {more} more"])
 
     def inside(self, layer: Any, asset_path: str) -> str | None:
         """Return where USD finds a file that a layer names, or None where there is none.

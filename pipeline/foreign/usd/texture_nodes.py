@@ -80,7 +80,7 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
     Raises:
         TrilightError: its picture is outside of the folder, or on the network.
     """
-    sources = sources_of(shader, "file")
+    sources = find_sources(shader, "file")
     attribute = sources[0] if sources else None
     asset = attribute.Get(time) if attribute else None
     named, resolved = "" if asset is None else asset.path, None
@@ -90,7 +90,7 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
     if "<UDIM>" in named:
         opened.lost.append(f"{shader.GetPath()}: {named!r:.100} has UDIM tiles, which are not read")
     for name in ("scale", "bias", "fallback"):
-        if any(is_output(source) for source in sources_of(shader, name)):
+        if any(is_output(source) for source in find_sources(shader, name)):
             opened.lost.append(f"{shader.GetPath()}.{name}: a network that is not read")
     fallback = value_of(shader, "fallback", time, None)
     return TextureNode(
@@ -110,7 +110,7 @@ def chart_of(shader: Any, time: Any, lost: list[str]) -> UvChart:
     """Return the coordinates of a texture's shader; `st` where it states none."""
     from pxr import UsdShade
 
-    sources, moves, primvar = sources_of(shader, "st"), list[Move](), "st"
+    sources, moves, primvar = find_sources(shader, "st"), list[Move](), "st"
     for _ in range(_MOST_NODES):
         if not sources or not is_output(sources[0]):
             break
@@ -123,7 +123,7 @@ def chart_of(shader: Any, time: Any, lost: list[str]) -> UvChart:
                     translation=_pair(value_of(node, "translation", time, (0, 0))),
                 )
             )
-            sources = sources_of(node, "in")
+            sources = find_sources(node, "in")
             continue
         primvar = str(value_of(node, "varname", time, primvar))
         if node.GetIdAttr().Get() != "UsdPrimvarReader_float2":
@@ -137,7 +137,7 @@ def chart_corners(chart: UvChart, cut: CutMesh, time: Any) -> NDArray[np.float64
 
     None where the mesh has none, or not for every corner.
     """
-    found = cut.primvar(chart.primvar, time)
+    found = cut.read_primvar(chart.primvar, time)
     if found is None or found.ndim != 3 or found.shape[2] < 2:
         return None
     return np.asarray(found[..., :2], np.float64)
@@ -168,7 +168,7 @@ def _require_size(size: int, max_bytes: int, name: str) -> None:
         raise TrilightError(f"{name}: {size} bytes; expected at most {max_bytes}.")
 
 
-def sources_of(shader: Any, name: str) -> Any:
+def find_sources(shader: Any, name: str) -> Any:
     """Return the attributes that give an input of a shader its value, its material's among them."""
     from pxr import UsdShade
 
@@ -185,7 +185,7 @@ def is_output(attribute: Any) -> bool:
 
 def value_of(shader: Any, name: str, time: Any, default: Any) -> Any:
     """Return an input of a shader, or of its material; the default where it is not stated."""
-    sources = sources_of(shader, name)
+    sources = find_sources(shader, name)
     value = sources[0].Get(time) if sources else None
     return default if value is None else value
 
