@@ -121,6 +121,9 @@ def _pictures(nodes: Sequence[TextureNode], left: int) -> MaterialFiles:
         if found is None:
             why = f"{node.named!r:.80} is not beside the object"
             refused[place] = Rejected("texture_missing", why)
+            if "<UDIM>" in node.named:
+                why = f"{node.named!r:.80} has UDIM tiles, which are not read"
+                refused[place] = Rejected("texture_unreadable", why)
         else:
             data[place], left = found, left - len(found)
     return MaterialFiles(data=data, refused=refused)

@@ -42,7 +42,8 @@ class BoundSkin:
             _bend(self.skeleton, self.binding, prim, points, time)
         if not self.binding.HasJointInfluences():
             return np.array(points, np.float64)
-        moves = self.skeleton.ComputeSkinningTransforms(time)
+        is_bound = self.skeleton and self.skeleton.HasBindPose()
+        moves = self.skeleton.ComputeSkinningTransforms(time) if is_bound else None
         if not moves or not self.binding.ComputeSkinnedPoints(moves, points, time):
             raise UnposedMesh(f"{prim.GetPath()}: bones pose it, and UsdSkel cannot compute how.")
         places = UsdGeom.XformCache(time)
@@ -88,9 +89,10 @@ class BoundSkins:
         """
         skin = self._bound.get(prim.GetPath())
         animation = prim.GetRelationship(_ANIMATION)
-        if skin is None and prim.GetAttribute(_JOINTS).HasValue():
+        is_posed = skin is not None and skin.binding.HasJointInfluences()
+        if not is_posed and prim.GetAttribute(_JOINTS).HasValue():
             raise UnposedMesh(
-                f"{prim.GetPath()}: it has bones, and no skeleton within a SkelRoot poses it. "
+                f"{prim.GetPath()}: it has bones, and no skeleton and weights pose it. "
                 "Apply the skin before exporting."
             )
         if skin is not None and animation and animation.HasAuthoredTargets():
@@ -105,7 +107,7 @@ def _bend(skeleton: Any, binding: Any, prim: Any, points: Any, time: Any) -> Non
     """Move points by the blend shapes of an animation, which there may be."""
     from pxr import UsdSkel
 
-    animation = skeleton.GetAnimQuery()
+    animation = skeleton.GetAnimQuery() if skeleton else None
     weights = animation.ComputeBlendShapeWeights(time) if animation else None
     if not weights:
         return
