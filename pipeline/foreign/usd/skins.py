@@ -88,14 +88,16 @@ class BoundSkins:
             UnposedMesh: bones are bound to it in another way than UsdSkel understands.
         """
         skin = self._bound.get(prim.GetPath())
-        animation = prim.GetRelationship(_ANIMATION)
+        stated = prim.GetRelationship(_ANIMATION)
         is_posed = skin is not None and skin.binding.HasJointInfluences()
         if not is_posed and prim.GetAttribute(_JOINTS).HasValue():
             raise UnposedMesh(
                 f"{prim.GetPath()}: it has bones, and no skeleton and weights pose it. "
                 "Apply the skin before exporting."
             )
-        if skin is not None and animation and animation.HasAuthoredTargets():
+        names = {path.name for path in stated.GetForwardedTargets()} if skin and stated else set()
+        used = skin.skeleton.GetAnimQuery() if skin and skin.skeleton else None
+        if names - {used.GetPrim().GetName() if used else ""}:
             raise UnposedMesh(
                 f"{prim.GetPath()}: its animation is bound to the mesh; UsdSkel poses by that of "
                 "the skeleton alone. Bind it there, or apply the skin before exporting."
