@@ -7,7 +7,7 @@ PointInstancer wherever they stand, also below an `over` or a class.
 import dataclasses
 from collections import Counter
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,7 @@ class Placed:
     to_world: NDArray[np.float64]  # [4, 4], for column vectors, into metres with +Z up
     metres: float = 1.0  # of a unit of the stage
     skin: BoundSkin | None = None  # what poses a mesh
+    lost: list[str] = field(default_factory=list)  # receives what is not read of it
 
 
 def placed_prims(
@@ -70,7 +71,7 @@ def placed_prims(
             if not np.isfinite(to_world).all():
                 raise TrilightError(f"{prim.GetPath()}: its place is not finite.")
             skin = skins.find(prim)
-            found.append(Placed(prim=prim, to_world=to_world, metres=metres, skin=skin))
+            found.append(Placed(prim=prim, to_world=to_world, metres=metres, skin=skin, lost=lost))
     lost += [f"{count} x {kind}: not read" for kind, count in sorted(unread.items())]
     return found
 
@@ -182,6 +183,11 @@ def _instances(above: _Visit, time: Any, lost: list[str]) -> Iterator[_Visit]:
             f"{prim.GetPath()}: its positions, orientations or scales are not as many as its "
             f"{len(which)} protoIndices."
         )
+    lost += [
+        f"{prim.GetPath()}.{primvar.GetName()}: values of single instances are not read"
+        for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()
+        if primvar.GetInterpolation() != UsdGeom.Tokens.constant
+    ]
     shown = instancer.ComputeMaskAtTime(time) or [True] * len(which)
     plain = Usd.PrimIsActive & Usd.PrimIsLoaded & Usd.PrimHasDefiningSpecifier
     for index, move, visible in zip(which, moves, shown, strict=True):

@@ -42,6 +42,8 @@ class CutMesh:
     """[T, 3] rows of `indices`, counter-clockwise from outside."""
     polygons: NDArray[np.int64]
     """[T] of the mesh"""
+    lost: list[str]
+    """Receives what does not fit."""
 
     def select(self, part: NDArray[np.bool_]) -> "CutMesh":
         """Return some of the triangles."""
@@ -80,7 +82,10 @@ class CutMesh:
             return None
         if str(self.prim.GetTypeName()) in SOLIDS and spread != "constant":
             return None  # their polygons are ours
-        return self.per_corner(convert_to_rec709(primvar.GetAttr(), values), spread)
+        fitting = self.per_corner(convert_to_rec709(primvar.GetAttr(), values), spread)
+        if fitting is None:
+            self.lost.append(f"{self.prim.GetPath()}.{primvar.GetName()}: its number does not fit")
+        return fitting
 
 
 def mesh_polygons(placed: Placed, time: Any) -> MeshPolygons:
@@ -130,7 +135,13 @@ def cut_mesh(mesh: MeshPolygons) -> CutMesh:
     mirrored = np.linalg.det(to_world[:3, :3]) < 0
     if mirrored != (UsdGeom.Gprim(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded):
         corners = corners[:, ::-1]
-    return CutMesh(prim=prim, indices=mesh.indices, corners=corners, polygons=polygons)
+    return CutMesh(
+        prim=prim,
+        indices=mesh.indices,
+        corners=corners,
+        polygons=polygons,
+        lost=mesh.placed.lost,
+    )
 
 
 def moved(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:

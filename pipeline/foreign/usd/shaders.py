@@ -138,7 +138,13 @@ class StatedMaterial:
 
     def read_values(self, name: str, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
         """Return what the primvar of an input is at corners [T, 3, 3]; None where there is none."""
-        return read_colors(cut, self.primvars[name], time) if name in self.primvars else None
+        if name not in self.primvars:
+            return None
+        values = read_colors(cut, self.primvars[name], time)
+        if values is None:
+            primvar = self.primvars[name]
+            cut.lost.append(f"{cut.prim.GetPath()}: no primvar {primvar!r:.60}; its fallback taken")
+        return values
 
 
 def read_colors(cut: CutMesh, primvar: str, time: Any) -> NDArray[np.float64] | None:
