@@ -54,7 +54,7 @@ def placed_prims(
     from pxr import UsdGeom
 
     found: list[Placed] = []
-    unread: Counter[str] = Counter()
+    unread, known = Counter[str](), dict[Any, list[str]]()
     metres, skins, visits = UsdGeom.GetStageMetersPerUnit(stage), BoundSkins(time), 0
     if not (np.isfinite(metres) and metres > 0):
         raise TrilightError(f"metersPerUnit is {metres:g}; expected a number above 0.")
@@ -64,7 +64,10 @@ def placed_prims(
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
         prim, to_world = visit.prim, visit.to_world
         kind = str(prim.GetTypeName())
-        unread.update(list_unread(prim, time, kinds))
+        path = prim.GetPath()
+        if path not in known:  # instances of one prototype have one path
+            known[path] = list(list_unread(prim, time, kinds))
+        unread.update(known[path])
         if kind == "SkelRoot":
             skins.take(prim, visit.predicate)
         if kind in kinds:
