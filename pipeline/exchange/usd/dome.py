@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES, decoded_pixels, linear_rgb
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
+from pipeline.exchange.usd.foreign_lights import read_light_color
 from pipeline.exchange.usd.names import MAP_TEXTS, SKY_ROWS, SKY_VISIBLE, VISIBLE_TO_CAMERA
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.foreign.usd.texture_nodes import asset_bytes
@@ -107,15 +108,12 @@ def foreign_dome(
     Raises:
         TrilightError: its file is outside of the folder or on the network.
     """
-    from pxr import UsdLux
-
-    light, place = UsdLux.DomeLight(prim), str(prim.GetPath())
-    radiance = _picture(light, time, opened)
+    place = str(prim.GetPath())
+    radiance = _picture(prim, time, opened)
     if radiance is None:
         return None
-    strength = light.GetIntensityAttr().Get(time) * 2.0 ** light.GetExposureAttr().Get(time)
-    tinted = radiance * strength * np.array(light.GetColorAttr().Get(time), np.float64)
-    left, _, right = np.linalg.svd(to_world[:3, :3])
+    tinted = radiance * read_light_color(prim, time, opened.lost)
+    left, _, right = np.linalg.svd(to_world[:3, :3] @ _turn_pole(prim))
     turn = left @ right
     if np.linalg.det(turn) < 0:
         opened.lost.append(f"{place}: a mirrored dome; its light was left out")
@@ -135,13 +133,25 @@ def foreign_dome(
     return sky
 
 
-def _picture(light: Any, time: Any, opened: OpenedUsd) -> NDArray[np.float64] | None:
+def _turn_pole(prim: Any) -> NDArray[np.float64]:
+    """Return what turns a dome, whose pole is +Y, to the axis that a DomeLight_1 states."""
+    from pxr import UsdGeom
+
+    stated = prim.GetAttribute("poleAxis")
+    axis = stated.Get() if stated else UsdGeom.Tokens.y
+    if axis == "scene":
+        axis = UsdGeom.GetStageUpAxis(prim.GetStage())
+    is_turned = axis == UsdGeom.Tokens.z
+    return np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) if is_turned else np.eye(3)
+
+
+def _picture(prim: Any, time: Any, opened: OpenedUsd) -> NDArray[np.float64] | None:
     """Return the map [H, 2 H, 3] of a dome: even where it names no file."""
-    place, attribute = str(light.GetPath()), light.GetTextureFileAttr()
+    place, attribute = str(prim.GetPath()), prim.GetAttribute(_PATH)
     asset = attribute.Get(time) if attribute else None
     if asset is None or not asset.path:
         return np.ones((1, 2, 3))
-    layout = light.GetTextureFormatAttr().Get(time)
+    layout = prim.GetAttribute("inputs:texture:format").Get(time)
     if layout not in (None, "automatic", "latlong"):
         opened.lost.append(f"{place}: a picture of format {layout}; expected latlong")
         return None

@@ -1,4 +1,4 @@
-"""The inputs of a shader that is understood: textures, constants, and what they make together."""
+"""The inputs of a material on a mesh: textures, constants, primvars, and what they come to."""
 
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -14,26 +14,29 @@ from pipeline.exchange.linear_maps import (
     on_one_grid,
     over_one,
 )
-from pipeline.exchange.usd.foreign_coordinates import coordinates
-from pipeline.exchange.usd.foreign_meshes import MeshToShade
+from pipeline.exchange.usd.foreign_meshes import TriangleSoup
+from pipeline.exchange.usd.foreign_skins import CHANNELS
 from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
-from pipeline.foreign.usd.shaders import StatedInputs
+from pipeline.foreign.usd.shaders import StatedMaterial, parse_color, reflect_head_on
 from pipeline.foreign.usd.stage import OpenedUsd
 from storage.records.texture import MapSource, Texture
 
 
 class ShaderInputs:
-    """What a shader is fed with."""
+    """What a material is fed with, on one mesh."""
 
-    def __init__(self, shader: Any, time: Any, opened: OpenedUsd) -> None:
+    def __init__(
+        self, stated: StatedMaterial, surface: TriangleSoup, time: Any, opened: OpenedUsd
+    ) -> None:
         """Remember it; nothing is read yet.
 
         Args:
-            shader: the shader of a material.
+            stated: the material.
+            surface: the mesh.
             time: of the values.
             opened: the file; what is lost is noted there.
         """
-        self._stated, self._time, self._opened = StatedInputs(shader, time, opened), time, opened
+        self.stated, self._surface, self._time, self._opened = stated, surface, time, opened
         self._read: dict[str, ForeignTexture | None] = {}
 
     def textures(self, names: Collection[str]) -> dict[str, ForeignTexture]:
@@ -43,33 +46,72 @@ class ShaderInputs:
 
     def constant(self, name: str) -> NDArray[np.float32]:
         """Return the value [3] of an input without a texture; a number stands in every channel."""
-        node = self._stated.texture(name)
+        node = self.stated.textures.get(name)
         if node is not None and node.fallback is not None and self._texture(name) is None:
-            return self._stated.finite(name, node.fallback[:3])
-        return self._stated.constant(name)
+            value = parse_color(node.fallback[:3])
+            if value is not None:
+                return value
+        return self.stated.constants[name]
 
-    def emission(self, surface: MeshToShade) -> NDArray[np.float32]:
+    def compute_varying(self, name: str) -> NDArray[np.float32] | None:
+        """Return the means [T, 3] over triangles of an input's primvar; None without one."""
+        values = self.stated.read_values(name, self._surface.cut, self._time)
+        return None if values is None else values.mean(axis=1).astype(np.float32)
+
+    def emission(self) -> NDArray[np.float32]:
         """Return the radiance [T, 3] of triangles: of a texture its mean over each."""
-        count = len(surface.soup.polygons)
-        texture = self._texture("emissiveColor")
+        count = len(self._surface.positions)
+        texture, glow = self._texture("emissiveColor"), self.compute_varying("emissiveColor")
         if texture is not None:
-            uv = coordinates(texture.chart, surface, self._time)
+            uv = self._surface.read_coordinates(texture.chart, self._time)
             if uv is None:
                 uv = np.broadcast_to(np.float64(0.5), (count, 3, 2))
             glow = texture.means(uv)
             self._opened.lost.append(
-                f"{surface.prim.GetPath()}: texture of emissiveColor became one value a triangle"
+                f"{self._surface.prim.GetPath()}: texture of emissiveColor became one value a "
+                "triangle"
             )
-        else:
+        elif glow is None:
             glow = np.broadcast_to(self.constant("emissiveColor"), (count, 3))
-        strength = self.constant("strength") if self._stated.has("strength") else np.float32(1)
+        strength = self.constant("strength") if self.stated.has_strength else np.float32(1)
         return np.maximum(glow * strength, 0).astype(np.float32)
 
     def _texture(self, name: str) -> ForeignTexture | None:
         if name not in self._read:
-            node = self._stated.texture(name)
+            node = self.stated.textures.get(name)
             self._read[name] = None if node is None else read_texture(node, self._opened)
         return self._read[name]
+
+
+def compute_varied(
+    inputs: ShaderInputs, textures: Mapping[str, Texture]
+) -> dict[str, NDArray[np.float32]]:
+    """Return the columns [T, 3] or [T, 1] of triangles that primvars of the mesh change.
+
+    Args:
+        inputs: of the material.
+        textures: of inputs that have one; their means count.
+    """
+    values = {name: inputs.compute_varying(name) for name in CHANNELS}
+    varying = {name: each for name, each in values.items() if each is not None}
+
+    def of(name: str) -> NDArray[np.float32]:
+        if name in varying:
+            return varying[name]
+        constant = textures[name].mean if name in textures else inputs.constant(name)
+        return np.broadcast_to(constant, 3).astype(np.float32)[None]
+
+    columns = {}
+    if "roughness" in varying:
+        columns["roughness"] = np.clip(varying["roughness"][:, :1], 0, 1)
+    if varying.keys() - {"roughness"}:
+        albedos = of("diffuseColor"), of("specularColor")
+        if not inputs.stated.is_specular:
+            albedos = _split_albedos(of("diffuseColor"), of("metallic"), reflect_head_on(of("ior")))
+        count = max(len(each) for each in varying.values())
+        for name, albedo in zip(("diffuse", "specular"), albedos, strict=True):
+            columns[name] = np.broadcast_to(np.clip(albedo, 0, 1), (count, 3))
+    return columns
 
 
 def worn_textures(
@@ -97,7 +139,7 @@ def worn_textures(
         )
 
     base, roughness = of("diffuseColor", 3), of("roughness", 1)
-    if inputs.constant("useSpecularWorkflow").any():
+    if inputs.stated.is_specular:
         diffuse, specular = base, of("specularColor", 3)
     else:
         diffuse, specular = _metallic(base, of("metallic", 1), inputs, textures, source)
@@ -118,16 +160,23 @@ def _metallic(
     ior = inputs.constant("ior")
     if "ior" in textures:
         ior = np.broadcast_to(textures["ior"].mean, 3)
-    head_on = np.square((ior - 1) / np.maximum(ior + 1, 1e-3)).astype(np.float32)
-    dielectric = Texture(texels=constant_map(np.clip(head_on, 0, 1)), source=source)
+    dielectric = reflect_head_on(ior).astype(np.float32)
     if not metal.greatest.any():
-        return base, dielectric
+        return base, Texture(texels=constant_map(np.clip(dielectric, 0, 1)), source=source)
     colour, share = on_one_grid(linear_map(base), linear_map(metal))
-    diffuse = (colour * (1 - share)).astype(np.float32)
-    specular = np.clip(head_on * (1 - share) + colour * share, 0, 1).astype(np.float32)
+    diffuse, specular = _split_albedos(colour, share, dielectric)
+    specular = np.clip(specular, 0, 1)
     if is_constant(diffuse):
         return tuple(Texture(texels=each, source=source) for each in (diffuse, specular))  # type: ignore[return-value]
     return colour_textures(diffuse, specular, source)
+
+
+def _split_albedos(
+    base: NDArray[np.float32], metal: NDArray[np.float32], dielectric: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return what a surface that is metal by a share reflects diffusely, and head-on."""
+    specular = dielectric * (1 - metal) + base * metal
+    return (base * (1 - metal)).astype(np.float32), specular.astype(np.float32)
 
 
 def _one_texel(texture: Texture) -> bool:

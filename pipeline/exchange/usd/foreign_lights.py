@@ -1,78 +1,121 @@
-"""Lights of USD as emissive triangles: rectangles, disks, spheres, and meshes that are lights.
+"""Lights of USD as emissive triangles: rectangles, disks, spheres, cylinders, and meshes.
 
-Radiance is intensity x 2^exposure x colour, divided by the area in world units where the light is
-normalised. Polygons stand for round lights and have exactly their area. Ours emit to both sides;
-rectangles and disks of USD do so to one, which is said.
+Radiance is intensity x 2^exposure x color, divided by the area where the light is normalized: in
+the units of the stage, as UsdLux has it, also where those are no metres. Polygons stand for round
+lights and have exactly their area. Ours emit to both sides; rectangles and disks of USD do so to
+one, which is said.
 """
 
 import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.placed import Placed
 
 _DISK_CORNERS = 24
 
+_NEUTRAL: Mapping[str, Any] = {
+    "inputs:diffuse": 1.0,
+    "inputs:specular": 1.0,
+    "inputs:shaping:cone:angle": 90.0,
+    "inputs:shaping:focus": 0.0,
+    "inputs:shadow:enable": True,
+    "inputs:shadow:color": (0.0, 0.0, 0.0),
+    "inputs:shadow:distance": -1.0,
+    "inputs:shadow:falloff": -1.0,
+}
+"""Inputs that have no place here, with the value at which they do nothing."""
+
 
 def light_triangles(placed: Placed, time: Any, lost: list[str]) -> NDArray[np.float32] | None:
     """Return the triangles [T, 3, 3] of a light in our world; None where it has no area."""
-    from pxr import UsdLux
-
     prim = placed.prim
     kind = str(prim.GetTypeName())
-    if kind == "RectLight":
-        light = UsdLux.RectLight(prim)
-        size = np.array([light.GetWidthAttr().Get(time), light.GetHeightAttr().Get(time), 1.0])
-        local = _square() * size
-    elif kind == "DiskLight":
-        local = _disk() * float(UsdLux.DiskLight(prim).GetRadiusAttr().Get(time))
-    else:
-        local = _sphere() * float(UsdLux.SphereLight(prim).GetRadiusAttr().Get(time))
-    world = np.einsum("ij,tcj->tci", placed.to_world[:3, :3], local) + placed.to_world[:3, 3]
+
+    def size(name: str) -> float:
+        return float(prim.GetAttribute(f"inputs:{name}").Get(time))
+
+    shapes: Mapping[str, Callable[[], NDArray[np.float64]]] = {
+        "RectLight": lambda: _square() * np.array([size("width"), size("height"), 1.0]),
+        "DiskLight": lambda: _disk() * size("radius"),
+        "SphereLight": lambda: _sphere() * size("radius"),
+        "CylinderLight": lambda: _build_tube() * [size("length"), size("radius"), size("radius")],
+    }
+    world = np.einsum("ij,tcj->tci", placed.to_world[:3, :3], shapes[kind]())
+    world = world + placed.to_world[:3, 3]
     area = _area(world)
     if not area > 0 or not np.isfinite(area):
         lost.append(f"{prim.GetPath()}: a light without an area")
         return None
-    if kind != "SphereLight":
+    if kind in ("RectLight", "DiskLight"):
         lost.append(f"{prim.GetPath()}: emits to one side there, and to both sides here")
-    _note_losses(prim, time, lost)
     return world.astype(np.float32)
 
 
-def radiance(prim: Any, triangles: NDArray[np.float32], time: Any) -> NDArray[np.float32]:
+def radiance(
+    placed: Placed, triangles: NDArray[np.float32], time: Any, lost: list[str]
+) -> NDArray[np.float32]:
     """Return the radiance [3] that the light API of a prim states.
 
     Args:
-        prim: a light, or a mesh that is one.
-        triangles: [T, 3, 3] in world units, for the area.
+        placed: a light, or a mesh that is one.
+        triangles: [T, 3, 3] in metres, for the area.
         time: of the values.
+        lost: receives what cannot be carried over.
     """
+    found = read_light_color(placed.prim, time, lost)
+    if placed.prim.GetAttribute("inputs:normalize").Get(time):
+        area = _area(triangles.astype(np.float64)) / placed.metres**2
+        found = found / max(area, 1e-30)
+    found = np.maximum(found, 0)
+    return np.where(np.isfinite(found), found, 0).astype(np.float32)
+
+
+def read_light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float64]:
+    """Return intensity x 2^exposure x color [3] of any light, tinted by its temperature."""
     from pxr import UsdLux
 
     light = UsdLux.LightAPI(prim)
     strength = light.GetIntensityAttr().Get(time) * 2.0 ** light.GetExposureAttr().Get(time)
-    colour = np.array(light.GetColorAttr().Get(time), np.float64)
+    color = convert_to_rec709(light.GetColorAttr(), np.array(light.GetColorAttr().Get(time), float))
     kelvin = light.GetColorTemperatureAttr()
     # Blender switches it on for every light and states none; the default of USD would tint by 4 %
     if light.GetEnableColorTemperatureAttr().Get(time) and kelvin.HasAuthoredValue():
-        colour = colour * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin.Get(time)))
-    if light.GetNormalizeAttr().Get(time):
-        strength = strength / max(_area(triangles.astype(np.float64)), 1e-30)
-    found = np.maximum(strength * colour, 0)
-    return np.where(np.isfinite(found), found, 0).astype(np.float32)
+        color = color * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin.Get(time)))
+    _note_losses(prim, time, lost)
+    return np.asarray(strength * color)
 
 
 def _note_losses(prim: Any, time: Any, lost: list[str]) -> None:
-    for name, neutral in (("inputs:shaping:cone:angle", 90.0), ("inputs:shaping:focus", 0.0)):
+    where = prim.GetPath()
+    for name, neutral in _NEUTRAL.items():
         attribute = prim.GetAttribute(name)
-        if attribute and attribute.HasAuthoredValue() and attribute.Get(time) != neutral:
-            lost.append(f"{prim.GetPath()}.{name}: the light shines in every direction here")
+        value = attribute.Get(time) if attribute and attribute.HasAuthoredValue() else None
+        if value is not None and value != neutral:
+            lost.append(f"{where}.{name}: has no place here")
     for name in ("inputs:texture:file", "inputs:shaping:ies:file"):
         attribute = prim.GetAttribute(name)
-        if attribute and attribute.Get(time) and attribute.Get(time).path:
-            lost.append(f"{prim.GetPath()}.{name}: has no place here")
+        is_map = "Dome" in str(prim.GetTypeName()) and name == "inputs:texture:file"
+        if not is_map and attribute and attribute.Get(time) and attribute.Get(time).path:
+            lost.append(f"{where}.{name}: has no place here")
+    lost += [
+        f"{where}.{name}: USD has read inputs:{name} alone since 21.02"
+        for name in ("intensity", "exposure", "color", "normalize", "radius", "width", "height")
+        if prim.HasAttribute(name) and prim.GetAttribute(name).HasAuthoredValue()
+    ]
+    for relation in prim.GetRelationships():
+        is_link = relation.GetName().startswith(("light:filters", "portals", "collection:"))
+        if is_link and relation.HasAuthoredTargets():
+            lost.append(f"{where}.{relation.GetName()}: has no place here")
+    lost += [
+        f"{where}.{attribute.GetName()}: a network that is not read"
+        for attribute in prim.GetAttributes()
+        if attribute.HasAuthoredConnections()
+    ]
 
 
 def _area(triangles: NDArray[np.float64]) -> float:
@@ -92,6 +135,17 @@ def _disk() -> NDArray[np.float64]:
     rim = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
     fan = np.stack([np.zeros_like(rim), rim, np.roll(rim, -1, axis=0)], axis=1)
     return fan * math.sqrt(math.pi / _area(fan))
+
+
+def _build_tube() -> NDArray[np.float64]:
+    """Return a tube of length 1 along X, of the area of a cylinder of radius 1 without its ends."""
+    turn = 2 * math.pi * np.arange(_DISK_CORNERS) / _DISK_CORNERS
+    low = np.stack([np.full_like(turn, -0.5), np.cos(turn), np.sin(turn)], axis=1)
+    low[:, 1:] *= math.pi / _DISK_CORNERS / math.sin(math.pi / _DISK_CORNERS)
+    along = np.array([1.0, 0.0, 0.0])
+    high, ahead = low + along, np.roll(low, -1, axis=0)
+    sides = [(low, ahead, high), (high, ahead, ahead + along)]
+    return np.concatenate([np.stack(side, axis=1) for side in sides])
 
 
 def _sphere() -> NDArray[np.float64]:

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.dressed import PLAIN, Worn
-from pipeline.exchange.usd.foreign_inputs import ShaderInputs, worn_textures
-from pipeline.exchange.usd.foreign_meshes import MeshToShade
+from pipeline.exchange.usd.foreign_inputs import ShaderInputs, compute_varied, worn_textures
+from pipeline.exchange.usd.foreign_meshes import TriangleSoup
 from pipeline.exchange.usd.foreign_skins import CHANNELS, skinned
 from pipeline.exchange.usd.names import added_column
-from pipeline.foreign.usd.polygons import primvar_corners
-from pipeline.foreign.usd.shaders import surface_shader, without_place
+from pipeline.foreign.usd.shaders import read_bindings, read_colors, read_material
 from pipeline.foreign.usd.stage import OpenedUsd
 from storage.records.material import (
     DIFFUSE,
@@ -29,9 +28,14 @@ from storage.records.material import (
     default_rows,
     laid_out,
 )
-from storage.records.texture import MapSource
+from storage.records.texture import TEXTURED, MapSource
 
 _DEFAULT_DIFFUSE = (0.18, 0.18, 0.18)
+_COLUMNS = {
+    "diffuse": DIFFUSE,
+    "specular": SPECULAR,
+    "roughness": slice(ROUGHNESS, ROUGHNESS + 1),
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,7 +52,7 @@ class Dressing:
     """Textures by material."""
 
 
-def dressing(surface: MeshToShade, time: Any, opened: OpenedUsd, licence: str) -> Dressing:
+def dressing(surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str) -> Dressing:
     """Return materials and textures of the triangles of a mesh.
 
     Args:
@@ -60,24 +64,14 @@ def dressing(surface: MeshToShade, time: Any, opened: OpenedUsd, licence: str) -
     Raises:
         TrilightError: a texture is outside of the folder, on the network, or too large.
     """
-    from pxr import UsdShade
-
-    binding = UsdShade.MaterialBindingAPI(surface.prim)
-    polygons = surface.soup.polygons
-    whole = _shaded(binding.ComputeBoundMaterial()[0], surface, time, opened, licence)
-    rows, uv, wardrobe = whole.rows, whole.uv, [whole.worn]
-    worn = np.zeros(len(polygons), np.int64)
-    for subset in binding.GetMaterialBindSubsets():
-        chosen = np.isin(polygons, np.array(subset.GetIndicesAttr().Get(time) or []))
-        bound = UsdShade.MaterialBindingAPI(subset.GetPrim()).ComputeBoundMaterial()[0]
-        if bound:
-            part = _shaded(bound, surface, time, opened, licence)
-            rows[chosen], uv[chosen], worn[chosen] = (
-                part.rows[chosen],
-                part.uv[chosen],
-                len(wardrobe),
-            )
-            wardrobe.append(part.worn)
+    count = len(surface.positions)
+    rows, uv = default_rows(count), np.zeros((count, 3, 2), np.float32)
+    wardrobe, worn = list[Worn](), np.zeros(count, np.int64)
+    for bound, polygons in read_bindings(surface.prim, time):
+        chosen = np.isin(surface.cut.polygons, polygons) if polygons is not None else slice(None)
+        part = _shaded(bound, surface, time, opened, licence)
+        rows[chosen], uv[chosen], worn[chosen] = part.rows[chosen], part.uv[chosen], len(wardrobe)
+        wardrobe.append(part.worn)
     _limit(rows, worn, wardrobe, surface, opened.lost)
     return Dressing(rows=rows, uv=uv, worn=worn, wardrobe=tuple(wardrobe))
 
@@ -86,7 +80,7 @@ def _limit(
     rows: NDArray[np.float32],
     worn: NDArray[np.int64],
     wardrobe: Sequence[Worn],
-    surface: MeshToShade,
+    surface: TriangleSoup,
     lost: list[str],
 ) -> None:
     """Lower diffuse albedos that, with the specular ones, would reflect more than they get."""
@@ -111,33 +105,38 @@ class _Shaded:
 
 
 def _shaded(
-    material: Any, surface: MeshToShade, time: Any, opened: OpenedUsd, licence: str
+    material: Any, surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
 ) -> _Shaded:
     """Return a material over the whole mesh; its display colour without one."""
-    shader = surface_shader(material) if material else None
-    if material and shader is None:
+    stated = read_material(material, time, opened) if material else None
+    if material and stated is None:
         opened.lost.append(
             f"{material.GetPath()}: no shader that is understood; display colour taken"
         )
-    count = len(surface.soup.polygons)
+    count = len(surface.positions)
     rows, nowhere = default_rows(count), np.zeros((count, 3, 2), np.float32)
-    if shader is None:
+    if stated is None:
         rows[:, DIFFUSE] = _display_colour(surface, time)
         rows[:, SPECULAR], rows[:, ROUGHNESS] = 0.04, 0.5
         return _Shaded(rows=rows, uv=nowhere, worn=PLAIN)
-    inputs = ShaderInputs(shader, time, opened)
-    source = MapSource(name=str(material.GetPrim().GetName()), licence=licence)
+    inputs = ShaderInputs(stated, surface, time, opened)
+    source = MapSource(name=stated.name, licence=licence)
     skin = skinned(inputs.textures(CHANNELS), surface, time, source, opened.lost)
     worn = worn_textures(inputs, skin.textures, source, f"{surface.prim.GetPath()}", opened.lost)
     for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), worn, strict=True):
         rows[:, part] = texture.mean if part != ROUGHNESS else texture.mean[0]
-    rows[:, EMISSION] = inputs.emission(surface)
-    for name in without_place(shader, time):
-        opened.lost.append(f"{shader.GetPath()}.{name}: has no place here")
+    rows[:, EMISSION] = inputs.emission()
+    kept = {
+        name: texture if texture.constant is None else None
+        for name, texture in zip(TEXTURED, worn, strict=True)
+    }
+    for name, column in compute_varied(inputs, skin.textures).items():
+        rows[:, _COLUMNS[name]], kept[name] = column, None
     _take_added_columns(rows, material, time, opened.lost)
-    kept = [texture if texture.constant is None else None for texture in worn]
     return _Shaded(
-        rows=rows, uv=nowhere if skin.uv is None else skin.uv, worn=(kept[0], kept[1], kept[2])
+        rows=rows,
+        uv=nowhere if skin.uv is None else skin.uv,
+        worn=(kept["diffuse"], kept["specular"], kept["roughness"]),
     )
 
 
@@ -172,12 +171,9 @@ def _numbers(value: Any) -> NDArray[np.float64]:
         return np.zeros(0)
 
 
-def _display_colour(surface: MeshToShade, time: Any) -> NDArray[np.float32]:
-    rows = np.full((len(surface.soup.polygons), 3), _DEFAULT_DIFFUSE, np.float32)
-    soup = surface.soup
-    found = primvar_corners(
-        surface.prim, "displayColor", surface.indices, soup.corners, soup.polygons, time
-    )
-    if found is not None and found.ndim == 3 and found.shape[2] == 3:
-        rows = np.clip(found.mean(axis=1), 0, 0.96).astype(np.float32)
+def _display_colour(surface: TriangleSoup, time: Any) -> NDArray[np.float32]:
+    rows = np.full((len(surface.positions), 3), _DEFAULT_DIFFUSE, np.float32)
+    colors = read_colors(surface.cut, "displayColor", time)
+    if colors is not None:
+        rows = np.clip(colors.mean(axis=1), 0, 0.96).astype(np.float32)
     return rows

@@ -7,7 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.usd.placed import Placed
-from pipeline.foreign.usd.polygons import as_array, mesh_polygons, mesh_triangles, moved, per_corner
+from pipeline.foreign.usd.polygons import (
+    CutMesh,
+    MeshPolygons,
+    as_array,
+    cut_mesh,
+    mesh_polygons,
+    moved,
+)
+from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 from pipeline.scenes.shading import smooth_shaded
 
 SMOOTH_ANGLE_DEG = 30.0
@@ -22,18 +30,21 @@ class TriangleSoup:
 
     positions: NDArray[np.float32]  # [T, 3, 3] world
     normals: NDArray[np.float32]  # [T, 3, 3] unit
-    corners: NDArray[np.int64]
-    """[T, 3] which corner of the mesh each was: where values per corner are found."""
-    polygons: NDArray[np.int64]  # [T] which polygon of the mesh
+    cut: CutMesh  # which corners of the mesh they were: where what lies at them is found
 
+    @property
+    def prim(self) -> Any:
+        """The mesh."""
+        return self.cut.prim
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MeshToShade:
-    """A mesh whose triangles get materials."""
-
-    prim: Any  # the mesh
-    soup: TriangleSoup  # its triangles
-    indices: NDArray[np.int64]  # point of each of its corners
+    def read_coordinates(self, chart: UvChart, time: Any) -> NDArray[np.float64] | None:
+        """Return texture coordinates [T, 3, 2]; None where not every corner has some."""
+        uv = chart_corners(chart, self.cut, time)
+        if uv is None or not np.isfinite(uv).all():
+            return None
+        for move in chart.moves:
+            uv = np.einsum("ij,tcj->tci", move.turn, uv) + move.translation
+        return uv
 
 
 def read_mesh(placed: Placed, time: Any, lost: list[str]) -> TriangleSoup:
@@ -42,64 +53,64 @@ def read_mesh(placed: Placed, time: Any, lost: list[str]) -> TriangleSoup:
     Raises:
         TrilightError: its arrays contradict each other, or are not finite.
     """
-    from pxr import UsdGeom
-
-    prim = placed.prim
-    mesh, found = UsdGeom.Mesh(prim), mesh_polygons(prim, time)
-    corners, polygons = mesh_triangles(prim, found, placed.to_world, time)
-    indices = found.indices
-    positions = moved(found.points, placed.to_world)[indices[corners]].astype(np.float32)
+    found = mesh_polygons(placed, time)
+    cut = cut_mesh(found)
+    rows = cut.indices[cut.corners]
+    positions = moved(found.points, placed.to_world)[rows].astype(np.float32)
     cross = _cross(positions)
     solid = np.sqrt(np.square(cross).sum(axis=1)) > _SMALLEST_DOUBLE_AREA
     if not solid.all():
-        lost.append(f"{prim.GetPath()}: {int((~solid).sum())} triangles without an area")
-    corners, polygons, positions = corners[solid], polygons[solid], positions[solid]
-    normals = _normals(placed, mesh, time, indices, corners, polygons, positions, lost)
-    return TriangleSoup(positions=positions, normals=normals, corners=corners, polygons=polygons)
+        lost.append(f"{cut.prim.GetPath()}: {int((~solid).sum())} triangles without an area")
+    cut, positions = cut.select(solid), positions[solid]
+    normals = _normals(found, cut, time, positions, lost)
+    return TriangleSoup(positions=positions, normals=normals, cut=cut)
 
 
 def _normals(
-    placed: Placed,
-    mesh: Any,
+    found: MeshPolygons,
+    cut: CutMesh,
     time: Any,
-    indices: NDArray[np.int64],
-    corners: NDArray[np.int64],
-    polygons: NDArray[np.int64],
     positions: NDArray[np.float32],
     lost: list[str],
 ) -> NDArray[np.float32]:
+    placed, where = found.placed, cut.prim.GetPath()
     cross = _cross(positions)
     flat = cross / np.linalg.norm(cross, axis=1, keepdims=True)
-    stated = _stated_normals(mesh, time)
+    stated = None if placed.skin is not None else _stated_normals(cut.prim, time)
     if stated is None:
-        if mesh.GetSubdivisionSchemeAttr().Get() == "none" or not len(positions):
+        if not (found.is_smooth or placed.skin is not None) or not len(positions):
             return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
-        lost.append(f"{placed.prim.GetPath()}: subdivision; its cage was read, with smooth normals")
-        return _smooth(positions, indices, corners)
-    found = per_corner(*stated, indices, corners, polygons)
-    if found is None:
-        lost.append(f"{placed.prim.GetPath()}: normals whose number does not fit")
+        if placed.skin is not None:
+            lost.append(f"{where}: posed by bones; its normals are those of its faces")
+        elif cut.prim.GetTypeName() == "Mesh":
+            lost.append(f"{where}: subdivision; its cage was read, with smooth normals")
+        return _smooth(positions, cut)
+    normals = cut.per_corner(*stated)
+    if normals is None:
+        lost.append(f"{where}: normals whose number does not fit")
         return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
     turn = np.linalg.inv(placed.to_world[:3, :3]).T
-    turned = np.einsum("ij,tcj->tci", turn, found)
+    turned = np.einsum("ij,tcj->tci", turn, normals)
     length = np.linalg.norm(turned, axis=2, keepdims=True)
     usable = np.isfinite(length) & (length > 0)
     unit = np.where(usable, turned / np.where(usable, length, 1), flat[:, None])
     return np.asarray(unit, np.float32)
 
 
-def _smooth(
-    positions: NDArray[np.float32], indices: NDArray[np.int64], corners: NDArray[np.int64]
-) -> NDArray[np.float32]:
-    _, first, inverse = np.unique(indices[corners], return_index=True, return_inverse=True)
+def _smooth(positions: NDArray[np.float32], cut: CutMesh) -> NDArray[np.float32]:
+    points = cut.indices[cut.corners]
+    _, first, inverse = np.unique(points, return_index=True, return_inverse=True)
     faces = inverse.reshape(-1, 3).astype(np.uint32)
     shaded = smooth_shaded(positions.reshape(-1, 3)[first], faces, SMOOTH_ANGLE_DEG)
     return shaded.normals[shaded.faces]
 
 
-def _stated_normals(mesh: Any, time: Any) -> tuple[NDArray[np.float64], str] | None:
+def _stated_normals(prim: Any, time: Any) -> tuple[NDArray[np.float64], str] | None:
     from pxr import UsdGeom
 
+    mesh = UsdGeom.Mesh(prim)
+    if not mesh:
+        return None
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
     if primvar and primvar.HasValue():
         values, interpolation = primvar.ComputeFlattened(time), str(primvar.GetInterpolation())

@@ -19,9 +19,10 @@ from pipeline.exchange.usd.dome import foreign_dome
 from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all, cameras
 from pipeline.exchange.usd.foreign_lights import light_triangles, radiance
 from pipeline.exchange.usd.foreign_materials import dressing
-from pipeline.exchange.usd.foreign_meshes import MeshToShade, TriangleSoup, read_mesh
+from pipeline.exchange.usd.foreign_meshes import TriangleSoup, read_mesh
 from pipeline.exchange.usd.names import OBJECT_TEXTS
-from pipeline.foreign.usd.placed import Placed, placed_prims
+from pipeline.foreign.usd.placed import DOMES, Placed, placed_prims
+from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.scenes.shading import flat_shaded
 from storage.errors import TrilightError
@@ -46,7 +47,7 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
     names: set[str] = set()
     triangles = 0
     for each in placed:
-        if each.prim.GetTypeName() in ("Camera", "DomeLight"):
+        if each.prim.GetTypeName() in ("Camera", *DOMES):
             continue
         found = _pieces(each, time, opened, licence, names)
         triangles += sum(len(one.piece.mesh.faces) for one in found)
@@ -58,9 +59,10 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
     sky = _environment(placed, time, opened, licence)
     is_lit = sky is not None and sky.radiance_rgb.any()
     if not is_lit and not any(one.piece.entry.kind == "emitter" for one in pieces):
+        unread = "; ".join(note for note in opened.lost if "Light" in note) or "there is none"
         raise TrilightError(
-            "no light that can be carried over; expected an emissive material, or a rectangle, "
-            "disk, sphere, mesh or dome light."
+            f"no light that can be carried over ({unread:.200}); expected an emissive material, or "
+            "a rectangle, disk, sphere, cylinder, mesh or dome light."
         )
     materials = sum(len(one.piece.materials) for one in pieces)
     if materials > MAX_ROWS:
@@ -96,7 +98,7 @@ def _environment(
     placed: Sequence[Placed], time: Any, opened: OpenedUsd, licence: str
 ) -> Environment | None:
     """Return that of the first dome that can be read; others are noted."""
-    domes = [each for each in placed if each.prim.GetTypeName() == "DomeLight"]
+    domes = [each for each in placed if each.prim.GetTypeName() in DOMES]
     sky = None
     for each in domes:
         if sky is not None:
@@ -110,23 +112,24 @@ def _pieces(
     each: Placed, time: Any, opened: OpenedUsd, licence: str, names: set[str]
 ) -> list[DressedPiece]:
     prim = each.prim
-    if prim.GetTypeName() != "Mesh":
+    if prim.GetTypeName() not in ("Mesh", *SOLIDS):
         triangles = light_triangles(each, time, opened.lost)
         if triangles is None:
             return []
-        return _split(each, _of_light(prim, triangles, time), licence, names)
+        light = radiance(each, triangles, time, opened.lost)
+        return _split(each, _of_light(triangles, light), licence, names)
     soup = read_mesh(each, time, opened.lost)
     if not len(soup.positions):
         opened.lost.append(f"{prim.GetPath()}: no triangle with an area")
         return []
-    return _split(each, _of_mesh(prim, soup, time, opened, licence), licence, names)
+    return _split(each, _of_mesh(each, soup, time, opened, licence), licence, names)
 
 
-def _of_light(prim: Any, triangles: NDArray[np.float32], time: Any) -> DressedTriangles:
+def _of_light(triangles: NDArray[np.float32], light: NDArray[np.float32]) -> DressedTriangles:
     count = len(triangles)
     rows = default_rows(count)
     rows[:, ROUGHNESS] = 1
-    rows[:, EMISSION] = radiance(prim, triangles, time)
+    rows[:, EMISSION] = light
     corners = triangles.reshape(-1, 3)
     flat = flat_shaded(corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3))
     return DressedTriangles(
@@ -140,16 +143,13 @@ def _of_light(prim: Any, triangles: NDArray[np.float32], time: Any) -> DressedTr
 
 
 def _of_mesh(
-    prim: Any, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
+    placed: Placed, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
 ) -> DressedTriangles:
-    from pxr import UsdGeom
-
-    indices = np.array(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr().Get(time), np.int64)
-    surface = MeshToShade(prim=prim, soup=soup, indices=indices)
-    found = dressing(surface, time, opened, licence)
+    prim = placed.prim
+    found = dressing(soup, time, opened, licence)
     rows = found.rows
     if prim.HasAPI("MeshLightAPI"):
-        light = radiance(prim, soup.positions, time)
+        light = radiance(placed, soup.positions, time, opened.lost)
         mode = prim.GetAttribute("light:materialSyncMode").Get(time)
         glows = rows[:, EMISSION].any()
         tints = mode == "materialGlowTintsLight" and glows

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.usd.foreign_coordinates import coordinates
-from pipeline.exchange.usd.foreign_meshes import MeshToShade
+from pipeline.exchange.usd.foreign_meshes import TriangleSoup
 from pipeline.exchange.usd.foreign_textures import ForeignTexture
 from pipeline.exchange.wrapping import repeated_near_zero, tiled, tiles_of
 from storage.records.texture import MapSource, Texture
@@ -33,7 +32,7 @@ class Skinned:
 
 def skinned(
     found: Mapping[str, ForeignTexture],
-    surface: MeshToShade,
+    surface: TriangleSoup,
     time: Any,
     source: MapSource,
     lost: list[str],
@@ -53,7 +52,7 @@ def skinned(
     if not names:
         return Skinned(textures={}, uv=None)
     chart = found[names[0]].chart
-    uv = coordinates(chart, surface, time)
+    uv = surface.read_coordinates(chart, time)
     if uv is None:
         lost.append(f"{where}: no coordinates {chart.primvar!r:.60}; means of textures taken")
         return Skinned(textures=_means(plain), uv=None)

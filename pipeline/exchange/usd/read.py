@@ -18,8 +18,6 @@ from storage.records.scene import Scene
 
 MAX_FRAMES = 10_000
 """Maximum number of scenes in a stage with time samples."""
-MAX_NOTES = 40
-"""Maximum number of notes on one scene; further notes are only counted."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,7 +78,7 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Usd
     except TrilightError as error:
         text = str(error).removeprefix(f"{path.name}: ")
         raise TrilightError(f"{path.name}: {text}") from error
-    return UsdScene(key=chosen, scene=scene, lost=_limited(opened.lost), exact=False)
+    return UsdScene(key=chosen, scene=scene, lost=opened.notes, exact=False)
 
 
 def _of_shard(opened: OpenedUsd, keys: list[str], key: str) -> UsdScene:
@@ -107,11 +105,11 @@ def _keys(opened: OpenedUsd) -> list[str]:
 
 def _frames(stage: Any) -> Iterator[str]:
     """Yield the time codes of a stage that moves: its frames, or else its samples."""
-    sampled = sorted({t for layer in stage.GetUsedLayers() for t in layer.ListAllTimeSamples()})
-    if len(sampled) < 2:
+    if len({t for layer in stage.GetUsedLayers() for t in layer.ListAllTimeSamples()}) < 2:
         return
-    times = np.array(sampled)
-    if stage.HasAuthoredTimeCodeRange():
+    if not stage.HasAuthoredTimeCodeRange():
+        times = np.unique([code for prim in _list_prims(stage) for code in _list_samples(prim)])
+    else:
         first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
         if not last - first < MAX_FRAMES:  # not a number neither
             raise TrilightError(
@@ -124,13 +122,20 @@ def _frames(stage: Any) -> Iterator[str]:
         yield f"{time:g}"
 
 
+def _list_prims(stage: Any) -> Iterator[Any]:
+    from pxr import Usd
+
+    for root in (stage.GetPseudoRoot(), *stage.GetPrototypes()):
+        yield from Usd.PrimRange.AllPrims(root)
+
+
+def _list_samples(prim: Any) -> Iterator[float]:
+    """Yield the time codes of a prim's samples: of the stage, whatever offsets its layers have."""
+    for attribute in prim.GetAuthoredAttributes():
+        yield from attribute.GetTimeSamples()
+
+
 def _time(code: str) -> Any:
     from pxr import Usd
 
     return Usd.TimeCode(float(code)) if code else Usd.TimeCode.EarliestTime()
-
-
-def _limited(lost: list[str]) -> tuple[str, ...]:
-    distinct = list(dict.fromkeys(lost))
-    more = len(distinct) - MAX_NOTES
-    return tuple(distinct if more <= 0 else [*distinct[:MAX_NOTES], f"and {more} more"])

@@ -1,5 +1,6 @@
 """What the materials of a USD stage state, by mesh and polygon, with the bytes of pictures."""
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,15 +11,11 @@ from numpy.typing import NDArray
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.usd.object_stage import UsdStage
 from pipeline.foreign.usd.placed import Placed
-from pipeline.foreign.usd.polygons import as_array
-from pipeline.foreign.usd.shaders import StatedInputs, surface_shader, without_place
+from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
 from pipeline.foreign.usd.stage import OutsideFile
 from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes
 from storage.errors import Rejected, TrilightError
 
-COLOURS = ("diffuseColor", "specularColor", "emissiveColor")
-NUMBERS = ("metallic", "roughness", "ior", "strength", "useSpecularWorkflow")
-_TEXTURED = (*COLOURS, "metallic", "roughness")
 _LOST = {
     "opacity": "transparency",
     "transmission": "transmission",
@@ -29,20 +26,6 @@ _LOST = {
     "normal": "normal map",
 }
 """Words for inputs without a place here, by how those begin."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StatedMaterial:
-    """One material before its pictures are decoded."""
-
-    constants: dict[str, NDArray[np.float32]]
-    """[3] by names of UsdPreviewSurface."""
-    textures: dict[str, TextureNode]
-    """Likewise; they stand before constants."""
-    has_strength: bool
-    """Whether emission is times `strength`."""
-    lost: tuple[str, ...]
-    """What else it states."""
 
 
 Binding = tuple[int, NDArray[np.int64] | None]
@@ -92,15 +75,8 @@ class _Reader:
         self.found: list[StatedMaterial] = []
 
     def bindings(self, placed: Placed) -> Iterator[Binding]:
-        from pxr import UsdShade
-
-        binding = UsdShade.MaterialBindingAPI(placed.prim)
-        yield self._row(binding.ComputeBoundMaterial()[0]), None
-        for subset in binding.GetMaterialBindSubsets():
-            bound = UsdShade.MaterialBindingAPI(subset.GetPrim()).ComputeBoundMaterial()[0]
-            if bound:
-                chosen = subset.GetIndicesAttr().Get(self._stage.time)
-                yield self._row(bound), as_array(chosen, np.int64, (-1,))
+        for material, polygons in read_bindings(placed.prim, self._stage.time):
+            yield self._row(material), polygons
 
     def _row(self, material: Any) -> int:
         if not material:
@@ -112,27 +88,23 @@ class _Reader:
         return self._rows[name]
 
     def _stated(self, material: Any) -> StatedMaterial:
-        opened, time = self._stage.opened, self._stage.time
-        shader = surface_shader(material)
-        if shader is None:
+        lost = self._stage.opened.lost
+        stated = read_material(material, self._stage.time, self._stage.opened)
+        if stated is None:
             name = str(material.GetPath())
             raise TrilightError(f"{name!r:.100} has no shader that is understood")
-        inputs, notes = StatedInputs(shader, time, opened), len(opened.lost)
-        textures = {name: inputs.texture(name) for name in _TEXTURED}
-        constants = {name: inputs.constant(name) for name in (*COLOURS, *NUMBERS)}
-        lost = {_word(name) for name in without_place(shader, time)}
-        if len(opened.lost) > notes:
-            lost.add("networks of shaders")
-        return StatedMaterial(
-            constants=constants,
-            textures={name: node for name, node in textures.items() if node is not None},
-            has_strength=inputs.has("strength"),
-            lost=tuple(sorted(lost)),
-        )
+        textures = dict(stated.textures)
+        if textures.pop("ior", None):
+            lost.append(f"{stated.where}.ior: its texture is not read; 1.5 taken")
+        return dataclasses.replace(stated, textures=textures)
 
 
-def _word(name: str) -> str:
-    return next(word for start, word in _LOST.items() if name.startswith(start))
+def name_losses(stated: StatedMaterial) -> tuple[str, ...]:
+    """Return the words for what a material states and has no place for."""
+    words = {
+        word for name in stated.lost for start, word in _LOST.items() if name.startswith(start)
+    }
+    return tuple(sorted(words | {"networks of shaders"} if stated.has_networks else words))
 
 
 def _pictures(nodes: Sequence[TextureNode], left: int) -> MaterialFiles:
@@ -149,6 +121,9 @@ def _pictures(nodes: Sequence[TextureNode], left: int) -> MaterialFiles:
         if found is None:
             why = f"{node.named!r:.80} is not beside the object"
             refused[place] = Rejected("texture_missing", why)
+            if "<UDIM>" in node.named:
+                why = f"{node.named!r:.80} has UDIM tiles, which are not read"
+                refused[place] = Rejected("texture_unreadable", why)
         else:
             data[place], left = found, left - len(found)
     return MaterialFiles(data=data, refused=refused)

@@ -5,7 +5,7 @@ states, and what the picture says of itself counts nothing.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,17 @@ from pipeline.foreign.material import MOST_UV_SETS, RGB, WHITE, Slot, SourceMate
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.parts import TexturedParts
 from pipeline.foreign.picture import Picture, has_colours
-from pipeline.foreign.usd.object_looks import Binding, StatedMaterial
+from pipeline.foreign.usd.object_looks import Binding, name_losses
 from pipeline.foreign.usd.object_meshes import PlacedPart
 from pipeline.foreign.usd.object_source import UsdSource
+from pipeline.foreign.usd.shaders import StatedMaterial, read_colors, reflect_head_on
 from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart
 from storage.errors import Rejected
 
 _CHANNELS = {"rgb": 0, "r": 0, "g": 1, "b": 2, "a": 3}
 _STRIP = 256
+_MOST_VARIED = 256
+"""Materials that the primvars of one make; of more values the mean is taken."""
 _UNBOUND = 0.18
 """What USD shows of a mesh without a material and a display colour."""
 
@@ -40,17 +43,17 @@ def usd_parts(source: UsdSource, decode: Decode, *, emission: bool = False) -> T
     primvars = list(dict.fromkeys(node.chart.primvar for node in nodes))
     if len(primvars) > MOST_UV_SETS:
         raise Rejected("no_texture_coordinates", f"textures lie on {len(primvars)} sets of them")
-    reader = _Reader(looks.pictures, primvars, decode)
+    reader = _Reader(looks.pictures, primvars, decode, emission=emission)
     materials = [reader.material(stated) for stated in looks.materials]
-    if emission:
-        pairs = zip(materials, looks.materials, strict=True)
-        materials = [reader.emitting(found, stated) for found, stated in pairs]
     plain = len(materials)
+    materials.append(SourceMaterial(roughness=0.5))
+    varied = _Varied(looks.materials, materials, time, emission=emission)
     rows, colours, coordinates = [], [], []
     for part in source.parts:
         mine = _rows(looks.bindings[part.number], part, plain)
-        rows.append(mine)
         colours.append(_colours(part, mine == plain, time))
+        varied.dress(part, mine, colours[-1])
+        rows.append(mine)
         coordinates.append(part.coordinates(primvars or ["st"], time))
     material, colour = np.concatenate(rows), np.concatenate(colours)
     if (material == plain).all() and (colour == _UNBOUND).all():
@@ -58,16 +61,16 @@ def usd_parts(source: UsdSource, decode: Decode, *, emission: bool = False) -> T
     return TexturedParts(
         mesh=source.mesh,
         material=material,
-        materials=(*materials, SourceMaterial(roughness=0.5)),
+        materials=tuple(materials),
         uv=np.concatenate(coordinates),
         colour=None if (colour == 1).all() else colour,
     )
 
 
 def _rows(bindings: Sequence[Binding], part: PlacedPart, plain: int) -> NDArray[np.int64]:
-    found = np.full(len(part.corners), plain)
+    found = np.full(len(part.cut.corners), plain)
     for row, polygons in bindings:
-        chosen = slice(None) if polygons is None else np.isin(part.polygons, polygons)
+        chosen = slice(None) if polygons is None else np.isin(part.cut.polygons, polygons)
         found[chosen] = plain if row < 0 else row
     return found
 
@@ -76,45 +79,121 @@ def _colours(part: PlacedPart, is_plain: NDArray[np.bool_], time: object) -> NDA
     """Return what tints corners [T, 3, 3]: display colours, where there is no material."""
     found = np.ones((len(is_plain), 3, 3))
     if is_plain.any():
-        shown = part.display_colour(time)
-        found[is_plain] = _UNBOUND if shown is None else shown[is_plain]
+        shown = read_colors(part.cut, "displayColor", time)
+        found[is_plain] = _UNBOUND if shown is None else np.clip(shown[is_plain], 0, 1)
     return found
+
+
+class _Varied:
+    """Materials whose inputs are primvars: a color tints corners, and a number makes materials."""
+
+    def __init__(
+        self,
+        stated: Sequence[StatedMaterial],
+        materials: list[SourceMaterial],
+        time: object,
+        *,
+        emission: bool,
+    ) -> None:
+        self._stated, self._materials, self._time = stated, materials, time
+        self._emission = emission
+        self._known: dict[tuple[int, bytes], int] = {}
+
+    def dress(
+        self, part: PlacedPart, rows: NDArray[np.int64], colours: NDArray[np.float64]
+    ) -> None:
+        """Change the rows [T] and tints [T, 3, 3] of triangles of such materials."""
+        for row in np.unique(rows):
+            if row >= len(self._stated) or not self._stated[row].primvars:
+                continue
+            stated, mine = self._stated[row], rows == row
+            base = stated.read_values("diffuseColor", part.cut, self._time)
+            if base is not None:
+                colours[mine] = np.clip(base, 0, 1)[mine]
+            elif "diffuseColor" in stated.primvars:
+                colours[mine] = np.maximum(stated.constants["diffuseColor"], 0)
+            values = {
+                name: stated.read_values(name, part.cut, self._time) for name in stated.primvars
+            }
+            values["diffuseColor"] = None
+            glow = values.get("emissiveColor")
+            if glow is not None:
+                values["emissiveColor"] = glow * _read_strength(stated) if self._emission else None
+            means = {name: each.mean(axis=1) for name, each in values.items() if each is not None}
+            if means:
+                rows[mine] = self._made(int(row), {k: v[mine] for k, v in means.items()})
+
+    def _made(self, row: int, means: Mapping[str, NDArray[np.float64]]) -> NDArray[np.int64]:
+        """Return rows [T] of materials that have the means [T, 3] of inputs over triangles."""
+        table = np.concatenate(list(means.values()), axis=1)
+        if len(np.unique(table, axis=0)) > _MOST_VARIED:
+            table = np.broadcast_to(table.mean(axis=0), table.shape)
+        distinct, index = np.unique(table, axis=0, return_inverse=True)
+        made = []
+        for values in distinct:
+            key = (row, values.tobytes())
+            if key not in self._known:
+                self._known[key] = len(self._materials)
+                parts = dict(zip(means, np.split(values, len(means)), strict=True))
+                self._materials.append(_replace_values(self._materials[row], parts))
+            made.append(self._known[key])
+        return np.array(made, np.int64)[index.reshape(-1)]
+
+
+def _replace_values(
+    material: SourceMaterial, values: Mapping[str, NDArray[np.float64]]
+) -> SourceMaterial:
+    """Return a material with other values [3] of inputs."""
+
+    def number(name: str, old: float) -> float:
+        return float(values[name][0]) if name in values else old
+
+    specular, glow = values.get("specularColor"), values.get("emissiveColor")
+    f0 = float(reflect_head_on(values["ior"])[0]) if "ior" in values else material.f0
+    return dataclasses.replace(
+        material,
+        metallic=number("metallic", material.metallic),
+        roughness=number("roughness", material.roughness),
+        f0=f0,
+        specular_rgb=material.specular_rgb if specular is None else _drop_negative(specular),
+        emission_rgb=material.emission_rgb if glow is None else _drop_negative(glow),
+    )
 
 
 class _Reader:
     """Makes materials of one stage, each picture once."""
 
-    def __init__(self, files: MaterialFiles, primvars: Sequence[str], decode: Decode) -> None:
+    def __init__(
+        self, files: MaterialFiles, primvars: Sequence[str], decode: Decode, *, emission: bool
+    ) -> None:
         self._files, self._primvars, self._decode = files, primvars, decode
+        self._emission = emission
         self._values: dict[str, NDArray] = {}
 
     def material(self, stated: StatedMaterial) -> SourceMaterial:
         base = self._colour(stated, "diffuseColor")
-        base_rgb = WHITE if base is not None else _rgb(stated, "diffuseColor")
-        roughness = self._number(stated, "roughness")
-        common = SourceMaterial(
-            base_rgb=base_rgb,
+        is_tint = base is not None or "diffuseColor" in stated.primvars
+        roughness, lost = self._number(stated, "roughness"), name_losses(stated)
+        glows = any(_glow(stated)) or "emissiveColor" in stated.primvars
+        material = SourceMaterial(
+            base_rgb=WHITE if is_tint else _rgb(stated, "diffuseColor"),
             base=base,
             roughness=1.0 if roughness is not None else _of(stated, "roughness"),
             roughness_map=roughness,
-            lost=("emission", *stated.lost) if any(_glow(stated)) else stated.lost,
+            lost=("emission", *lost) if glows else lost,
         )
-        if stated.constants["useSpecularWorkflow"].any():
-            return self._specular(stated, common)
-        ior, metallic = _of(stated, "ior"), self._number(stated, "metallic")
+        if self._emission and any(_glow(stated)):
+            picture = self._colour(stated, "emissiveColor")
+            material = dataclasses.replace(material, emission_rgb=_glow(stated), emission=picture)
+        if stated.is_specular:
+            return self._specular(stated, material)
+        metallic = self._number(stated, "metallic")
         return dataclasses.replace(
-            common,
+            material,
             metallic=1.0 if metallic is not None else _of(stated, "metallic"),
             metallic_map=metallic,
-            f0=((ior - 1) / (ior + 1)) ** 2 if ior > 0 else 1.0,
+            f0=float(reflect_head_on(stated.constants["ior"].astype(float))[0]),
         )
-
-    def emitting(self, found: SourceMaterial, stated: StatedMaterial) -> SourceMaterial:
-        """Return a material with what it emits."""
-        if not any(_glow(stated)):
-            return found
-        picture = self._colour(stated, "emissiveColor")
-        return dataclasses.replace(found, emission_rgb=_glow(stated), emission=picture)
 
     def _specular(self, stated: StatedMaterial, common: SourceMaterial) -> SourceMaterial:
         colour = self._colour(stated, "specularColor")
@@ -188,17 +267,25 @@ def _moves(chart: UvChart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _rgb(stated: StatedMaterial, name: str) -> RGB:
-    red, green, blue = np.maximum(stated.constants[name], 0).tolist()
+    return _drop_negative(stated.constants[name])
+
+
+def _drop_negative(values: NDArray) -> RGB:
+    red, green, blue = np.maximum(values, 0).tolist()
     return red, green, blue
 
 
 def _glow(stated: StatedMaterial) -> RGB:
     """Return what times the picture, if there is one, a material emits."""
-    strength = max(_of(stated, "strength"), 0.0) if stated.has_strength else 1.0
+    strength = _read_strength(stated)
     if "emissiveColor" in stated.textures:
         return (strength, strength, strength)
     red, green, blue = (strength * value for value in _rgb(stated, "emissiveColor"))
     return red, green, blue
+
+
+def _read_strength(stated: StatedMaterial) -> float:
+    return max(_of(stated, "strength"), 0.0) if stated.has_strength else 1.0
 
 
 def _of(stated: StatedMaterial, name: str) -> float:

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.usd.object_stage import UsdStage
-from pipeline.foreign.usd.placed import Placed
-from pipeline.foreign.usd.polygons import mesh_polygons, mesh_triangles, moved, primvar_corners
+from pipeline.foreign.usd.polygons import CutMesh, cut_mesh, mesh_polygons, moved
 from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 from storage.errors import Rejected
 
@@ -25,37 +24,19 @@ class PlacedPart:
 
     number: int
     """Which of the stage's meshes it is."""
-    placed: Placed
-    """Where it is."""
     points: NDArray[np.float64]
     """[P, 3] metres, +Z up."""
-    indices: NDArray[np.int64]
-    """Point of each corner of a polygon."""
-    corners: NDArray[np.int64]
-    """[T, 3] rows of `indices`."""
-    polygons: NDArray[np.int64]
-    """[T]"""
+    cut: CutMesh
+    """Its triangles."""
 
     def coordinates(self, primvars: Sequence[str], time: object) -> NDArray[np.float64]:
         """Return values [T, S, 3, 2] of primvars at corners; not a number where there are none."""
-        found = np.full((len(self.corners), len(primvars), 3, 2), np.nan)
+        found = np.full((len(self.cut.corners), len(primvars), 3, 2), np.nan)
         for row, name in enumerate(primvars):
-            chart = UvChart(primvar=name, moves=())
-            values = chart_corners(
-                chart, self.placed.prim, self.indices, self.corners, self.polygons, time
-            )
+            values = chart_corners(UvChart(primvar=name, moves=()), self.cut, time)
             if values is not None:
                 found[:, row] = values
         return found
-
-    def display_colour(self, time: object) -> NDArray[np.float64] | None:
-        """Return the linear display colour [T, 3, 3] of corners; None where it has none."""
-        found = primvar_corners(
-            self.placed.prim, "displayColor", self.indices, self.corners, self.polygons, time
-        )
-        if found is None or found.ndim != 3 or found.shape[2] != 3 or not np.isfinite(found).all():
-            return None
-        return np.clip(found.astype(np.float64), 0, 1)
 
 
 def placed_parts(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedPart, ...]:
@@ -67,25 +48,16 @@ def placed_parts(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedPart, ...]:
     """
     parts, left, farthest = list[PlacedPart](), limits.max_faces, 0.0
     for number, each in enumerate(stage.meshes):
-        found = mesh_polygons(each.prim, stage.time)
+        found = mesh_polygons(each, stage.time)
         left -= int(np.maximum(found.counts - 2, 0).sum())
         if left < 0:
             raise Rejected("too_many_faces", f"expected <= {limits.max_faces} faces")
-        corners, polygons = mesh_triangles(each.prim, found, each.to_world, stage.time)
-        if len(corners):
+        cut = cut_mesh(found)
+        if len(cut.corners):
             scale = np.linalg.norm(each.to_world[:3, :3], 2)
             farthest = max(farthest, float(scale * np.abs(found.points).max()))
             points = moved(found.points, each.to_world)
-            parts.append(
-                PlacedPart(
-                    number=number,
-                    placed=each,
-                    points=points,
-                    indices=found.indices,
-                    corners=corners,
-                    polygons=polygons,
-                )
-            )
+            parts.append(PlacedPart(number=number, points=points, cut=cut))
     if not parts:
         raise Rejected("no_faces", "the stage shows no mesh with triangles")
     _require_precision(parts, farthest)
@@ -95,14 +67,14 @@ def placed_parts(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedPart, ...]:
 def joined(parts: Sequence[PlacedPart]) -> TriangleMesh:
     """Return all parts as one mesh, unwelded."""
     starts = np.cumsum([0, *(len(part.points) for part in parts)])
-    faces = [p.indices[p.corners] + k for p, k in zip(parts, starts[:-1], strict=True)]
+    faces = [p.cut.indices[p.cut.corners] + k for p, k in zip(parts, starts[:-1], strict=True)]
     return TriangleMesh(
         positions=np.concatenate([part.points for part in parts]), faces=np.concatenate(faces)
     )
 
 
 def _require_precision(parts: Sequence[PlacedPart], farthest: float) -> None:
-    used = np.concatenate([part.points[part.indices[part.corners.ravel()]] for part in parts])
+    used = np.concatenate([p.points[p.cut.indices[p.cut.corners.ravel()]] for p in parts])
     extent = float(np.ptp(used, axis=0).max())
     if farthest > _MAX_OFFSET * extent > 0:
         raise Rejected(

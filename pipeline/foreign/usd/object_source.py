@@ -42,6 +42,11 @@ class UsdSource:
                 digest.update(pictures[place])
         return digest.hexdigest()
 
+    @property
+    def unread(self) -> tuple[str, ...]:
+        """What the file says and nothing reads, each once."""
+        return self.stage.opened.notes
+
     @cached_property
     def parts(self) -> tuple[PlacedPart, ...]:
         """Its meshes; raises Rejected as `placed_parts`, or load_error."""

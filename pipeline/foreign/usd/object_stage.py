@@ -2,7 +2,7 @@
 
 USD resolves what a file names by itself, so it is given a path; every file that it may open is
 checked first (pipeline.foreign.usd.stage). What would give a plausible but wrong mesh is refused: a
-missing reference, solids that are no meshes, bones.
+missing reference, surfaces that are no polygons, bones that nothing poses.
 """
 
 from collections.abc import Callable
@@ -12,11 +12,10 @@ from typing import Any, TypeVar
 
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.usd.placed import Placed, placed_prims
+from pipeline.foreign.usd.skins import UnposedMesh
+from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedUsd, OutsideFile, quietly
 from storage.errors import Rejected, TrilightError
-
-_SOLIDS = ("Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane", "NurbsPatch", "TetMesh")
-_BONES = "primvars:skel:jointIndices"
 
 Read = TypeVar("Read")
 
@@ -49,13 +48,13 @@ def refusing(path: Path, read: Callable[[], Read]) -> Read:
     """Return what `read` makes of a USD file; its errors become reasons.
 
     Raises:
-        Rejected: external_uri, load_error, or as `read`.
+        Rejected: external_uri, skinned_mesh, load_error, or as `read`.
     """
     try:
         return quietly(path, read)
     except TrilightError as error:
-        reason = "external_uri" if isinstance(error, OutsideFile) else "load_error"
-        raise Rejected(reason, f"{error!s:.300}") from error
+        reasons = {OutsideFile: "external_uri", UnposedMesh: "skinned_mesh"}
+        raise Rejected(reasons.get(type(error), "load_error"), f"{error!s:.300}") from error
 
 
 def _opened(path: Path, limits: ReadLimits) -> UsdStage:
@@ -65,13 +64,14 @@ def _opened(path: Path, limits: ReadLimits) -> UsdStage:
     stage, time = opened.compose(), Usd.TimeCode.EarliestTime()
     if opened.unresolved:
         raise Rejected("missing_file", f"{opened.unresolved[0]}; an object needs all of its parts")
-    placed = placed_prims(stage, time, opened.lost, ("Mesh", *_SOLIDS))
+    placed = placed_prims(stage, time, opened.lost, ("Mesh", *SOLIDS, "NurbsPatch"))
     if len(placed) > limits.max_instances:
         raise Rejected("too_many_instances", f"{len(placed)} meshes; <= {limits.max_instances}")
     for each in placed:
         kind, where = each.prim.GetTypeName(), str(each.prim.GetPath())
-        if kind != "Mesh":
+        if kind == "NurbsPatch":
             raise Rejected("unsupported_primitive", f"{where!r:.100} is a {kind}; make it a mesh")
-        if each.prim.GetAttribute(_BONES).HasValue():
-            raise Rejected("skinned_mesh", "bones pose a mesh; apply the skin before exporting")
+        scheme = each.prim.GetAttribute("subdivisionScheme")
+        if scheme and scheme.Get() != "none":
+            opened.lost.append(f"{where}: subdivision; its cage was read")
     return UsdStage(opened=opened, composed=stage, meshes=tuple(placed), time=time)

@@ -1,13 +1,21 @@
-"""Every mesh, light and camera of a composed stage with its place in our world, instances too."""
+"""Every mesh, light and camera of a composed stage with its place in our world, instances too.
 
+What is seen is what UsdGeom says: visibility and purposes as they are inherited, prototypes of a
+PointInstancer wherever they stand, also below an `over` or a class.
+"""
+
+import dataclasses
 from collections import Counter
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.usd.schemas import list_unread
+from pipeline.foreign.usd.skins import BoundSkin, BoundSkins
+from pipeline.foreign.usd.solids import SOLIDS
 from storage.errors import TrilightError
 
 MAX_PLACED = 100_000
@@ -15,9 +23,10 @@ MAX_PLACED = 100_000
 MAX_NESTED = 150
 """Maximum nesting of prims, through prototypes too."""
 
-SCENE_KINDS = ("Mesh", "Camera", "RectLight", "DiskLight", "SphereLight", "DomeLight")
+DOMES = ("DomeLight", "DomeLight_1")
+LAMPS = ("RectLight", "DiskLight", "SphereLight", "CylinderLight")
+SCENE_KINDS = ("Mesh", *SOLIDS, "Camera", *LAMPS, *DOMES)
 """Kinds of prims that a scene is made of."""
-_SILENT = ("Xform", "Scope", "Material", "Shader", "NodeGraph", "GeomSubset", "SkelRoot", "")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -26,6 +35,9 @@ class Placed:
 
     prim: Any  # the USD prim; several places may share one
     to_world: NDArray[np.float64]  # [4, 4], for column vectors, into metres with +Z up
+    metres: float = 1.0  # of a unit of the stage
+    skin: BoundSkin | None = None  # what poses a mesh
+    lost: list[str] = field(default_factory=list)  # receives what is not read of it
 
 
 def placed_prims(
@@ -33,93 +45,132 @@ def placed_prims(
 ) -> list[Placed]:
     """Return the prims of some kinds that are seen of a stage at a time, in its own order.
 
-    Invisible prims, guides and proxies are left out; kinds of prims that cannot be read are noted.
+    Invisible prims, guides and proxies are left out; schemas that nothing reads are noted.
 
     Raises:
         TrilightError: more than MAX_PLACED prims with all instances, prims or prototypes that are
-            nested more than MAX_NESTED deep, or a place that is not finite.
+            nested more than MAX_NESTED deep, a place that is not finite, or UnposedMesh.
     """
+    from pxr import UsdGeom
+
     found: list[Placed] = []
-    unread: Counter[str] = Counter()
-    visits = 0
-    for prim, to_world in _visited(stage.GetPseudoRoot(), _base(stage), time):
+    unread, known = Counter[str](), dict[Any, list[str]]()
+    metres, skins, visits = UsdGeom.GetStageMetersPerUnit(stage), BoundSkins(time), 0
+    if not (np.isfinite(metres) and metres > 0):
+        raise TrilightError(f"metersPerUnit is {metres:g}; expected a number above 0.")
+    for visit in _visited(stage, _base(stage, metres), time, lost):
         visits += 1
         if visits > MAX_PLACED:
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
+        prim, to_world = visit.prim, visit.to_world
         kind = str(prim.GetTypeName())
+        path = prim.GetPath()
+        if path not in known:  # instances of one prototype have one path
+            known[path] = list(list_unread(prim, time, kinds))
+        unread.update(known[path])
+        if kind == "SkelRoot":
+            skins.take(prim, visit.predicate)
         if kind in kinds:
             if not np.isfinite(to_world).all():
                 raise TrilightError(f"{prim.GetPath()}: its place is not finite.")
-            found.append(Placed(prim=prim, to_world=to_world))
-        elif kind not in _SILENT and kind != "PointInstancer":
-            unread[kind] += 1
-    lost += [f"{count} x {kind}: such prims are not read" for kind, count in sorted(unread.items())]
+            skin = skins.find(prim)
+            found.append(Placed(prim=prim, to_world=to_world, metres=metres, skin=skin, lost=lost))
+    lost += [f"{count} x {kind}: not read" for kind, count in sorted(unread.items())]
     return found
 
 
-def _base(stage: Any) -> NDArray[np.float64]:
+def _base(stage: Any, metres: float) -> NDArray[np.float64]:
     """Return the matrix from a stage's units and axis to metres with +Z up."""
     from pxr import UsdGeom
 
-    metres = UsdGeom.GetStageMetersPerUnit(stage)
     base = np.diag([metres, metres, metres, 1.0])
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         base[:3, :3] = metres * np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     return base
 
 
-def _visited(
-    root: Any, base: NDArray[np.float64], time: Any
-) -> Iterator[tuple[Any, NDArray[np.float64]]]:
-    """Yield what is seen below a prim with its place, in the order of the tree."""
-    from pxr import UsdGeom
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Visit:
+    """A prim, and what it has from above."""
 
-    levels = [_children(root, base)]
+    prim: Any
+    to_world: NDArray[np.float64]  # of what is above it until it is moved
+    origin: NDArray[np.float64]  # where `!resetXformStack!` begins: the stage, or an instance
+    purpose: str = "default"
+    is_render_shown: bool = True  # what VisibilityAPI says of the purpose `render`
+    predicate: Any = None  # which children there are
+
+
+def _visited(stage: Any, base: NDArray[np.float64], time: Any, lost: list[str]) -> Iterator[_Visit]:
+    """Yield what is seen of a stage with its place, in the order of the tree."""
+    from pxr import Usd, UsdGeom
+
+    root = _Visit(
+        prim=stage.GetPseudoRoot(),
+        to_world=base,
+        origin=base,
+        predicate=Usd.TraverseInstanceProxies(),
+    )
+    levels = [_children(root)]
     while levels:
-        found = next(levels[-1], None)
-        if found is None:
+        above = next(levels[-1], None)
+        if above is None:
             levels.pop()
             continue
-        prim, above = found
+        prim = above.prim
         if len(levels) > MAX_NESTED:
             raise TrilightError(
                 f"{prim.GetPath()}: nested more than {MAX_NESTED} deep, prototypes counted."
             )
-        seen = UsdGeom.Imageable(prim)
-        if seen and seen.GetVisibilityAttr().Get(time) == UsdGeom.Tokens.invisible:
+        imageable = UsdGeom.Imageable(prim)
+        if imageable and imageable.GetVisibilityAttr().Get(time) == UsdGeom.Tokens.invisible:
             continue
-        if seen and seen.GetPurposeAttr().Get(time) in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
-            continue
-        to_world = _moved(prim, above, time)
-        yield prim, to_world
-        below = _instances if prim.IsA(UsdGeom.PointInstancer) else _children
-        levels.append(below(prim, to_world, time))
+        visit = _take_purpose(above, imageable, time)
+        visit = dataclasses.replace(visit, to_world=_moved(visit, time))
+        is_shown = visit.purpose == "default" or (
+            visit.purpose == "render" and visit.is_render_shown
+        )
+        if is_shown:  # else a child may still have a purpose of its own
+            yield visit
+        is_instancer = prim.IsA(UsdGeom.PointInstancer)
+        if is_shown or not is_instancer:
+            levels.append(_instances(visit, time, lost) if is_instancer else _children(visit))
 
 
-def _children(
-    prim: Any, to_world: NDArray[np.float64], time: Any = None
-) -> Iterator[tuple[Any, NDArray[np.float64]]]:
-    from pxr import Usd
-
-    return ((child, to_world) for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies()))
+def _children(above: _Visit) -> Iterator[_Visit]:
+    children = above.prim.GetFilteredChildren(above.predicate)
+    return (dataclasses.replace(above, prim=child) for child in children)
 
 
-def _moved(prim: Any, above: NDArray[np.float64], time: Any) -> NDArray[np.float64]:
+def _take_purpose(above: _Visit, imageable: Any, time: Any) -> _Visit:
+    """Return a visit with the prim's own purpose, which its children have too, if it has one."""
     from pxr import UsdGeom
 
-    move = UsdGeom.Xformable(prim)
-    if not move:
+    if not imageable:
         return above
+    purpose, shown = imageable.GetPurposeAttr(), above.is_render_shown
+    if above.prim.HasAPI(UsdGeom.VisibilityAPI):
+        stated = UsdGeom.VisibilityAPI(above.prim).GetRenderVisibilityAttr().Get(time)
+        shown = shown if stated in (None, "inherited") else stated == "visible"
+    own = str(purpose.Get()) if purpose.HasAuthoredValue() else above.purpose
+    return dataclasses.replace(above, purpose=own, is_render_shown=shown)
+
+
+def _moved(visit: _Visit, time: Any) -> NDArray[np.float64]:
+    from pxr import UsdGeom
+
+    move = UsdGeom.Xformable(visit.prim)
+    if not move:
+        return visit.to_world
     local = np.array(move.GetLocalTransformation(time)).T
-    start = _base(prim.GetStage()) if move.GetResetXformStack() else above
+    start = visit.origin if move.GetResetXformStack() else visit.to_world
     return np.einsum("ij,jk->ik", start, local)
 
 
-def _instances(
-    prim: Any, to_world: NDArray[np.float64], time: Any
-) -> Iterator[tuple[Any, NDArray[np.float64]]]:
-    from pxr import UsdGeom
+def _instances(above: _Visit, time: Any, lost: list[str]) -> Iterator[_Visit]:
+    from pxr import Usd, UsdGeom
 
+    prim = above.prim
     instancer = UsdGeom.PointInstancer(prim)
     targets = instancer.GetPrototypesRel().GetForwardedTargets()
     which = instancer.GetProtoIndicesAttr().Get(time) or []
@@ -130,11 +181,30 @@ def _instances(
     moves = instancer.ComputeInstanceTransformsAtTime(
         time, time, UsdGeom.PointInstancer.ExcludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
     )
+    if len(moves) != len(which):
+        raise TrilightError(
+            f"{prim.GetPath()}: its positions, orientations or scales are not as many as its "
+            f"{len(which)} protoIndices."
+        )
+    lost += [
+        f"{prim.GetPath()}.{primvar.GetName()}: values of single instances are not read"
+        for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()
+        if primvar.GetInterpolation() != UsdGeom.Tokens.constant
+    ]
     shown = instancer.ComputeMaskAtTime(time) or [True] * len(which)
-    for index, move, visible in zip(which, moves, shown, strict=False):
-        if not visible or not 0 <= index < len(targets):
-            continue
-        prototype = prim.GetStage().GetPrimAtPath(targets[index])
-        if prototype:
-            place = np.einsum("ij,jk->ik", to_world, np.array(move).T)
-            yield prototype, place
+    plain = Usd.PrimIsActive & Usd.PrimIsLoaded & Usd.PrimHasDefiningSpecifier
+    for index, move, visible in zip(which, moves, shown, strict=True):
+        named = targets[index] if 0 <= index < len(targets) else None
+        prototype = None if named is None else prim.GetStage().GetPrimAtPath(named)
+        if not prototype:
+            lost.append(f"{prim.GetPath()}: instances of prototype {index}, which is not there")
+        elif visible and prototype.IsActive():
+            place = np.einsum("ij,jk->ik", above.to_world, np.array(move).T)
+            known = plain if prototype.IsAbstract() else plain & ~Usd.PrimIsAbstract
+            yield dataclasses.replace(
+                above,
+                prim=prototype,
+                to_world=place,
+                origin=place,
+                predicate=Usd.TraverseInstanceProxies(known),
+            )

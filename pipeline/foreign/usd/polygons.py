@@ -1,14 +1,18 @@
-"""A mesh of a stage as polygons with its numbers checked, and polygons as triangles.
+"""A mesh or a solid of a stage as polygons with its numbers checked, and polygons as triangles.
 
 Fans where they are convex, cut-off ears where they are not.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.usd.colors import convert_to_rec709
+from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.solids import SOLIDS, build_solid
 from storage.errors import TrilightError
 
 MAX_EAR_CORNERS = 2000
@@ -19,53 +23,125 @@ MAX_EAR_CORNERS = 2000
 class MeshPolygons:
     """The arrays of a mesh, which fit each other."""
 
+    placed: Placed
     points: NDArray[np.float64]  # [P, 3] in the units of the mesh, finite
     counts: NDArray[np.int64]  # [F] corners of each polygon
     indices: NDArray[np.int64]  # [sum of counts] rows of `points`
+    holes: NDArray[np.int64]  # polygons that are none
+    is_smooth: bool  # whether normals that nobody states are smooth: it stands for a curved surface
 
 
-def mesh_polygons(prim: Any, time: Any) -> MeshPolygons:
-    """Return the polygons of a mesh at a time.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CutMesh:
+    """The triangles of a mesh, and what lies at their corners."""
+
+    prim: Any
+    indices: NDArray[np.int64]
+    """Point of each corner of the mesh."""
+    corners: NDArray[np.int64]
+    """[T, 3] rows of `indices`, counter-clockwise from outside."""
+    polygons: NDArray[np.int64]
+    """[T] of the mesh"""
+    lost: list[str]
+    """Receives what does not fit."""
+
+    def select(self, part: NDArray[np.bool_]) -> "CutMesh":
+        """Return some of the triangles."""
+        return dataclasses.replace(self, corners=self.corners[part], polygons=self.polygons[part])
+
+    def per_corner(self, values: NDArray, interpolation: str) -> NDArray | None:
+        """Return values [N, ...] at corners [T, 3, ...]; None where their number is wrong.
+
+        Args:
+            values: one for each element.
+            interpolation: constant, uniform, vertex, varying or faceVarying.
+        """
+        where = {
+            "constant": np.zeros_like(self.corners),
+            "uniform": np.repeat(self.polygons[:, None], 3, axis=1),
+            "vertex": self.indices[self.corners],
+            "varying": self.indices[self.corners],
+            "faceVarying": self.corners,
+        }.get(interpolation)
+        if where is None or (where.size and where.max() >= len(values)):
+            return None
+        return values[where]
+
+    def read_primvar(self, name: str, time: Any) -> NDArray | None:
+        """Return a primvar of the mesh, or of what is above it, at corners [T, 3, ...].
+
+        None where it has none, or not for every corner.
+        """
+        from pxr import UsdGeom
+
+        primvar = UsdGeom.PrimvarsAPI(self.prim).FindPrimvarWithInheritance(name)
+        if not primvar or not primvar.HasValue():
+            return None
+        values, spread = np.array(primvar.ComputeFlattened(time)), str(primvar.GetInterpolation())
+        if values.ndim == 0 or values.dtype.kind not in "fiu":
+            return None
+        if str(self.prim.GetTypeName()) in SOLIDS and spread != "constant":
+            return None  # their polygons are ours
+        fitting = self.per_corner(convert_to_rec709(primvar.GetAttr(), values), spread)
+        if fitting is None:
+            self.lost.append(f"{self.prim.GetPath()}.{primvar.GetName()}: its number does not fit")
+        return fitting
+
+
+def mesh_polygons(placed: Placed, time: Any) -> MeshPolygons:
+    """Return the polygons of a mesh or solid at a time, posed by its bones if it has any.
 
     Raises:
         TrilightError: its arrays contradict each other, or are not finite.
     """
     from pxr import UsdGeom
 
-    mesh = UsdGeom.Mesh(prim)
-    points = as_array(mesh.GetPointsAttr().Get(time), np.float64, (-1, 3))
-    counts = as_array(mesh.GetFaceVertexCountsAttr().Get(time), np.int64, (-1,))
-    indices = as_array(mesh.GetFaceVertexIndicesAttr().Get(time), np.int64, (-1,))
+    prim = placed.prim
+    holes = as_array(None, np.int64, (-1,))
+    if prim.GetTypeName() in SOLIDS:
+        points, counts, indices, is_smooth = build_solid(prim, time)
+    else:
+        mesh = UsdGeom.Mesh(prim)
+        stated = mesh.GetPointsAttr().Get(time)
+        points = as_array(stated, np.float64, (-1, 3))
+        if placed.skin is not None and len(points):
+            points = placed.skin.pose(prim, stated, time)
+        counts = as_array(mesh.GetFaceVertexCountsAttr().Get(time), np.int64, (-1,))
+        indices = as_array(mesh.GetFaceVertexIndicesAttr().Get(time), np.int64, (-1,))
+        holes = as_array(mesh.GetHoleIndicesAttr().Get(time), np.int64, (-1,))
+        is_smooth = mesh.GetSubdivisionSchemeAttr().Get() != "none"
     _check(prim, points, counts, indices)
-    return MeshPolygons(points=points, counts=counts, indices=indices)
+    return MeshPolygons(
+        placed=placed,
+        points=points,
+        counts=counts,
+        indices=indices,
+        holes=holes,
+        is_smooth=is_smooth,
+    )
 
 
-def mesh_triangles(
-    prim: Any, found: MeshPolygons, to_world: NDArray[np.float64], time: Any
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def cut_mesh(mesh: MeshPolygons) -> CutMesh:
     """Return the triangles of a mesh in its place, holes left out.
 
-    Args:
-        prim: the mesh.
-        found: its polygons.
-        to_world: [4, 4] its place; a mirrored one turns windings round.
-        time: of the holes.
-
-    Returns:
-        Corners [T, 3] as rows of `indices`, counter-clockwise from outside, and the polygon [T] of
-        each.
+    A mirrored place turns windings round.
     """
     from pxr import UsdGeom
 
-    mesh = UsdGeom.Mesh(prim)
-    corners, polygons = triangulated(found.points, found.counts, found.indices)
-    holes = as_array(mesh.GetHoleIndicesAttr().Get(time), np.int64, (-1,))
-    kept = ~np.isin(polygons, holes)
+    prim, to_world = mesh.placed.prim, mesh.placed.to_world
+    corners, polygons = triangulated(mesh.points, mesh.counts, mesh.indices)
+    kept = ~np.isin(polygons, mesh.holes)
     corners, polygons = corners[kept], polygons[kept]
     mirrored = np.linalg.det(to_world[:3, :3]) < 0
-    if mirrored != (mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded):
+    if mirrored != (UsdGeom.Gprim(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded):
         corners = corners[:, ::-1]
-    return corners, polygons
+    return CutMesh(
+        prim=prim,
+        indices=mesh.indices,
+        corners=corners,
+        polygons=polygons,
+        lost=mesh.placed.lost,
+    )
 
 
 def moved(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -78,56 +154,6 @@ def as_array(values: Any, dtype: type, shape: tuple[int, ...]) -> NDArray:
     """Return values of USD as an array of a kind and shape; raises TypeError for another kind."""
     found = np.zeros(0, dtype) if values is None else np.array(values)
     return found.astype(dtype, casting="same_kind").reshape(shape)
-
-
-def per_corner(
-    values: NDArray,
-    interpolation: str,
-    indices: NDArray[np.int64],
-    corners: NDArray[np.int64],
-    polygons: NDArray[np.int64],
-) -> NDArray | None:
-    """Return values at the corners [T, 3, ...] of triangles; None where their number is wrong.
-
-    Args:
-        values: [N, ...].
-        interpolation: constant, uniform, vertex, varying or faceVarying.
-        indices: point of each corner of the mesh.
-        corners, polygons: the triangles, as `mesh_triangles` returns them.
-    """
-    where = {
-        "constant": np.zeros_like(corners),
-        "uniform": np.repeat(polygons[:, None], 3, axis=1),
-        "vertex": indices[corners],
-        "varying": indices[corners],
-        "faceVarying": corners,
-    }.get(interpolation)
-    if where is None or (where.size and where.max() >= len(values)):
-        return None
-    return values[where]
-
-
-def primvar_corners(
-    prim: Any,
-    name: str,
-    indices: NDArray[np.int64],
-    corners: NDArray[np.int64],
-    polygons: NDArray[np.int64],
-    time: Any,
-) -> NDArray | None:
-    """Return a primvar of a mesh, or of what is above it, at the corners of triangles.
-
-    None where it has none, or not for every corner; arguments as of `per_corner`.
-    """
-    from pxr import UsdGeom
-
-    primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
-    if not primvar or not primvar.HasValue():
-        return None
-    values = np.array(primvar.ComputeFlattened(time))
-    if values.ndim == 0 or values.dtype.kind not in "fiu":
-        return None
-    return per_corner(values, str(primvar.GetInterpolation()), indices, corners, polygons)
 
 
 def triangulated(

@@ -1,17 +1,26 @@
-"""What the shader of a material states: constants and textures by the names of UsdPreviewSurface.
+"""What a material of a stage states, by the names of UsdPreviewSurface.
 
 OpenPBR and Standard Surface, which MaterialX brings, are read by the same names as far as they mean
-the same.
+the same. An input is a constant, a texture, or a primvar of the mesh.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.usd.colors import convert_to_rec709
+from pipeline.foreign.usd.polygons import CutMesh, as_array
 from pipeline.foreign.usd.stage import OpenedUsd
-from pipeline.foreign.usd.texture_nodes import TextureNode, texture_node
+from pipeline.foreign.usd.texture_nodes import (
+    TextureNode,
+    find_sources,
+    is_output,
+    texture_node,
+    value_of,
+)
 
 PREVIEW = "UsdPreviewSurface"
 NAMES: Mapping[str, Mapping[str, str]] = {
@@ -45,18 +54,141 @@ DEFAULTS: Mapping[str, Any] = {
     "strength": 0.0,
     "useSpecularWorkflow": 0.0,
 }
-
-_NEUTRAL = {
-    "opacity": 1.0,
-    "clearcoat": 0.0,
-    "displacement": 0.0,
-    "transmission_weight": 0.0,
-    "transmission": 0.0,
-    "coat_weight": 0.0,
-    "coat": 0.0,
-    "subsurface_weight": 0.0,
+_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
+    PREVIEW: DEFAULTS,
+    "ND_open_pbr_surface_surfaceshader": {
+        **DEFAULTS,
+        "diffuseColor": 0.8,
+        "roughness": 0.3,
+        "emissiveColor": 1.0,
+    },
+    "ND_standard_surface_surfaceshader": {
+        **DEFAULTS,
+        "diffuseColor": 0.8,
+        "roughness": 0.2,
+        "emissiveColor": 1.0,
+    },
 }
+"""What a shader takes for an input that is not stated."""
+
+TEXTURED = ("diffuseColor", "specularColor", "emissiveColor", "metallic", "roughness", "ior")
+"""Inputs that need not be constants."""
+
+_NEUTRAL: Mapping[str, float] = {
+    **dict.fromkeys(
+        ("opacity", "occlusion", "specular", "specular_weight", "specular_color",
+         "geometry_opacity"),
+        1.0,
+    ),
+    **dict.fromkeys(
+        ("clearcoat", "displacement", "diffuse_roughness", "specular_anisotropy",
+         "specular_roughness_anisotropy", "base_diffuse_roughness", "transmission_weight",
+         "transmission", "coat_weight", "coat", "subsurface_weight", "subsurface", "fuzz_weight",
+         "sheen", "thin_film_weight", "thin_film_thickness", "thin_walled",
+         "geometry_thin_walled"),
+        0.0,
+    ),
+}  # fmt: skip
 """Inputs that have no place here, with the value at which they do nothing."""
+
+_WEIGHTS = ("base", "base_weight")
+"""What the color of a base is multiplied with."""
+
+_PARTS = "clearcoat|coat_|opacity|transmission_|subsurface_|fuzz_|sheen_|thin_film_".split("|")
+"""What inputs begin with that only say more of one of those above."""
+
+_READERS: Mapping[str, tuple[str, str]] = {
+    **{
+        f"UsdPrimvarReader_{kind}": ("varname", "fallback")
+        for kind in ("float", "float3", "float4", "int", "vector", "point", "normal")
+    },
+    **{
+        f"ND_geompropvalue_{kind}": ("geomprop", "default")
+        for kind in ("float", "color3", "color4", "vector3")
+    },
+}
+"""Nodes that read a primvar: their inputs for its name, and for what stands where there is none."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StatedMaterial:
+    """One material before its pictures are decoded."""
+
+    name: str
+    """Of its prim."""
+    where: str
+    """The path of its shader, for notes."""
+    constants: Mapping[str, NDArray[np.float32]]
+    """[3] by names of UsdPreviewSurface; of a primvar what stands where a mesh has none."""
+    textures: Mapping[str, TextureNode]
+    """Likewise; they stand before constants."""
+    primvars: Mapping[str, str]
+    """Names of primvars by those of inputs; likewise."""
+    has_strength: bool
+    """Whether emission is times `strength`."""
+    lost: tuple[str, ...]
+    """Inputs that have no place here and do something."""
+    has_networks: bool
+    """Whether inputs are fed by nodes that are not read, or by no finite number."""
+
+    @property
+    def is_specular(self) -> bool:
+        """Whether its workflow is the specular one."""
+        return bool(self.constants["useSpecularWorkflow"].any())
+
+    def read_values(self, name: str, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
+        """Return what the primvar of an input is at corners [T, 3, 3]; None where there is none."""
+        if name not in self.primvars:
+            return None
+        values = read_colors(cut, self.primvars[name], time)
+        if values is None:
+            primvar = self.primvars[name]
+            cut.lost.append(f"{cut.prim.GetPath()}: no primvar {primvar!r:.60}; its fallback taken")
+        return values
+
+
+def read_colors(cut: CutMesh, primvar: str, time: Any) -> NDArray[np.float64] | None:
+    """Return numbers or colors at corners as colors [T, 3, 3]; None for anything else."""
+    values = cut.read_primvar(primvar, time)
+    if values is None:
+        return None
+    wide = values[..., None] if values.ndim == 2 else values
+    if wide.ndim != 3 or wide.shape[2] not in (1, 3, 4) or not np.isfinite(wide).all():
+        return None
+    count = 3 if wide.shape[2] > 1 else 1
+    return np.broadcast_to(wide[..., :count], (*wide.shape[:2], 3)).astype(np.float64)
+
+
+def reflect_head_on(ior: Any) -> Any:
+    """Return the share that a dielectric of an index of refraction reflects head-on."""
+    return np.square((ior - 1) / np.maximum(ior + 1, 1e-3))
+
+
+def read_bindings(prim: Any, time: Any) -> Iterator[tuple[Any, NDArray[np.int64] | None]]:
+    """Yield the material of a mesh, or None; then those of its subsets with their polygons.
+
+    Of what is bound for rendering in full and for a preview, the first one counts that has a shader
+    which is understood. Later subsets stand before earlier ones.
+    """
+    from pxr import UsdShade
+
+    yield _find_material(prim), None
+    for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
+        bound = _find_material(subset.GetPrim())
+        if bound:
+            yield bound, as_array(subset.GetIndicesAttr().Get(time), np.int64, (-1,))
+
+
+def _find_material(prim: Any) -> Any:
+    from pxr import UsdShade
+
+    first = None
+    for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
+        material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)[0]
+        if material and surface_shader(material):
+            return material
+        first = first or material or None
+    return first
 
 
 def surface_shader(material: Any) -> Any:
@@ -70,87 +202,142 @@ def surface_shader(material: Any) -> Any:
     return found
 
 
-def without_place(shader: Any, time: Any) -> list[str]:
-    """Return the inputs of a shader that do something, and have no place here."""
-    found = []
-    for name, neutral in _NEUTRAL.items():
-        known = shader.GetInput(name)
-        if known and (known.HasConnectedSource() or known.Get(time) not in (None, neutral)):
-            found.append(name)
-    bump = shader.GetInput("normal")
-    return [*found, "normal"] if bump and bump.HasConnectedSource() else found
+def read_material(material: Any, time: Any, opened: OpenedUsd) -> StatedMaterial | None:
+    """Return what a material states, or None where no shader of it is understood.
+
+    Args:
+        material: the UsdShade.Material.
+        time: of the values.
+        opened: the file; what is lost is noted there.
+
+    Raises:
+        TrilightError: a picture is outside of the folder, or on the network.
+    """
+    shader = surface_shader(material)
+    if shader is None:
+        return None
+    reader, notes = _Reader(shader, time, opened), len(opened.lost)
+    for name in TEXTURED:
+        reader.take(name)
+    constants = {name: reader.constant(name) for name in DEFAULTS}
+    has_networks = len(opened.lost) > notes
+    constants["diffuseColor"] = constants["diffuseColor"] * reader.weight()
+    if material.GetDisplacementOutput().HasConnectedSource():
+        opened.lost.append(f"{material.GetPath()}: its displacement has no place here")
+    lost = tuple(reader.without_place())
+    opened.lost += [f"{shader.GetPath()}.{name}: has no place here" for name in lost]
+    return StatedMaterial(
+        name=str(material.GetPrim().GetName()),
+        where=str(shader.GetPath()),
+        constants=constants,
+        textures=reader.textures,
+        primvars=reader.primvars,
+        has_strength=reader.has("strength"),
+        lost=lost,
+        has_networks=has_networks,
+    )
 
 
-class StatedInputs:
-    """The inputs of a shader as it states them."""
+class _Reader:
+    """Reads the inputs of a shader."""
 
     def __init__(self, shader: Any, time: Any, opened: OpenedUsd) -> None:
-        """Remember it; nothing is read yet.
-
-        Args:
-            shader: one of NAMES.
-            time: of the values.
-            opened: the file; what is lost is noted there.
-        """
         self._shader, self._time, self._opened = shader, time, opened
         self._names = NAMES[shader.GetShaderId()]
-        self._nodes: dict[str, TextureNode | None] = {}
+        self._defaults = _DEFAULTS[shader.GetShaderId()]
+        self.textures: dict[str, TextureNode] = {}
+        self.primvars: dict[str, str] = {}
+        self._fallbacks: dict[str, Any] = {}
 
     def has(self, name: str) -> bool:
         """Return whether this kind of shader has the input under a name of its own."""
         return name in self._names
 
-    def texture(self, name: str) -> TextureNode | None:
-        """Return the texture that an input is connected to.
+    def take(self, name: str) -> None:
+        """Take the texture or the primvar that an input is connected to."""
+        from pxr import UsdShade
 
-        Raises:
-            TrilightError: as `texture_node`.
-        """
-        if name not in self._nodes:
-            self._nodes[name] = self._node(name)
-        return self._nodes[name]
+        sources = self._sources(name)
+        if not sources or not is_output(sources[0]):
+            return
+        node = UsdShade.Shader(sources[0].GetPrim())
+        if node.GetShaderId() == "UsdUVTexture":
+            output = UsdShade.Output(sources[0]).GetBaseName()
+            self.textures[name] = texture_node(node, output, self._time, self._opened)
+        elif node.GetShaderId() in _READERS:
+            primvar, fallback = _READERS[node.GetShaderId()]
+            self.primvars[name] = str(value_of(node, primvar, self._time, ""))
+            self._fallbacks[name] = value_of(node, fallback, self._time, 0.0)
+        else:
+            self._lose(name, f"{node.GetShaderId() or 'a network'} that is not read")
 
     def constant(self, name: str) -> NDArray[np.float32]:
         """Return the value [3] of an input without a texture; a number stands in every channel."""
+        if name in self._fallbacks:
+            return self._finite(name, self._fallbacks[name])
         sources = self._sources(name)
-        stated = sources[0].Get(self._time) if sources and not _is_output(sources[0]) else None
-        return self.finite(name, DEFAULTS[name] if stated is None else stated)
+        stated = sources[0].Get(self._time) if sources and not is_output(sources[0]) else None
+        if stated is None:
+            return self._finite(name, self._defaults[name])
+        return self._finite(name, convert_to_rec709(sources[0], np.array(stated)))
 
-    def finite(self, name: str, stated: Any) -> NDArray[np.float32]:
-        """Return a number or colour as a colour [3]; the default of the input for anything else."""
-        value = np.array(stated, np.float32)
-        if value.ndim > 1 or value.shape not in ((), (3,)) or not np.isfinite(value).all():
-            self._lose(name, "no finite number or colour")
-            value = np.array(DEFAULTS[name], np.float32)
+    def weight(self) -> NDArray[np.float32]:
+        """Return what the color of the base is multiplied with; textures are not."""
+        product = np.ones(3, np.float32)
+        for name in _WEIGHTS:
+            value = self._value(name, 1.0)
+            if value is None or ("diffuseColor" in self.textures and (value != 1).any()):
+                self._opened.lost.append(f"{self._shader.GetPath()}.{name}: has no place here")
+            else:
+                product = product * value
+        return product
+
+    def without_place(self) -> list[str]:
+        """Return inputs that do something, and have no place here; unknown ones too."""
+        read = {*(self._names.get(name, name) for name in DEFAULTS), *_WEIGHTS}
+        names = []
+        for each in self._shader.GetInputs():
+            name = str(each.GetBaseName())
+            if name in _NEUTRAL:
+                value = self._value(name, _NEUTRAL[name])
+                is_lost = value is None or (value != _NEUTRAL[name]).any()
+            elif name in read or name.startswith(tuple(_PARTS)):
+                is_lost = False
+            else:
+                is_lost = each.HasConnectedSource() or (
+                    name != "normal" and each.GetAttr().HasAuthoredValue()
+                )
+            if is_lost:
+                names.append(name)
+        return names
+
+    def _value(self, name: str, default: float) -> NDArray[np.float32] | None:
+        """Return what an input states [3]; None where that is a network, or no color."""
+        sources = self._sources(name)
+        if sources and is_output(sources[0]):
+            return None
+        return parse_color(value_of(self._shader, name, self._time, default))
+
+    def _finite(self, name: str, stated: Any) -> NDArray[np.float32]:
+        value = parse_color(stated)
+        if value is None:
+            self._lose(name, "no finite number or color")
+            value = np.array(self._defaults[name], np.float32)
         return np.broadcast_to(value, 3).astype(np.float32)
 
-    def _node(self, name: str) -> TextureNode | None:
-        from pxr import UsdShade
-
-        sources = self._sources(name)
-        if not sources or not _is_output(sources[0]):
-            return None
-        output = UsdShade.Output(sources[0])
-        node = UsdShade.Shader(sources[0].GetPrim())
-        if node.GetShaderId() == "UsdUVTexture":
-            return texture_node(node, output.GetBaseName(), self._time, self._opened)
-        self._lose(name, "a network that is not read")
-        return None
-
     def _sources(self, name: str) -> Any:
-        from pxr import UsdShade
-
-        known = self._shader.GetInput(self._names.get(name, name))
-        return UsdShade.Utils.GetValueProducingAttributes(known) if known else []
+        return find_sources(self._shader, self._names.get(name, name))
 
     def _lose(self, name: str, why: str) -> None:
         called = self._names.get(name, name)
         self._opened.lost.append(
-            f"{self._shader.GetPath()}.{called}: {why}; {DEFAULTS[name]} taken"
+            f"{self._shader.GetPath()}.{called}: {why}; {self._defaults[name]} taken"
         )
 
 
-def _is_output(attribute: Any) -> bool:
-    from pxr import UsdShade
-
-    return bool(UsdShade.Output.IsOutput(attribute))
+def parse_color(stated: Any) -> NDArray[np.float32] | None:
+    """Return a number or color as a color [3]; None for anything else."""
+    value = np.array(stated, np.float32)  # None becomes no number
+    if value.shape not in ((), (3,)) or not np.isfinite(value).all():
+        return None
+    return np.broadcast_to(value, 3).astype(np.float32)

@@ -12,6 +12,7 @@ native code, so untrusted files are opened in a child process with limits (pipel
 
 import re
 import zipfile
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -23,6 +24,8 @@ SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 MAX_FILE_BYTES = 1 << 30
 """Maximum size of a file; a million triangles take about 70 MB."""
 MAX_LAYERS = 1000
+MAX_NOTES = 40
+"""Maximum number of notes on what is lost of one file; further notes are only counted."""
 MAX_MEMBERS = 10_000
 """Maximum number of members in a usdz archive."""
 
@@ -79,6 +82,23 @@ class OpenedUsd:
         """The files that are open, the root first and the others sorted."""
         outer = {file_and_member(name)[0] for name in self._layers}
         return [self.path, *sorted(outer - {self.path})]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is lost, each kind once with the first place that it is of."""
+        kinds = Counter[tuple[str, str]]()
+        first = dict[tuple[str, str], str]()
+        for note in dict.fromkeys(self.lost):
+            where, _, text = note.partition(": ")
+            kind = (where.partition(".")[2] if where.startswith("/") else where, text)
+            kinds[kind] += 1
+            first.setdefault(kind, note)
+        notes = [
+            first[kind] if count == 1 else f"{first[kind]} ({count} such)"
+            for kind, count in kinds.items()
+        ]
+        more = len(notes) - MAX_NOTES
+        return tuple(notes if more <= 0 else [*notes[:MAX_NOTES], f"and {more} more"])
 
     def inside(self, layer: Any, asset_path: str) -> str | None:
         """Return where USD finds a file that a layer names, or None where there is none.

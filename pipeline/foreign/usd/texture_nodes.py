@@ -8,7 +8,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.usd.polygons import primvar_corners
+from pipeline.foreign.usd.polygons import CutMesh
 from pipeline.foreign.usd.stage import OpenedUsd, file_and_member
 from storage.errors import TrilightError
 
@@ -80,12 +80,18 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
     Raises:
         TrilightError: its picture is outside of the folder, or on the network.
     """
-    attribute = shader.GetInput("file")
+    sources = find_sources(shader, "file")
+    attribute = sources[0] if sources else None
     asset = attribute.Get(time) if attribute else None
     named, resolved = "" if asset is None else asset.path, None
-    if named:
-        specs = attribute.GetAttr().GetPropertyStack(time)
+    if attribute and named:
+        specs = attribute.GetPropertyStack(time)
         resolved = opened.inside(specs[0].layer if specs else opened.root, named)
+    if "<UDIM>" in named:
+        opened.lost.append(f"{shader.GetPath()}: {named!r:.100} has UDIM tiles, which are not read")
+    for name in ("scale", "bias", "fallback"):
+        if any(is_output(source) for source in find_sources(shader, name)):
+            opened.lost.append(f"{shader.GetPath()}.{name}: a network that is not read")
     fallback = value_of(shader, "fallback", time, None)
     return TextureNode(
         named=named,
@@ -94,22 +100,21 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
         wrap=(_wrap(shader, "wrapS", time), _wrap(shader, "wrapT", time)),
         scale=np.array(value_of(shader, "scale", time, (1, 1, 1, 1)), np.float32),
         bias=np.array(value_of(shader, "bias", time, (0, 0, 0, 0)), np.float32),
-        chart=chart_of(shader, time),
+        chart=chart_of(shader, time, opened.lost),
         output=output if output in ("r", "g", "b", "a") else "rgb",
         fallback=None if fallback is None else np.array(fallback, np.float64),
     )
 
 
-def chart_of(shader: Any, time: Any) -> UvChart:
+def chart_of(shader: Any, time: Any, lost: list[str]) -> UvChart:
     """Return the coordinates of a texture's shader; `st` where it states none."""
     from pxr import UsdShade
 
-    st, moves = shader.GetInput("st"), list[Move]()
+    sources, moves, primvar = find_sources(shader, "st"), list[Move](), "st"
     for _ in range(_MOST_NODES):
-        source = st.GetConnectedSources()[0] if st and st.HasConnectedSource() else []
-        if not source:
+        if not sources or not is_output(sources[0]):
             break
-        node = UsdShade.Shader(source[0].source.GetPrim())
+        node = UsdShade.Shader(sources[0].GetPrim())
         if node.GetIdAttr().Get() == "UsdTransform2d":
             moves.append(
                 Move(
@@ -118,29 +123,21 @@ def chart_of(shader: Any, time: Any) -> UvChart:
                     translation=_pair(value_of(node, "translation", time, (0, 0))),
                 )
             )
-            st = node.GetInput("in")
+            sources = find_sources(node, "in")
             continue
-        name = node.GetInput("varname")
-        stated = UsdShade.Utils.GetValueProducingAttributes(name) if name else []
-        if stated:
-            return UvChart(primvar=str(stated[0].Get(time)), moves=tuple(reversed(moves)))
+        primvar = str(value_of(node, "varname", time, primvar))
+        if node.GetIdAttr().Get() != "UsdPrimvarReader_float2":
+            lost.append(f"{node.GetPath()}: not read; texture coordinates {primvar!r:.60} taken")
         break
-    return UvChart(primvar="st", moves=tuple(reversed(moves)))
+    return UvChart(primvar=primvar, moves=tuple(reversed(moves)))
 
 
-def chart_corners(
-    chart: UvChart,
-    prim: Any,
-    indices: NDArray[np.int64],
-    corners: NDArray[np.int64],
-    polygons: NDArray[np.int64],
-    time: Any,
-) -> NDArray[np.float64] | None:
+def chart_corners(chart: UvChart, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
     """Return the coordinates [T, 3, 2] of a chart, before its moves; not all need be finite.
 
-    None where the mesh has none, or not for every corner. Arguments as of `primvar_corners`.
+    None where the mesh has none, or not for every corner.
     """
-    found = primvar_corners(prim, chart.primvar, indices, corners, polygons, time)
+    found = cut.read_primvar(chart.primvar, time)
     if found is None or found.ndim != 3 or found.shape[2] < 2:
         return None
     return np.asarray(found[..., :2], np.float64)
@@ -171,10 +168,25 @@ def _require_size(size: int, max_bytes: int, name: str) -> None:
         raise TrilightError(f"{name}: {size} bytes; expected at most {max_bytes}.")
 
 
+def find_sources(shader: Any, name: str) -> Any:
+    """Return the attributes that give an input of a shader its value, its material's among them."""
+    from pxr import UsdShade
+
+    stated = shader.GetInput(name)
+    return UsdShade.Utils.GetValueProducingAttributes(stated) if stated else []
+
+
+def is_output(attribute: Any) -> bool:
+    """Return whether a value comes out of another node."""
+    from pxr import UsdShade
+
+    return bool(UsdShade.Output.IsOutput(attribute))
+
+
 def value_of(shader: Any, name: str, time: Any, default: Any) -> Any:
-    """Return an input of a shader, or the default where it is not stated."""
-    attribute = shader.GetInput(name)
-    value = attribute.Get(time) if attribute else None
+    """Return an input of a shader, or of its material; the default where it is not stated."""
+    sources = find_sources(shader, name)
+    value = sources[0].Get(time) if sources else None
     return default if value is None else value
 
 

@@ -1,29 +1,22 @@
 """USD files as objects: what of a stage is the object, and what is refused by name."""
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.foreign.load import load_mesh
-from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.source_file import read_source
 from storage.records.asset import decode_asset
 from tests.for_each import for_each
 from tests.pipeline.assets.child_kit import Bench, run
 from tests.pipeline.assets.meshes_by_hand import (
-    as_rows,
     cube,
     geometry,
     moved,
     prepare,
     reason_of,
-    volume,
 )
 from tests.pipeline.assets.own.textured_kit import CORNERS, KEEP, UV_UP, lost, picture_bytes
 from tests.pipeline.assets.own.usd_kit import (
@@ -37,57 +30,8 @@ from tests.pipeline.assets.own.usd_kit import (
     usd_mesh,
 )
 
-SETTINGS = AssetSettings()
 BOX = moved(cube(), scale=[1.0, 0.5, 0.25])
 """Without symmetry of its axes."""
-
-
-def loaded(stage: Usd.Stage, path: Path) -> TriangleMesh:
-    return load_mesh(read_source(exported(stage, path), SETTINGS.read_limits))
-
-
-def rows_of(mesh: TriangleMesh) -> set[tuple[tuple[float, ...], ...]]:
-    return as_rows(np.round(mesh.positions, 5) + 0.0, mesh.faces)
-
-
-@pytest.mark.parametrize(("y_up", "unit"), [(False, 1.0), (True, 1.0), (True, 0.01)])
-def test_axes_and_units_are_those_that_the_stage_states(
-    tmp_path: Path, y_up: bool, unit: float
-) -> None:
-    stage = new_stage(y_up=y_up, unit=unit)
-    usd_mesh(stage, BOX, y_up=y_up, unit=unit)
-    assert rows_of(loaded(stage, tmp_path / "a.usdc")) == rows_of(BOX)
-
-
-def test_all_meshes_are_one_in_their_places_and_instances_too(tmp_path: Path) -> None:
-    """A mesh under two transforms, and three instances of another; what is hidden is not there."""
-    stage = new_stage()
-    usd_mesh(stage, BOX)
-    world = UsdGeom.Xformable(stage.GetPrimAtPath("/W"))
-    world.AddTranslateOp().Set((0, 0, 3))
-    UsdGeom.Xformable(stage.GetPrimAtPath(MESH)).AddScaleOp().Set((2, 2, 2))
-    usd_mesh(stage, BOX, "/W/many/proto")
-    many = UsdGeom.PointInstancer.Define(stage, "/W/many")
-    many.CreatePrototypesRel().AddTarget("/W/many/proto")
-    many.CreateProtoIndicesAttr([0, 0, 0])
-    many.CreatePositionsAttr([(k, 5, 0) for k in (0, 2, 4)])
-    usd_mesh(stage, BOX, "/W/hidden").CreateVisibilityAttr("invisible")
-    usd_mesh(stage, BOX, "/W/proxy").CreatePurposeAttr("proxy")
-    wanted = rows_of(moved(BOX, 2, [0, 0, 3]))
-    for k in (0, 2, 4):
-        wanted |= rows_of(moved(BOX, 1, [k, 5, 3]))
-    assert rows_of(loaded(stage, tmp_path / "a.usda")) == wanted
-
-
-@for_each(("left_handed", "mirrored"), itertools.product([False, True], [False, True]))
-def test_windings_stay_outward(tmp_path: Path, left_handed: bool, mirrored: bool) -> None:
-    stage = new_stage()
-    mesh = BOX if not left_handed else dataclasses.replace(BOX, faces=BOX.faces[:, ::-1])
-    made = usd_mesh(stage, mesh)
-    made.CreateOrientationAttr("leftHanded" if left_handed else "rightHanded")
-    if mirrored:
-        UsdGeom.Xformable(made).AddScaleOp().Set((-1, 1, 1))
-    assert volume(loaded(stage, tmp_path / "a.usda")) == pytest.approx(0.125, rel=1e-5)
 
 
 def _reference(name: str) -> Callable[[Usd.Stage], object]:
@@ -137,7 +81,7 @@ REFUSED: dict[str, tuple[str, Callable[[Usd.Stage], object]]] = {
             or stage.GetPrimAtPath(MESH).GetAttribute("faceVertexIndices").Block()
         ),
     ),
-    "a solid": ("unsupported_primitive", lambda stage: UsdGeom.Cube.Define(stage, "/W/cube")),
+    "a patch": ("unsupported_primitive", lambda stage: UsdGeom.NurbsPatch.Define(stage, "/W/a")),
     "bones": ("skinned_mesh", _skinned),
     "a crowd": ("too_many_instances", _crowd),
     "points far from their origin": ("offset_precision", _far_points),

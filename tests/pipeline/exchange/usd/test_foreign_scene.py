@@ -59,7 +59,7 @@ def test_units_and_axes(stage: UsdScene) -> None:
         ("rect", [0, 0, -0.1], [20, 20, 20]),
         ("disk", [0, math.pi * 0.04, 0], [1, 0.5, 0.25]),
         ("lamp", [0, 0, 0.005], [7, 7, 7]),
-        ("sphere", [0, 0, 0], [3 / (4 * math.pi * 0.01)] * 3),
+        ("sphere", [0, 0, 0], [3 / (4 * math.pi * 10**2)] * 3),  # normalized: in centimetres
     ],
 )
 def test_lights_have_their_area_and_radiance(
@@ -93,15 +93,15 @@ def test_a_stated_temperature_tints_a_light(
     assert (red == blue == 20) == (kelvin is None)
 
 
-def test_instances_stand_where_they_are_placed_and_mirrors_keep_their_outside(
-    stage: UsdScene,
-) -> None:
-    for name, left in (("L", 0), ("L.2", 0.3), ("L.3", 0.6), ("L.4", -0.2)):
-        corners, _ = object_of(stage.scene, name)
-        assert facing(corners) == pytest.approx([0, -0.03, 0], abs=1e-7)
-        assert corners[..., 0].min() == pytest.approx(left, abs=1e-7)
-    names = [entry.name for entry in stage.scene.objects]
-    assert "hidden" not in names and "guide" not in names
+def test_light_is_that_of_the_stages_units_and_temperature(shared: Path) -> None:
+    folder = shared / "cases" / "36-usd-normalised-light" / "in"
+    for name in ("metres", "centimetres"):
+        rows = read(folder / f"{name}.usda").scene.materials
+        assert rows[:, EMISSION].max() == pytest.approx(10, rel=1e-5)
+    sky = read(shared / "cases" / "37-usd-dome-temperature" / "in" / "dome.usda").scene.environment
+    assert sky is not None
+    expected = UsdLux.BlackbodyTemperatureAsRgb(3000)
+    assert sky.radiance_rgb[0, 0] == pytest.approx(np.array(expected), rel=1e-5)
 
 
 def test_what_is_lost_is_said(stage: UsdScene) -> None:

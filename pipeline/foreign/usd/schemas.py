@@ -1,0 +1,41 @@
+"""What a prim of a stage is or has on it that nothing here reads, by name."""
+
+from collections.abc import Collection, Iterator
+from typing import Any
+
+_SILENT = (
+    "|Xform|Scope|Camera|Material|Shader|NodeGraph|GeomSubset|PointInstancer|SkelRoot|Skeleton|"
+    "SkelAnimation|BlendShape|Backdrop|SpatialAudio"
+).split("|")
+"""Kinds of prims that are read, or that change neither a shape nor a color nor light."""
+
+_READ = (
+    "MaterialBindingAPI|SkelBindingAPI|ColorSpaceAPI|ColorSpaceDefinitionAPI|VisibilityAPI|"
+    "CollectionAPI|ShapingAPI|ShadowAPI|GeomModelAPI|ModelAPI|MotionAPI|LightListAPI|ListAPI|"
+    "AssetPreviewsAPI|NodeGraphNodeAPI|SceneGraphPrimAPI|AccessibilityAPI|NodeDefAPI|"
+    "MaterialXConfigAPI|CoordSysAPI"
+).split("|")
+"""Likewise for API schemas; what lights lose of theirs is said of each."""
+
+_OF_OTHERS = ("Physics", "Physx", "Semantics", "Render", "Hydra")
+"""What schemas begin with that say how things move, what they mean, or how they are rendered."""
+
+
+def list_unread(prim: Any, time: Any, kinds: Collection[str]) -> Iterator[str]:
+    """Yield what a prim is or has that is not read, if only `kinds` are."""
+    kind = str(prim.GetTypeName())
+    if not (kind in kinds or kind in _SILENT or kind.startswith(_OF_OTHERS)):
+        yield kind
+    applied = prim.GetMetadata("apiSchemas")
+    names = {} if applied is None else dict.fromkeys(map(str, applied.ApplyOperations([])))
+    for name in dict.fromkeys(name.partition(":")[0] for name in names):
+        is_read = name == "MeshLightAPI" and "RectLight" in kinds and kind == "Mesh"
+        is_own = name == "LightAPI" and ("Light" in kind or "MeshLightAPI" in names)
+        if not (is_read or is_own or name in _READ or name.startswith(_OF_OTHERS)):
+            yield f"API schema {name}"
+    mode = prim.GetAttribute("model:drawMode")
+    if mode and mode.HasAuthoredValue() and mode.Get(time) not in ("default", "inherited"):
+        yield f"model:drawMode {mode.Get()}"
+    opacity = prim.GetAttribute("primvars:displayOpacity")
+    if opacity and any(value < 1 for value in opacity.Get(time) or ()):
+        yield "primvar displayOpacity"
