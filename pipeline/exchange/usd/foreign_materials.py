@@ -17,6 +17,12 @@ from pipeline.exchange.dressed import PLAIN, Worn
 from pipeline.exchange.usd.foreign_inputs import ShaderInputs, worn_textures
 from pipeline.exchange.usd.foreign_meshes import MeshToShade
 from pipeline.exchange.usd.foreign_skins import CHANNELS, skinned
+from pipeline.exchange.usd.held_materials import (
+    held_emission,
+    held_material,
+    held_textures,
+    worn_held,
+)
 from pipeline.exchange.usd.names import added_column
 from pipeline.foreign.usd.polygons import primvar_corners
 from pipeline.foreign.usd.shaders import surface_shader, without_place
@@ -31,6 +37,10 @@ from storage.records.material import (
 )
 from storage.records.texture import MapSource
 
+_HELD = (
+    "materials of Trilight are exact where nothing was changed; positions and normals are as this "
+    "file has them, and the provenance is not in it"
+)
 _DEFAULT_DIFFUSE = (0.18, 0.18, 0.18)
 
 
@@ -115,23 +125,39 @@ def _shaded(
 ) -> _Shaded:
     """Return a material over the whole mesh; its display colour without one."""
     shader = surface_shader(material) if material else None
-    if material and shader is None:
+    held = held_material(material, time) if material else None
+    if held is not None:
+        opened.lost.append(_HELD)
+    if held is not None and shader is None:
+        opened.lost.append(f"{material.GetPath()}: no shader; what Trilight wrote on it taken")
+    elif material and shader is None:
         opened.lost.append(
             f"{material.GetPath()}: no shader that is understood; display colour taken"
         )
     count = len(surface.soup.polygons)
     rows, nowhere = default_rows(count), np.zeros((count, 3, 2), np.float32)
+    if held is not None and shader is None:
+        return _Shaded(rows=np.tile(held.row, (count, 1)), uv=nowhere, worn=PLAIN)
     if shader is None:
         rows[:, DIFFUSE] = _display_colour(surface, time)
         rows[:, SPECULAR], rows[:, ROUGHNESS] = 0.04, 0.5
         return _Shaded(rows=rows, uv=nowhere, worn=PLAIN)
     inputs = ShaderInputs(shader, time, opened)
     source = MapSource(name=str(material.GetPrim().GetName()), licence=licence)
-    skin = skinned(inputs.textures(CHANNELS), surface, time, source, opened.lost)
-    worn = worn_textures(inputs, skin.textures, source, f"{surface.prim.GetPath()}", opened.lost)
+    found, where = inputs.textures(CHANNELS), f"{surface.prim.GetPath()}"
+    if held is not None:
+        found = {**held_textures(held, material, time, opened), **found}
+        where = f"{material.GetPath()}"
+    skin = skinned(found, surface, time, source, opened.lost)
+    if held is None:
+        worn = worn_textures(inputs, skin.textures, source, where, opened.lost)
+    else:
+        worn = worn_held(held, inputs, skin.textures, source, where, opened.lost)
     for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), worn, strict=True):
         rows[:, part] = texture.mean if part != ROUGHNESS else texture.mean[0]
     rows[:, EMISSION] = inputs.emission(surface)
+    if held is not None:
+        rows[:, EMISSION] = held_emission(held, rows[:, EMISSION], where, opened.lost)
     for name in without_place(shader, time):
         opened.lost.append(f"{shader.GetPath()}.{name}: has no place here")
     _take_added_columns(rows, material, time, opened.lost)
