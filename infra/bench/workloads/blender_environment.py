@@ -3,6 +3,10 @@
 Blender is under the GPL, large, and exists for one version of Python. So it is never a dependency:
 it is installed from the package index into the user's cache when a comparison asks for it, and only
 a process of its own imports it (infra.bench.workloads.blender_process).
+
+    python -m infra.bench.workloads.blender_environment
+
+installs it before the slow tests; where it cannot be had, it says so, and they skip.
 """
 
 import shutil
@@ -15,6 +19,9 @@ from storage.errors import TrilightError
 
 BLENDER = "4.5.15"
 """The version of Blender, and of its wheel; the reference pictures were made with it."""
+
+LOCK = Path(__file__).with_name("blender.txt")
+"""What is installed, with the digests of all files."""
 
 PYTHON = "3.11"
 """The one version of Python that this wheel exists for."""
@@ -43,8 +50,8 @@ def blender_python() -> Path:
     folder = _folder()
     _run("make its environment", [_base_python(), "-m", "venv", "--clear", str(folder)])
     python = _python_of(folder)
-    pip = [str(python), "-m", "pip", "install", "--quiet", "--only-binary", ":all:"]
-    _run("install it from the package index", [*pip, f"bpy=={BLENDER}"])
+    pip = [str(python), "-m", "pip", "install", "--quiet", "--only-binary", ":all:", "--no-deps"]
+    _run("install it from the package index", [*pip, "--require-hashes", "-r", str(LOCK)])
     _run("load it", [str(python), "-I", "-c", _PROBE])
     (folder / _READY).touch()  # last: an interrupted installation begins anew
     return python
@@ -82,3 +89,10 @@ def _run(step: str, command: list[str]) -> None:
 
 def _unavailable(why: str) -> TrilightError:
     return TrilightError(f"Blender {BLENDER}: {why}.")
+
+
+if __name__ == "__main__":
+    try:
+        blender_python()
+    except TrilightError as error:
+        print(f"{error} Tests beside it will skip.")  # noqa: T201
