@@ -36,7 +36,7 @@ TO_OUR_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _PATH = "inputs:texture:file"
 
 _SAME_TURN = 1e-5
-"""Difference up to which a rotation is the one that Trilight wrote: angles are float32 elsewhere."""
+"""Difference up to which a rotation is the one that Trilight wrote: angles have float32 there."""
 
 
 def add_dome(layer: Any, path: str, sky: Environment) -> dict[str, bytes]:

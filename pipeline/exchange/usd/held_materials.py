@@ -74,7 +74,7 @@ def held_material(material: Any, time: Any) -> HeldMaterial | None:
 
 
 def held_map(text: Any) -> tuple[str, MapSource] | None:
-    """Return digest, and name and rights, of a map from the line of names.map_text, if it is one."""
+    """Return digest, and name and rights, of a map from a line of names.map_text; else None."""
     try:
         fields = json.loads(text)
         sha256, source = fields.pop("sha256"), MapSource(**fields)

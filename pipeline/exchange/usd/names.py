@@ -2,7 +2,7 @@
 
     /Scene                        Xform, the default prim: provenance and digest
     /Scene/Materials/material_<m> one per material row: UsdPreviewSurface, and OpenPBR or textures
-    /Scene/Objects/<name>         one Mesh per object about its center, with a GeomSubset per material
+    /Scene/Objects/<name>         one Mesh per object, about its center, with a subset per material
     /Scene/Cameras/camera_<c>     one per camera
     /Scene/Environment            a DomeLight, where there is an environment
 

@@ -2,11 +2,11 @@
 
 Our BRDF is Lambert + specular x GGX without a Fresnel term. UsdPreviewSurface in its specular
 workflow takes the same albedos and roughness, but lets its specular albedo rise to 1 at grazing
-angles. Blender multiplies it by what its index of refraction reflects head-on, so that the index is
-one that reflects almost all; a UsdPreviewSurface of this workflow does not read it. OpenPBR's base has one index of refraction: it is chosen so that the strongest channel
-reflects our specular albedo head-on, and the tint gives the others. So both look alike and neither
-is equal; the exact values are in the attributes, which our Blender script reads. Textures are
-connected to the preview (pipeline.exchange.usd.write_textures).
+angles. Blender multiplies that albedo by what the index of refraction reflects head-on, which
+nothing else reads here: the index is one that reflects almost all. OpenPBR's base has one index of
+refraction: it is chosen so that the strongest channel reflects our specular albedo head-on, and the
+tint gives the others. So both look alike and neither is equal; the exact values are in the
+attributes. Textures are connected to the preview (pipeline.exchange.usd.write_textures).
 
 OpenPBR counts emission in nits and UsdPreviewSurface as a plain colour: both get our radiance.
 """
