@@ -46,7 +46,9 @@ MESH: Attributes = {
     "subdivisionScheme": ("uniform token", "none"),
     "subsetFamily:materialBind:familyType": ("uniform token", "partition"),
 }
-CENTER = "xformOp:translate"
+CENTER = "xformOp:translate:center"
+"""Has a name of its own, so that others may add a translation."""
+
 SUBSET: Attributes = {
     "elementType": ("uniform token", "face"),
     "familyName": ("uniform token", "materialBind"),

@@ -102,7 +102,7 @@ def test_the_tutorial_keeps_everything(
     lamp = next(row for row, entry in enumerate(scene.objects) if entry.kind == "emitter")
     painted = int(scene.material_index[scene.object_index == lamp][0]) if name == "map" else 0
     write_usd(tmp_path / "a.usdz", scene)
-    asked = {"usd": str(tmp_path / "a.usdz"), "export": str(tmp_path / "back.usdc")}
+    asked: dict[str, Any] = {"usd": str(tmp_path / "a.usdz"), "export": str(tmp_path / "back.usdc")}
     asked |= {"lamp": scene.objects[lamp].name, "material": f"material_{painted}"}
     asked |= {"color": COLOR, "resolution": RESOLUTION, "spp": SPP, "denoise": name == "cbox"}
     theirs = run_blender("blender_usd_process.py", tmp_path / "blender", asked)
