@@ -3,10 +3,6 @@
 Blender is under the GPL, large, and exists for one version of Python. So it is never a dependency:
 it is installed from the package index into the user's cache when a comparison asks for it, and only
 a process of its own imports it (infra.bench.workloads.blender_process).
-
-    python -m infra.bench.workloads.blender_environment
-
-installs it before the slow tests; where it cannot be had, it says so, and they skip.
 """
 
 import shutil
@@ -21,7 +17,7 @@ BLENDER = "4.5.15"
 """The version of Blender, and of its wheel; the reference pictures were made with it."""
 
 LOCK = Path(__file__).with_name("blender.txt")
-"""What is installed, with the digests of all files."""
+"""What is installed, with the digests of all files (infra/setup/lock.sh)."""
 
 PYTHON = "3.11"
 """The one version of Python that this wheel exists for."""
@@ -44,8 +40,7 @@ def blender_python() -> Path:
         TrilightError: there is no Python of that version, the package index does not give the
             wheel, or what it gave cannot be loaded here.
     """
-    found = installed_python()
-    if found:
+    if found := installed_python():
         return found
     folder = _folder()
     _run("make its environment", [_base_python(), "-m", "venv", "--clear", str(folder)])
@@ -89,10 +84,3 @@ def _run(step: str, command: list[str]) -> None:
 
 def _unavailable(why: str) -> TrilightError:
     return TrilightError(f"Blender {BLENDER}: {why}.")
-
-
-if __name__ == "__main__":
-    try:
-        blender_python()
-    except TrilightError as error:
-        print(f"{error} Tests beside it will skip.")  # noqa: T201

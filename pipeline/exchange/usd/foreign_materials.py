@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.dressed import PLAIN, Worn
-from pipeline.exchange.usd.foreign_inputs import ShaderInputs, worn_textures
+from pipeline.exchange.usd.foreign_inputs import ShaderInputs
 from pipeline.exchange.usd.foreign_meshes import MeshToShade
 from pipeline.exchange.usd.foreign_skins import CHANNELS, skinned
 from pipeline.exchange.usd.held_materials import (
+    HeldMaterial,
     held_emission,
     held_material,
     held_textures,
@@ -128,36 +129,20 @@ def _shaded(
     held = held_material(material, time) if material else None
     if held is not None:
         opened.lost.append(_HELD)
-    if held is not None and shader is None:
-        opened.lost.append(f"{material.GetPath()}: no shader; what Trilight wrote on it taken")
-    elif material and shader is None:
-        opened.lost.append(
-            f"{material.GetPath()}: no shader that is understood; display colour taken"
-        )
     count = len(surface.soup.polygons)
     rows, nowhere = default_rows(count), np.zeros((count, 3, 2), np.float32)
-    if held is not None and shader is None:
-        return _Shaded(rows=np.tile(held.row, (count, 1)), uv=nowhere, worn=PLAIN)
     if shader is None:
-        rows[:, DIFFUSE] = _display_colour(surface, time)
-        rows[:, SPECULAR], rows[:, ROUGHNESS] = 0.04, 0.5
+        rows[:] = _without_shader(material, held, surface, time, opened.lost)
         return _Shaded(rows=rows, uv=nowhere, worn=PLAIN)
     inputs = ShaderInputs(shader, time, opened)
     source = MapSource(name=str(material.GetPrim().GetName()), licence=licence)
-    found, where = inputs.textures(CHANNELS), f"{surface.prim.GetPath()}"
-    if held is not None:
-        found = {**held_textures(held, material, time, opened), **found}
-        where = f"{material.GetPath()}"
+    found = {**held_textures(held, material, time, opened), **inputs.textures(CHANNELS)}
     skin = skinned(found, surface, time, source, opened.lost)
-    if held is None:
-        worn = worn_textures(inputs, skin.textures, source, where, opened.lost)
-    else:
-        worn = worn_held(held, inputs, skin.textures, source, where, opened.lost)
+    where = f"{surface.prim.GetPath()}"
+    worn = worn_held(held, inputs, skin.textures, source, where, opened.lost)
     for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), worn, strict=True):
         rows[:, part] = texture.mean if part != ROUGHNESS else texture.mean[0]
-    rows[:, EMISSION] = inputs.emission(surface)
-    if held is not None:
-        rows[:, EMISSION] = held_emission(held, rows[:, EMISSION], where, opened.lost)
+    rows[:, EMISSION] = held_emission(held, inputs.emission(surface), opened.lost)
     for name in without_place(shader, time):
         opened.lost.append(f"{shader.GetPath()}.{name}: has no place here")
     _take_added_columns(rows, material, time, opened.lost)
@@ -165,6 +150,22 @@ def _shaded(
     return _Shaded(
         rows=rows, uv=nowhere if skin.uv is None else skin.uv, worn=(kept[0], kept[1], kept[2])
     )
+
+
+def _without_shader(
+    material: Any, held: HeldMaterial | None, surface: MeshToShade, time: Any, lost: list[str]
+) -> NDArray[np.float32]:
+    """Return rows [T, 10 or more] of a material without a shader: as held, or display colours."""
+    rows = default_rows(len(surface.soup.polygons))
+    if held is not None:
+        lost.append(f"{material.GetPath()}: no shader; what Trilight wrote on it taken")
+        rows[:] = held.row
+        return rows
+    if material:
+        lost.append(f"{material.GetPath()}: no shader that is understood; display colour taken")
+    rows[:, DIFFUSE] = _display_colour(surface, time)
+    rows[:, SPECULAR], rows[:, ROUGHNESS] = 0.04, 0.5
+    return rows
 
 
 def _take_added_columns(

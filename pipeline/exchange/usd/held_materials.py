@@ -40,6 +40,8 @@ _SAME = 1e-5
 class HeldMaterial:
     """The exact values of a material."""
 
+    where: str
+    """The path of its prim, for notes."""
     columns: Mapping[str, NDArray[np.float32]]
     """By the names of the published columns."""
     maps: Mapping[str, tuple[str, MapSource]]
@@ -70,7 +72,7 @@ def held_material(material: Any, time: Any) -> HeldMaterial | None:
         held = held_map(text.Get(time) if text else None)
         if held is not None:
             maps[name] = held
-    return HeldMaterial(columns=columns, maps=maps)
+    return HeldMaterial(where=str(prim.GetPath()), columns=columns, maps=maps)
 
 
 def held_map(text: Any) -> tuple[str, MapSource] | None:
@@ -85,14 +87,16 @@ def held_map(text: Any) -> tuple[str, MapSource] | None:
 
 
 def held_textures(
-    held: HeldMaterial, material: Any, time: Any, opened: OpenedUsd
+    held: HeldMaterial | None, material: Any, time: Any, opened: OpenedUsd
 ) -> dict[str, ForeignTexture]:
     """Return the specular texture where only the roughness of a coat still names it."""
     from pxr import UsdShade
 
+    if held is None or "specular" not in held.maps:
+        return {}
     known = surface_shader(material).GetInput(COAT_ROUGHNESS.removeprefix("inputs:"))
     sources = UsdShade.Utils.GetValueProducingAttributes(known) if known else []
-    if "specular" not in held.maps or not sources or not UsdShade.Output.IsOutput(sources[0]):
+    if not sources or not UsdShade.Output.IsOutput(sources[0]):
         return {}
     node = UsdShade.Shader(sources[0].GetPrim())
     if node.GetShaderId() != "UsdUVTexture":
@@ -102,7 +106,7 @@ def held_textures(
 
 
 def worn_held(
-    held: HeldMaterial,
+    held: HeldMaterial | None,
     inputs: ShaderInputs,
     textures: Mapping[str, Texture],
     source: MapSource,
@@ -112,16 +116,20 @@ def worn_held(
     """Return diffuse, specular and roughness of a material, exact where they are as written.
 
     Args:
-        held: what was written.
+        held: what was written, if anything.
         inputs: of its shader.
         textures: of inputs that have one.
         source: name and rights of other textures.
-        where: the material, for notes.
+        where: the mesh, for notes.
         lost: receives what was changed.
     """
+    if held is None:
+        return worn_textures(inputs, textures, source, where, lost)
     is_specular = bool(inputs.constant("useSpecularWorkflow").any())
     if not is_specular and ("metallic" in textures or inputs.constant("metallic").any()):
-        lost.append(f"{where}: became a metal since Trilight wrote it; read as any other material")
+        lost.append(
+            f"{held.where}: became a metal since Trilight wrote it; read as any other material"
+        )
         return worn_textures(inputs, textures, source, where, lost)
     worn, is_changed = dict[str, Texture](), False
     for column, (name, channels) in _STATED.items():
@@ -131,11 +139,11 @@ def worn_held(
             stated = Texture(texels=texels, source=source)
         exact = _exact(held, column, stated)
         if exact is None and stated is None:
-            lost.append(f"{where}: the texture of {column} is not in the file; its mean taken")
+            lost.append(f"{held.where}: the texture of {column} is not in the file; its mean taken")
             stated = Texture(texels=constant_map(held.columns[column]), source=source)
         elif exact is None:
             lost.append(
-                f"{where}: {column} was changed since Trilight wrote it; taken as it is now"
+                f"{held.where}: {column} was changed since Trilight wrote it; taken as it is now"
             )
             is_changed = True
         texture = stated if exact is None else exact
@@ -150,13 +158,15 @@ def worn_held(
 
 
 def held_emission(
-    held: HeldMaterial, stated: NDArray[np.float32], where: str, lost: list[str]
+    held: HeldMaterial | None, stated: NDArray[np.float32], lost: list[str]
 ) -> NDArray[np.float32]:
     """Return the radiance [T, 3] of triangles: the exact one where the shader states the same."""
+    if held is None:
+        return stated
     exact = held.row[EMISSION]
     if _are_same(stated, exact):
         return np.broadcast_to(exact, stated.shape).astype(np.float32)
-    lost.append(f"{where}: emission was changed since Trilight wrote it; taken as it is now")
+    lost.append(f"{held.where}: emission was changed since Trilight wrote it; taken as it is now")
     return stated
 
 
