@@ -54,7 +54,9 @@ def restore_sky() -> None:
     world = bpy.context.scene.world
     marked = [item for item in bpy.data.objects if f"{_PREFIX}skyVisibleToCamera" in item]
     if world is None or not marked:
-        bpy.context.scene.world = None
+        nodes = world.node_tree.nodes if world is not None and world.node_tree else []
+        if not any(node.bl_idname == "ShaderNodeTexEnvironment" for node in nodes):
+            bpy.context.scene.world = None
         return
     world.cycles_visibility.camera = bool(marked[0][f"{_PREFIX}skyVisibleToCamera"])
     rows = np.array([list(marked[0][f"{_PREFIX}skyRotationRow{row}"]) for row in range(3)])

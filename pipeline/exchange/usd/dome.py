@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
-from pipeline.exchange.usd.held_materials import held_map
+from pipeline.exchange.usd.held_materials import parse_map_text
 from pipeline.exchange.usd.names import (
     MAP_TEXTS,
     SKY_ROWS,
     SKY_SOURCE,
     SKY_VISIBLE,
     VISIBLE_TO_CAMERA,
-    map_text,
+    format_map,
 )
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.foreign.usd.texture_nodes import asset_bytes
@@ -85,7 +85,7 @@ def sky_attributes(sky: Environment | None) -> Attributes:
             for name, row in zip(SKY_ROWS, sky.rotation, strict=True)
         },
         SKY_VISIBLE: ("bool", sky.is_seen),
-        SKY_SOURCE: ("string", map_text(sky.sha256, sky.source)),
+        SKY_SOURCE: ("string", format_map(sky.sha256, sky.source)),
     }
 
 
@@ -145,14 +145,14 @@ def foreign_dome(
     except TrilightError as error:
         opened.lost.append(f"{place}: {error}; its light was left out")
         return None
-    return _as_held(sky, prim, time)
+    return _take_held(sky, prim, time)
 
 
-def _as_held(sky: Environment, dome: Any, time: Any) -> Environment:
+def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
     """Return an environment with what Trilight once wrote of it on the prim of the scene."""
     stage = dome.GetStage()
     holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(SKY_SOURCE)), None)
-    held = None if holder is None else held_map(holder.GetAttribute(SKY_SOURCE).Get(time))
+    held = None if holder is None else parse_map_text(holder.GetAttribute(SKY_SOURCE).Get(time))
     if holder is None or held is None or held[0] != sky.sha256:
         return sky
     sky = dataclasses.replace(sky, source=held[1])

@@ -20,7 +20,7 @@ class Changed(Exception):
     """The layer is not as export wrote it."""
 
 
-def as_known(prim: Any, properties: Mapping[str, T], added: set[str]) -> dict[str, T]:
+def drop_absent(prim: Any, properties: Mapping[str, T], added: set[str]) -> dict[str, T]:
     """Return what is expected of a prim without what an older Trilight did not write yet."""
     return {
         name: value

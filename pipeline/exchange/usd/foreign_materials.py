@@ -19,10 +19,11 @@ from pipeline.exchange.usd.foreign_meshes import MeshToShade
 from pipeline.exchange.usd.foreign_skins import CHANNELS, skinned
 from pipeline.exchange.usd.held_materials import (
     HeldMaterial,
-    held_emission,
-    held_material,
-    held_textures,
-    worn_held,
+    choose_emission,
+    choose_textures,
+    parse_numbers,
+    read_held_material,
+    read_held_textures,
 )
 from pipeline.exchange.usd.names import added_column
 from pipeline.foreign.usd.polygons import primvar_corners
@@ -40,7 +41,7 @@ from storage.records.texture import MapSource
 
 _HELD = (
     "materials of Trilight are exact where nothing was changed; positions and normals are as this "
-    "file has them, and the provenance is not in it"
+    "file has them, and the provenance is a new one"
 )
 _DEFAULT_DIFFUSE = (0.18, 0.18, 0.18)
 
@@ -126,23 +127,23 @@ def _shaded(
 ) -> _Shaded:
     """Return a material over the whole mesh; its display colour without one."""
     shader = surface_shader(material) if material else None
-    held = held_material(material, time) if material else None
+    held = read_held_material(material, time) if material else None
     if held is not None:
         opened.lost.append(_HELD)
     count = len(surface.soup.polygons)
     rows, nowhere = default_rows(count), np.zeros((count, 3, 2), np.float32)
     if shader is None:
-        rows[:] = _without_shader(material, held, surface, time, opened.lost)
+        rows[:] = _build_plain_rows(material, held, surface, time, opened.lost)
         return _Shaded(rows=rows, uv=nowhere, worn=PLAIN)
     inputs = ShaderInputs(shader, time, opened)
     source = MapSource(name=str(material.GetPrim().GetName()), licence=licence)
-    found = {**held_textures(held, material, time, opened), **inputs.textures(CHANNELS)}
+    found = {**read_held_textures(held, material, time, opened), **inputs.textures(CHANNELS)}
     skin = skinned(found, surface, time, source, opened.lost)
     where = f"{surface.prim.GetPath()}"
-    worn = worn_held(held, inputs, skin.textures, source, where, opened.lost)
+    worn = choose_textures(held, inputs, skin.textures, source, where, opened.lost)
     for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), worn, strict=True):
         rows[:, part] = texture.mean if part != ROUGHNESS else texture.mean[0]
-    rows[:, EMISSION] = held_emission(held, inputs.emission(surface), opened.lost)
+    rows[:, EMISSION] = choose_emission(held, inputs.emission(surface), opened.lost)
     for name in without_place(shader, time):
         opened.lost.append(f"{shader.GetPath()}.{name}: has no place here")
     _take_added_columns(rows, material, time, opened.lost)
@@ -152,7 +153,7 @@ def _shaded(
     )
 
 
-def _without_shader(
+def _build_plain_rows(
     material: Any, held: HeldMaterial | None, surface: MeshToShade, time: Any, lost: list[str]
 ) -> NDArray[np.float32]:
     """Return rows [T, 10 or more] of a material without a shader: as held, or display colours."""
@@ -181,7 +182,7 @@ def _take_added_columns(
             lost.append(f"{attribute.GetPath()}: this material column is not declared here")
             continue
         column, part = places[name]
-        value = _numbers(attribute.Get(time))
+        value = parse_numbers(attribute.Get(time))
         if len(value) == column.width and np.all(column.within.holds(value)):
             rows[:, part] = value
         else:
@@ -189,14 +190,6 @@ def _take_added_columns(
                 f"{attribute.GetPath()}: expected {column.width} numbers {column.within}; "
                 "the default taken"
             )
-
-
-def _numbers(value: Any) -> NDArray[np.float64]:
-    """Return what an attribute holds as a row of numbers; an empty one of anything else."""
-    try:
-        return np.array(value, np.float64).reshape(-1)
-    except (TypeError, ValueError):
-        return np.zeros(0)
 
 
 def _display_colour(surface: MeshToShade, time: Any) -> NDArray[np.float32]:

@@ -21,7 +21,7 @@ from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all, cameras
 from pipeline.exchange.usd.foreign_lights import light_triangles, radiance
 from pipeline.exchange.usd.foreign_materials import dressing
 from pipeline.exchange.usd.foreign_meshes import MeshToShade, TriangleSoup, read_mesh
-from pipeline.exchange.usd.names import FOV_DEG, INDEX, OBJECT_TEXTS, camera_row
+from pipeline.exchange.usd.names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
 from pipeline.foreign.usd.placed import Placed, placed_prims
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.scenes.shading import flat_shaded
@@ -42,7 +42,7 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
         TrilightError: too much of something, arrays that contradict each other, or no triangle or
             no light at all.
     """
-    placed = sorted(placed_prims(stage, time, opened.lost), key=_written_row)
+    placed = sorted(placed_prims(stage, time, opened.lost), key=_read_row)
     pieces: list[DressedPiece] = []
     names: set[str] = set()
     triangles = 0
@@ -69,12 +69,12 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
     return _scene(pieces, placed, time, opened, sky)
 
 
-def _written_row(each: Placed) -> float:
+def _read_row(each: Placed) -> float:
     """Return the row that Trilight once wrote on an object or camera; infinity for any other."""
     prim = each.prim
     row = prim.GetAttribute(INDEX).Get()
     if prim.HasAttribute(FOV_DEG):
-        row = camera_row(prim.GetName())
+        row = parse_camera_row(prim.GetName())
     return row if isinstance(row, int) else math.inf
 
 

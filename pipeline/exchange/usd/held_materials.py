@@ -57,26 +57,26 @@ class HeldMaterial:
         return row
 
 
-def held_material(material: Any, time: Any) -> HeldMaterial | None:
+def read_held_material(material: Any, time: Any) -> HeldMaterial | None:
     """Return the exact values of a material; None where it does not hold all of them."""
     prim, columns = material.GetPrim(), dict[str, NDArray[np.float32]]()
     for name, attribute in MATERIAL_ATTRIBUTES.items():
         value, column = prim.GetAttribute(attribute), declared_column(name)
-        stated = _numbers(value.Get(time) if value else None)
+        stated = parse_numbers(value.Get(time) if value else None)
         if len(stated) != column.width or not np.all(column.within.holds(stated)):
             return None
         columns[name] = stated.astype(np.float32)
     maps = {}
     for name in TEXTURED:
         text = prim.GetAttribute(texture_attribute(name))
-        held = held_map(text.Get(time) if text else None)
+        held = parse_map_text(text.Get(time) if text else None)
         if held is not None:
             maps[name] = held
     return HeldMaterial(where=str(prim.GetPath()), columns=columns, maps=maps)
 
 
-def held_map(text: Any) -> tuple[str, MapSource] | None:
-    """Return digest, and name and rights, of a map from a line of names.map_text; else None."""
+def parse_map_text(text: Any) -> tuple[str, MapSource] | None:
+    """Return digest, and name and rights, of a map from a line of names.format_map; else None."""
     try:
         fields = json.loads(text)
         sha256, source = fields.pop("sha256"), MapSource(**fields)
@@ -86,7 +86,7 @@ def held_map(text: Any) -> tuple[str, MapSource] | None:
     return (sha256, source) if all(isinstance(each, str) for each in texts) else None
 
 
-def held_textures(
+def read_held_textures(
     held: HeldMaterial | None, material: Any, time: Any, opened: OpenedUsd
 ) -> dict[str, ForeignTexture]:
     """Return the specular texture where only the roughness of a coat still names it."""
@@ -105,7 +105,7 @@ def held_textures(
     return {} if found is None else {"specularColor": found}
 
 
-def worn_held(
+def choose_textures(
     held: HeldMaterial | None,
     inputs: ShaderInputs,
     textures: Mapping[str, Texture],
@@ -137,7 +137,7 @@ def worn_held(
         if stated is None and (column != "specular" or is_specular):
             texels = constant_map(np.clip(inputs.constant(name)[:channels], 0, 1))
             stated = Texture(texels=texels, source=source)
-        exact = _exact(held, column, stated)
+        exact = _find_exact(held, column, stated)
         if exact is None and stated is None:
             lost.append(f"{held.where}: the texture of {column} is not in the file; its mean taken")
             stated = Texture(texels=constant_map(held.columns[column]), source=source)
@@ -157,37 +157,38 @@ def worn_held(
     return diffuse, specular, worn["roughness"]
 
 
-def held_emission(
+def choose_emission(
     held: HeldMaterial | None, stated: NDArray[np.float32], lost: list[str]
 ) -> NDArray[np.float32]:
     """Return the radiance [T, 3] of triangles: the exact one where the shader states the same."""
     if held is None:
         return stated
     exact = held.row[EMISSION]
-    if _are_same(stated, exact):
+    if _agree(stated, exact):
         return np.broadcast_to(exact, stated.shape).astype(np.float32)
     lost.append(f"{held.where}: emission was changed since Trilight wrote it; taken as it is now")
     return stated
 
 
-def _exact(held: HeldMaterial, column: str, stated: Texture | None) -> Texture | None:
+def _find_exact(held: HeldMaterial, column: str, stated: Texture | None) -> Texture | None:
     """Return the exact texture or constant of a column; None where another one is stated."""
     if column in held.maps:
         sha256, source = held.maps[column]
         is_same = stated is not None and stated.sha256 == sha256
         return dataclasses.replace(stated, source=source) if stated and is_same else None
     if stated is not None and not (
-        stated.constant is not None and _are_same(stated.constant, held.columns[column])
+        stated.constant is not None and _agree(stated.constant, held.columns[column])
     ):
         return None
     return Texture(texels=constant_map(held.columns[column]))
 
 
-def _are_same(stated: NDArray[np.float32], exact: NDArray[np.float32]) -> bool:
+def _agree(stated: NDArray[np.float32], exact: NDArray[np.float32]) -> bool:
     return bool(np.allclose(stated, exact, rtol=_SAME, atol=0))
 
 
-def _numbers(value: Any) -> NDArray[np.float64]:
+def parse_numbers(value: Any) -> NDArray[np.float64]:
+    """Return what an attribute holds as a row of numbers; an empty one of anything else."""
     try:
         return np.array(value, np.float64).reshape(-1)
     except (TypeError, ValueError):

@@ -58,7 +58,7 @@ SKY_ROWS = tuple(f"{NAMESPACE}skyRotationRow{row}" for row in range(3))
 SKY_VISIBLE = NAMESPACE + "skyVisibleToCamera"
 SKY_SOURCE = NAMESPACE + "skySource"
 """Attributes of `/Scene` where there is an environment: its rotation in rows, whether it is seen,
-and its map (map_text). Blender makes a world of a dome, which keeps no attribute of its prim."""
+and its map (format_map). Blender makes a world of a dome, which keeps no attribute of its prim."""
 
 TEXTURE_ROW = NAMESPACE + "textureRow"
 """Attribute of a texture's shader: its row among the textures of the scene."""
@@ -69,7 +69,7 @@ EXACT_POSITIONS = NAMESPACE + "exactPositions"
 precision, and where they are."""
 
 _TEXTURE_SOURCE = NAMESPACE + "texture:"
-"""Prefix of the attribute of a textured column of a material: its texture (map_text)."""
+"""Prefix of the attribute of a textured column of a material: its texture (format_map)."""
 
 MATERIAL_ATTRIBUTES = {
     "diffuse": NAMESPACE + "diffuseAlbedo",
@@ -102,7 +102,7 @@ def texture_attribute(column: str) -> str:
     return _TEXTURE_SOURCE + column
 
 
-def map_text(sha256: str, source: MapSource) -> str:
+def format_map(sha256: str, source: MapSource) -> str:
     """Return one line for a texture or a map: the digest of its content, its name and rights."""
     return canonical_json({"sha256": sha256, **dataclasses.asdict(source)}).decode()
 
@@ -117,7 +117,7 @@ def camera_name(row: int) -> str:
     return f"camera_{row}"
 
 
-def camera_row(name: str) -> int | None:
+def parse_camera_row(name: str) -> int | None:
     """Return the row of the camera of a prim's name; None where it is no such name."""
     row = name.removeprefix("camera_")
     return int(row) if row.isdecimal() and camera_name(int(row)) == name else None

@@ -10,8 +10,8 @@ from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.authoring import as_expected
 from pipeline.exchange.usd.exact_layer import (
-    as_known,
     children_of,
+    drop_absent,
     numbered,
     require,
     require_plain,
@@ -80,8 +80,8 @@ def _require_prims(
     own = prim.path.StripAllVariantSelections()
     for place in tables:
         part = prim.nameChildren[place.removeprefix("/")] if place else prim
-        table = as_known(part, tables[place], _ADDED)
-        linked = as_known(part, links[place], _ADDED)
+        table = drop_absent(part, tables[place], _ADDED)
+        linked = drop_absent(part, links[place], _ADDED)
         require(as_expected(part, table))
         require_plain(part, {*table, *linked})
         for attribute in part.attributes:

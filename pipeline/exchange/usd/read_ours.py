@@ -17,8 +17,8 @@ from pipeline.exchange.usd.authoring import as_expected
 from pipeline.exchange.usd.dome import dome_as_written, dome_attributes, sky_attributes
 from pipeline.exchange.usd.exact_layer import (
     Changed,
-    as_known,
     children_of,
+    drop_absent,
     numbered,
     require,
     require_plain,
@@ -31,10 +31,10 @@ from pipeline.exchange.usd.write_meshes import (
     CENTER,
     MESH,
     SUBSET,
-    centered,
+    center_points,
     object_attributes,
     place_attributes,
-    summed,
+    sum_positions,
 )
 from pipeline.exchange.usd.write_textures import ST
 from pipeline.foreign.usd.stage import OpenedUsd
@@ -173,7 +173,7 @@ def _vertices(
     """Return positions and normals [V, 3] from the rows that meshes and root say are theirs."""
     own = {names.VERSION, names.DIGEST, names.PROVENANCE}
     own |= {names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS}
-    attributes = as_known(root, sky_attributes(sky), {names.SKY_SOURCE})
+    attributes = drop_absent(root, sky_attributes(sky), {names.SKY_SOURCE})
     require_plain(root, own | set(attributes))
     require(as_expected(root, attributes))
     kinds = [(root, names.UNUSED_ROWS, names.UNUSED_NORMALS)]
@@ -195,9 +195,9 @@ def _positions(mesh: Any) -> NDArray[np.float32]:
     if CENTER not in mesh.attributes:
         return points
     center = np.array(mesh.attributes[CENTER].default, np.float64)
-    positions = summed(center, points)
+    positions = sum_positions(center, points)
     positions[whole_numbers(mesh, names.EXACT_ROWS)] = vectors(mesh, names.EXACT_POSITIONS)
-    expected_center, expected_points = centered(positions)
+    expected_center, expected_points = center_points(positions)
     require(np.array_equal(center, expected_center))
     require(np.array_equal(points.view(np.uint32), expected_points.view(np.uint32)))
     require(as_expected(mesh, place_attributes(center, points, positions)))

@@ -33,8 +33,8 @@ from pipeline.exchange.usd.write_textures import (
     OPENPBR,
     PREVIEW,
     Used,
+    build_source_table,
     material_links,
-    source_table,
     texture_tables,
     used_textures,
 )
@@ -107,7 +107,7 @@ def material_tables(
         },
     }
     if used:
-        tables[""] = {**tables[""], **source_table(used)}
+        tables[""] = {**tables[""], **build_source_table(used)}
         return {**tables, **texture_tables(used)}
     return {**tables, f"/{OPENPBR}": _openpbr(diffuse, specular, roughness, emission)}
 

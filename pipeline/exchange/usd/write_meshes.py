@@ -115,7 +115,7 @@ def _add_object(
         add_relationship(subset, BINDING, f"{materials}/{name}")
 
 
-def centered(
+def center_points(
     positions: NDArray[np.float32],
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Return the middle [3] of positions [V, 3], which fits single precision, and points [V, 3]."""
@@ -125,7 +125,7 @@ def centered(
     return center, (wide - center).astype(np.float32)
 
 
-def summed(center: NDArray[np.float64], points: NDArray[np.float32]) -> NDArray[np.float32]:
+def sum_positions(center: NDArray[np.float64], points: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return where points [V, 3] about a center are, in single precision."""
     return (points.astype(np.float64) + center).astype(np.float32)
 
@@ -134,7 +134,7 @@ def place_attributes(
     center: NDArray[np.float64], points: NDArray[np.float32], positions: NDArray[np.float32]
 ) -> Attributes:
     """Return the attributes that place a mesh, with the positions that its sums do not give."""
-    same = summed(center, points).view(np.uint32) == positions.view(np.uint32)
+    same = sum_positions(center, points).view(np.uint32) == positions.view(np.uint32)
     rows = np.flatnonzero(~same.all(axis=1))
     return {
         CENTER: ("double3", center.tolist()),
@@ -146,7 +146,7 @@ def place_attributes(
 
 def _add_arrays(prim: Any, scene: Scene, faces: NDArray[np.intp]) -> None:
     rows, corners = np.unique(scene.faces[faces], return_inverse=True)
-    center, points = centered(scene.vertex_positions[rows])
+    center, points = center_points(scene.vertex_positions[rows])
     extent = np.stack([points.min(axis=0), points.max(axis=0)])
     add_attributes(
         prim,

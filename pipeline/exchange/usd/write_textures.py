@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pipeline.exchange.usd.authoring import Attributes
-from pipeline.exchange.usd.names import MAP_TEXTS, TEXTURE_ROW, map_text, texture_attribute
+from pipeline.exchange.usd.names import MAP_TEXTS, TEXTURE_ROW, format_map, texture_attribute
 from pipeline.exchange.usd.texture_files import encoded_texture, texture_file
 from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, TEXTURED, Texture
@@ -67,10 +67,10 @@ def texture_files(scene: Scene) -> dict[str, bytes]:
     return {texture_file(texture): encoded_texture(texture) for texture in scene.textures}
 
 
-def source_table(used: Used) -> Attributes:
+def build_source_table(used: Used) -> Attributes:
     """Return the attributes of a material that say which textures it has."""
     return {
-        texture_attribute(name): ("string", map_text(texture.sha256, texture.source))
+        texture_attribute(name): ("string", format_map(texture.sha256, texture.source))
         for name, (_, texture) in used.items()
     }
 
