@@ -1,16 +1,17 @@
 """For Blender: makes an imported Trilight scene look exactly as Trilight renders it.
 
-USD has no word for Trilight's material, so that an import shows one that is alike. The exact values
-come along as custom properties `trilight:*`. Open the USD file (File > Import > Universal Scene
+USD has no word for Trilight's material, so that an import shows one that is alike: its gloss takes
+light from what is below it, and lamps are seen. Open the USD file (File > Import > Universal Scene
 Description), open this file in the text editor and press Run Script; or, from the command line,
 
     blender --python exact_materials.py -- scene.usdz
 
-Materials become Add(Diffuse BSDF of roughness 0, Glossy BSDF "Multiscatter GGX") without a Fresnel
-term, emitters emit to both sides, reflect by their albedos, and are hidden from camera rays alone.
-Textures stay connected, and are interpolated between linear values instead of encoded ones. A sky
-is turned as the scene says, and seen by cameras only where it is there. (Blender imports a sky into
-the world of its scene; this needs one.) It needs nothing but Blender 4.2 or later.
+A material becomes Add(Principled BSDF without gloss, Glossy BSDF "Multiscatter GGX"), which has no
+Fresnel term. The Principled BSDF stays what people edit and what Blender exports: the gloss follows
+its roughness and its specular tint. Emitters are hidden from camera rays alone. Textures are
+interpolated between linear values instead of encoded ones. A sky is turned as the scene says, and
+seen by cameras only where it is there. (Blender imports a sky into the world of its scene; this
+needs one.) It needs nothing but Blender 4.2 or later.
 """
 
 import sys
@@ -22,21 +23,8 @@ from mathutils import Matrix
 
 _PREFIX = "trilight:"
 
-_COLUMNS = {
-    ("ShaderNodeBsdfPrincipled", "Base Color"): "diffuse",
-    ("ShaderNodeBsdfPrincipled", "Specular Tint"): "specular",
-    ("ShaderNodeBsdfPrincipled", "Roughness"): "roughness",
-    ("ShaderNodeBsdfDiffuse", "Color"): "diffuse",
-    ("ShaderNodeBsdfAnisotropic", "Color"): "specular",
-    ("ShaderNodeBsdfAnisotropic", "Roughness"): "roughness",
-}
-"""What an input of an imported material, or of one that was restored before, stands for."""
-
-_REPLACED = {node for node, _ in _COLUMNS} | {
-    "ShaderNodeAddShader",
-    "ShaderNodeEmission",
-    "ShaderNodeOutputMaterial",
-}
+_GLOSS, _SUM, _LINEAR = "Trilight gloss", "Trilight sum", "Trilight linear"
+"""Names of what a restored material has beside its Principled BSDF; of textures the beginning."""
 
 
 def restore_scene() -> tuple[int, int]:
@@ -52,10 +40,9 @@ def restore_scene() -> tuple[int, int]:
             # Blender lifts shadow rays off coarse triangles; Trilight traces them as they are
             item.shadow_terminator_geometry_offset = 0.0
             emitters += not visible
-    for image in list(bpy.data.images):
-        interpolate_linear_values(image)
     if materials:
         restore_sky()
+        restore_view()
     return len(materials), emitters
 
 
@@ -67,7 +54,9 @@ def restore_sky() -> None:
     world = bpy.context.scene.world
     marked = [item for item in bpy.data.objects if f"{_PREFIX}skyVisibleToCamera" in item]
     if world is None or not marked:
-        bpy.context.scene.world = None
+        nodes = world.node_tree.nodes if world is not None and world.node_tree else []
+        if not any(node.bl_idname == "ShaderNodeTexEnvironment" for node in nodes):
+            bpy.context.scene.world = None
         return
     world.cycles_visibility.camera = bool(marked[0][f"{_PREFIX}skyVisibleToCamera"])
     rows = np.array([list(marked[0][f"{_PREFIX}skyRotationRow{row}"]) for row in range(3)])
@@ -77,17 +66,31 @@ def restore_sky() -> None:
             node.inputs["Rotation"].default_value = Matrix(rows.T.tolist()).to_euler("XYZ")
 
 
-def interpolate_linear_values(image: Any) -> None:
-    """Let a texture hold linear values: Cycles decodes sRGB after it has interpolated."""
+def restore_view() -> None:
+    """Look through the first camera at square pictures of Cycles, where no camera is chosen yet."""
+    scene, first = bpy.context.scene, bpy.data.objects.get("camera_0")
+    scene.render.engine = "CYCLES"
+    if first is not None and scene.camera in (None, first):
+        scene.camera = first
+        scene.render.resolution_y = scene.render.resolution_x
+
+
+def interpolate_linear_values(image: Any) -> Any:
+    """Return a copy of a texture that holds linear values: Cycles decodes sRGB after interpolating.
+
+    None where the texture holds such values already.
+    """
     if image.is_float or image.colorspace_settings.name != "sRGB" or not image.size[0]:
-        return
+        return None
+    if f"{image.name} linear" in bpy.data.images:
+        return bpy.data.images[f"{image.name} linear"]
     encoded = np.zeros(image.size[0] * image.size[1] * image.channels, np.float32)
     image.pixels.foreach_get(encoded)
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     held = bpy.data.images.new(f"{image.name} linear", *image.size, float_buffer=True, is_data=True)
     held.pixels.foreach_set(linear.astype(np.float32))
     held.pack()
-    image.user_remap(held)
+    return held
 
 
 def property_of(item: Any, name: str) -> Any:
@@ -99,54 +102,74 @@ def property_of(item: Any, name: str) -> Any:
 
 
 def restore_material(material: Any) -> None:
-    """Replace the nodes of a material by the exact ones."""
-    diffuse, specular, emission = (
-        (*map(float, material[_PREFIX + name]), 1.0)
-        for name in ("diffuseAlbedo", "specularAlbedo", "emittedRadiance")
-    )
-    material.use_nodes = True
+    """Take the gloss of a material out of its Principled BSDF, and add it beside it."""
     nodes, link = material.node_tree.nodes, material.node_tree.links.new
-    textures = {}
-    for known in material.node_tree.links:
-        column = _COLUMNS.get((known.to_node.bl_idname, known.to_socket.name))
-        if column is not None:
-            textures[column] = known.from_socket
-    for node in [node for node in nodes if node.bl_idname in _REPLACED]:
-        nodes.remove(node)
-    lambert = nodes.new("ShaderNodeBsdfDiffuse")
-    lambert.inputs["Color"].default_value = diffuse
-    lambert.inputs["Roughness"].default_value = 0.0
-    glossy = nodes.new("ShaderNodeBsdfAnisotropic")  # what "Glossy BSDF" is called inside
-    glossy.distribution = "MULTI_GGX"
-    glossy.inputs["Color"].default_value = specular
-    glossy.inputs["Roughness"].default_value = float(material[_PREFIX + "roughness"])
-    sockets = {
-        "diffuse": lambert.inputs["Color"],
-        "specular": glossy.inputs["Color"],
-        "roughness": glossy.inputs["Roughness"],
-    }
-    for column, source in textures.items():
-        link(source, sockets[column])
-    surface = _added(nodes, link, lambert, glossy)
-    if any(emission[:3]):
-        light = nodes.new("ShaderNodeEmission")
-        light.inputs["Color"].default_value = emission
-        light.inputs["Strength"].default_value = 1.0
-        surface = _added(nodes, link, surface, light)
-        material.cycles.emission_sampling = "FRONT_BACK"
-    link(surface.outputs[0], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
-
-
-def _added(nodes: Any, link: Any, one: Any, other: Any) -> Any:
+    base = next((n for n in nodes if n.bl_idname == "ShaderNodeBsdfPrincipled"), None)
+    if base is None or _GLOSS in nodes:
+        return
+    for node in [node for node in nodes if node.bl_idname == "ShaderNodeTexImage" and node.image]:
+        show_linear_values(material.node_tree, node)
+    gloss = nodes.new("ShaderNodeBsdfAnisotropic")  # what "Glossy BSDF" is called inside
+    gloss.name = gloss.label = _GLOSS
+    gloss.distribution = "MULTI_GGX"
+    follow(material, "specularAlbedo", base.inputs["Specular Tint"], gloss.inputs["Color"])
+    follow(material, "roughness", base.inputs["Roughness"], gloss.inputs["Roughness"])
+    base.inputs["Specular IOR Level"].default_value = 0.0
     both = nodes.new("ShaderNodeAddShader")
-    link(one.outputs[0], both.inputs[0])
-    link(other.outputs[0], both.inputs[1])
-    return both
+    both.name = _SUM
+    link(base.outputs[0], both.inputs[0])
+    link(gloss.outputs[0], both.inputs[1])
+    output = next(node for node in nodes if node.bl_idname == "ShaderNodeOutputMaterial")
+    link(both.outputs[0], output.inputs["Surface"])
+    material.cycles.emission_sampling = "FRONT_BACK"
+
+
+def follow(material: Any, name: str, base: Any, gloss: Any) -> None:
+    """Let an input of the gloss have the texture of that of its base; without one, a property.
+
+    The property then is what people edit, and what Blender exports.
+    """
+    if base.is_linked:
+        material.node_tree.links.new(base.links[0].from_socket, gloss)
+        return
+    is_color = base.type == "RGBA"
+    shown = list(base.default_value)[:3] if is_color else base.default_value
+    if not np.allclose(shown, material[_PREFIX + name], rtol=1e-6):  # edited before this script
+        material[_PREFIX + name] = shown
+    for socket in (base, gloss):
+        curves = socket.driver_add("default_value")
+        for channel, curve in enumerate(curves[:3] if is_color else [curves]):
+            curve.driver.type = "AVERAGE"
+            target = curve.driver.variables.new().targets[0]
+            target.id_type, target.id = "MATERIAL", material
+            part = f"[{channel}]" if is_color else ""
+            target.data_path = f'["{_PREFIX}{name}"]{part}'
+
+
+def show_linear_values(tree: Any, node: Any) -> None:
+    """Put a copy with linear values in the place of a texture, which stays what is exported."""
+    held = interpolate_linear_values(node.image)
+    if held is None:
+        return
+    shown = tree.nodes.new("ShaderNodeTexImage")
+    shown.name, shown.image, shown.extension = f"{_LINEAR} {node.name}", held, node.extension
+    for known in node.inputs["Vector"].links:
+        tree.links.new(known.from_socket, shown.inputs["Vector"])
+    chosen = tree.nodes.new("ShaderNodeMix")  # Blender exports the first texture that it finds
+    chosen.data_type = "RGBA"
+    factor, first, second = (chosen.inputs[n] for n in (0, 6, 7))
+    factor.default_value = 1.0
+    targets = [known.to_socket for known in node.outputs["Color"].links]
+    tree.links.new(node.outputs["Color"], first)
+    tree.links.new(shown.outputs["Color"], second)
+    for target in targets:
+        tree.links.new(chosen.outputs[2], target)
 
 
 def main() -> None:
     """Import the file named after `--`, if there is one, and restore the scene."""
     if "--" in sys.argv[:-1]:
+        bpy.ops.wm.read_homefile(use_empty=True)
         if bpy.context.scene.world is None:
             bpy.context.scene.world = bpy.data.worlds.new("World")
         bpy.ops.wm.usd_import(filepath=sys.argv[sys.argv.index("--") + 1], attr_import_mode="ALL")

@@ -29,4 +29,4 @@ grep -E '^(nvidia|cuda|triton)-?' "$cuda" >cuda.txt
 rm "$cuda"
 
 cd ..
-python -m infra.setup.hashes requirements/*.txt
+python -m infra.setup.hashes requirements/*.txt infra/bench/workloads/blender.txt

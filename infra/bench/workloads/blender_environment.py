@@ -16,6 +16,9 @@ from storage.errors import TrilightError
 BLENDER = "4.5.15"
 """The version of Blender, and of its wheel; the reference pictures were made with it."""
 
+LOCK = Path(__file__).with_name("blender.txt")
+"""What is installed, with the digests of all files (infra/setup/lock.sh)."""
+
 PYTHON = "3.11"
 """The one version of Python that this wheel exists for."""
 
@@ -37,14 +40,13 @@ def blender_python() -> Path:
         TrilightError: there is no Python of that version, the package index does not give the
             wheel, or what it gave cannot be loaded here.
     """
-    found = installed_python()
-    if found:
+    if found := installed_python():
         return found
     folder = _folder()
     _run("make its environment", [_base_python(), "-m", "venv", "--clear", str(folder)])
     python = _python_of(folder)
-    pip = [str(python), "-m", "pip", "install", "--quiet", "--only-binary", ":all:"]
-    _run("install it from the package index", [*pip, f"bpy=={BLENDER}"])
+    pip = [str(python), "-m", "pip", "install", "--quiet", "--only-binary", ":all:", "--no-deps"]
+    _run("install it from the package index", [*pip, "--require-hashes", "-r", str(LOCK)])
     _run("load it", [str(python), "-I", "-c", _PROBE])
     (folder / _READY).touch()  # last: an interrupted installation begins anew
     return python

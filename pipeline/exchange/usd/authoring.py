@@ -113,6 +113,7 @@ def _converter(kind: str) -> Callable[[Any], Any]:
         "float2": Gf.Vec2f,
         "float3": lambda value: Gf.Vec3f(*value),
         "matrix4d": Gf.Matrix4d,
+        "double3": lambda value: Gf.Vec3d(*value),
     }
     plain = kind.removeprefix(UNIFORM)
     return known.get(plain, _vectors if plain.endswith("[]") else _as_it_is)

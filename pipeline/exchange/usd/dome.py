@@ -6,6 +6,7 @@ turn by it here, so that a scene comes back bit for bit and other programs show 
 file is an OpenEXR of float32, because half floats end below the radiance of suns.
 """
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,15 @@ from numpy.typing import NDArray
 from pipeline.exchange.pictures import MAX_BYTES, decoded_pixels, linear_rgb
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
 from pipeline.exchange.usd.foreign_lights import read_light_color
-from pipeline.exchange.usd.names import MAP_TEXTS, SKY_ROWS, SKY_VISIBLE, VISIBLE_TO_CAMERA
+from pipeline.exchange.usd.held_materials import parse_map_text
+from pipeline.exchange.usd.names import (
+    MAP_TEXTS,
+    SKY_ROWS,
+    SKY_SOURCE,
+    SKY_VISIBLE,
+    VISIBLE_TO_CAMERA,
+    format_map,
+)
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.errors import TrilightError
@@ -26,6 +35,9 @@ TO_OUR_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """From the axes of a dome to those of a map: X becomes Y, Y becomes Z, Z becomes X."""
 
 _PATH = "inputs:texture:file"
+
+_SAME_TURN = 1e-5
+"""Difference up to which a rotation is the one that Trilight wrote: angles have float32 there."""
 
 
 def add_dome(layer: Any, path: str, sky: Environment) -> dict[str, bytes]:
@@ -74,6 +86,7 @@ def sky_attributes(sky: Environment | None) -> Attributes:
             for name, row in zip(SKY_ROWS, sky.rotation, strict=True)
         },
         SKY_VISIBLE: ("bool", sky.is_seen),
+        SKY_SOURCE: ("string", format_map(sky.sha256, sky.source)),
     }
 
 
@@ -130,7 +143,23 @@ def foreign_dome(
     except TrilightError as error:
         opened.lost.append(f"{place}: {error}; its light was left out")
         return None
-    return sky
+    return _take_held(sky, prim, time)
+
+
+def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
+    """Return an environment with what Trilight once wrote of it on the prim of the scene."""
+    stage = dome.GetStage()
+    holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(SKY_SOURCE)), None)
+    held = None if holder is None else parse_map_text(holder.GetAttribute(SKY_SOURCE).Get(time))
+    if holder is None or held is None or held[0] != sky.sha256:
+        return sky
+    sky = dataclasses.replace(sky, source=held[1])
+    if not dome.HasAttribute(VISIBLE_TO_CAMERA):
+        sky = dataclasses.replace(sky, is_seen=bool(holder.GetAttribute(SKY_VISIBLE).Get(time)))
+    rows = [holder.GetAttribute(name).Get(time) for name in SKY_ROWS]
+    if None in rows or not np.allclose(rows, sky.rotation, atol=_SAME_TURN):
+        return sky
+    return dataclasses.replace(sky, rotation=np.array(rows, np.float32))
 
 
 def _turn_pole(prim: Any) -> NDArray[np.float64]:

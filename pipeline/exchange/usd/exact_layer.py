@@ -4,11 +4,13 @@ Each function gives what stands there, or raises `Changed`, LookupError, TypeErr
 where it is not as export writes it.
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+T = TypeVar("T")
 
 _PLAIN_INFO = {"specifier", "typeName", "apiSchemas", "documentation", "comment", "displayName"}
 """What may stand on a prim without changing what it shows."""
@@ -16,6 +18,15 @@ _PLAIN_INFO = {"specifier", "typeName", "apiSchemas", "documentation", "comment"
 
 class Changed(Exception):
     """The layer is not as export wrote it."""
+
+
+def drop_absent(prim: Any, properties: Mapping[str, T], added: set[str]) -> dict[str, T]:
+    """Return what is expected of a prim without what an older Trilight did not write yet."""
+    return {
+        name: value
+        for name, value in properties.items()
+        if name not in added or name in prim.properties
+    }
 
 
 def numbered(folder: Any, name: Callable[[int], str]) -> list[Any]:

@@ -7,11 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.usd.names import FOV_DEG
 from pipeline.foreign.usd.placed import Placed
 from storage.conventions import look_at_c2w
 
 _FOV_DEG = 40.0
 """Field of view of the camera that is added to a stage without cameras."""
+_SAME = 1e-5
+"""Relative difference up to which a lens is the one that Trilight wrote."""
 
 
 def cameras(
@@ -52,14 +55,17 @@ def _camera(placed: Placed, time: Any, lost: list[str]) -> tuple[NDArray[np.floa
     if camera.GetProjectionAttr().Get(time) != "perspective" or pose is None or not focal > 0:
         lost.append(f"{where}: no perspective camera with a focal length")
         return None
-    if not math.isclose(wide, high, rel_tol=1e-4):
+    angle = math.degrees(2 * math.atan(wide / (2 * focal)))
+    held = placed.prim.GetAttribute(FOV_DEG).Get(time)
+    is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=_SAME)
+    if not is_held and not math.isclose(wide, high, rel_tol=1e-4):
         lost.append(f"{where}: pictures are square here; its horizontal angle was taken")
     if any(a.Get(time) for a in (camera.GetHorizontalApertureOffsetAttr(),
                                  camera.GetVerticalApertureOffsetAttr())):  # fmt: skip
         lost.append(f"{where}: its shift has no place here")
     if camera.GetFStopAttr().Get(time):
         lost.append(f"{where}: depth of field has no place here")
-    angle = math.degrees(2 * math.atan(wide / (2 * focal)))
+    angle = held if is_held else angle
     return (pose, angle) if 0 < angle < 180 else None
 
 

@@ -14,9 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.dressed import PLAIN, Worn
-from pipeline.exchange.usd.foreign_inputs import ShaderInputs, compute_varied, worn_textures
+from pipeline.exchange.usd.foreign_inputs import ShaderInputs, compute_varied
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup
 from pipeline.exchange.usd.foreign_skins import CHANNELS, skinned
+from pipeline.exchange.usd.held_materials import (
+    HeldMaterial,
+    choose_emission,
+    choose_textures,
+    parse_numbers,
+    read_held_material,
+    read_held_textures,
+)
 from pipeline.exchange.usd.names import added_column
 from pipeline.foreign.usd.shaders import read_bindings, read_colors, read_material
 from pipeline.foreign.usd.stage import OpenedUsd
@@ -30,6 +38,10 @@ from storage.records.material import (
 )
 from storage.records.texture import TEXTURED, MapSource
 
+_HELD = (
+    "materials of Trilight are exact where nothing was changed; positions and normals are as this "
+    "file has them, and the provenance is a new one"
+)
 _DEFAULT_DIFFUSE = (0.18, 0.18, 0.18)
 _COLUMNS = {
     "diffuse": DIFFUSE,
@@ -109,23 +121,23 @@ def _shaded(
 ) -> _Shaded:
     """Return a material over the whole mesh; its display colour without one."""
     stated = read_material(material, time, opened) if material else None
-    if material and stated is None:
-        opened.lost.append(
-            f"{material.GetPath()}: no shader that is understood; display colour taken"
-        )
+    held = read_held_material(material, time) if material else None
+    if held is not None:
+        opened.lost.append(_HELD)
     count = len(surface.positions)
     rows, nowhere = default_rows(count), np.zeros((count, 3, 2), np.float32)
     if stated is None:
-        rows[:, DIFFUSE] = _display_colour(surface, time)
-        rows[:, SPECULAR], rows[:, ROUGHNESS] = 0.04, 0.5
+        rows[:] = _build_plain_rows(material, held, surface, time, opened.lost)
         return _Shaded(rows=rows, uv=nowhere, worn=PLAIN)
     inputs = ShaderInputs(stated, surface, time, opened)
     source = MapSource(name=stated.name, licence=licence)
-    skin = skinned(inputs.textures(CHANNELS), surface, time, source, opened.lost)
-    worn = worn_textures(inputs, skin.textures, source, f"{surface.prim.GetPath()}", opened.lost)
+    textures = {**read_held_textures(held, material, time, opened), **inputs.textures(CHANNELS)}
+    skin = skinned(textures, surface, time, source, opened.lost)
+    where = f"{surface.prim.GetPath()}"
+    worn = choose_textures(held, inputs, skin.textures, source, where, opened.lost)
     for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), worn, strict=True):
         rows[:, part] = texture.mean if part != ROUGHNESS else texture.mean[0]
-    rows[:, EMISSION] = inputs.emission()
+    rows[:, EMISSION] = choose_emission(held, inputs.emission(), opened.lost)
     kept = {
         name: texture if texture.constant is None else None
         for name, texture in zip(TEXTURED, worn, strict=True)
@@ -138,6 +150,22 @@ def _shaded(
         uv=nowhere if skin.uv is None else skin.uv,
         worn=(kept["diffuse"], kept["specular"], kept["roughness"]),
     )
+
+
+def _build_plain_rows(
+    material: Any, held: HeldMaterial | None, surface: TriangleSoup, time: Any, lost: list[str]
+) -> NDArray[np.float32]:
+    """Return rows [T, 10 or more] of a material without a shader: as held, or display colours."""
+    rows = default_rows(len(surface.positions))
+    if held is not None:
+        lost.append(f"{material.GetPath()}: no shader; what Trilight wrote on it taken")
+        rows[:] = held.row
+        return rows
+    if material:
+        lost.append(f"{material.GetPath()}: no shader that is understood; display colour taken")
+    rows[:, DIFFUSE] = _display_colour(surface, time)
+    rows[:, SPECULAR], rows[:, ROUGHNESS] = 0.04, 0.5
+    return rows
 
 
 def _take_added_columns(
@@ -153,7 +181,7 @@ def _take_added_columns(
             lost.append(f"{attribute.GetPath()}: this material column is not declared here")
             continue
         column, part = places[name]
-        value = _numbers(attribute.Get(time))
+        value = parse_numbers(attribute.Get(time))
         if len(value) == column.width and np.all(column.within.holds(value)):
             rows[:, part] = value
         else:
@@ -161,14 +189,6 @@ def _take_added_columns(
                 f"{attribute.GetPath()}: expected {column.width} numbers {column.within}; "
                 "the default taken"
             )
-
-
-def _numbers(value: Any) -> NDArray[np.float64]:
-    """Return what an attribute holds as a row of numbers; an empty one of anything else."""
-    try:
-        return np.array(value, np.float64).reshape(-1)
-    except (TypeError, ValueError):
-        return np.zeros(0)
 
 
 def _display_colour(surface: TriangleSoup, time: Any) -> NDArray[np.float32]:

@@ -1,5 +1,6 @@
 """Makes a `Scene` of the placed prims of a stage."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +21,7 @@ from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all, cameras
 from pipeline.exchange.usd.foreign_lights import light_triangles, radiance
 from pipeline.exchange.usd.foreign_materials import dressing
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup, read_mesh
-from pipeline.exchange.usd.names import OBJECT_TEXTS
+from pipeline.exchange.usd.names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
 from pipeline.foreign.usd.placed import DOMES, Placed, placed_prims
 from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedUsd
@@ -42,7 +43,7 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
         TrilightError: too much of something, arrays that contradict each other, or no triangle or
             no light at all.
     """
-    placed = placed_prims(stage, time, opened.lost)
+    placed = sorted(placed_prims(stage, time, opened.lost), key=_read_row)
     pieces: list[DressedPiece] = []
     names: set[str] = set()
     triangles = 0
@@ -68,6 +69,15 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
     if materials > MAX_ROWS:
         raise TrilightError(f"{materials} materials; expected at most {MAX_ROWS}.")
     return _scene(pieces, placed, time, opened, sky)
+
+
+def _read_row(each: Placed) -> float:
+    """Return the row that Trilight once wrote on an object or camera; infinity for any other."""
+    prim = each.prim
+    row = prim.GetAttribute(INDEX).Get()
+    if prim.HasAttribute(FOV_DEG):
+        row = parse_camera_row(prim.GetName())
+    return row if isinstance(row, int) else math.inf
 
 
 def _scene(

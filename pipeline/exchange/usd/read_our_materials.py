@@ -9,14 +9,23 @@ from numpy.typing import NDArray
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.authoring import as_expected
-from pipeline.exchange.usd.exact_layer import children_of, numbered, require, require_plain
+from pipeline.exchange.usd.exact_layer import (
+    children_of,
+    drop_absent,
+    numbered,
+    require,
+    require_plain,
+)
 from pipeline.exchange.usd.texture_files import decoded_texture
 from pipeline.exchange.usd.write_materials import material_tables
-from pipeline.exchange.usd.write_textures import SHADERS, Used, material_links
+from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, SHADERS, Used, material_links
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.records.material import PUBLISHED_COLUMNS, declared_column, default_rows, laid_out
 from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
+
+_ADDED = {"inputs:ior", COAT_ROUGHNESS, "outputs:r", *map(names.texture_attribute, TEXTURED)}
+"""Properties that files of an older Trilight have not; its roughness textures have `outputs:r`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,12 +78,14 @@ def _require_prims(
     tables, links = material_tables(values, columns, used), material_links(list(used))
     children_of(prim, {place.removeprefix("/") for place in tables if place})
     own = prim.path.StripAllVariantSelections()
-    for place, table in tables.items():
+    for place in tables:
         part = prim.nameChildren[place.removeprefix("/")] if place else prim
+        table = drop_absent(part, tables[place], _ADDED)
+        linked = drop_absent(part, links[place], _ADDED)
         require(as_expected(part, table))
-        require_plain(part, {*table, *links[place]})
+        require_plain(part, {*table, *linked})
         for attribute in part.attributes:
-            source = links[place].get(attribute.name, ("", None))[1]
+            source = linked.get(attribute.name, ("", None))[1]
             found = [str(path) for path in attribute.connectionPathList.explicitItems]
             require(found == ([] if source is None else [f"{own}/{source}"]))
 

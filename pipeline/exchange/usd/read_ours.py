@@ -18,6 +18,7 @@ from pipeline.exchange.usd.dome import dome_as_written, dome_attributes, sky_att
 from pipeline.exchange.usd.exact_layer import (
     Changed,
     children_of,
+    drop_absent,
     numbered,
     require,
     require_plain,
@@ -26,7 +27,15 @@ from pipeline.exchange.usd.exact_layer import (
 )
 from pipeline.exchange.usd.read_our_materials import materials_as_written
 from pipeline.exchange.usd.write import ENVIRONMENT, camera_attributes
-from pipeline.exchange.usd.write_meshes import MESH, SUBSET, object_attributes
+from pipeline.exchange.usd.write_meshes import (
+    CENTER,
+    MESH,
+    SUBSET,
+    center_points,
+    object_attributes,
+    place_attributes,
+    sum_positions,
+)
 from pipeline.exchange.usd.write_textures import ST
 from pipeline.foreign.usd.stage import OpenedUsd
 from storage.conventions import require_readable
@@ -36,6 +45,7 @@ from storage.records.material import UndeclaredColumn
 from storage.records.scene import OBJECT_KINDS, Scene, SceneObject
 from storage.records.scene_file import scene_digest, scene_provenance
 
+_PLACE = {CENTER, "xformOpOrder", names.EXACT_ROWS, names.EXACT_POSITIONS}
 _ARRAYS = {"points", "normals", "extent", "faceVertexCounts", "faceVertexIndices"}
 
 
@@ -133,6 +143,7 @@ def _scene(root: Any, opened: OpenedUsd | None) -> Scene:
         if prim.typeName == "Mesh":
             expected |= {*MESH, *_ARRAYS, names.VERTEX_ROWS, names.FACE_ROWS, "material:binding"}
             expected |= {ST} if scene.textures else set()
+            expected |= _PLACE if CENTER in prim.attributes else set()
             require(as_expected(prim, MESH))
         require_plain(prim, expected)
     return scene
@@ -162,20 +173,35 @@ def _vertices(
     """Return positions and normals [V, 3] from the rows that meshes and root say are theirs."""
     own = {names.VERSION, names.DIGEST, names.PROVENANCE}
     own |= {names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS}
-    require_plain(root, own | set(sky_attributes(sky)))
-    require(as_expected(root, sky_attributes(sky)))
-    kinds = [(root, names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS)]
-    kinds += [(mesh, names.VERTEX_ROWS, "points", "normals") for mesh in meshes]
-    rows = np.concatenate([whole_numbers(prim, name) for prim, name, _, _ in kinds])
+    attributes = drop_absent(root, sky_attributes(sky), {names.SKY_SOURCE})
+    require_plain(root, own | set(attributes))
+    require(as_expected(root, attributes))
+    kinds = [(root, names.UNUSED_ROWS, names.UNUSED_NORMALS)]
+    kinds += [(mesh, names.VERTEX_ROWS, "normals") for mesh in meshes]
+    rows = np.concatenate([whole_numbers(prim, name) for prim, name, _ in kinds])
     require(len(rows) > 0 and rows.min() >= 0)
     count = int(rows.max()) + 1
     require(count <= len(rows) and len(np.unique(rows)) == count)
-    arrays = []
-    for column in (2, 3):
-        values = np.zeros((count, 3), np.float32)
-        values[rows] = np.concatenate([vectors(kind[0], kind[column]) for kind in kinds])
-        arrays.append(values)
-    return arrays[0], arrays[1]
+    positions, normals = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
+    unused = vectors(root, names.UNUSED_POSITIONS)
+    positions[rows] = np.concatenate([unused, *(_positions(mesh) for mesh in meshes)])
+    normals[rows] = np.concatenate([vectors(prim, name) for prim, _, name in kinds])
+    return positions, normals
+
+
+def _positions(mesh: Any) -> NDArray[np.float32]:
+    """Return where the vertices [V, 3] of a mesh are; meshes of old files stand at the origin."""
+    points = vectors(mesh, "points")
+    if CENTER not in mesh.attributes:
+        return points
+    center = np.array(mesh.attributes[CENTER].default, np.float64)
+    positions = sum_positions(center, points)
+    positions[whole_numbers(mesh, names.EXACT_ROWS)] = vectors(mesh, names.EXACT_POSITIONS)
+    expected_center, expected_points = center_points(positions)
+    require(np.array_equal(center, expected_center))
+    require(np.array_equal(points.view(np.uint32), expected_points.view(np.uint32)))
+    require(as_expected(mesh, place_attributes(center, points, positions)))
+    return positions
 
 
 def _faces(

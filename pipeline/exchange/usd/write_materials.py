@@ -2,10 +2,11 @@
 
 Our BRDF is Lambert + specular x GGX without a Fresnel term. UsdPreviewSurface in its specular
 workflow takes the same albedos and roughness, but lets its specular albedo rise to 1 at grazing
-angles. OpenPBR's base has one index of refraction: it is chosen so that the strongest channel
-reflects our specular albedo head-on, and the tint gives the others. So both look alike and neither
-is equal; the exact values are in the attributes, which our Blender script reads. Textures are
-connected to the preview (pipeline.exchange.usd.write_textures).
+angles. Blender multiplies that albedo by what the index of refraction reflects head-on, which
+nothing else reads here: the index is one that reflects almost all. OpenPBR's base has one index of
+refraction: it is chosen so that the strongest channel reflects our specular albedo head-on, and the
+tint gives the others. So both look alike and neither is equal; the exact values are in the
+attributes. Textures are connected to the preview (pipeline.exchange.usd.write_textures).
 
 OpenPBR counts emission in nits and UsdPreviewSurface as a plain colour: both get our radiance.
 """
@@ -32,6 +33,7 @@ from pipeline.exchange.usd.write_textures import (
     OPENPBR,
     PREVIEW,
     Used,
+    build_source_table,
     material_links,
     texture_tables,
     used_textures,
@@ -47,6 +49,9 @@ from storage.records.material import (
 from storage.records.scene import Scene
 
 Colour = tuple[float, float, float]
+
+INDEX_OF_REFRACTION = 1000.0
+"""Of the preview; 1000 is the most that Blender takes, and reflects 0.996 head-on."""
 
 _MOST_REFLECTING = 0.98
 """Head-on reflectance beyond which no index of refraction is sought: 0.98 needs 199."""
@@ -98,9 +103,11 @@ def material_tables(
             "inputs:specularColor": ("color3f", specular),
             "inputs:roughness": ("float", roughness),
             "inputs:emissiveColor": ("color3f", emission),
+            "inputs:ior": ("float", INDEX_OF_REFRACTION),
         },
     }
     if used:
+        tables[""] = {**tables[""], **build_source_table(used)}
         return {**tables, **texture_tables(used)}
     return {**tables, f"/{OPENPBR}": _openpbr(diffuse, specular, roughness, emission)}
 

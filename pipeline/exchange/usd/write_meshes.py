@@ -1,5 +1,9 @@
 """The objects of a scene as meshes: one each, with its normals, and a subset per material.
 
+A mesh stands at the middle of its box, and its points are relative to it: other programs turn and
+scale an object about its origin. Where center plus point, in single precision, is not the position
+to the last bit, the mesh says the position.
+
 An emitter is emissive geometry and a light at once: its material glows, and `MeshLightAPI` with its
 default `materialGlowTintsLight` and a white intensity of 1 emits what the material glows.
 """
@@ -16,6 +20,8 @@ from pipeline.exchange.usd.authoring import (
     add_relationship,
 )
 from pipeline.exchange.usd.names import (
+    EXACT_POSITIONS,
+    EXACT_ROWS,
     FACE_ROWS,
     INDEX,
     OBJECT_TEXTS,
@@ -40,6 +46,9 @@ MESH: Attributes = {
     "subdivisionScheme": ("uniform token", "none"),
     "subsetFamily:materialBind:familyType": ("uniform token", "partition"),
 }
+CENTER = "xformOp:translate:center"
+"""Has a name of its own, so that others may add a translation."""
+
 SUBSET: Attributes = {
     "elementType": ("uniform token", "face"),
     "familyName": ("uniform token", "materialBind"),
@@ -106,16 +115,46 @@ def _add_object(
         add_relationship(subset, BINDING, f"{materials}/{name}")
 
 
+def center_points(
+    positions: NDArray[np.float32],
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Return the middle [3] of positions [V, 3], which fits single precision, and points [V, 3]."""
+    wide = positions.astype(np.float64)
+    middle = (wide.min(axis=0) + wide.max(axis=0)) / 2
+    center = middle.astype(np.float32).astype(np.float64)
+    return center, (wide - center).astype(np.float32)
+
+
+def sum_positions(center: NDArray[np.float64], points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return where points [V, 3] about a center are, in single precision."""
+    return (points.astype(np.float64) + center).astype(np.float32)
+
+
+def place_attributes(
+    center: NDArray[np.float64], points: NDArray[np.float32], positions: NDArray[np.float32]
+) -> Attributes:
+    """Return the attributes that place a mesh, with the positions that its sums do not give."""
+    same = sum_positions(center, points).view(np.uint32) == positions.view(np.uint32)
+    rows = np.flatnonzero(~same.all(axis=1))
+    return {
+        CENTER: ("double3", center.tolist()),
+        "xformOpOrder": ("uniform token[]", (CENTER,)),
+        EXACT_ROWS: ("int[]", rows.astype(np.int32)),
+        EXACT_POSITIONS: ("point3f[]", positions[rows]),
+    }
+
+
 def _add_arrays(prim: Any, scene: Scene, faces: NDArray[np.intp]) -> None:
     rows, corners = np.unique(scene.faces[faces], return_inverse=True)
-    positions = scene.vertex_positions[rows]
-    extent = np.stack([positions.min(axis=0), positions.max(axis=0)])
+    center, points = center_points(scene.vertex_positions[rows])
+    extent = np.stack([points.min(axis=0), points.max(axis=0)])
     add_attributes(
         prim,
         {
+            **place_attributes(center, points, scene.vertex_positions[rows]),
             "faceVertexCounts": ("int[]", np.full(len(faces), 3, np.int32)),
             "faceVertexIndices": ("int[]", corners.ravel().astype(np.int32)),
-            "points": ("point3f[]", positions),
+            "points": ("point3f[]", points),
             "normals": ("normal3f[]", scene.vertex_normals[rows]),
             "extent": ("float3[]", extent),
             VERTEX_ROWS: ("int[]", rows.astype(np.int32)),

@@ -3,7 +3,8 @@
 A textured column of a material is an input of its UsdPreviewSurface that is connected to a texture,
 which reads the coordinates `st` of the meshes. USD's coordinates are ours: v up, the bottom row of
 a picture at v = 0. A textured material has no OpenPBR beside it: renderers of MaterialX then take
-the preview, with its textures, instead of one colour.
+the preview, with its textures, instead of one colour. A specular texture is also that of the
+roughness of a coat that is not there: Blender writes no specular texture, and keeps this one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pipeline.exchange.usd.authoring import Attributes
-from pipeline.exchange.usd.names import MAP_TEXTS, TEXTURE_ROW
+from pipeline.exchange.usd.names import MAP_TEXTS, TEXTURE_ROW, format_map, texture_attribute
 from pipeline.exchange.usd.texture_files import encoded_texture, texture_file
 from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, TEXTURED, Texture
@@ -39,6 +40,9 @@ _INPUTS = {
 }
 """Of each column: type and name of the input, and name and type of the output that it reads."""
 
+COAT_ROUGHNESS = "inputs:clearcoatRoughness"
+"""Input of a preview without a coat that keeps the specular texture where others lose it."""
+
 Used = Mapping[str, tuple[int, Texture]]
 """The textures of a material by the columns that they stand for, with their rows."""
 
@@ -61,6 +65,14 @@ def used_textures(scene: Scene, row: int) -> Used:
 def texture_files(scene: Scene) -> dict[str, bytes]:
     """Return the files of the textures of a scene by their names; raises TrilightError."""
     return {texture_file(texture): encoded_texture(texture) for texture in scene.textures}
+
+
+def build_source_table(used: Used) -> Attributes:
+    """Return the attributes of a material that say which textures it has."""
+    return {
+        texture_attribute(name): ("string", format_map(texture.sha256, texture.source))
+        for name, (_, texture) in used.items()
+    }
 
 
 def texture_tables(used: Used) -> dict[str, Attributes]:
@@ -86,17 +98,21 @@ def material_links(textured: Sequence[str]) -> dict[str, Links]:
         "outputs:surface": ("token", f"{PREVIEW}.outputs:surface")
     }
     preview: dict[str, tuple[str, str | None]] = {"outputs:surface": ("token", None)}
-    places: dict[str, Links] = {"": surface, f"/{PREVIEW}": preview}
+    places: dict[str, dict[str, tuple[str, str | None]]] = {"": surface, f"/{PREVIEW}": preview}
     if not textured:
         surface["outputs:mtlx:surface"] = ("token", f"{OPENPBR}.outputs:out")
         return {**places, f"/{OPENPBR}": {"outputs:out": ("token", None)}}
     for name in textured:
         kind, socket, output, output_kind = _INPUTS[name]
         preview[socket] = (kind, f"{SHADERS[name]}.{output}")
-        places[f"/{SHADERS[name]}"] = {
+        shader = {
             output: (output_kind, None),
             "inputs:st": ("float2", f"{COORDINATES}.outputs:result"),
         }
+        if name == "specular":
+            preview[COAT_ROUGHNESS] = ("float", f"{SHADERS[name]}.outputs:r")
+            shader["outputs:r"] = ("float", None)
+        places[f"/{SHADERS[name]}"] = shader
     return {**places, f"/{COORDINATES}": {"outputs:result": ("float2", None)}}
 
 

@@ -297,6 +297,7 @@ def test_an_interrupted_installation_does_not_count(
     assert environment.installed_python() is None
     assert environment.blender_python() == environment.installed_python()
     assert len(steps) == 2 + 3  # began anew
+    assert f"bpy=={environment.BLENDER} " in environment.LOCK.read_text()
     environment.blender_python()
     assert len(steps) == 2 + 3  # and is remembered
 

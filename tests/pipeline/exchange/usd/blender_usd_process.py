@@ -1,10 +1,10 @@
-"""Runs in Blender's own Python: imports a USD file, says what is in it, and renders it with Cycles.
+"""Runs in Blender's own Python: does what the tutorial does with one of our scenes.
 
     python -I blender_usd_process.py FOLDER
 
-FOLDER/request.json: `usd`, `exact` (whether infra/blender restores the materials), `export` (a
-USD file to write from the imported scene, or null), and what blender_process.py takes.
-Receives facts.json and picture.npy.
+FOLDER/request.json: `usd` (opened by our script), `lamp`, `material` and `color` (what is changed),
+`export` (the USD file to write), and what blender_process.py takes. Receives facts.json and, of the
+scene before the changes, picture.npy.
 """
 
 import importlib.util
@@ -31,47 +31,47 @@ def facts() -> dict[str, Any]:
     meshes = {
         item.name: {
             "triangles": len(item.data.polygons),
-            "materials": [m.name for m in item.data.materials],
             "custom_normals": item.data.has_custom_normals,
+            "off_center": np.abs(np.array(item.bound_box).mean(axis=0)).max(),
+            "visible": item.visible_camera,
         }
         for item in bpy.data.objects
         if item.type == "MESH"
     }
     materials = {}
     for material in bpy.data.materials:
-        (node,) = (n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeBsdfPrincipled")
+        inputs = material.node_tree.nodes["Principled BSDF"].inputs
         materials[material.name] = {
-            "diffuse": list(node.inputs["Base Color"].default_value)[:3],
-            "specular": list(node.inputs["Specular Tint"].default_value)[:3],
-            "roughness": node.inputs["Roughness"].default_value,
-            "emission": list(node.inputs["Emission Color"].default_value)[:3],
-            "strength": node.inputs["Emission Strength"].default_value,
+            "diffuse": list(inputs["Base Color"].default_value)[:3],
+            "specular": list(inputs["Specular Tint"].default_value)[:3],
+            "roughness": inputs["Roughness"].default_value,
+            "emission": list(inputs["Emission Color"].default_value)[:3],
+            "strength": inputs["Emission Strength"].default_value,
         }
-    cameras = {
-        item.name: {
-            "fov": np.degrees(item.data.angle_x),
-            "c2w": np.array(item.matrix_world).tolist(),
-        }
-        for item in bpy.data.objects
-        if item.type == "CAMERA"
-    }
-    return {"meshes": meshes, "materials": materials, "cameras": cameras}
+    return {"meshes": meshes, "materials": materials}
+
+
+def change(request: dict[str, Any]) -> None:
+    """Move, turn and scale a lamp; color a material; make another one rough by its property."""
+    lamp = bpy.data.objects[request["lamp"]]
+    lamp.location.x += 0.125
+    lamp.rotation_euler.z += np.pi / 2
+    lamp.scale = (0.5, 0.5, 0.5)
+    nodes = bpy.data.materials[request["material"]].node_tree.nodes
+    nodes["Principled BSDF"].inputs["Base Color"].default_value = (*request["color"], 1.0)
 
 
 def main(folder: Path) -> None:
     request = json.loads((folder / "request.json").read_text())
     cycles = module("infra/bench/workloads/blender_process.py")
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    bpy.ops.wm.usd_import(filepath=request["usd"], attr_import_mode="ALL")
-    (folder / "facts.json").write_text(json.dumps(facts()))
-    if request["exact"]:
-        module("infra/blender/exact_materials.py").restore_scene()
-    if request["export"]:
-        bpy.ops.wm.usd_export(filepath=request["export"])
-    bpy.context.scene.camera = bpy.data.objects[request["camera"]]
+    sys.argv = ["blender", "--", request["usd"]]
+    module("infra/blender/exact_materials.py").main()
+    (folder / "facts.json").write_text(json.dumps(facts(), default=float))
     cycles.set_up_cycles(request, folder / "render.exr")
     cycles.render(samples=request["spp"])
     np.save(folder / "picture.npy", cycles.pixels(folder / "render.exr"), allow_pickle=False)
+    change(request)
+    bpy.ops.wm.usd_export(filepath=request["export"])
 
 
 if __name__ == "__main__":

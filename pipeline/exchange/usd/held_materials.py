@@ -1,0 +1,194 @@
+"""What Trilight once wrote on a material, where another program has kept it.
+
+Blender keeps the exact values of a material beside the shader that it writes itself. They stand for
+what that shader still shows as Trilight wrote it; a column that was changed there is taken from the
+shader, and said. Blender writes no specular albedo, so that the exact one stays.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.linear_maps import colour_textures, constant_map, linear_map, over_one
+from pipeline.exchange.usd.foreign_inputs import ShaderInputs, worn_textures
+from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
+from pipeline.exchange.usd.names import MATERIAL_ATTRIBUTES, texture_attribute
+from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS
+from pipeline.foreign.usd.shaders import surface_shader
+from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.texture_nodes import find_sources, is_output, texture_node
+from storage.records.material import EMISSION, declared_column, default_rows, laid_out
+from storage.records.texture import TEXTURED, MapSource, Texture
+
+_STATED = {
+    "diffuse": ("diffuseColor", 3),
+    "specular": ("specularColor", 3),
+    "roughness": ("roughness", 1),
+}
+"""Of each column that may be textured: the input of a preview, and its channels."""
+
+_SAME = 1e-5
+"""Relative difference up to which a value is what was written: programs count in float32."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeldMaterial:
+    """The exact values of a material."""
+
+    where: str
+    """The path of its prim, for notes."""
+    columns: Mapping[str, NDArray[np.float32]]
+    """By the names of the published columns."""
+    maps: Mapping[str, tuple[str, MapSource]]
+    """Digest, and name and rights, of the texture of each textured column."""
+
+    @property
+    def row(self) -> NDArray[np.float32]:
+        """[10 or more] the columns of `Scene.materials`."""
+        row = default_rows(1)[0]
+        for column, part in laid_out():
+            if column.name in self.columns:
+                row[part] = self.columns[column.name]
+        return row
+
+
+def read_held_material(material: Any, time: Any) -> HeldMaterial | None:
+    """Return the exact values of a material; None where it does not hold all of them."""
+    prim, columns = material.GetPrim(), dict[str, NDArray[np.float32]]()
+    for name, attribute in MATERIAL_ATTRIBUTES.items():
+        value, column = prim.GetAttribute(attribute), declared_column(name)
+        stated = parse_numbers(value.Get(time) if value else None)
+        if len(stated) != column.width or not np.all(column.within.holds(stated)):
+            return None
+        columns[name] = stated.astype(np.float32)
+    maps = {}
+    for name in TEXTURED:
+        text = prim.GetAttribute(texture_attribute(name))
+        held = parse_map_text(text.Get(time) if text else None)
+        if held is not None:
+            maps[name] = held
+    return HeldMaterial(where=str(prim.GetPath()), columns=columns, maps=maps)
+
+
+def parse_map_text(text: Any) -> tuple[str, MapSource] | None:
+    """Return digest, and name and rights, of a map from a line of names.format_map; else None."""
+    try:
+        fields = json.loads(text)
+        sha256, source = fields.pop("sha256"), MapSource(**fields)
+    except (TypeError, ValueError, KeyError, AttributeError):
+        return None
+    texts = (sha256, *dataclasses.astuple(source))
+    return (sha256, source) if all(isinstance(each, str) for each in texts) else None
+
+
+def read_held_textures(
+    held: HeldMaterial | None, material: Any, time: Any, opened: OpenedUsd
+) -> dict[str, ForeignTexture]:
+    """Return the specular texture where only the roughness of a coat still names it."""
+    from pxr import UsdShade
+
+    if held is None or "specular" not in held.maps:
+        return {}
+    sources = find_sources(surface_shader(material), COAT_ROUGHNESS.removeprefix("inputs:"))
+    if not sources or not is_output(sources[0]):
+        return {}
+    node = UsdShade.Shader(sources[0].GetPrim())
+    if node.GetShaderId() != "UsdUVTexture":
+        return {}
+    found = read_texture(texture_node(node, "rgb", time, opened), opened)
+    return {} if found is None else {"specularColor": found}
+
+
+def choose_textures(
+    held: HeldMaterial | None,
+    inputs: ShaderInputs,
+    textures: Mapping[str, Texture],
+    source: MapSource,
+    where: str,
+    lost: list[str],
+) -> tuple[Texture, Texture, Texture]:
+    """Return diffuse, specular and roughness of a material, exact where they are as written.
+
+    Args:
+        held: what was written, if anything.
+        inputs: of its shader.
+        textures: of inputs that have one.
+        source: name and rights of other textures.
+        where: the mesh, for notes.
+        lost: receives what was changed.
+    """
+    if held is None:
+        return worn_textures(inputs, textures, source, where, lost)
+    is_specular = inputs.stated.is_specular
+    if not is_specular and ("metallic" in textures or inputs.constant("metallic").any()):
+        lost.append(
+            f"{held.where}: became a metal since Trilight wrote it; read as any other material"
+        )
+        return worn_textures(inputs, textures, source, where, lost)
+    worn, is_changed = dict[str, Texture](), False
+    for column, (name, channels) in _STATED.items():
+        stated = textures.get(name)
+        if stated is None and (column != "specular" or is_specular):
+            texels = constant_map(np.clip(inputs.constant(name)[:channels], 0, 1))
+            stated = Texture(texels=texels, source=source)
+        exact = _find_exact(held, column, stated)
+        if exact is None and stated is None:
+            lost.append(f"{held.where}: the texture of {column} is not in the file; its mean taken")
+            stated = Texture(texels=constant_map(held.columns[column]), source=source)
+        elif exact is None:
+            lost.append(
+                f"{held.where}: {column} was changed since Trilight wrote it; taken as it is now"
+            )
+            is_changed = True
+        texture = stated if exact is None else exact
+        assert texture is not None
+        worn[column] = texture
+    diffuse, specular = worn["diffuse"], worn["specular"]
+    is_textured = any(texture.constant is None for texture in (diffuse, specular))
+    if is_changed and is_textured and over_one(diffuse, specular):
+        lost.append(f"{where}: textured diffuse lowered where it would reflect more than it gets")
+        diffuse, specular = colour_textures(linear_map(diffuse), linear_map(specular), source)
+    return diffuse, specular, worn["roughness"]
+
+
+def choose_emission(
+    held: HeldMaterial | None, stated: NDArray[np.float32], lost: list[str]
+) -> NDArray[np.float32]:
+    """Return the radiance [T, 3] of triangles: the exact one where the shader states the same."""
+    if held is None:
+        return stated
+    exact = held.row[EMISSION]
+    if _agree(stated, exact):
+        return np.broadcast_to(exact, stated.shape).astype(np.float32)
+    lost.append(f"{held.where}: emission was changed since Trilight wrote it; taken as it is now")
+    return stated
+
+
+def _find_exact(held: HeldMaterial, column: str, stated: Texture | None) -> Texture | None:
+    """Return the exact texture or constant of a column; None where another one is stated."""
+    if column in held.maps:
+        sha256, source = held.maps[column]
+        is_same = stated is not None and stated.sha256 == sha256
+        return dataclasses.replace(stated, source=source) if stated and is_same else None
+    if stated is not None and not (
+        stated.constant is not None and _agree(stated.constant, held.columns[column])
+    ):
+        return None
+    return Texture(texels=constant_map(held.columns[column]))
+
+
+def _agree(stated: NDArray[np.float32], exact: NDArray[np.float32]) -> bool:
+    return bool(np.allclose(stated, exact, rtol=_SAME, atol=0))
+
+
+def parse_numbers(value: Any) -> NDArray[np.float64]:
+    """Return what an attribute holds as a row of numbers; an empty one of anything else."""
+    try:
+        return np.array(value, np.float64).reshape(-1)
+    except (TypeError, ValueError):
+        return np.zeros(0)

@@ -1,0 +1,175 @@
+"""Exact values where another program kept them, changed what stands beside them, or lost it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pxr import Sdf, UsdGeom
+
+from pipeline.exchange.usd.read import UsdScene, read_usd
+from pipeline.exchange.usd.write import write_usd
+from storage.records.scene import Scene
+from storage.records.scene_file import encode_scene
+from storage.records.texture import Texture
+from tests.for_each import for_each
+from tests.pipeline.exchange.usd.test_write import odd_scene
+from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
+from tests.textured_by_hand import number_texture, sky, textured_scene
+
+MATERIAL = f"/Scene/Materials/material_{FLOOR}"
+PREVIEW = f"{MATERIAL}/Preview"
+EXACT = ("trilight:exactRows", "trilight:exactPositions")
+
+
+def edited(tmp_path: Path, scene: Scene, edit: Callable[[Any], None]) -> UsdScene:
+    """Return what is read after an edit of the layer that we wrote."""
+    write_usd(tmp_path / "a.usda", scene)
+    layer = Sdf.Layer.OpenAsAnonymous(str(tmp_path / "a.usda"))
+    edit(layer)
+    layer.Export(str(tmp_path / "b.usda"))
+    return read_usd(tmp_path / "b.usda", None, None, "CC0-1.0")
+
+
+def as_blender_writes(layer: Any) -> None:
+    """Leave what Blender does: no marks of ours, the metallic workflow, one index of refraction."""
+    scene = layer.GetPrimAtPath("/Scene")
+    for name in ("trilight:schemaVersion", "trilight:sceneSha256"):
+        del scene.properties[name]
+    for material in layer.GetPrimAtPath("/Scene/Materials").nameChildren:
+        if "OpenPBR" in material.nameChildren:
+            del material.nameChildren["OpenPBR"]
+            del material.properties["outputs:mtlx:surface"]
+        for shader in material.nameChildren:
+            for name in list(shader.properties.keys()):
+                if "pecular" in name or name.startswith("trilight:"):
+                    del shader.properties[name]
+
+
+def set_input(name: str, value: Any) -> Callable[[Any], None]:
+    def edit(layer: Any) -> None:
+        layer.GetAttributeAtPath(f"{PREVIEW}.inputs:{name}").default = value
+
+    return edit
+
+
+def rows(scene: Scene) -> np.ndarray:
+    return np.asarray(scene.materials[scene.material_index])
+
+
+@for_each("in_blender", [False, True])
+@for_each(
+    "name, value, column",
+    [
+        ("diffuseColor", (0.1, 0.2, 0.3), slice(0, 3)),
+        ("roughness", 0.25, slice(6, 7)),
+        ("emissiveColor", (1, 2, 3), slice(7, 10)),
+    ],
+)
+def test_an_edit_changes_its_column_alone(
+    tmp_path: Path, in_blender: bool, name: str, value: Any, column: slice
+) -> None:
+    def edit(layer: Any) -> None:
+        set_input(name, value)(layer)
+        if in_blender:
+            as_blender_writes(layer)
+
+    scene = tiny_scene()
+    found = edited(tmp_path, scene, edit)
+    expected = rows(scene).copy()
+    expected[:2, column] = value
+    emits = [2, 0, 1] if name == "emissiveColor" else [0, 1, 2]
+    assert np.array_equal(np.sort(rows(found.scene), axis=0), np.sort(expected[emits], axis=0))
+    assert sum("was changed since" in text for text in found.lost) == 1
+
+
+@pytest.mark.parametrize("specular", [False, True])
+def test_what_blender_loses_is_still_there(tmp_path: Path, specular: bool) -> None:
+    scene = textured_scene(environment=sky())
+    if specular:
+        gloss = Texture(texels=np.array([[[9, 9, 9], [50, 40, 30]]], np.uint8))
+        index = np.array([[-1, 1, 0], [-1, -1, -1]], np.int32)
+        scene = textured_scene(0, number_texture(), gloss, material_textures=index)
+    found = edited(tmp_path, scene, as_blender_writes)
+    assert not found.exact and len(found.lost) == 1
+    assert {t.sha256: t.source for t in found.scene.textures} == {
+        t.sha256: t.source for t in scene.textures
+    }
+    assert np.array_equal(rows(found.scene)[2], rows(scene)[2])
+    assert found.scene.objects == scene.objects
+
+
+def drop_shader(layer: Any) -> None:
+    del layer.GetPrimAtPath(MATERIAL).nameChildren["Preview"]
+    del layer.GetPrimAtPath(MATERIAL).nameChildren["OpenPBR"]
+
+
+def to_metal(layer: Any) -> None:
+    as_blender_writes(layer)
+    metal = Sdf.AttributeSpec(
+        layer.GetPrimAtPath(PREVIEW), "inputs:metallic", Sdf.ValueTypeNames.Float
+    )
+    metal.default = 1.0
+
+
+def spoil(layer: Any) -> None:
+    layer.GetAttributeAtPath(f"{MATERIAL}.trilight:diffuseAlbedo").default = (0.5, np.nan, 7.0)
+
+
+@for_each(
+    "edit, albedos, said",
+    [
+        (drop_shader, (0.5, 0.4, 0.3, 0.2, 0.2, 0.2), "what Trilight wrote on it taken"),
+        (to_metal, (0, 0, 0, 0.5, 0.4, 0.3), "became a metal"),
+        (spoil, (0.5, 0.4, 0.3, 0.2, 0.2, 0.2), "changed since Trilight wrote it"),
+    ],
+)
+def test_what_is_no_longer_so_is_said(
+    tmp_path: Path, edit: Callable[[Any], None], albedos: tuple[float, ...], said: str
+) -> None:
+    found = edited(tmp_path, tiny_scene(), edit)
+    assert rows(found.scene)[0, :6] == pytest.approx(albedos, rel=1e-6)
+    assert any(said in text for text in found.lost)
+
+
+def as_written_before(layer: Any) -> None:
+    """Take away what an older Trilight did not write: meshes stood at the origin."""
+    for material in layer.GetPrimAtPath("/Scene/Materials").nameChildren:
+        for prim in [material, *material.nameChildren]:
+            for name in list(prim.properties.keys()):
+                is_new = name in ("inputs:ior", "inputs:clearcoatRoughness")
+                if is_new or name.startswith("trilight:texture:"):
+                    del prim.properties[name]
+    for mesh in layer.GetPrimAtPath("/Scene/Objects").nameChildren:
+        if mesh.typeName == "Mesh":
+            points = np.array(mesh.attributes["points"].default, np.float64)
+            points += np.array(mesh.attributes["xformOp:translate:center"].default)
+            positions = points.astype(np.float32)
+            exact, known = (mesh.attributes[name].default for name in EXACT)
+            positions[list(exact)] = np.array(known, np.float32).reshape(-1, 3)
+            mesh.attributes["points"].default = positions
+            for name in ("xformOp:translate:center", "xformOpOrder", *EXACT):
+                del mesh.properties[name]
+
+
+def test_files_of_an_older_trilight_are_exact(tmp_path: Path) -> None:
+    for scene in (odd_scene(), textured_scene()):
+        found = edited(tmp_path, scene, as_written_before)
+        assert found.exact and encode_scene(found.scene) == encode_scene(scene)
+
+
+def test_objects_turn_about_their_centers(tmp_path: Path) -> None:
+    def turn(layer: Any) -> None:
+        from pxr import Usd
+
+        stage = Usd.Stage.Open(layer)
+        UsdGeom.Xformable(stage.GetPrimAtPath("/Scene/Objects/light")).AddRotateZOp().Set(180)
+
+    scene = tiny_scene()
+    found = edited(tmp_path, scene, turn)
+    was, now = (s.vertex_positions[s.faces[2]] for s in (scene, found.scene))
+    assert now.mean(axis=0)[2] == 2
+    assert np.array_equal(rows(found.scene)[2], scene.materials[LIGHT])
+    middle = (was.min(axis=0) + was.max(axis=0)) / 2
+    assert now == pytest.approx((middle - was) * [1, 1, 0] + middle, abs=1e-6)
