@@ -120,8 +120,9 @@ def _shaded(
     material: Any, surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
 ) -> _Shaded:
     """Return a material over the whole mesh; its display colour without one."""
-    stated = read_material(material, time, opened) if material else None
     held = read_held_material(material, time) if material else None
+    known = () if held is None else ("specular",)  # Blender's level of it
+    stated = read_material(material, time, opened, known) if material else None
     if held is not None:
         opened.lost.append(_HELD)
     count = len(surface.positions)

@@ -4,7 +4,7 @@ OpenPBR and Standard Surface, which MaterialX brings, are read by the same names
 the same. An input is a constant, a texture, or a primvar of the mesh.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -90,6 +90,8 @@ _NEUTRAL: Mapping[str, float] = {
     ),
 }  # fmt: skip
 """Inputs that have no place here, with the value at which they do nothing."""
+_OF_BLENDER = {"specular": 0.5}
+"""Likewise of a preview that Blender writes: its text knows no such input."""
 
 _WEIGHTS = ("base", "base_weight")
 """What the color of a base is multiplied with."""
@@ -202,13 +204,16 @@ def surface_shader(material: Any) -> Any:
     return found
 
 
-def read_material(material: Any, time: Any, opened: OpenedUsd) -> StatedMaterial | None:
+def read_material(
+    material: Any, time: Any, opened: OpenedUsd, known: Collection[str] = ()
+) -> StatedMaterial | None:
     """Return what a material states, or None where no shader of it is understood.
 
     Args:
         material: the UsdShade.Material.
         time: of the values.
         opened: the file; what is lost is noted there.
+        known: inputs without a place here whose meaning the caller knows.
 
     Raises:
         TrilightError: a picture is outside of the folder, or on the network.
@@ -224,7 +229,7 @@ def read_material(material: Any, time: Any, opened: OpenedUsd) -> StatedMaterial
     constants["diffuseColor"] = constants["diffuseColor"] * reader.weight()
     if material.GetDisplacementOutput().HasConnectedSource():
         opened.lost.append(f"{material.GetPath()}: its displacement has no place here")
-    lost = tuple(reader.without_place())
+    lost = tuple(name for name in reader.without_place() if name not in known)
     opened.lost += [f"{shader.GetPath()}.{name}: has no place here" for name in lost]
     return StatedMaterial(
         name=str(material.GetPrim().GetName()),
@@ -245,6 +250,8 @@ class _Reader:
         self._shader, self._time, self._opened = shader, time, opened
         self._names = NAMES[shader.GetShaderId()]
         self._defaults = _DEFAULTS[shader.GetShaderId()]
+        is_preview = shader.GetShaderId() == PREVIEW
+        self._neutral = {**_NEUTRAL, **_OF_BLENDER} if is_preview else _NEUTRAL
         self.textures: dict[str, TextureNode] = {}
         self.primvars: dict[str, str] = {}
         self._fallbacks: dict[str, Any] = {}
@@ -298,9 +305,9 @@ class _Reader:
         names = []
         for each in self._shader.GetInputs():
             name = str(each.GetBaseName())
-            if name in _NEUTRAL:
-                value = self._value(name, _NEUTRAL[name])
-                is_lost = value is None or (value != _NEUTRAL[name]).any()
+            if name in self._neutral:
+                value = self._value(name, self._neutral[name])
+                is_lost = value is None or (value != self._neutral[name]).any()
             elif name in read or name.startswith(tuple(_PARTS)):
                 is_lost = False
             else:
