@@ -1,4 +1,4 @@
-"""From bytes to triangles: trimesh reads every format, and its silent failures become reasons."""
+"""From a file to triangles: by its format's own reader, a glTF by trimesh."""
 
 import io
 
@@ -18,11 +18,23 @@ def load_mesh(source: SourceFile) -> TriangleMesh:
     vertices are as the file has them: unwelded, some unused, possibly not finite.
 
     Raises:
-        Rejected: load_error, index_range, point_cloud, no_faces; of USD also too_many_faces and
-            offset_precision.
+        Rejected: load_error, index_range, point_cloud, no_faces, header_size_mismatch, cut_off; of
+            USD also too_many_faces and offset_precision.
     """
     if source.usd is not None:
         return source.usd.mesh
+    if source.kind in ("glb", "gltf"):
+        return _load_gltf(source)
+    mesh, unread = source.contents.mesh, "; ".join(source.contents.unread)
+    if len(mesh.faces) == 0:
+        reason = "point_cloud" if len(mesh.positions) and not unread else "no_faces"
+        raise Rejected(
+            reason, "the file holds no triangles" + (f"; not read: {unread}" if unread else "")
+        )
+    return mesh
+
+
+def _load_gltf(source: SourceFile) -> TriangleMesh:
     try:
         scene = trimesh.load_scene(
             io.BytesIO(source.data),
@@ -41,10 +53,10 @@ def load_mesh(source: SourceFile) -> TriangleMesh:
         raise Rejected(reason, f"trimesh: {type(error).__name__}: {error!s:.200}") from error
     if len(mesh.faces) == 0:
         raise Rejected("no_faces", "the file holds no triangles, or no node places them")
-    positions = np.asarray(mesh.vertices, np.float64)
-    if source.kind in ("glb", "gltf"):
-        positions = np.stack([positions[:, 0], -positions[:, 2], positions[:, 1]], axis=1)
-    return TriangleMesh(positions=positions, faces=np.asarray(mesh.faces, np.int64))
+    x, y, z = np.asarray(mesh.vertices, np.float64).T
+    return TriangleMesh(
+        positions=np.stack([x, -z, y], axis=1), faces=np.asarray(mesh.faces, np.int64)
+    )
 
 
 def _check_geometries(scene: trimesh.Scene) -> None:

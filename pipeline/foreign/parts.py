@@ -1,7 +1,8 @@
-"""The triangles of a file with their materials: the same ones that `reading.load` gives.
+"""The triangles of a file with their materials: the same ones that `load` gives.
 
-The mesh library is shown a file without any picture: what it would decode itself, it would decode
-without limits. Materials come to it as bare names, and coordinates as custom attributes.
+Of a glTF, the mesh library is shown a file without any picture: what it would decode itself, it
+would decode without limits. Materials come to it as bare names, and coordinates as custom
+attributes.
 """
 
 import io
@@ -14,7 +15,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.foreign.material import SourceMaterial
-from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.mesh import FileMesh, TriangleMesh
 from storage.errors import Rejected
 
 MOST_UV_SETS = 4
@@ -38,6 +39,22 @@ class TexturedParts:
     """[F, 3, 3] linear colour of each corner, times the base colour; None where it is white."""
 
 
+def mesh_parts(
+    contents: FileMesh, materials: Sequence[SourceMaterial], default: SourceMaterial
+) -> TexturedParts:
+    """Return the triangles of a file, given its materials and that of faces without any."""
+    count = len(contents.mesh.faces)
+    rows = np.full(count, -1) if contents.material is None else contents.material
+    uv = np.full((count, 3, 2), np.nan) if contents.uv is None else contents.uv
+    return TexturedParts(
+        mesh=contents.mesh,
+        material=np.where(rows < 0, len(materials), rows),
+        materials=(*materials, default),
+        uv=uv[:, None],
+        colour=contents.color,
+    )
+
+
 def load_parts(
     data: bytes,
     kind: str,
@@ -59,8 +76,8 @@ def load_parts(
     """
     rows = {name: row for row, name in enumerate(materials)}
     start, found = 0, []
-    for part in dumped(data, kind, files):
-        found.append(_part(part, start, rows.get(_material_name(part), len(rows)), kind))
+    for part in _dump(data, kind, files):
+        found.append(_part(part, start, rows.get(_material_name(part), len(rows))))
         start += len(part.vertices)
     if not found:
         raise Rejected("materials_unreadable", "the file holds no triangles")
@@ -74,7 +91,7 @@ def load_parts(
     )
 
 
-def dumped(data: bytes, kind: str, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
+def _dump(data: bytes, kind: str, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
     """Return the meshes of a file, each as often as it is placed.
 
     Raises:
@@ -86,7 +103,6 @@ def dumped(data: bytes, kind: str, files: Mapping[str, bytes]) -> list[trimesh.T
             file_type=kind,
             resolver=dict(files),
             process=False,
-            skip_materials=kind == "ply",  # an OBJ needs its names
         )
         return [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
     except MemoryError:
@@ -97,11 +113,10 @@ def dumped(data: bytes, kind: str, files: Mapping[str, bytes]) -> list[trimesh.T
         ) from error
 
 
-def _part(part: trimesh.Trimesh, start: int, material: int, kind: str) -> dict[str, NDArray]:
+def _part(part: trimesh.Trimesh, start: int, material: int) -> dict[str, NDArray]:
     faces = np.asarray(part.faces, np.int64)
-    positions = np.asarray(part.vertices, np.float64)
-    if kind in ("glb", "gltf"):
-        positions = np.stack([positions[:, 0], -positions[:, 2], positions[:, 1]], axis=1)
+    x, y, z = np.asarray(part.vertices, np.float64).T
+    positions = np.stack([x, -z, y], axis=1)
     sets = np.full((len(positions), MOST_UV_SETS, 2), np.nan)
     for number, values in _coordinates(part).items():
         if len(values) == len(positions) and values.ndim == 2 and values.shape[1] == 2:
@@ -132,9 +147,6 @@ def _coordinates(part: trimesh.Trimesh) -> dict[int, NDArray[np.float64]]:
         if values is not None and np.ndim(values) == 2:
             unit = _unit(np.asarray(values))
             found[number] = np.stack([unit[:, 0], 1 - unit[:, 1]], axis=1)
-    plain = getattr(part.visual, "uv", None)
-    if not found and plain is not None:
-        found[0] = np.asarray(plain, np.float64)[:, :2]
     return found
 
 

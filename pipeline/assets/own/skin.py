@@ -17,10 +17,9 @@ from pipeline.foreign.gltf_materials import GltfMaterials, bare_gltf, data_uri_b
 from pipeline.foreign.gltf_tree import read_tree
 from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.obj_materials import bare_obj, obj_materials
+from pipeline.foreign.mesh_materials import read_parts
 from pipeline.foreign.parts import TexturedParts, load_parts
 from pipeline.foreign.picture import Decoder
-from pipeline.foreign.ply_colours import ply_parts
 from pipeline.foreign.source_file import SourceFile
 from pipeline.foreign.usd.object_materials import usd_parts
 from storage.errors import Rejected
@@ -102,14 +101,8 @@ def _parts(
 ) -> TexturedParts:
     if source.usd is not None:
         return usd_parts(source.usd, decode, emission=emission)
-    if source.kind == "obj":
-        materials = obj_materials(source.data, source.materials, decode, emission=emission)
-        data, files = bare_obj(source.data)
-        return load_parts(data, source.kind, files, materials, SourceMaterial())
-    if source.kind == "ply":
-        return ply_parts(source.data)
     if source.kind not in ("glb", "gltf"):
-        raise Rejected("no_materials", f"a .{source.kind} file has no materials that are read")
+        return read_parts(source, decode, emission=emission)
     tree = read_tree(source.data, f".{source.kind}")
     if not tree.get("materials"):
         raise Rejected("no_materials", "the glTF has no materials")

@@ -74,6 +74,7 @@ def _record(root: Path, row: dict[str, Any], place: str, name: str) -> ObjectRec
     return ObjectRecord(
         uid=uid,
         path=str(_inside(root, path, place)),
+        root=str(root),
         title=_published(row, "title", place, uid),
         licence=_published(row, "licence", place, UNKNOWN),
         licence_source=_published(row, "licence_source", place, name),
