@@ -73,7 +73,9 @@ def read_ply(data: bytes) -> FileMesh:
         Rejected: load_error, header_size_mismatch or index_range.
     """
     header = _read_header(data)
-    elements, seen = _read_elements(data, header), _Seen()
+    seen, (elements, rest) = _Seen(), _read_elements(data, header)
+    if rest:
+        seen.note("bytes after the last element")
     vertex, face = elements.get("vertex", {}), elements.get("face", {})
     coordinates = seen.take(vertex, "vertex", "x", "y", "z")
     if coordinates is None:
@@ -168,8 +170,8 @@ def _property(words: Sequence[bytes]) -> _Property:
 Columns = Mapping[str, NDArray | _Lists]
 
 
-def _read_elements(data: bytes, header: _Header) -> dict[str, Columns]:
-    """Return the columns of each element."""
+def _read_elements(data: bytes, header: _Header) -> tuple[dict[str, Columns], int]:
+    """Return the columns of each element, and how many bytes follow the last one."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     body = _Binary(data, header.order) if header.order else _Text(data[header.size :])
     columns: dict[str, Columns] = {}
@@ -177,7 +179,9 @@ def _read_elements(data: bytes, header: _Header) -> dict[str, Columns]:
     for element in header.elements:
         if element.properties:
             columns[element.name], at = _read_rows(body, element, at)
-    return columns
+    if at < body.size and not header.order:
+        raise Rejected("header_size_mismatch", f"the PLY holds {body.size - at} numbers too many")
+    return columns, body.size - at
 
 
 class _Text:

@@ -36,7 +36,8 @@ _CACHE = "object-batches"
 _NUM_OBJECTS = 32
 """Objects of a batch, in the mean: a minute of one core where nothing is known yet."""
 _WHOLE = (".off", ".stl", ".usdz")
-"""Suffixes of files that name no other ones; what lies beside the others counts too."""
+"""Suffixes of files that name no other ones; what lies beside the others counts too, of a PLY where
+its pictures are read."""
 _LAYERS = (".usd", ".usda", ".usdc")
 """Of those that may name other objects."""
 _PAUSES_S = (0.2, 10.0)
@@ -301,7 +302,7 @@ def _facts(
         return [facts]
     fetched = path.is_relative_to(cache_folder(""))  # when it came says nothing
     suffix = path.suffix.lower()
-    alone = fetched or suffix in _WHOLE
+    alone = fetched or suffix in _WHOLE or (suffix == ".ply" and not with_pictures)
     folder = Path(root) if root and with_pictures else path.parent
     beside = "" if alone else _beside(folder, suffix in _LAYERS, folders)
     return [facts, path.suffix, *_state(path, fetched), beside]
