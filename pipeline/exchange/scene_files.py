@@ -22,6 +22,7 @@ from pipeline.exchange.from_description import (
     scene_from_description,
 )
 from pipeline.exchange.renderformer_json import MAX_BYTES, read_cameras, read_description
+from pipeline.foreign.material_files import find_in_any_case
 from storage.digests import sha256_hex
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
@@ -231,8 +232,8 @@ def _below(root: Path, relative: str, where: str) -> Path:
     """Return the file that a path means, links followed, if it is below `root`."""
     try:
         path = (root / relative).resolve()
-        if not path.exists() and "\\" in relative:  # as a program on Windows writes it
-            path = (root / relative.replace("\\", "/")).resolve()
+        if not path.exists():  # as a program on Windows writes it
+            path = find_in_any_case(root, relative.replace("\\", "/"), root)
     except (OSError, RuntimeError) as error:  # links in a circle
         raise TrilightError(
             f"{where} is {relative}, which cannot be followed ({error})."

@@ -24,6 +24,8 @@ READ_MAPS = {"map_kd", "map_ks", "map_pr", "map_pm", "map_ke"}
 """Maps of an MTL whose pictures are read."""
 _ENCODINGS = ("cp1252", "cp932", "gbk", "cp1251", "cp437")
 """Those of old programs, in which a name that is not UTF-8 may be meant."""
+_LAYOUTS = ("textures", "images", "../textures", "../images", "../materials/textures")
+"""Folders where large collections keep pictures that their MTL files name without a folder."""
 _WINDOWS_ROOT = re.compile(r"[A-Za-z]:/|/")
 
 ReadFile = Callable[[Path, int], bytes]
@@ -98,11 +100,12 @@ class SourceFolder:
         if "\x00" in plain or (parts and (parts.scheme or parts.netloc)):
             raise Rejected("texture_outside", "it lies elsewhere, and is never fetched")
         is_outside = False
-        for spelling in [plain] if is_uri else _spellings(plain):
-            target = _in_any_case(self._folder, spelling, self._root)
-            is_outside |= not target.is_relative_to(self._root)
-            if target.is_relative_to(self._root) and target.is_file():
+        for spelling in _spellings(plain):
+            target = find_in_any_case(self._folder, spelling, self._root)
+            is_inside = target.is_relative_to(self._root)
+            if is_inside and target.is_file():
                 return target
+            is_outside |= spelling == plain and not is_inside
         if is_outside:
             raise Rejected("texture_outside", "it lies outside the folder of the objects")
         raise Rejected("missing_file", "there is no such file")
@@ -117,14 +120,16 @@ def _spellings(name: str) -> Iterator[str]:
         for encoding in _ENCODINGS if not name.isascii() else ():
             with contextlib.suppress(UnicodeDecodeError):
                 yield code.decode(encoding)
+    last = name.rpartition("/")[2]
     if _WINDOWS_ROOT.match(name):  # a path of the machine on which the file was written
-        yield name.rpartition("/")[2]
+        yield last
+    yield from (f"{folder}/{last}" for folder in _LAYOUTS)
 
 
-def _in_any_case(folder: Path, name: str, root: Path) -> Path:
+def find_in_any_case(folder: Path, name: str, root: Path) -> Path:
     """Return a file below a folder, links followed; its name may differ in case or composition."""
     target = Path(os.path.realpath(folder / name))
-    if target.exists() or not target.is_relative_to(root) or name.startswith("/"):
+    if not target.is_relative_to(root) or target.exists() or name.startswith("/"):
         return target
     place = folder
     for part in Path(name).parts:

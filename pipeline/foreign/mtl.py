@@ -25,7 +25,7 @@ def read_mtl(data: bytes) -> dict[str, Fields]:
             continue
         key, value = decode_name(words[0]).lower(), decode_name(b"".join(words[1:]))
         if key == "newmtl":
-            fields = materials.setdefault(unquote_name(value), {})
+            fields = materials[unquote_name(value)] = {}
         else:
             fields[key] = value
     return materials

@@ -252,7 +252,9 @@ def test_sizes_that_are_no_sizes(outcome: Outcome) -> None:
         assert outcome(mesh)[1] == "extent_range", scale
 
 
-@pytest.mark.parametrize(("suffix", "reason"), [(".stl", "offset_precision"), (".ply", ""), (".obj", "")])
+@pytest.mark.parametrize(
+    ("suffix", "reason"), [(".stl", "offset_precision"), (".ply", ""), (".obj", "")]
+)
 def test_an_object_far_from_its_origin(outcome: Outcome, suffix: str, reason: str) -> None:
     """An offset of 1e6 extents is refused in single precision; doubles and text are exact."""
     asset, found = outcome(by_hand.moved(by_hand.sphere(), 1.0, 1e6), suffix=suffix)

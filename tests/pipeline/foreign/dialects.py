@@ -70,7 +70,7 @@ def write_obj(mesh: Polygons, rng: Rng) -> bytes:
     space, colored = rng.choice([" ", "\t", "  "]), rng.random() < 0.5
     form = rng.choice(["{v}", "{v}/{v}", "{v}//{n}", "{v}/{v}/{n}", "{v}/"])
     interleaved, weighted = rng.random() < 0.5, rng.random() < 0.3
-    lines, faces = ["# ends with \\", "mtllib m.mtl", "vn 0 0 1"], []
+    lines, faces = ["# ends with \\", "mtllib m.mtl", "vn 0 0 1"], list[str]()
     for row, (ring, face) in enumerate(zip(mesh.rings, mesh.faces, strict=True)):
         for point in ring:
             more = [repr(code / 255) for code in mesh.colors[row]] if colored else []
@@ -109,19 +109,23 @@ def write_ply(mesh: Polygons, rng: Rng) -> bytes:
         [(code, name, value * scale) for name, value in zip(names, rgb, strict=True)]
         for rgb in mesh.colors
     ]
-    owner = np.repeat(np.arange(len(mesh.rings)), [len(ring) for ring in mesh.rings])
+    owner = [row for row, ring in enumerate(mesh.rings) for _ in ring]
     vertices = []
     for point, row in zip(mesh.points, owner, strict=True):
         named = [(kind, name, value) for name, value in zip("xyz", point, strict=True)]
         vertices.append([("B", "quality", 7), *named, *([] if of_faces else colors[row])])
     shuffled = rng.sample(range(len(vertices[0])), len(vertices[0]))
     vertices = [[entry[i] for i in shuffled] for entry in vertices]
-    faces = [
+    faces: list[list[Any]] = [
         [("B", "flags", 1), (f"{count_kind}{index_kind}", "vertex_indices", face)]
         + (colors[row] if of_faces else [])
         for row, face in enumerate(mesh.faces)
     ]
-    elements = [("vertex", vertices), ("face", faces), ("edge", [[("i", "a", 0)], [("i", "a", 1)]])]
+    elements: list[tuple[str, list[list[Any]]]] = [
+        ("vertex", vertices),
+        ("face", faces),
+        ("edge", [[("i", "a", 0)], [("i", "a", 1)]]),
+    ]
     rng.shuffle(elements)
     head = ["ply", f"format {form} 1.0", "comment end_header property", "obj_info 1"]
     body, text = b"", []
@@ -165,7 +169,7 @@ def write_off(mesh: Polygons, rng: Rng) -> bytes:
     """Return an OFF with colors of its vertices or faces."""
     kind = rng.choice(["", "C", "N", "CN", "ST", "4", "STC"])
     lines, floats = [], rng.random() < 0.5
-    owner = np.repeat(np.arange(len(mesh.rings)), [len(ring) for ring in mesh.rings])
+    owner = [row for row, ring in enumerate(mesh.rings) for _ in ring]
 
     def color(row: int) -> list[str]:
         return [repr(code / 255) if floats else str(code) for code in mesh.colors[row]]

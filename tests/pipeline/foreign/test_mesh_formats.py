@@ -89,7 +89,7 @@ def test_a_file_that_ends_early_is_refused_or_whole(rng: Rng, kind: str, place: 
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
-READ = {
+READ: dict[str, tuple[str, int, str | bytes, tuple[str, ...]]] = {
     "keyhole": ("obj", 8, "v 0 0 0\nv 3 0 0\nv 3 3 0\nv 0 3 0\nv 1 1 0\nv 1 2 0\nv 2 2 0\nv 2 1 0\n"
                 "f 1 2 3 4 1 5 6 7 8 5\n", ()),
     "free form": ("obj", 1, TRIANGLE + "cstype bezier\ncurv 0 1 1 2\np 1\nf 1 2 3\n",
@@ -179,6 +179,7 @@ SPELLINGS: dict[str, tuple[bytes, str]] = {
     "another case": (b"map_Kd Maps\\A.PNG", "maps/a.png"),
     "of another machine": (b"map_Kd C:\\Users\\x\\a.png", "a.png"),
     "above": (b"map_Kd ..\\images\\a.png", "../images/a.png"),
+    "scanned objects": (b"map_Kd a.png", "../materials/textures/a.png"),
     "latin-1": ("map_Kd größe.png".encode("latin-1"), "größe.png"),
     "shift-jis": ("map_Kd 木.png".encode("cp932"), "木.png"),
 }  # fmt: skip
@@ -218,7 +219,7 @@ def test_statements_of_an_mtl_are_read_or_named(tmp_path: Path) -> None:
     assert red > 0.9 and max(green, blue) < 0.02
 
 
-CASES = {
+CASES: dict[str, dict[str, tuple[int, float | None]]] = {
     "01-obj-concave-polygon": {"u.obj": (28, 30.0)},
     "04-obj-interleaved-negative": {"two.obj": (24, 12.0)},
     "06a-ply-binary-mixed": {"pyramid.ply": (6, None)},
