@@ -1,10 +1,10 @@
 """The parts of files that no code has read, for logs and for people."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
 from storage.atomic import write_atomically
-from storage.digests import canonical_json
 
 Unread = Mapping[str, tuple[str, ...]]
 """Short sentences by the uid of an object."""
@@ -13,11 +13,10 @@ _MOST_LINES = 5
 
 
 def write_unread(logs: Path, unread: Unread) -> Path:
-    """Write `unread.jsonl`, a line per object; without any, remove an earlier one."""
-    path = logs / "unread.jsonl"
-    rows = [canonical_json({"item": uid, "unread": unread[uid]}) + b"\n" for uid in sorted(unread)]
-    if rows:
-        write_atomically(path, b"".join(rows))
+    """Write `unread.json`, the sentences by uid; without any, remove an earlier one."""
+    path = logs / "unread.json"
+    if unread:
+        write_atomically(path, json.dumps(unread, indent=1, sort_keys=True).encode())
     else:
         path.unlink(missing_ok=True)
     return path
