@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.mesh import FileMesh, TriangleMesh, decode_colors
-from pipeline.foreign.polygons import check_indices, sort_by_size, triangulate
+from pipeline.foreign.polygons import cut_polygons
 from pipeline.foreign.text import TextLines, list_some, parse_numbers, plain_text, split_lines
 from storage.errors import Rejected
 
@@ -118,8 +118,7 @@ class _Reader:
 
     def _points(self, starts: NDArray[np.int64]) -> NDArray[np.float64]:
         points = self._numbers[starts[:, None] + np.arange(self._dims)]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return points[:, :3] / points[:, 3:] if self._dims == 4 else points
+        return points[:, :3] / points[:, 3:] if self._dims == 4 else points
 
     def _whole(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
         whole = np.clip(values, -1, 2**62)
@@ -164,18 +163,10 @@ class _Reader:
         if not (named == np.floor(named)).all():
             raise Rejected("load_error", "a face of the OFF names no whole number")
         indices = np.clip(named, -1, 2**62).astype(np.int64)
-        check_indices(indices, len(points))
-        if (sizes < 3).any():
-            self._unread["faces with fewer than three corners"] = int((sizes < 3).sum())
-        corners, owner = triangulate(points, sizes, indices)
-        corners, owner = sort_by_size(corners, owner, sizes, np.zeros_like(sizes))
-        rows = indices[corners]
-        color = by_vertex[rows] if by_vertex is not None else None
-        if color is None and by_face is not None:
-            color = np.repeat(by_face[owner][:, None], 3, axis=1)
+        cut = cut_polygons(points, sizes, indices, self._unread)
         return FileMesh(
-            mesh=TriangleMesh(positions=points, faces=rows),
-            color=color,
+            mesh=TriangleMesh(positions=points, faces=cut.vertices),
+            color=cut.spread(by_vertex, by_face),
             unread=list_some(self._unread),
         )
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.mesh import FileMesh, TriangleMesh, decode_colors
-from pipeline.foreign.polygons import check_indices, sort_by_size, triangulate
+from pipeline.foreign.polygons import CutPolygons, cut_polygons
 from pipeline.foreign.text import decode_name, list_some, parse_numbers, split_lines
 from storage.errors import Rejected
 
@@ -84,32 +84,20 @@ def read_ply(data: bytes) -> FileMesh:
     polygons = _polygons(seen, face, "face")
     strips = _cut_strips(_polygons(seen, elements.get("tristrips", {}), "tristrips"))
     indices = np.concatenate([polygons.values.astype(np.int64), strips.ravel()])
-    check_indices(indices, len(points))
     counts = np.concatenate([polygons.counts, np.full(len(strips), 3)])
-    if (counts < 3).any():
-        seen.note("faces with fewer than three corners")
-    corners, owner = triangulate(points, counts, indices)
-    corners, owner = sort_by_size(corners, owner, counts, np.zeros_like(counts))
-    rows = indices[corners]
-
-    def of_faces(values: NDArray, default: object) -> NDArray:
-        return np.concatenate([values, np.full((len(strips), *values.shape[1:]), default)])[owner]
-
-    color = None
-    if (by_vertex := _colors(seen, vertex, "vertex")) is not None:
-        color = by_vertex[rows]
-    elif (by_face := _colors(seen, face, "face")) is not None:
-        color = np.repeat(of_faces(by_face, 1.0)[:, None], 3, axis=1)
-    material = np.zeros(len(corners), np.int64)
-    if len(header.pictures) > 1 and (number := seen.take(face, "face", "texnumber")) is not None:
-        material = of_faces(number[0].astype(np.int64), -1)
-    known = (0 <= material) & (material < len(header.pictures))
+    cut = cut_polygons(points, counts, indices, seen.notes)
+    by_vertex = _colors(seen, vertex, "vertex")
+    by_face = _colors(seen, face, "face") if by_vertex is None else None
+    if by_face is not None:
+        by_face = np.concatenate([by_face, np.ones((len(strips), 3))])
+    number = seen.take(face, "face", "texnumber") or [np.zeros(len(polygons.counts))]
+    rows = np.append(number[0].astype(np.int64), np.full(len(strips), -1))[cut.owner]
     return FileMesh(
-        mesh=TriangleMesh(positions=points, faces=rows),
-        material=np.where(known, material, -1),
+        mesh=TriangleMesh(positions=points, faces=cut.vertices),
+        material=np.where((rows >= 0) & (rows < len(header.pictures)), rows, -1),
         material_names=tuple(header.pictures),
-        uv=_uv(seen, elements, polygons, rows, corners),
-        color=color,
+        uv=_uv(seen, elements, polygons, cut),
+        color=cut.spread(by_vertex, by_face),
         is_single=any(one.dtype == np.float32 for one in coordinates),
         unread=seen.unread(elements),
     )
@@ -198,8 +186,7 @@ class _Text:
         return int(self._values[at])
 
     def take(self, at: NDArray[np.int64], kind: np.dtype) -> NDArray:
-        with np.errstate(invalid="ignore"):
-            return self._values[at].astype(kind)
+        return self._values[at].astype(kind)
 
 
 class _Binary:
@@ -306,11 +293,11 @@ class _Seen:
 
     def __init__(self) -> None:
         self._read: set[tuple[str, str]] = set()
-        self._notes = Counter[str]()
+        self.notes = Counter[str]()
 
     def note(self, text: str) -> None:
         """Add a sentence."""
-        self._notes[text] = 1
+        self.notes[text] = 1
 
     def take(self, columns: Columns, element: str, *names: str) -> list[NDArray] | None:
         """Return single values by their names; None where one is missing."""
@@ -337,7 +324,7 @@ class _Seen:
             for name in columns:
                 if (element, name) not in self._read and name not in _SILENT:
                     self.note(f"property {name[:24]!r} of {element}")
-        return list_some(self._notes)
+        return list_some(self.notes)
 
 
 def _polygons(seen: _Seen, columns: Columns, element: str) -> _Lists:
@@ -379,18 +366,17 @@ def _uv(
     seen: _Seen,
     columns: Mapping[str, Columns],
     polygons: _Lists,
-    rows: NDArray[np.int64],
-    corners: NDArray[np.int64],
+    cut: CutPolygons,
 ) -> NDArray[np.float64] | None:
     """Return texture coordinates [T, 3, 2] of corners: of faces, or else of vertices."""
     lists = seen.take_lists(columns.get("face", {}), "face", "texcoord")
     if lists is not None and len(lists.values):
-        uv = np.full((max(int(corners.max(initial=-1)) + 1, len(polygons.values)), 2), np.nan)
+        uv = np.full((max(int(cut.corners.max(initial=-1)) + 1, len(polygons.values)), 2), np.nan)
         has = lists.counts == 2 * polygons.counts
         own, theirs = np.repeat(has, polygons.counts), np.repeat(has, lists.counts)
         uv[: len(polygons.values)][own] = lists.values[theirs].reshape(-1, 2)
-        return uv[corners]
+        return uv[cut.corners]
     for names in _UVS:
         if (values := seen.take(columns.get("vertex", {}), "vertex", *names)) is not None:
-            return np.stack(values, axis=1).astype(np.float64)[rows]
+            return np.stack(values, axis=1).astype(np.float64)[cut.vertices]
     return None

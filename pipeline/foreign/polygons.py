@@ -1,5 +1,8 @@
 """Polygons as triangles: fans where they are convex, cut-off ears where they are not."""
 
+from collections import Counter
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +17,45 @@ def check_indices(indices: NDArray[np.int64], count: int) -> None:
     if len(indices) and not (0 <= indices.min() and indices.max() < count):
         bad = indices.min() if indices.min() < 0 else indices.max()
         raise Rejected("index_range", f"a face names vertex {bad} of {count}, counted from 0")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CutPolygons:
+    """The triangles of a file's polygons."""
+
+    corners: NDArray[np.int64]
+    """[T, 3] places within the indices of the polygons."""
+    owner: NDArray[np.int64]
+    """[T] polygon of each."""
+    vertices: NDArray[np.int64]
+    """[T, 3] rows of the points."""
+
+    def spread(
+        self, by_vertex: NDArray[np.float64] | None, by_face: NDArray[np.float64] | None
+    ) -> NDArray[np.float64] | None:
+        """Return colors [T, 3, 3] of corners: of vertices [V, 3], or else of polygons [F, 3]."""
+        if by_vertex is not None:
+            return by_vertex[self.vertices]
+        return None if by_face is None else np.repeat(by_face[self.owner][:, None], 3, axis=1)
+
+
+def cut_polygons(
+    points: NDArray[np.float64],
+    counts: NDArray[np.int64],
+    indices: NDArray[np.int64],
+    unread: Counter[str],
+) -> CutPolygons:
+    """Cut polygons into triangles; arguments as of `triangulate`, and what is not read.
+
+    Raises:
+        Rejected: index_range.
+    """
+    check_indices(indices, len(points))
+    if few := int((counts < 3).sum()):
+        unread["faces with fewer than three corners"] = few
+    corners, owner = triangulate(points, counts, indices)
+    corners, owner = sort_by_size(corners, owner, counts, np.zeros_like(counts))
+    return CutPolygons(corners=corners, owner=owner, vertices=indices[corners])
 
 
 def triangulate(
@@ -77,9 +119,8 @@ def sort_by_size(
 
 def _folded(fans: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return for fans [F, N, 3, 3] whether a triangle faces away from its polygon."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        cross = np.cross(fans[:, :, 1] - fans[:, :, 0], fans[:, :, 2] - fans[:, :, 0])
-        facing = np.einsum("fni,fi->fn", cross, cross.sum(axis=1))
+    cross = np.cross(fans[:, :, 1] - fans[:, :, 0], fans[:, :, 2] - fans[:, :, 0])
+    facing = np.einsum("fni,fi->fn", cross, cross.sum(axis=1))
     return np.asarray((facing < 0).any(axis=1))
 
 

@@ -12,6 +12,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pipeline.foreign.gltf_tree import buffer_paths, check_tree, read_tree
 from pipeline.foreign.headers import check_header
 from pipeline.foreign.limits import ReadLimits
@@ -76,7 +78,8 @@ class SourceFile:
             Rejected: load_error, index_range, header_size_mismatch or cut_off.
         """
         try:
-            contents = _READERS[self.kind](self.data)
+            with np.errstate(all="ignore"):  # numbers of strangers: guards look at the results
+                contents = _READERS[self.kind](self.data)
         except (MemoryError, Rejected):
             raise
         except Exception as error:  # no file of a stranger may show a mistake of ours as one

@@ -18,6 +18,8 @@ _WORDS = {
 }
 """Key words of a facet by their place among its 21 words."""
 _NUM_WORDS = 21
+_MOST_INDENT = 4096
+"""Bytes that are looked at before a solid begins or ends."""
 
 
 def read_stl(data: bytes) -> FileMesh:
@@ -64,8 +66,7 @@ def _without_names(text: bytes) -> tuple[bytes, bool]:
     pieces, kept, balance, at = list[bytes](), 0, 0, text.find(b"solid")
     while at >= 0:
         start = at - 3 if text[at - 3 : at] == b"end" else at
-        line = max(text.rfind(b"\n", 0, start) + 1, start - 4096)
-        before = text[line:start].rstrip()
+        before = text[max(start - _MOST_INDENT, 0) : start].rpartition(b"\n")[2].rstrip()
         end = at + len(b"solid")
         if not before or before.endswith(b"endfacet"):
             balance += 1 if start == at else -1

@@ -1,7 +1,6 @@
 """OBJ, PLY, STL and OFF: read back as written in every dialect; a cut-off file is refused."""
 
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.assets.settings import AssetSettings
+from pipeline.exchange.scene_files import build_scene
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import FileMesh
+from pipeline.foreign.mesh_materials import read_parts
+from pipeline.foreign.picture import Decoder
 from pipeline.foreign.polygons import triangulate
 from pipeline.foreign.source_file import SourceFile, read_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.pipeline.assets.own import textured_kit as kit
 from tests.pipeline.foreign.dialects import WRITERS, Polygons, Rng, draw_polygons
 
@@ -219,37 +221,78 @@ def test_statements_of_an_mtl_are_read_or_named(tmp_path: Path) -> None:
     assert red > 0.9 and max(green, blue) < 0.02
 
 
-CASES: dict[str, dict[str, tuple[int, float | None]]] = {
-    "01-obj-concave-polygon": {"u.obj": (28, 30.0)},
-    "04-obj-interleaved-negative": {"two.obj": (24, 12.0)},
-    "06a-ply-binary-mixed": {"pyramid.ply": (6, None)},
-    "07a-stl-facet-on-one-line": {"one-line-a-facet.stl": (12, None)},
-    "08a-stl-key-words-in-names": {"key-word-names.stl": (24, None)},
-    "09a-off-glued-cut-off": {"glued-cut-off.off": (0, None)},
-    "10a-obj-second-group-indented": {"second-group-indented.obj": (12, None)},
-    "10b-obj-tab-separated": {"tab-separated.obj": (12, None)},
-    "60-ply-double-utm": {"block.ply": (12, None)},
+SHAPES: dict[str, tuple[int, float | None]] = {
+    "01-obj-concave-polygon/in/u.obj": (28, 30.0),
+    "04-obj-interleaved-negative/in/two.obj": (24, 12.0),
+    "06a-ply-binary-mixed/in/pyramid.ply": (6, None),
+    "07a-stl-facet-on-one-line/in/one-line-a-facet.stl": (12, None),
+    "08a-stl-key-words-in-names/in/key-word-names.stl": (24, None),
+    "10a-obj-second-group-indented/in/second-group-indented.obj": (12, None),
+    "10b-obj-tab-separated/in/tab-separated.obj": (12, None),
+    "60-ply-double-utm/in/block.ply": (12, None),
+}
+RED, BLUE = (0.8, 0.05, 0.05), (0.05, 0.1, 0.7)
+SEEN_RED, SEEN_BLUE = (0.578, 0.013, 0.013), (0.013, 0.013, 0.578)
+SHADES = {
+    "17a-mtl-tabs/in/cube.obj": {RED: 0.5, BLUE: 0.5},
+    "18a-obj-latin1-names/in/cube.obj": {(0.05, 0.6, 0.05): 0.5, (0.9, 0.9, 0.9): 0.5},
+    "20-shapenet-layout/in/03001627/abc/models/model_normalized.obj": {
+        SEEN_RED: 0.5,
+        SEEN_BLUE: 0.5,
+    },
+    "21-bop-ply-texture/in/coloured/obj_000002.ply": {(0.013, 0.352, 0.013): 1.0},
+    "21-bop-ply-texture/in/textured/obj_000001.ply": {SEEN_RED: 0.5, SEEN_BLUE: 0.5},
+    "28a-mtl-halo/in/cube.obj": {RED: 0.5, BLUE: 0.5},
 }
 
 
-def read_cases(shared: Path) -> Iterator[tuple[str, int, float | None, SourceFile]]:
-    for folder, files in CASES.items():
-        for name, (count, area) in files.items():
-            path = shared / "cases" / folder / "in" / name
-            yield folder, count, area, read_source(path, AssetSettings().read_limits)
+def test_shapes_of_public_reports(shared: Path) -> None:
+    for name, (count, area) in SHAPES.items():
+        with case(name):
+            mesh = load_mesh(read_source(shared / "cases" / name, ReadLimits()))
+            assert len(mesh.faces) == count
+            if area is not None:
+                double = np.linalg.norm(mesh.double_area_vectors, axis=1).sum()
+                assert double / 2 == pytest.approx(area)
+    off = shared / "cases/09a-off-glued-cut-off/in/glued-cut-off.off"
+    with pytest.raises(Rejected, match="header_size_mismatch"):
+        load_mesh(read_source(off, ReadLimits()))
 
 
-def test_files_of_public_reports(shared: Path) -> None:
-    found = Counter[str]()
-    for folder, count, area, read in read_cases(shared):
-        if count == 0:
-            with pytest.raises(Rejected, match="header_size_mismatch"):
-                load_mesh(read)
-            continue
-        mesh = load_mesh(read)
-        assert len(mesh.faces) == count, folder
-        if area is not None:
-            away = np.linalg.norm(mesh.double_area_vectors, axis=1).sum() / 2
-            assert away == pytest.approx(area), folder
-        found[folder] += 1
-    assert len(found) == 8
+def test_shades_of_public_reports(shared: Path) -> None:
+    """The base color at the middle of each face, by area."""
+    for name, shades in SHADES.items():
+        with case(name):
+            path = shared / "cases" / name
+            root = shared / "cases" / name.partition("/")[0] / "in"
+            read = read_source(path, ReadLimits(with_materials=True), root)
+            parts = read_parts(read, Decoder(1 << 20), emission=False)
+            area = np.linalg.norm(parts.mesh.double_area_vectors, axis=1) / 2
+            found = Counter[tuple[float, ...]]()
+            for face, share in enumerate(area / area.sum()):
+                material = parts.materials[parts.material[face]]
+                color = np.array(material.base_rgb)
+                if parts.colour is not None:
+                    color = color * parts.colour[face].mean(axis=0)
+                if material.base is not None:
+                    middle = parts.uv[face, 0].mean(axis=0)[None]
+                    color = color * material.base.picture.at(middle, np.zeros(1, int))[0, :3]
+                found[tuple(np.round(color, 3).tolist())] += share
+            assert dict(found) == pytest.approx(shades)
+
+
+@pytest.mark.parametrize("name", ["46-json-concave-polygon/scene", "45-json-windows-paths/windows"])
+def test_json_scenes_of_public_reports(shared: Path, name: str) -> None:
+    folder, _, scene = name.partition("/")
+    built, _ = build_scene(
+        shared / "cases" / folder / "in",
+        f"{scene}.json",
+        AssetSettings(),
+        licence="CC0-1.0",
+        num_views=None,
+        scene_index=0,
+        seed=0,
+    )
+    corners = built.vertex_positions[built.faces[built.object_index == 0]].astype(np.float64)
+    vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.linalg.norm(vectors, axis=1).sum() / 2 == pytest.approx(1.2, rel=1e-5)
