@@ -106,9 +106,10 @@ class _Reader:
         at = self._at + self._width * self._num_points
         begin, sizes = np.zeros((2, self._num_faces), np.int64)
         for row in range(self._num_faces):
-            if not (at < len(self._numbers) and 0 <= self._numbers[at] <= len(self._numbers)):
+            size = self._numbers[at] if at < len(self._numbers) else 0.0
+            if not (1 <= size <= len(self._numbers) and size.is_integer()):
                 raise _cut_off(self._num_faces, row)
-            begin[row], sizes[row] = at + 1, self._numbers[at]
+            begin[row], sizes[row] = at + 1, size
             at += 1 + int(sizes[row])
         if at != len(self._numbers):
             raise _cut_off(self._num_points + self._num_faces, len(self._counts))
