@@ -76,12 +76,14 @@ class SourceFolder:
         self._root = root if self._folder.is_relative_to(root) else self._folder
         self._read = read
 
-    def read_all(self, names: Iterable[str], left: int, *, is_uri: bool = False) -> MaterialFiles:
-        """Return files by name; `left` is the bound of bytes for all together."""
+    def read_all(
+        self, names: Iterable[str], left: int, *, is_uri: bool = False, beside: Iterable[str] = ()
+    ) -> MaterialFiles:
+        """Return files by name, within `left` bytes; they may lie in folders `beside`, too."""
         data, refused = dict[str, bytes](), dict[str, Rejected]()
         for name in dict.fromkeys(names):
             try:
-                data[name] = self._read(self._find(name, is_uri=is_uri), left)
+                data[name] = self._read(self._find(name, beside, is_uri=is_uri), left)
                 left -= len(data[name])
             except Rejected as why:
                 code = {"too_large_bytes": "texture_too_large", "missing_file": "texture_missing"}
@@ -89,7 +91,7 @@ class SourceFolder:
                 refused[name] = Rejected(code.get(why.reason, why.reason), message)
         return MaterialFiles(data=data, refused=refused)
 
-    def _find(self, name: str, *, is_uri: bool) -> Path:
+    def _find(self, name: str, beside: Iterable[str], *, is_uri: bool) -> Path:
         """Return the file that a name means, links followed.
 
         Raises:
@@ -100,7 +102,7 @@ class SourceFolder:
         if "\x00" in plain or (parts and (parts.scheme or parts.netloc)):
             raise Rejected("texture_outside", "it lies elsewhere, and is never fetched")
         is_outside = False
-        for spelling in _spellings(plain):
+        for spelling in (*_spellings(plain), *(f"{folder}/{plain}" for folder in beside)):
             target = find_in_any_case(self._folder, spelling, self._root)
             is_inside = target.is_relative_to(self._root)
             if is_inside and target.is_file():
@@ -165,7 +167,8 @@ def obj_files(data: bytes, folder: SourceFolder, left: int) -> MaterialFiles:
         libraries = libraries.joined(found)
     libraries = dataclasses.replace(libraries, libraries=(*libraries.data, *libraries.refused))
     named = [name for text in libraries.data.values() for name in list_pictures(text, READ_MAPS)]
-    return libraries.joined(folder.read_all(named, left))
+    beside = {name.replace("\\", "/").rpartition("/")[0] for name in libraries.data} - {""}
+    return libraries.joined(folder.read_all(named, left, beside=sorted(beside)))
 
 
 def ply_files(data: bytes, folder: SourceFolder, left: int) -> MaterialFiles:

@@ -11,7 +11,7 @@ from pipeline.foreign.polygons import cut_polygons
 from pipeline.foreign.text import TextLines, list_some, parse_numbers, plain_text, split_lines
 from storage.errors import Rejected
 
-_HEADER = re.compile(rb"\s*((?:ST|[CN4n])*)OFF(?![A-Za-z])(\s+BINARY)?|\s*(?=\d)")
+_HEADER = re.compile(rb"\s*((?:ST|[CN4n])*)(?:OFF|off)(?![A-Za-z])(\s+BINARY)?|\s*(?=\d)")
 _COLOR_COUNTS = (0, 1, 3, 4)
 
 

@@ -35,16 +35,18 @@ def source(kind: str, data: bytes) -> SourceFile:
 def by_color(contents: FileMesh, mesh: Polygons) -> dict[int, float]:
     """Return the area of each polygon by its color, or by its material's number."""
     area = np.linalg.norm(contents.mesh.double_area_vectors, axis=1) / 2
+    rows = None
     if contents.material_names:
         number = [int(name.removeprefix("größe ")) for name in contents.material_names]
-        assert contents.material is not None
         rows = np.array(number)[contents.material]
-    else:
-        assert contents.color is not None
+    if contents.color is not None:
         table = linear_from_srgb8()[np.array(mesh.colors)]
         away = np.abs(contents.color[:, :, None] - table).max(axis=-1)
         assert (away.min(axis=-1) < 1e-5).all()
-        rows = away[:, 0].argmin(axis=-1)
+        of_color = away[:, 0].argmin(axis=-1)
+        assert rows is None or np.array_equal(rows, of_color)
+        rows = of_color
+    assert rows is not None
     return dict(enumerate(np.bincount(rows, area)))
 
 
@@ -184,6 +186,7 @@ SPELLINGS: dict[str, tuple[bytes, str]] = {
     "another case": (b"map_Kd Maps\\A.PNG", "maps/a.png"),
     "of another machine": (b"map_Kd C:\\Users\\x\\a.png", "a.png"),
     "above": (b"map_Kd ..\\images\\a.png", "../images/a.png"),
+    "beside its library": (b"map_Kd a.png", "more/a.png"),
     "scanned objects": (b"map_Kd a.png", "../materials/textures/a.png"),
     "latin-1": ("map_Kd größe.png".encode("latin-1"), "größe.png"),
     "shift-jis": ("map_Kd 木.png".encode("cp932"), "木.png"),
@@ -194,7 +197,8 @@ SPELLINGS: dict[str, tuple[bytes, str]] = {
 def test_pictures_are_found_however_their_names_are_spelled(tmp_path: Path, name: str) -> None:
     statement, place = SPELLINGS[name]
     library = b"newmtl m\n" + statement + b"\n"
-    path = placed(tmp_path, b"mtllib b.mtl c.mtl\nusemtl m\n", {"c.mtl": library, place: PICTURE})
+    files = {"more/c.mtl": library, place: PICTURE}
+    path = placed(tmp_path, b"mtllib b.mtl more/c.mtl\nusemtl m\n", files)
     read = read_source(path, ReadLimits(with_materials=True), tmp_path)
     assert [data for data in read.materials.data.values() if data == PICTURE] == [PICTURE]
 
