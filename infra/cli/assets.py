@@ -122,9 +122,9 @@ def _tell(
 
 
 def _unread_rows(report: "AssetReport", folder: "AssetFolder") -> list[tuple[str, str]]:
-    from pipeline.making.unread import unread_lines
+    from pipeline.making.unread import format_unread
 
-    lines = unread_lines(report.unread, folder.logs)
+    lines = format_unread(report.unread, folder.logs)
     return [("" if row else "not read", line) for row, line in enumerate(lines)]
 
 

@@ -51,7 +51,7 @@ class MaterialFiles:
             name, Rejected("texture_missing", f"{name!r:.80} is not beside the object")
         )
 
-    def joined(self, others: "MaterialFiles") -> "MaterialFiles":
+    def join(self, others: "MaterialFiles") -> "MaterialFiles":
         """Return these files and others."""
         return MaterialFiles(
             data={**self.data, **others.data},
@@ -102,20 +102,21 @@ class SourceFolder:
         if "\x00" in plain or (parts and (parts.scheme or parts.netloc)):
             raise Rejected("texture_outside", "it lies elsewhere, and is never fetched")
         is_outside = False
-        for spelling in (*_spellings(plain), *(f"{folder}/{plain}" for folder in beside)):
-            target = find_in_any_case(self._folder, spelling, self._root)
-            is_inside = target.is_relative_to(self._root)
-            if is_inside and target.is_file():
-                return target
-            is_outside |= spelling == plain and not is_inside
+        others = (f"{folder}/{plain}" for folder in beside)
+        for spelling in (plain, *others, *_list_spellings(plain)):
+            with contextlib.suppress(OSError):  # such as a name that is too long
+                target = find_in_any_case(self._folder, spelling, self._root)
+                is_inside = target.is_relative_to(self._root)
+                if is_inside and target.is_file():
+                    return target
+                is_outside |= spelling == plain and not is_inside
         if is_outside:
             raise Rejected("texture_outside", "it lies outside the folder of the objects")
         raise Rejected("missing_file", "there is no such file")
 
 
-def _spellings(name: str) -> Iterator[str]:
-    """Yield a name, and what else it may mean: in another encoding, or on another machine."""
-    yield name
+def _list_spellings(name: str) -> Iterator[str]:
+    """Yield what else a name may mean: in another encoding, or on another machine."""
     with contextlib.suppress(UnicodeEncodeError):
         code = name.encode("latin-1")
         yield os.fsdecode(code)
@@ -138,13 +139,13 @@ def find_in_any_case(folder: Path, name: str, root: Path) -> Path:
         following = place / part
         if part != ".." and place.is_relative_to(root) and not following.exists():
             with contextlib.suppress(OSError):
-                alike = [one for one in os.listdir(place) if _folded(one) == _folded(part)]
+                alike = [one for one in os.listdir(place) if _fold_name(one) == _fold_name(part)]
                 following = place / min(alike, default=part)
         place = Path(os.path.realpath(following))
     return place
 
 
-def _folded(name: str) -> str:
+def _fold_name(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
 
 
@@ -160,15 +161,15 @@ def obj_files(data: bytes, folder: SourceFolder, left: int) -> MaterialFiles:
     """Return the MTL files of an OBJ and the pictures that those name."""
     libraries = MaterialFiles()
     for name, *several in list_libraries(data):
-        found = folder.read_all([name], left)
-        if not found.data and several != [name]:
-            found = folder.read_all(several, left)
-        left -= sum(map(len, found.data.values()))
-        libraries = libraries.joined(found)
+        files = folder.read_all([name], left)
+        if not files.data and several != [name]:
+            files = folder.read_all(several, left)
+        left -= sum(map(len, files.data.values()))
+        libraries = libraries.join(files)
     libraries = dataclasses.replace(libraries, libraries=(*libraries.data, *libraries.refused))
     named = [name for text in libraries.data.values() for name in list_pictures(text, READ_MAPS)]
     beside = {name.replace("\\", "/").rpartition("/")[0] for name in libraries.data} - {""}
-    return libraries.joined(folder.read_all(named, left, beside=sorted(beside)))
+    return libraries.join(folder.read_all(named, left, beside=sorted(beside)))
 
 
 def ply_files(data: bytes, folder: SourceFolder, left: int) -> MaterialFiles:

@@ -42,9 +42,9 @@ def read_obj(data: bytes) -> FileMesh:
     text = plain_text(data)
     if _BY_MESHLAB in text[:1000] and _END_BY_MESHLAB not in text[-1000:]:
         raise Rejected("cut_off", "the OBJ lacks the last line that MeshLab writes")
-    lines, kinds = _statements(join_continued(text))
+    lines, kinds = _read_statements(join_continued(text))
     numbers = _Numbers(lines, kinds)
-    points, width = numbers.rows(_V, 3)
+    points, width = numbers.read_rows(_V, 3)
     unread = _name_others(lines, np.flatnonzero(kinds == _OTHER))
     if points.shape[1] > 3 and (points[(width == 4) | (width == 7), 3] != 1).any():
         unread["weights of vertices"] = 1
@@ -56,21 +56,21 @@ def read_obj(data: bytes) -> FileMesh:
     if few == len(faces):
         mesh = TriangleMesh(positions=points[:, :3], faces=np.zeros((0, 3), np.int64))
         return FileMesh(mesh=mesh, unread=list_some(unread))
-    corners = _corners(lines, kinds, faces, numbers)
+    corners = _read_corners(lines, kinds, faces, numbers)
     check_indices(corners[:, 0], len(points))
-    material, names = _materials(lines, kinds, faces)
+    material, names = _read_materials(lines, kinds, faces)
     triangles, polygon = triangulate(points[:, :3], counts, corners[:, 0])
     group = 1 + material.max() - material
     group[_is_mixed(counts, group)[group]] *= -1
     triangles, polygon = sort_by_size(triangles, polygon, counts, group)
     chosen = corners[triangles.ravel()]
     first, vertex = _unmerge(chosen, np.repeat(material[polygon], 3))
-    places, _ = numbers.rows(_VT, 1)
+    places, _ = numbers.read_rows(_VT, 1)
     used = chosen[:, 1]
     if (used >= len(places)).any() or (used < -1).any():
         unread["texture coordinates that the file does not hold"] = 1
         used = np.where((used < 0) | (used >= len(places)), -1, used)
-    colors = _colors(points, width)
+    colors = _decode_colors(points, width)
     return FileMesh(
         mesh=TriangleMesh(positions=points[chosen[first, 0], :3], faces=vertex.reshape(-1, 3)),
         material=material[polygon],
@@ -89,10 +89,10 @@ def _is_mixed(counts: NDArray[np.int64], group: NDArray[np.int64]) -> NDArray[np
     return np.asarray(least < most)
 
 
-def _statements(text: bytes) -> tuple[TextLines, NDArray[np.int8]]:
+def _read_statements(text: bytes) -> tuple[TextLines, NDArray[np.int8]]:
     """Return the lines of a text and the kind of each, without comments after numbers."""
     lines = split_lines(text)
-    kinds = _kinds(lines)
+    kinds = _classify_lines(lines)
     hashes = np.flatnonzero(lines.codes[lines.words] == _HASH)
     row = np.searchsorted(lines.first, hashes, side="right") - 1
     inner = (hashes > lines.first[row]) & (kinds[row] >= _V)
@@ -102,10 +102,10 @@ def _statements(text: bytes) -> tuple[TextLines, NDArray[np.int8]]:
     for start, end in zip(lines.words[hashes[inner]], ends[row[inner]], strict=True):
         plain[start:end] = b" " * int(end - start)
     lines = split_lines(bytes(plain[: -len(PADDING)]))
-    return lines, _kinds(lines)
+    return lines, _classify_lines(lines)
 
 
-def _kinds(lines: TextLines) -> NDArray[np.int8]:
+def _classify_lines(lines: TextLines) -> NDArray[np.int8]:
     """Return what each line is by its first word, in whichever case."""
     kinds = np.zeros(len(lines.starts), np.int8)
     rows = np.flatnonzero(lines.counts)
@@ -136,15 +136,15 @@ class _Numbers:
         codes[keys[is_long] + 1] = _SPACE
         self._text = codes.tobytes()
 
-    def text(self, kind: int) -> bytes:
+    def take_text(self, kind: int) -> bytes:
         """Return the lines of a kind without their key words."""
-        return self._lines.of_rows(self._by_kind[kind], self._text)
+        return self._lines.take_rows(self._by_kind[kind], self._text)
 
-    def before(self, kind: int, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    def count_before(self, kind: int, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return how many lines of a kind stand before each line."""
         return np.searchsorted(self._by_kind[kind], rows)
 
-    def rows(self, kind: int, least: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def read_rows(self, kind: int, least: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the numbers [N, W] of lines, zero where one has fewer, and how many it has."""
         rows = self._by_kind[kind]
         counts = self._lines.counts[rows] - 1
@@ -153,7 +153,7 @@ class _Numbers:
             self.require_complete(short, f"expected {least} numbers or more")
             line = self._lines.line(int(short[0]))
             raise Rejected("load_error", f"{line[:60]!r}: expected {least} numbers or more")
-        flat = parse_numbers(self.text(kind), int(counts.sum()), np.float64)
+        flat = parse_numbers(self.take_text(kind), int(counts.sum()), np.float64)
         width = max(int(counts.max(initial=0)), max(least, 2))
         if len(flat) == width * len(rows):
             return flat.reshape(-1, width), counts
@@ -170,12 +170,12 @@ class _Numbers:
             raise Rejected("cut_off", f"the file ends within a statement: {why}")
 
 
-def _corners(
+def _read_corners(
     lines: TextLines, kinds: NDArray[np.int8], faces: NDArray[np.int64], numbers: _Numbers
 ) -> NDArray[np.int64]:
     """Return rows [C, 3] of vertex, texture coordinate and normal of corners; -1 where none."""
     counts = lines.counts[faces] - 1
-    text = re.sub(rb"/(?![-+0-9])", b"/0", numbers.text(_F))
+    text = re.sub(rb"/(?![-+0-9])", b"/0", numbers.take_text(_F))
     words = split_lines(text)
     if len(words.words) != counts.sum():
         raise Rejected("load_error", "a corner of a face is malformed")
@@ -191,20 +191,20 @@ def _corners(
     for column, kind in enumerate((_V, _VT, _VN)):
         has = parts > column
         index = flat[start[has] + column]
-        before = numbers.before(kind, row[has])
+        before = numbers.count_before(kind, row[has])
         index = np.where(index > 0, index - 1, np.where(index < 0, before + index, -1))
         corners[has, column] = index
     return corners
 
 
-def _materials(
+def _read_materials(
     lines: TextLines, kinds: NDArray[np.int8], faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], tuple[str, ...]]:
     """Return for each face the row of its material among those that faces use, or -1."""
     named = [
         (row, name)
         for row in np.flatnonzero(kinds == _OTHER).tolist()
-        if (name := _value(lines.line(row), b"usemtl")) is not None
+        if (name := _read_value(lines.line(row), b"usemtl")) is not None
     ]
     rows: dict[str, int] = {}
     known = [-1, *(rows.setdefault(name, len(rows)) if name else -1 for _, name in named)]
@@ -215,7 +215,9 @@ def _materials(
     return flat - int(used[0] < 0), tuple(names[row] for row in used if row >= 0)
 
 
-def _colors(points: NDArray[np.float64], width: NDArray[np.int64]) -> NDArray[np.float64] | None:
+def _decode_colors(
+    points: NDArray[np.float64], width: NDArray[np.int64]
+) -> NDArray[np.float64] | None:
     """Return the linear colors [V, 3] of vertices, white where one has none."""
     has = (width == 6) | (width == 7)
     if not has.any():
@@ -226,7 +228,7 @@ def _colors(points: NDArray[np.float64], width: NDArray[np.int64]) -> NDArray[np
     return colors
 
 
-def _value(line: bytes, key: bytes) -> str | None:
+def _read_value(line: bytes, key: bytes) -> str | None:
     """Return what a statement says, or None where it is another one."""
     word = line.split(maxsplit=1)[0]
     if word.lower() != key:
@@ -236,12 +238,12 @@ def _value(line: bytes, key: bytes) -> str | None:
 
 def _name_others(lines: TextLines, rows: NDArray[np.int64]) -> Counter[str]:
     """Count the statements that are not read."""
-    found = Counter[str]()
+    unread = Counter[str]()
     for row in rows.tolist():
         word = lines.line(row).split(maxsplit=1)[0].decode("latin-1")
         if word.lower() not in _SILENT:
-            found[f"statement {word[:24]!r}"] += 1
-    return found
+            unread[f"statement {word[:24]!r}"] += 1
+    return unread
 
 
 def _unmerge(
@@ -287,9 +289,9 @@ def list_libraries(data: bytes) -> list[Sequence[str]]:
     text = join_continued(plain_text(data))
     lines = dict.fromkeys(re.findall(rb"(?mi)^[ \t]*mtllib[ \t]+([^\n]{1,4000})", text))
     names = map(decode_name, list(lines)[:_MOST_LIBRARIES])
-    return [(unquote_name(name), *_several_names(name)) for name in names]
+    return [(unquote_name(name), *_split_names(name)) for name in names]
 
 
-def _several_names(name: str) -> list[str]:
+def _split_names(name: str) -> list[str]:
     quoted = re.findall(r'"([^"]+)"|(\S.*?\.mtl)(?=\s|$)|(\S+)', name, re.IGNORECASE)
     return ["".join(words) for words in quoted]

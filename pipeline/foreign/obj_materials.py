@@ -74,7 +74,7 @@ def obj_materials(
     except ValueError as error:
         raise Rejected("materials_unreadable", f"the MTL is malformed ({error!s:.120})") from error
     unread = [f"library {name[:60]!r}: it is not there" for name in absent]
-    unread += [text for name in used for text in _unread(known[name])]
+    unread += [text for name in used for text in _list_unread(known[name])]
     return materials, list(dict.fromkeys(unread))
 
 
@@ -161,7 +161,7 @@ def _is_over(text: str, bound: float) -> bool:
         return bound > 0
 
 
-def _unread(fields: Fields) -> Iterator[str]:
+def _list_unread(fields: Fields) -> Iterator[str]:
     """Yield what no code reads of a material."""
     for key, value in fields.items():
         if key not in _READ | _LOST | _MEANINGLESS:
@@ -178,7 +178,7 @@ def _unread(fields: Fields) -> Iterator[str]:
 
 def _rgb(fields: Fields, name: str, default: float) -> RGB:
     text = fields.get(name, str(default))
-    if text.startswith("spectral"):  # a file of a curve, which `_unread` names
+    if text.startswith("spectral"):  # a file of a curve, which `_list_unread` names
         text = str(default)
     is_xyz = text.startswith("xyz")
     values = _numbers(text.removeprefix("xyz"))

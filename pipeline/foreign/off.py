@@ -31,8 +31,8 @@ def read_off(data: bytes) -> FileMesh:
     text = re.sub(rb"#[^\n]*", b"", plain_text(data))
     header = _HEADER.match(text)
     if not header or header[2]:
-        found = "is binary" if header else "does not begin with OFF or with its counts"
-        raise Rejected("load_error", f"the OFF {found}; expected text. Save it as text")
+        state = "is binary" if header else "does not begin with OFF or with its counts"
+        raise Rejected("load_error", f"the OFF {state}; expected text. Save it as text")
     flags = header[1] or b""
     lines = split_lines(text[header.end() :])
     numbers = parse_numbers(lines.text, len(lines.words), np.float64)
@@ -48,7 +48,7 @@ def read_off(data: bytes) -> FileMesh:
         raise Rejected("load_error", "a face of the OFF names no whole number")
     unread = Counter[str]()
     cut = cut_polygons(points, rows.sizes, np.clip(indices, -1, 2**62).astype(np.int64), unread)
-    color = cut.spread(*_colors(numbers, rows, flags, unread))
+    color = cut.spread(*_read_colors(numbers, rows, flags, unread))
     mesh = TriangleMesh(positions=points, faces=cut.vertices)
     return FileMesh(mesh=mesh, color=color, unread=list_some(unread))
 
@@ -95,7 +95,7 @@ def _find_rows(lines: TextLines, numbers: NDArray[np.float64], flags: bytes) -> 
         if (more < 0).any() or (is_open and len(more) > 1 and more[-1] < more[-2]):
             raise _cut_off(num_faces, int((more >= 0).sum()))
     else:
-        width = _width(flags)
+        width = _count_numbers(flags)
         starts, sizes = _find_words(numbers, before + len(head), width, num_points, num_faces)
         widths, more = np.full(num_points, width), np.zeros(num_faces)
     if not ((sizes >= 0) & (sizes == np.floor(sizes))).all():
@@ -110,23 +110,23 @@ def _find_rows(lines: TextLines, numbers: NDArray[np.float64], flags: bytes) -> 
     )
 
 
-def _width(flags: bytes) -> int:
+def _count_numbers(flags: bytes) -> int:
     """Return the numbers of a vertex as the header says."""
     normal, color, uv = (3 * (b"N" in flags), 4 * (b"C" in flags), 2 * (b"ST" in flags))
     return 3 + (b"4" in flags) + normal + color + uv
 
 
-def _colors(
+def _read_colors(
     numbers: NDArray[np.float64], rows: _Rows, flags: bytes, unread: Counter[str]
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
     """Return the linear colors of vertices [V, 3], or else of faces [F, 3]."""
     others = int(((rows.more > 0) & (rows.more != 3) & (rows.more != 4)).sum())
     if others:  # such as rows of a map of colors
         unread["more numbers of faces"] = others
-    if b"C" in flags and len(rows.widths) and (rows.widths >= _width(flags) - 1).all():
+    if b"C" in flags and len(rows.widths) and (rows.widths >= _count_numbers(flags) - 1).all():
         first = rows.points + rows.dims + 3 * (b"N" in flags)
         return decode_colors(numbers[first[:, None] + np.arange(3)]), None
-    if others := int((rows.widths != _width(flags)).sum()):
+    if others := int((rows.widths != _count_numbers(flags)).sum()):
         unread["more numbers of vertices"] = others
     has = (rows.more == 3) | (rows.more == 4)
     if not has.any():

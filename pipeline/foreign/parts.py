@@ -39,7 +39,7 @@ class TexturedParts:
     """[F, 3, 3] linear colour of each corner, times the base colour; None where it is white."""
 
 
-def mesh_parts(
+def build_parts(
     contents: FileMesh, materials: Sequence[SourceMaterial], default: SourceMaterial
 ) -> TexturedParts:
     """Return the triangles of a file, given its materials and that of faces without any."""

@@ -81,13 +81,13 @@ def read_ply(data: bytes) -> FileMesh:
     if coordinates is None:
         raise Rejected("load_error", "the PLY has no vertices with x, y and z")
     points = np.stack(coordinates, axis=1).astype(np.float64)
-    polygons = _polygons(seen, face, "face")
-    strips = _cut_strips(_polygons(seen, elements.get("tristrips", {}), "tristrips"))
+    polygons = _read_polygons(seen, face, "face")
+    strips = _cut_strips(_read_polygons(seen, elements.get("tristrips", {}), "tristrips"))
     indices = np.concatenate([polygons.values.astype(np.int64), strips.ravel()])
     counts = np.concatenate([polygons.counts, np.full(len(strips), 3)])
     cut = cut_polygons(points, counts, indices, seen.notes)
-    by_vertex = _colors(seen, vertex, "vertex")
-    by_face = _colors(seen, face, "face") if by_vertex is None else None
+    by_vertex = _read_colors(seen, vertex, "vertex")
+    by_face = _read_colors(seen, face, "face") if by_vertex is None else None
     if by_face is not None:
         by_face = np.concatenate([by_face, np.ones((len(strips), 3))])
     number = seen.take(face, "face", "texnumber") or [np.zeros(len(polygons.counts))]
@@ -96,7 +96,7 @@ def read_ply(data: bytes) -> FileMesh:
         mesh=TriangleMesh(positions=points, faces=cut.vertices),
         material=np.where((rows >= 0) & (rows < len(header.pictures)), rows, -1),
         material_names=tuple(header.pictures),
-        uv=_uv(seen, elements, polygons, cut),
+        uv=_read_uv(seen, elements, polygons, cut),
         color=cut.spread(by_vertex, by_face),
         is_single=any(one.dtype == np.float32 for one in coordinates),
         unread=seen.unread(elements),
@@ -135,7 +135,7 @@ def _read_header(data: bytes) -> _Header:
         elif key == b"element" and len(words) == 3 and re.fullmatch(rb"\d{1,18}", words[2]):
             elements.append(_Element(name=decode_name(words[1]), rows=int(words[2])))
         elif key == b"property" and elements and len(words) in (3, 5):
-            elements[-1].properties.append(_property(words))
+            elements[-1].properties.append(_read_property(words))
         else:
             raise Rejected("load_error", f"the PLY header has the line {line[:60]!r}")
     if form not in _ORDERS:
@@ -143,7 +143,7 @@ def _read_header(data: bytes) -> _Header:
     return _Header(order=_ORDERS[form], elements=elements, pictures=pictures, size=start)
 
 
-def _property(words: Sequence[bytes]) -> _Property:
+def _read_property(words: Sequence[bytes]) -> _Property:
     kinds = [_TYPES.get(word.decode("latin-1")) for word in words[1:-1] if word != b"list"]
     is_list = words[1] == b"list"
     if None in kinds or len(kinds) != 1 + is_list or (is_list and kinds[0] in ("f4", "f8")):
@@ -327,7 +327,7 @@ class _Seen:
         return list_some(self.notes)
 
 
-def _polygons(seen: _Seen, columns: Columns, element: str) -> _Lists:
+def _read_polygons(seen: _Seen, columns: Columns, element: str) -> _Lists:
     """Return the vertices of faces or strips."""
     lists = seen.take_lists(columns, element, *_INDICES)
     if lists is None and columns:
@@ -351,18 +351,18 @@ def _cut_strips(strips: _Lists) -> NDArray[np.int64]:
     return np.stack([values[same + turned], values[same + 1 - turned], values[same + 2]], axis=1)
 
 
-def _colors(seen: _Seen, columns: Columns, element: str) -> NDArray[np.float64] | None:
+def _read_colors(seen: _Seen, columns: Columns, element: str) -> NDArray[np.float64] | None:
     """Return the linear colors [N, 3] of vertices or faces."""
     for names in _COLORS:
         if (values := seen.take(columns, element, *names)) is not None:
             alpha = seen.take(columns, element, "alpha") or seen.take(columns, element, "a")
-            if alpha is not None and len(alpha[0]) and alpha[0].min() < alpha[0].max():
+            if alpha is not None and (decode_colors(alpha[0]) < 1).any():
                 seen.note("transparency of colors")
             return decode_colors(np.stack(values, axis=1))
     return None
 
 
-def _uv(
+def _read_uv(
     seen: _Seen,
     columns: Mapping[str, Columns],
     polygons: _Lists,

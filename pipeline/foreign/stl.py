@@ -48,17 +48,17 @@ def _read_binary(data: bytes) -> FileMesh:
     if b"COLOR=" in data[:80]:
         unread["color of the header"] = 1
     return FileMesh(
-        mesh=_facet_mesh(facets["corners"].reshape(-1, 3).astype(np.float64)),
+        mesh=_build_mesh(facets["corners"].reshape(-1, 3).astype(np.float64)),
         is_single=True,
         unread=list_some(unread),
     )
 
 
-def _facet_mesh(corners: np.ndarray) -> TriangleMesh:
+def _build_mesh(corners: np.ndarray) -> TriangleMesh:
     return TriangleMesh(positions=corners, faces=np.arange(len(corners)).reshape(-1, 3))
 
 
-def _without_names(text: bytes) -> tuple[bytes, bool]:
+def _strip_names(text: bytes) -> tuple[bytes, bool]:
     """Return a text without what begins and ends solids, and whether each of them ends.
 
     The name of a solid goes to the end of its line, or to a facet on the same line.
@@ -80,7 +80,7 @@ def _without_names(text: bytes) -> tuple[bytes, bool]:
 
 
 def _read_text(text: bytes) -> FileMesh:
-    text, is_closed = _without_names(text)
+    text, is_closed = _strip_names(text)
     lines = split_lines(text)
     words = lines.words
     if len(words) % _NUM_WORDS or not is_closed:
@@ -94,4 +94,4 @@ def _read_text(text: bytes) -> FileMesh:
     begins, ends = facets[:, 7].tolist(), facets[:, 19].tolist()
     loops = b" ".join(lines.text[low:high] for low, high in zip(begins, ends, strict=True))
     numbers = parse_numbers(loops.replace(b"vertex", b" "), 9 * len(facets), np.float64)
-    return FileMesh(mesh=_facet_mesh(numbers.reshape(-1, 3)))
+    return FileMesh(mesh=_build_mesh(numbers.reshape(-1, 3)))

@@ -71,7 +71,7 @@ class TextLines:
     counts: NDArray[np.int64]
     """[L] words of each line."""
 
-    def of_rows(self, rows: NDArray[np.int64], text: bytes) -> bytes:
+    def take_rows(self, rows: NDArray[np.int64], text: bytes) -> bytes:
         """Return lines of a text that has this one's places."""
         if not len(rows):
             return b""

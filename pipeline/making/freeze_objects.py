@@ -15,7 +15,7 @@ from pipeline.making.frozen_pool import FrozenPool
 from pipeline.making.object_batches import PreparedObject
 from pipeline.making.publication import Publication
 from pipeline.making.revisited_scenes import RevisitedScenes
-from pipeline.making.unread import unread_lines, write_unread
+from pipeline.making.unread import format_unread, write_unread
 from storage.conventions import SPLITS
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
@@ -223,7 +223,7 @@ def _tell_of_unread(source: str, prepared: list[PreparedObject], logs: Path) -> 
             source,
             len(unread),
             len(prepared),
-            "\n".join(unread_lines(unread, path)),
+            "\n".join(format_unread(unread, path)),
         )
 
 

@@ -22,7 +22,7 @@ def write_unread(logs: Path, unread: Unread) -> Path:
     return path
 
 
-def unread_lines(unread: Unread, path: Path) -> list[str]:
+def format_unread(unread: Unread, path: Path) -> list[str]:
     """Return a line for each of the first objects, and where the others stand."""
     lines = [f"{uid}: {', '.join(unread[uid])}" for uid in sorted(unread)[:_MOST_LINES]]
     more = len(unread) - len(lines)
