@@ -186,11 +186,14 @@ def srgb8(linear: ArrayLike) -> NDArray[np.uint8]:
     return np.round(encoded * 255).astype(np.uint8)
 
 
+def linear_from_srgb(encoded: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the linear values of sRGB-encoded ones in [0, 1]."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
 def linear_from_srgb8() -> NDArray[np.float32]:
     """Return the linear value [256] of every 8-bit sRGB value: the inverse of `srgb8`."""
-    coded = np.arange(256) / 255
-    linear = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
-    return linear.astype(np.float32)
+    return linear_from_srgb(np.arange(256) / 255).astype(np.float32)
 
 
 def preview_srgb8(radiance_rgb: ArrayLike) -> NDArray[np.uint8]:

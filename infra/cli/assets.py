@@ -105,6 +105,7 @@ def _tell(
         *_material_rows(report, settings),
         ("rejected", f"{len(report.failures)}"),
         *(("", f"{count} x {reason}") for _, reason, count in count_by_reason(report.failures)),
+        *_unread_rows(report, folder),
         ("meshes, catalogue", f"{folder.meshes}, {folder.catalogue}"),
     ]
     print_rows("Assets finished", rows)
@@ -118,6 +119,13 @@ def _tell(
                 own_materials=asked.own_materials,
             )
         )
+
+
+def _unread_rows(report: "AssetReport", folder: "AssetFolder") -> list[tuple[str, str]]:
+    from pipeline.making.unread import format_unread
+
+    lines = format_unread(report.unread, folder.logs)
+    return [("" if row else "not read", line) for row, line in enumerate(lines)]
 
 
 def _epsilon_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[str, str]]:

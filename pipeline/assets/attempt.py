@@ -16,3 +16,5 @@ class AssetAttempt:
     """With the levels that passed the gate, possibly none."""
     missed: Mapping[int, tuple[str, str]]
     """Reason and message by budget, for the levels that did not."""
+    unread: tuple[str, ...] = ()
+    """What of the file no code has read, in short sentences."""

@@ -24,22 +24,25 @@ from storage.errors import Rejected
 from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
 
 
-def prepare_asset(path: Path, settings: AssetSettings, method: str) -> AssetAttempt:
+def prepare_asset(
+    path: Path, settings: AssetSettings, method: str, root: Path | None = None
+) -> AssetAttempt:
     """Return the clean, outward oriented object at all budgets at which it passes the gate.
 
     Args:
         path: the only file that is opened, with the buffers that a glTF names below its folder.
         settings: profile, budgets and limits.
         method: a name of `recipe.methods_of`, for the levels that are not the source as it is.
+        root: folder of its pictures, as of `read_source`.
 
     Raises:
         Rejected: the object is unusable by any method; the reason codes are those of the steps.
 
     What it does not do: close holes, or remove inner parts.
     """
-    source = read_source(path, settings.read_limits)
+    source = read_source(path, settings.read_limits, root)
     raw = load_mesh(source)
-    check_raw(raw, source.kind, settings)
+    check_raw(raw, settings, is_single=source.is_single)
     cleaned = clean(normalise(raw))
     check_clean(cleaned)
     mesh, front_share = orient_outward(cleaned)
@@ -58,6 +61,7 @@ def prepare_asset(path: Path, settings: AssetSettings, method: str) -> AssetAtte
             materials=materials,
         ),
         missed=missed,
+        unread=source.unread,
     )
 
 

@@ -33,6 +33,8 @@ class SceneMesh:
     """Distance of the farthest of them from the centre."""
     sha256: str
     """Digest of the file."""
+    unread: tuple[str, ...]
+    """What of the file no code has read, in short sentences."""
 
 
 def load_scene_mesh(path: Path, settings: AssetSettings, remesh_faces: int | None) -> SceneMesh:
@@ -51,13 +53,19 @@ def load_scene_mesh(path: Path, settings: AssetSettings, remesh_faces: int | Non
     """
     source = read_source(path, settings.read_limits)
     raw = load_mesh(source)
-    check_raw(raw, source.kind, settings)
+    check_raw(raw, settings, is_single=source.is_single)
     if not np.isfinite(raw.positions).all():
         raise Rejected("nonfinite_vertices", "a vertex without a triangle is not finite")
     centre = raw.positions.mean(axis=0)
     reach = float(np.sqrt(np.sum(np.square(raw.positions - centre), axis=1).max()))
     mesh = raw if remesh_faces is None else remeshed(raw, remesh_faces)
-    return SceneMesh(mesh=mesh, centre=centre, reach=reach, sha256=source.sha256)
+    return SceneMesh(
+        mesh=mesh,
+        centre=centre,
+        reach=reach,
+        sha256=source.sha256,
+        unread=source.unread,
+    )
 
 
 def remeshed(raw: TriangleMesh, num_faces: int) -> TriangleMesh:

@@ -38,6 +38,8 @@ class PreparedAsset:
     """Digest of its cleaned geometry."""
     without_own: str = ""
     """Reason code of why it goes without materials of its own, where they were asked for."""
+    unread: tuple[str, ...] = ()
+    """What of its file no code has read, in short sentences."""
 
 
 def prepare_assets(
@@ -87,20 +89,20 @@ def _prepare_once(
     borrow_child: BorrowChild,
 ) -> PreparedAsset:
     """Find or make the outcome of an object; raises Rejected where there is no asset."""
-    source = Path(record.path)
-    key = _key(source, settings, store, borrow_child)
+    source, root = Path(record.path), Path(record.root) if record.root else None
+    key = _key(source, root, settings, store, borrow_child)
     path = store.asset_path(key)
     with store.making(key):
         if refusal := store.refusal(key):
             raise refusal
         if not path.exists():
-            outcome = _outcome(source, settings, methods, borrow_child)
-            if _key(source, settings, store, borrow_child) != key:
+            outcome = _outcome(source, root, settings, methods, borrow_child)
+            if _key(source, root, settings, store, borrow_child) != key:
                 raise Rejected("unreadable_file", "it changed while it was being prepared")
             if isinstance(outcome, Rejected):
                 store.refuse(key, outcome.reason, outcome.message)
                 raise outcome
-            store.keep(key, outcome)
+            store.keep(key, *outcome)
     data = path.read_bytes()
     asset = decode_asset(data)
     return PreparedAsset(
@@ -109,20 +111,25 @@ def _prepare_once(
         asset_sha256=sha256_hex(data),
         geometry_sha256=asset.geometry_sha256,
         without_own="" if asset.materials is None else asset.materials.reason,
+        unread=store.unread(key),
     )
 
 
 def _key(
-    source: Path, settings: AssetSettings, store: AssetStore, borrow_child: BorrowChild
+    source: Path,
+    root: Path | None,
+    settings: AssetSettings,
+    store: AssetStore,
+    borrow_child: BorrowChild,
 ) -> str:
     """Return the name of the outcome of a source, which its pre-flight may refuse (Rejected)."""
     try:
         if not needs_child(source):
-            kind, digest = source_digest(source, settings)
+            kind, digest = source_digest(source, settings, root)
         else:
             with borrow_child() as child:
-                child.may(reach(files=[source]))
-                kind, digest = call_with_retries(child, source_digest, source, settings)
+                child.may(reach(files=[source, root or source]))
+                kind, digest = call_with_retries(child, source_digest, source, settings, root)
     except ChildFailed as failure:
         raise Rejected(failure.reason, failure.message) from failure
     except OSError as error:
@@ -130,29 +137,35 @@ def _key(
     return store.key(kind, digest, settings)
 
 
-def source_digest(source: Path, settings: AssetSettings) -> tuple[str, str]:
+def source_digest(
+    source: Path, settings: AssetSettings, root: Path | None = None
+) -> tuple[str, str]:
     """Return kind and digest of a source after the checks that come before any mesh library.
 
     Raises:
         Rejected: as `read_source`.
         OSError: it cannot be read.
     """
-    found = read_source(source, settings.read_limits)
+    found = read_source(source, settings.read_limits, root)
     return found.kind, found.sha256
 
 
 def _outcome(
-    source: Path, settings: AssetSettings, methods: tuple[str, ...], borrow_child: BorrowChild
-) -> Asset | Rejected:
-    """Return what is to be kept of an object: its asset, or the verdict on it.
+    source: Path,
+    root: Path | None,
+    settings: AssetSettings,
+    methods: tuple[str, ...],
+    borrow_child: BorrowChild,
+) -> tuple[Asset, tuple[str, ...]] | Rejected:
+    """Return what is to be kept of an object: its asset and what is unread, or the verdict on it.
 
     Raises:
         Rejected: the environment failed; nothing is to be kept, and the next run tries again.
     """
     try:
         with borrow_child() as child:
-            child.may(reach(files=[source]))
-            return _by_any_method(child, source, settings, methods)
+            child.may(reach(files=[source, root or source]))
+            return _by_any_method(child, source, root, settings, methods)
     except Rejected as rejection:
         return rejection
     except ChildFailed as failure:
@@ -163,8 +176,12 @@ def _outcome(
 
 
 def _by_any_method(
-    child: IsolatedChild, source: Path, settings: AssetSettings, methods: tuple[str, ...]
-) -> Asset:
+    child: IsolatedChild,
+    source: Path,
+    root: Path | None,
+    settings: AssetSettings,
+    methods: tuple[str, ...],
+) -> tuple[Asset, tuple[str, ...]]:
     """Try the methods in turn, each in a fresh child, for the levels that are still missing.
 
     Raises:
@@ -174,6 +191,7 @@ def _by_any_method(
             ended by something else, which says nothing about the method and leads to no other.
     """
     asset: Asset | None = None
+    unread: tuple[str, ...] = ()
     levels: list[Level] = []
     first_miss: tuple[str, str] | None = None
     death: ChildFailed | None = None
@@ -185,13 +203,13 @@ def _by_any_method(
             settings, budgets=missing, epsilon=settings.epsilon if finest else None
         )
         try:
-            attempt = call_with_retries(child, attempt_in_child, source, wanted, method)
+            attempt = call_with_retries(child, attempt_in_child, source, wanted, method, root)
         except ChildFailed as failure:
             if not failure.is_verdict:
                 raise
             death = failure
             continue
-        asset = _remembering(asset, attempt.asset)
+        asset, unread = _remembering(asset, attempt.asset), attempt.unread
         if attempt.method in waiting:  # it stood in for what is not safe for this mesh
             waiting = waiting[waiting.index(attempt.method) + 1 :]
         levels += asset.levels
@@ -206,7 +224,7 @@ def _by_any_method(
     if not levels:
         assert first_miss is not None
         raise Rejected(*first_miss)
-    return dataclasses.replace(asset, levels=_rising(levels))
+    return dataclasses.replace(asset, levels=_rising(levels)), unread
 
 
 def _remembering(before: Asset | None, now: Asset) -> Asset:
@@ -228,11 +246,13 @@ def _rising(levels: list[Level]) -> tuple[Level, ...]:
     return tuple(reversed(kept))
 
 
-def attempt_in_child(source: Path, settings: AssetSettings, method: str) -> AssetAttempt:
+def attempt_in_child(
+    source: Path, settings: AssetSettings, method: str, root: Path | None = None
+) -> AssetAttempt:
     """Run the recipe; only here are the mesh libraries imported, and only children come here."""
     from pipeline.assets.prepare import prepare_asset
 
-    return prepare_asset(source, settings, method)
+    return prepare_asset(source, settings, method, root)
 
 
 def _failure(record: ObjectRecord, reason: str, message: str) -> Failure:

@@ -53,9 +53,16 @@ class AssetStore:
         path = self._refusal_path(key)
         return Rejected(**json.loads(path.read_bytes())) if path.exists() else None
 
-    def keep(self, key: str, asset: Asset) -> None:
+    def unread(self, key: str) -> tuple[str, ...]:
+        """Return what of the source no code has read."""
+        path = self._unread_path(key)
+        return tuple(json.loads(path.read_bytes())) if path.exists() else ()
+
+    def keep(self, key: str, asset: Asset, unread: tuple[str, ...] = ()) -> None:
         """Store an asset; raises TrilightError where that cannot be written."""
         path = self.asset_path(key)
+        if unread:
+            write_atomically(self._unread_path(key), canonical_json(unread))
         write_atomically(path, encode_asset(asset))
         _remove_old_leftovers(path.parent)
 
@@ -82,6 +89,9 @@ class AssetStore:
             yield
         finally:
             os.close(descriptor)
+
+    def _unread_path(self, key: str) -> Path:
+        return self.asset_path(key).with_suffix(".unread.json")
 
     def _refusal_path(self, key: str) -> Path:
         return self.asset_path(key).with_suffix(".json")

@@ -6,6 +6,7 @@ One file without scripts or links to elsewhere; text from outside is escaped.
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,7 @@ def encode_quality_page(
     rows: Sequence[AssetRow],
     failures: Sequence[Failure],
     pairs: Mapping[str, Sequence[Pair]],
+    unread: Mapping[str, Sequence[str]] = MappingProxyType({}),
     *,
     budget: int,
     target: str,
@@ -50,6 +52,7 @@ def encode_quality_page(
         rows: the accepted objects.
         failures: the rejected ones.
         pairs: pictures by the name of their group.
+        unread: what no code has read of accepted objects, by uid.
         budget: most triangles of an object.
         target: what was asked for, in words.
     """
@@ -59,6 +62,7 @@ def encode_quality_page(
         *([_histograms(rows, budget)] if rows else []),
         *(_group(name, group) for name, group in pairs.items() if group),
         *([_rejected(failures)] if failures else []),
+        *([_unread(unread)] if unread else []),
         _accepted(rows),
     ]
     return page("Assets", joined(parts), style=_STYLE)
@@ -140,6 +144,12 @@ def _pair(pair: Pair) -> Markup:
 def _rejected(failures: Sequence[Failure]) -> Markup:
     cells = [(row.item, row.reason, row.message) for row in failures]
     return joined([element("h2", "Rejected"), table(("object", "reason", "what was found"), cells)])
+
+
+def _unread(unread: Mapping[str, Sequence[str]]) -> Markup:
+    cells = [(uid, ", ".join(unread[uid])) for uid in sorted(unread)]
+    heading = element("h2", "Not read")
+    return joined([heading, table(("object", "what its file holds beside that"), cells)])
 
 
 def _accepted(rows: Sequence[AssetRow]) -> Markup:

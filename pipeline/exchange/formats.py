@@ -161,6 +161,7 @@ def _write_glb(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...
 def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
     root, name = source.path.parent.resolve(), source.path.name
     unknown = described_by(root, name).unknown_fields
+    unread: list[str] = []
     scene, _ = build_scene(
         root,
         name,
@@ -170,8 +171,9 @@ def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
         scene_index=0,
         seed=0,
         albedo_over_one=source.albedo_over_one,
+        notes=unread,
     )
-    texts = (*(f"unknown field {field}" for field in unknown), *scaled_albedo_notes(scene))
+    texts = (*(f"unknown field {field}" for field in unknown), *unread, *scaled_albedo_notes(scene))
     return LoadedScene(scene=scene, notes=tuple(f"{name}: {text}" for text in texts))
 
 

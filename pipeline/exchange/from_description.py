@@ -60,6 +60,7 @@ class LoadedMesh:
     faces: NDArray[np.int64]  # [F, 3]
     centre: NDArray[np.float64]  # [3] mean of the vertices of the file
     reach: float  # distance of the farthest of them from the centre
+    unread: tuple[str, ...] = ()  # what of the file no code has read
 
 
 def scene_from_description(

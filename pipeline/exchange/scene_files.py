@@ -22,6 +22,7 @@ from pipeline.exchange.from_description import (
     scene_from_description,
 )
 from pipeline.exchange.renderformer_json import MAX_BYTES, read_cameras, read_description
+from pipeline.foreign.material_files import find_in_any_case
 from storage.digests import sha256_hex
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
@@ -106,6 +107,7 @@ def build_scene(
     scene_index: int,
     seed: int,
     albedo_over_one: AlbedoOverOne = "scale",
+    notes: list[str] | None = None,
 ) -> tuple[Scene, Mapping[str, str]]:
     """Build the scene of one file; only children come here, since it reads meshes.
 
@@ -118,6 +120,7 @@ def build_scene(
         scene_index: which scene of the dataset this is; stands in its provenance.
         seed: of the dataset; stands in the provenance, and decides nothing here.
         albedo_over_one: what to do where albedos add up to more than 1.
+        notes: receives what of the meshes no code has read.
 
     Returns:
         The scene, and the sha256 of every file that it was made of by path below `root`.
@@ -135,6 +138,8 @@ def build_scene(
         if key not in meshes:
             meshes[key], digest = _load(root, described, name, settings, licence)
             digests[meshes[key].uid] = digest
+            if notes is not None:
+                notes += (f"{meshes[key].uid}: {text}" for text in meshes[key].unread)
     scene = scene_from_description(
         description,
         [meshes[described.mesh_path, described.remesh_faces] for described in description.objects],
@@ -207,6 +212,7 @@ def load_mesh_file(
         faces=loaded.mesh.faces,
         centre=loaded.centre,
         reach=loaded.reach,
+        unread=loaded.unread,
     )
     return mesh, loaded.sha256
 
@@ -226,6 +232,8 @@ def _below(root: Path, relative: str, where: str) -> Path:
     """Return the file that a path means, links followed, if it is below `root`."""
     try:
         path = (root / relative).resolve()
+        if not path.exists():  # as a program on Windows writes it
+            path = find_in_any_case(root, relative.replace("\\", "/"), root)
     except (OSError, RuntimeError) as error:  # links in a circle
         raise TrilightError(
             f"{where} is {relative}, which cannot be followed ({error})."

@@ -1,9 +1,11 @@
-"""`TriangleMesh`: the arrays that the steps of this stage hand to one another."""
+"""`TriangleMesh` and `FileMesh`: the arrays of a mesh, and what its file says of them."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from storage.conventions import linear_from_srgb, linear_from_srgb8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,3 +32,35 @@ class TriangleMesh:
     def diagonal(self) -> float:
         """Length of the diagonal of the bounding box."""
         return float(np.linalg.norm(np.ptp(self.positions, axis=0)))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FileMesh:
+    """What a file of one mesh holds, in its own units."""
+
+    mesh: TriangleMesh
+    """Its triangles, unwelded; without any, its points."""
+    material: NDArray[np.int64] | None = None
+    """[F] row of `material_names`, or -1; None where the file knows no materials."""
+    material_names: tuple[str, ...] = ()
+    """Names of materials, or of the pictures that stand for them."""
+    uv: NDArray[np.float64] | None = None
+    """[F, 3, 2] texture coordinates of corners, v up; not a number where a corner has none."""
+    color: NDArray[np.float64] | None = None
+    """[F, 3, 3] linear color of corners."""
+    is_single: bool = False
+    """Whether the file stores its positions in single precision."""
+    unread: tuple[str, ...] = ()
+    """What of the file no code reads, in short sentences."""
+
+
+def decode_colors(codes: NDArray) -> NDArray[np.float64]:
+    """Return linear colors [N, 3] of sRGB codes: integers, or numbers up to 1 or else 255."""
+    if codes.dtype == np.uint8:
+        return linear_from_srgb8()[codes].astype(np.float64)
+    coded = np.nan_to_num(codes.astype(np.float64))
+    if codes.dtype == np.uint16:
+        coded /= 65535
+    elif coded.size and coded.max() > 1:
+        coded /= 255
+    return np.asarray(linear_from_srgb(np.clip(coded, 0, 1)), np.float64)

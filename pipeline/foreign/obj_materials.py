@@ -8,74 +8,74 @@ is no highlight.
 """
 
 import dataclasses
-import re
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.material import RGB, WHITE, Slot, SourceMaterial
-from pipeline.foreign.material_files import MaterialFiles, libraries_of, map_words
+from pipeline.foreign.material_files import READ_MAPS, MaterialFiles
+from pipeline.foreign.mtl import Fields, read_mtl, split_map
 from pipeline.foreign.picture import Picture
 from storage.errors import Rejected
 
 _F0_OF_KS = 0.08
 _MOST_NS = 1000.0
-_USEMTL = re.compile(rb"^[ \t]*usemtl[ \t]+([^\r\n]+)", re.MULTILINE)
-_LIBRARY = "trilight.mtl"
 _PHYSICAL = {"pm", "pr", "map_pm", "map_pr"}
 """What makes a material one of metal and roughness."""
+_READ = {*_PHYSICAL, "kd", "ks", "ns", "ke", "illum", "map_kd", "map_ks", "map_ke"}
+_LOST = {"norm", "bump", "map_bump", "disp", "d", "tr", "map_d"}
+"""Statements that `SourceMaterial.lost` names in words."""
+_MEANINGLESS = {"ka", "map_ka", "ni", "sharpness", "map_aat"}
+"""Statements about ambient light, the inside of what is opaque, and antialiasing."""
+_CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
+_SILENT_OPTIONS = {"-s", "-o", "-clamp", "-imfchan", "-blendu", "-blendv", "-cc", "-texres"}
+_RGB_OF_XYZ = np.array(
+    [[3.2404542, -1.5371385, -0.4985314], [-0.969266, 1.8760108, 0.041556],
+     [0.0556434, -0.2040259, 1.0572252]]
+)  # fmt: skip
+"""Of linear Rec.709."""
 
-Fields = dict[str, str]
 Decode = Callable[[bytes, str], NDArray]
 
 
 def obj_materials(
-    data: bytes, files: MaterialFiles, decode: Decode, *, emission: bool = False
-) -> dict[str, SourceMaterial]:
-    """Return the materials that the faces of an OBJ use, by name; what they emit only if asked.
+    used: Sequence[str], files: MaterialFiles, decode: Decode, *, emission: bool = False
+) -> tuple[list[SourceMaterial], list[str]]:
+    """Return the materials of some names, and what of them is not read.
+
+    Args:
+        used: names, in the order of the result.
+        files: the libraries and pictures beside the OBJ.
+        decode: what makes values of the bytes of a picture.
+        emission: whether what emits is read too.
 
     Raises:
         Rejected: no_materials where it has none, materials_unreadable, or as reading a picture.
     """
-    used = _used(data)
-    libraries = libraries_of(data)
-    if not used or not libraries:
+    if not used or not files.libraries:
         raise Rejected("no_materials", "the OBJ names no materials")
-    known = {name: entry for library in libraries for name, entry in _entries(files.of(library))}
-    missing = [name for name in used if name not in known]
-    if missing:
+    known: dict[str, Fields] = {}
+    for library in files.libraries:
+        if library in files.data:
+            known = {**read_mtl(files.data[library]), **known}
+    absent = [name for name in files.libraries if name not in files.data]
+    if missing := [name for name in used if name not in known]:
+        if absent:
+            files.of(absent[0])
         raise Rejected("materials_unreadable", f"no library has the material {missing[0]!r:.80}")
     reader = _Reader(files, decode)
     try:
-        found = {name: reader.material(known[name]) for name in used}
+        materials = [reader.material(known[name]) for name in used]
         if emission:
-            found = {name: reader.emitting(found[name], known[name]) for name in used}
-        return found
+            materials = [
+                reader.emitting(one, known[name]) for one, name in zip(materials, used, strict=True)
+            ]
     except ValueError as error:
         raise Rejected("materials_unreadable", f"the MTL is malformed ({error!s:.120})") from error
-
-
-def bare_obj(data: bytes) -> tuple[bytes, dict[str, bytes]]:
-    """Return the OBJ with a library that holds the names of its materials and nothing else."""
-    names = "".join(f"newmtl {name}\n" for name in _used(data))
-    return f"mtllib {_LIBRARY}\n".encode() + data, {_LIBRARY: names.encode()}
-
-
-def _used(data: bytes) -> list[str]:
-    names = (name.decode("utf-8", "replace").strip() for name in _USEMTL.findall(data))
-    return list(dict.fromkeys(names))
-
-
-def _entries(data: bytes) -> Iterator[tuple[str, Fields]]:
-    fields: Fields = {}
-    for line in data.decode("utf-8", "replace").splitlines():
-        key, _, value = line.strip().partition(" ")
-        if key.lower() == "newmtl":
-            fields = {}
-            yield value.strip(), fields
-        elif key and not key.startswith("#"):
-            fields[key.lower()] = value.strip()
+    unread = [f"library {name[:60]!r}: it is not there" for name in absent]
+    unread += [text for name in used for text in _list_unread(known[name])]
+    return materials, list(dict.fromkeys(unread))
 
 
 class _Reader:
@@ -100,7 +100,7 @@ class _Reader:
                 roughness_map=roughness,
                 lost=lost,
             )
-        shiny = fields.get("illum", "2") not in ("0", "1")
+        shiny = _number(fields, "illum", 2.0) not in (0, 1)
         smooth = np.sqrt(np.clip(_number(fields, "ns", 250.0), 0, _MOST_NS) / _MOST_NS)
         return SourceMaterial(
             base_rgb=base_rgb,
@@ -125,7 +125,7 @@ class _Reader:
     def _slot(self, text: str | None, *, is_srgb: bool = False) -> Slot | None:
         if text is None:
             return None
-        options, name = map_words(text)
+        options, name = split_map(text)
         if name not in self._values:
             self._values[name] = self._decode(self._files.of(name), name)
         clamp = options.get("-clamp") == ["on"]
@@ -138,26 +138,56 @@ class _Reader:
             picture=picture,
             turn=np.diag(_pair(options.get("-s"), 1.0)),
             shift=np.array(_pair(options.get("-o"), 0.0)),
+            channel=_CHANNELS.get("".join(options.get("-imfchan", ["r"])), 0),
         )
 
 
 def _lost(fields: Fields) -> tuple[str, ...]:
     found = {
-        "emission": any(_numbers(fields.get("ke", "0"))) or "map_ke" in fields,
+        "emission": _is_over(fields.get("ke", "0"), 0) or "map_ke" in fields,
         "normal map": bool({"norm", "bump", "map_bump", "disp"} & set(fields)),
-        "transparency": _number(fields, "d", 1.0) < 1
-        or _number(fields, "tr", 0.0) > 0
+        "transparency": not _is_over(fields.get("d", "1"), 1 - 1e-9)
+        or _is_over(fields.get("tr", "0"), 0)
         or "map_d" in fields,
     }
     return tuple(word for word, is_there in found.items() if is_there)
 
 
+def _is_over(text: str, bound: float) -> bool:
+    """Return whether a number of a statement is over a bound; unknown words count for nothing."""
+    try:
+        return any(value > bound for value in _numbers(text.removeprefix("-halo")))
+    except ValueError:
+        return bound > 0
+
+
+def _list_unread(fields: Fields) -> Iterator[str]:
+    """Yield what no code reads of a material."""
+    for key, value in fields.items():
+        if key not in _READ | _LOST | _MEANINGLESS:
+            yield f"statement {key[:24]!r}"
+        elif key in READ_MAPS:
+            options = split_map(value)[0]
+            unknown = [name for name in options if name not in _SILENT_OPTIONS]
+            if options.get("-imfchan", ["r"])[0] not in _CHANNELS:
+                unknown.append("-imfchan")
+            yield from (f"option {name[:24]!r} of {key}" for name in unknown)
+        elif value.startswith("spectral"):
+            yield f"spectral curve of {key}"
+
+
 def _rgb(fields: Fields, name: str, default: float) -> RGB:
-    values = _numbers(fields.get(name, str(default)))
+    text = fields.get(name, str(default))
+    if text.startswith("spectral"):  # a file of a curve, which `_list_unread` names
+        text = str(default)
+    is_xyz = text.startswith("xyz")
+    values = _numbers(text.removeprefix("xyz"))
     if len(values) == 1:
         values = values * 3
     if len(values) != 3:
         raise ValueError(f"{name} is {fields.get(name)!r:.60}; expected three numbers")
+    if is_xyz:
+        values = np.maximum(_RGB_OF_XYZ @ values, 0).tolist()
     return values[0], values[1], values[2]
 
 
@@ -166,7 +196,7 @@ def _number(fields: Fields, name: str, default: float) -> float:
 
 
 def _numbers(text: str) -> list[float]:
-    values = [float(word) for word in text.split()]
+    values = [float(word) for word in text.partition("#")[0].split()]
     if not values or not np.isfinite(values).all():
         raise ValueError(f"{text!r:.60}; expected finite numbers")
     return values

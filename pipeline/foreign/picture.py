@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.foreign.light_pictures import read_linear_picture
-from storage.conventions import linear_from_srgb8
+from storage.conventions import linear_from_srgb, linear_from_srgb8
 from storage.errors import Rejected
 
 Wrap = Literal["repeat", "clamp", "mirror", "black"]
@@ -152,7 +152,7 @@ class Picture:
             most = 65535 if texels.dtype == np.uint16 else 1
             deep: NDArray[np.float32] = np.divide(texels, most, dtype=np.float32)
             if self.is_srgb:
-                deep[..., :3] = _from_srgb(deep[..., :3])
+                deep[..., :3] = linear_from_srgb(deep[..., :3])
             return deep
         found: NDArray[np.float32] = np.divide(texels, 255, dtype=np.float32)
         if self.is_srgb:
@@ -189,11 +189,6 @@ class Picture:
         found: NDArray[np.float32] = ((1 - across) * low + across * high).astype(np.float32)
         found[beyond] = 0
         return found
-
-
-def _from_srgb(coded: NDArray[np.floating]) -> NDArray[np.float32]:
-    linear = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
-    return linear.astype(np.float32)
 
 
 def _halved(values: NDArray[np.float32]) -> NDArray[np.float32]:

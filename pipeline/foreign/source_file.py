@@ -6,14 +6,23 @@ so that no file can make it open another one. USD alone is given paths, which it
 
 import hashlib
 import stat
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from pipeline.foreign.gltf.document import GltfDocument, open_gltf
 from pipeline.foreign.headers import check_header
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.material_files import MaterialFiles, obj_files
+from pipeline.foreign.material_files import MaterialFiles, SourceFolder, obj_files, ply_files
+from pipeline.foreign.mesh import FileMesh
+from pipeline.foreign.obj import read_obj
+from pipeline.foreign.off import read_off
+from pipeline.foreign.ply import read_ply
+from pipeline.foreign.stl import read_stl
 from pipeline.foreign.usd.stage import SUFFIXES as USD_SUFFIXES
 from storage.errors import Rejected
 
@@ -23,6 +32,14 @@ if TYPE_CHECKING:
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", *USD_SUFFIXES)
 """Formats that we read. The suffix decides: a file that lies about it is refused or fails to load,
 and is never handed to the loader of another format."""
+
+_READERS: Mapping[str, Callable[[bytes], FileMesh]] = {
+    "obj": read_obj,
+    "off": read_off,
+    "ply": read_ply,
+    "stl": read_stl,
+}
+"""Readers of formats with one mesh a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +59,40 @@ class SourceFile:
     """What a USD file holds; `data` is empty then."""
     gltf: GltfDocument | None = None
     """What a glTF holds."""
-    unread: tuple[str, ...] = ()
-    """What the file says and no code reads, as short sentences, each once."""
+    notes: list[str] = field(default_factory=list)
+    """What of the file no code reads, in short sentences; added while it is read."""
+
+    @cached_property
+    def contents(self) -> FileMesh:
+        """Mesh of an OBJ, OFF, PLY or STL; call in a child alone.
+
+        Raises:
+            Rejected: load_error, index_range, header_size_mismatch or cut_off.
+        """
+        try:
+            with np.errstate(all="ignore"):  # numbers of strangers: guards look at the results
+                contents = _READERS[self.kind](self.data)
+        except (MemoryError, Rejected):
+            raise
+        except Exception as error:  # no file of a stranger may show a mistake of ours as one
+            reason = f"the .{self.kind} file is malformed ({type(error).__name__})"
+            raise Rejected("load_error", reason) from error
+        self.notes.extend(contents.unread)
+        return contents
+
+    @property
+    def is_single(self) -> bool:
+        """Whether the positions are stored in single precision."""
+        if self.usd is not None:
+            return False
+        return self.kind not in _READERS or self.contents.is_single
+
+    @property
+    def unread(self) -> tuple[str, ...]:
+        """What of the file no code has read, each sentence once."""
+        usd = () if self.usd is None else self.usd.unread
+        gltf = () if self.gltf is None else self.gltf.unread
+        return tuple(dict.fromkeys((*usd, *gltf, *self.notes)))
 
 
 def needs_child(path: Path) -> bool:
@@ -51,10 +100,15 @@ def needs_child(path: Path) -> bool:
     return path.suffix.lower() in USD_SUFFIXES
 
 
-def read_source(path: Path, limits: ReadLimits) -> SourceFile:
+def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> SourceFile:
     """Return a source after the checks that need no mesh library.
 
     Where `needs_child`, it may only run in one.
+
+    Args:
+        path: the file.
+        limits: what is refused as too much.
+        root: folder below which pictures and materials may lie; the file's own one by default.
 
     Raises:
         Rejected: missing_file, unsupported_format, too_large_bytes, archive_refused,
@@ -71,12 +125,13 @@ def read_source(path: Path, limits: ReadLimits) -> SourceFile:
     check_header(data, suffix, limits.max_faces)
     gltf: GltfDocument | None = None
     materials, keep = MaterialFiles(), limits.with_materials
+    folder = SourceFolder(path.parent, root or path.parent, _read_regular)
     if suffix in (".glb", ".gltf"):
-        gltf = open_gltf(data, suffix, path.parent, limits, _read_regular)
+        gltf = open_gltf(data, suffix, path.parent, folder, limits, _read_regular)
         materials = gltf.pictures
-    elif suffix == ".obj" and keep:
-        left = limits.max_bytes - len(data)
-        materials = obj_files(data, path.parent, left, _read_regular)
+    elif suffix in (".obj", ".ply") and keep:
+        list_files = obj_files if suffix == ".obj" else ply_files
+        materials = list_files(data, folder, limits.max_bytes - len(data))
     digest = hashlib.sha256(data)
     buffers = {} if gltf is None else gltf.buffers
     for files in (buffers, materials.data):
@@ -88,7 +143,6 @@ def read_source(path: Path, limits: ReadLimits) -> SourceFile:
         sha256=digest.hexdigest(),
         materials=materials,
         gltf=gltf,
-        unread=() if gltf is None else gltf.unread,
     )
 
 

@@ -120,6 +120,7 @@ def build_once(
     root: Path, name: str, settings: AssetSettings, num_views: int, over_one: AlbedoOverOne
 ) -> BuiltScene:
     """Build a scene; only children come here. Raises TrilightError as `build_scene`."""
+    unread: list[str] = []
     scene, sha256 = build_scene(
         root,
         name,
@@ -129,8 +130,9 @@ def build_once(
         scene_index=0,
         seed=0,
         albedo_over_one=over_one,
+        notes=unread,
     )
-    notes = tuple(f"{name}: {text}" for text in scaled_albedo_notes(scene))
+    notes = tuple(f"{name}: {text}" for text in (*unread, *scaled_albedo_notes(scene)))
     return BuiltScene(sha256=sha256, notes=notes)
 
 

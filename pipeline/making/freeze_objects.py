@@ -15,6 +15,7 @@ from pipeline.making.frozen_pool import FrozenPool
 from pipeline.making.object_batches import PreparedObject
 from pipeline.making.publication import Publication
 from pipeline.making.revisited_scenes import RevisitedScenes
+from pipeline.making.unread import format_unread, write_unread
 from storage.conventions import SPLITS
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
@@ -83,6 +84,7 @@ def freeze_objects(
         _require_enough(objects, settings, publication, shown)
         _warn_of(shown, passing)
         _tell_of_materials(shown, prepared)
+        _tell_of_unread(shown, prepared, publication.folder.logs)
         publication.lock_objects(locked)
     else:
         require_same(shown, frozen, locked)
@@ -208,6 +210,20 @@ def _tell_of_materials(source: str, prepared: list[PreparedObject]) -> None:
             sum(reasons.values()),
             len(prepared),
             counts,
+        )
+
+
+def _tell_of_unread(source: str, prepared: list[PreparedObject], logs: Path) -> None:
+    """Say what no code has read of the objects' files, and write it down."""
+    unread = {asset.record.uid: asset.unread for asset in prepared if asset.unread}
+    path = write_unread(logs, unread)
+    if unread:
+        log.warning(
+            "objects %r: %d of %d have parts that are not read:\n%s",
+            source,
+            len(unread),
+            len(prepared),
+            "\n".join(format_unread(unread, path)),
         )
 
 

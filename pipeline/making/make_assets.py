@@ -22,6 +22,7 @@ from pipeline.documents.quality_page import Pair, encode_quality_page
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.isolation import ChildFailed, call_with_retries, reach
 from pipeline.making.prepare_isolated import asset_child, prepare_isolated
+from pipeline.making.unread import Unread, write_unread
 from pipeline.objects.glb import encode_glb
 from pipeline.objects.ply import encode_ply
 from pipeline.objects.sources import find_objects
@@ -66,6 +67,10 @@ class AssetFolder:
         return self.root / "quality.html"
 
     @property
+    def logs(self) -> Path:
+        return self.root / "logs"
+
+    @property
     def meshes(self) -> Path:
         return self.root / "meshes"
 
@@ -80,6 +85,8 @@ class AssetReport:
     """The rejected ones."""
     geometry_sha256: tuple[str, ...]
     """Digest of the geometry of each written mesh, by which `generate` deals it to a split."""
+    unread: Unread
+    """What no code has read of the accepted ones."""
 
     @property
     def num_repaired(self) -> int:
@@ -94,6 +101,7 @@ class AssetReport:
             "rejected": len(self.failures),
             "objects": [row.as_json() for row in self.rows],
             "failures": [dataclasses.asdict(failure) for failure in self.failures],
+            "unread": dict(self.unread),
         }
 
 
@@ -145,11 +153,17 @@ def make_assets(
         rows=tuple(rows),
         failures=tuple(sorted([*found.failures, *rejected], key=lambda row: row.item)),
         geometry_sha256=tuple(map(_geometry_sha256, levels)),
+        unread={asset.record.uid: asset.unread for asset in prepared if asset.unread},
     )
     _write(folder, settings, report, levels)
     pairs = _pairs(prepared, rows, levels, settings)
     page = encode_quality_page(
-        rows, report.failures, pairs, budget=settings.budgets[0], target=_target(settings)
+        rows,
+        report.failures,
+        pairs,
+        report.unread,
+        budget=settings.budgets[0],
+        target=_target(settings),
     )
     write_atomically(folder.page, page)
     return report
@@ -225,6 +239,7 @@ def _write(
     lines = [canonical_json(row.as_json()) + b"\n" for row in report.rows]
     write_atomically(folder.catalogue, b"".join(lines))
     write_failures(folder.failures, report.failures)
+    write_unread(folder.logs, report.unread)
     write_atomically(folder.attribution, encode_attribution(report.rows))
     summary = {
         "accepted": len(report.rows),

@@ -35,8 +35,9 @@ _CACHE = "object-batches"
 """Folder of the user's cache with results for later datasets."""
 _NUM_OBJECTS = 32
 """Objects of a batch, in the mean: a minute of one core where nothing is known yet."""
-_WHOLE = (".off", ".ply", ".stl", ".usdz")
-"""Suffixes of files that name no other ones; what lies beside the others counts too."""
+_WHOLE = (".off", ".stl", ".usdz")
+"""Suffixes of files that name no other ones; what lies beside the others counts too, of a PLY where
+its pictures are read."""
 _LAYERS = (".usd", ".usda", ".usdc")
 """Of those that may name other objects."""
 _PAUSES_S = (0.2, 10.0)
@@ -59,6 +60,8 @@ class PreparedObject:
     """Of its coarsest level."""
     without_own: str = ""
     """Reason code of why it goes without materials of its own, where they were asked for."""
+    unread: tuple[str, ...] = ()
+    """What of its file no code has read, in short sentences."""
 
 
 PrepareResult = tuple[list[PreparedObject], list[Failure]]
@@ -74,6 +77,7 @@ def prepared_object(asset: PreparedAsset) -> PreparedObject:
         geometry_sha256=asset.geometry_sha256,
         least_triangles=least_triangles_in(asset.path),
         without_own=asset.without_own,
+        unread=asset.unread,
     )
 
 
@@ -92,7 +96,8 @@ class ObjectWork:
 
     def name(self, records: Sequence[ObjectRecord], *, are_here: bool) -> str:
         """Return the name of the result of a batch, whose files may be here to be looked at."""
-        of_objects = [_facts(record, are_here, self._folders) for record in records]
+        named = self.settings.own_materials.keep
+        of_objects = [_facts(record, are_here, self._folders, named) for record in records]
         facts = [of_objects, asdict(self.settings), RECIPE]
         digest = sha256_hex(canonical_json(facts))[:32]
         return f"{digest[:2]}/{digest}.jsonl"
@@ -184,7 +189,8 @@ class ObjectBatch:
                 failures.append(Failure(**row))
             else:
                 record = self._by_uid[row.pop("uid")]
-                prepared.append(PreparedObject(record=record, **row))
+                unread = tuple(row.pop("unread", ()))
+                prepared.append(PreparedObject(record=record, unread=unread, **row))
         if len(prepared) + len(failures) != len(self.records):
             raise ValueError("rows are missing")
         return prepared, failures
@@ -278,23 +284,27 @@ def _encode(result: PrepareResult) -> bytes:
 
 
 def _row(one: PreparedObject) -> dict[str, Any]:
-    row = {name: value for name, value in vars(one).items() if name != "record"}
+    left_out = {"record"} if one.unread else {"record", "unread"}
+    row = {name: value for name, value in vars(one).items() if name not in left_out}
     return {"uid": one.record.uid, **row}
 
 
-def _facts(record: ObjectRecord, is_here: bool, folders: dict[tuple[Path, bool], str]) -> list[Any]:
+def _facts(
+    record: ObjectRecord, is_here: bool, folders: dict[tuple[Path, bool], str], with_pictures: bool
+) -> list[Any]:
     """Return what a result depends on; of a file that is here, that it is as it was.
 
     `folders` remembers what was found in folders.
     """
     facts = asdict(record)
-    path = Path(facts.pop("path"))
+    path, root = Path(facts.pop("path")), facts.pop("root")
     if not is_here:
         return [facts]
     fetched = path.is_relative_to(cache_folder(""))  # when it came says nothing
     suffix = path.suffix.lower()
-    alone = fetched or suffix in _WHOLE
-    beside = "" if alone else _beside(path.parent, suffix in _LAYERS, folders)
+    alone = fetched or suffix in _WHOLE or (suffix == ".ply" and not with_pictures)
+    folder = Path(root) if root and with_pictures else path.parent
+    beside = "" if alone else _beside(folder, suffix in _LAYERS, folders)
     return [facts, path.suffix, *_state(path, fetched), beside]
 
 

@@ -53,7 +53,8 @@ class MeshWork:
         self, records: list[ObjectRecord], done: Callable[[], None]
     ) -> tuple[list[PreparedAsset], list[Failure]]:
         """Prepare objects; arguments and errors as `prepare_assets`; from any thread."""
-        all_files = reach(files=(Path(record.path) for record in records))
+        places = {place for one in records for place in (one.path, one.root) if place}
+        all_files = reach(files=map(Path, sorted(places)))
 
         @contextlib.contextmanager
         def borrow() -> Iterator[IsolatedChild]:

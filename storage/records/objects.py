@@ -41,6 +41,8 @@ class ObjectRecord(NamedObject):
 
     path: str
     """The file, absolute, on this machine; never published."""
+    root: str = ""
+    """Folder in which its pictures may lie anywhere; its own one where empty. Never published."""
 
 
 OBJECT, TEXTURE, SKY = "object", "texture", "sky"

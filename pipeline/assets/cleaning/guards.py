@@ -20,16 +20,14 @@ MIN_BULK = 0.02
 """Longest side of the box of 99 % of the area, in the unit box; below it a few far vertices have
 shrunk the object to a dot."""
 
-_SINGLE_PRECISION = ("glb", "gltf", "stl", "ply")
 
-
-def check_raw(mesh: TriangleMesh, kind: str, settings: AssetSettings) -> None:
+def check_raw(mesh: TriangleMesh, settings: AssetSettings, *, is_single: bool) -> None:
     """Raise Rejected where a loaded mesh is too large, not finite, or out of range.
 
     Args:
         mesh: as loaded, in the units of the file.
-        kind: format of the file, which says how precise its numbers can be.
         settings: the limits.
+        is_single: whether the file stores positions in single precision.
     """
     if len(mesh.faces) > settings.max_source_faces:
         raise Rejected(
@@ -45,7 +43,7 @@ def check_raw(mesh: TriangleMesh, kind: str, settings: AssetSettings) -> None:
         offset = float(np.abs(0.5 * low + 0.5 * high).max())
     if not EXTENT_RANGE[0] <= extent <= EXTENT_RANGE[1]:
         raise Rejected("extent_range", f"longest side {extent:.3g}; expected {EXTENT_RANGE}")
-    if kind in _SINGLE_PRECISION and offset > MAX_OFFSET * extent:
+    if is_single and offset > MAX_OFFSET * extent:
         raise Rejected(
             "offset_precision",
             f"the object is {offset / extent:.3g} times its size away from the origin",

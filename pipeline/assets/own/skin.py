@@ -14,12 +14,10 @@ from pipeline.assets.own.source_surface import SourceSurface, source_surface
 from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.foreign.gltf.materials import GltfMaterials
 from pipeline.foreign.gltf.objects import gltf_parts
-from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.obj_materials import bare_obj, obj_materials
-from pipeline.foreign.parts import TexturedParts, load_parts
+from pipeline.foreign.mesh_materials import read_parts
+from pipeline.foreign.parts import TexturedParts
 from pipeline.foreign.picture import Decoder
-from pipeline.foreign.ply_colours import ply_parts
 from pipeline.foreign.source_file import SourceFile
 from pipeline.foreign.usd.object_materials import usd_parts
 from storage.errors import Rejected
@@ -103,10 +101,4 @@ def _parts(
         return usd_parts(source.usd, decode, emission=emission)
     if source.gltf is not None:
         return gltf_parts(source.gltf, GltfMaterials(source.gltf, decode, emission=emission))
-    if source.kind == "obj":
-        materials = obj_materials(source.data, source.materials, decode, emission=emission)
-        data, files = bare_obj(source.data)
-        return load_parts(data, source.kind, files, materials, SourceMaterial())
-    if source.kind == "ply":
-        return ply_parts(source.data)
-    raise Rejected("no_materials", f"a .{source.kind} file has no materials that are read")
+    return read_parts(source, decode, emission=emission)

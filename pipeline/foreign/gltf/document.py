@@ -19,7 +19,7 @@ from pipeline.foreign.gltf.container import (
 from pipeline.foreign.gltf.nodes import INSTANCING, PlacedNode, entry, extension, transforms
 from pipeline.foreign.gltf.unread import unread_parts
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.material_files import MaterialFiles, ReadFile, gltf_files
+from pipeline.foreign.material_files import MaterialFiles, ReadFile, SourceFolder, gltf_files
 from storage.errors import Rejected, TrilightError
 
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -186,14 +186,20 @@ class GltfDocument:
 
 
 def open_gltf(
-    data: bytes, suffix: str, folder: Path, limits: ReadLimits, read: ReadFile
+    data: bytes,
+    suffix: str,
+    folder: Path,
+    files: SourceFolder,
+    limits: ReadLimits,
+    read: ReadFile,
 ) -> GltfDocument:
     """Return a glTF with its buffers, and with its pictures where the limits say so.
 
     Args:
         data: the file.
         suffix: of its name, `.glb` or `.gltf`.
-        folder: of the file; nothing outside of it is read.
+        folder: of the file; no buffer outside of it is read.
+        files: reads pictures.
         limits: bound what is read.
         read: reads a regular file of at most so many bytes.
 
@@ -216,6 +222,6 @@ def open_gltf(
         tree=tree,
         binary=binary,
         buffers=buffers,
-        pictures=gltf_files(tree, folder, left, read) if has_pictures else MaterialFiles(),
+        pictures=gltf_files(tree, files, left) if has_pictures else MaterialFiles(),
         unread=unread,
     )

@@ -74,6 +74,7 @@ def _record(root: Path, row: dict[str, Any], place: str, name: str) -> ObjectRec
     return ObjectRecord(
         uid=uid,
         path=str(_inside(root, path, place)),
+        root=str(root),
         title=_published(row, "title", place, uid),
         licence=_published(row, "licence", place, UNKNOWN),
         licence_source=_published(row, "licence_source", place, name),
@@ -101,6 +102,8 @@ def _inside(root: Path, path: str, place: str) -> Path:
     if not path or "\x00" in path or path != path.encode("utf-8", "ignore").decode():
         raise TrilightError(f"{place}: path is {shown!r}; expected the name of a file.")
     target = Path(os.path.realpath(root / path))
+    if "\\" in path and not target.exists():  # as a program on Windows writes it
+        target = Path(os.path.realpath(root / path.replace("\\", "/")))
     if not target.is_relative_to(root) or target == root:
         raise TrilightError(
             f"{place}: path {shown!r} leads out of the folder; expected a path below it. "

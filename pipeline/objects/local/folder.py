@@ -1,6 +1,7 @@
 """Objects of a folder of this machine: those of its catalogue, or else its object files."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
@@ -61,7 +62,7 @@ def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
             )
             failures.append(failure(uid, "link_outside", message))
             continue
-        records.append(file_record(uid, str(root / name), licence))
+        records.append(replace(file_record(uid, str(root / name), licence), root=str(root)))
     return Listing(records=records, failures=failures)
 
 

@@ -34,7 +34,9 @@ def nothing() -> None:
     """Set up nothing."""
 
 
-def recorded_attempt(source: Path, settings: AssetSettings, method: str) -> AssetAttempt:
+def recorded_attempt(
+    source: Path, settings: AssetSettings, method: str, root: Path | None = None
+) -> AssetAttempt:
     """Write down who was called for what, then do what the plan beside the source says."""
     call = {"pid": os.getpid(), "name": source.name, "method": method, "budgets": settings.budgets}
     with (source.parent / CALLS).open("a") as stream:
@@ -47,7 +49,7 @@ def recorded_attempt(source: Path, settings: AssetSettings, method: str) -> Asse
         _ACTIONS[action](source)
     from pipeline.assets.prepare import prepare_asset  # late: a child that dies pays for none of it
 
-    attempt = prepare_asset(source, settings, method)
+    attempt = prepare_asset(source, settings, method, root)
     missed = plan.get(f"{method} misses")
     return _without(attempt, int(missed)) if missed else attempt
 

@@ -252,9 +252,11 @@ def test_sizes_that_are_no_sizes(outcome: Outcome) -> None:
         assert outcome(mesh)[1] == "extent_range", scale
 
 
-@pytest.mark.parametrize(("suffix", "reason"), [(".ply", "offset_precision"), (".obj", "")])
+@pytest.mark.parametrize(
+    ("suffix", "reason"), [(".stl", "offset_precision"), (".ply", ""), (".obj", "")]
+)
 def test_an_object_far_from_its_origin(outcome: Outcome, suffix: str, reason: str) -> None:
-    """PLY is usually single precision, so an offset of 1e6 extents is refused; text is exact."""
+    """An offset of 1e6 extents is refused in single precision; doubles and text are exact."""
     asset, found = outcome(by_hand.moved(by_hand.sphere(), 1.0, 1e6), suffix=suffix)
     assert found == reason
     assert (asset is None) == bool(reason)

@@ -131,11 +131,6 @@ RAW_FILES: dict[str, tuple[str, str, bytes]] = (
         "stl bomb": ("header_size_mismatch", ".stl", bytes(80) + b"\xff" * 4 + bytes(500)),
         "points": ("point_cloud", ".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"),
         "obj range": ("index_range", ".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
-        "ply strips": (
-            "unsupported_primitive",
-            ".ply",
-            _ply(f"element vertex 3\n{_XYZ}\nelement tristrips 1\n{_LIST}", bytes(100)),
-        ),
         "ply range": (
             "index_range",
             ".ply",

@@ -23,14 +23,18 @@ LOST_SCENE = 2
 """All of its attempts do."""
 
 
-def prepare_or_crash(source: Path, settings: AssetSettings, method: str) -> AssetAttempt:
+def prepare_or_crash(
+    source: Path, settings: AssetSettings, method: str, root: Path | None
+) -> AssetAttempt:
     """Read address 0 as a broken mesh library does, or prepare the object."""
     if source.name == OBJECT:
         ctypes.string_at(0)
-    return attempt_in_child(source, settings, method)
+    return attempt_in_child(source, settings, method, root)
 
 
-def prepare_or_die(source: Path, settings: AssetSettings, method: str) -> AssetAttempt:
+def prepare_or_die(
+    source: Path, settings: AssetSettings, method: str, root: Path | None
+) -> AssetAttempt:
     """Be killed as often as the file DEATHS above the source says, or prepare the object.
 
     The file counts down.
@@ -39,7 +43,7 @@ def prepare_or_die(source: Path, settings: AssetSettings, method: str) -> AssetA
     if source.name == VICTIM and (left := int(deaths.read_text())):
         deaths.write_text(str(left - 1))
         os.kill(os.getpid(), signal.SIGKILL)
-    return attempt_in_child(source, settings, method)
+    return attempt_in_child(source, settings, method, root)
 
 
 def render_or_abort(split: str, scene_index: int, attempt: int) -> SceneAttempt:

@@ -52,6 +52,8 @@ def source(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in REAL:
         (folder / name).parent.mkdir(exist_ok=True)
         shutil.copy(shared / "objects" / name, folder / name)
+    with (folder / REAL[0]).open("a") as stream:
+        stream.write("\ncurv 0 1 1 2\n")
     (folder / "bad").mkdir()
     for name, (data, _) in BAD.items():
         (folder / name).write_bytes(data)
@@ -129,6 +131,10 @@ def test_every_document_tells_the_same(made: tuple[Path, AssetReport]) -> None:
     for row in report.rows:
         assert row.uid in page
     assert page.count("header_size_mismatch") == 1
+    unread = {"classic/suzanne": ("statement 'curv'",)}
+    assert report.unread == unread and "Not read" in page
+    logged = json.loads((AssetFolder(out).logs / "unread.json").read_bytes())
+    assert logged == {"classic/suzanne": ["statement 'curv'"]}
     assert not list(out.rglob("*.part"))
 
 

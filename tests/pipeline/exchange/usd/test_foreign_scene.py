@@ -11,7 +11,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
 from pipeline.exchange.usd.read import UsdScene, read_usd, usd_keys
 from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
-from pipeline.foreign.usd.polygons import triangulated
+from pipeline.foreign.polygons import triangulate
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from storage.errors import TrilightError
 from storage.records.material import EMISSION
@@ -229,7 +229,7 @@ def test_polygons_of_any_shape_keep_their_area() -> None:
             flat = rng.uniform(0.2, 1, count)[:, None] * np.stack([np.cos(turn), np.sin(turn)], 1)
             basis, _ = np.linalg.qr(rng.normal(size=(3, 3)))
             points = np.einsum("nk,ki->ni", flat, basis[:2])
-            corners, owner = triangulated(points, np.array([count]), np.arange(count))
+            corners, owner = triangulate(points, np.array([count]), np.arange(count))
             assert len(corners) == count - 2 and (owner == 0).all()
             ahead = np.roll(points, -1, axis=0)
             whole = np.cross(points, ahead).sum(axis=0)

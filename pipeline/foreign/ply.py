@@ -1,0 +1,382 @@
+"""The mesh of a PLY, by its header: any elements, properties, types and lists, text or binary."""
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.foreign.mesh import FileMesh, TriangleMesh, decode_colors
+from pipeline.foreign.polygons import CutPolygons, cut_polygons
+from pipeline.foreign.text import decode_name, list_some, parse_numbers, split_lines
+from storage.errors import Rejected
+
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
+    **{"int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8"},
+    **{"float32": "f4", "float64": "f8"},
+}
+Order = Literal["<", ">"]
+_ORDERS: Mapping[bytes, Order | None] = {
+    b"ascii": None,
+    b"binary_little_endian": "<",
+    b"binary_big_endian": ">",
+}
+_MAX_HEADER_BYTES = 1 << 20
+_INDICES = ("vertex_indices", "vertex_index")
+_COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), tuple("rgb"))
+_UVS = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"), ("texture_s", "texture_t"))
+_SILENT = {"x", "y", "z", "nx", "ny", "nz"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Property:
+    name: str
+    kind: np.dtype
+    count: np.dtype | None = None
+    """Type of the number before a list."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Element:
+    name: str
+    rows: int
+    properties: list[_Property] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Header:
+    order: Order | None
+    """Order of bytes; None of a text."""
+    elements: Sequence[_Element]
+    pictures: Sequence[str]
+    size: int
+    """Bytes up to the data."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Lists:
+    """The values of a property that is a list, one list after the other."""
+
+    values: NDArray
+    counts: NDArray[np.int64]
+
+
+def read_ply(data: bytes) -> FileMesh:
+    """Return the triangles of a PLY with its colors and texture coordinates.
+
+    Raises:
+        Rejected: load_error, header_size_mismatch or index_range.
+    """
+    header = _read_header(data)
+    seen, (elements, rest) = _Seen(), _read_elements(data, header)
+    if rest:
+        seen.note("bytes after the last element")
+    vertex, face = elements.get("vertex", {}), elements.get("face", {})
+    coordinates = seen.take(vertex, "vertex", "x", "y", "z")
+    if coordinates is None:
+        raise Rejected("load_error", "the PLY has no vertices with x, y and z")
+    points = np.stack(coordinates, axis=1).astype(np.float64)
+    polygons = _read_polygons(seen, face, "face")
+    strips = _cut_strips(_read_polygons(seen, elements.get("tristrips", {}), "tristrips"))
+    indices = np.concatenate([polygons.values.astype(np.int64), strips.ravel()])
+    counts = np.concatenate([polygons.counts, np.full(len(strips), 3)])
+    cut = cut_polygons(points, counts, indices, seen.notes)
+    by_vertex = _read_colors(seen, vertex, "vertex")
+    by_face = _read_colors(seen, face, "face") if by_vertex is None else None
+    if by_face is not None:
+        by_face = np.concatenate([by_face, np.ones((len(strips), 3))])
+    number = seen.take(face, "face", "texnumber") or [np.zeros(len(polygons.counts))]
+    rows = np.append(number[0].astype(np.int64), np.full(len(strips), -1))[cut.owner]
+    return FileMesh(
+        mesh=TriangleMesh(positions=points, faces=cut.vertices),
+        material=np.where((rows >= 0) & (rows < len(header.pictures)), rows, -1),
+        material_names=tuple(header.pictures),
+        uv=_read_uv(seen, elements, polygons, cut),
+        color=cut.spread(by_vertex, by_face),
+        is_single=any(one.dtype == np.float32 for one in coordinates),
+        unread=seen.unread(elements),
+    )
+
+
+def list_ply_pictures(data: bytes) -> Sequence[str]:
+    """Return the names of the pictures of a PLY; none where its header is malformed."""
+    try:
+        return _read_header(data).pictures
+    except Rejected:
+        return ()
+
+
+def _read_header(data: bytes) -> _Header:
+    data = data.removeprefix(b"\xef\xbb\xbf")[:_MAX_HEADER_BYTES]
+    begin = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
+    if not begin:
+        raise Rejected("load_error", "the PLY header has no beginning")
+    form: bytes = b""
+    elements, pictures, start = list[_Element](), list[str](), begin.end()
+    while True:
+        end = data.find(begin[1], start)
+        if end < 0:
+            raise Rejected("header_size_mismatch", "the PLY ends within its header")
+        line, start = data[start:end].strip(), end + len(begin[1])
+        words = line.split()
+        key = words[0] if words else b"comment"
+        if key == b"end_header":
+            break
+        if key == b"format" and len(words) > 1:
+            form = words[1]
+        elif key in (b"comment", b"obj_info"):
+            if picture := re.match(rb"(?i)\w+\s+TextureFile\s+(.+)", line):
+                pictures.append(decode_name(picture[1]))
+        elif key == b"element" and len(words) == 3 and re.fullmatch(rb"\d{1,18}", words[2]):
+            elements.append(_Element(name=decode_name(words[1]), rows=int(words[2])))
+        elif key == b"property" and elements and len(words) in (3, 5):
+            elements[-1].properties.append(_read_property(words))
+        else:
+            raise Rejected("load_error", f"the PLY header has the line {line[:60]!r}")
+    if form not in _ORDERS:
+        raise Rejected("load_error", f"the PLY is of the format {form[:24]!r}")
+    return _Header(order=_ORDERS[form], elements=elements, pictures=pictures, size=start)
+
+
+def _read_property(words: Sequence[bytes]) -> _Property:
+    kinds = [_TYPES.get(word.decode("latin-1")) for word in words[1:-1] if word != b"list"]
+    is_list = words[1] == b"list"
+    if None in kinds or len(kinds) != 1 + is_list or (is_list and kinds[0] in ("f4", "f8")):
+        raise Rejected("load_error", f"the PLY has a property {b' '.join(words)[:60]!r}")
+    return _Property(
+        name=decode_name(words[-1]),
+        kind=np.dtype(kinds[-1]),
+        count=np.dtype(kinds[0]) if is_list else None,
+    )
+
+
+Columns = Mapping[str, NDArray | _Lists]
+
+
+def _read_elements(data: bytes, header: _Header) -> tuple[dict[str, Columns], int]:
+    """Return the columns of each element, and how many bytes follow the last one."""
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    body = _Binary(data, header.order) if header.order else _Text(data[header.size :])
+    columns: dict[str, Columns] = {}
+    at = header.size if header.order else 0
+    for element in header.elements:
+        if element.properties:
+            columns[element.name], at = _read_rows(body, element, at)
+    if at < body.size and not header.order:
+        raise Rejected("header_size_mismatch", f"the PLY holds {body.size - at} numbers too many")
+    return columns, body.size - at
+
+
+class _Text:
+    """The data of a text, by word."""
+
+    def __init__(self, data: bytes) -> None:
+        self.size = len(split_lines(data).words)
+        self._values = parse_numbers(data, self.size, np.float64)
+
+    def width(self, kind: np.dtype) -> int:
+        return 1
+
+    def count(self, at: int, kind: np.dtype) -> int:
+        return int(self._values[at])
+
+    def take(self, at: NDArray[np.int64], kind: np.dtype) -> NDArray:
+        return self._values[at].astype(kind)
+
+
+class _Binary:
+    """Binary data, by byte."""
+
+    def __init__(self, data: bytes, order: Order) -> None:
+        self.size, self._data = len(data), data
+        self._order: Order = order
+        self._codes = np.frombuffer(data, np.uint8)
+
+    def width(self, kind: np.dtype) -> int:
+        return kind.itemsize
+
+    def count(self, at: int, kind: np.dtype) -> int:
+        piece = self._data[at : at + kind.itemsize]
+        return int(np.frombuffer(piece, kind.newbyteorder(self._order))[0])
+
+    def take(self, at: NDArray[np.int64], kind: np.dtype) -> NDArray:
+        taken = self._codes[at[:, None] + np.arange(kind.itemsize)]
+        ordered = kind.newbyteorder(self._order)
+        return np.ascontiguousarray(taken).view(ordered)[:, 0].astype(kind)
+
+
+def _read_rows(body: _Text | _Binary, element: _Element, at: int) -> tuple[Columns, int]:
+    """Return the columns of an element whose rows begin at a place, and where they end."""
+    widths = [body.width(one.count or one.kind) for one in element.properties]
+    if element.rows * sum(widths) > body.size - at:
+        raise Rejected(
+            "header_size_mismatch",
+            f"the PLY header counts {element.rows} rows of {element.name[:24]!r}, which the file "
+            "does not hold",
+        )
+    lengths = _list_lengths(body, element, at)
+    begins, end = _place_rows(body, element, at, lengths)
+    if end > body.size:
+        raise Rejected("header_size_mismatch", f"the PLY ends within {element.name[:24]!r}")
+    columns: dict[str, NDArray | _Lists] = {}
+    lists = iter(lengths.T)
+    for one, begin in zip(element.properties, begins.T, strict=True):
+        if one.count is None:
+            columns[one.name] = body.take(begin, one.kind)
+            continue
+        count = next(lists)
+        within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+        at_value = np.repeat(begin + body.width(one.count), count) + body.width(one.kind) * within
+        columns[one.name] = _Lists(values=body.take(at_value, one.kind), counts=count)
+    return columns, end
+
+
+def _place_rows(
+    body: _Text | _Binary, element: _Element, at: int, lengths: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], int]:
+    """Return where each property [rows, P] begins, and where the last one ends."""
+    steps = np.zeros((element.rows, len(element.properties)), np.int64)
+    lists = iter(lengths.T)
+    for column, one in enumerate(element.properties):
+        size = body.width(one.kind)
+        steps[:, column] = size if one.count is None else body.width(one.count) + size * next(lists)
+    ends = at + np.cumsum(steps.ravel()).reshape(steps.shape)
+    return ends - steps, int(ends[-1, -1]) if element.rows else at
+
+
+def _list_lengths(body: _Text | _Binary, element: _Element, at: int) -> NDArray[np.int64]:
+    """Return the lengths [rows, L] of lists: those of the first row, where all rows agree."""
+    lists = [k for k, one in enumerate(element.properties) if one.count is not None]
+    if not lists or not element.rows:
+        return np.zeros((element.rows, len(lists)), np.int64)
+    first = _walk(body, element, at, 1)
+    lengths = np.broadcast_to(first, (element.rows, len(lists)))
+    begins, end = _place_rows(body, element, at, lengths)
+    if end <= body.size:
+        kinds = [element.properties[k].count for k in lists]
+        read = [body.take(begins[:, k], kind) for k, kind in zip(lists, kinds, strict=True) if kind]
+        if (np.stack(read, axis=1) == lengths).all():
+            return lengths
+    return _walk(body, element, at, element.rows)
+
+
+def _walk(body: _Text | _Binary, element: _Element, at: int, rows: int) -> NDArray[np.int64]:
+    """Return the lengths [rows, L] of lists, row by row."""
+    steps: list[tuple[int, np.dtype, int]] = []
+    skipped = 0
+    for one in element.properties:
+        if one.count is None:
+            skipped += body.width(one.kind)
+        else:
+            steps.append((skipped, one.count, body.width(one.kind)))
+            skipped = 0
+    lengths = np.zeros((rows, len(steps)), np.int64)
+    for row in range(rows):
+        for column, (before, kind, size) in enumerate(steps):
+            at += before
+            length = body.count(at, kind) if at + body.width(kind) <= body.size else -1
+            if not 0 <= length <= body.size:
+                raise Rejected("header_size_mismatch", f"the PLY ends within {element.name[:24]!r}")
+            lengths[row, column] = length
+            at += body.width(kind) + size * length
+        at += skipped
+    return lengths
+
+
+class _Seen:
+    """Reads columns and notes what was read."""
+
+    def __init__(self) -> None:
+        self._read: set[tuple[str, str]] = set()
+        self.notes = Counter[str]()
+
+    def note(self, text: str) -> None:
+        """Add a sentence."""
+        self.notes[text] = 1
+
+    def take(self, columns: Columns, element: str, *names: str) -> list[NDArray] | None:
+        """Return single values by their names; None where one is missing."""
+        values = [columns.get(name) for name in names]
+        if not all(isinstance(value, np.ndarray) for value in values):
+            return None
+        self._read.update((element, name) for name in names)
+        return [value for value in values if isinstance(value, np.ndarray)]
+
+    def take_lists(self, columns: Columns, element: str, *names: str) -> _Lists | None:
+        """Return the first list of these names."""
+        for name in names:
+            if isinstance(values := columns.get(name), _Lists):
+                self._read.add((element, name))
+                return values
+        return None
+
+    def unread(self, elements: Mapping[str, Columns]) -> tuple[str, ...]:
+        """Return sentences on what nothing has read."""
+        for element, columns in elements.items():
+            if element not in ("vertex", "face", "tristrips"):
+                self.note(f"element {element[:24]!r}")
+                continue
+            for name in columns:
+                if (element, name) not in self._read and name not in _SILENT:
+                    self.note(f"property {name[:24]!r} of {element}")
+        return list_some(self.notes)
+
+
+def _read_polygons(seen: _Seen, columns: Columns, element: str) -> _Lists:
+    """Return the vertices of faces or strips."""
+    lists = seen.take_lists(columns, element, *_INDICES)
+    if lists is None and columns:
+        names = [name for name, values in columns.items() if isinstance(values, _Lists)]
+        lists = seen.take_lists(columns, element, *names) if len(names) == 1 else None
+    if lists is None:
+        return _Lists(values=np.zeros(0, np.int64), counts=np.zeros(0, np.int64))
+    return lists
+
+
+def _cut_strips(strips: _Lists) -> NDArray[np.int64]:
+    """Return the triangles [T, 3] of strips; -1 begins another one, every second is turned."""
+    values = strips.values.astype(np.int64)
+    piece = np.repeat(np.arange(len(strips.counts)), strips.counts) + np.cumsum(values == -1)
+    kept = values != -1
+    values, piece = values[kept], piece[kept]
+    _, first = np.unique(piece, return_index=True)
+    position = np.arange(len(values)) - np.repeat(first, np.diff(np.append(first, len(values))))
+    same = np.flatnonzero(piece[2:] == piece[:-2])
+    turned = position[same] % 2
+    return np.stack([values[same + turned], values[same + 1 - turned], values[same + 2]], axis=1)
+
+
+def _read_colors(seen: _Seen, columns: Columns, element: str) -> NDArray[np.float64] | None:
+    """Return the linear colors [N, 3] of vertices or faces."""
+    for names in _COLORS:
+        if (values := seen.take(columns, element, *names)) is not None:
+            alpha = seen.take(columns, element, "alpha") or seen.take(columns, element, "a")
+            if alpha is not None and (decode_colors(alpha[0]) < 1).any():
+                seen.note("transparency of colors")
+            return decode_colors(np.stack(values, axis=1))
+    return None
+
+
+def _read_uv(
+    seen: _Seen,
+    columns: Mapping[str, Columns],
+    polygons: _Lists,
+    cut: CutPolygons,
+) -> NDArray[np.float64] | None:
+    """Return texture coordinates [T, 3, 2] of corners: of faces, or else of vertices."""
+    lists = seen.take_lists(columns.get("face", {}), "face", "texcoord")
+    if lists is not None and len(lists.values):
+        uv = np.full((max(int(cut.corners.max(initial=-1)) + 1, len(polygons.values)), 2), np.nan)
+        has = lists.counts == 2 * polygons.counts
+        own, theirs = np.repeat(has, polygons.counts), np.repeat(has, lists.counts)
+        uv[: len(polygons.values)][own] = lists.values[theirs].reshape(-1, 2)
+        return uv[cut.corners]
+    for names in _UVS:
+        if (values := seen.take(columns.get("vertex", {}), "vertex", *names)) is not None:
+            return np.stack(values, axis=1).astype(np.float64)[cut.vertices]
+    return None

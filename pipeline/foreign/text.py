@@ -1,0 +1,135 @@
+"""Text of strangers' files: bytes as lines and words, found by numpy."""
+
+import codecs
+import re
+import warnings
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import Rejected
+
+_MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16", codecs.BOM_UTF8: ""}
+PADDING = b"\n\n\n"
+"""What `split_lines` adds to a text."""
+T = TypeVar("T", bound=np.generic)
+
+_SPACE = 32
+"""Bytes up to this one stand between words."""
+
+
+def plain_text(data: bytes) -> bytes:
+    """Return a text without its byte order mark, its lines ended by a line feed."""
+    for mark, encoding in _MARKS.items():
+        if data.startswith(mark):
+            data = data[len(mark) :] if not encoding else _from_utf16(data)
+            break
+    return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
+
+
+def _from_utf16(data: bytes) -> bytes:
+    return data.decode("utf-16", "replace").encode()
+
+
+def decode_name(data: bytes) -> str:
+    """Return a name in UTF-8, or else each byte as the character of its number (Latin-1)."""
+    try:
+        return data.decode().strip()
+    except UnicodeDecodeError:
+        return data.decode("latin-1").strip()
+
+
+def unquote_name(name: str) -> str:
+    """Return a name without the quotation marks around it."""
+    return name[1:-1] if len(name) > 2 and name[0] == name[-1] == '"' else name
+
+
+def join_continued(text: bytes) -> bytes:
+    r"""Return a text whose lines that end with \ go on; comment lines never do."""
+    if b"\\" not in text:
+        return text
+    text = re.sub(rb"(?m)^[ \t]*#[^\n]*", b"", text)
+    return re.sub(rb"\\[ \t]*\n", b" ", text)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TextLines:
+    """The lines and words of a text."""
+
+    text: bytes
+    """With some line breaks more at its end."""
+    codes: NDArray[np.uint8]
+    """Its bytes."""
+    starts: NDArray[np.int64]
+    """[L] first byte of each line."""
+    words: NDArray[np.int64]
+    """[W] first byte of each word."""
+    first: NDArray[np.int64]
+    """[L] row of `words` with which each line begins, or that of the next line."""
+    counts: NDArray[np.int64]
+    """[L] words of each line."""
+
+    def take_rows(self, rows: NDArray[np.int64], text: bytes) -> bytes:
+        """Return lines of a text that has this one's places."""
+        if not len(rows):
+            return b""
+        ends = np.append(self.starts[1:], len(self.text))
+        breaks = np.flatnonzero(np.diff(rows) != 1)
+        begin = self.starts[rows[np.append(0, breaks + 1)]].tolist()
+        end = ends[rows[np.append(breaks, len(rows) - 1)]].tolist()
+        return b"".join(text[low:high] for low, high in zip(begin, end, strict=True))
+
+    def line(self, row: int) -> bytes:
+        """Return one line, without spaces around it."""
+        end = self.starts[row + 1] if row + 1 < len(self.starts) else len(self.text)
+        return self.text[self.starts[row] : end].strip()
+
+
+def split_lines(text: bytes) -> TextLines:
+    """Find the lines and words of a text."""
+    text += PADDING
+    codes = np.frombuffer(text, np.uint8)
+    starts = np.append(0, np.flatnonzero(codes == ord("\n"))[:-1] + 1)
+    is_word = codes > _SPACE
+    is_word[1:] &= codes[:-1] <= _SPACE
+    words = np.flatnonzero(is_word)
+    first = np.searchsorted(words, starts)
+    counts = np.diff(np.append(first, len(words)))
+    return TextLines(text=text, codes=codes, starts=starts, words=words, first=first, counts=counts)
+
+
+def parse_numbers(text: bytes, count: int, dtype: type[T]) -> NDArray[T]:
+    """Return the numbers of a text whose words are as many numbers.
+
+    Raises:
+        Rejected: load_error where a word is no number of this kind.
+    """
+    if count == 0:
+        return np.zeros(0, dtype)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)
+            values = np.fromstring(text, dtype, sep=" ")
+    except (ValueError, DeprecationWarning):
+        values = np.zeros(0, dtype)
+    if len(values) != count:
+        word = next((word for word in text.split() if not _is_number(word)), b"")
+        raise Rejected("load_error", f"{word[:40]!r} stands where a number is expected")
+    return values
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return b"_" not in word
+
+
+def list_some(sentences: dict[str, int], most: int = 12) -> tuple[str, ...]:
+    """Return the first sentences of a file, and how many more there are."""
+    listed = [text if count == 1 else f"{count} x {text}" for text, count in sentences.items()]
+    more = len(listed) - most
+    return (*listed[:most], *([f"{more} other things"] if more > 0 else []))

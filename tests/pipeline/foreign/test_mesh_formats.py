@@ -1,0 +1,305 @@
+"""OBJ, PLY, STL and OFF: read back as written in every dialect; a cut-off file is refused."""
+
+import re
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.assets.settings import AssetSettings
+from pipeline.exchange.scene_files import build_scene
+from pipeline.foreign.limits import ReadLimits
+from pipeline.foreign.load import load_mesh
+from pipeline.foreign.mesh import FileMesh
+from pipeline.foreign.mesh_materials import read_parts
+from pipeline.foreign.picture import Decoder
+from pipeline.foreign.polygons import triangulate
+from pipeline.foreign.source_file import SourceFile, read_source
+from storage.conventions import linear_from_srgb8
+from storage.errors import Rejected
+from tests.for_each import case, for_each
+from tests.pipeline.assets.own import textured_kit as kit
+from tests.pipeline.foreign.dialects import WRITERS, Polygons, Rng, draw_polygons
+
+KINDS = list(WRITERS)
+RANDOM = st.randoms(use_true_random=False)
+
+
+def source(kind: str, data: bytes) -> SourceFile:
+    return SourceFile(kind=kind, data=data, sha256="")
+
+
+def by_color(contents: FileMesh, mesh: Polygons) -> dict[int, float]:
+    """Return the area of each polygon by its color, or by its material's number."""
+    area = np.linalg.norm(contents.mesh.double_area_vectors, axis=1) / 2
+    rows = None
+    if contents.material_names:
+        number = [int(name.removeprefix("größe ")) for name in contents.material_names]
+        rows = np.array(number)[contents.material]
+    if contents.color is not None:
+        table = linear_from_srgb8()[np.array(mesh.colors)]
+        away = np.abs(contents.color[:, :, None] - table).max(axis=-1)
+        assert (away.min(axis=-1) < 1e-5).all()
+        of_color = away[:, 0].argmin(axis=-1)
+        assert rows is None or np.array_equal(rows, of_color)
+        rows = of_color
+    assert rows is not None
+    return dict(enumerate(np.bincount(rows, area)))
+
+
+@settings(max_examples=150, deadline=None)
+@given(rng=RANDOM, kind=st.sampled_from(KINDS))
+def test_a_mesh_is_read_as_it_was_written(rng: Rng, kind: str) -> None:
+    mesh = draw_polygons(rng, 3 if kind == "stl" else 9)
+    read = source(kind, WRITERS[kind](mesh, rng))
+    triangles, contents = load_mesh(read), read.contents
+    assert len(triangles.faces) == sum(len(ring) - 2 for ring in mesh.rings)
+    corners = {tuple(point) for point in triangles.corners.reshape(-1, 3)}
+    assert corners == {tuple(point) for point in mesh.points}
+    if contents.color is None and not contents.material_names:
+        area = np.linalg.norm(triangles.double_area_vectors, axis=1).sum() / 2
+        assert kind == "stl" and area == pytest.approx(sum(mesh.areas), rel=1e-6)
+        return
+    assert by_color(contents, mesh) == pytest.approx(dict(enumerate(mesh.areas)), rel=1e-6)
+    if contents.uv is not None:
+        is_mapped = np.array_equal(contents.uv, triangles.corners[..., :2])
+        assert is_mapped or np.isnan(contents.uv).all()
+    named = {
+        "obj": set(),
+        "off": {"more numbers of vertices"},
+        "stl": set(),
+        "ply": {"element 'edge'", "property 'flags' of face", "property 'quality' of vertex"},
+    }
+    assert {text.partition(" x ")[2] or text for text in read.unread} <= named[kind]
+
+
+@settings(max_examples=150, deadline=None)
+@given(rng=RANDOM, kind=st.sampled_from(["ply", "stl", "off"]), place=st.floats(0, 1))
+def test_a_file_that_ends_early_is_refused_or_whole(rng: Rng, kind: str, place: float) -> None:
+    mesh = draw_polygons(rng, 3 if kind == "stl" else 9)
+    data = WRITERS[kind](mesh, rng)
+    cut = data[: int(place * (len(data) - 1))]
+    if kind != "stl" and cut[-1:].isdigit() and not data[len(cut) :].split(None, 1)[1:]:
+        return  # within its last number, which then is another one
+    if kind == "stl" and re.search(rb"endfacet\s+endsolid[^\n]*\n?$", cut.lower()):
+        return  # behind the first of two solids
+    try:
+        left = load_mesh(source(kind, cut))
+    except Rejected as refusal:
+        assert refusal.reason in {"header_size_mismatch", "cut_off", "load_error"}, refusal
+    else:
+        whole = load_mesh(source(kind, data))
+        assert np.array_equal(left.corners, whole.corners)
+
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+READ: dict[str, tuple[str, int, str | bytes, tuple[str, ...]]] = {
+    "keyhole": ("obj", 8, "v 0 0 0\nv 3 0 0\nv 3 3 0\nv 0 3 0\nv 1 1 0\nv 1 2 0\nv 2 2 0\nv 2 1 0\n"
+                "f 1 2 3 4 1 5 6 7 8 5\n", ()),
+    "free form": ("obj", 1, TRIANGLE + "cstype bezier\ncurv 0 1 1 2\np 1\nf 1 2 3\n",
+                  ("statement 'cstype'", "statement 'curv'", "statement 'p'")),
+    "no such vt": ("obj", 1, TRIANGLE + "f 1/7 2/8 3/9\n",
+                   ("texture coordinates that the file does not hold",)),
+    "strips": ("ply", 3, "ply\nformat ascii 1.0\nelement vertex 4\nproperty double x\n"
+               "property double y\nproperty double z\nelement tristrips 1\n"
+               "property list int int vertex_indices\nend_header\n"
+               "0 0 0\n1 0 0\n0 1 0\n1 1 0\n8 0 1 2 3 -1 2 1 0\n", ()),
+    "no header": ("off", 1, "3 1 0 0 0 0 1 0 0\n0 1 0 3 0\n1 2\n", ()),
+    "stl attributes": ("stl", 1, b"COLOR=".ljust(80) + b"\1\0\0\0" + bytes(12) + np.eye(
+        3, dtype="<f4").tobytes() + b"\1\x80",
+        ("attributes of facets, which often are colors", "color of the header")),
+}  # fmt: skip
+
+
+@for_each("name", READ)
+def test_what_is_read_and_what_is_named(name: str) -> None:
+    kind, count, text, unread = READ[name]
+    read = source(kind, text if isinstance(text, bytes) else text.encode())
+    mesh = load_mesh(read)
+    assert len(mesh.faces) == count and read.unread == unread
+    if name == "keyhole":
+        assert np.linalg.norm(mesh.double_area_vectors, axis=1).sum() / 2 == pytest.approx(8)
+    if name == "strips":
+        assert (mesh.double_area_vectors[:2, 2] > 0).all() and not read.is_single
+
+
+BY_MESHLAB = "# OBJ File Generated by Meshlab\n"
+REFUSED = {
+    "obj within a face": ("obj", "cut_off", TRIANGLE + "f 1 2"),
+    "obj within a vertex": ("obj", "cut_off", TRIANGLE + "f 1 2 3\nv 1 2"),
+    "obj zero": ("obj", "index_range", TRIANGLE + "f 0 1 2\n"),
+    "obj too far back": ("obj", "index_range", TRIANGLE + "f -1 -2 -4\n"),
+    "obj no number": ("obj", "load_error", TRIANGLE + "f 1 2 3x\n"),
+    "obj of MeshLab": ("obj", "cut_off", BY_MESHLAB + TRIANGLE),
+    "obj of curves": ("obj", "no_faces", TRIANGLE + "curv 0 1 1 2\n"),
+    "stl without end": ("stl", "cut_off", "solid a\n"),
+    "off binary": ("off", "load_error", "OFF BINARY\n3 1 0\n"),
+    "off of four dimensions": ("off", "load_error", "nOFF 4\n3 1 0\n"),
+    "ply of another format": ("ply", "load_error", "ply\nformat xml 1.0\nend_header\n"),
+}  # fmt: skip
+
+
+@for_each("name", REFUSED)
+def test_what_is_refused(name: str) -> None:
+    kind, reason, text = REFUSED[name]
+    with pytest.raises(Rejected) as refusal:
+        load_mesh(source(kind, text.encode()))
+    assert refusal.value.reason == reason
+
+
+@for_each("count", [40, 3000])
+def test_a_comb_is_cut_as_it_is(count: int) -> None:
+    """Every second corner is drawn in; more corners than were ever cut by ears count alike."""
+    turn = 2 * np.pi * np.arange(count) / count
+    ring = np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+    ring *= np.where(np.arange(count) % 2, 0.5, 1.0)[:, None]
+    corners, _ = triangulate(ring, np.array([count]), np.arange(count))
+    cross = np.cross(*(ring[corners[:, k]] - ring[corners[:, 0]] for k in (1, 2)))[:, 2]
+    assert len(corners) == count - 2 and (cross > 0).all()
+    assert cross.sum() / 2 == pytest.approx(count / 4 * np.sin(2 * np.pi / count))
+
+
+MTL = "Kd xyz 0.4124 0.2126 0.0193\nillum 2 # x\nd -halo 0.5\nsharpness 60\nsparkle 1\nTr 0\n"
+
+
+def placed(folder: Path, obj: bytes, files: dict[str, bytes]) -> Path:
+    """Write an OBJ of one square with what it names, below a folder of a root."""
+    path = folder / "a" / "models" / "a.obj"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = [f"v {x} {y} {z}\n" for x, y, z in kit.SQUARE.positions]
+    rows += [f"vt {u} {v}\n" for u, v in kit.UV_UP]
+    path.write_bytes("".join(rows).encode() + obj + b"f 1/1 2/2 3/3 4/4\n")
+    for name, data in files.items():
+        (path.parent / name).parent.mkdir(exist_ok=True, parents=True)
+        (path.parent / name).write_bytes(data)
+    return path
+
+
+PICTURE = kit.picture_bytes(np.full((4, 4, 3), [255, 0, 0], np.uint8))
+SPELLINGS: dict[str, tuple[bytes, str]] = {
+    "as it is": (b"map_Kd a b.png", "a b.png"),
+    "quoted": (b'map_Kd "a b.png"', "a b.png"),
+    "options": (b"map_Kd -blendu on -mm 0 1 -o 0 0 0 -s 1 -texres 4 -cc off a  b.png", "a  b.png"),
+    "another case": (b"map_Kd Maps\\A.PNG", "maps/a.png"),
+    "of another machine": (b"map_Kd C:\\Users\\x\\a.png", "a.png"),
+    "above": (b"map_Kd ..\\images\\a.png", "../images/a.png"),
+    "beside its library": (b"map_Kd a.png", "more/a.png"),
+    "scanned objects": (b"map_Kd a.png", "../materials/textures/a.png"),
+    "latin-1": ("map_Kd größe.png".encode("latin-1"), "größe.png"),
+    "shift-jis": ("map_Kd 木.png".encode("cp932"), "木.png"),
+}  # fmt: skip
+
+
+@for_each("name", SPELLINGS)
+def test_pictures_are_found_however_their_names_are_spelled(tmp_path: Path, name: str) -> None:
+    statement, place = SPELLINGS[name]
+    library = b"newmtl m\n" + statement + b"\n"
+    files = {"more/c.mtl": library, place: PICTURE}
+    path = placed(tmp_path, b"mtllib b.mtl more/c.mtl\nusemtl m\n", files)
+    read = read_source(path, ReadLimits(with_materials=True), tmp_path)
+    assert [data for data in read.materials.data.values() if data == PICTURE] == [PICTURE]
+
+
+def test_nothing_is_read_outside_of_the_folder_that_was_given(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    for spelling in (b"../../../x.png", b"link/x.png", bytes(tmp_path / "x.png")):
+        path = placed(root, b"mtllib c.mtl\nusemtl m\n", {"c.mtl": b"newmtl m\nmap_Kd " + spelling})
+        (tmp_path / "x.png").write_bytes(PICTURE)
+        (path.parent / "link").unlink(missing_ok=True)
+        (path.parent / "link").symlink_to(tmp_path)
+        (reason,) = read_source(
+            path, ReadLimits(with_materials=True), root
+        ).materials.refused.values()
+        assert reason.reason == "texture_outside"
+
+
+def test_statements_of_an_mtl_are_read_or_named(tmp_path: Path) -> None:
+    from pipeline.assets.prepare import prepare_asset
+
+    files = {"m.mtl": b"\xef\xbb\xbfnewmtl\tm #1\r\n" + MTL.replace("\n", "\r\n").encode()}
+    path = placed(tmp_path, b"usemtl m #1\nmtllib m.mtl\n", files)
+    made = prepare_asset(path, kit.KEEP, "meshoptimizer")
+    assert made.asset.materials is not None and made.asset.materials.lost == ("transparency",)
+    assert made.unread == ("statement 'sparkle'",)
+    red, green, blue = kit.seen_at(made.asset, 0, 0)
+    assert red > 0.9 and max(green, blue) < 0.02
+
+
+SHAPES: dict[str, tuple[int, float | None]] = {
+    "01-obj-concave-polygon/in/u.obj": (28, 30.0),
+    "04-obj-interleaved-negative/in/two.obj": (24, 12.0),
+    "06a-ply-binary-mixed/in/pyramid.ply": (6, None),
+    "07a-stl-facet-on-one-line/in/one-line-a-facet.stl": (12, None),
+    "08a-stl-key-words-in-names/in/key-word-names.stl": (24, None),
+    "10a-obj-second-group-indented/in/second-group-indented.obj": (12, None),
+    "10b-obj-tab-separated/in/tab-separated.obj": (12, None),
+    "60-ply-double-utm/in/block.ply": (12, None),
+}
+RED, BLUE = (0.8, 0.05, 0.05), (0.05, 0.1, 0.7)
+SEEN_RED, SEEN_BLUE = (0.578, 0.013, 0.013), (0.013, 0.013, 0.578)
+SHADES = {
+    "17a-mtl-tabs/in/cube.obj": {RED: 0.5, BLUE: 0.5},
+    "18a-obj-latin1-names/in/cube.obj": {(0.05, 0.6, 0.05): 0.5, (0.9, 0.9, 0.9): 0.5},
+    "20-shapenet-layout/in/03001627/abc/models/model_normalized.obj": {
+        SEEN_RED: 0.5,
+        SEEN_BLUE: 0.5,
+    },
+    "21-bop-ply-texture/in/coloured/obj_000002.ply": {(0.013, 0.352, 0.013): 1.0},
+    "21-bop-ply-texture/in/textured/obj_000001.ply": {SEEN_RED: 0.5, SEEN_BLUE: 0.5},
+    "28a-mtl-halo/in/cube.obj": {RED: 0.5, BLUE: 0.5},
+}
+
+
+def test_shapes_of_public_reports(shared: Path) -> None:
+    for name, (count, area) in SHAPES.items():
+        with case(name):
+            mesh = load_mesh(read_source(shared / "cases" / name, ReadLimits()))
+            assert len(mesh.faces) == count
+            if area is not None:
+                double = np.linalg.norm(mesh.double_area_vectors, axis=1).sum()
+                assert double / 2 == pytest.approx(area)
+    off = shared / "cases/09a-off-glued-cut-off/in/glued-cut-off.off"
+    with pytest.raises(Rejected, match="header_size_mismatch"):
+        load_mesh(read_source(off, ReadLimits()))
+
+
+def test_shades_of_public_reports(shared: Path) -> None:
+    """The base color at the middle of each face, by area."""
+    for name, shades in SHADES.items():
+        with case(name):
+            path = shared / "cases" / name
+            root = shared / "cases" / name.partition("/")[0] / "in"
+            read = read_source(path, ReadLimits(with_materials=True), root)
+            parts = read_parts(read, Decoder(1 << 20), emission=False)
+            area = np.linalg.norm(parts.mesh.double_area_vectors, axis=1) / 2
+            found = Counter[tuple[float, ...]]()
+            for face, share in enumerate(area / area.sum()):
+                material = parts.materials[parts.material[face]]
+                color = np.array(material.base_rgb)
+                if parts.colour is not None:
+                    color = color * parts.colour[face].mean(axis=0)
+                if material.base is not None:
+                    middle = parts.uv[face, 0].mean(axis=0)[None]
+                    color = color * material.base.picture.at(middle, np.zeros(1, int))[0, :3]
+                found[tuple(np.round(color, 3).tolist())] += share
+            assert dict(found) == pytest.approx(shades)
+
+
+@pytest.mark.parametrize("name", ["46-json-concave-polygon/scene", "45-json-windows-paths/windows"])
+def test_json_scenes_of_public_reports(shared: Path, name: str) -> None:
+    folder, _, scene = name.partition("/")
+    built, _ = build_scene(
+        shared / "cases" / folder / "in",
+        f"{scene}.json",
+        AssetSettings(),
+        licence="CC0-1.0",
+        num_views=None,
+        scene_index=0,
+        seed=0,
+    )
+    corners = built.vertex_positions[built.faces[built.object_index == 0]].astype(np.float64)
+    vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.linalg.norm(vectors, axis=1).sum() / 2 == pytest.approx(1.2, rel=1e-5)
