@@ -108,7 +108,8 @@ _CHOSEN = re.compile(r'reason = "([a-z_]+)" if [^\n]+ else "([a-z_]+)"')
 def codes() -> set[str]:
     """Return every reason that the stage or its children can give, as their sources have them."""
     found: set[str] = set()
-    for path in (ROOT / "pipeline" / "assets").rglob("*.py"):
+    folders = (ROOT / "pipeline" / name for name in ("assets", "foreign"))
+    for path in (path for folder in folders for path in folder.rglob("*.py")):
         text = path.read_text()
         found.update(_RAISED.findall(text))
         found.update(code for pair in _CHOSEN.findall(text) for code in pair)
