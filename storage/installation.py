@@ -46,7 +46,9 @@ def order_installed_first(paths: Sequence[str]) -> list[str]:
         return list(paths)
     if folder in [*_named_paths(), str(IMPORT_ROOT)]:
         return list(paths)
-    return sorted(paths, key=lambda path: path in ("", folder))
+    kept = [path for path in paths if path not in ("", folder)]
+    ours = [] if str(IMPORT_ROOT) in kept else [str(IMPORT_ROOT)]  # a hook of pip's finds us later
+    return [*kept, *ours, *(path for path in paths if path in ("", folder))]
 
 
 def _named_paths() -> list[str]:
