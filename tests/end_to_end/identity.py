@@ -48,8 +48,8 @@ KEPT = Path(__file__).with_name("identity.json")
 
 SETS = {
     "plain": ("smoke", "builtin:", 8, 4),
-    "out-of-range": ("out-of-range", "builtin:", 30, 15),
-    "renderformer-v1-256": ("renderformer-v1-256", "objects", 12, 6),
+    "out-of-range": ("out-of-range", "builtin:", 10, 5),
+    "renderformer-v1-256": ("renderformer-v1-256", "objects", 4, 2),
     "textured": ("textured-256", "builtin:", 4, 2),
     "sky": ("sky-256", "builtin:", 4, 2),
 }
