@@ -23,6 +23,9 @@ Worn = tuple[Texture | None, Texture | None, Texture | None]
 
 PLAIN: Worn = (None, None, None)
 
+_SMALLEST_DOUBLE_AREA = 1e-12
+"""In square metres."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DressedTriangles:
@@ -63,6 +66,15 @@ class DressedPiece:
     """[T, 3, 2]"""
     worn: tuple[Worn, ...]
     """Textures of each of its material rows."""
+
+
+def have_areas(corners: NDArray[np.floating], cross: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether triangles [T, 3, 3] have an area; `cross` [T, 3] are as long as twice theirs.
+
+    In a mesh below a metre that is measured by its size: triangles of a watch are small.
+    """
+    size = min(float(np.ptp(corners.reshape(-1, 3), axis=0).max()), 1.0) if corners.size else 1.0
+    return np.asarray(np.linalg.norm(cross, axis=1) > _SMALLEST_DOUBLE_AREA * size**2)
 
 
 def by_kind(triangles: DressedTriangles) -> list[tuple[ObjectKind, DressedTriangles]]:

@@ -3,11 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.dressed import have_areas
 from pipeline.foreign.gltf.primitives import PlacedPrimitive
 from storage.errors import Rejected
-
-_SMALLEST_DOUBLE_AREA = 1e-12
-"""In square metres; of a mesh below a metre, in squares of its size."""
 
 
 class WorldTriangles:
@@ -21,13 +19,12 @@ class WorldTriangles:
             raise Rejected("nonfinite_vertices", "positions are not finite")
         wide = corners.astype(np.float32).astype(np.float64)
         cross = np.cross(wide[:, 1] - wide[:, 0], wide[:, 2] - wide[:, 0])
-        length = np.linalg.norm(cross, axis=1, keepdims=True)
-        size = min(float(np.ptp(wide.reshape(-1, 3), axis=0).max()), 1.0) if wide.size else 1.0
-        self._kept = length[:, 0] > _SMALLEST_DOUBLE_AREA * size**2
+        self._kept = have_areas(wide, cross)
         self.without_area = int((~self._kept).sum())
         self.positions = wide[self._kept].astype(np.float32)
         """[T, 3, 3]"""
-        self._flat = np.repeat((cross[self._kept] / length[self._kept])[:, None], 3, axis=1)
+        length = np.linalg.norm(cross[self._kept], axis=1, keepdims=True)
+        self._flat = np.repeat((cross[self._kept] / length)[:, None], 3, axis=1)
 
     @property
     def colors(self) -> NDArray[np.float64] | None:

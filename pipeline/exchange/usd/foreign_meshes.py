@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.dressed import have_areas
 from pipeline.foreign.usd.placed import Placed
 from pipeline.foreign.usd.polygons import (
     CutMesh,
@@ -20,8 +21,6 @@ from pipeline.scenes.shading import smooth_shaded
 
 SMOOTH_ANGLE_DEG = 30.0
 """Edges up to this angle are smooth where a subdivision surface states no normals."""
-
-_SMALLEST_DOUBLE_AREA = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,7 +57,7 @@ def read_mesh(placed: Placed, time: Any, lost: list[str]) -> TriangleSoup:
     rows = cut.indices[cut.corners]
     positions = moved(found.points, placed.to_world)[rows].astype(np.float32)
     cross = _cross(positions)
-    solid = np.sqrt(np.square(cross).sum(axis=1)) > _SMALLEST_DOUBLE_AREA
+    solid = have_areas(positions, cross)
     if not solid.all():
         lost.append(f"{cut.prim.GetPath()}: {int((~solid).sum())} triangles without an area")
     cut, positions = cut.select(solid), positions[solid]
