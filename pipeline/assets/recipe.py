@@ -38,6 +38,10 @@ RECIPE = (
 )
 """What asset files and their names in the asset store say of how they were made."""
 
+READERS = 2
+"""Number of what readers make of files: it is in the names of what caches keep, and in no asset, so
+that a mended reader reads again."""
+
 _METHODS: Mapping[Profile, tuple[str, ...]] = {
     "faithful": ("pymeshlab_collapse", "meshoptimizer", "meshoptimizer_sloppy"),
     "uniform": (

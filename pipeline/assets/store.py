@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from pipeline.assets.recipe import RECIPE
+from pipeline.assets.recipe import READERS, RECIPE
 from pipeline.assets.settings import AssetSettings
 from storage.atomic import TEMPORARY_SUFFIX, write_atomically, write_error
 from storage.digests import canonical_json, sha256_hex
@@ -41,7 +41,7 @@ class AssetStore:
 
     def key(self, kind: str, source_sha256: str, settings: AssetSettings) -> str:
         """Return the name of the outcome of a source file of a kind and a digest."""
-        parts = [kind, source_sha256, asdict(settings), RECIPE]
+        parts = [kind, source_sha256, asdict(settings), RECIPE, READERS]
         return sha256_hex(canonical_json(parts))[:32]
 
     def asset_path(self, key: str) -> Path:

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.assets.recipe import RECIPE
+from pipeline.assets.recipe import READERS, RECIPE
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset
 from pipeline.isolation import is_passing
@@ -98,7 +98,7 @@ class ObjectWork:
         """Return the name of the result of a batch, whose files may be here to be looked at."""
         named = self.settings.own_materials.keep
         of_objects = [_facts(record, are_here, self._folders, named) for record in records]
-        facts = [of_objects, asdict(self.settings), RECIPE]
+        facts = [of_objects, asdict(self.settings), RECIPE, READERS]
         digest = sha256_hex(canonical_json(facts))[:32]
         return f"{digest[:2]}/{digest}.jsonl"
 
