@@ -1,6 +1,7 @@
 """Reads scenes of a user's files in a child process with limits; only checked scenes come out."""
 
 import dataclasses
+import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import TracebackType
@@ -23,6 +24,8 @@ from pipeline.isolation import (
 )
 from storage.errors import TrilightError
 from storage.records.scene import Scene
+
+log = logging.getLogger("trilight.exchange")
 
 
 class SceneReader:
@@ -61,10 +64,16 @@ class SceneReader:
         return self._call(source.name, load_cameras, source)
 
     def mesh(self, path: Path, licence: str) -> LoadedMesh:
-        """Read a file of an object, as it is; raises TrilightError as `load_mesh_file`."""
+        """Read a file of an object, as it is; raises TrilightError as `load_mesh_file`.
+
+        What of the file nothing reads is logged.
+        """
         self._child.may(reach(files=[path]))
         wanted = (path, path.name, path.name, AssetSettings(), licence)
-        return self._call(path.name, load_mesh_file, *wanted)[0]
+        mesh, _ = self._call(path.name, load_mesh_file, *wanted)
+        if mesh.unread:
+            log.warning("%s: not read: %s", path.name, "; ".join(mesh.unread))
+        return mesh
 
     def within_budget(self, scene: Scene, max_triangles: int) -> LoadedScene:
         """Return a scene of fewer triangles; raises TrilightError as `within_budget`."""
