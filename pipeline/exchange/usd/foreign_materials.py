@@ -21,6 +21,7 @@ from pipeline.exchange.usd.held_materials import (
     HeldMaterial,
     choose_emission,
     choose_textures,
+    name_lost_columns,
     parse_numbers,
     read_held_material,
     read_held_textures,
@@ -146,6 +147,8 @@ def _shaded(
     for name, column in compute_varied(inputs, skin.textures).items():
         rows[:, _COLUMNS[name]], kept[name] = column, None
     _take_added_columns(rows, material, time, opened.lost)
+    if held is not None:
+        opened.lost += name_lost_columns(material)
     return _Shaded(
         rows=rows,
         uv=nowhere if skin.uv is None else skin.uv,

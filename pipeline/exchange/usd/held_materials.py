@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 from pipeline.exchange.linear_maps import colour_textures, constant_map, linear_map, over_one
 from pipeline.exchange.usd.foreign_inputs import ShaderInputs, worn_textures
 from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
-from pipeline.exchange.usd.names import MATERIAL_ATTRIBUTES, texture_attribute
+from pipeline.exchange.usd.names import (
+    ADDED_COLUMNS,
+    MATERIAL_ATTRIBUTES,
+    column_attribute,
+    texture_attribute,
+)
 from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS
 from pipeline.foreign.usd.shaders import surface_shader
 from pipeline.foreign.usd.stage import OpenedUsd
@@ -184,6 +189,16 @@ def _find_exact(held: HeldMaterial, column: str, stated: Texture | None) -> Text
 
 def _agree(stated: NDArray[np.float32], exact: NDArray[np.float32]) -> bool:
     return bool(np.allclose(stated, exact, rtol=_SAME, atol=0))
+
+
+def name_lost_columns(material: Any) -> list[str]:
+    """Return a note for each added column that another program has not kept."""
+    prim = material.GetPrim()
+    return [
+        f"{prim.GetPath()}: material column {name!r} is not in the file any more; its default taken"
+        for name in str(prim.GetAttribute(ADDED_COLUMNS).Get() or "").split()
+        if not prim.HasAttribute(column_attribute(name))
+    ]
 
 
 def parse_numbers(value: Any) -> NDArray[np.float64]:

@@ -82,6 +82,9 @@ MATERIAL_ATTRIBUTES = {
 _ADDED_COLUMN = NAMESPACE + "column:"
 """Prefix of the attribute of a column that was added to the published ones."""
 
+ADDED_COLUMNS = NAMESPACE + "columns"
+"""Attribute of a material: names of its added columns, since programs may keep texts alone."""
+
 FOV_DEG = NAMESPACE + "fovDeg"
 """Attribute of a camera; its pose is the transform, in doubles that hold floats exactly."""
 

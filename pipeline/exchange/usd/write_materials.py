@@ -26,6 +26,8 @@ from pipeline.exchange.usd.authoring import (
     usd_value,
 )
 from pipeline.exchange.usd.names import (
+    ADDED_COLUMNS,
+    MATERIAL_ATTRIBUTES,
     column_attribute,
     material_name,
 )
@@ -140,6 +142,8 @@ def _exact(values: NDArray[np.float32], columns: Sequence[str]) -> Attributes:
                 kind,
                 float(value[0]) if kind == "float" else value,
             )
+    if added := [name for name in columns if name not in MATERIAL_ATTRIBUTES]:
+        found[ADDED_COLUMNS] = ("string", " ".join(added))
     return found
 
 

@@ -104,18 +104,6 @@ def packed_channels(part: str) -> Mapping[str, int]:
     return _PACKED.get(part, {})
 
 
-def named_part(stem: str) -> tuple[str, str]:
-    """Return the texture that a file belongs to, and its part; a name without one is a base.
-
-    `oak_floor_rough_4k` is part "roughness" of `oak_floor_4k`.
-
-    Args:
-        stem: the name without its suffix, perhaps with folders before it.
-    """
-    named = _named(stem)
-    return (stem, "base") if named is None else (named.stem, named.part)
-
-
 def group_textures(
     names: Sequence[str],
 ) -> tuple[dict[str, dict[str, str]], dict[str, tuple[str, str]]]:

@@ -13,6 +13,7 @@ from pipeline.exchange.usd.write import write_usd
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
 from storage.records.texture import Texture
+from tests.columns_kit import COAT, WAVES, declared
 from tests.for_each import for_each
 from tests.pipeline.exchange.usd.test_write import odd_scene
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
@@ -131,6 +132,20 @@ def test_what_is_no_longer_so_is_said(
     found = edited(tmp_path, tiny_scene(), edit)
     assert rows(found.scene)[0, :6] == pytest.approx(albedos, rel=1e-6)
     assert any(said in text for text in found.lost)
+
+
+def test_a_column_that_blender_drops_is_named(tmp_path: Path) -> None:
+    def drop_array(layer: Any) -> None:
+        as_blender_writes(layer)
+        for material in layer.GetPrimAtPath("/Scene/Materials").nameChildren:
+            del material.properties[f"trilight:column:{WAVES.name}"]
+
+    with declared(COAT, WAVES):
+        scene = tiny_scene()
+        scene.materials[:, -WAVES.width :] = 0.25
+        found = edited(tmp_path, scene, drop_array)
+    notes = [text for text in found.lost if "is not in the file any more" in text]
+    assert notes and all(f"{WAVES.name!r}" in text for text in notes)
 
 
 def as_written_before(layer: Any) -> None:
