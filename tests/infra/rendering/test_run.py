@@ -237,7 +237,6 @@ def test_an_mp4_shows_the_pictures_in_a_row(tmp_path: Path) -> None:
     av = pytest.importorskip("av", reason="H.264 is made by PyAV")
     frames = _frames(tmp_path)
     write_video(tmp_path / "x.mp4", frames, 20)
-    first = (tmp_path / "x.mp4").read_bytes()
     with av.open(str(tmp_path / "x.mp4")) as video:
         assert (video.streams.video[0].average_rate, video.streams.video[0].frames) == (20, 6)
         shown = [
@@ -246,8 +245,6 @@ def test_an_mp4_shows_the_pictures_in_a_row(tmp_path: Path) -> None:
         ]
     for pixels, path in zip(shown, frames, strict=True):
         assert abs(pixels.astype(int) - np.asarray(Image.open(path))).mean() < 8  # as above
-    write_video(tmp_path / "x.mp4", frames, 20)
-    assert (tmp_path / "x.mp4").read_bytes() == first
 
 
 def test_out_says_what_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

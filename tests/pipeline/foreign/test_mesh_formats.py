@@ -292,7 +292,7 @@ def test_shades_of_public_reports(shared: Path) -> None:
 def test_json_scenes_of_public_reports(shared: Path, name: str) -> None:
     folder, _, scene = name.partition("/")
     built, _ = build_scene(
-        shared / "cases" / folder / "in",
+        (shared / "cases" / folder / "in").resolve(),
         f"{scene}.json",
         AssetSettings(),
         licence="CC0-1.0",
