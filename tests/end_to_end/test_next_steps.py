@@ -189,7 +189,7 @@ def test_what_plan_names_is_what_was_priced(trilight: Trilight, tmp_path: Path) 
 
 
 SCENES = (
-    *("--objects", "builtin:benchmark-v1", "--scenes", "4", "--resolution", "64"),
+    *("--objects", "builtin:benchmark-v1", "--scenes", "8", "--resolution", "64"),
     *("--noise-floor", "34", "--set", "renders.max_spp=64", "--set", "scenes.max_triangles=768"),
     *("--set", "assets.budgets=[600,420,300,200,120,70]", "--set", "splits.one_split=true"),
 )
@@ -206,6 +206,6 @@ def test_its_pictures_come_from_the_scene_it_is_shown(trilight: Trilight, tmp_pa
     assert judged.returncode == 0, judged.stderr
     found = json.loads((tmp_path / "judged/evaluation.json").read_text())
     swapped = found["swapped scenes"]
-    assert swapped["views"] == 4 * 3
+    assert swapped["views"] == 4 * 7
     # the triangles of another scene, judged against this one's picture
     assert swapped["median_db"] > 3

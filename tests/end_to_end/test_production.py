@@ -30,7 +30,7 @@ from tests.end_to_end.production_kit import (
     served,
 )
 
-MANY, FEW = 24, 8
+MANY, FEW = 16, 8
 """Scenes, four to a shard: so many that a second worker, which looks for work every ten seconds and
 then starts a process, comes before the first has made them all; and two shards."""
 SMALL: dict[str, Any] = {
