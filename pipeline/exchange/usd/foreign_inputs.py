@@ -53,6 +53,11 @@ class ShaderInputs:
                 return value
         return self.stated.constants[name]
 
+    def build_constant(self, name: str, channels: int, source: MapSource) -> Texture:
+        """Return an input without a texture as one of one texel, of 1 or 3 channels in [0, 1]."""
+        texels = constant_map(np.clip(self.constant(name)[:channels], 0, 1))
+        return Texture(texels=texels, source=source)
+
     def compute_varying(self, name: str) -> NDArray[np.float32] | None:
         """Return the means [T, 3] over triangles of an input's primvar; None without one."""
         values = self.stated.read_values(name, self._surface.cut, self._time)
@@ -132,11 +137,7 @@ def worn_textures(
     """
 
     def of(name: str, channels: int) -> Texture:
-        if name in textures:
-            return textures[name]
-        return Texture(
-            texels=constant_map(np.clip(inputs.constant(name)[:channels], 0, 1)), source=source
-        )
+        return textures.get(name) or inputs.build_constant(name, channels, source)
 
     base, roughness = of("diffuseColor", 3), of("roughness", 1)
     if inputs.stated.is_specular:
@@ -144,9 +145,16 @@ def worn_textures(
     else:
         diffuse, specular = _metallic(base, of("metallic", 1), inputs, textures, source)
     if over_one(diffuse, specular) and not (_one_texel(diffuse) and _one_texel(specular)):
-        lost.append(f"{where}: textured diffuse lowered where it would reflect more than it gets")
-        diffuse, specular = colour_textures(linear_map(diffuse), linear_map(specular), source)
+        diffuse, specular = lower_diffuse(diffuse, specular, source, where, lost)
     return diffuse, specular, roughness
+
+
+def lower_diffuse(
+    diffuse: Texture, specular: Texture, source: MapSource, where: str, lost: list[str]
+) -> tuple[Texture, Texture]:
+    """Return two albedos that add up to at most 1, and say so; arguments of `worn_textures`."""
+    lost.append(f"{where}: textured diffuse lowered where it would reflect more than it gets")
+    return colour_textures(linear_map(diffuse), linear_map(specular), source)
 
 
 def _metallic(

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.linear_maps import colour_textures, constant_map, linear_map, over_one
-from pipeline.exchange.usd.foreign_inputs import ShaderInputs, worn_textures
+from pipeline.exchange.linear_maps import constant_map, over_one
+from pipeline.exchange.usd.foreign_inputs import ShaderInputs, lower_diffuse, worn_textures
 from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
 from pipeline.exchange.usd.names import (
     ADDED_COLUMNS,
@@ -139,8 +139,7 @@ def choose_textures(
     for column, (name, channels) in _STATED.items():
         stated = textures.get(name)
         if stated is None and (column != "specular" or is_specular):
-            texels = constant_map(np.clip(inputs.constant(name)[:channels], 0, 1))
-            stated = Texture(texels=texels, source=source)
+            stated = inputs.build_constant(name, channels, source)
         exact = _find_exact(held, column, stated)
         if exact is None and stated is None:
             lost.append(f"{held.where}: the texture of {column} is not in the file; its mean taken")
@@ -156,8 +155,7 @@ def choose_textures(
     diffuse, specular = worn["diffuse"], worn["specular"]
     is_textured = any(texture.constant is None for texture in (diffuse, specular))
     if is_changed and is_textured and over_one(diffuse, specular):
-        lost.append(f"{where}: textured diffuse lowered where it would reflect more than it gets")
-        diffuse, specular = colour_textures(linear_map(diffuse), linear_map(specular), source)
+        diffuse, specular = lower_diffuse(diffuse, specular, source, where, lost)
     return diffuse, specular, worn["roughness"]
 
 
