@@ -57,7 +57,7 @@ def read_obj(data: bytes) -> FileMesh:
         mesh = TriangleMesh(positions=points[:, :3], faces=np.zeros((0, 3), np.int64))
         return FileMesh(mesh=mesh, unread=list_some(unread))
     corners = _read_corners(lines, kinds, faces, numbers)
-    check_indices(corners[:, 0], len(points))
+    check_indices(corners[:, 0], len(points), first=1)
     material, names = _read_materials(lines, kinds, faces)
     triangles, polygon = triangulate(points[:, :3], counts, corners[:, 0])
     group = 1 + material.max() - material
