@@ -15,10 +15,8 @@ _MOST_FROM_START = 2000
 def check_indices(indices: NDArray[np.int64], count: int, first: int = 0) -> None:
     """Raise Rejected for an index of none of `count` vertices; the file counts from `first`."""
     if len(indices) and not (0 <= indices.min() and indices.max() < count):
-        bad = indices.min() if indices.min() < 0 else indices.max()
-        raise Rejected(
-            "index_range", f"a face names vertex {bad + first} of {count} from {first} on"
-        )
+        bad = first + (indices.min() if indices.min() < 0 else indices.max())
+        raise Rejected("index_range", f"a face names vertex {bad} of {count} from {first} on")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
