@@ -1,6 +1,5 @@
 """What commands say first and last: words before work, and next steps that run as printed."""
 
-import json
 import os
 import shlex
 import signal
@@ -13,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from infra.cli.leaving import temporary_folder
-from model.open import BUILTIN_TOKENS
 from storage.dataset.manifest import read_manifest
 from tests.end_to_end.conftest import Trilight, command
 from tests.for_each import for_each
@@ -186,26 +184,3 @@ def test_what_plan_names_is_what_was_priced(trilight: Trilight, tmp_path: Path) 
     assert made["seed"] == 3
     assert made["scenes"]["num_views"] == 1
     assert (made["renders"]["resolution"], made["renders"]["noise_floor_db"]) == (64, 15.0)
-
-
-SCENES = (
-    *("--objects", "builtin:benchmark-v1", "--scenes", "8", "--resolution", "64"),
-    *("--noise-floor", "34", "--set", "renders.max_spp=64", "--set", "scenes.max_triangles=768"),
-    *("--set", "assets.budgets=[600,420,300,200,120,70]", "--set", "splits.one_split=true"),
-)
-"""As its training scenes were made (`model/builtin/README.md`)."""
-
-
-@pytest.mark.slow("training")
-def test_its_pictures_come_from_the_scene_it_is_shown(trilight: Trilight, tmp_path: Path) -> None:
-    made = trilight("generate", "smoke", *SCENES, "--out", "set")
-    assert made.returncode == 0, made.stderr
-    judged = trilight(
-        "evaluate", BUILTIN_TOKENS, "--data", "set", "--split", "test", "--out", "judged"
-    )
-    assert judged.returncode == 0, judged.stderr
-    found = json.loads((tmp_path / "judged/evaluation.json").read_text())
-    swapped = found["swapped scenes"]
-    assert swapped["views"] == 4 * 7
-    # the triangles of another scene, judged against this one's picture
-    assert swapped["median_db"] > 3

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from model.neural_renderer import NeuralRenderer
-from storage.cache import cache_folder
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
 from tests.conftest import ROOT
@@ -21,11 +20,9 @@ from tests.end_to_end.production_kit import (
     STOP,
     Postgres,
     call,
-    copy_of_the_project,
     dask_cluster,
     documented_run,
     documented_serving,
-    free_port,
     postgres,
     served,
 )
@@ -47,14 +44,6 @@ def _generate(out: Path, scenes: int, *more: str) -> None:
     size = (*OPTIONS, "--scenes", str(scenes))
     call(["-m", "trilight", "generate", "smoke", *size, "--out", str(out), *more],
          dict(os.environ), RUN_S)  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def digest_of_few(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The digest of FEW scenes that one command makes."""
-    out = tmp_path_factory.mktemp("plain") / "few"
-    _generate(out, FEW)
-    return _verified(out)
 
 
 def _verified(out: Path) -> str:
@@ -152,34 +141,8 @@ def _refuses_secrets(tmp_path: Path, environment: dict[str, str], database: Post
 
 
 @pytest.mark.slow("servers")
-@pytest.mark.timeout(1800)
-def test_the_lines_of_the_readme_need_nothing_exported(tmp_path: Path, digest_of_few: str) -> None:
-    """In a checkout: serve, a run, stop. Its cache is empty but for objects made before."""
-    checkout, cache = tmp_path / "checkout", tmp_path / "cache"
-    copy_of_the_project(checkout)
-    cache.mkdir()
-    for known in cache_folder("assets").parent.glob("*"):
-        if known.name not in ("serve", "prefect"):
-            (cache / known.name).symlink_to(known)
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
-    bare = {**kept, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    bare |= {"TRILIGHT_CACHE": str(cache)}
-    port = str(free_port())
-    try:
-        told = call(START, {**bare, "TRILIGHT_PORT": port}, RUN_S, checkout)
-        assert told.splitlines()[-1] == f"Next: {' '.join(documented_serving()[1].split()[:5])}"
-        assert call(["-m", "prefect", "config", "view"], bare, RUN_S, checkout).count(port)
-        run = documented_run(**{**SMALL, "scenes": FEW}, out=tmp_path / "mine")
-        call(run, bare, RUN_S, checkout)
-        assert _verified(tmp_path / "mine") == digest_of_few
-    finally:
-        call(STOP, bare, RUN_S, checkout)
-    assert not (checkout / "prefect.toml").is_symlink()
-
-
-@pytest.mark.slow("servers")
 def test_ranges_at_the_same_time_and_who_is_last_finishes(
-    tmp_path: Path, digest_of_few: str
+    tmp_path: Path,
 ) -> None:
     command = [sys.executable, "-m", "trilight", "generate", "smoke", *OPTIONS]
     command += ["--scenes", str(FEW)]
@@ -188,7 +151,8 @@ def test_ranges_at_the_same_time_and_who_is_last_finishes(
         for shards in ("0:1", "0:2")
     ]
     assert [run.wait(RUN_S) for run in runs] == [0, 0]
-    assert _verified(tmp_path / "set") == digest_of_few
+    _generate(tmp_path / "plain", FEW)
+    assert _verified(tmp_path / "set") == _verified(tmp_path / "plain")
     # nothing was made twice
     rows = [line for path in (tmp_path / "set" / "logs").glob("*.jsonl") for line in path.open()]
     assert len(rows) == FEW

@@ -1,21 +1,33 @@
-"""What `make serve` starts, attacked: by requests, by pages of other origins, by rebinding."""
+"""What `make serve` starts, attacked by requests, origins and rebinding; then it does its work."""
 
 import http
 import http.client
 import json
+import os
 import stat
 import subprocess
 import sys
 import time
+import tomllib
 from base64 import b64encode
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from storage.dataset.verify import verify_dataset
 from tests.end_to_end.browser_kit import Browser, browser
-from tests.end_to_end.production_kit import START_S, free_port, served
+from tests.end_to_end.production_kit import (
+    START,
+    START_S,
+    STOP,
+    call,
+    copy_of_the_project,
+    documented_run,
+    documented_serving,
+    free_port,
+)
 from tests.for_each import for_each
 
 ATTACK = (Path(__file__).parent / "attack.html").read_text()
@@ -29,10 +41,13 @@ pytestmark = [pytest.mark.slow("servers"), pytest.mark.timeout(1800)]
 class Server:
     """A server, and who asks it."""
 
-    def __init__(self, url: str, password: str | None, folder: Path) -> None:
+    def __init__(
+        self, url: str, password: str | None, folder: Path, environment: Mapping[str, str]
+    ) -> None:
         self.host = url.removeprefix("http://").removesuffix("/api")
         self.password = password
         self.folder = folder
+        self.environment = environment
 
     def ask(
         self, method: str, path: str, body: Any = None, *, known: bool = True, **headers: str
@@ -77,12 +92,20 @@ class Server:
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """What `make serve` starts, with a new database of SQLite."""
-    folder = tmp_path_factory.mktemp("served")
-    database = f"sqlite+aiosqlite:///{folder}/prefect/prefect.db"
-    with served(folder, database, workers=1) as environment:
-        password = environment["PREFECT_API_AUTH_STRING"]
-        yield Server(environment["PREFECT_API_URL"], password, folder)
+    """What `make serve` starts in a checkout, with nothing exported but where its files lie."""
+    checkout = tmp_path_factory.mktemp("served")
+    copy_of_the_project(checkout)
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+    bare = {**kept, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    bare |= {"TRILIGHT_CACHE": str(checkout / "cache")}
+    try:
+        told = call(START, {**bare, "TRILIGHT_PORT": str(free_port())}, 2 * START_S, checkout)
+        assert told.splitlines()[-1] == f"Next: {' '.join(documented_serving()[1].split()[:5])}"
+        api = tomllib.loads((checkout / "prefect.toml").read_text())["api"]
+        yield Server(api["url"], api["auth_string"], checkout / "cache", bare)
+    finally:
+        call(STOP, bare, START_S, checkout)
+        assert not (checkout / "prefect.toml").is_symlink()
 
 
 WISHES: tuple[dict[str, Any], ...] = (
@@ -139,7 +162,7 @@ def test_what_the_server_keeps_is_its_users_alone(server: Server) -> None:
     assert server.password
     secret = server.password.partition(":")[2]
     holds = []
-    for folder in (server.folder / "state", server.folder / "prefect"):
+    for folder in (server.folder / "serve", server.folder / "prefect"):
         for path in (folder, *folder.rglob("*")):
             if "ui" in path.parts or path.name == "mark":  # what Prefect publishes; no secret
                 continue
@@ -202,7 +225,7 @@ def test_the_same_page_does_as_it_likes_with_prefect_alone(tmp_path: Path) -> No
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     ) as process:  # fmt: skip
         try:
-            alone = Server(f"http://127.0.0.1:{port}/api", None, tmp_path)
+            alone = Server(f"http://127.0.0.1:{port}/api", None, tmp_path, environment)
             _until_it_answers(alone)
             _, flow = alone.ask("POST", "/api/flows/", {"name": "f"})
             given = {"name": "local", "flow_id": flow["id"], "entrypoint": "f_scenes"}
@@ -247,3 +270,13 @@ def test_its_own_page_opens_with_the_password(server: Server, name: str, tmp_pat
             assert page.run("document.documentElement.scrollWidth") <= size[0]
             page.picture(tmp_path / f"{size[0]}.png")
             assert (tmp_path / f"{size[0]}.png").stat().st_size > 10_000
+
+
+def test_the_lines_of_the_readme_need_nothing_exported(server: Server, tmp_path: Path) -> None:
+    """The server has started; a run ends as its documents say."""
+    checkout = server.folder.parent
+    run = documented_run(
+        objects="builtin:24", scenes=4, resolution=64, noise_floor_db=20, out=tmp_path / "mine"
+    )
+    call(run, server.environment, 900, checkout)
+    assert verify_dataset(tmp_path / "mine").problems == []

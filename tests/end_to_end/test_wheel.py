@@ -57,6 +57,7 @@ def place(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("place")
     _call([sys.executable, "-m", "venv", "env"], folder)
     pip = [str(folder / "env/bin/python"), "-m", "pip", "install", "--quiet"]
+    pip.append("--no-compile")  # of torch and all: half the time
     pins = folder / "pins.txt"  # with digests, pip would ask for the wheel's own too
     rows = read_lock(ROOT / "requirements/all.txt")
     pins.write_text("".join(f"{row.name}=={row.version}\n" for row in rows))

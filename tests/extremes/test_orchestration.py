@@ -182,8 +182,8 @@ def test_batches_may_exceed_the_split_and_stand_in_distant_epochs(tmp_path: Path
     assert [place.position for place in far] == list(range(3 * first, 3 * first + 64))
 
 
-SCENES = 600
-"""Sixty to a tenth; twelve shards of 50, each packed and published; three children of 200 calls."""
+SCENES = 400
+"""Forty to a tenth; eight shards of 50, each packed and published; two children of 200 calls."""
 EVERY_S, GRACE_S = 0.5, 10.0
 LASTING_LOOKS = 10
 """Processes that are seen less often have made too few scenes to say anything."""
