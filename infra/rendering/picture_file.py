@@ -16,6 +16,7 @@ from storage.errors import TrilightError
 from storage.records.exr import read_header
 from storage.records.layers import decode_picture, encode_picture
 from storage.records.lights import rounded_to_half
+from storage.records.safe_read import read_plain
 
 Radiance = NDArray[np.float32]
 """[R, R, 3] linear radiance."""
@@ -78,7 +79,7 @@ class PictureFile:
 def kept_picture(path: Path, wanted: Request) -> tuple[PictureFile, Radiance] | None:
     """Return the picture in a file, as `write_picture`, if it is the one that is wanted."""
     try:
-        data = path.read_bytes()
+        data = read_plain(path)
         header = read_header(data)
         if header.get(_PREFIX + _REQUEST) != wanted.header[_REQUEST]:
             return None

@@ -131,7 +131,7 @@ def _key(
                 child.may(reach(files=[source, root or source]))
                 kind, digest = call_with_retries(child, source_digest, source, settings, root)
     except ChildFailed as failure:
-        raise Rejected(failure.reason, failure.message) from failure
+        raise Rejected(failure.reason, failure.sentence) from failure
     except OSError as error:
         raise Rejected("unreadable_file", f"cannot be read ({error.strerror})") from error
     return store.key(kind, digest, settings)
@@ -169,7 +169,7 @@ def _outcome(
     except Rejected as rejection:
         return rejection
     except ChildFailed as failure:
-        refusal = Rejected(failure.reason, failure.message)
+        refusal = Rejected(failure.reason, failure.sentence)
         if failure.is_verdict:
             return refusal
         raise refusal from failure

@@ -56,7 +56,7 @@ MANY_PARTS = 0x1000
 _MOST_ATTRIBUTES = 4096
 _MOST_CHANNEL_BYTES = 1 << 18
 _MOST_HEADER_BYTES = 16 << 20
-"""Most of all headers of a file: the library compares each attribute and channel with all others."""
+"""Most of all headers of a file: the library compares each attribute with all others."""
 
 _MOST_LISTED = 6
 """Maximum number of channel names in a message."""

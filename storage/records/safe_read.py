@@ -31,6 +31,12 @@ def open_plain(path: Path) -> BinaryIO:
     return os.fdopen(descriptor, "rb")
 
 
+def read_plain(path: Path) -> bytes:
+    """Return the bytes of a regular file; raises OSError as `open_plain`."""
+    with open_plain(path) as stream:
+        return stream.read()
+
+
 def read_safetensors(
     data: bytes, max_header_bytes: int = MAX_HEADER_BYTES, *, name: str = "safetensors"
 ) -> tuple[dict[str, NDArray], dict[str, str]]:
