@@ -50,7 +50,7 @@ def read_safetensors(
     try:
         arrays = load(data)
     except (SafetensorError, ValueError) as error:
-        raise TrilightError(f"{name}: unreadable ({error}).") from error
+        raise TrilightError(f"{name}: unreadable; expected a safetensors file.") from error
     metadata = header.get("__metadata__", {})
     return {name: np.asarray(array) for name, array in arrays.items()}, metadata
 
@@ -78,7 +78,7 @@ def safetensors_header(
     try:
         header = json.loads(data[8 : 8 + length])
     except (ValueError, RecursionError) as error:
-        raise TrilightError(f"{name}: unreadable ({error}).") from error
+        raise TrilightError(f"{name}: unreadable; expected a safetensors file.") from error
     if not isinstance(header, dict):
         raise TrilightError(f"{name}: the header is not a JSON object.")
     return header

@@ -328,7 +328,7 @@ def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
     except KeyError as error:
         raise TrilightError(f"scene: metadata {_METADATA} are missing.") from error
     except (ValueError, RecursionError) as error:
-        raise TrilightError(f"scene: metadata {_METADATA} are not JSON ({error}).") from error
+        raise TrilightError(f"scene: metadata {_METADATA} are not JSON.") from error
     version = record.get("schema_version") if isinstance(record, dict) else None
     if version not in (SCHEMA_VERSION, MAPS_VERSION):
         raise TrilightError(
