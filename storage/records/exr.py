@@ -274,7 +274,7 @@ def _readable() -> Iterator[None]:
     except (RuntimeError, ValueError, KeyError) as error:
         if isinstance(error, TrilightError):
             raise
-        raise TrilightError(f"picture: not a readable OpenEXR file.") from error
+        raise TrilightError("picture: not a readable OpenEXR file.") from error
 
 
 def window_size(header: Header) -> tuple[int, int]:

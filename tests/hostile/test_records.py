@@ -2,11 +2,11 @@
 
 import ast
 import json
-import random
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline.exchange.renderformer_json import read_description
@@ -33,7 +33,7 @@ PICTURES = [
     *(WHOLE[:40], WHOLE[:20] + b"\xff" * 9 + WHOLE[29:], kit.picture_bytes(kit.CORNERS, "GIF")),
     *(kit.picture_bytes(kit.CORNERS, kind)[:-30] for kind in ("JPEG", "TIFF", "BMP", "WEBP")),
 ]
-VALUES = [None, "x", float("nan"), 1e999, -1, 10**30, [], {"a": 1}, True]
+VALUES: list[Any] = [None, "x", float("nan"), 1e999, -1, 10**30, [], {"a": 1}, True]
 USD = ["", "#usda 1.0\n(", '#usda 1.0\ndef Mesh "m" {', '#usda 1.0\ndef Mesh "m" { int x = 1.5.2 }',
        '#usda 1.0\ndef "a" (references = </b>) {}', '#usda 1.0\ndef "a" (references = </a/b>) {}',
        '#usda 1.0\ndef Mesh "m" { point3f[] points = [(nan, 0, 0)] }']  # fmt: skip
@@ -48,7 +48,7 @@ def _leaves(tree: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
             yield from _leaves(tree[key], (*place, key))
 
 
-def _objects(folder: Path, draw: random.Random) -> Iterator[Path]:
+def _objects(folder: Path, rng: np.random.Generator) -> Iterator[Path]:
     for number, picture in enumerate(PICTURES):
         yield kit.textured_glb(folder / f"p{number}.glb", picture)
         yield kit.textured_obj(folder / f"o{number}" / "a.obj", picture)
@@ -64,9 +64,9 @@ def _objects(folder: Path, draw: random.Random) -> Iterator[Path]:
     for suffix, write in WRITERS.items():
         data = write(folder / f"whole{suffix}", cube()).read_bytes()
         for number in range(12):
-            at = draw.randrange(len(data))
+            at = int(rng.integers(len(data)))
             path = folder / f"{number}{suffix}"
-            path.write_bytes(data[:at] + draw.randbytes(draw.randrange(9)) + data[at + 3 :])
+            path.write_bytes(data[:at] + rng.bytes(int(rng.integers(9))) + data[at + 3 :])
             yield path
     (folder / "a.gltf").write_bytes(b'{"asset": }')
     yield folder / "a.gltf"
@@ -78,7 +78,7 @@ def _objects(folder: Path, draw: random.Random) -> Iterator[Path]:
 
 
 def _refusals(folder: Path) -> Iterator[tuple[str, Exception]]:
-    for path in _objects(folder, random.Random(0)):
+    for path in _objects(folder, np.random.default_rng(0)):
         try:
             prepare(path, kit.REFUSE)
         except Rejected as refusal:

@@ -28,10 +28,10 @@ def look_at_parts(path: Path) -> str:
     """Read all of a file and return what is not read; what became of its numbers is finite."""
     source = read_source(path, kit.KEEP.read_limits)
     for material in _parts(source, Decoder(1 << 20), emission=True).materials:
-        colors = (material.base_rgb, material.specular_rgb, material.emission_rgb)
+        colors = (*material.base_rgb, *material.specular_rgb, *material.emission_rgb)
         numbers = (material.metallic, material.roughness, material.f0, material.specular_strength)
-        moves = [array for slot in material.slots for array in (slot.turn, slot.shift)]
-        assert all(np.isfinite(values).all() for values in (*colors, *numbers, *moves))
+        moves = [[*slot.turn.flat, *slot.shift] for slot in material.slots]
+        assert np.isfinite([*colors, *numbers, *itertools.chain(*moves)]).all()
     return "; ".join(source.unread)
 
 
