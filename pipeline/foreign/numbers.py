@@ -25,7 +25,8 @@ def read_number(stated: Any, field: str, within: Within = FINITE) -> float:
     if not is_number or not within.holds(stated):
         is_plain = is_number or isinstance(stated, str | int | list | dict | None)
         shown = f"{stated!r:.60}" if is_plain else f"a {type(stated).__name__}"
-        raise Malformed(f"{field} is {shown}; expected a number {within}")
+        range_text = "that is finite" if within is FINITE else str(within)
+        raise Malformed(f"{field} is {shown}; expected a number {range_text}")
     return float(stated)
 
 
@@ -34,7 +35,8 @@ def read_numbers(stated: Any, count: int, field: str, within: Within = FINITE) -
     rows = list(stated) if hasattr(stated, "__len__") else []
     if len(rows) != count:
         raise Malformed(f"{field} has {len(rows)} values; expected {count} numbers")
-    return tuple(read_number(row, f"{field}[{at}]", within) for at, row in enumerate(rows))
+    names = [field] if count == 1 else [f"{field}[{at}]" for at in range(count)]
+    return tuple(read_number(row, name, within) for name, row in zip(names, rows, strict=True))
 
 
 def parse_number(word: str, field: str, within: Within = FINITE) -> float:
