@@ -15,7 +15,7 @@ from pipeline.assets.store import AssetStore
 from pipeline.foreign.source_file import needs_child, read_source
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
 from storage.digests import sha256_hex
-from storage.errors import Rejected
+from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.records.asset import Asset, Level, decode_asset
 from storage.records.objects import Failure, ObjectRecord
 
@@ -252,7 +252,12 @@ def attempt_in_child(
     """Run the recipe; only here are the mesh libraries imported, and only children come here."""
     from pipeline.assets.prepare import prepare_asset
 
-    return prepare_asset(source, settings, method, root)
+    try:
+        return prepare_asset(source, settings, method, root)
+    except EnvironmentFailure:
+        raise
+    except TrilightError as error:  # of its data: that ends no run
+        raise Rejected("law_broken", str(error)) from error
 
 
 def _failure(record: ObjectRecord, reason: str, message: str) -> Failure:
