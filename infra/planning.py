@@ -25,6 +25,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.shard import contents_of
 from storage.dataset.splits import planned_scenes, shard_name, shards_for
 from storage.dataset.staging import read_staged_scene
+from storage.records.safe_read import open_plain
 from storage.records.sample import sample_key
 from storage.seeds import rng_for
 
@@ -193,7 +194,7 @@ def _scene_bytes(folder: DatasetFolder, shard: str, scene: int) -> int:
     The last scene of a shard is packed already, and the others wait for it.
     """
     if folder.shard(shard).exists():
-        with folder.shard(shard).open("rb") as stream:
+        with open_plain(folder.shard(shard)) as stream:
             members = contents_of(stream, shard).samples.get(sample_key(scene), {})
         sizes = [member.num_bytes for member in members.values()]
     else:

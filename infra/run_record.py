@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from storage.errors import TrilightError
+from storage.records.safe_read import read_plain
 from train.folder import RunFolder
 from train.watching.rows import read_rows
 
@@ -41,7 +42,7 @@ def run_facts(root: Path) -> dict[str, Any]:
         raise TrilightError(f"{root}: no run here; expected a folder that `trilight train` wrote.")
     folder = RunFolder(root)
     try:
-        settings = json.loads(folder.settings.read_text())["settings"]
+        settings = json.loads(read_plain(folder.settings))["settings"]
         rows = read_rows(folder.metrics)
         step, planned = max((row["step"] for row in rows), default=0), settings["num_steps"]
         facts = {

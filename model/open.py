@@ -32,6 +32,7 @@ from model.weights import (
 )
 from storage.atomic import write_atomically
 from storage.errors import TrilightError, expected_one_of
+from storage.records.safe_read import open_plain
 
 WEIGHTS_NAME, CONFIG_NAME = "model.safetensors", "config.json"
 """What a checkpoint's folder holds; only published ones have the second."""
@@ -189,7 +190,7 @@ def save_published(model: RenderFormer, folder: Path) -> None:
 
 def _read_config(path: Path) -> PublishedConfig:
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             fields = json.loads(file.read(MAX_CONFIG_BYTES))
     except OSError as error:
         raise TrilightError(

@@ -17,7 +17,7 @@ from torch import Tensor
 from model.config import REMOVED, ModelConfig
 from model.renderformer import RenderFormer
 from storage.errors import TrilightError
-from storage.records.safe_read import MAX_HEADER_BYTES, safetensors_header
+from storage.records.safe_read import MAX_HEADER_BYTES, open_plain, safetensors_header
 from storage.removed import without_removed
 
 RANGE_KEY = "trilight_trained_range"
@@ -148,7 +148,7 @@ def read_metadata(path: Path) -> dict[str, str]:
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             start = file.read(8)
         _require_safetensors(path, start)
         with safe_open(path, "pt") as tensors:

@@ -1,6 +1,7 @@
 """The command `trilight`: what it does with a mistake, and with Ctrl-C."""
 
 import os
+import resource
 import shlex
 import signal
 import sys
@@ -11,7 +12,9 @@ from cyclopts import CycloptsError
 from infra.cli.commands import app, complaint
 from infra.cli.extending import extended
 from infra.cli.leaving import leave, open_missing_streams
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, TrilightError
+
+_ENOUGH_BYTES = 2 << 30
 
 
 def main() -> None:
@@ -28,14 +31,36 @@ def main() -> None:
     except CycloptsError as mistake:
         leave(f"trilight: {complaint(mistake)}", 2)
     except TrilightError as mistake:
-        leave(f"trilight: {mistake}", mistake.exit_status)
+        leave(f"trilight: {mistake}{_describe_limit()}", mistake.exit_status)
     except OSError as error:
         try:
             os.write(sys.stdout.fileno(), b"\n")
         except OSError:
             said = f"what is printed cannot be written ({error.strerror}); choose another place"
             leave(f"trilight: {said}. What was finished is safe.", 1)
+        _leave_without_memory(error)
         raise
+    except Exception as error:
+        _leave_without_memory(error)
+        raise
+
+
+def _leave_without_memory(error: Exception) -> None:
+    """End with a sentence where memory lacks: every library fails in its own way then."""
+    if isinstance(error, MemoryError) or _describe_limit():
+        said = f"too little memory ({type(error).__name__}); what was finished is safe."
+        leave(f"trilight: {said}{_describe_limit()}", EnvironmentFailure.exit_status)
+
+
+def _describe_limit() -> str:
+    """Return a sentence about a limit of memory that few commands get along with, or ""."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY or limit >= _ENOUGH_BYTES:
+        return ""
+    return (
+        f" A process of this shell may take {limit >> 20} MiB of memory; expected "
+        f"{_ENOUGH_BYTES >> 20} or more, since less may be the reason: raise `ulimit -v`."
+    )
 
 
 def _require_usable_names() -> None:

@@ -11,6 +11,7 @@ from pipeline.exchange.exports.scenes import picture_name
 from pipeline.exchange.pictures import MAX_BYTES, decoded_pixels
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.records.safe_read import read_plain
 from storage.records.sample import Sample
 
 _LEAST = -1e-2
@@ -87,7 +88,7 @@ def _bytes_of(path: Path) -> bytes:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise TrilightError(f"{path.name}: expected a picture of at most {MAX_BYTES} bytes.")
-        return path.read_bytes()
+        return read_plain(path)
     except OSError as error:
         raise TrilightError(f"{path.name}: cannot be read ({error.strerror}).") from error
 

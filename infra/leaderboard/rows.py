@@ -13,6 +13,7 @@ from typing import Any
 
 from storage.atomic import write_error
 from storage.errors import TrilightError
+from storage.records.safe_read import read_plain
 
 UNKNOWN_MACHINE = "a machine that is not named"
 """Of rows that were written before they named it."""
@@ -111,7 +112,7 @@ class BoardRows:
 
     def _whole_lines(self) -> list[bytes]:
         """Return the lines, and cut off one that was being written when a run was killed."""
-        data = self.path.read_bytes() if self.path.is_file() else b""
+        data = read_plain(self.path) if self.path.is_file() else b""
         end = data.rfind(b"\n") + 1
         if end < len(data):
             os.truncate(self.path, end)

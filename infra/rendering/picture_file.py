@@ -1,13 +1,11 @@
 """One EXR file of a picture that says how it was made, and is kept if it would come out again."""
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenEXR
 from numpy.typing import NDArray
 
 from infra.rendering.cameras import ShotCamera
@@ -15,8 +13,10 @@ from infra.rendering.engines import Fact, Facts, Rendered
 from storage.atomic import write_atomically
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
+from storage.records.exr import read_header
 from storage.records.layers import decode_picture, encode_picture
 from storage.records.lights import rounded_to_half
+from storage.records.safe_read import read_plain
 
 Radiance = NDArray[np.float32]
 """[R, R, 3] linear radiance."""
@@ -79,8 +79,8 @@ class PictureFile:
 def kept_picture(path: Path, wanted: Request) -> tuple[PictureFile, Radiance] | None:
     """Return the picture in a file, as `write_picture`, if it is the one that is wanted."""
     try:
-        data = path.read_bytes()
-        header = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).header()
+        data = read_plain(path)
+        header = read_header(data)
         if header.get(_PREFIX + _REQUEST) != wanted.header[_REQUEST]:
             return None
         names = {channel.name.rpartition(".")[0] for channel in header["channels"]}

@@ -15,7 +15,7 @@ from pipeline.assets.store import AssetStore
 from pipeline.foreign.source_file import needs_child, read_source
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
 from storage.digests import sha256_hex
-from storage.errors import Rejected
+from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.records.asset import Asset, Level, decode_asset
 from storage.records.objects import Failure, ObjectRecord
 
@@ -131,7 +131,7 @@ def _key(
                 child.may(reach(files=[source, root or source]))
                 kind, digest = call_with_retries(child, source_digest, source, settings, root)
     except ChildFailed as failure:
-        raise Rejected(failure.reason, failure.message) from failure
+        raise Rejected(failure.reason, failure.sentence) from failure
     except OSError as error:
         raise Rejected("unreadable_file", f"cannot be read ({error.strerror})") from error
     return store.key(kind, digest, settings)
@@ -169,7 +169,7 @@ def _outcome(
     except Rejected as rejection:
         return rejection
     except ChildFailed as failure:
-        refusal = Rejected(failure.reason, failure.message)
+        refusal = Rejected(failure.reason, failure.sentence)
         if failure.is_verdict:
             return refusal
         raise refusal from failure
@@ -252,7 +252,12 @@ def attempt_in_child(
     """Run the recipe; only here are the mesh libraries imported, and only children come here."""
     from pipeline.assets.prepare import prepare_asset
 
-    return prepare_asset(source, settings, method, root)
+    try:
+        return prepare_asset(source, settings, method, root)
+    except EnvironmentFailure:
+        raise
+    except TrilightError as error:  # of its data: that ends no run
+        raise Rejected("law_broken", str(error)) from error
 
 
 def _failure(record: ObjectRecord, reason: str, message: str) -> Failure:

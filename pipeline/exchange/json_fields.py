@@ -7,7 +7,9 @@ named instead of silently having no effect.
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
 
+from pipeline.foreign.numbers import Malformed, read_number
 from storage.errors import TrilightError
+from storage.settings.ranges import Within
 
 _SHOWN = 120
 """Most characters of a value in a message."""
@@ -109,10 +111,10 @@ class Fields:
         return Fields(value, file=self._file, where=where, unknown=self._unknown)
 
     def _number(self, name: str, value: Any, low: float, high: float) -> float:
-        usable = isinstance(value, int | float) and not isinstance(value, bool)
-        if not usable or not low <= value <= high:  # an overflow is infinite, and refused here
-            self._refuse(name, value, f"a number from {low:g} to {high:g}")
-        return float(value)
+        try:
+            return read_number(value, shown(name), Within(low, high))
+        except Malformed as error:
+            raise TrilightError(f"{self._file}: {error}.") from error
 
     def _get(self, key: str, default: Any = None) -> Any:
         """Return a value; a field without default must be there."""

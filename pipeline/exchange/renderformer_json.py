@@ -30,6 +30,7 @@ from pipeline.exchange.description import (
 )
 from pipeline.exchange.from_description import SHELL_FOLDER, SMOOTH_ANGLE_DEG
 from pipeline.exchange.json_fields import Fields
+from pipeline.foreign.numbers import Malformed
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import face_normals, smooth_shaded
 from storage.conventions import HALF_FLOAT_MAX
@@ -112,20 +113,25 @@ def _parsed(data: bytes, name: str) -> Any:
         )
     except RecursionError as error:
         raise TrilightError(f"{name}: nested too deeply for a scene; expected JSON.") from error
-    except ValueError as error:
+    except Malformed as error:
         raise TrilightError(f"{name}: not readable as JSON ({error}).") from error
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno}, column {error.colno}"
+        raise TrilightError(f"{name}: not readable as JSON from {where} on.") from error
+    except ValueError as error:
+        raise TrilightError(f"{name}: not readable as JSON in UTF-8.") from error
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         (repeated, _), *_ = Counter(key for key, _ in pairs).most_common(1)
-        raise ValueError(f"the name {repeated!r:.60} stands twice in one object")
+        raise Malformed(f"the name {repeated!r:.60} stands twice in one object")
     return found
 
 
 def _refused_constant(text: str) -> float:
-    raise ValueError(f"{text} is no JSON number")
+    raise Malformed(f"{text} is no JSON number")
 
 
 def _object(name: str, fields: Fields) -> DescribedObject:

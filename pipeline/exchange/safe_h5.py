@@ -55,13 +55,15 @@ def opened_h5(path: Path) -> Iterator[Any]:
 
     try:
         open_plain(path).close()
+    except OSError as error:
+        raise TrilightError(f"{path.name}: cannot be read ({error.strerror}).") from error
+    try:
         with h5py.File(path, "r", locking=False) as file:
             yield file
     except TrilightError as error:
         raise TrilightError(f"{path.name}: {error}") from error
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
-        why = str(error).replace(str(path), path.name)
-        raise TrilightError(f"{path.name}: not a readable HDF5 file ({why}).") from error
+        raise TrilightError(f"{path.name}: not a readable HDF5 file.") from error
 
 
 def names_in(group: Any) -> list[str]:
@@ -204,7 +206,7 @@ def _unpacked(array: H5Array, packed: bytes, filters: list[int]) -> bytes:
         try:
             packed = inflater.decompress(packed, num_bytes + 1)  # never more, whatever it claims
         except zlib.error as error:
-            raise TrilightError(f"{array.name}: a chunk is damaged ({error}).") from error
+            raise TrilightError(f"{array.name}: a chunk is damaged.") from error
         if not inflater.eof:
             raise TrilightError(f"{array.name}: a chunk ends too early or too late.")
     if len(packed) != num_bytes:

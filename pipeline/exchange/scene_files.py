@@ -236,7 +236,7 @@ def _below(root: Path, relative: str, where: str) -> Path:
             path = find_in_any_case(root, relative.replace("\\", "/"), root)
     except (OSError, RuntimeError) as error:  # links in a circle
         raise TrilightError(
-            f"{where} is {relative}, which cannot be followed ({error})."
+            f"{where} is {relative}, which cannot be followed: links in a circle."
         ) from error
     if not path.is_relative_to(root) or path == root:
         raise TrilightError(

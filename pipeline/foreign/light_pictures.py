@@ -3,6 +3,7 @@
 from pipeline.foreign import openexr, radiance_hdr
 from pipeline.foreign.linear_picture import LinearPicture
 from storage.errors import Rejected
+from storage.records.exr import MAGIC
 
 
 def read_linear_picture(
@@ -19,7 +20,7 @@ def read_linear_picture(
         Rejected: not_hdr, load_error or too_many_pixels.
     """
     try:
-        if data.startswith(openexr.MAGIC):
+        if data.startswith(MAGIC):
             return openexr.read_openexr(data, max_pixels, is_color=is_color)
         if data.startswith(radiance_hdr.MAGIC):
             return radiance_hdr.read_radiance_hdr(data, max_pixels, is_color=is_color)

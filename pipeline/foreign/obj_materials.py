@@ -8,7 +8,7 @@ is no highlight.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.foreign.material import RGB, WHITE, Slot, SourceMaterial
 from pipeline.foreign.material_files import READ_MAPS, MaterialFiles
 from pipeline.foreign.mtl import Fields, read_mtl, split_map
+from pipeline.foreign.numbers import Malformed, parse_number
 from pipeline.foreign.picture import Picture
 from storage.errors import Rejected
 
@@ -71,8 +72,8 @@ def obj_materials(
             materials = [
                 reader.emitting(one, known[name]) for one, name in zip(materials, used, strict=True)
             ]
-    except ValueError as error:
-        raise Rejected("materials_unreadable", f"the MTL is malformed ({error!s:.120})") from error
+    except Malformed as error:
+        raise Rejected("materials_unreadable", f"the MTL is malformed ({error!s:.200})") from error
     unread = [f"library {name[:60]!r}: it is not there" for name in absent]
     unread += [text for name in used for text in _list_unread(known[name])]
     return materials, list(dict.fromkeys(unread))
@@ -136,8 +137,8 @@ class _Reader:
         )
         return Slot(
             picture=picture,
-            turn=np.diag(_pair(options.get("-s"), 1.0)),
-            shift=np.array(_pair(options.get("-o"), 0.0)),
+            turn=np.diag(_pair(options, "-s", 1.0)),
+            shift=np.array(_pair(options, "-o", 0.0)),
             channel=_CHANNELS.get("".join(options.get("-imfchan", ["r"])), 0),
         )
 
@@ -156,7 +157,7 @@ def _lost(fields: Fields) -> tuple[str, ...]:
 def _is_over(text: str, bound: float) -> bool:
     """Return whether a number of a statement is over a bound; unknown words count for nothing."""
     try:
-        return any(value > bound for value in _numbers(text.removeprefix("-halo")))
+        return any(value > bound for value in _numbers(text.removeprefix("-halo"), ""))
     except ValueError:
         return bound > 0
 
@@ -181,27 +182,27 @@ def _rgb(fields: Fields, name: str, default: float) -> RGB:
     if text.startswith("spectral"):  # a file of a curve, which `_list_unread` names
         text = str(default)
     is_xyz = text.startswith("xyz")
-    values = _numbers(text.removeprefix("xyz"))
+    values = _numbers(text.removeprefix("xyz"), name)
     if len(values) == 1:
         values = values * 3
     if len(values) != 3:
-        raise ValueError(f"{name} is {fields.get(name)!r:.60}; expected three numbers")
+        raise Malformed(f"{name} is {fields.get(name)!r:.60}; expected three numbers")
     if is_xyz:
         values = np.maximum(_RGB_OF_XYZ @ values, 0).tolist()
     return values[0], values[1], values[2]
 
 
 def _number(fields: Fields, name: str, default: float) -> float:
-    return _numbers(fields.get(name, str(default)))[0]
+    return _numbers(fields.get(name, str(default)), name)[0]
 
 
-def _numbers(text: str) -> list[float]:
-    values = [float(word) for word in text.partition("#")[0].split()]
-    if not values or not np.isfinite(values).all():
-        raise ValueError(f"{text!r:.60}; expected finite numbers")
+def _numbers(text: str, field: str) -> list[float]:
+    values = [parse_number(word, field) for word in text.partition("#")[0].split()]
+    if not values:
+        raise Malformed(f"{field} is empty; expected numbers")
     return values
 
 
-def _pair(values: Sequence[str] | None, default: float) -> list[float]:
-    found = [float(value) for value in values or ()][:2]
-    return found + [default] * (2 - len(found))
+def _pair(options: Mapping[str, list[str]], name: str, default: float) -> list[float]:
+    numbers = [parse_number(value, f"option {name}") for value in options.get(name, ())[:2]]
+    return numbers + [default] * (2 - len(numbers))

@@ -25,15 +25,13 @@ from pipeline.foreign.linear_picture import (
     as_rec709,
     luminance_weights,
 )
-from storage.errors import Rejected
-
-MAGIC = b"\x76\x2f\x31\x01"
-"""First bytes of a file."""
+from storage.errors import Rejected, TrilightError
+from storage.records.exr import MANY_PARTS, find_header_end
 
 _MAX_BYTES = 3 << 30
 """Maximum bytes of the pixels of all parts: the library reads them all."""
 
-_TILED, _MANY_PARTS = 0x200, 0x1000
+_TILED = 0x200
 
 _GREY, _CHROMA, _COLOR = ("Y",), ("BY", "RY", "Y"), ("R", "G", "B")
 _MAIN_LAYERS = ("combined", "beauty", "rgba", "rgb", "color", "colour", "c")
@@ -81,8 +79,12 @@ def read_openexr(data: bytes, max_pixels: int, *, is_color: bool = True) -> Line
     Raises:
         Rejected: load_error or too_many_pixels.
     """
+    try:
+        end = find_header_end(data)
+    except TrilightError as error:
+        raise Rejected("load_error", str(error)) from error
     headers = _headers(data)
-    _require_whole(data)
+    _require_whole(data, end)
     choice = _chosen(headers)
     header = headers[choice.part]
     window = _picture_window(header)
@@ -120,21 +122,14 @@ def _parts(data: bytes, *, header_only: bool) -> Sequence[Any]:
     return parts
 
 
-def _require_whole(data: bytes) -> None:
+def _require_whole(data: bytes, at: int) -> None:
     """Raise Rejected where chunks of a file of one part are missing or lie beyond its end.
 
-    The library prints much about such files.
+    The library prints much about such files. The headers end at `at`.
     """
-    flags, at = int.from_bytes(data[4:8], "little"), 8
-    if flags & _MANY_PARTS:
+    flags, first, last = int.from_bytes(data[4:8], "little"), len(data), 0
+    if flags & MANY_PARTS:
         return
-    while data[at : at + 1] not in (
-        b"",
-        b"\0",
-    ):  # the attributes: name, type and size, which the library has read
-        at = data.find(0, data.find(0, at) + 1) + 1 or len(data)
-        at += 4 + int.from_bytes(data[at : at + 4], "little")
-    at, first, last = at + 1, len(data), 0
     while at < first:  # the table ends where the first chunk begins
         offset = int.from_bytes(data[at : at + 8], "little")
         at, first, last = at + 8, min(first, offset), max(last, offset)

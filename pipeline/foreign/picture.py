@@ -24,6 +24,12 @@ Wrap = Literal["repeat", "clamp", "mirror", "black"]
 FORMATS = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "TIFF")
 """What is decoded; a file of another format is refused by its content."""
 
+UNREADABLE_PICTURE = (
+    "it is cut off or damaged, or no PNG, JPEG, WebP, TGA, BMP, TIFF, OpenEXR or Radiance picture; "
+    "write it again"
+)
+"""What records say of it, since they hold no word of a library."""
+
 _STRIP = 256  # rows, an even number
 
 
@@ -70,11 +76,9 @@ def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
         reason = "texture_too_large" if large else "texture_unreadable"
         raise Rejected(reason, f"{name!r:.80}: {error.message}") from error
     except Image.DecompressionBombError as error:
-        raise Rejected("texture_too_large", f"{name!r:.80}: {error!s:.120}") from error
+        raise Rejected("texture_too_large", f"{name!r:.80}: it has too many pixels") from error
     except Exception as error:  # decoders of other people's files fail in every way
-        raise Rejected(
-            "texture_unreadable", f"{name!r:.80}: {type(error).__name__}: {error!s:.120}"
-        ) from error
+        raise Rejected("texture_unreadable", f"{name!r:.80}: {UNREADABLE_PICTURE}") from error
 
 
 def has_colours(data: bytes) -> bool:

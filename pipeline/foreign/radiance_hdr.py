@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.linear_picture import LinearPicture, are_rec709, as_rec709
+from pipeline.foreign.numbers import Malformed, parse_number
 from storage.errors import Rejected
 
 MAGIC = b"#?"
@@ -139,10 +140,10 @@ def _variables(lines: Sequence[bytes]) -> Iterator[tuple[str, str]]:
 
 def _numbers(text: str, count: int, name: str) -> NDArray[np.float64]:
     try:
-        numbers = np.array([float(word) for word in text.split()])
-    except ValueError:
+        numbers = np.array([parse_number(word, name) for word in text.split()])
+    except Malformed:
         numbers = np.zeros(0)
-    if len(numbers) != count or not np.isfinite(numbers).all():
+    if len(numbers) != count:
         raise Rejected("not_hdr", f"its {name} is {text!r:.60}; expected {count} numbers")
     return numbers
 

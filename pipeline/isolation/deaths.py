@@ -5,6 +5,8 @@ remembered of an item and never leads to another method, another level or anothe
 call is made again in a fresh child, and where that does not help, the item fails for this run only.
 """
 
+import logging
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -12,6 +14,8 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 Result = TypeVar("Result")
+
+_LOG = logging.getLogger("trilight.children")
 
 _PAUSE_S = 0.5
 """After the first failure of the environment, twice as long after the second: what passes by
@@ -68,6 +72,14 @@ class ChildFailed(Exception):
         self.message = message
 
     @property
+    def sentence(self) -> str:
+        """What records hold of it: of an error that nobody foresaw its type, not its words."""
+        if self.reason != "exception":
+            return self.message
+        kind = re.search(r"\b(\w{0,60}(?:Error|Exception))(?::| \||$)", self.message)
+        return f"an unforeseen error ({kind[1] if kind else 'unknown'}); the log has it"
+
+    @property
     def is_verdict(self) -> bool:
         """Whether the call itself is to blame, once `with_retries` has given up."""
         return ENDS[_kind(self.reason)].is_verdict
@@ -93,6 +105,8 @@ def with_retries(call: Callable[[], Result]) -> Result:
             kind = _kind(failure.reason)
             failures[kind] += 1
             if failures[kind] >= ENDS[kind].tries:
+                if failure.reason == "exception":
+                    _LOG.warning("%s", failure)
                 raise
             if not failure.is_verdict:
                 time.sleep(_PAUSE_S * failures[kind])

@@ -170,7 +170,7 @@ def _outcome(asked: MapFiles, child: IsolatedChild) -> Path:
         try:
             data, unread = call_with_retries(child, prepare_map, asked)
         except ChildFailed as failure:
-            raise Rejected(failure.reason, failure.message) from failure
+            raise Rejected(failure.reason, failure.sentence) from failure
         if outcome_name(asked) != name:
             raise Rejected("unreadable_file", "it changed while it was being prepared")
         if unread:

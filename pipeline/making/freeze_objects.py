@@ -27,6 +27,7 @@ from storage.records.objects import (
     count_by_reason,
     read_objects_lock,
 )
+from storage.records.safe_read import open_plain
 from storage.remote.safe_url import safe_url
 
 log = logging.getLogger("trilight.objects")
@@ -106,7 +107,7 @@ def _index(
     """Write the index of the lock, by which later makers trust it."""
     assets, publication = {asset.record.uid: asset for asset in prepared}, order.publication
     folder, objects, offset = publication.folder, list[IndexedObject](), 0
-    with folder.objects_lock.open("rb") as lines:
+    with open_plain(folder.objects_lock) as lines:
         for line, entry in zip(lines, sorted(locked, key=attrgetter("uid")), strict=True):
             if entry.kind == OBJECT:
                 asset = assets[entry.uid]

@@ -248,9 +248,11 @@ def make_scene(
                 restore(*tried.away)
                 tried = call_with_retries(child, attempt_scene, split, scene_index, attempt)
         except (ChildFailed, Rejected) as error:
-            stage, reason, why = "renders", "environmental_skip", str(error)
             if isinstance(error, Rejected):
                 stage, reason, why = "scenes", error.reason, error.message
+            else:
+                why = f"{error.reason}: {error.sentence}"
+                stage, reason = "renders", "environmental_skip"
             failures.append(
                 Failure(stage=stage, item=key, reason=reason, message=why, attempt=attempt)
             )

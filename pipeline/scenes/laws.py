@@ -26,7 +26,11 @@ def require_laws(scene: Scene, settings: SceneSettings, *, in_budget: bool = Tru
     try:
         scene.check()
     except TrilightError as error:
-        raise Rejected("law_broken", str(error)) from error
+        uids = {entry.uid for entry in scene.objects if entry.uid} | {
+            *scene.provenance.get("maps", ())
+        }
+        named = ", ".join(sorted(uids)) or "none"
+        raise Rejected("law_broken", f"{error} Its objects and maps are {named}.") from error
     if in_budget and scene.num_triangles > settings.max_triangles:
         found = f"{scene.num_triangles} triangles; at most {settings.max_triangles} were allowed"
         raise Rejected("over_budget", found)

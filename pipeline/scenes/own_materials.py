@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pipeline.scenes.pieces import Skin
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.materials import MaterialSettings
+from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level
 from storage.records.objects import LockedObject
 from storage.records.skin import LevelSkin
@@ -34,6 +35,9 @@ def own_skins(
         seed: of the dataset.
         scene_index: which scene.
         attempt: how many times this scene was rejected before.
+
+    Raises:
+        Rejected: law_broken, which names the object.
     """
     if settings.source != "object":
         return [None] * len(chosen)
@@ -46,7 +50,15 @@ def own_skins(
 
 
 def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
-    """Return a skin whose textures have the rights of the object that they are of."""
+    """Return a skin whose textures have the rights of the object that they are of.
+
+    Raises:
+        Rejected: law_broken where they are none: an object may have been prepared long ago.
+    """
+    try:
+        textures = skin.textures
+    except TrilightError as error:
+        raise Rejected("law_broken", f"object {locked.uid}: {error}") from error
     first, second, third = (
         dataclasses.replace(
             texture,
@@ -57,6 +69,6 @@ def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
                 source_url=locked.source_url,
             ),
         )
-        for texture, column in zip(skin.textures, TEXTURED, strict=True)
+        for texture, column in zip(textures, TEXTURED, strict=True)
     )
     return Skin(uv=skin.uv.reshape(-1, 2), textures=(first, second, third), emission=skin.emission)

@@ -16,6 +16,7 @@ from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.records.objects import LockedObject, locked_uids, read_objects_lock
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
+from storage.records.safe_read import open_plain
 from storage.records.sample import decode_scene
 from storage.remote.safe_url import safe_url
 
@@ -129,7 +130,7 @@ class SampleReader:
     def _open(self, shard: ShardEntry) -> BinaryIO:
         if shard is not self._shard or self._stream is None:
             self.close()
-            self._stream = self._folder.shard(shard.name).open("rb")
+            self._stream = open_plain(self._folder.shard(shard.name))
             self._shard, self._contents = shard, contents_of(self._stream, shard.name)
         return self._stream
 

@@ -26,6 +26,7 @@ from storage.dataset.layout import numbered
 from storage.dataset.shard import scan_samples
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError
+from storage.records.safe_read import open_plain
 
 SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.tar")
 """Names are relative to the manifest and cannot leave its folder."""
@@ -98,7 +99,7 @@ def index_shard(path: Path) -> ShardEntry:
     Raises:
         TrilightError: the name is not a shard's, or the file is not a whole shard.
     """
-    with path.open("rb") as stream:
+    with open_plain(path) as stream:
         return index_stream(stream, path.name)
 
 
@@ -163,7 +164,7 @@ def read_head(path: Path) -> Manifest:
 
 def _read(path: Path, decode: Callable[[BinaryIO, str], Manifest]) -> Manifest:
     try:
-        with path.open("rb") as stream:
+        with open_plain(path) as stream:
             return decode(stream, str(path))
     except FileNotFoundError as error:
         raise TrilightError(

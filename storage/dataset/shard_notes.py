@@ -17,6 +17,7 @@ from storage.dataset.manifest import ShardEntry, index_shard, shard_of_row, shar
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures, encode_failures, read_failures
+from storage.records.safe_read import read_plain
 
 _SUFFIX = ".json"
 _AT_ONCE = 32
@@ -82,7 +83,7 @@ def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:
     path, shard = note_of(folder, name), folder.shard(name)
     # a kill before the note leaves none; then, and where it is no note, the shard itself is read
     with contextlib.suppress(*NOT_A_NOTE):
-        note = decode_note(path.read_bytes())
+        note = decode_note(read_plain(path))
         if folder.is_sent(name):
             return note
         facts = shard.stat()

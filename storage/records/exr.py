@@ -49,6 +49,15 @@ _LOSSY = frozenset(
     getattr(OpenEXR, f"{name}_COMPRESSION") for name in ("B44", "B44A", "DWAA", "DWAB", "LJ2K")
 )
 
+MAGIC = b"\x76\x2f\x31\x01"
+"""First bytes of a file."""
+MANY_PARTS = 0x1000
+"""Flag of a file of several parts, behind them."""
+_MOST_ATTRIBUTES = 4096
+_MOST_CHANNEL_BYTES = 1 << 18
+_MOST_HEADER_BYTES = 16 << 20
+"""Most of all headers of a file: the library compares each attribute with all others."""
+
 _MOST_LISTED = 6
 """Maximum number of channel names in a message."""
 
@@ -143,8 +152,7 @@ def channel_names(data: bytes) -> list[str]:
     Raises:
         TrilightError: not an EXR file, truncated, or of several parts.
     """
-    with _readable():
-        return [str(channel.name) for channel in _only_header(data)["channels"]]
+    return [str(channel.name) for channel in read_header(data)["channels"]]
 
 
 def decode_exr(data: bytes) -> NDArray[np.float32]:
@@ -208,19 +216,54 @@ def decode_channels(
             than MAX_RESOLUTION, of more than 3 GiB, or refused by `check`.
     """
     with _readable():
-        header = _only_header(data)
+        header = read_header(data)
         check(header)
         _check_pixels(header, names)
         file = OpenEXR.File(io.BytesIO(data), num_threads=0, separate_channels=separate)
         return {name: channel.pixels for name, channel in file.channels().items()}
 
 
-def _only_header(data: bytes) -> Header:
-    parts = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).parts
+def read_header(data: bytes) -> Header:
+    """Return the header of an OpenEXR file of one part; raises TrilightError as `channel_names`."""
+    with _readable():
+        find_header_end(data)
+        parts = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).parts
     if len(parts) != 1:
         raise TrilightError(f"picture: the file has {len(parts)} parts; expected one.")
     header: Header = parts[0].header
     return header
+
+
+def find_header_end(data: bytes) -> int:
+    """Return where the headers of an OpenEXR file end, found without the library.
+
+    Raises:
+        TrilightError: they have more attributes, channels or bytes than are read.
+    """
+    is_many = int.from_bytes(data[4:8], "little") & MANY_PARTS
+    at, attributes, channel_bytes = 8, 0, 0
+    while data.startswith(MAGIC):
+        while data[at : at + 1] not in (b"", b"\0"):  # name, type, size, value
+            kind = data.find(0, at) + 1
+            value = ((data.find(0, kind) + 1 if kind else 0) or len(data)) + 4
+            size = int.from_bytes(data[value - 4 : value], "little")
+            attributes += 1
+            channel_bytes += size if data[kind : value - 5] == b"chlist" else 0
+            at = value + size
+            if (
+                attributes > _MOST_ATTRIBUTES
+                or channel_bytes > _MOST_CHANNEL_BYTES
+                or at > _MOST_HEADER_BYTES
+            ):
+                raise TrilightError(
+                    f"picture: its header has {attributes} attributes or more, {channel_bytes} "
+                    f"bytes of channels, {at} bytes; expected at most {_MOST_ATTRIBUTES}, "
+                    f"{_MOST_CHANNEL_BYTES} and {_MOST_HEADER_BYTES}. Write it again without them."
+                )
+        at += 1
+        if not is_many or data[at : at + 1] in (b"", b"\0"):
+            break
+    return at + bool(is_many)
 
 
 @contextlib.contextmanager
@@ -231,7 +274,7 @@ def _readable() -> Iterator[None]:
     except (RuntimeError, ValueError, KeyError) as error:
         if isinstance(error, TrilightError):
             raise
-        raise TrilightError(f"picture: not a readable OpenEXR file ({error}).") from error
+        raise TrilightError("picture: not a readable OpenEXR file.") from error
 
 
 def window_size(header: Header) -> tuple[int, int]:

@@ -15,6 +15,7 @@ from typing import Any
 from storage.atomic import write_atomically
 from storage.digests import canonical_json
 from storage.errors import TrilightError
+from storage.records.safe_read import read_plain
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +115,7 @@ def read_objects_lock(path: Path) -> list[LockedObject]:
         TrilightError: missing, or a line that is not a locked object.
     """
     try:
-        data = path.read_bytes()
+        data = read_plain(path)
     except OSError as error:
         raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
     return decode_objects_lock(data, str(path))
@@ -151,7 +152,7 @@ def decode_failures(data: bytes) -> list[Failure]:
 
 def read_failures(path: Path) -> list[Failure]:
     """Return the failures of a file; none where there is no file."""
-    return decode_failures(path.read_bytes()) if path.exists() else []
+    return decode_failures(read_plain(path)) if path.exists() else []
 
 
 def write_failures(path: Path, failures: Iterable[Failure]) -> None:

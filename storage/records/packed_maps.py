@@ -190,7 +190,7 @@ class _Packed:
         try:
             data = unpacker.decompress(self._data, most)
         except zlib.error as error:
-            raise TrilightError(f"{self.name}: damaged ({error}).") from error
+            raise TrilightError(f"{self.name}: damaged.") from error
         if whole and (not unpacker.eof or unpacker.unused_data):
             raise TrilightError(f"{self.name}: cut short, or goes on after its end.")
         return data

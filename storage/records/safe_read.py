@@ -31,6 +31,12 @@ def open_plain(path: Path) -> BinaryIO:
     return os.fdopen(descriptor, "rb")
 
 
+def read_plain(path: Path) -> bytes:
+    """Return the bytes of a regular file; raises OSError as `open_plain`."""
+    with open_plain(path) as stream:
+        return stream.read()
+
+
 def read_safetensors(
     data: bytes, max_header_bytes: int = MAX_HEADER_BYTES, *, name: str = "safetensors"
 ) -> tuple[dict[str, NDArray], dict[str, str]]:
@@ -44,7 +50,7 @@ def read_safetensors(
     try:
         arrays = load(data)
     except (SafetensorError, ValueError) as error:
-        raise TrilightError(f"{name}: unreadable ({error}).") from error
+        raise TrilightError(f"{name}: unreadable; expected a safetensors file.") from error
     metadata = header.get("__metadata__", {})
     return {name: np.asarray(array) for name, array in arrays.items()}, metadata
 
@@ -72,7 +78,7 @@ def safetensors_header(
     try:
         header = json.loads(data[8 : 8 + length])
     except (ValueError, RecursionError) as error:
-        raise TrilightError(f"{name}: unreadable ({error}).") from error
+        raise TrilightError(f"{name}: unreadable; expected a safetensors file.") from error
     if not isinstance(header, dict):
         raise TrilightError(f"{name}: the header is not a JSON object.")
     return header

@@ -328,7 +328,8 @@ def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
     except KeyError as error:
         raise TrilightError(f"scene: metadata {_METADATA} are missing.") from error
     except (ValueError, RecursionError) as error:
-        raise TrilightError(f"scene: metadata {_METADATA} are not JSON ({error}).") from error
+        said = f" ({error})" if isinstance(error, TrilightError) else ""
+        raise TrilightError(f"scene: metadata {_METADATA} are not JSON{said}.") from error
     version = record.get("schema_version") if isinstance(record, dict) else None
     if version not in (SCHEMA_VERSION, MAPS_VERSION):
         raise TrilightError(
@@ -340,7 +341,7 @@ def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _refused_constant(text: str) -> float:
-    raise ValueError(f"{text} is no JSON number")
+    raise TrilightError(f"{text} is no JSON number")
 
 
 def _broken(name: str, got: Any, expected: str) -> NoReturn:

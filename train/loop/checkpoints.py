@@ -25,7 +25,7 @@ from model.weights import TrainedRange, decode_config, encode_config, load_tenso
 from storage.atomic import atomic_writer, remove_leftovers
 from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
-from storage.records.safe_read import read_safetensors
+from storage.records.safe_read import read_plain, read_safetensors
 from train.data.mixture import RECORD
 from train.folder import RunFolder
 from train.going_on import GoingOn, event_records
@@ -117,7 +117,7 @@ def is_checkpoint(metadata: Mapping[str, str]) -> bool:
 def read_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint; raises TrilightError, with its path, where it is damaged or none."""
     try:
-        data = path.read_bytes()
+        data = read_plain(path)
         arrays, metadata = read_safetensors(data)
         if not is_checkpoint(metadata):
             raise TrilightError("it belongs to no run; expected one that `trilight train` wrote")

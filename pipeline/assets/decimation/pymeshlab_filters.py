@@ -83,7 +83,7 @@ def _apply(mesh: TriangleMesh, name: str, parameters: dict) -> TriangleMesh:
         meshes.add_mesh(pymeshlab.Mesh(mesh.positions, mesh.faces.astype(np.int32)))
         meshes.apply_filter(name, **parameters)
     except pymeshlab.PyMeshLabException as error:
-        raise Rejected("decimation_failed", f"pymeshlab: {error!s:.200}") from error
+        raise Rejected("decimation_failed", f"pymeshlab has no result of {name}") from error
     result = meshes.current_mesh()
     return TriangleMesh(
         positions=result.vertex_matrix(), faces=result.face_matrix().astype(np.int64)

@@ -1,7 +1,7 @@
 """`SkinMaker`: own materials of one object, from its file to the skins of its levels."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,16 @@ from pipeline.foreign.gltf.materials import GltfMaterials
 from pipeline.foreign.gltf.objects import gltf_parts
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.mesh_materials import read_parts
+from pipeline.foreign.numbers import FINITE
 from pipeline.foreign.parts import TexturedParts
 from pipeline.foreign.picture import Decoder
 from pipeline.foreign.source_file import SourceFile
 from pipeline.foreign.usd.object_materials import usd_parts
-from storage.errors import Rejected
+from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level
 from storage.records.packed_maps import pack_texture
 from storage.records.skin import LevelSkin, OwnMaterials, SkinQuality
+from storage.records.texture import TEXTURED, Texture
 
 _LEAST_REACH = 1e-3
 """How far rays look for the source at least, in the unit box; otherwise as far as the level is off.
@@ -42,7 +44,8 @@ class SkinMaker:
         """Return a level with its skin.
 
         Raises:
-            Rejected: colours_changed or colours_missed where it is over a bound.
+            Rejected: colours_changed or colours_missed where it is over a bound, or
+                materials_unreadable where no scene could hold it.
         """
         mesh = TriangleMesh(
             positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
@@ -52,8 +55,9 @@ class SkinMaker:
         baked = bake(mesh, self._surface, self._nearest, self._settings, reach)
         quality = skin_quality(mesh, baked, self._surface, self._nearest, reach)
         self._require_near(quality, level.record.budget)
-        first, second, third = map(pack_texture, baked.textures)
         glow = level_emission(mesh, self._surface, self._nearest, reach)
+        _require_lawful(baked.textures, glow)
+        first, second, third = map(pack_texture, baked.textures)
         skin = LevelSkin(uv=baked.uv, packed=(first, second, third), quality=quality, emission=glow)
         return dataclasses.replace(level, skin=skin)
 
@@ -70,6 +74,16 @@ class SkinMaker:
                 f"{quality.missed_cells:.1%} of the texels have no surface of the source near at "
                 f"{budget} faces; expected <= {self._settings.max_missed:.1%}",
             )
+
+
+def _require_lawful(textures: Sequence[Texture], emission: NDArray[np.float32] | None) -> None:
+    try:
+        for texture, column in zip(textures, TEXTURED, strict=True):
+            texture.check(column)
+    except TrilightError as error:
+        raise Rejected("materials_unreadable", str(error)) from error
+    if emission is not None and not FINITE.holds(emission).all():
+        raise Rejected("materials_unreadable", f"it emits {emission.max()}; expected {FINITE}")
 
 
 def skin_maker(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipeline.exchange.dressed import PLAIN, DressedTriangles
 from pipeline.exchange.usd.foreign_cameras import rigid_pose
 from pipeline.foreign.gltf.nodes import PlacedNode
+from pipeline.foreign.numbers import read_number, read_numbers
 from storage.conventions import latlong_direction, latlong_uv
 from storage.records.environment import Environment
 from storage.records.material import EMISSION, ROUGHNESS, default_rows
@@ -36,11 +37,11 @@ def camera_of(
     """Return pose [4, 4] and full angle in degrees of a camera; None where it has neither."""
     camera, pose = tree["cameras"][placed.node["camera"]], rigid_pose(placed.to_world)
     lens = camera.get("perspective", {})
-    angle = math.degrees(float(lens.get("yfov", 0)))
+    angle = math.degrees(read_number(lens.get("yfov", 0), "yfov"))
     if camera.get("type") != "perspective" or pose is None or not 0 < angle < 180:
         lost.append("a camera without perspective")
         return None
-    if not math.isclose(float(lens.get("aspectRatio", 1)), 1, rel_tol=1e-3):
+    if not math.isclose(read_number(lens.get("aspectRatio", 1), "aspectRatio"), 1, rel_tol=1e-3):
         lost.append("pictures are square here: the vertical angle of a camera was taken")
     return pose, angle
 
@@ -70,11 +71,10 @@ def light_triangles(
     cross = np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0])
     length = np.linalg.norm(cross, axis=1, keepdims=True)
     shown = float(length.sum()) / 8  # half of the cross products are areas, a quarter is seen
-    colour = np.array(light.get("color", (1, 1, 1)), np.float64)
     rows = default_rows(len(positions))
     rows[:, ROUGHNESS] = 1
-    rows[:, EMISSION] = np.clip(colour * float(light.get("intensity", 1)) / shown, 0, 1e9)
-    if not rows[:, EMISSION].any() or not np.isfinite(rows).all():
+    rows[:, EMISSION] = np.clip(_read_light(light) / shown, 0, 1e9)
+    if not rows[:, EMISSION].any() or not np.isfinite(positions).all():
         lost.append("lights that shine no light")
         return None
     return DressedTriangles(
@@ -85,6 +85,12 @@ def light_triangles(
         worn=np.zeros(len(positions), np.int64),
         wardrobe=(PLAIN,),
     )
+
+
+def _read_light(light: dict[str, Any]) -> NDArray[np.float64]:
+    """Return color x intensity [3]; raises Malformed."""
+    color = np.array(read_numbers(light.get("color", (1, 1, 1)), 3, "color of a light"))
+    return color * read_number(light.get("intensity", 1), "intensity of a light")
 
 
 def sky_with_suns(
@@ -107,9 +113,7 @@ def sky_with_suns(
         u, v = latlong_uv(towards @ turn)
         row = min(int((1 - v) * _SUN_ROWS), _SUN_ROWS - 1)
         angle = np.square(np.pi / _SUN_ROWS) * np.sin(np.pi * (row + 0.5) / _SUN_ROWS)
-        color = np.array(light.get("color", (1, 1, 1)), np.float64)
-        lux = color * float(light.get("intensity", 1))
-        radiance[row, int(u * 2 * _SUN_ROWS) % (2 * _SUN_ROWS)] += lux / angle
+        radiance[row, int(u * 2 * _SUN_ROWS) % (2 * _SUN_ROWS)] += _read_light(light) / angle
     if not np.isfinite(radiance).all() or not (radiance > 0).any():
         lost.extend(["lights that shine no light"] if suns else [])
         return None

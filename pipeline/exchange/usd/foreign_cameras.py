@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.usd.names import FOV_DEG
+from pipeline.foreign.numbers import read_number
 from pipeline.foreign.usd.placed import Placed
 from storage.conventions import look_at_c2w
 
@@ -46,11 +47,12 @@ def _camera(placed: Placed, time: Any, lost: list[str]) -> tuple[NDArray[np.floa
     from pxr import UsdGeom
 
     camera, where = UsdGeom.Camera(placed.prim), placed.prim.GetPath()
-    focal = camera.GetFocalLengthAttr().Get(time)
-    wide, high = (
-        camera.GetHorizontalApertureAttr().Get(time),
-        camera.GetVerticalApertureAttr().Get(time),
+    lens = (
+        camera.GetFocalLengthAttr(),
+        camera.GetHorizontalApertureAttr(),
+        camera.GetVerticalApertureAttr(),
     )
+    focal, wide, high = (read_number(each.Get(time), str(each.GetPath())) for each in lens)
     pose = rigid_pose(placed.to_world)
     if camera.GetProjectionAttr().Get(time) != "perspective" or pose is None or not focal > 0:
         lost.append(f"{where}: no perspective camera with a focal length")

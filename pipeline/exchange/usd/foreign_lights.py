@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.numbers import FINITE, read_number, read_numbers
 from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.placed import Placed
+from storage.settings.ranges import Within
 
 _DISK_CORNERS = 24
 
@@ -31,13 +33,16 @@ _NEUTRAL: Mapping[str, Any] = {
 """Inputs that have no place here, with the value at which they do nothing."""
 
 
+_EXPOSURES = Within(-1000, 1000, unit="stops")
+
+
 def light_triangles(placed: Placed, time: Any, lost: list[str]) -> NDArray[np.float32] | None:
     """Return the triangles [T, 3, 3] of a light in our world; None where it has no area."""
     prim = placed.prim
     kind = str(prim.GetTypeName())
 
     def size(name: str) -> float:
-        return float(prim.GetAttribute(f"inputs:{name}").Get(time))
+        return _read(prim.GetAttribute(f"inputs:{name}"), time)
 
     shapes: Mapping[str, Callable[[], NDArray[np.float64]]] = {
         "RectLight": lambda: _square() * np.array([size("width"), size("height"), 1.0]),
@@ -80,14 +85,21 @@ def read_light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float6
     from pxr import UsdLux
 
     light = UsdLux.LightAPI(prim)
-    strength = light.GetIntensityAttr().Get(time) * 2.0 ** light.GetExposureAttr().Get(time)
-    color = convert_to_rec709(light.GetColorAttr(), np.array(light.GetColorAttr().Get(time), float))
+    strength = _read(light.GetIntensityAttr(), time)
+    strength *= 2.0 ** _read(light.GetExposureAttr(), time, _EXPOSURES)
+    stated = light.GetColorAttr()
+    rgb = read_numbers(stated.Get(time), 3, str(stated.GetPath()))
+    color = convert_to_rec709(stated, np.array(rgb))
     kelvin = light.GetColorTemperatureAttr()
     # Blender switches it on for every light and states none; the default of USD would tint by 4 %
     if light.GetEnableColorTemperatureAttr().Get(time) and kelvin.HasAuthoredValue():
-        color = color * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin.Get(time)))
+        color = color * np.array(UsdLux.BlackbodyTemperatureAsRgb(_read(kelvin, time)))
     _note_losses(prim, time, lost)
     return np.asarray(strength * color)
+
+
+def _read(attribute: Any, time: Any, within: Within = FINITE) -> float:
+    return read_number(attribute.Get(time), str(attribute.GetPath()), within)
 
 
 def _note_losses(prim: Any, time: Any, lost: list[str]) -> None:

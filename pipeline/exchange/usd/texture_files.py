@@ -58,7 +58,7 @@ def decoded_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSour
         texture = Texture(texels=np.ascontiguousarray(texels), is_srgb=is_srgb, source=source)
         texture.check("texture")
     except (TrilightError, OSError, SyntaxError, ValueError) as error:
-        raise LookupError(str(error)) from error
+        raise LookupError("it is no texture that was written here") from error
     return texture
 
 

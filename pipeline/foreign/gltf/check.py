@@ -9,6 +9,7 @@ from typing import Any
 from pipeline.foreign.gltf.nodes import entry, num_instances, placed_meshes
 from pipeline.foreign.gltf.unread import is_known
 from pipeline.foreign.limits import ReadLimits
+from pipeline.foreign.numbers import Malformed, read_count
 from storage.errors import Rejected
 
 _SURFACE_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_")
@@ -24,7 +25,7 @@ def check_tree(tree: dict[str, Any], limits: ReadLimits) -> None:
     """Raise Rejected for a tree that would load wrongly, or as more than the limits."""
     for kind in _LISTS:
         if not isinstance(tree.get(kind, []), list):
-            raise ValueError(f"{kind} is no list")
+            raise Malformed(f"{kind} is no list")
     _check_extensions(tree)
     faces: dict[int, int] = {}
     placed = total = 0
@@ -76,7 +77,7 @@ def _count_faces(tree: dict[str, Any], primitive: dict[str, Any], limits: ReadLi
         accessor = entry(tree, "accessors", number)
         if "bufferView" not in accessor and _COMPRESSED[0] in primitive.get("extensions", {}):
             raise Rejected("compressed_geometry", f"a mesh has compressed geometry only; {_UNPACK}")
-        counts.append(int(accessor["count"]))
+        counts.append(read_count(accessor, "count"))
         if counts[-1] > 3 * limits.max_faces:
             raise Rejected("too_many_faces", f"an accessor counts {counts[-1]} items")
     return counts[-1] // 3 if mode == TRIANGLES else max(counts[-1] - 2, 0)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote_to_bytes, urlsplit
 
+from pipeline.foreign.numbers import Malformed
 from storage.errors import Rejected
 
 _MAX_JSON_BYTES = 64_000_000
@@ -73,9 +74,11 @@ def _parse_json(text: bytes) -> dict[str, Any]:
     except json.JSONDecodeError as error:
         if plain and (error.pos >= len(plain.rstrip()) or error.msg.startswith("Unterminated")):
             raise Rejected("cut_off", "the file is cut off: its JSON ends early") from error
-        raise Rejected("load_error", f"the glTF JSON cannot be read ({error})") from error
+        where = f"line {error.lineno}, column {error.colno}"
+        raise Rejected("load_error", f"the glTF JSON is none from {where} on") from error
     except (ValueError, RecursionError) as error:
-        raise Rejected("load_error", f"the glTF JSON cannot be read ({error!s:.120})") from error
+        message = "the glTF JSON nests too deeply, or has a number of too many digits"
+        raise Rejected("load_error", message) from error
     if not isinstance(tree, dict):
         raise Rejected("load_error", "the glTF JSON is not an object")
     return tree
@@ -98,10 +101,10 @@ def _other_version(version: str) -> Rejected:
 
 
 def data_uri_bytes(uri: str) -> bytes:
-    """Return what a data: URI of any media type holds; raises ValueError where it is no base64."""
+    """Return what a data: URI of any media type holds; raises Malformed where it is no base64."""
     head, comma, body = uri.partition(",")
     if not comma:
-        raise ValueError(f"the URI {uri!r:.40} has no data")
+        raise Malformed(f"the URI {uri!r:.40} has no data")
     plain = unquote_to_bytes(body)
     if not head.lower().endswith(";base64"):
         return plain

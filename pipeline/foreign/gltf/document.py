@@ -20,6 +20,7 @@ from pipeline.foreign.gltf.nodes import INSTANCING, PlacedNode, entry, extension
 from pipeline.foreign.gltf.unread import unread_parts
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles, ReadFile, SourceFolder, gltf_files
+from pipeline.foreign.numbers import Malformed, read_count
 from storage.errors import Rejected, TrilightError
 
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -37,10 +38,15 @@ def refuse_malformed(reason: str, subject: str) -> Iterator[None]:
     """Turn what Python says of a tree that keeps no law of its format into Rejected."""
     try:
         yield
+    except Malformed as error:
+        raise Rejected(reason, f"{subject} malformed ({error!s:.200})") from error
     except TrilightError:
         raise
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        raise Rejected(reason, f"{subject} malformed ({error!r:.120})") from error
+    except KeyError as error:
+        missing = f"{error.args[0]!r:.40} is missing or unknown"
+        raise Rejected(reason, f"{subject} malformed ({missing})") from error
+    except (IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise Rejected(reason, f"{subject} malformed: a value is of another kind") from error
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,9 +81,9 @@ class GltfDocument:
         """
         stated, whole = self._stated(index), self._elements(index)
         if whole.shape[1] not in widths:
-            raise ValueError(f"accessor {index} has {whole.shape[1]} components")
+            raise Malformed(f"accessor {index} has {whole.shape[1]} components")
         if not isinstance(rows, slice) and rows.size and rows.max() >= len(whole):
-            raise ValueError(f"accessor {index} has {len(whole)} values, one for each vertex")
+            raise Malformed(f"accessor {index} has {len(whole)} values, one for each vertex")
         found = whole[rows].astype(np.float64)
         if whole.dtype.kind in "ui" and (stated.get("normalized") if is_unit is None else is_unit):
             found = np.maximum(found / np.iinfo(whole.dtype).max, -1)
@@ -87,12 +93,12 @@ class GltfDocument:
         """Return an accessor of vertices [N]."""
         whole = self._elements(index)
         if whole.shape[1] != 1 or whole.dtype.kind != "u":
-            raise ValueError(f"indices are of type {whole.dtype} x {whole.shape[1]}")
+            raise Malformed(f"indices are of type {whole.dtype} x {whole.shape[1]}")
         return whole[:, 0].astype(np.int64)
 
     def count(self, index: Any) -> int:
         """Return the number of values of an accessor."""
-        return int(self._stated(index)["count"])
+        return read_count(self._stated(index), "count")
 
     def instances(self, place: PlacedNode) -> NDArray[np.float64]:
         """Return the places [N, 4, 4] of the mesh of a node."""
@@ -122,12 +128,12 @@ class GltfDocument:
     def _elements(self, index: Any) -> NDArray:
         """Return the values [N, K] of an accessor as they are stored; zeros where nothing is."""
         stated = self._stated(index)
-        code, kind, count = stated["componentType"], stated["type"], int(stated["count"])
+        code, kind, count = stated["componentType"], stated["type"], read_count(stated, "count")
         if code not in _DTYPES or kind not in _WIDTHS:
             raise Rejected("unsupported_accessor", f"values of type {code!r:.20} {kind!r:.20}")
         dtype, width = np.dtype(_DTYPES[code]), _WIDTHS[kind]
         if "bufferView" in stated:
-            offset = int(stated.get("byteOffset", 0))
+            offset = read_count(stated, "byteOffset", 0)
             values = self._strided(stated["bufferView"], offset, dtype, width, count)
         else:
             values = np.broadcast_to(np.zeros(1, dtype), (count, width))
@@ -135,12 +141,12 @@ class GltfDocument:
 
     def _with_replaced(self, values: NDArray, sparse: Mapping[str, Any]) -> NDArray:
         """Return values with those that a sparse accessor replaces."""
-        count, where, stated = int(sparse["count"]), sparse["indices"], sparse["values"]
+        count, where, stated = read_count(sparse, "count"), sparse["indices"], sparse["values"]
         dtype = np.dtype(_DTYPES[where["componentType"]])
-        offsets = [int(each.get("byteOffset", 0)) for each in (where, stated)]
+        offsets = [read_count(each, "byteOffset", 0) for each in (where, stated)]
         rows = self._strided(where["bufferView"], offsets[0], dtype, 1, count)[:, 0]
         if count and int(rows.max()) >= len(values):
-            raise ValueError(f"a sparse accessor replaces value {rows.max()} of {len(values)}")
+            raise Malformed(f"a sparse accessor replaces value {rows.max()} of {len(values)}")
         if len(values) > _MOST_REPLACED:
             raise Rejected("too_many_faces", f"a sparse accessor counts {len(values)} items")
         found = values.copy()
@@ -153,9 +159,9 @@ class GltfDocument:
         self, view: Any, offset: int, dtype: np.dtype[Any], width: int, count: int
     ) -> NDArray:
         data, size = self._view(view), dtype.itemsize * width
-        step = int(entry(self.tree, "bufferViews", view).get("byteStride", 0)) or size
-        if count < 0 or offset < 0 or step < size:
-            raise ValueError(f"{count} values, byte offset {offset}, byte stride {step}")
+        step = read_count(entry(self.tree, "bufferViews", view), "byteStride", 0) or size
+        if step < size:
+            raise Malformed(f"byteStride is {step}; expected at least {size}")
         if count and offset + (count - 1) * step + size > len(data):
             raise Rejected(
                 "load_error",
@@ -173,14 +179,14 @@ class GltfDocument:
             if is_data_uri(uri) and uri not in self._embedded:
                 self._embedded[uri] = data_uri_bytes(uri)
             data = memoryview(self._embedded[uri] if is_data_uri(uri) else self.buffers[uri])
-        if data is None or len(data) < int(buffer["byteLength"]) - _PADDING:
+        if data is None or len(data) < read_count(buffer, "byteLength") - _PADDING:
             raise Rejected(
                 "cut_off",
                 f"a buffer is cut off: it states {buffer['byteLength']} bytes and has "
                 f"{0 if data is None else len(data)}",
             )
-        start, length = int(view.get("byteOffset", 0)), int(view["byteLength"])
-        if start < 0 or length < 0 or start + length > len(data):
+        start, length = read_count(view, "byteOffset", 0), read_count(view, "byteLength")
+        if start + length > len(data):
             raise Rejected("load_error", f"buffer view {index} goes beyond its buffer")
         return memoryview(data)[start : start + length]
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pipeline.foreign.gltf.document import GltfDocument
 from pipeline.foreign.gltf.nodes import entry, extension
 from pipeline.foreign.material import MOST_UV_SETS, RGB, Slot, SourceMaterial
+from pipeline.foreign.numbers import Malformed, read_count, read_number, read_numbers
 from pipeline.foreign.picture import Picture, Wrap
 from storage.errors import Rejected
 
@@ -152,8 +153,8 @@ class GltfMaterials:
         wrap = _WRAPS[sampler.get("wrapS", 10497)], _WRAPS[sampler.get("wrapT", 10497)]
         moved = extension(info, "KHR_texture_transform")
         turn, shift = _moves(moved)
-        uv_set = int(moved.get("texCoord", info.get("texCoord", 0)))
-        if not 0 <= uv_set < MOST_UV_SETS:
+        uv_set = read_count(moved, "texCoord", info.get("texCoord", 0))
+        if uv_set >= MOST_UV_SETS:
             raise Rejected("no_texture_coordinates", f"a texture lies on TEXCOORD_{uv_set}")
         values = self._picture(source)
         return Slot(
@@ -191,13 +192,13 @@ class GltfMaterials:
     ) -> list[float]:
         """Return factors within [0, `most`]; the default, with a note, where they are none."""
         try:
-            found = _finite(row.get(name, default), len(default))
+            found = [*read_numbers(row.get(name, default), len(default), name)]
             if most > 1 and max(found) > most and self._notes is None:
-                raise ValueError(f"{max(found):g}; expected at most {most:g}")
-        except (TypeError, ValueError) as error:
+                raise Malformed(f"{name} is {max(found):g}; expected at most {most:g}")
+        except Malformed as error:
             if self._notes is None:
-                raise ValueError(f"{name}: {error}") from error
-            self._notes.append(f"{name}: {error}; {[*default]} taken")
+                raise
+            self._notes.append(f"{error}; {[*default]} taken")
             return list(default)
         clamped = [min(max(value, 0.0), most) for value in found]
         if self._notes is not None and clamped != found:
@@ -225,18 +226,11 @@ def _moves(moved: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.fl
 
     The extension says (u, w)' = shift + R S (u, w) with w down, and w = 1 - v.
     """
-    (angle,) = _finite([moved.get("rotation", 0)], 1)
-    scale = _finite(moved.get("scale", [1, 1]), 2)
+    angle = read_number(moved.get("rotation", 0), "rotation")
+    scale = read_numbers(moved.get("scale", (1, 1)), 2, "scale")
     cos, sin = np.cos(angle), np.sin(angle)
     down = np.array([[cos, sin], [-sin, cos]]) @ np.diag(scale)
-    offset = np.array(_finite(moved.get("offset", [0, 0]), 2))
+    offset = np.array(read_numbers(moved.get("offset", (0, 0)), 2, "offset"))
     flip = np.diag([1.0, -1.0])
     one = np.array([0.0, 1.0])
     return flip @ down @ flip, flip @ (offset + down @ one) + one
-
-
-def _finite(values: Any, count: int) -> list[float]:
-    found = [float(value) for value in values]
-    if len(found) != count or not np.isfinite(found).all():
-        raise ValueError(f"{values!r:.60}; expected {count} finite numbers")
-    return found

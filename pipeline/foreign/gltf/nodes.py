@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.foreign.numbers import Malformed, read_count
 from storage.errors import Rejected
 
 INSTANCING = "EXT_mesh_gpu_instancing"
@@ -28,13 +29,13 @@ class PlacedNode:
 
 
 def entry(tree: Mapping[str, Any], kind: str, index: Any) -> dict[str, Any]:
-    """Return an entry of a list of the tree; raises ValueError where there is none."""
+    """Return an entry of a list of the tree; raises Malformed where there is none."""
     rows = tree.get(kind, ())
     if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(rows):
-        raise ValueError(f"{kind} {index!r:.20} of {len(rows)}")
+        raise Malformed(f"{kind} {index!r:.20} of {len(rows)}")
     row = rows[index]
     if not isinstance(row, dict):
-        raise ValueError(f"{kind} {index} is no object")
+        raise Malformed(f"{kind} {index} is no object")
     return row
 
 
@@ -70,8 +71,16 @@ def placed_nodes(tree: Mapping[str, Any]) -> Iterator[PlacedNode]:
 
 
 def placed_meshes(tree: Mapping[str, Any]) -> Iterator[PlacedNode]:
-    """Yield the nodes that show a mesh."""
-    return (place for place in placed_nodes(tree) if "mesh" in place.node and place.is_visible)
+    """Yield the nodes that show a mesh; raises Rejected nonfinite_vertices, or as placed nodes."""
+    for place in placed_nodes(tree):
+        if "mesh" in place.node and place.is_visible:
+            if not np.isfinite(place.to_world).all():
+                fields = ("matrix", "translation", "rotation", "scale", "name")
+                said = {name: place.node[name] for name in fields if name in place.node}
+                raise Rejected(
+                    "nonfinite_vertices", f"a node or one above it has a place {said!r:.120}"
+                )
+            yield place
 
 
 def _roots(tree: Mapping[str, Any]) -> list[int]:
@@ -119,9 +128,11 @@ def _rows(*rows: list[ArrayLike]) -> NDArray[np.float64]:
 
 
 def num_instances(tree: Mapping[str, Any], node: Mapping[str, Any]) -> int:
-    """Return how often a node places its mesh; raises ValueError where attributes disagree."""
+    """Return how often a node places its mesh; raises Malformed where attributes disagree."""
     attributes = extension(node, INSTANCING).get("attributes", {})
-    counts = {int(entry(tree, "accessors", number)["count"]) for number in attributes.values()}
+    counts = {
+        read_count(entry(tree, "accessors", number), "count") for number in attributes.values()
+    }
     if len(counts) > 1:
-        raise ValueError(f"the instances of a node have attributes of {sorted(counts)} values")
+        raise Malformed(f"the instances of a node have attributes of {sorted(counts)} values")
     return counts.pop() if counts else 1

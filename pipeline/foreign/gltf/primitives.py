@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pipeline.foreign.gltf.check import FAN, POINTS_AND_LINES, STRIP, TRIANGLES
 from pipeline.foreign.gltf.document import GltfDocument, Rows
 from pipeline.foreign.gltf.nodes import PlacedNode, entry
+from pipeline.foreign.numbers import read_number
 from storage.errors import Rejected
 
 
@@ -83,7 +84,7 @@ class GltfPrimitive:
             if weight and name in target:
                 more = self._document.values(target[name], widths, self._rows, is_unit=is_unit)
                 with np.errstate(invalid="ignore", over="ignore"):
-                    values = values + float(weight) * more
+                    values = values + read_number(weight, "weights") * more
         return values
 
 

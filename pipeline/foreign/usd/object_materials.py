@@ -248,8 +248,6 @@ class _Reader:
 
 def _scaled(picture: Picture, scale: NDArray[np.float32], bias: NDArray[np.float32]) -> Picture:
     """Return a picture of linear values in float32, scaled and moved, none below 0."""
-    if not (np.isfinite(scale).all() and np.isfinite(bias).all()):
-        raise Rejected("materials_unreadable", "a texture is scaled by what is no number")
     values = np.zeros((*picture.values.shape[:2], 4), np.float32)
     for row in range(0, len(values), _STRIP):
         part = slice(row, row + _STRIP)

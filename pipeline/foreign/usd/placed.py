@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.numbers import FINITE, read_number
 from pipeline.foreign.usd.schemas import list_unread
 from pipeline.foreign.usd.skins import BoundSkin, BoundSkins
 from pipeline.foreign.usd.solids import SOLIDS
 from storage.errors import TrilightError
+from storage.settings.ranges import Within
 
 MAX_PLACED = 100_000
 """Maximum number of visited prims; every instance counts."""
@@ -55,9 +57,8 @@ def placed_prims(
 
     found: list[Placed] = []
     unread, known = Counter[str](), dict[Any, list[str]]()
-    metres, skins, visits = UsdGeom.GetStageMetersPerUnit(stage), BoundSkins(time), 0
-    if not (np.isfinite(metres) and metres > 0):
-        raise TrilightError(f"metersPerUnit is {metres:g}; expected a number above 0.")
+    skins, visits, above_zero = BoundSkins(time), 0, Within(0, FINITE.high, low_open=True)
+    metres = read_number(UsdGeom.GetStageMetersPerUnit(stage), "metersPerUnit", above_zero)
     for visit in _visited(stage, _base(stage, metres), time, lost):
         visits += 1
         if visits > MAX_PLACED:

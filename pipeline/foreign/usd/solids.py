@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.numbers import read_number
+
 SOLIDS = ("Cube", "Sphere", "Cylinder", "Cylinder_1", "Cone", "Capsule", "Capsule_1", "Plane",
           "TetMesh")  # fmt: skip
 """Kinds of prims that are read so."""
@@ -26,7 +28,7 @@ def build_solid(prim: Any, time: Any) -> Polygons:
     kind = str(prim.GetTypeName())
 
     def of(name: str) -> float:
-        return float(prim.GetAttribute(name).Get(time))
+        return read_number(prim.GetAttribute(name).Get(time), f"{prim.GetPath()}.{name}")
 
     if kind == "TetMesh":
         return _read_tetrahedra(prim, time)

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+from pipeline.foreign.numbers import Malformed
 from pipeline.foreign.usd.composition import composition_errors
 from storage.errors import TrilightError
 
@@ -186,7 +187,8 @@ class OpenedUsd:
 
         if isinstance(error, Pcp.ErrorInvalidAssetPath | Pcp.ErrorInvalidSublayerPath):
             return  # noted when its file was looked for
-        text = " ".join(str(error).replace(f"{self.folder}/", "").split())
+        site = re.search(r"<[^<>]*>$", str(error.rootSite))
+        text = f"{type(error).__name__.removeprefix('Error')} {site[0] if site else ''}"
         if isinstance(error, Pcp.ErrorArcCycle | Pcp.ErrorSublayerCycle):
             raise TrilightError(f"{self.path.name}: refers to itself in a circle ({text:.160}).")
         if isinstance(error, Pcp.ErrorCapacityExceeded):
@@ -230,8 +232,7 @@ class OpenedUsd:
             else:
                 layer = Sdf.Layer.FindOrOpen(resolved)
         except Tf.ErrorException as error:
-            why = said(error, outer)
-            raise TrilightError(f"{outer.name}: not readable as USD ({why}).") from error
+            raise TrilightError(f"{outer.name}: not readable as USD{_find_line(error)}.") from error
         if layer is None:
             raise TrilightError(f"{outer.name}: not readable as USD.")
         self._layers[resolved] = layer
@@ -255,7 +256,7 @@ def _check_package(path: Path, size: int) -> None:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
     except (zipfile.BadZipFile, NotImplementedError, ValueError) as error:
-        raise TrilightError(f"{path.name}: not a readable usdz archive ({error}).") from error
+        raise TrilightError(f"{path.name}: not a readable usdz archive; pack it again.") from error
     if not 1 <= len(members) <= MAX_MEMBERS:
         raise TrilightError(f"{path.name}: {len(members)} members; expected 1 to {MAX_MEMBERS}.")
     total = 0
@@ -273,8 +274,6 @@ def _check_package(path: Path, size: int) -> None:
 
 Read = TypeVar("Read")
 
-_MAX_LETTERS = 300
-
 
 def quietly(path: Path, read: Callable[[], Read]) -> Read:
     """Return what `read` makes of a file, without USD's own warnings on standard error.
@@ -287,25 +286,25 @@ def quietly(path: Path, read: Callable[[], Read]) -> Read:
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         return read()
+    except Malformed as error:
+        raise Malformed(f"{path.name}: {str(error).removeprefix(f'{path.name}: ')}.") from error
     except TrilightError:
         raise
     except Tf.ErrorException as error:
-        raise TrilightError(f"{path.name}: not readable as USD ({said(error, path)}).") from error
+        raise TrilightError(f"{path.name}: not readable as USD{_find_line(error)}.") from error
     except (TypeError, ValueError, AttributeError, LookupError, OverflowError) as error:
         raise TrilightError(
-            f"{path.name}: holds a value of another kind than USD states ({said(error, path)})."
+            f"{path.name}: holds a value of another kind than USD states."
         ) from error
     finally:
         delegate.TakeUncoalescedDiagnostics()
         del delegate
 
 
-def said(error: Exception, path: Path) -> str:
-    """Return what an error says, without USD's own source files and the folder of `path`."""
+def _find_line(error: Exception) -> str:
+    """Return where USD's parser stopped: a number of its sentence, which no record holds itself."""
     try:
-        text = " ".join(str(error).split())
+        line = re.search(r":(\d{1,9}):\d+: ", str(error))
     except UnicodeDecodeError:  # it cites the file
-        return "bytes that are no text"
-    found = re.findall(r"\.(?:cpp|h|yy) : '(.*?)'?(?= Error in |$)", text)
-    text = (found[-1] if found else text).replace(f"{path.resolve().parent}/", "")
-    return "".join(letter if letter.isprintable() else "?" for letter in text)[:_MAX_LETTERS]
+        line = None
+    return f" from line {line[1]} on" if line else ""

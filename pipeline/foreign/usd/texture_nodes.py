@@ -8,6 +8,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.numbers import read_number, read_numbers
 from pipeline.foreign.usd.polygons import CutMesh
 from pipeline.foreign.usd.stage import OpenedUsd, file_and_member
 from storage.errors import TrilightError
@@ -23,9 +24,9 @@ _WRAPS = ("repeat", "mirror", "clamp", "black")
 class Move:
     """A UsdTransform2d: scaled, turned counter-clockwise, and shifted, in this order."""
 
-    scale: tuple[float, float]
+    scale: tuple[float, ...]
     rotation_deg: float
-    translation: tuple[float, float]
+    translation: tuple[float, ...]
 
     @property
     def turn(self) -> NDArray[np.float64]:
@@ -78,7 +79,7 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
         opened: the file, which says where others are.
 
     Raises:
-        TrilightError: its picture is outside of the folder, or on the network.
+        TrilightError: its picture is outside of the folder, or on the network, or Malformed.
     """
     sources = find_sources(shader, "file")
     attribute = sources[0] if sources else None
@@ -98,8 +99,8 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
         resolved=resolved,
         colour_space=str(value_of(shader, "sourceColorSpace", time, "auto")),
         wrap=(_wrap(shader, "wrapS", time), _wrap(shader, "wrapT", time)),
-        scale=np.array(value_of(shader, "scale", time, (1, 1, 1, 1)), np.float32),
-        bias=np.array(value_of(shader, "bias", time, (0, 0, 0, 0)), np.float32),
+        scale=np.array(_vector(shader, "scale", time, (1, 1, 1, 1)), np.float32),
+        bias=np.array(_vector(shader, "bias", time, (0, 0, 0, 0)), np.float32),
         chart=chart_of(shader, time, opened.lost),
         output=output if output in ("r", "g", "b", "a") else "rgb",
         fallback=None if fallback is None else np.array(fallback, np.float64),
@@ -118,9 +119,11 @@ def chart_of(shader: Any, time: Any, lost: list[str]) -> UvChart:
         if node.GetIdAttr().Get() == "UsdTransform2d":
             moves.append(
                 Move(
-                    scale=_pair(value_of(node, "scale", time, (1, 1))),
-                    rotation_deg=float(value_of(node, "rotation", time, 0)),
-                    translation=_pair(value_of(node, "translation", time, (0, 0))),
+                    scale=_vector(node, "scale", time, (1, 1)),
+                    rotation_deg=read_number(
+                        value_of(node, "rotation", time, 0), f"{node.GetPath()}.rotation"
+                    ),
+                    translation=_vector(node, "translation", time, (0, 0)),
                 )
             )
             sources = find_sources(node, "in")
@@ -195,6 +198,6 @@ def _wrap(shader: Any, name: str, time: Any) -> NodeWrap:
     return cast(NodeWrap, mode) if mode in _WRAPS else "repeat"
 
 
-def _pair(value: Any) -> tuple[float, float]:
-    one, two = value
-    return float(one), float(two)
+def _vector(shader: Any, name: str, time: Any, default: tuple[float, ...]) -> tuple[float, ...]:
+    stated = value_of(shader, name, time, default)
+    return read_numbers(stated, len(default), f"{shader.GetPath()}.{name}")

@@ -15,6 +15,7 @@ from typing import Any
 from pipeline.objects.licences import UNKNOWN
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
+from storage.records.safe_read import read_plain
 from storage.remote.safe_url import printable, public_text
 
 CATALOGUE_NAMES = ("objects.jsonl", "objects.csv")
@@ -189,7 +190,7 @@ def _csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _file_text(path: Path) -> str:
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        return read_plain(path).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise TrilightError(

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from pipeline.foreign.light_pictures import read_linear_picture
+from pipeline.foreign.picture import UNREADABLE_PICTURE
 from storage.errors import Rejected
 from storage.records.texture import MAX_SIDE
 
@@ -76,5 +77,5 @@ def _plain_values(data: bytes) -> tuple[NDArray[np.float32], bool]:
             "colors of 16 or 32 bits are not: write it as PNG or OpenEXR",
         ) from error
     except (OSError, SyntaxError, ValueError, LookupError, Image.DecompressionBombError) as error:
-        raise Rejected("load_error", f"it is not a readable picture ({error})") from error
+        raise Rejected("load_error", UNREADABLE_PICTURE) from error
     return (values if values.ndim == 3 else values[..., None]), is_linear

@@ -22,7 +22,7 @@ from storage.records.quantities import QUANTITIES
 from storage.settings.described import option_of
 from tests.command_line import trilight
 from tests.conftest import ROOT
-from tests.for_each import case
+from tests.for_each import case, for_each
 
 ALL = {found.name: found for found in every_command()}
 TYPED = "pre"
@@ -129,6 +129,15 @@ def test_the_real_command_names_no_module() -> None:
     assert found.returncode == 2
     assert "infra.cli" not in found.stdout + found.stderr
     assert "trilight verify" in found.stdout + found.stderr
+
+
+@for_each("kib", [300_000, 700_000])
+def test_too_little_memory_is_one_sentence(tmp_path: Path, kib: int) -> None:
+    train = f"{sys.executable} -m trilight train smoke --data {tmp_path} --out {tmp_path}/run"
+    ended = _run(["bash", "-c", f"ulimit -v {kib}; exec {train}"], dict(os.environ))
+    *before, last = ended.stderr.splitlines()
+    assert ended.returncode == 1 and "Traceback" not in " ".join(before)
+    assert last.startswith("trilight: too little memory") and last.endswith("raise `ulimit -v`.")
 
 
 def _run(words: list[str], environment: dict[str, str]) -> "subprocess.CompletedProcess[str]":

@@ -5,7 +5,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -13,11 +13,12 @@ import pytest
 from pipeline.assets import stage
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings, GateSettings
-from pipeline.assets.stage import _rising, prepare_assets
+from pipeline.assets.stage import _rising, attempt_in_child, prepare_assets
 from pipeline.assets.store import AssetStore
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.isolation import is_passing
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, Rejected, TrilightError
+from tests.for_each import for_each
 from tests.pipeline.assets.child_kit import (
     CALLS,
     FIRST,
@@ -281,3 +282,15 @@ def test_a_source_that_changes_meanwhile_is_judged_by_the_next_run(
     bench.set()
     source.write_bytes(data)
     assert methods(made(bench)) == [(1000, FIRST), (500, FIRST), (340, FIRST)]
+
+
+@for_each("error, kept", [(TrilightError("nan"), Rejected), (EnvironmentFailure("full"), None)])
+def test_a_law_that_an_object_breaks_costs_it_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, kept: type[Exception] | None
+) -> None:
+    def broken(*_: object) -> NoReturn:
+        raise error
+
+    monkeypatch.setattr("pipeline.assets.prepare.prepare_asset", broken)
+    with pytest.raises(kept or type(error)):
+        attempt_in_child(tmp_path / "a.obj", AssetSettings(), "source")

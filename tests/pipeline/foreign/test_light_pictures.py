@@ -3,6 +3,7 @@
 import io
 import itertools
 import struct
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,8 @@ from pipeline.foreign.linear_picture import (
     luminance_weights,
     rec709_from,
 )
-from storage.errors import Rejected
+from storage.errors import Rejected, TrilightError
+from storage.records.exr import channel_names, decode_exr
 from tests.for_each import for_each
 
 ACESCG = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33766)
@@ -209,6 +211,26 @@ def test_files_of_openexr_that_are_not_read_say_why() -> None:
     ):
         with pytest.raises(Rejected, match=message):
             read(data)
+
+
+@for_each("flag", [0, 0x1000])
+@for_each("what", ["attributes", "channels", "value"])
+def test_a_header_is_counted_before_the_library_reads_it(what: str, flag: int) -> None:
+    channels = b"".join(b"c%d\0" % row + struct.pack("<4i", 1, 0, 1, 1) for row in range(100_000))
+    extra = {
+        "attributes": b"".join(_attribute(f"a{row}", "string", b"abcd") for row in range(150_000)),
+        "channels": _attribute("more", "chlist", channels + b"\0"),
+        "value": _attribute("a", "string", b"")[:-4] + struct.pack("<I", 2**31 - 1),
+    }[what]
+    data = raw_exr({name: (noise(2, 4), 1) for name in "RGB"}, (0, 0, 4, 2), (0, 0, 4, 2), extra)
+    data = data[:4] + struct.pack("<I", 2 | flag) + data[8:]
+    began = time.process_time()
+    with pytest.raises(Rejected, match="expected at most 4096, 262144 and 16777216"):
+        read(data)
+    for decode in (decode_exr, channel_names):
+        with pytest.raises(TrilightError, match="picture: its header has"):
+            decode(data)
+    assert time.process_time() - began < 1
 
 
 @for_each("tiled", [False, True])

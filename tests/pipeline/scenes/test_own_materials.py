@@ -16,6 +16,7 @@ from pipeline.scenes.subdivision import subdivided
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Emitter
 from scene_templates.settings import SceneSettings
+from storage.errors import Rejected
 from storage.records.asset import Level
 from storage.records.lookup import texture_values
 from storage.records.material import EMISSION
@@ -117,6 +118,16 @@ def test_as_many_objects_keep_their_own_as_stated() -> None:
         everybody = own_skins(entries, levels, OWN.materials, **name)
         assert all(skin is not None for skin in everybody)
     require_plausible({"own": share(found, 0.3)})
+
+
+def test_an_object_whose_textures_break_a_law_costs_scenes_by_its_name() -> None:
+    entries, level = _pool()[1:2], _skinned(small_pool()[1].asset.levels[0])
+    assert level.skin is not None
+    broken = pack_texture(Texture(texels=np.full((1, 1, 3), np.nan, np.float32)))
+    skin = dataclasses.replace(level.skin, packed=(broken, *level.skin.packed[1:]))
+    levels = [dataclasses.replace(level, skin=skin)]
+    with pytest.raises(Rejected, match=f"^law_broken: object {entries[0].locked.uid}: .*diffuse"):
+        own_skins(entries, levels, OWN.materials, seed=0, scene_index=0, attempt=0)
 
 
 def test_subdivision_moves_no_colour() -> None:
