@@ -1,32 +1,42 @@
-"""A large JSON object, entry by entry: never more in memory than one value and a piece of text."""
+"""A large JSON object, entry by entry: never more in memory than one value and a piece of text.
+
+Values stay text: `storage.typed_json` reads each by its type.
+"""
 
 import codecs
 import json
 import re
 from collections.abc import Iterator
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 PIECE_BYTES = 1 << 20
+_MOST_WAITING = 1 << 24
+"""Maximum characters of one value."""
 _SPACE = re.compile(r"[ \t\n\r]*")
 _AFTER = tuple(", ]}:\t\n\r")
 _DECODER = json.JSONDecoder()
 
 
-def entries(stream: BinaryIO) -> Iterator[tuple[str, Any]]:
-    """Yield (name, value) of the entries of an object; of an array, (name, item) for each item.
+def entries(stream: BinaryIO, listed: str) -> Iterator[tuple[str, str]]:
+    """Yield name and text of the entries of an object.
+
+    Args:
+        stream: the object.
+        listed: name of an array, of which each item comes apart.
 
     Raises:
-        ValueError: the stream holds no JSON object, or something after it.
+        ValueError: the stream holds no JSON object, something after it, or too long a value.
         RecursionError: a value is nested too deeply.
     """
     text = _Text(stream)
     text.expect("{")
     while not text.took("}"):
-        name = text.value()
-        if not isinstance(name, str):
-            raise ValueError(f"{name!r} where a name is expected")
+        if text.next_mark() != '"':
+            raise ValueError(f"{text.next_mark()!r} where a name is expected")
+        name: str = json.loads(text.value())
         text.expect(":")
-        if text.took("["):
+        if name == listed:
+            text.expect("[")
             while not text.took("]"):
                 yield name, text.value()
                 text.comma_before("]")
@@ -72,23 +82,25 @@ class _Text:
             if self.next_mark() == end:
                 raise ValueError(f"a comma before {end!r}")
 
-    def value(self) -> Any:
-        """Return the next value, when all of it has come."""
+    def value(self) -> str:
+        """Return the text of the next value, when all of it has come."""
         self.next_mark()
         while True:
             try:
-                value, end = _DECODER.raw_decode(self._text, self._at)
+                _, end = _DECODER.raw_decode(self._text, self._at)
             except ValueError:
                 if not self._more():
                     raise
                 continue
             if self._text[end : end + 1] in _AFTER or not self._more():  # a number might go on
-                self._at = end
-                return value
+                text, self._at = self._text[self._at : end], end
+                return text
 
     def _more(self) -> bool:
         """Read on, as much again as is waiting, so that a long value is not tried too often."""
         waiting = self._text[self._at :]
+        if len(waiting) > _MOST_WAITING:
+            raise ValueError(f"a value of more than {_MOST_WAITING} characters")
         piece = self._stream.read(max(PIECE_BYTES, len(waiting)))
         self._text, self._at = waiting + self._decode(piece, final=not piece), 0
         return bool(piece)

@@ -1,7 +1,8 @@
 """Checks a dataset against its manifest: every hash, every member, and the laws of every sample."""
 
+import io
 import os
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -14,10 +15,10 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset, LocalFiles, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, index_stream
+from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, index_stream
 from storage.dataset.planned import num_planned
 from storage.dataset.shard import contents_of, samples_of
-from storage.digests import sha256_hex
+from storage.digests import seal_of, sha256_hex
 from storage.errors import TrilightError
 from storage.licences import mixed_share_alike
 from storage.records.held_maps import HeldMaps
@@ -93,6 +94,7 @@ def verify_dataset(
     lock = dataset.lock_bytes()
     problems = list(_check_lock(lock, dataset))
     locked = {} if problems or lock is None else _by_uid(lock)
+    problems += _check_manifest(dataset)
     problems += [f"{name}: not in the manifest" for name in _unlisted(dataset)]
     where: dict[str, str] = {}
     bad: list[str] = []
@@ -158,6 +160,32 @@ def _check_lock(lock: bytes | None, dataset: Dataset) -> Iterator[str]:
         yield "objects.lock.jsonl: missing"
     elif sha256_hex(lock) != manifest.objects_lock_sha256:
         yield "objects.lock.jsonl: sha256 differs from the manifest"
+
+
+def _check_manifest(dataset: Dataset) -> Iterator[str]:
+    """Yield the faults of the manifest in itself, and of the documents that it vouches for."""
+    data = dataset.files.read("manifest.json") or b""
+    listed = decode_manifest(io.BytesIO(data), "manifest.json")
+    stored, name = listed.stored, "manifest.json"
+    assert stored is not None  # it was just read
+    if (seal := stored.manifest_sha256) and seal_of(data, seal) != seal:
+        yield f"{name}: its bytes are not those that were written (manifest_sha256 differs)"
+    if stored.dataset_digest != listed.dataset_digest:
+        yield (
+            f"{name}: dataset_digest is {stored.dataset_digest}; its shards, lock and settings "
+            f"have {listed.dataset_digest}"
+        )
+    sums = Totals(samples=listed.num_samples, bytes=listed.num_bytes)
+    if stored.totals not in (None, sums):
+        yield f"{name}: totals are {stored.totals}; its shards add up to {sums}"
+    for shard, count in Counter(shard.name for shard in listed.shards).items():
+        if count > 1:
+            yield f"{name}: {shard} is listed {count} times"
+    for document, sha256 in listed.documents.items():
+        if (found := dataset.files.read(document)) is None:
+            yield f"{document}: missing"
+        elif sha256_hex(found) != sha256:
+            yield f"{document}: sha256 differs from the manifest"
 
 
 def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Iterator[str]:

@@ -5,7 +5,6 @@
 """
 
 import dataclasses
-import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Any
 from storage.atomic import write_atomically
 from storage.digests import canonical_json
 from storage.errors import TrilightError
+from storage.typed_json import read_json_lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,13 +122,7 @@ def read_objects_lock(path: Path) -> list[LockedObject]:
 
 def decode_objects_lock(data: bytes, place: str) -> list[LockedObject]:
     """Return the objects of the bytes of a lock; raises as `read_objects_lock`, naming `place`."""
-    objects = []
-    for number, line in enumerate(data.splitlines(), start=1):
-        try:
-            objects.append(LockedObject(**json.loads(line)))
-        except (TypeError, ValueError) as error:
-            raise TrilightError(f"{place}:{number}: not a locked object ({error}).") from error
-    return objects
+    return read_json_lines(data, LockedObject, place)
 
 
 def encode_failures(failures: Iterable[Failure]) -> bytes:
@@ -143,10 +137,7 @@ def decode_failures(data: bytes) -> list[Failure]:
     Raises:
         TrilightError: a line is not a failure.
     """
-    try:
-        return [Failure(**json.loads(line)) for line in data.splitlines()]
-    except (TypeError, ValueError) as error:
-        raise TrilightError(f"failures.jsonl: a line is not a failure ({error}).") from error
+    return read_json_lines(data, Failure, "failures.jsonl")
 
 
 def read_failures(path: Path) -> list[Failure]:
