@@ -34,8 +34,10 @@ SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.t
 """Names are relative to the manifest and cannot leave its folder."""
 
 
-Document = Literal["LICENSE.md", "README.md", "attribution.csv", "croissant.json"]
-"""Names of the documents that a manifest vouches for: rights hang on them."""
+DocumentName = Annotated[
+    str, Spelled(r"(LICENSE|README)\.md|attribution\.csv|croissant\.json", "a document's name")
+]
+"""Document that a manifest vouches for: rights hang on it."""
 
 Scenes = Annotated[int, Within(0, 1_000_000_000, unit="scenes")]
 Bytes = Annotated[int, Within(0, 2**63 - 1, unit="bytes")]
@@ -87,7 +89,7 @@ class _Head:
     extensions: Mapping[str, Sha256] = dataclasses.field(default_factory=dict)
     """The sha256 of each extension that took part in making it, by its file name; nothing that is
     named here is ever imported (storage.extensions)."""
-    documents: Mapping[Document, Sha256] = dataclasses.field(default_factory=dict)
+    documents: Mapping[DocumentName, Sha256] = dataclasses.field(default_factory=dict)
     """The sha256 of each document by name; empty until they are written, and in older manifests."""
 
 
