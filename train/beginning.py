@@ -18,6 +18,7 @@ from storage.dataset.training_data import TrainingData
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.extensions import recorded
+from storage.typed_json import read_json
 from train.data.mixture import RECORD, mixture_of
 from train.folder import RunFolder
 from train.going_on import Event, GoingOn, event_records, going_on
@@ -220,8 +221,8 @@ def _write_settings(
 def _read_settings(folder: RunFolder) -> dict[str, Any]:
     """Return what settings.json says of the run's beginning; nothing where there is none."""
     try:
-        return dict(json.loads(folder.settings.read_bytes()))
-    except (OSError, ValueError, TypeError):
+        return read_json(folder.settings.read_bytes(), dict[str, Any], str(folder.settings))
+    except (OSError, TrilightError):
         return {}
 
 

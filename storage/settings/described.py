@@ -279,8 +279,9 @@ def _complaint(
         return law
     where = f"{called}: " if called else ""
     if first["type"] == "json_invalid":
+        what = f"{option(within[1])} is" if within else "all of it is"
         why = first["ctx"]["error"]
-        return TrilightError(f"{where}not JSON ({why}); expected the file as it was written.")
+        return TrilightError(f"{where}{what} not JSON ({why}); expected it as it was written.")
     steps = [str(step) for step in first["loc"]]
     shown, holder, field = _place([within[0], *steps] if within else steps, kind)
     if within:
