@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import BinaryIO
 
 PIECE_BYTES = 1 << 20
-_MOST_WAITING = 1 << 24
+_MOST_WAITING = 1 << 23
 """Maximum characters of one value."""
 _SPACE = re.compile(r"[ \t\n\r]*")
 _AFTER = tuple(", ]}:\t\n\r")

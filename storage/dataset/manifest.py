@@ -133,6 +133,13 @@ class Manifest(_Head):
         return sum(shard.num_bytes for shard in self.shards)
 
     @property
+    def passes(self) -> tuple[str, ...]:
+        """Names of the passes beside each picture; none where the settings do not name them."""
+        storage = self.settings.get("storage")
+        names = storage.get("passes") if isinstance(storage, Mapping) else None
+        return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
+
+    @property
     def dataset_digest(self) -> str:
         """sha256 over the sorted shard digests, the object lock and the settings."""
         shards = sorted([shard.name, shard.sha256] for shard in self.shards)

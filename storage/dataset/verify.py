@@ -13,13 +13,19 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.dataset.dataset import Dataset, LocalFiles, RemoteDatasetFiles, open_dataset
+from storage.dataset.dataset import (
+    Dataset,
+    LocalFiles,
+    RemoteDatasetFiles,
+    ShardMissing,
+    open_dataset,
+)
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, index_stream
 from storage.dataset.planned import num_planned
 from storage.dataset.shard import contents_of, samples_of
 from storage.digests import seal_of, sha256_hex
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, TrilightError, Unreadable
 from storage.licences import mixed_share_alike
 from storage.records.held_maps import HeldMaps
 from storage.records.lights import sum_of_lights
@@ -53,7 +59,7 @@ class Verification:
     num_samples: int
     """Samples that were checked."""
     bad_shards: Sequence[str]
-    """Names of the shards that are missing or not what they should be."""
+    """Names of the shards that are missing, or were read and are not what they should be."""
     num_shards_planned: int
     """Shards of the finished dataset."""
     is_finished: bool
@@ -65,6 +71,7 @@ class _Found:
     """What was found in one shard."""
 
     faults: list[str] = field(default_factory=list)
+    unread: list[str] = field(default_factory=list)
     keys: list[str] = field(default_factory=list)
 
 
@@ -108,7 +115,8 @@ def verify_dataset(
                 faults = [*found.faults, *_twice(found.keys, shard, where)]
                 bad += [shard.name] if faults else []
                 problems += [
-                    f"{shard.name}: {fault.removeprefix(f'{shard.name}: ')}" for fault in faults
+                    f"{shard.name}: {fault.removeprefix(f'{shard.name}: ')}"
+                    for fault in (*faults, *found.unread)
                 ]
                 shard_done(shard.name)
         except BaseException:
@@ -199,27 +207,28 @@ def _check_shard(
 ) -> _Found:
     found = _Found()
     try:
-        found.faults += _check_size(dataset, shard)
+        num_bytes = dataset.files.num_bytes(shard)
+        if num_bytes not in (None, shard.num_bytes):
+            found.faults.append(f"{num_bytes} bytes; expected {shard.num_bytes}")
         if found.faults or (fast and isinstance(dataset.files, RemoteDatasetFiles)):
+            found.unread += ["its server states no size"] * (num_bytes is None)
             return found
         with _opened(dataset, shard) as stream:
             if fast:
                 _check_members(stream, shard, found)
             else:
                 _check_content(stream, shard, dataset.manifest, locked, found)
+    except EnvironmentFailure:
+        raise
+    except ShardMissing:
+        found.faults.append("missing")
+    except Unreadable as error:
+        found.unread.append(str(error))
+    except TransferFailed as error:
+        found.unread.append(f"cannot be read ({error.message})")
     except TrilightError as error:
         found.faults.append(str(error))
-    except TransferFailed as error:
-        found.faults.append(f"cannot be read ({error.message})")
     return found
-
-
-def _check_size(dataset: Dataset, shard: ShardEntry) -> Iterator[str]:
-    num_bytes = dataset.files.num_bytes(shard)
-    if num_bytes is None:
-        yield "missing"
-    elif num_bytes != shard.num_bytes:
-        yield f"{num_bytes} bytes; expected {shard.num_bytes}"
 
 
 def _opened(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
@@ -282,8 +291,7 @@ def check_sample(
     yield from _check_lights(sample, apart=bool(renders.get("per_light")))
     bounces, lobes = (bool(renders.get(name)) for name in ("split", "split_lobes"))
     yield from _check_parts(sample, part_names(bounces=bounces, lobes=lobes))
-    stored = manifest.settings.get("storage")
-    yield from _check_passes(sample, stored.get("passes") if isinstance(stored, Mapping) else ())
+    yield from _check_passes(sample, manifest.passes)
     if mixed := mixed_share_alike(sample.scene.licences):
         yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
     scene = sample.scene
@@ -337,12 +345,12 @@ def _differing(what: str, differs: NDArray[np.bool_]) -> Iterator[str]:
         yield f"{what} in {len(pixels)} pixels, first in ({row}, {column})"
 
 
-def _check_passes(sample: Sample, names: Sequence[str] | None) -> Iterator[str]:
+def _check_passes(sample: Sample, names: Sequence[str]) -> Iterator[str]:
     """Yield the faults of stored passes; settings without that field ask for none."""
     if sample.passes_exr is None or not names:
         if names or sample.passes_exr is not None:
             has = "lacks" if names else "has"
-            yield f"sample {sample.key}: {has} passes; storage.passes is {list(names or ())}"
+            yield f"sample {sample.key}: {has} passes; storage.passes is {list(names)}"
         return
     resolution = sample.radiance_rgb.shape[2]
     for view, packed in enumerate(sample.passes_exr):

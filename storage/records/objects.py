@@ -161,6 +161,12 @@ def _lines(rows: Iterable[LockedObject | Failure]) -> bytes:
 
 
 def _record(row: LockedObject | Failure) -> dict[str, Any]:
-    """Return a row as JSON values; locks of objects alone know no kinds, as before."""
-    record = dataclasses.asdict(row)
-    return {name: value for name, value in record.items() if (name, value) != ("kind", OBJECT)}
+    """Return a row as JSON values; locks of objects alone know no kinds, as before.
+
+    Lone surrogates, which texts from outside may hold and UTF-8 does not, become `?`.
+    """
+    return {
+        name: value.encode(errors="replace").decode() if isinstance(value, str) else value
+        for name, value in dataclasses.asdict(row).items()
+        if (name, value) != ("kind", OBJECT)
+    }

@@ -306,7 +306,7 @@ def test_a_manifest_that_names_a_file_elsewhere_is_refused(tmp_path: Path, name:
     publication: Publication = _dataset(tmp_path, scenes=4)
     shards = json.loads(publication.folder.manifest.read_text())["shards"]
     root = edit_manifest(open_dataset(str(tmp_path)), shards=[{**shards[0], "name": name}])
-    with pytest.raises(TrilightError, match="shard name"):
+    with pytest.raises(TrilightError, match="expected the name of a shard"):
         open_dataset(str(root))
 
 
