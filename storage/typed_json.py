@@ -8,7 +8,6 @@ The type is a dataclass, or made of dataclasses; ranges and spellings are notes 
 
 import functools
 import json
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar, cast
@@ -28,13 +27,10 @@ class Spelled:
     """What to write, for a person."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Let pydantic check the spelling after the type."""
-        return _checked_after(self._require, handler(source))
+        """Let pydantic check the spelling with the type."""
+        from pydantic_core import core_schema
 
-    def _require(self, text: str) -> str:
-        if not re.fullmatch(self.pattern, text, re.DOTALL):
-            raise ValueError(self.expected)
-        return text
+        return core_schema.str_schema(pattern=rf"(?s)\A(?:{self.pattern})\z", strict=True)
 
 
 @dataclass(frozen=True)
@@ -46,7 +42,9 @@ class Finite:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Let pydantic look for such numbers after the type."""
-        return _checked_after(self._require, handler(source))
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_after_validator_function(self._require, handler(source))
 
     def _require(self, value: Any) -> Any:
         json.dumps(value, allow_nan=False)
@@ -96,7 +94,7 @@ def read_json_lines(data: bytes, kind: type[T], source: str, *, torn_end: bool =
         try:
             rows.append(read_json(line, kind, f"{source}:{number}"))
         except TrilightError:
-            if not (torn_end and number == len(lines)):
+            if not torn_end or number < len(lines) or data.endswith(b"\n"):
                 raise
     return rows
 
@@ -106,9 +104,3 @@ def _reader_of(kind: Any) -> Callable[[bytes | str], Any]:
     from storage.settings.described import strict_adapter
 
     return strict_adapter(kind).validate_json
-
-
-def _checked_after(check: Callable[[Any], Any], schema: Any) -> Any:
-    from pydantic_core import core_schema
-
-    return core_schema.no_info_after_validator_function(check, schema)

@@ -4,6 +4,7 @@ They hold what must not be in a dataset: times, hosts, retries. Any process may 
 many, a look reads those that were written last, and evenly spaced ones that stand for all.
 """
 
+import contextlib
 import heapq
 import json
 import os
@@ -12,10 +13,14 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from storage.atomic import write_error
 from storage.dataset.layout import DatasetFolder
+from storage.errors import TrilightError
 from storage.records.sample import sample_key
+from storage.settings.ranges import Within
+from storage.typed_json import Spelled, read_json
 
 LAST_SCENES = 200
 """Scenes over which a rate is taken."""
@@ -35,6 +40,29 @@ class SceneLog:
     """Time of completion by the worker's clock."""
     scene_index: int | None = None
     """Which scene; None where the row does not say."""
+
+
+Seconds = Annotated[float, Within(0, 1e12, unit="seconds")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Row:
+    """Row of a log's file."""
+
+    scene: Annotated[str, Spelled("[0-9]{1,18}", "the key of a scene")] | None = None
+    """Key of the scene."""
+    seconds: Seconds
+    """Wall time."""
+    cores: Annotated[int, Within(0, 10**6, unit="cores")] = 1
+    """Cores of the worker; earlier versions did not say."""
+    finished_unix_s: Seconds
+    """Time of completion."""
+    rejected_attempts: int = 0
+    """Attempts before."""
+    host: str = ""
+    """Machine."""
+    pid: int = 0
+    """Process."""
 
 
 def log_scene(
@@ -77,16 +105,14 @@ def log_name(shard: str) -> str:
 def decode_scene_log(text: str) -> Iterator[SceneLog]:
     """Yield the rows of a log; those that a kill has cut are left out."""
     for line in text.splitlines():
-        try:
-            row = json.loads(line)
+        with contextlib.suppress(TrilightError):
+            row = read_json(line, _Row, "log")
             yield SceneLog(
-                seconds=float(row["seconds"]),
-                cores=int(row.get("cores", 1)),  # earlier versions did not say
-                finished_unix_s=float(row["finished_unix_s"]),
-                scene_index=int(row["scene"]) if "scene" in row else None,
+                seconds=row.seconds,
+                cores=row.cores,
+                finished_unix_s=row.finished_unix_s,
+                scene_index=None if row.scene is None else int(row.scene),
             )
-        except (ValueError, KeyError, TypeError, AttributeError):
-            continue
 
 
 @dataclass(frozen=True, kw_only=True)

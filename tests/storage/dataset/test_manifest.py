@@ -4,8 +4,10 @@ import dataclasses
 import hashlib
 import io
 import json
+import math
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from storage.dataset.manifest import (
     read_manifest,
     write_manifest,
 )
+from storage.dataset.progress import missing_shards
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import (
     named_shard,
@@ -178,6 +181,53 @@ def test_opening_a_large_dataset_takes_few_bytes_a_sample(tmp_path: Path) -> Non
     write_manifest_of(tmp_path / "small", 1)
     taken = memory_of_opening(tmp_path / "large", tmp_path / "small")["peak_bytes"]
     assert taken < 100_000 * 40  # 390 shards; measured: 17, nearly all of it a piece of the text
+
+
+LIES: dict[str, Any] = {
+    "num_scenes": (-5, 10**15, "4", 4.0, True, None, math.nan, math.inf),
+    "num_views": (0, -1, 10**9, "one"),
+    "settings": (None, [], 3, {"seed": math.nan}),
+    "build": (5, "x" * 5_000, "x" * 20_000_000),
+    "environment": (None, 7),
+    "extensions": (["a"], {"evil.py": 7}),
+    "documents": ({"../x": "0" * 64}, {"README.md": 1}),
+    "objects_lock_sha256": (1, "../x"),
+    "dataset_digest": (None, 3),
+    "evil": (1,),
+    "shards.num_samples": (-3, 10**12, 2.0, None, True, "2"),
+    "shards.num_bytes": (-1, "61440", 2**63),
+    "shards.split": ("../x", ["train"]),
+    "shards.sha256": (7, "../x", "A" * 64),
+    "shards.name": ("../train-000000.tar", "train-000000.tar\n", ["train-000000.tar"]),
+    "shards.evil": (1,),
+}
+"""Values that a manifest does not have, by field."""
+
+
+@for_each("field, value", [(field, value) for field, values in LIES.items() for value in values])
+def test_a_manifest_that_lies_is_one_sentence_within_a_second(
+    tmp_path: Path, field: str, value: object
+) -> None:
+    write_manifest_of(tmp_path, 5)
+    path = tmp_path / "manifest.json"
+    record = json.loads(path.read_bytes())
+    (record if "." not in field else record["shards"][0])[field.rpartition(".")[2]] = value
+    path.write_text(json.dumps(record, sort_keys=True))
+    began = time.process_time()
+    with pytest.raises(TrilightError) as caught:
+        read_manifest(path)
+    assert time.process_time() - began < 1
+    said = str(caught.value)
+    assert said.startswith(f"{path}: ") and "\n" not in said and len(said) < 600
+    assert field.rpartition(".")[2] in said or "more than 8388608 characters" in said
+
+
+def test_a_billion_planned_shards_cost_nothing(tmp_path: Path) -> None:
+    dataset = five_scenes(tmp_path)
+    settings = {"splits": {"scenes_per_shard": 1}}
+    edit_manifest(dataset, settings=settings, num_scenes=10**9)
+    with pytest.raises(TrilightError, match="1000000000 shards; expected at most 1000000"):
+        missing_shards(str(tmp_path))
 
 
 SETTINGS = SplitSettings(scenes_per_shard=4)
