@@ -51,7 +51,17 @@ class Finite:
         return value
 
 
-FINITE = Finite()
+class Dropped:
+    """Note at a field whose JSON is read and not kept."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Let pydantic take anything, for None."""
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_plain_validator_function(lambda value: None)
+
+
+DROPPED, FINITE = Dropped(), Finite()
 Sha256 = Annotated[str, Spelled("[0-9a-f]{64}", "64 hexadecimal digits")]
 ShortText = Annotated[str, Spelled(".{0,1000}", "a text of at most 1000 characters")]
 

@@ -15,20 +15,19 @@ import hashlib
 import itertools
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, BinaryIO, Literal
 
 from storage.atomic import atomic_writer
 from storage.conventions import MANIFEST_VERSION, READABLE_MANIFESTS, SPLITS, require_readable
-from storage.dataset.json_pieces import entries
 from storage.dataset.layout import numbered
 from storage.dataset.shard import scan_samples
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError
 from storage.settings.ranges import Within
-from storage.typed_json import FINITE, Sha256, ShortText, Spelled, read_json
+from storage.typed_json import DROPPED, FINITE, Sha256, ShortText, Spelled, read_json
 
 SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.tar")
 """Names are relative to the manifest and cannot leave its folder."""
@@ -38,6 +37,9 @@ DocumentName = Annotated[
     str, Spelled(r"(LICENSE|README)\.md|attribution\.csv|croissant\.json", "a document's name")
 ]
 """Document that a manifest vouches for: rights hang on it."""
+
+_HEAD_BYTES, _ROW_BYTES = 1 << 22, 1 << 17
+"""Maximum sizes of a manifest without its shards, and of a shard in it."""
 
 Scenes = Annotated[int, Within(0, 1_000_000_000, unit="scenes")]
 Bytes = Annotated[int, Within(0, 2**63 - 1, unit="bytes")]
@@ -58,19 +60,13 @@ class ShardEntry:
     """Size of the file."""
     sha256: Sha256
     """Digest of the file."""
+    members: Annotated[None, DROPPED] = dataclasses.field(default=None, compare=False, repr=False)
+    """An index of its members in rows of before version 5, which is not kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class _IndexedShard(ShardEntry):
-    """A row of before version 5."""
-
-    members: Annotated[Any, FINITE] = None
-    """An index of its members."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Head:
-    """Fields of a manifest beside its shards."""
+class _Fields:
+    """Fields of a manifest, and of its file."""
 
     build: ShortText
     """Name of the build."""
@@ -91,6 +87,8 @@ class _Head:
     named here is ever imported (storage.extensions)."""
     documents: Mapping[DocumentName, Sha256] = dataclasses.field(default_factory=dict)
     """The sha256 of each document by name; empty until they are written, and in older manifests."""
+    shards: tuple[ShardEntry, ...]
+    """The finished shards by number; none while they are made."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,8 +102,8 @@ class Totals:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StoredHead(_Head):
-    """Fields of a manifest's file beside its shards."""
+class StoredManifest(_Fields):
+    """File of a manifest."""
 
     dataset_digest: Sha256
     """The dataset digest as it was written."""
@@ -116,12 +114,10 @@ class StoredHead(_Head):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Manifest(_Head):
+class Manifest(_Fields):
     """Content of `manifest.json`."""
 
-    shards: tuple[ShardEntry, ...]
-    """The finished shards by number; none while they are made."""
-    stored: StoredHead | None = dataclasses.field(default=None, compare=False, repr=False)
+    stored: StoredManifest | None = dataclasses.field(default=None, compare=False, repr=False)
     """What the file says that was read, for `trilight verify`."""
 
     @property
@@ -190,7 +186,7 @@ def write_manifest(path: Path, manifest: Manifest) -> None:
 
 def _encoded(manifest: Manifest, seal: str) -> Iterator[bytes]:
     """Yield the pieces of a manifest's file row by row: there may be a million."""
-    record = {field.name: getattr(manifest, field.name) for field in dataclasses.fields(_Head)}
+    record = {field.name: getattr(manifest, field.name) for field in dataclasses.fields(_Fields)}
     record |= {"schema_version": MANIFEST_VERSION, "manifest_sha256": seal, "shards": []}
     record["totals"] = {"samples": manifest.num_samples, "bytes": manifest.num_bytes}
     record["dataset_digest"] = manifest.dataset_digest
@@ -209,7 +205,8 @@ def _encoded(manifest: Manifest, seal: str) -> Iterator[bytes]:
 
 def shard_row(shard: ShardEntry) -> dict[str, Any]:
     """Return the JSON values of an entry."""
-    return {field.name: getattr(shard, field.name) for field in dataclasses.fields(ShardEntry)}
+    row = {field.name: getattr(shard, field.name) for field in dataclasses.fields(shard)}
+    return {name: value for name, value in row.items() if name != "members"}
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -240,7 +237,7 @@ def _read(path: Path, decode: Callable[[BinaryIO, str], Manifest]) -> Manifest:
 
 
 def decode_manifest(stream: BinaryIO, place: str) -> Manifest:
-    """Return the manifest of an open file; one shard at a time is held as JSON.
+    """Return the manifest of an open file.
 
     Args:
         stream: the file.
@@ -249,40 +246,34 @@ def decode_manifest(stream: BinaryIO, place: str) -> Manifest:
     Raises:
         TrilightError: as `read_manifest`.
     """
-    return _manifest(entries(stream, "shards"), place)
+    return _manifest(stream.read(), place)
 
 
 def decode_head(stream: BinaryIO, place: str) -> Manifest:
     """Return the manifest of an open file without its shards; otherwise as `decode_manifest`."""
-    by_name = entries(stream, "shards")  # sorted: shards and totals come last
-    head = itertools.takewhile(lambda entry: entry[0] not in ("shards", "totals"), by_name)
-    return _manifest(head, place)
+    lines = itertools.takewhile(lambda line: not line.startswith(b' "shards": ['), stream)
+    head = b"".join(lines)
+    is_cut = head.endswith(b",\n")  # as `write_manifest` has it: shards and totals come last
+    return _manifest(head + b'"shards": []}' if is_cut else head, place)
 
 
-def _manifest(by_name: Iterable[tuple[str, str]], place: str) -> Manifest:
-    head: dict[str, str] = {}
-    shards: list[ShardEntry] = []
-    kind: type[ShardEntry] = ShardEntry
+def _manifest(data: bytes, place: str) -> Manifest:
+    if len(data) > _HEAD_BYTES + _ROW_BYTES * data.count(b'.tar"'):
+        raise TrilightError(f"{place}: {len(data)} bytes are too many for the shards in it.")
     try:
-        for name, text in by_name:
-            if name == "shards":
-                shards.append(read_json(text, kind, f"{place}: shard {len(shards)}"))
-                continue
-            if name in head:
-                raise ValueError(f"{name!r} is given twice")
-            if name == "schema_version":  # it comes before the shards, which it explains
-                require_readable(version := json.loads(text), place, READABLE_MANIFESTS)
-                kind = ShardEntry if version == MANIFEST_VERSION else _IndexedShard
-            head[name] = text
+        stored = read_json(data, StoredManifest, place)
     except TrilightError:
+        if (version := _version_of(data)) is not None:
+            require_readable(version, place, READABLE_MANIFESTS)
         raise
-    except (ValueError, RecursionError) as error:
-        raise TrilightError(f"{place}: not a readable manifest ({error}).") from error
-    if "schema_version" not in head:
-        require_readable(None, place, READABLE_MANIFESTS)
-    text = ",".join(f"{json.dumps(name)}:{value}" for name, value in head.items())
-    stored = read_json(f"{{{text}}}", StoredHead, place)
-    fields = {field.name: getattr(stored, field.name) for field in dataclasses.fields(_Head)}
-    if kind is not ShardEntry:
-        shards = [ShardEntry(**shard_row(shard)) for shard in shards]
-    return Manifest(shards=tuple(shards), stored=stored, **fields)
+    require_readable(stored.schema_version, place, READABLE_MANIFESTS)
+    fields = {field.name: getattr(stored, field.name) for field in dataclasses.fields(_Fields)}
+    return Manifest(stored=stored, **fields)
+
+
+def _version_of(data: bytes) -> object:
+    """Return the version that a manifest of unknown form states; None where it states none."""
+    try:
+        return json.loads(data)["schema_version"]
+    except (ValueError, LookupError, TypeError, RecursionError):
+        return None

@@ -5,6 +5,7 @@ many, a look reads those that were written last, and evenly spaced ones that sta
 """
 
 import contextlib
+import dataclasses
 import heapq
 import json
 import os
@@ -20,7 +21,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
 from storage.records.sample import sample_key
 from storage.settings.ranges import Within
-from storage.typed_json import Spelled, read_json
+from storage.typed_json import read_json
 
 LAST_SCENES = 200
 """Scenes over which a rate is taken."""
@@ -28,41 +29,27 @@ MOST_LOGS = 1024
 """Maximum number of logs that stand for all."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneLog:
-    """Log row of one finished scene."""
-
-    seconds: float
-    """Wall time."""
-    cores: int
-    """Cores that the worker used for it."""
-    finished_unix_s: float
-    """Time of completion by the worker's clock."""
-    scene_index: int | None = None
-    """Which scene; None where the row does not say."""
-
-
 Seconds = Annotated[float, Within(0, 1e12, unit="seconds")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Row:
-    """Row of a log's file."""
+class SceneLog:
+    """Log row of one finished scene."""
 
-    scene: Annotated[str, Spelled("[0-9]{1,18}", "the key of a scene")] | None = None
+    scene: str = ""
     """Key of the scene."""
     seconds: Seconds
     """Wall time."""
     cores: Annotated[int, Within(0, 10**6, unit="cores")] = 1
-    """Cores of the worker; earlier versions did not say."""
-    finished_unix_s: Seconds
-    """Time of completion."""
+    """Cores that the worker used for it; earlier versions did not say."""
     rejected_attempts: int = 0
-    """Attempts before."""
+    """Attempts that were rejected before."""
     host: str = ""
-    """Machine."""
+    """Name of the worker's machine."""
     pid: int = 0
-    """Process."""
+    """Process id of the worker."""
+    finished_unix_s: Seconds
+    """Time of completion by the worker's clock."""
 
 
 def log_scene(
@@ -79,20 +66,20 @@ def log_scene(
     Raises:
         TrilightError: the disk is full or the folder cannot be written.
     """
-    row = {
-        "scene": sample_key(scene_index),
-        "seconds": round(seconds, 3),
-        "cores": cores,
-        "rejected_attempts": num_rejected,
-        "host": socket.gethostname(),
-        "pid": os.getpid(),
-        "finished_unix_s": round(time.time(), 1),
-    }
+    row = SceneLog(
+        scene=sample_key(scene_index),
+        seconds=round(seconds, 3),
+        cores=cores,
+        rejected_attempts=num_rejected,
+        host=socket.gethostname(),
+        pid=os.getpid(),
+        finished_unix_s=round(time.time(), 1),
+    )
     path = folder.root / log_name(shard)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a") as stream:
-            stream.write(json.dumps(row) + "\n")
+            stream.write(json.dumps(dataclasses.asdict(row)) + "\n")
     except OSError as error:
         raise write_error(path, error) from error
 
@@ -106,13 +93,7 @@ def decode_scene_log(text: str) -> Iterator[SceneLog]:
     """Yield the rows of a log; those that a kill has cut are left out."""
     for line in text.splitlines():
         with contextlib.suppress(TrilightError):
-            row = read_json(line, _Row, "log")
-            yield SceneLog(
-                seconds=row.seconds,
-                cores=row.cores,
-                finished_unix_s=row.finished_unix_s,
-                scene_index=None if row.scene is None else int(row.scene),
-            )
+            yield read_json(line, SceneLog, "log")
 
 
 @dataclass(frozen=True, kw_only=True)
