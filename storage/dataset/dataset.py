@@ -12,14 +12,10 @@ from typing import BinaryIO
 
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import (
-    Manifest,
-    ShardEntry,
-    decode_manifest,
-)
+from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest
 from storage.dataset.shard import ShardContents, contents_of, samples_of
 from storage.digests import sha256_of_stream
-from storage.errors import TrilightError, Unreadable
+from storage.errors import ShardMissing, TrilightError, Unreadable
 from storage.records.held_maps import HeldMaps
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
 from storage.records.safe_read import open_plain
@@ -32,10 +28,6 @@ from storage.remote.url import RemoteUrl, parse_url
 
 MAX_BESIDE_BYTES = 1 << 30
 """Largest file beside the shards: a manifest takes 230 bytes a shard, a lock 400 an object."""
-
-
-class ShardMissing(TrilightError):
-    """A shard is not there."""
 
 
 def _unopened(path: Path, error: OSError) -> TrilightError:

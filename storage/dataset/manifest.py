@@ -38,6 +38,8 @@ DocumentName = Annotated[
 ]
 """Document that a manifest vouches for: rights hang on it."""
 
+MAX_BYTES = 1 << 30
+"""Maximum size of a manifest: a shard takes 220 bytes."""
 _HEAD_BYTES, _ROW_BYTES = 1 << 22, 1 << 17
 """Maximum sizes of a manifest without its shards, and of a shard in it."""
 
@@ -246,7 +248,7 @@ def decode_manifest(stream: BinaryIO, place: str) -> Manifest:
     Raises:
         TrilightError: as `read_manifest`.
     """
-    return _manifest(stream.read(), place)
+    return _manifest(stream.read(MAX_BYTES), place)
 
 
 def decode_head(stream: BinaryIO, place: str) -> Manifest:

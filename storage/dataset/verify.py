@@ -13,19 +13,13 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.dataset.dataset import (
-    Dataset,
-    LocalFiles,
-    RemoteDatasetFiles,
-    ShardMissing,
-    open_dataset,
-)
+from storage.dataset.dataset import Dataset, LocalFiles, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, index_stream
 from storage.dataset.planned import num_planned
 from storage.dataset.shard import contents_of, samples_of
 from storage.digests import seal_of, sha256_hex
-from storage.errors import EnvironmentFailure, TrilightError, Unreadable
+from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.licences import mixed_share_alike
 from storage.records.held_maps import HeldMaps
 from storage.records.lights import sum_of_lights
