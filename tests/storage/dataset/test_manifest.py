@@ -155,7 +155,18 @@ LIES: dict[str, Any] = {
     "shards.num_bytes": (-1, "61440", 2**63),
     "shards.split": ("../x", ["train"]),
     "shards.sha256": (7, "../x", "A" * 64),
-    "shards.name": ("../train-000000.tar", "train-000000.tar\n", ["train-000000.tar"]),
+    "shards.name": (
+        "../train-000000.tar",
+        "part-0001/../train-000000.tar",
+        "/train-000000.tar",
+        "x",
+        "part-1/train-000000.tar",
+        "a/train-000000.tar",
+        "part-0001/part-0001/train-000000.tar",
+        "pipe:train-000000.tar",
+        "train-000000.tar\n",
+        ["train-000000.tar"],
+    ),
     "shards.evil": (1,),
 }
 """Values that a manifest does not have, by field."""
@@ -177,6 +188,13 @@ def test_a_manifest_that_lies_is_one_sentence_within_a_second(
     said = str(caught.value)
     assert said.startswith(f"{path}: ") and "\n" not in said and len(said) < 600
     assert field.rpartition(".")[2] in said or "bytes are too many" in said
+
+
+@for_each("text", ["", "[" * 100_000, "[]", "{}", "3", '{"schema_version": 3}', "\\", "{}{}"])
+def test_what_is_no_manifest_is_one_sentence(tmp_path: Path, text: str) -> None:
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(TrilightError, match=r"^[^\n]*manifest.json: [^\n]*$"):
+        read_manifest(tmp_path / "manifest.json")
 
 
 def test_a_billion_planned_shards_cost_nothing(tmp_path: Path) -> None:
