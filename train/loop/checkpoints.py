@@ -57,38 +57,23 @@ Steps = Annotated[int, Within(0, 10**12, unit="steps")]
 
 @dataclass(frozen=True, kw_only=True)
 class _Header:
-    """Header of a checkpoint; older ones lack what has a default."""
+    """Header of a checkpoint, as `_encoded` writes it; older ones lack what has a default."""
 
     step: Steps
-    """Steps done."""
     skipped_steps: Steps
-    """Steps that changed nothing."""
     skipped_in_a_row: Steps = 0
-    """Those since the last update."""
     unusable: Mapping[str, Annotated[int, Within(0, 10**9, unit="samples")]]
-    """Lost samples by a digest of the name of what was damaged."""
     reports: tuple[StepReport, ...] = ()
-    """Steps since the last row of the log."""
     settings: Annotated[Mapping[str, Any], FINITE]
-    """Settings of the run."""
     model: str
-    """Configuration of the network as JSON."""
     data_digest: str
-    """Digest of what it learns from."""
     mixture: Mixture | None = None
-    """Mixture of its datasets."""
     history: tuple[Event, ...] = ()
-    """Events beside its steps."""
     world_size: Annotated[int, Within(1, 10**6, unit="processes")]
-    """Number of processes."""
     threads: Annotated[int, Within(1, 10**6, unit="threads")] | None = None
-    """Threads of each process."""
     muon_precision: Precision | None = None
-    """Precision of Muon's products."""
     extensions: Mapping[str, Sha256] = dataclasses.field(default_factory=dict)
-    """The sha256 of extensions by file name."""
     sha256: Sha256 | None = None
-    """Seal of the file (storage.digests.seal_of)."""
 
     def __post_init__(self) -> None:
         if self.skipped_steps > self.step:
