@@ -94,7 +94,7 @@ def verify_dataset(
     manifest = dataset.manifest
     lock = dataset.lock_bytes()
     problems = list(_check_lock(lock, dataset))
-    locked = {} if problems or lock is None else _by_uid(lock)
+    locked = None if problems else _by_uid(lock or b"")
     problems += _check_manifest(dataset)
     problems += [f"{name}: not in the manifest" for name in _unlisted(dataset)]
     where: dict[str, str] = {}
@@ -201,7 +201,7 @@ def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Ite
 
 
 def _check_shard(
-    dataset: Dataset, shard: ShardEntry, locked: Mapping[str, LockedObject], *, fast: bool
+    dataset: Dataset, shard: ShardEntry, locked: Mapping[str, LockedObject] | None, *, fast: bool
 ) -> _Found:
     found = _Found()
     try:
@@ -252,7 +252,7 @@ def _check_content(
     stream: BinaryIO,
     shard: ShardEntry,
     manifest: Manifest,
-    locked: Mapping[str, LockedObject],
+    locked: Mapping[str, LockedObject] | None,
     found: _Found,
 ) -> None:
     if index_stream(stream, shard.name) != shard:
@@ -271,7 +271,7 @@ def _check_content(
 
 
 def check_sample(
-    sample: Sample, split: str, manifest: Manifest, locked: Mapping[str, LockedObject]
+    sample: Sample, split: str, manifest: Manifest, locked: Mapping[str, LockedObject] | None
 ) -> Iterator[str]:
     """Yield the faults of one sample: laws of the scene, pictures, and rights of its objects."""
     try:
@@ -292,6 +292,8 @@ def check_sample(
     yield from _check_passes(sample, manifest.passes)
     if mixed := mixed_share_alike(sample.scene.licences):
         yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
+    if locked is None:  # a lock that is wrong says nothing of a sample
+        return
     scene = sample.scene
     for uid in locked_uids(((row.kind, row.uid) for row in scene.objects), scene.provenance):
         lock = locked.get(uid)

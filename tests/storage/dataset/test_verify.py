@@ -104,7 +104,7 @@ def test_the_lock_is_compared(
     else:
         path.write_bytes(lock(path.read_bytes()))
     found = verify_dataset(dataset.folder.root, fast=fast)
-    assert f"objects.lock.jsonl: {fault}" in found.problems, found.problems
+    assert found.problems == [f"objects.lock.jsonl: {fault}"] and not found.bad_shards
 
 
 @pytest.mark.parametrize("fast", [False, True])
