@@ -1,6 +1,5 @@
 """How far a training run is, from its folder and without torch."""
 
-import json
 import math
 import shlex
 from collections.abc import Mapping, Sequence
@@ -9,6 +8,7 @@ from typing import Any
 
 from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
+from storage.typed_json import read_json
 from train.folder import RunFolder
 from train.watching.rows import read_rows
 
@@ -42,7 +42,8 @@ def run_facts(root: Path) -> dict[str, Any]:
         raise TrilightError(f"{root}: no run here; expected a folder that `trilight train` wrote.")
     folder = RunFolder(root)
     try:
-        settings = json.loads(read_plain(folder.settings))["settings"]
+        place = str(folder.settings)
+        settings = read_json(read_plain(folder.settings), dict[str, Any], place)["settings"]
         rows = read_rows(folder.metrics)
         step, planned = max((row["step"] for row in rows), default=0), settings["num_steps"]
         facts = {

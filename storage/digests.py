@@ -27,6 +27,18 @@ def sha256_of_stream(stream: BinaryIO) -> str:
     return digest.hexdigest()
 
 
+def seal_of(data: bytes, sha256: str) -> str:
+    """Return the sha256 of sealed bytes, which hold it: of all but its first 64 digits.
+
+    Raises:
+        ValueError: the digits are not there.
+    """
+    start, view = data.index(sha256.encode()), memoryview(data)
+    digest = hashlib.sha256(view[:start])
+    digest.update(view[start + len(sha256) :])
+    return digest.hexdigest()
+
+
 def canonical_json(value: Any) -> bytes:
     """Return the one spelling of a JSON value: sorted keys, no spaces, UTF-8, no NaN."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)

@@ -23,6 +23,14 @@ class EnvironmentFailure(TrilightError):
     """
 
 
+class Unreadable(TrilightError):
+    """A file cannot be read now, and may be whole: no permission, or no answer of a server."""
+
+
+class ShardMissing(TrilightError):
+    """A shard is not there."""
+
+
 class Rejected(Exception):
     """An object, scene or view that breaks a law. It is data, not a failure of the program.
 

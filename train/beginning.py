@@ -19,6 +19,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.extensions import recorded
 from storage.records.safe_read import read_plain
+from storage.typed_json import read_json
 from train.data.mixture import RECORD, mixture_of
 from train.folder import RunFolder
 from train.going_on import Event, GoingOn, event_records, going_on
@@ -221,8 +222,8 @@ def _write_settings(
 def _read_settings(folder: RunFolder) -> dict[str, Any]:
     """Return what settings.json says of the run's beginning; nothing where there is none."""
     try:
-        return dict(json.loads(read_plain(folder.settings)))
-    except (OSError, ValueError, TypeError):
+        return read_json(read_plain(folder.settings), dict[str, Any], str(folder.settings))
+    except (OSError, TrilightError):
         return {}
 
 

@@ -123,11 +123,8 @@ def going_on(
 
 
 def events_of(records: Sequence[Mapping[str, Any]]) -> tuple[Event, ...]:
-    """Return the events of their records; raises TrilightError where they are none."""
-    try:
-        return tuple(Event(**record) for record in records)
-    except TypeError as error:
-        raise TrilightError(f"resume: the history of the run is not readable ({error}).") from error
+    """Return the events of their records."""
+    return tuple(Event(**record) for record in records)
 
 
 def event_records(events: Sequence[Event]) -> list[dict[str, Any]]:

@@ -1,6 +1,5 @@
 """Settings that differ from the named ones: as a dataset or run has them, of a file, by `--set`."""
 
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from storage.errors import TrilightError
 from storage.settings.changes import changed, differences, json_or_word
 from storage.settings.described import checked, settings_record
+from storage.typed_json import read_json
 
 _OF_SOURCES = ("build", "derived", "revisit")
 """What the settings of a dataset say of its name and of the datasets that it was made of."""
@@ -46,7 +46,10 @@ def parse_changes(texts: Iterable[str]) -> dict[str, Any]:
                 f"--set {text!r}: expected NAME=VALUE with each name once, such as "
                 "scenes.lights.coloured_share=0.5."
             )
-        changes[name] = json_or_word(value)
+        try:
+            changes[name] = json_or_word(value)
+        except TrilightError as error:
+            raise TrilightError(f"--set {name:.200}: {error}") from error
     return changes
 
 
@@ -112,7 +115,7 @@ def run_record(shared: Shared) -> dict[str, Any]:
 
     path = Path(shared.like) / "settings.json"
     try:
-        settings = dict(json.loads(path.read_bytes())["settings"])
+        settings = dict(read_json(path.read_bytes(), dict[str, Any], str(path))["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrilightError(
             f"--like {shared.like}: {path} cannot be read; expected the folder of a run."

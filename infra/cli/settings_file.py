@@ -5,11 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from yaml.error import MarkedYAMLError
 
 from storage.errors import TrilightError
+from storage.records.safe_read import open_plain
 from storage.settings.changes import json_or_word
 
-_MOST_BYTES = 1 << 24
+_MOST_BYTES = 1 << 16
 _EXAMPLE = "such as scenes.lights.coloured_share: 0.5"
 
 Stated = dict[str, tuple[Any, int]]
@@ -26,9 +28,17 @@ def read_settings_file(file: str) -> Stated:
             and line are named.
     """
     try:
-        if Path(file).stat().st_size > _MOST_BYTES:
-            raise TrilightError(f"--settings {file}: too large; expected {_MOST_BYTES} bytes.")
-        root = yaml.compose(Path(file).read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+        with open_plain(Path(file)) as stream:
+            data = stream.read(_MOST_BYTES + 1)
+        if len(data) > _MOST_BYTES:
+            raise TrilightError(
+                f"--settings {file}: too large; expected at most {_MOST_BYTES} bytes."
+            )
+        root = yaml.compose(data.decode(), Loader=_Loader)
+    except RecursionError as error:
+        raise TrilightError(
+            f"--settings {file}: nested too deeply; expected names with values, {_EXAMPLE}."
+        ) from error
     except (OSError, UnicodeDecodeError) as error:
         raise TrilightError(f"--settings {file}: not readable ({error}).") from error
     except yaml.YAMLError as error:
@@ -43,6 +53,16 @@ def read_settings_file(file: str) -> Stated:
     return stated
 
 
+class _Loader(yaml.SafeLoader):
+    """Reader without aliases, which could stand for any number of values, or for themselves."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            mark = self.peek_event().start_mark
+            raise MarkedYAMLError(problem="an alias; expected the value itself", problem_mark=mark)
+        return super().compose_node(parent, index)
+
+
 def _entries(node: yaml.Node, file: str, prefix: str) -> Iterator[tuple[str, Any, int]]:
     """Yield dotted name, value and line of each setting below a node."""
     if not isinstance(node, yaml.MappingNode):
@@ -53,21 +73,25 @@ def _entries(node: yaml.Node, file: str, prefix: str) -> Iterator[tuple[str, Any
         if isinstance(value, yaml.MappingNode):
             yield from _entries(value, file, f"{prefix}{key.value}.")
         else:
-            yield f"{prefix}{key.value}", _json(value, file), _line(key)
+            name = f"{prefix}{key.value}"
+            yield name, _json(value, file, name), _line(key)
 
 
-def _json(node: yaml.Node, file: str) -> Any:
-    """Return a value as JSON has it."""
+def _json(node: yaml.Node, file: str, name: str) -> Any:
+    """Return a value as JSON has it; `name` is the setting, for messages."""
     if isinstance(node, yaml.SequenceNode):
-        return [_json(entry, file) for entry in node.value]
+        return [_json(entry, file, name) for entry in node.value]
     if isinstance(node, yaml.MappingNode):
-        found = {str(key.value): _json(value, file) for key, value in node.value}
+        found = {str(key.value): _json(value, file, name) for key, value in node.value}
         if len(found) < len(node.value):
             raise TrilightError(
                 f"{file}, line {_line(node)}: a name is given twice; expected it once."
             )
         return found
-    return json_or_word(node.value) if node.style is None else node.value
+    try:
+        return json_or_word(node.value) if node.style is None else node.value
+    except TrilightError as error:
+        raise TrilightError(f"{file}, line {_line(node)}: {name}: {error}") from error
 
 
 def _line(node: yaml.Node) -> int:

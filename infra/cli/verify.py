@@ -77,8 +77,13 @@ def _print_repair(found: Verification, dataset: str) -> None:
             next_step((*asked, "--out", dataset))
         else:
             look_at("To resume, run the trilight generate command that began it.")
-    elif not found.bad_shards:
+    elif not found.problems:
         return
+    elif not found.bad_shards:
+        look_at(
+            "No shard was found wrong. Verify again what could not be read, and restore other "
+            "named files from a copy."
+        )
     elif is_remote:
         look_at(
             "Delete the named shards there and run trilight generate again, or copy them again "

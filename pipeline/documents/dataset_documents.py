@@ -1,5 +1,7 @@
 """Everything that stands beside the shards of a finished dataset, for people and for hubs."""
 
+import dataclasses
+
 from pipeline.documents.attribution import attribution_of
 from pipeline.documents.card import encode_card
 from pipeline.documents.croissant import encode_croissant
@@ -11,7 +13,9 @@ from pipeline.documents.sums import renew_sums
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import read_manifest, write_manifest
 from storage.dataset.statistics import Statistics, dataset_statistics
+from storage.digests import sha256_hex, sha256_of_file
 
 
 def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Statistics:
@@ -35,6 +39,19 @@ def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Stati
     write_contact_sheet(dataset, statistics, out=out)
     write_report(dataset, found, out=out)
     write_atomically(out.croissant, encode_croissant(manifest, rights))
-    write_atomically(out.card, encode_card(out, manifest, found, rights))
+    card = encode_card(out, manifest, found, rights)
+    if out.manifest.exists():
+        _write_digests(out, card)
+    write_atomically(out.card, card)  # last: with it, the dataset is finished
     renew_sums(out.root)
     return statistics
+
+
+def _write_digests(folder: DatasetFolder, card: bytes) -> None:
+    """Have the manifest vouch for the documents; `card` is still to be written."""
+    with folder.turn("manifest"):
+        written = (folder.attribution, folder.licences, folder.croissant)
+        documents = {path.name: sha256_of_file(path) for path in written}
+        documents[folder.card.name] = sha256_hex(card)
+        manifest = read_manifest(folder.manifest)
+        write_manifest(folder.manifest, dataclasses.replace(manifest, documents=documents))

@@ -5,7 +5,7 @@ it in `report/`. It tells nothing of the clock or the machine: equal datasets gi
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.documents import report_sections
@@ -122,19 +122,17 @@ def _overview(dataset: Dataset, found: Distributions) -> Markup:
     rows += [
         ("objects", f"{len(found.objects)}, {len(found.placements)} of them in scenes"),
         ("rejections", f"{len(found.failures)}"),
-        ("passes", _passes(manifest.settings)),
+        ("passes", _passes(manifest.passes)),
         ("size", f"{manifest.num_bytes / 1e6:.1f} MB in {len(manifest.shards)} shards"),
         ("dataset digest", manifest.dataset_digest),
     ]
     return table((), rows, class_="narrow")
 
 
-def _passes(settings: Mapping[str, object]) -> Markup:
+def _passes(names: Sequence[str]) -> Markup:
     """Return which passes the shards hold; where they hold none, the command that writes some."""
-    storage = settings.get("storage")
-    names = storage.get("passes") if isinstance(storage, Mapping) else None
     if names:
-        return joined([", ".join(map(str, names)), "beside each picture"], " ")
+        return joined([", ".join(names), "beside each picture"], " ")
     command = element("code", passes_command())
     return joined(["none stored;", command, "in the dataset's folder writes them"], " ")
 

@@ -45,6 +45,7 @@ class BucketPublication(Publication):
         return self._mirror.dataset(read_manifest(self.folder.manifest))
 
     def send_documents(self) -> None:
+        self._mirror.send_manifest()  # it vouches for them
         self._mirror.send_documents()
 
     def lock_objects(self, objects: list[LockedObject]) -> None:

@@ -207,7 +207,7 @@ class Publication:
                 shards |= {note.shard.name: note.shard for note in notes}
                 every = tuple(sorted(shards.values(), key=number_of_shard))
                 self._add_failures(failure for note in notes for failure in note.failures)
-                listed = dataclasses.replace(listed, shards=every)
+                listed = dataclasses.replace(listed, shards=every, documents={})
                 write_manifest(self.folder.manifest, listed)
             for staged in (self.folder.staged_entries, self.folder.staged_failures):
                 shutil.rmtree(staged, ignore_errors=True)
@@ -225,7 +225,7 @@ class Publication:
 
     def extend(self, num_scenes: int) -> None:
         """Plan more scenes; call in the turn of the manifest."""
-        self._write(num_scenes=num_scenes)
+        self._write(num_scenes=num_scenes, documents={})
 
     def add_failures(self, failures: Iterable[Failure]) -> None:
         """Add rows to `failures.jsonl`; a row that is there already stays single."""

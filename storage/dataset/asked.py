@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
+from storage.errors import TrilightError
 from storage.extensions import is_reference
+from storage.typed_json import read_json
 
 _NAME = "logs/asked.json"
 
@@ -27,15 +29,13 @@ def read_asked(dataset: Dataset) -> list[str] | None:
     and none that would run a file when they are repeated.
     """
     try:
-        words = json.loads(dataset.files.read(_NAME) or b"null")
-    except ValueError:
+        words = read_json(dataset.files.read(_NAME) or b"[]", list[str], _NAME)
+    except TrilightError:
         return None
-    if not isinstance(words, list) or words[:1] != ["generate"]:
+    if words[:1] != ["generate"]:
         return None
     harmless = all(
-        isinstance(word, str)
-        and word.isprintable()
-        and not (is_reference(word) or word.startswith("--extend"))
+        word.isprintable() and not (is_reference(word) or word.startswith("--extend"))
         for word in words
     )
     return words if harmless else None

@@ -12,14 +12,10 @@ from typing import BinaryIO
 
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import (
-    Manifest,
-    ShardEntry,
-    decode_manifest,
-)
+from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest
 from storage.dataset.shard import ShardContents, contents_of, samples_of
 from storage.digests import sha256_of_stream
-from storage.errors import TrilightError
+from storage.errors import ShardMissing, TrilightError, Unreadable
 from storage.records.held_maps import HeldMaps
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
 from storage.records.safe_read import open_plain
@@ -32,6 +28,14 @@ from storage.remote.url import RemoteUrl, parse_url
 
 MAX_BESIDE_BYTES = 1 << 30
 """Largest file beside the shards: a manifest takes 230 bytes a shard, a lock 400 an object."""
+
+
+def _unopened(path: Path, error: OSError) -> TrilightError:
+    if isinstance(error, FileNotFoundError | NotADirectoryError):
+        return ShardMissing(
+            f"{path}: the shard is missing; run `trilight generate` again to make it."
+        )
+    return Unreadable(f"{path}: cannot be read ({error.strerror}); fix its permissions.")
 
 
 class _Files(ABC):
@@ -69,9 +73,12 @@ class LocalFiles(_Files):
             ) from error
 
     def num_bytes(self, shard: ShardEntry) -> int | None:
-        """Return the size of a shard, or None where it is missing."""
+        """Return the size of a shard; raises ShardMissing, or Unreadable."""
         path = self.root / shard.name
-        return path.stat().st_size if path.exists() else None
+        try:
+            return path.stat().st_size
+        except OSError as error:
+            raise _unopened(path, error) from error
 
     def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
         """Open a shard for reading.
@@ -86,14 +93,8 @@ class LocalFiles(_Files):
         path = self.root / shard.name
         try:
             stream = open_plain(path)
-        except FileNotFoundError as error:
-            raise TrilightError(
-                f"{path}: the shard is missing; run `trilight generate` again to make it."
-            ) from error
         except OSError as error:
-            raise TrilightError(
-                f"{path}: cannot be read ({error.strerror}); mend its permissions."
-            ) from error
+            raise _unopened(path, error) from error
         if checked:
             self._check(path, stream, shard)
         return stream
@@ -136,13 +137,18 @@ class RemoteDatasetFiles(_Files):
             raise unreadable(url, error) from error
 
     def num_bytes(self, shard: ShardEntry) -> int | None:
-        """Return the size of a shard, or None where it is missing or the size is not said."""
+        """Return the size of a shard, or None where the server does not state it.
+
+        Raises:
+            ShardMissing: there is none.
+            Unreadable: the server gives no answer.
+        """
         url = self.url.child(shard.name)
         try:
             return facts_of(url).num_bytes
         except TransferFailed as error:
             if error.__cause__ is not None and is_missing(error.__cause__):
-                return None
+                raise ShardMissing(f"{url.shown}: the shard is missing.") from error
             raise unreadable(url, error) from error
 
     def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:

@@ -10,68 +10,118 @@ has a note (storage.dataset.shard_notes): no maker reads or writes what the othe
 finds all shards there lists them, once.
 """
 
-import contextlib
 import dataclasses
+import hashlib
+import itertools
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, Literal
 
 from storage.atomic import atomic_writer
 from storage.conventions import MANIFEST_VERSION, READABLE_MANIFESTS, SPLITS, require_readable
-from storage.dataset.json_pieces import entries
 from storage.dataset.layout import numbered
 from storage.dataset.shard import scan_samples
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError
 from storage.records.safe_read import open_plain
+from storage.settings.ranges import Within
+from storage.typed_json import DROPPED, FINITE, Sha256, ShortText, Spelled, read_json
 
 SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.tar")
 """Names are relative to the manifest and cannot leave its folder."""
+
+
+DocumentName = Annotated[
+    str, Spelled(r"(LICENSE|README)\.md|attribution\.csv|croissant\.json", "a document's name")
+]
+"""Document that a manifest vouches for: rights hang on it."""
+
+MAX_BYTES = 1 << 30
+"""Maximum size of a manifest: a shard takes 220 bytes."""
+_HEAD_BYTES, _ROW_BYTES = 1 << 22, 1 << 17
+"""Maximum sizes of a manifest without its shards, and of a shard in it."""
+
+Scenes = Annotated[int, Within(0, 1_000_000_000, unit="scenes")]
+Bytes = Annotated[int, Within(0, 2**63 - 1, unit="bytes")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShardEntry:
     """One shard as the manifest describes it."""
 
-    name: str
+    name: Annotated[str, Spelled(SHARD_NAME.pattern, "the name of a shard")]
     """File name beside the manifest, or in one of the parts of its folder
     (storage.dataset.layout)."""
-    split: str
+    split: Annotated[str, Spelled("|".join(SPLITS), "train, validation or test")]
     """train, validation or test."""
-    num_samples: int
+    num_samples: Scenes
     """Scenes in it."""
-    num_bytes: int
+    num_bytes: Bytes
     """Size of the file."""
-    sha256: str
+    sha256: Sha256
     """Digest of the file."""
+    members: Annotated[None, DROPPED] = dataclasses.field(default=None, compare=False, repr=False)
+    """An index of its members in rows of before version 5, which is not kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Manifest:
-    """What `manifest.json` says."""
+class _Fields:
+    """Fields of a manifest, and of its file."""
 
-    build: str
+    build: ShortText
     """Name of the build."""
-    settings: Mapping[str, Any]
+    settings: Annotated[Mapping[str, Any], FINITE]
     """All settings of the build; a dataset keeps them for life."""
-    environment: Mapping[str, Any]
+    environment: Annotated[Mapping[str, Any], FINITE]
     """What the bytes depend on besides the settings: variant, processor, library versions."""
-    num_scenes: int
+    num_scenes: Scenes
     """How many scenes were asked for so far; more extend the dataset."""
-    num_views: int
+    num_views: Annotated[int, Within(1, 1_000_000, unit="pictures")]
     """Pictures per scene."""
-    objects_lock_sha256: str
+    objects_lock_sha256: Sha256 | Literal[""]
     """Digest of `objects.lock.jsonl`; empty until the objects are prepared."""
-    shards: tuple[ShardEntry, ...]
-    """The finished shards by number; none while they are made."""
     schema_version: int = MANIFEST_VERSION
     """Version that was read; what is written has MANIFEST_VERSION."""
-    extensions: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    extensions: Mapping[str, Sha256] = dataclasses.field(default_factory=dict)
     """The sha256 of each extension that took part in making it, by its file name; nothing that is
     named here is ever imported (storage.extensions)."""
+    documents: Mapping[DocumentName, Sha256] = dataclasses.field(default_factory=dict)
+    """The sha256 of each document by name; empty until they are written, and in older manifests."""
+    shards: tuple[ShardEntry, ...]
+    """The finished shards by number; none while they are made."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Totals:
+    """Sums over the shards of a manifest."""
+
+    samples: int
+    """Scenes in the shards."""
+    bytes: int
+    """Sizes of the shards."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredManifest(_Fields):
+    """File of a manifest."""
+
+    dataset_digest: Sha256
+    """The dataset digest as it was written."""
+    totals: Totals | None = None
+    """Sums as they were written."""
+    manifest_sha256: Sha256 | None = None
+    """Seal of the file (storage.digests.seal_of); older manifests have none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest(_Fields):
+    """Content of `manifest.json`."""
+
+    stored: StoredManifest | None = dataclasses.field(default=None, compare=False, repr=False)
+    """What the file says that was read, for `trilight verify`."""
 
     @property
     def num_samples(self) -> int:
@@ -80,6 +130,13 @@ class Manifest:
     @property
     def num_bytes(self) -> int:
         return sum(shard.num_bytes for shard in self.shards)
+
+    @property
+    def passes(self) -> tuple[str, ...]:
+        """Names of the passes beside each picture; none where the settings do not name them."""
+        storage = self.settings.get("storage")
+        names = storage.get("passes") if isinstance(storage, Mapping) else None
+        return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
 
     @property
     def dataset_digest(self) -> str:
@@ -122,30 +179,37 @@ def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
 
 def write_manifest(path: Path, manifest: Manifest) -> None:
     """Write the manifest atomically, a shard a line; equal manifests give equal bytes."""
-    record = _fields(manifest) | {"schema_version": MANIFEST_VERSION}
+    seal = hashlib.sha256()
+    for piece in _encoded(manifest, ""):
+        seal.update(piece)
+    with atomic_writer(path) as stream:
+        for piece in _encoded(manifest, seal.hexdigest()):
+            stream.write(piece)
+
+
+def _encoded(manifest: Manifest, seal: str) -> Iterator[bytes]:
+    """Yield the pieces of a manifest's file row by row: there may be a million."""
+    record = {field.name: getattr(manifest, field.name) for field in dataclasses.fields(_Fields)}
+    record |= {"schema_version": MANIFEST_VERSION, "manifest_sha256": seal, "shards": []}
     record["totals"] = {"samples": manifest.num_samples, "bytes": manifest.num_bytes}
     record["dataset_digest"] = manifest.dataset_digest
-    if not manifest.extensions:  # as manifests are that were written before there were any
-        del record["extensions"]
-    record["shards"] = []
+    for name in ("extensions", "documents"):  # as manifests were before there were any
+        if not record[name]:
+            del record[name]
     head, mark, tail = json.dumps(record, indent=1, sort_keys=True).partition(
         '\n "shards": ['
     )  # no text of JSON holds a line break
-    with atomic_writer(path) as stream:  # row by row: there may be a million
-        stream.write(f"{head}{mark}".encode())
-        for number, shard in enumerate(manifest.shards):
-            row = json.dumps(shard_row(shard), sort_keys=True)
-            stream.write(f"{',' if number else ''}\n  {row}".encode())
-        stream.write(f"{tail}\n".encode())
+    yield f"{head}{mark}".encode()
+    for number, shard in enumerate(manifest.shards):
+        row = json.dumps(shard_row(shard), sort_keys=True)
+        yield f"{',' if number else ''}\n  {row}".encode()
+    yield f"{tail}\n".encode()
 
 
 def shard_row(shard: ShardEntry) -> dict[str, Any]:
     """Return the JSON values of an entry."""
-    return _fields(shard)
-
-
-def _fields(record: Manifest | ShardEntry) -> dict[str, Any]:
-    return {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+    row = {field.name: getattr(shard, field.name) for field in dataclasses.fields(shard)}
+    return {name: value for name, value in row.items() if name != "members"}
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -176,7 +240,7 @@ def _read(path: Path, decode: Callable[[BinaryIO, str], Manifest]) -> Manifest:
 
 
 def decode_manifest(stream: BinaryIO, place: str) -> Manifest:
-    """Return the manifest of an open file; one shard at a time is held as JSON.
+    """Return the manifest of an open file.
 
     Args:
         stream: the file.
@@ -185,59 +249,34 @@ def decode_manifest(stream: BinaryIO, place: str) -> Manifest:
     Raises:
         TrilightError: as `read_manifest`.
     """
-    with _decoding(place):
-        return _manifest(entries(stream), place)
+    return _manifest(stream.read(MAX_BYTES), place)
 
 
 def decode_head(stream: BinaryIO, place: str) -> Manifest:
     """Return the manifest of an open file without its shards; otherwise as `decode_manifest`."""
-
-    def up_to_shards() -> Iterator[tuple[str, Any]]:
-        for name, value in entries(stream):
-            if name in ("shards", "totals"):  # they come last: names are sorted
-                return
-            yield name, value
-
-    with _decoding(place):
-        return _manifest(up_to_shards(), place)
+    lines = itertools.takewhile(lambda line: not line.startswith(b' "shards": ['), stream)
+    head = b"".join(lines)
+    is_cut = head.endswith(b",\n")  # as `write_manifest` has it: shards and totals come last
+    return _manifest(head + b'"shards": []}' if is_cut else head, place)
 
 
-@contextlib.contextmanager
-def _decoding(place: str) -> Iterator[None]:
+def _manifest(data: bytes, place: str) -> Manifest:
+    if len(data) > _HEAD_BYTES + _ROW_BYTES * data.count(b'.tar"'):
+        raise TrilightError(f"{place}: {len(data)} bytes are too many for the shards in it.")
     try:
-        yield
+        stored = read_json(data, StoredManifest, place)
     except TrilightError:
+        if (version := _version_of(data)) is not None:
+            require_readable(version, place, READABLE_MANIFESTS)
         raise
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise TrilightError(f"{place}: not a readable manifest ({error}).") from error
+    require_readable(stored.schema_version, place, READABLE_MANIFESTS)
+    fields = {field.name: getattr(stored, field.name) for field in dataclasses.fields(_Fields)}
+    return Manifest(stored=stored, **fields)
 
 
-def _manifest(found: Iterable[tuple[str, Any]], place: str) -> Manifest:
-    record: dict[str, Any] = {}
-    shards: list[ShardEntry] = []
-    for name, value in found:
-        if name == "shards":
-            shards.append(shard_of_row(value))
-            continue
-        if name == "schema_version":  # it comes before the shards, which it explains
-            require_readable(value, place, READABLE_MANIFESTS)
-        record[name] = value
-    require_readable(record.get("schema_version"), place, READABLE_MANIFESTS)
-    del record["dataset_digest"]
-    record.pop("totals", None)
-    if not all(isinstance(sha256, str) for sha256 in record.get("extensions", {}).values()):
-        raise ValueError("extensions without digests")
-    return Manifest(shards=tuple(shards), **record)
-
-
-def shard_of_row(row: dict[str, Any]) -> ShardEntry:
-    """Return the entry of what `shard_row` gave.
-
-    Raises:
-        KeyError, TypeError, ValueError: it was something else.
-    """
-    if not SHARD_NAME.fullmatch(row["name"]):
-        raise ValueError(f"shard name {row['name']!r}")
-    return ShardEntry(
-        **{name: value for name, value in row.items() if name != "members"}
-    )  # before version 5, rows had an index of their members
+def _version_of(data: bytes) -> object:
+    """Return the version that a manifest of unknown form states; None where it states none."""
+    try:
+        return json.loads(data)["schema_version"]
+    except (ValueError, LookupError, TypeError, RecursionError):
+        return None

@@ -35,6 +35,6 @@ def num_planned(manifest: Manifest) -> int:
 
 def _splits(manifest: Manifest) -> SplitSettings:
     try:
-        return from_record(SplitSettings, manifest.settings["splits"])
-    except (KeyError, TrilightError) as error:
-        raise TrilightError(f"manifest: settings.splits is not readable ({error!r}).") from error
+        return from_record(SplitSettings, manifest.settings.get("splits"))
+    except TrilightError as error:
+        raise TrilightError(f"manifest: settings.splits: {error}") from error

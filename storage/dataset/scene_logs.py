@@ -4,6 +4,8 @@ They hold what must not be in a dataset: times, hosts, retries. Any process may 
 many, a look reads those that were written last, and evenly spaced ones that stand for all.
 """
 
+import contextlib
+import dataclasses
 import heapq
 import json
 import os
@@ -12,10 +14,14 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from storage.atomic import write_error
 from storage.dataset.layout import DatasetFolder
+from storage.errors import TrilightError
 from storage.records.sample import sample_key
+from storage.settings.ranges import Within
+from storage.typed_json import read_json
 
 LAST_SCENES = 200
 """Scenes over which a rate is taken."""
@@ -23,18 +29,27 @@ MOST_LOGS = 1024
 """Maximum number of logs that stand for all."""
 
 
+Seconds = Annotated[float, Within(0, 1e12, unit="seconds")]
+
+
 @dataclass(frozen=True, kw_only=True)
 class SceneLog:
     """Log row of one finished scene."""
 
-    seconds: float
+    scene: str = ""
+    """Key of the scene."""
+    seconds: Seconds
     """Wall time."""
-    cores: int
-    """Cores that the worker used for it."""
-    finished_unix_s: float
+    cores: Annotated[int, Within(0, 10**6, unit="cores")] = 1
+    """Cores that the worker used for it; earlier versions did not say."""
+    rejected_attempts: int = 0
+    """Attempts that were rejected before."""
+    host: str = ""
+    """Name of the worker's machine."""
+    pid: int = 0
+    """Process id of the worker."""
+    finished_unix_s: Seconds
     """Time of completion by the worker's clock."""
-    scene_index: int | None = None
-    """Which scene; None where the row does not say."""
 
 
 def log_scene(
@@ -51,20 +66,20 @@ def log_scene(
     Raises:
         TrilightError: the disk is full or the folder cannot be written.
     """
-    row = {
-        "scene": sample_key(scene_index),
-        "seconds": round(seconds, 3),
-        "cores": cores,
-        "rejected_attempts": num_rejected,
-        "host": socket.gethostname(),
-        "pid": os.getpid(),
-        "finished_unix_s": round(time.time(), 1),
-    }
+    row = SceneLog(
+        scene=sample_key(scene_index),
+        seconds=round(seconds, 3),
+        cores=cores,
+        rejected_attempts=num_rejected,
+        host=socket.gethostname(),
+        pid=os.getpid(),
+        finished_unix_s=round(time.time(), 1),
+    )
     path = folder.root / log_name(shard)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a") as stream:
-            stream.write(json.dumps(row) + "\n")
+            stream.write(json.dumps(dataclasses.asdict(row)) + "\n")
     except OSError as error:
         raise write_error(path, error) from error
 
@@ -77,16 +92,8 @@ def log_name(shard: str) -> str:
 def decode_scene_log(text: str) -> Iterator[SceneLog]:
     """Yield the rows of a log; those that a kill has cut are left out."""
     for line in text.splitlines():
-        try:
-            row = json.loads(line)
-            yield SceneLog(
-                seconds=float(row["seconds"]),
-                cores=int(row.get("cores", 1)),  # earlier versions did not say
-                finished_unix_s=float(row["finished_unix_s"]),
-                scene_index=int(row["scene"]) if "scene" in row else None,
-            )
-        except (ValueError, KeyError, TypeError, AttributeError):
-            continue
+        with contextlib.suppress(TrilightError):
+            yield read_json(line, SceneLog, "log")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,6 @@ the shard, and what was rejected on the way. So nobody's work grows with what ot
 """
 
 import contextlib
-import json
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,11 +12,12 @@ from pathlib import Path
 
 from storage.atomic import write_atomically
 from storage.dataset.layout import DatasetFolder, shard_names_in
-from storage.dataset.manifest import ShardEntry, index_shard, shard_of_row, shard_row
+from storage.dataset.manifest import ShardEntry, index_shard, shard_row
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures, encode_failures, read_failures
 from storage.records.safe_read import read_plain
+from storage.typed_json import read_json
 
 _SUFFIX = ".json"
 _AT_ONCE = 32
@@ -32,6 +32,16 @@ class ShardNote:
     """What the manifest says of it."""
     failures: tuple[Failure, ...]
     """Its scenes that were given up, and attempts that were rejected."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Note:
+    """File of a note."""
+
+    shard: ShardEntry
+    """The shard's row of the manifest."""
+    failures: str = ""
+    """Lines of failures.jsonl."""
 
 
 def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:
@@ -56,19 +66,10 @@ def encode_note(note: ShardNote) -> bytes:
     return canonical_json({"shard": shard_row(note.shard), "failures": failures})
 
 
-def decode_note(data: bytes) -> ShardNote:
-    """Return the note of a file; one of before version 5 is a row without rejections.
-
-    Raises:
-        ValueError, KeyError, TypeError, AttributeError: it is none.
-    """
-    record = json.loads(data)
-    failures = decode_failures(record.get("failures", "").encode())
-    return ShardNote(shard=shard_of_row(record.get("shard", record)), failures=tuple(failures))
-
-
-NOT_A_NOTE = (OSError, ValueError, KeyError, TypeError, AttributeError)
-"""What `decode_note` raises, or reading its file."""
+def decode_note(data: bytes, source: str) -> ShardNote:
+    """Return the note of a file; raises TrilightError, naming `source`, where it is none."""
+    note = read_json(data, _Note, source)
+    return ShardNote(shard=note.shard, failures=tuple(decode_failures(note.failures.encode())))
 
 
 def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:
@@ -82,8 +83,8 @@ def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:
     """
     path, shard = note_of(folder, name), folder.shard(name)
     # a kill before the note leaves none; then, and where it is no note, the shard itself is read
-    with contextlib.suppress(*NOT_A_NOTE):
-        note = decode_note(read_plain(path))
+    with contextlib.suppress(OSError, TrilightError):
+        note = decode_note(read_plain(path), str(path))
         if folder.is_sent(name):
             return note
         facts = shard.stat()
@@ -114,10 +115,10 @@ def fetched_notes(
 
     def fetched(name: str) -> ShardNote:
         try:
-            note = decode_note(read(name) or b"")
+            note = decode_note(read(name) or b"", name)
             if not name.endswith(f"/{note.shard.name}{_SUFFIX}"):
-                raise ValueError(note.shard.name)
-        except NOT_A_NOTE as error:
+                raise TrilightError(note.shard.name)
+        except TrilightError as error:
             raise TrilightError(
                 f"{shown}/{name}: not a note on its shard ({error}); delete both, and the shard is "
                 "made again."

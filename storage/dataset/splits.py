@@ -73,11 +73,25 @@ def planned_scenes(num_scenes: int, settings: "SplitSettings") -> int:
     return shards_for(num_scenes, settings) * settings.scenes_per_shard
 
 
+MOST_SHARDS = 1_000_000
+"""Maximum number of shards in a dataset: a shard's name has six digits."""
+
+
 def shards_for(num_scenes: int, settings: "SplitSettings") -> int:
-    """Return how many shards hold at least `num_scenes` scenes."""
+    """Return how many shards hold at least `num_scenes` scenes.
+
+    Raises:
+        TrilightError: more than MOST_SHARDS.
+    """
     if settings.listed_shards:
         return len(settings.listed_shards)
-    return -(-num_scenes // settings.scenes_per_shard)
+    count = -(-num_scenes // settings.scenes_per_shard)
+    if count > MOST_SHARDS:
+        raise TrilightError(
+            f"scenes: {num_scenes} in shards of {settings.scenes_per_shard} are {count} shards; "
+            f"expected at most {MOST_SHARDS}. Raise splits.scenes_per_shard, or make fewer scenes."
+        )
+    return count
 
 
 def require_objects(num_by_split: Mapping[str, int], needed: set[str]) -> None:

@@ -1,7 +1,8 @@
 """Checks a dataset against its manifest: every hash, every member, and the laws of every sample."""
 
+import io
 import os
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -14,11 +15,11 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset, LocalFiles, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, index_stream
+from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, index_stream
 from storage.dataset.planned import num_planned
 from storage.dataset.shard import contents_of, samples_of
-from storage.digests import sha256_hex
-from storage.errors import TrilightError
+from storage.digests import seal_of, sha256_hex
+from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.licences import mixed_share_alike
 from storage.records.held_maps import HeldMaps
 from storage.records.lights import sum_of_lights
@@ -52,7 +53,7 @@ class Verification:
     num_samples: int
     """Samples that were checked."""
     bad_shards: Sequence[str]
-    """Names of the shards that are missing or not what they should be."""
+    """Names of the shards that are missing, or were read and are not what they should be."""
     num_shards_planned: int
     """Shards of the finished dataset."""
     is_finished: bool
@@ -64,6 +65,7 @@ class _Found:
     """What was found in one shard."""
 
     faults: list[str] = field(default_factory=list)
+    unread: list[str] = field(default_factory=list)
     keys: list[str] = field(default_factory=list)
 
 
@@ -92,7 +94,8 @@ def verify_dataset(
     manifest = dataset.manifest
     lock = dataset.lock_bytes()
     problems = list(_check_lock(lock, dataset))
-    locked = {} if problems or lock is None else _by_uid(lock)
+    locked = None if problems else _by_uid(lock or b"")
+    problems += _check_manifest(dataset)
     problems += [f"{name}: not in the manifest" for name in _unlisted(dataset)]
     where: dict[str, str] = {}
     bad: list[str] = []
@@ -106,7 +109,8 @@ def verify_dataset(
                 faults = [*found.faults, *_twice(found.keys, shard, where)]
                 bad += [shard.name] if faults else []
                 problems += [
-                    f"{shard.name}: {fault.removeprefix(f'{shard.name}: ')}" for fault in faults
+                    f"{shard.name}: {fault.removeprefix(f'{shard.name}: ')}"
+                    for fault in (*faults, *found.unread)
                 ]
                 shard_done(shard.name)
         except BaseException:
@@ -160,6 +164,36 @@ def _check_lock(lock: bytes | None, dataset: Dataset) -> Iterator[str]:
         yield "objects.lock.jsonl: sha256 differs from the manifest"
 
 
+def _check_manifest(dataset: Dataset) -> Iterator[str]:
+    """Yield the faults of the manifest in itself, and of the documents that it vouches for."""
+    name, listed = "manifest.json", dataset.manifest
+    data = dataset.files.read(name) or b""
+    stored = listed.stored
+    if dataset.num_listed < len(listed.shards) or stored is None:  # it knows more than the file
+        listed = decode_manifest(io.BytesIO(data), name)
+        stored = listed.stored
+    assert stored is not None  # it was read
+    seal = stored.manifest_sha256
+    if seal and (seal.encode() not in data or seal_of(data, seal) != seal):
+        yield f"{name}: its bytes are not those that were written (manifest_sha256 differs)"
+    if stored.dataset_digest != listed.dataset_digest:
+        yield (
+            f"{name}: dataset_digest is {stored.dataset_digest}; its shards, lock and settings "
+            f"have {listed.dataset_digest}"
+        )
+    sums = Totals(samples=listed.num_samples, bytes=listed.num_bytes)
+    if stored.totals not in (None, sums):
+        yield f"{name}: totals are {stored.totals}; its shards add up to {sums}"
+    for shard, count in Counter(shard.name for shard in listed.shards).items():
+        if count > 1:
+            yield f"{name}: {shard} is listed {count} times"
+    for document, sha256 in listed.documents.items():
+        if (found := dataset.files.read(document)) is None:
+            yield f"{document}: missing"
+        elif sha256_hex(found) != sha256:
+            yield f"{document}: sha256 differs from the manifest"
+
+
 def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Iterator[str]:
     for key in keys:
         if (other := where.setdefault(key, shard.name)) != shard.name:
@@ -167,31 +201,32 @@ def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Ite
 
 
 def _check_shard(
-    dataset: Dataset, shard: ShardEntry, locked: Mapping[str, LockedObject], *, fast: bool
+    dataset: Dataset, shard: ShardEntry, locked: Mapping[str, LockedObject] | None, *, fast: bool
 ) -> _Found:
     found = _Found()
     try:
-        found.faults += _check_size(dataset, shard)
+        num_bytes = dataset.files.num_bytes(shard)
+        if num_bytes not in (None, shard.num_bytes):
+            found.faults.append(f"{num_bytes} bytes; expected {shard.num_bytes}")
         if found.faults or (fast and isinstance(dataset.files, RemoteDatasetFiles)):
+            found.unread += ["its server states no size"] * (num_bytes is None)
             return found
         with _opened(dataset, shard) as stream:
             if fast:
                 _check_members(stream, shard, found)
             else:
                 _check_content(stream, shard, dataset.manifest, locked, found)
+    except EnvironmentFailure:
+        raise
+    except ShardMissing:
+        found.faults.append("missing")
+    except Unreadable as error:
+        found.unread.append(str(error))
+    except TransferFailed as error:
+        found.unread.append(f"cannot be read ({error.message})")
     except TrilightError as error:
         found.faults.append(str(error))
-    except TransferFailed as error:
-        found.faults.append(f"cannot be read ({error.message})")
     return found
-
-
-def _check_size(dataset: Dataset, shard: ShardEntry) -> Iterator[str]:
-    num_bytes = dataset.files.num_bytes(shard)
-    if num_bytes is None:
-        yield "missing"
-    elif num_bytes != shard.num_bytes:
-        yield f"{num_bytes} bytes; expected {shard.num_bytes}"
 
 
 def _opened(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
@@ -217,7 +252,7 @@ def _check_content(
     stream: BinaryIO,
     shard: ShardEntry,
     manifest: Manifest,
-    locked: Mapping[str, LockedObject],
+    locked: Mapping[str, LockedObject] | None,
     found: _Found,
 ) -> None:
     if index_stream(stream, shard.name) != shard:
@@ -236,7 +271,7 @@ def _check_content(
 
 
 def check_sample(
-    sample: Sample, split: str, manifest: Manifest, locked: Mapping[str, LockedObject]
+    sample: Sample, split: str, manifest: Manifest, locked: Mapping[str, LockedObject] | None
 ) -> Iterator[str]:
     """Yield the faults of one sample: laws of the scene, pictures, and rights of its objects."""
     try:
@@ -254,10 +289,11 @@ def check_sample(
     yield from _check_lights(sample, apart=bool(renders.get("per_light")))
     bounces, lobes = (bool(renders.get(name)) for name in ("split", "split_lobes"))
     yield from _check_parts(sample, part_names(bounces=bounces, lobes=lobes))
-    stored = manifest.settings.get("storage")
-    yield from _check_passes(sample, stored.get("passes") if isinstance(stored, Mapping) else ())
+    yield from _check_passes(sample, manifest.passes)
     if mixed := mixed_share_alike(sample.scene.licences):
         yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
+    if locked is None:  # a lock that is wrong says nothing of a sample
+        return
     scene = sample.scene
     for uid in locked_uids(((row.kind, row.uid) for row in scene.objects), scene.provenance):
         lock = locked.get(uid)
@@ -309,12 +345,12 @@ def _differing(what: str, differs: NDArray[np.bool_]) -> Iterator[str]:
         yield f"{what} in {len(pixels)} pixels, first in ({row}, {column})"
 
 
-def _check_passes(sample: Sample, names: Sequence[str] | None) -> Iterator[str]:
+def _check_passes(sample: Sample, names: Sequence[str]) -> Iterator[str]:
     """Yield the faults of stored passes; settings without that field ask for none."""
     if sample.passes_exr is None or not names:
         if names or sample.passes_exr is not None:
             has = "lacks" if names else "has"
-            yield f"sample {sample.key}: {has} passes; storage.passes is {list(names or ())}"
+            yield f"sample {sample.key}: {has} passes; storage.passes is {list(names)}"
         return
     resolution = sample.radiance_rgb.shape[2]
     for view, packed in enumerate(sample.passes_exr):

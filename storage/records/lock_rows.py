@@ -1,6 +1,5 @@
 """Rows of `objects.lock.jsonl`, read where one is wanted: a lock may list millions."""
 
-import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 from storage.errors import TrilightError
 from storage.records.objects import LockedObject
 from storage.records.safe_read import open_plain
+from storage.typed_json import read_json
 
 
 class LockRows:
@@ -73,10 +73,5 @@ class LockRows:
         return low
 
     def _row(self, line: bytes, offset: int) -> LockedObject:
-        try:
-            return LockedObject(**json.loads(line))
-        except (TypeError, ValueError) as error:
-            raise TrilightError(
-                f"{self._path}: no locked object begins at byte {offset} ({error}); expected the "
-                "file as it was frozen. Restore it."
-            ) from error
+        place = f"{self._path}: row at byte {offset}"
+        return read_json(line, LockedObject, place)

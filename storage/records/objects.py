@@ -5,7 +5,6 @@
 """
 
 import dataclasses
-import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from storage.atomic import write_atomically
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
+from storage.typed_json import read_json_lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,13 +123,7 @@ def read_objects_lock(path: Path) -> list[LockedObject]:
 
 def decode_objects_lock(data: bytes, place: str) -> list[LockedObject]:
     """Return the objects of the bytes of a lock; raises as `read_objects_lock`, naming `place`."""
-    objects = []
-    for number, line in enumerate(data.splitlines(), start=1):
-        try:
-            objects.append(LockedObject(**json.loads(line)))
-        except (TypeError, ValueError) as error:
-            raise TrilightError(f"{place}:{number}: not a locked object ({error}).") from error
-    return objects
+    return read_json_lines(data, LockedObject, place)
 
 
 def encode_failures(failures: Iterable[Failure]) -> bytes:
@@ -144,10 +138,7 @@ def decode_failures(data: bytes) -> list[Failure]:
     Raises:
         TrilightError: a line is not a failure.
     """
-    try:
-        return [Failure(**json.loads(line)) for line in data.splitlines()]
-    except (TypeError, ValueError) as error:
-        raise TrilightError(f"failures.jsonl: a line is not a failure ({error}).") from error
+    return read_json_lines(data, Failure, "failures.jsonl")
 
 
 def read_failures(path: Path) -> list[Failure]:
@@ -171,6 +162,12 @@ def _lines(rows: Iterable[LockedObject | Failure]) -> bytes:
 
 
 def _record(row: LockedObject | Failure) -> dict[str, Any]:
-    """Return a row as JSON values; locks of objects alone know no kinds, as before."""
-    record = dataclasses.asdict(row)
-    return {name: value for name, value in record.items() if (name, value) != ("kind", OBJECT)}
+    """Return a row as JSON values; locks of objects alone know no kinds, as before.
+
+    Lone surrogates, which texts from outside may hold and UTF-8 does not, become `?`.
+    """
+    return {
+        name: value.encode(errors="replace").decode() if isinstance(value, str) else value
+        for name, value in dataclasses.asdict(row).items()
+        if (name, value) != ("kind", OBJECT)
+    }

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
-from storage.errors import TrilightError
+from storage.errors import Unreadable
 from storage.remote.tries import PATIENCE, Interrupted, Pace, TransferFailed, with_tries
 from storage.remote.url import RemoteUrl, shared_driver, transfer_timeout
 
@@ -180,10 +180,10 @@ def _start_over(stream: BinaryIO) -> None:
     stream.truncate()
 
 
-def unreadable(url: RemoteUrl, error: TransferFailed) -> TrilightError:
+def unreadable(url: RemoteUrl, error: TransferFailed) -> Unreadable:
     """Return the user's view of a file that cannot be read."""
     hint = " Public buckets need FSSPEC_S3_ANON=true." if url.scheme == "s3" else ""
-    return TrilightError(
+    return Unreadable(
         f"{url.what} {url.shown!r}: cannot be read ({error.message}); expected a file that can be "
         f"reached. Check the URL and your access to it.{hint}"
     )

@@ -30,12 +30,19 @@ def json_or_word(text: str) -> Any:
     """Return the JSON value that a text is, or the text: what a person writes as a value.
 
     Words in a list need no quotes either: [depth,normal].
+
+    Raises:
+        TrilightError: a number of thousands of digits, or values nested hundreds deep.
     """
     try:
         return json.loads(text)
     except json.JSONDecodeError:
         listed = _LIST_OF_WORDS.fullmatch(text)
         return text if listed is None else [word.strip() for word in listed[1].split(",")]
+    except (ValueError, RecursionError) as error:
+        raise TrilightError(
+            f"{text:.40}... has too many digits or is nested too deeply; expected a value."
+        ) from error
 
 
 def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:

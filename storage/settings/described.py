@@ -16,6 +16,7 @@ import dataclasses
 import functools
 import inspect
 import json
+import reprlib
 import textwrap
 import types
 import typing
@@ -38,6 +39,11 @@ _RULES = pydantic.ConfigDict(
     allow_inf_nan=False,
     arbitrary_types_allowed=True,
 )
+
+_SHORT = reprlib.Repr()
+"""Shows wrong values, the long and deep ones in part."""
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 200
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 20
 
 _KINDS = {bool: "true or false", str: "a text", int: "a whole number", float: "a number"}
 
@@ -153,7 +159,8 @@ def expected_of(hint: Any) -> str:
     """Return what a value of a type without a range looks like, for a person."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        return expected_of(args[0])
+        stated = (getattr(note, "expected", "") for note in args[1:])
+        return next(filter(None, stated), "") or expected_of(args[0])
     if origin is Literal:
         *others, last = map(str, args)
         return f"{', '.join(others)} or {last}" if others else last
@@ -218,6 +225,20 @@ def _read(hint: Any, value: Any) -> Any:
     return _adapter(hint).validate_json(json.dumps(value))
 
 
+def strict_adapter(kind: Any) -> "pydantic.TypeAdapter[Any]":
+    """Return the strict reader of a type that is made of plain dataclasses; it takes null too."""
+    # pydantic takes rules for a union, and hands them on to the plain dataclasses in it
+    return pydantic.TypeAdapter(kind | None, config={"extra": "forbid", "strict": True})
+
+
+def read_error(error: ValueError, kind: Any, source: str) -> TrilightError:
+    """Return the complaint of a value of JSON that was read; `source` begins it."""
+    assert isinstance(error, pydantic.ValidationError)
+    complaint = _complaint(error, kind, called=source, option=str)
+    told = str(complaint)
+    return complaint if told.startswith(source) else TrilightError(f"{source}: {told}")
+
+
 @functools.cache
 def _hints(kind: type) -> Mapping[str, Any]:
     return typing.get_type_hints(kind, include_extras=True)
@@ -257,11 +278,15 @@ def _complaint(
     if isinstance(law, TrilightError):
         return law
     where = f"{called}: " if called else ""
+    if first["type"] == "json_invalid":
+        what = f"{option(within[1])} is" if within else "all of it is"
+        why = first["ctx"]["error"]
+        return TrilightError(f"{where}{what} not JSON ({why}); expected it as it was written.")
     steps = [str(step) for step in first["loc"]]
     shown, holder, field = _place([within[0], *steps] if within else steps, kind)
     if within:
         shown[0] = within[1]
-    place = option(".".join(shown))
+    place = option(".".join(shown)) if shown else "all of it"
     if first["type"] in ("unexpected_keyword_argument", "unexpected_property"):
         if steps[-1] in removed_fields(holder):
             return TrilightError(removal_message(f"{where}{place}"))
@@ -270,7 +295,7 @@ def _complaint(
     expected = field.expected if field else expected_of(holder)
     if first["type"].startswith("missing"):
         return TrilightError(f"{where}{place} is missing; expected {expected}.")
-    return TrilightError(f"{where}{place} is {first['input']!r}; expected {expected}.")
+    return TrilightError(f"{where}{place} is {_SHORT.repr(first['input'])}; expected {expected}.")
 
 
 def _place(steps: Sequence[str], kind: type) -> tuple[list[str], type, Described | None]:
@@ -283,7 +308,8 @@ def _place(steps: Sequence[str], kind: type) -> tuple[list[str], type, Described
             continue
         if len(groups) == 1 and not step.isdigit():
             (holder,) = groups.values()
-        field = {each.name: each for each in described(holder)}.get(step, field)
+        fields = described(holder) if group_of(holder) else ()
+        field = {each.name: each for each in fields}.get(step, field)
         shown.append(step)
     return shown, holder, field
 

@@ -108,7 +108,7 @@ DAMAGES: dict[str, tuple[str, bytes | None]] = {
     "FileNotFoundError": ("train-000009.tar", b""),
     "train-000000.tar": ("train-000000.tar", b"half"),
     "train-000000.tar is listed and not there": ("train-000000.tar", None),
-    "not a readable manifest": ("manifest.json", b"{"),
+    "manifest.json: all of it is not JSON": ("manifest.json", b"{"),
     "JSONDecodeError": ("failures.jsonl", b'{"stage"'),
 }
 """What must never be seen, by what the watcher says of it: a file, and its bytes, if any."""

@@ -18,7 +18,7 @@ from storage.removed import LAST_COMMIT
 from storage.settings.described import settings_record
 from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run
-from train.going_on import GoingOn, event_records, events_of, going_on
+from train.going_on import GoingOn, event_records, going_on
 from train.runs import RUNS, changed_run, in_proportion, named_run
 from train.settings import AugmentationSettings, TrainSettings
 from train.stored_settings import known_settings, stored_settings
@@ -223,9 +223,7 @@ def test_a_rate_that_rises_again_is_said() -> None:
     assert not any("falling" in note for note in early.notes)
 
 
-def test_unknown_runs_and_histories_that_are_none_are_refused() -> None:
-    with pytest.raises(TrilightError, match="history of the run is not readable"):
-        events_of([{"when": 3}])
+def test_unknown_runs_are_refused() -> None:
     message = "'smoek': no such run; did you mean smoke.* builtin, fine"
     with pytest.raises(TrilightError, match=message):
         named_run("smoek")

@@ -12,10 +12,11 @@ import heapq
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
+from storage.settings.ranges import FLOAT32_MAX, Within
 from train.data.order import Place
 
 if TYPE_CHECKING:
@@ -33,15 +34,19 @@ class Mixture:
     """Of the datasets, in their order."""
     names: tuple[str, ...]
     """What they are called."""
-    weights: tuple[float, ...]
+    weights: Annotated[tuple[float, ...], Within(0, FLOAT32_MAX, low_open=True)]
     """Scenes of each, in proportion."""
-    first: int = 0
+    first: Annotated[int, Within(0, 2**63 - 1, unit="scenes")] = 0
     """Position of the stream from which this holds: 0, or where the run's data, weights or batch
     were changed."""
-    before: tuple[int, ...]
+    before: Annotated[tuple[int, ...], Within(0, 2**63 - 1, unit="scenes")]
     """Scenes of each that the run had been shown until then."""
-    scenes_per_step: int
+    scenes_per_step: Annotated[int, Within(1, 10**9, unit="scenes")]
     """Scenes of a global batch."""
+
+    def __post_init__(self) -> None:
+        if len({len(self.digests), len(self.names), len(self.weights), len(self.before)}) > 1:
+            raise TrilightError("mixture: expected as many names, weights and counts as digests.")
 
     def taken(self, position: int) -> tuple[int, ...]:
         """Return how many scenes of each the stream has shown before a position, `first` or later.

@@ -7,13 +7,13 @@ sha256 of itself, because safetensors would not notice a weight that a disk chan
 """
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors.torch import save
@@ -23,18 +23,22 @@ from model.open import FoundNetwork
 from model.renderformer import RenderFormer
 from model.weights import TrainedRange, decode_config, encode_config, load_tensors, read_metadata
 from storage.atomic import atomic_writer, remove_leftovers
+from storage.digests import seal_of
 from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
 from storage.records.safe_read import read_plain, read_safetensors
-from train.data.mixture import RECORD
+from storage.settings.described import from_record
+from storage.settings.ranges import Within
+from storage.typed_json import FINITE, Sha256, read_json
+from train.data.mixture import RECORD, Mixture
 from train.folder import RunFolder
-from train.going_on import GoingOn, event_records
+from train.going_on import Event, GoingOn, event_records
 from train.loop.crew import Crew
 from train.loop.schedule import decay_begins
 from train.loop.state import TrainState, new_state
 from train.loop.step import StepReport
 from train.settings import Precision, TrainSettings
-from train.stored_settings import stored_settings
+from train.stored_settings import known_settings, stored_settings
 
 PREFIX, SUFFIX = "step-", ".safetensors"
 """Names of the files, around the number of the step."""
@@ -46,6 +50,36 @@ products."""
 
 UNSEALED = "0" * 64
 """Placeholder for the sha256 while it is computed. Old checkpoints have no sha256."""
+
+
+Steps = Annotated[int, Within(0, 10**12, unit="steps")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Header:
+    """Header of a checkpoint, as `_encoded` writes it; older ones lack what has a default."""
+
+    step: Steps
+    skipped_steps: Steps
+    skipped_in_a_row: Steps = 0
+    unusable: Mapping[str, Annotated[int, Within(0, 10**9, unit="samples")]]
+    reports: tuple[StepReport, ...] = ()
+    settings: Annotated[Mapping[str, Any], FINITE]
+    model: str
+    data_digest: str
+    mixture: Mixture | None = None
+    history: tuple[Event, ...] = ()
+    world_size: Annotated[int, Within(1, 10**6, unit="processes")]
+    threads: Annotated[int, Within(1, 10**6, unit="threads")] | None = None
+    muon_precision: Precision | None = None
+    extensions: Mapping[str, Sha256] = dataclasses.field(default_factory=dict)
+    sha256: Sha256 | None = None
+
+    def __post_init__(self) -> None:
+        if self.skipped_steps > self.step:
+            raise TrilightError(
+                f"skipped_steps is {self.skipped_steps}; expected at most the {self.step} of step."
+            )
 
 
 def save_checkpoint(
@@ -87,9 +121,10 @@ def _encoded(
 
 
 def _write_sealed(path: Path, data: bytes) -> None:
-    before, after = _around(data, UNSEALED)
+    start, view = data.index(UNSEALED.encode()), memoryview(data)
+    seal = seal_of(data, UNSEALED).encode()
     with atomic_writer(path) as stream:
-        for part in (before, _seal(before, after).encode(), after):
+        for part in (view[:start], seal, view[start + len(seal) :]):
             stream.write(part)
 
 
@@ -121,27 +156,18 @@ def read_checkpoint(path: Path) -> Checkpoint:
         arrays, metadata = read_safetensors(data)
         if not is_checkpoint(metadata):
             raise TrilightError("it belongs to no run; expected one that `trilight train` wrote")
-        header = json.loads(metadata[HEADER_KEY])
-        if "sha256" in header and header["sha256"] != _seal(*_around(data, header["sha256"])):
+        seal = read_json(metadata[HEADER_KEY], _Header, "its header").sha256
+        if seal and seal_of(data, seal) != seal:
             raise TrilightError("its bytes are not those that were written")
-    except (OSError, ValueError, TypeError, TrilightError) as error:
+        for name, array in arrays.items():
+            is_weight = name.startswith(("model/", "mean/"))
+            if is_weight and not (array.dtype == np.float32 and np.isfinite(array).all()):
+                raise TrilightError(f"{name} is {array.dtype}; expected finite float32 numbers")
+    except (OSError, ValueError) as error:
         raise TrilightError(
             f"checkpoint {path} is not readable: {str(error).rstrip('.')}."
         ) from error
-    return Checkpoint(header=header, arrays=arrays)
-
-
-def _around(data: bytes, sha256: str) -> tuple[memoryview, memoryview]:
-    """Return what stands before and after the place of the sha256, which is in the header."""
-    start = data.index(sha256.encode())
-    view = memoryview(data)
-    return view[:start], view[start + len(UNSEALED) :]
-
-
-def _seal(before: memoryview, after: memoryview) -> str:
-    digest = hashlib.sha256(before)
-    digest.update(after)
-    return digest.hexdigest()
+    return Checkpoint(header=json.loads(metadata[HEADER_KEY]), arrays=arrays)
 
 
 def resumed_state(
@@ -310,10 +336,11 @@ def network_of_run(path: Path) -> FoundNetwork | None:
     if not is_checkpoint(read_metadata(path)):
         return None
     checkpoint = read_checkpoint(path)
-    settings = checkpoint.header["settings"]
+    stored = known_settings(checkpoint.header["settings"], f"checkpoint {path}")
+    settings = from_record(TrainSettings, stored)
     return FoundNetwork(
         path=path,
-        trained=TrainedRange(resolution=int(settings["resolution"])),
-        any_width=settings["model"].get("view_stage") == "hits",
+        trained=TrainedRange(resolution=settings.resolution),
+        any_width=settings.model.view_stage == "hits",
         open=checkpoint.network,
     )

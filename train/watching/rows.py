@@ -1,10 +1,11 @@
 """Reads metrics.jsonl: one JSON object a line."""
 
-import json
 from pathlib import Path
 from typing import Any
 
+from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
+from storage.typed_json import read_json_lines
 
 LAYER_COLUMNS = ("grad_norm", "weight_norm", "update_ratio")
 """What a row tells of a layer: length of its gradient before clipping, length of its weights, and
@@ -12,8 +13,15 @@ how far the update moved them as a share of that length."""
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Return the whole rows of a log; a missing file has none."""
+    """Return the rows of a log, each with its `step`; a missing file has none.
+
+    Raises:
+        TrilightError: a line before the last is no such row; of the last, a kill may have cut it.
+    """
     if not path.exists():
         return []
-    whole_lines = read_plain(path).decode().split("\n")[:-1]
-    return [json.loads(line) for line in whole_lines]
+    rows = read_json_lines(read_plain(path), dict[str, Any], str(path), torn_end=True)
+    for number, row in enumerate(rows, start=1):
+        if not isinstance(row.get("step"), int):
+            raise TrilightError(f"{path}:{number}: step is {row.get('step')!r}; expected a number.")
+    return rows

@@ -332,6 +332,9 @@ WRONG: dict[str, tuple[str, str]] = {
     "a: [{b: 1, b: 2}]\n": ("line 1", "a name is given twice"),
     "seed: 1\nrenders:\n  resolution: wide\n": ("line 3", "'renders.resolution' is 'wide'"),
     "seeed: 1\n": ("line 1", "did you mean seed?"),
+    "a: &a [1, 1]\nb: [*a, *a]\n": ("line 2", "an alias; expected the value itself"),
+    "seed: &a [*a]\n": ("line 1", "an alias"),
+    f"seed: {'9' * 10_000}\n": ("line 1", "seed: 9999"),
 }
 
 
@@ -344,6 +347,11 @@ def test_what_is_wrong_in_a_file_is_named_with_its_line(tmp_path: Path) -> None:
                 line, problem = WRONG[text]
                 assert told.startswith(f"{file}, {line}: ")
                 assert problem in told
+    deep = _file(tmp_path, "seed: " + "[" * 20_000)
+    told = trilight(["plan", "smoke", "--settings", deep]).mistake
+    assert told.startswith(f"--settings {deep}: nested too deeply")
+    for value in ("9" * 10_000, "[" * 50_000, "[" * 500 + "]" * 500):
+        assert "seed" in trilight(["plan", "smoke", "--set", f"seed={value}"]).mistake
     for option in ("--settings", "--like"):
         told = trilight(["train", "smoke", option, "nowhere"]).mistake
         assert told.startswith(f"{option} nowhere: ")

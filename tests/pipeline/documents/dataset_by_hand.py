@@ -4,6 +4,7 @@ Every scene has the floor (two triangles, smooth, one material) and the light of
 per object two flat triangles of two colours, seen by two cameras.
 """
 
+import contextlib
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
@@ -14,8 +15,9 @@ import numpy as np
 
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, index_shard, write_manifest
+from storage.dataset.manifest import Manifest, index_shard, read_manifest, write_manifest
 from storage.dataset.shard import write_shard
+from storage.errors import TrilightError
 from storage.records.objects import Failure, LockedObject, write_failures, write_objects_lock
 from storage.records.sample import Sample, encode_sample, sample_key
 from storage.records.scene import Scene, SceneObject
@@ -124,7 +126,14 @@ def five_scenes(root: Path) -> Dataset:
 
 
 def edit_manifest(dataset: Dataset, **changes: Any) -> Path:
-    """Change fields of a manifest on disk, and return its folder."""
+    """Change fields of a manifest on disk, digest and totals included, and return its folder."""
     path = dataset.folder.manifest
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+    record = {**json.loads(path.read_text()), **changes}
+    record.pop("manifest_sha256", None)
+    path.write_text(json.dumps(record))
+    with contextlib.suppress(TrilightError):
+        now = read_manifest(path)
+        totals = {"samples": now.num_samples, "bytes": now.num_bytes}
+        record |= {"dataset_digest": now.dataset_digest, "totals": totals}
+        path.write_text(json.dumps(record))
     return dataset.folder.root

@@ -308,6 +308,7 @@ def test_text_from_outside_stays_text(tmp_path: Path) -> None:
     objects = read_objects_lock(lock)
     for value in HOSTILE:
         write_objects_lock(lock, [*objects, locked("z", value, title=value)])
+        value = value.encode(errors="replace").decode()
         hostile = {**settings, "source": value, "seed": [value]}
         edit_manifest(dataset, build=value, settings=hostile, environment={"processor": value})
         front, body = card_of(open_dataset(str(tmp_path)))

@@ -17,7 +17,8 @@ from pipeline.documents.chosen import Chosen, choose_scenes
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sums import SUMS, published_files, renew_sums, stale_sums, write_sums
 from storage.dataset.dataset import Dataset
-from storage.dataset.manifest import ShardEntry
+from storage.dataset.manifest import ShardEntry, read_manifest
+from storage.digests import sha256_of_file
 from storage.errors import TrilightError
 from tests.pipeline.documents.dataset_by_hand import five_scenes
 from tests.pipeline.documents.rows_by_hand import row
@@ -45,6 +46,9 @@ def test_documents_that_are_written_again_have_their_sums(tmp_path: Path) -> Non
     write_sums(root)
     write_documents(dataset)
     assert checked(root) == [] == stale_sums(root)
+    vouched = ("LICENSE.md", "README.md", "attribution.csv", "croissant.json")
+    documents = read_manifest(dataset.folder.manifest).documents
+    assert documents == {name: sha256_of_file(root / name) for name in vouched}
     names = {line.partition("  ")[2] for line in (root / SUMS).read_text().splitlines()}
     assert names == {p.relative_to(root).as_posix() for p in published_files(root)} - {SUMS}
 

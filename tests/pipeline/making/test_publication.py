@@ -1,7 +1,6 @@
 """A dataset is begun once, refuses to become another, and grows without changing what is there."""
 
 import dataclasses
-import json
 from pathlib import Path
 
 import pytest
@@ -28,7 +27,7 @@ from storage.errors import TrilightError
 from storage.records.objects import Failure, LockedObject, read_failures
 from storage.records.sample import Sample, sample_key
 from tests.for_each import for_each
-from tests.pipeline.documents.dataset_by_hand import edit_manifest, locked
+from tests.pipeline.documents.dataset_by_hand import locked
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 ENVIRONMENT = {"mitsuba_variant": "llvm_ad_rgb", "libraries": {"mitsuba": "3.9.1"}}
@@ -295,19 +294,6 @@ def test_staged_scenes_and_built_in_objects_stand_in_parts(tmp_path: Path) -> No
     assert len({entry.uid for entry in objects}) == 30
     assert all("part" not in entry.uid for entry in objects)
     assert _most_entries(tmp_path) == 2
-
-
-@for_each(
-    "name",
-    ["../train-000000.tar", "part-0001/../train-000000.tar", "/train-000000.tar",
-     "part-1/train-000000.tar", "a/train-000000.tar", "part-0001/part-0001/train-000000.tar"],
-)  # fmt: skip
-def test_a_manifest_that_names_a_file_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
-    publication: Publication = _dataset(tmp_path, scenes=4)
-    shards = json.loads(publication.folder.manifest.read_text())["shards"]
-    root = edit_manifest(open_dataset(str(tmp_path)), shards=[{**shards[0], "name": name}])
-    with pytest.raises(TrilightError, match="shard name"):
-        open_dataset(str(root))
 
 
 def test_two_workers_are_kept_apart(tmp_path: Path) -> None:

@@ -5,19 +5,22 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.manifest import index_shard, write_manifest
+from storage.dataset.manifest import index_shard, read_manifest, write_manifest
 from storage.dataset.shard import write_shard
 from storage.dataset.verify import Verification, verify_dataset
-from storage.digests import sha256_hex
+from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.records.map_references import map_member
 from storage.records.packed_maps import pack_environment, pack_texture
 from storage.records.sample import encode_sample, sample_key
+from storage.seeds import rng_for
+from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes, write_dataset
 from tests.storage.dataset.test_shard import TRAIN, four_samples
 from tests.textured_by_hand import colour_texture, number_texture, sky, textured_sample
@@ -101,7 +104,7 @@ def test_the_lock_is_compared(
     else:
         path.write_bytes(lock(path.read_bytes()))
     found = verify_dataset(dataset.folder.root, fast=fast)
-    assert f"objects.lock.jsonl: {fault}" in found.problems, found.problems
+    assert found.problems == [f"objects.lock.jsonl: {fault}"] and not found.bad_shards
 
 
 @pytest.mark.parametrize("fast", [False, True])
@@ -122,6 +125,55 @@ def test_sizes_counts_and_members_are_compared(dataset: Dataset, fast: bool) -> 
     assert f"{shards[1]['name']}: not a readable shard (a header at byte 0)" in text
     assert f"{shards[2]['name']}: missing" in text
     assert "train-000007.tar: not in the manifest" in text
+
+
+def test_every_flipped_bit_beside_the_shards_is_found(tmp_path: Path) -> None:
+    folder = opened(five_scenes(tmp_path)).folder
+    for path in (folder.attribution, folder.licences, folder.croissant, folder.card):
+        path.write_text("\u00e9 1e-05")
+    manifest = read_manifest(folder.manifest)
+    names = ("LICENSE.md", "README.md", "attribution.csv", "croissant.json")
+    documents = {name: sha256_of_file(tmp_path / name) for name in names}
+    environment = {"host": "\u00e9", "least": 1e-05}
+    manifest = dataclasses.replace(manifest, environment=environment, documents=documents)
+    write_manifest(folder.manifest, manifest)
+    assert verify_dataset(tmp_path, fast=True).problems == []
+    rng = rng_for(1, "flipped bits")
+    for name, count in {"manifest.json": 300, **dict.fromkeys(names, 8)}.items():
+        data = (tmp_path / name).read_bytes()
+        for bit in map(int, rng.integers(8 * len(data), size=count)):
+            flipped = bytearray(data)
+            flipped[bit // 8] ^= 1 << bit % 8
+            (tmp_path / name).write_bytes(flipped)
+            try:
+                found = verify_dataset(tmp_path, fast=True).problems
+            except TrilightError as error:
+                found = [str(error)]
+            assert found and "\n" not in "".join(found), (name, bit)
+        (tmp_path / name).write_bytes(data)
+    folder.card.unlink()
+    assert verify_dataset(tmp_path).problems == ["README.md: missing"]
+
+
+LIES: dict[str, Callable[[dict[str, Any]], object]] = {
+    "dataset_digest is 0+; its shards": lambda record: record.update(dataset_digest="0" * 64),
+    "settings have": lambda record: record["settings"].update(seed=999),
+    "totals are .*samples=7": lambda record: record["totals"].update(samples=7),
+    "is listed 2 times": lambda record: record["shards"].append(record["shards"][0]),
+}
+
+
+@for_each("fault, lie", LIES.items())
+def test_a_manifest_that_contradicts_itself_is_a_fault(
+    tmp_path: Path, fault: str, lie: Callable[[dict[str, Any]], object]
+) -> None:
+    """Also one of before there was a seal."""
+    path = opened(five_scenes(tmp_path)).folder.manifest
+    record = json.loads(path.read_bytes())
+    lie(record)
+    path.write_text(json.dumps(record))
+    problems = verify_dataset(tmp_path).problems
+    assert any(re.search(f"manifest.json: .*{fault}", problem) for problem in problems), problems
 
 
 @pytest.mark.parametrize("renders", [None, 3, {}])

@@ -60,7 +60,7 @@ def test_every_row_is_found_by_its_uid(tmp_path: Path, count: int) -> None:
 
 def test_a_lock_that_is_none_is_refused(tmp_path: Path) -> None:
     (tmp_path / "lock").write_bytes(b'{"uid": "a"}\n')
-    with pytest.raises(TrilightError, match="no locked object begins at byte 0"):
+    with pytest.raises(TrilightError, match="lock: row at byte 0: title is missing"):
         LockRows(tmp_path / "lock").find("a")
     with pytest.raises(TrilightError, match="cannot be read"):
         LockRows(tmp_path / "none")

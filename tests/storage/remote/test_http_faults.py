@@ -17,6 +17,7 @@ import pytest
 
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.shard_places import listed_shards
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.remote import tries
 from storage.remote import url as remote_url
@@ -95,6 +96,25 @@ def test_what_stays_broken_is_named(server: Site, cache: Path, fault: Fault, mes
     assert "s3cret" not in text and "ada" not in text and "pa55" not in text
     assert not list(cache.iterdir()), "nothing is left, under any name"
     assert server.gets()[PATH] == {403: 1, 404: 1, 500: 5}.get(fault.status, 2 if fault.flip else 5)
+
+
+@pytest.mark.usefixtures("cache")
+def test_advice_to_delete_is_given_for_what_was_read_and_found_wrong_only(
+    server: Site, local: Dataset
+) -> None:
+    server.always[PATH] = Fault(no_length=True)
+    assert verify_dataset(server.url).problems == []
+    unread = verify_dataset(server.url, fast=True)
+    assert unread.problems == [f"{SHARD}: its server states no size"]
+    server.always[PATH] = Fault(status=500)
+    slow = verify_dataset(server.url)
+    assert len(slow.problems) == 1 and "cannot be read" in slow.problems[0]
+    assert [*unread.bad_shards, *slow.bad_shards] == []
+    server.always[PATH] = Fault(flip=True)
+    assert verify_dataset(server.url).bad_shards == [SHARD]
+    del server.always[PATH]
+    (local.folder.root / SHARD).unlink()
+    assert verify_dataset(server.url).problems == [f"{SHARD}: missing"]
 
 
 def test_a_shard_of_another_size_is_named_at_once(server: Site, local: Dataset) -> None:

@@ -11,11 +11,14 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import save as save_tensors
 
 from model.neural_renderer import NeuralRenderer
 from model.open import find_network, open_network
 from model.weights import encode_weights
+from storage.digests import seal_of
 from storage.errors import TrilightError
+from storage.records.safe_read import read_safetensors
 from storage.settings.described import from_record, settings_record
 from tests.conftest import ROOT
 from tests.extensions_kit import EXAMPLES, loaded, written
@@ -27,6 +30,8 @@ from train.data.scenes import training_scene
 from train.folder import RunFolder
 from train.going_on import going_on
 from train.loop.checkpoints import (
+    HEADER_KEY,
+    UNSEALED,
     keep_checkpoint,
     network_of_run,
     path_of_step,
@@ -152,6 +157,34 @@ def test_a_damaged_newest_one_is_named_and_the_one_before_it_is_used(
         resumed_checkpoint(tmp_path, ALONE, pytest.fail)
     for step in (4, 8, 12):
         assert f"{path_of_step(tmp_path, step)} is not readable" in str(caught.value)
+
+
+def reseal(path: Path, **changes: object) -> None:
+    """Change the header of a checkpoint, or its weights to NaN, and seal it as its writer does."""
+    arrays, metadata = read_safetensors(path.read_bytes())
+    weights = {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
+    if changes.pop("nan", False):
+        next(iter(weights.values())).fill_(torch.nan)
+    header = json.loads(metadata[HEADER_KEY]) | changes
+    data = save_tensors(weights, metadata={HEADER_KEY: json.dumps(header | {"sha256": UNSEALED})})
+    path.write_bytes(data.replace(UNSEALED.encode(), seal_of(data, UNSEALED).encode()))
+
+
+@for_each(
+    "lie",
+    [{"step": "8"}, {"step": -1}, {"step": 10**13}, {"unusable": [1]}, {"unusable": {"a": -1}},
+     {"settings": None}, {"model": None}, {"reports": [{"a": 1}]}, {"history": [{"a": 1}]},
+     {"world_size": -1}, {"extensions": {"evil.py": 1}}, {"skipped_steps": 9},
+     {"skipped_steps": -5}, {"evil": 1}, {"mixture": {}}, {"nan": True}],
+)  # fmt: skip
+def test_a_sealed_lie_is_passed_over(tmp_path: Path, lie: dict[str, object]) -> None:
+    keep(tmp_path, 4, 8)
+    reseal(path_of_step(tmp_path, 8))
+    assert resumed_checkpoint(tmp_path, ALONE, pytest.fail).header["step"] == 8
+    reseal(path_of_step(tmp_path, 8), **lie)
+    notes: list[str] = []
+    assert resumed_checkpoint(tmp_path, ALONE, notes.append).header["step"] == 4
+    assert len(notes) == 1 and f"{path_of_step(tmp_path, 8)} is not readable: " in notes[0]
 
 
 def test_a_damaged_later_one_takes_nobodys_place(tmp_path: Path) -> None:
@@ -307,8 +340,8 @@ def test_the_log_is_cut_back_to_the_checkpoint(tmp_path: Path) -> None:
     log = MetricsLog(path, first_step=0)
     for step in (2, 4, 6):
         log.append({"step": step, "loss": 1.0 / step})
-    with path.open("a") as stream:
-        stream.write('{"step": 8, "lo')
+    with path.open("ab") as stream:
+        stream.write(b'{"step": 8, "lo\xff\xff')
     MetricsLog(path, first_step=4)
     assert [row["step"] for row in read_rows(path)] == [2, 4]
 

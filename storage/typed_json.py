@@ -1,0 +1,116 @@
+"""Typed reading of JSON that Trilight wrote: a wrong type or number is one sentence.
+
+    note = read_json(data, ShardNote, "train-000003.tar.json")
+
+The type is a dataclass, or made of dataclasses; ranges and spellings are notes at its fields
+(`Within`, `Spelled`, `FINITE`). Numbers of 5,000 digits, depth and unknown fields are refused too.
+"""
+
+import functools
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeVar, cast
+
+from storage.errors import TrilightError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Spelled:
+    """Spelling of a whole text."""
+
+    pattern: str
+    """Regular expression that matches all of it."""
+    expected: str
+    """What to write, for a person."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Let pydantic check the spelling with the type."""
+        from pydantic_core import core_schema
+
+        return core_schema.str_schema(pattern=rf"(?s)\A(?:{self.pattern})\z", strict=True)
+
+
+@dataclass(frozen=True)
+class Finite:
+    """Law of any JSON value: no NaN and no infinity in it."""
+
+    expected: str = "JSON values with finite numbers"
+    """What to write, for a person."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Let pydantic look for such numbers after the type."""
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_after_validator_function(self._require, handler(source))
+
+    def _require(self, value: Any) -> Any:
+        json.dumps(value, allow_nan=False)
+        return value
+
+
+class Dropped:
+    """Note at a field whose JSON is read and not kept."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Let pydantic take anything, for None."""
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_plain_validator_function(lambda value: None)
+
+
+DROPPED, FINITE = Dropped(), Finite()
+Sha256 = Annotated[str, Spelled("[0-9a-f]{64}", "64 hexadecimal digits")]
+ShortText = Annotated[str, Spelled(".{0,1000}", "a text of at most 1000 characters")]
+
+
+def read_json(data: bytes | str, kind: type[T], source: str) -> T:
+    """Return the value of a JSON text, checked strictly.
+
+    Args:
+        data: the text; bytes are UTF-8.
+        kind: its type.
+        source: begins the complaint, such as the path of the file.
+
+    Raises:
+        TrilightError: other JSON than the type says; names source, field, value and what was
+            expected.
+    """
+    hint: Any = kind
+    try:
+        value = _reader_of(hint)(data)
+    except ValueError as error:
+        from storage.settings.described import read_error  # pydantic takes time to import
+
+        raise read_error(error, kind, source) from None
+    if value is None:
+        raise TrilightError(f"{source}: null; expected the file as it was written.")
+    return cast(T, value)
+
+
+def read_json_lines(data: bytes, kind: type[T], source: str, *, torn_end: bool = False) -> list[T]:
+    """Return the values of lines of JSON; raises as `read_json`, naming the line.
+
+    Args:
+        data: the lines.
+        kind: type of each.
+        source: the file, for messages.
+        torn_end: leave out a last line that a kill has cut.
+    """
+    lines, rows = data.splitlines(), list[T]()
+    for number, line in enumerate(lines, start=1):
+        try:
+            rows.append(read_json(line, kind, f"{source}:{number}"))
+        except TrilightError:
+            if not torn_end or number < len(lines) or data.endswith(b"\n"):
+                raise
+    return rows
+
+
+@functools.cache
+def _reader_of(kind: Any) -> Callable[[bytes | str], Any]:
+    from storage.settings.described import strict_adapter
+
+    return strict_adapter(kind).validate_json
