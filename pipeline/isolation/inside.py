@@ -1,5 +1,6 @@
 """What happens inside a child: it keeps its limits, answers calls, and dies with its owner."""
 
+import contextlib
 import ctypes
 import fcntl
 import math
@@ -48,14 +49,33 @@ def _die_with_owner() -> None:
         os._exit(1)
 
 
-def serve(connection: Connection, memory_bytes: int, cpu_s: int | None) -> None:
+def _close_what_is_inherited(connection: Connection, words: Connection) -> None:
+    """Leave of the files of the owner and its servers the connection, and a pipe for words.
+
+    So a child has no terminal, and a fork server that no child holds open ends with its owner.
+    """
+    owner = multiprocessing.parent_process()
+    assert owner is not None
+    with open(os.devnull, "rb") as nothing:
+        os.dup2(nothing.fileno(), 0)
+    for standard in (1, 2):
+        os.dup2(words.fileno(), standard)
+    kept = {0, 1, 2, connection.fileno(), owner.sentinel}
+    for file in set(map(int, os.listdir("/dev/fd"))) - kept:
+        with contextlib.suppress(OSError):  # the listing's own is closed
+            os.close(file)
+
+
+def serve(connection: Connection, words: Connection, memory_bytes: int, cpu_s: int | None) -> None:
     """Answer calls until the owner closes the connection; ignores Ctrl-C: the owner decides.
 
     Args:
         connection: to the owner.
+        words: takes what is printed here.
         memory_bytes: most address space.
         cpu_s: most processor seconds of one call, or None for no limit.
     """
+    _close_what_is_inherited(connection, words)
     _die_with_owner()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -67,7 +87,8 @@ def serve(connection: Connection, memory_bytes: int, cpu_s: int | None) -> None:
     while True:
         try:
             # our owner's own words, which are trusted; of ours it trusts none
-            function, args = ForkingPickler.loads(receive(file, wait_forever, sys.maxsize))
+            (asked,) = receive(file, wait_forever, sys.maxsize)
+            function, args = ForkingPickler.loads(asked.data)
         except EOFError:
             os._exit(0)  # the parent has died: skip the destructors of native libraries
         _allow_cpu(cpu_s)
@@ -85,7 +106,7 @@ def _allow_cpu(seconds: int | None) -> None:
 
 def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> list[bytes | memoryview]:
     try:
-        return encode_result(function(*args), function)
+        return encode_result(function(*args))
     except Rejected as rejection:
         return encode_error("rejected", rejection.reason, rejection.message)
     except EnvironmentFailure as failure:

@@ -1,9 +1,12 @@
 """A child that a file has taken over, or that dies: its tries are refused, its end is judged."""
 
 import os
+import shutil
 import signal
-import socket
-from collections.abc import Iterator
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,13 +23,17 @@ from pipeline.isolation import (
     deaths,
     is_passing,
     reach,
+    seccomp,
 )
 from pipeline.isolation.deaths import ENDS, with_retries
 from pipeline.isolation.landlock import landlock_version
-from pipeline.isolation.seccomp import _NUMBERS, _program, seccomp_works
+from pipeline.isolation.seccomp import seccomp_works
+from pipeline.making.prepare_isolated import asset_child
 from storage.errors import EnvironmentFailure, TrilightError
+from tests.conftest import ROOT
 from tests.for_each import for_each
-from tests.pipeline.isolation import called
+from tests.pipeline.isolation import called, probes
+from tests.pipeline.isolation.probes import PROBES
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=20, calls_per_child=100)
 needs_landlock = pytest.mark.skipif(not landlock_version(), reason="no Landlock here")
@@ -76,25 +83,106 @@ def test_inputs_are_read_outputs_written_and_nothing_outside(
     assert (place / "in" / "file").read_text() == "in"
 
 
+WALLS = ("", "rights", "seccomp", *(f"landlock {number}" for number in (1, 2, 3, 5, 6)))
+
+
+def _holds(wall: str, by: str) -> bool:
+    """Return whether a wall is among those that hold a probe; a later Landlock holds more."""
+    kind, _, version = wall.partition(" ")
+    known = dict(each.partition(" ")[::2] for each in by.split(", "))
+    return kind in known and int(version or 0) >= int(known[kind] or 0)
+
+
+def _tried(child: IsolatedChild, place: Path, *wall: str) -> Mapping[str, bool | None]:
+    shutil.rmtree(place / "probed", ignore_errors=True)
+    (place / "probed").mkdir()
+    for name in PROBES:
+        (place / "probed" / name).write_text(name)
+    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as victim:
+        try:
+            return child.call(probes.try_all, *wall, place, victim.pid)
+        finally:
+            victim.kill()
+
+
+@pytest.fixture(scope="module")
+def let_in(place: Path) -> list[str]:
+    """Return the probes that nothing but a wall refuses to this account, on this kernel."""
+    with closing(IsolatedChild(limits=LIMITS, setup=called.nothing)) as child:
+        return [name for name, refused in _tried(child, place, "").items() if refused is False]
+
+
+@for_each("wall", WALLS[1:])
+def test_each_wall_holds_what_the_page_says_of_it_and_no_more(
+    place: Path, let_in: list[str], wall: str
+) -> None:
+    kind, _, version = wall.partition(" ")
+    if (kind == "seccomp" and not seccomp_works()) or int(version or 0) > landlock_version():
+        return  # as the page says: this kernel has none
+    with closing(IsolatedChild(limits=LIMITS, setup=called.nothing)) as child:
+        refused = _tried(child, place, wall)
+    held = {name for name in let_in if _holds(wall, PROBES[name][0])}
+    assert held <= {name for name in let_in if refused[name]}
+    if kind != "rights":  # without these the kernel itself refuses more
+        assert {name for name in let_in if refused[name]} <= held
+
+
+@needs_landlock
 @needs_seccomp
-def test_nothing_is_connected_to_and_no_program_started(child: IsolatedChild) -> None:
-    families = [int(each) for each in (socket.AF_INET, socket.AF_INET6, socket.AF_UNIX)]
-    assert child.call(called.refused_sockets, families) == families
-    _refused(child, called.start_program)
+def test_a_confined_child_is_behind_all_walls(child: IsolatedChild, place: Path) -> None:
+    refused = _tried(child, place, "")
+    walls = ("rights", "seccomp", f"landlock {landlock_version()}")
+    held = {name for name, (by, _) in PROBES.items() if any(_holds(wall, by) for wall in walls)}
+    assert {name for name, is_refused in refused.items() if is_refused} == held
+    assert child.call(called.double, 4) == 8
+    assert child.call(called.thread) != child.call(called.process_id)
 
 
-@pytest.mark.skipif(landlock_version() < 6, reason="Landlock of Linux 6.12 is needed")
-def test_no_signal_reaches_another_process(child: IsolatedChild) -> None:
-    _refused(child, called.end_process, os.getpid())
+TERMINAL = """
+from pipeline.isolation import ChildLimits, IsolatedChild, reach
+from tests.pipeline.isolation import called, probes
+limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
+child = IsolatedChild(limits=limits, setup=called.nothing, confined_to=reach())
+print("terminals:", child.call(probes.open_terminals))
+"""
 
 
+def test_a_child_has_no_terminal_and_what_it_prints_arrives_without_commands() -> None:
+    ours, theirs = os.openpty()
+    command = [sys.executable, "-c", TERMINAL]
+    subprocess.run(command, cwd=ROOT, stdin=theirs, stdout=theirs, stderr=theirs, check=True)
+    os.close(theirs)
+    shown = os.read(ours, 1 << 16).decode()
+    assert "terminals: []" in shown and "said\ufffd]0;title\ufffd" in shown
+    os.close(ours)
+
+
+OWNER = """
+import pathlib, sys
+from pipeline.isolation import ChildLimits, IsolatedChild, reach
+from tests.pipeline.isolation import called, probes
+folder = pathlib.Path(sys.argv[1])
+limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
+reached = reach(files=[folder], writes=[folder])
+child = IsolatedChild(limits=limits, setup=called.nothing, confined_to=reached)
+child.call(probes.stay, folder / "child")
+"""
+
+
+@needs_landlock
 @needs_seccomp
-@pytest.mark.skipif(os.uname().machine != "x86_64", reason="numbers of x86_64")
-@for_each("name", ["ptrace", "mount", "bpf", "unshare", "keyctl", "io_uring_setup"])
-def test_ways_around_are_refused(child: IsolatedChild, name: str) -> None:
-    assert child.call(called.call_kernel, _NUMBERS[name][0]) == 1  # EPERM
-    assert child.call(called.call_kernel, _NUMBERS[name][0] | 0x40000000) == 1  # by the second set
-    assert child.call(called.call_kernel, 39) == 0  # getpid
+def test_a_child_that_would_outlive_its_owner_does_not(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", OWNER, str(tmp_path)], cwd=ROOT) as owner:
+        said, deadline_s = tmp_path / "child", time.monotonic() + 60
+        while not said.exists() or not said.read_text():
+            assert time.monotonic() < deadline_s
+            time.sleep(0.02)
+        owner.kill()
+    process = Path(f"/proc/{said.read_text()}")
+    deadline_s = time.monotonic() + 10
+    while process.exists() and time.monotonic() < deadline_s:
+        time.sleep(0.02)
+    assert not process.exists()
 
 
 @needs_landlock
@@ -138,9 +226,8 @@ def test_what_cannot_be_had_is_said(
 ) -> None:
     monkeypatch.setenv(confinement.VARIABLE, word)
     monkeypatch.setattr(confinement, "landlock_version", lambda: 0)
-    child = confined(reach())
-    with pytest.raises(error, match=said):
-        child.call(called.double, 2)
+    with pytest.raises(error, match=said):  # at once: no child may be needed where all is cached
+        asset_child()
     monkeypatch.setenv(confinement.VARIABLE, "auto")
     assert confinement.confinement_wanted()
 
@@ -155,14 +242,42 @@ def test_very_many_folders_become_those_above_and_never_the_whole_disk() -> None
     assert Path("/") not in wide.reads
 
 
-@for_each("machine", ["x86_64", "aarch64"])
-def test_every_jump_of_the_filter_ends_at_its_last_two_steps(machine: str) -> None:
-    steps = _program(machine)
-    assert [step[0] for step in steps[-2:]] == [0x06, 0x06]
-    for at, (_, taken, other, _) in enumerate(steps[3:-2], start=3):
-        assert at + 1 + taken == len(steps) - 1
-        assert other == 0
-    assert 1 + 1 + steps[1][2] == len(steps) - 1  # another architecture
+def _decided(machine: str, call: int, *arguments: int, architecture: int | None = None) -> int:
+    """Return what the filter answers to a call, as the kernel runs it."""
+    known = seccomp._MACHINES[machine][1]
+    data = {0: call, 4: architecture or known}
+    data |= {16 + 8 * place: value & 0xFFFFFFFF for place, value in enumerate(arguments)}
+    steps, at, loaded = seccomp._program(machine, 77), 0, 0
+    passes = {0x15: int.__eq__, 0x35: int.__ge__, 0x45: int.__and__}
+    while True:
+        code, then, otherwise, value = steps[at]
+        if code == 0x06:
+            return value
+        if code == 0x20:
+            loaded = data[value]
+        at += 1 + (code != 0x20 and (then if passes[code](loaded, value) else otherwise))
+
+
+@for_each(("machine", "column"), [("x86_64", 0), ("aarch64", 1)])
+def test_the_filter_refuses_calls_by_number_and_by_argument(machine: str, column: int) -> None:
+    allow, refuse, unknown = 0x7FFF0000, 0x50001, 0x50026
+    numbers = {name: row[column] for name, row in seccomp._NUMBERS.items()}
+    by_argument = {name: row[:2][column] for name, row in seccomp._BY_ARGUMENT.items()}
+    known = [each for each in (*numbers.values(), *by_argument.values()) if each is not None]
+    assert len(set(known)) == len(known)
+    assert all(_decided(machine, each) == refuse for each in numbers.values() if each is not None)
+    assert _decided(machine, 63) == allow
+    assert _decided(machine, 63, architecture=3) == _decided(machine, 63 | 0x40000000) == refuse
+    assert _decided(machine, 435) == unknown
+    for name, arguments, answer in (
+        ("ioctl", (1, 0x5401), allow), ("ioctl", (1, 0x5412), refuse),
+        ("ioctl", (1, 0x7_0000_541C), refuse), ("fcntl", (1, 4), allow), ("fcntl", (1, 8), refuse),
+        ("kill", (77, 6), allow), ("kill", (78, 6), refuse), ("tgkill", (77, 78), allow),
+        ("prlimit64", (0,), allow), ("prlimit64", (77,), allow), ("prlimit64", (1,), refuse),
+        ("clone", (0x3D0F00,), allow), ("clone", (0x1200011,), refuse), ("prctl", (1,), refuse),
+        ("prctl", (15,), allow),
+    ):  # fmt: skip
+        assert _decided(machine, by_argument[name], *arguments) == answer, (name, arguments)
 
 
 PATIENT = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=9)
