@@ -3,7 +3,7 @@
 A child runs calls one after another, so that slow imports and compiled kernels are paid once. It
 has limits on memory and on wall time, is replaced after a number of calls, ignores Ctrl-C (the
 parent decides), and dies with its owner even if that is killed with SIGKILL while native code holds
-the child: the kernel itself watches the pipe between the two, no thread of Python is needed.
+the child: the kernel ends it with its parent, the fork server, which ends with the owner.
 """
 
 import contextlib

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast, get_args
 
-from pipeline.isolation.inside import die_with_parent
 from pipeline.isolation.landlock import give_up_privileges, landlock_version, restrict_files
 from pipeline.isolation.seccomp import refuse_calls, seccomp_works
 from storage.errors import EnvironmentFailure, TrilightError, expected_one_of
@@ -129,7 +128,6 @@ def confine(allowed: Reach, code: frozenset[Path]) -> None:
     """
     try:
         os.setsid()
-        die_with_parent()  # which ends with the owner, for no child holds it open
         if sys.platform == "linux":
             give_up_privileges()
         if landlock_version():

@@ -1,7 +1,7 @@
 """What a function declares to return, as a reader of bytes: they choose no class and no function.
 
-Known are dataclasses, numpy arrays, tuples, lists, mappings by text or int, `None`, bool, int, float,
-str, bytes, `Path`, `Literal`, unions of these, and `Any` for values of JSON.
+Known are dataclasses, numpy arrays, tuples, lists, mappings by text or int, `None`, bool, int,
+float, str, bytes, `Path`, `Literal`, unions of these, and `Any` for values of JSON.
 """
 
 import dataclasses

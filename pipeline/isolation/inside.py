@@ -1,10 +1,7 @@
 """What happens inside a child: it keeps its limits, answers calls, and dies with its owner."""
 
-import contextlib
 import ctypes
-import fcntl
 import math
-import multiprocessing
 import os
 import resource
 import signal
@@ -20,7 +17,6 @@ from pipeline.isolation.frames import receive, send, wait_forever
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 
 _PR_SET_PDEATHSIG = 1
-_F_SETSIG = 10  # Linux; Python's fcntl module does not name it
 
 
 def die_with_parent() -> None:
@@ -29,41 +25,19 @@ def die_with_parent() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _die_with_owner() -> None:
-    """Ask the kernel to kill this child when the process that owns it ends.
+def _leave_owner(connection: Connection, words: Connection) -> None:
+    """Have of all that was open in the owner and its servers nothing but the way to it.
 
-    A child's direct parent is the fork server, which lives on while it has children, so that
-    `die_with_parent` would wait forever. What ends with the owner is the sentinel pipe that
-    multiprocessing gives every child: its end sends SIGIO, which is turned into SIGKILL here.
-    Elsewhere than on Linux a child only notices its owner's end when its call returns.
+    So a child has no terminal. And the fork server, which no child holds open then, ends with the
+    owner, whatever ends that, and its children with it.
     """
-    if sys.platform != "linux":
-        return
-    owner = multiprocessing.parent_process()
-    assert owner is not None
-    sentinel = owner.sentinel
-    fcntl.fcntl(sentinel, fcntl.F_SETOWN, os.getpid())
-    fcntl.fcntl(sentinel, _F_SETSIG, signal.SIGKILL)
-    fcntl.fcntl(sentinel, fcntl.F_SETFL, fcntl.fcntl(sentinel, fcntl.F_GETFL) | os.O_ASYNC)
-    if not owner.is_alive():
-        os._exit(1)
-
-
-def _close_what_is_inherited(connection: Connection, words: Connection) -> None:
-    """Leave of the files of the owner and its servers the connection, and a pipe for words.
-
-    So a child has no terminal, and a fork server that no child holds open ends with its owner.
-    """
-    owner = multiprocessing.parent_process()
-    assert owner is not None
-    with open(os.devnull, "rb") as nothing:
-        os.dup2(nothing.fileno(), 0)
+    nothing = os.open(os.devnull, os.O_RDWR)
+    kept = {1, 2, nothing, connection.fileno()}
     for standard in (1, 2):
         os.dup2(words.fileno(), standard)
-    kept = {0, 1, 2, connection.fileno(), owner.sentinel}
     for file in set(map(int, os.listdir("/dev/fd"))) - kept:
-        with contextlib.suppress(OSError):  # the listing's own is closed
-            os.close(file)
+        os.dup2(nothing, file, inheritable=file == 0)  # closed, another file would get its number
+    die_with_parent()
 
 
 def serve(connection: Connection, words: Connection, memory_bytes: int, cpu_s: int | None) -> None:
@@ -75,8 +49,7 @@ def serve(connection: Connection, words: Connection, memory_bytes: int, cpu_s: i
         memory_bytes: most address space.
         cpu_s: most processor seconds of one call, or None for no limit.
     """
-    _close_what_is_inherited(connection, words)
-    _die_with_owner()
+    _leave_owner(connection, words)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     most = resource.getrlimit(resource.RLIMIT_AS)[1]
