@@ -222,14 +222,21 @@ def test_off_confines_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> N
     [("no", TrilightError, "auto"), ("required", EnvironmentFailure, "lacks Landlock")],
 )
 def test_what_cannot_be_had_is_said(
-    monkeypatch: pytest.MonkeyPatch, word: str, error: type[Exception], said: str
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    word: str,
+    error: type[Exception],
+    said: str,
 ) -> None:
     monkeypatch.setenv(confinement.VARIABLE, word)
     monkeypatch.setattr(confinement, "landlock_version", lambda: 0)
     with pytest.raises(error, match=said):  # at once: no child may be needed where all is cached
         asset_child()
     monkeypatch.setenv(confinement.VARIABLE, "auto")
-    assert confinement.confinement_wanted()
+    confinement._warn.cache_clear()
+    assert confinement.confinement_wanted() and confinement.confinement_wanted()
+    assert [record.getMessage().count("lacks Landlock") for record in caplog.records] == [1]
+    caplog.clear()
 
 
 def test_very_many_folders_become_those_above_and_never_the_whole_disk() -> None:
