@@ -128,7 +128,9 @@ PROBES: Mapping[str, tuple[str, Probe]] = {
 def build(wall: str, inside: Path) -> None:
     """Confine this process by one wall alone."""
     name, _, version = wall.partition(" ")
-    if name == "rights":
+    if name == "all":
+        confinement.confine(confinement.reach(files=[inside]), frozenset([ROOT]))
+    elif name == "rights":
         landlock.give_up_privileges()
     elif name:
         LIBC.prctl(38, 1, 0, 0, 0)
@@ -158,11 +160,12 @@ def _is_refused(probe: Probe, path: Path, victim: int) -> bool | None:
     return False
 
 
-def stay(path: Path) -> None:
+def stay(path: Path, is_confined: bool) -> None:
     """Say who this is, and try not to end with the owner."""
     os.closerange(3, 256)
-    with contextlib.suppress(PermissionError):
-        kernel("prctl", 1, 0, 0, 0, 0)
+    if is_confined:
+        with contextlib.suppress(PermissionError):
+            kernel("prctl", 1, 0, 0, 0, 0)
     path.write_text(str(os.getpid()))
     time.sleep(60)
 
