@@ -218,9 +218,7 @@ def traced_view(scene: Scene, view: int, settings: PreviewSettings) -> NDArray[n
     return _show(PreviewRenderer(scene, settings), scene, view)
 
 
-def preview_prices(
-    scene: Scene, resolution: int, most_s: float
-) -> Sequence[tuple[Level, Price]]:
+def preview_prices(scene: Scene, resolution: int, most_s: float) -> Sequence[tuple[Level, Price]]:
     """Return what previews of a scene's first view take, once warm; runs in the child.
 
     Samples are doubled until the fast filter takes longer than `most_s` core-seconds; the last of

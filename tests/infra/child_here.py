@@ -37,7 +37,9 @@ class ChildHere:
                 setup(*setup_args)
                 self._setup = None
             # as between processes: an answer of another type than declared is a failure
-            answer = [np.frombuffer(part, np.uint8).copy() for part in encode_result(function(*args))]
+            answer = [
+                np.frombuffer(part, np.uint8).copy() for part in encode_result(function(*args))
+            ]
             return cast(Result, decode_answer(answer, function))
         except (Rejected, TrilightError):
             raise

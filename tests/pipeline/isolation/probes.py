@@ -56,7 +56,7 @@ PROBES: Mapping[str, tuple[str, Probe]] = {
     "symlink": ("landlock 1", lambda path, pid: path.with_suffix(".link").symlink_to("/etc")),
     "fifo": ("landlock 1", lambda path, pid: os.mkfifo(path.with_suffix(".fifo"))),
     "shared memory files": ("landlock 1", lambda path, pid: os.listdir("/dev/shm")),
-    "root of proc": ("landlock 1", lambda path, pid: os.listdir("/proc/self/root/etc")),
+    "root of proc": ("landlock 1", lambda path, pid: os.listdir(Path("/proc/self", "root", "etc"))),
     "environment": ("landlock 1", lambda path, pid: Path(f"/proc/{pid}/environ").read_bytes()),
     "compare": ("landlock 1, seccomp", lambda path, pid: kernel("kcmp", os.getpid(), pid, 0, 0, 0)),
     "memory": (

@@ -263,18 +263,12 @@ def child() -> Iterator[IsolatedChild]:
     child.close()
 
 
-@for_each("form", ["frame", "connection", "inner"])
-def test_a_hostile_pickle_makes_no_file(child: IsolatedChild, tmp_path: Path, form: str) -> None:
+def test_a_hostile_pickle_makes_no_file(tmp_path: Path) -> None:
     code = pickle.dumps(Hostile(tmp_path / "made"))
-    sent = {
-        "frame": frame(code),
-        "connection": len(code).to_bytes(4, "big") + code,  # as multiprocessing has it
-        "inner": frame(b'["result"]', code),
-    }[form]
-    with pytest.raises(ChildFailed, match=r"nonsense|timeout_wall"):
-        child.call(called.taken_over, [sent], 0.0)
+    for parts in ([code], [b'["result"]', code], [b'["result"]', b"[0]", code]):
+        with pytest.raises(ChildFailed, match="nonsense"):
+            read(parts, int)
     assert not (tmp_path / "made").exists()
-    assert child.call(called.double, 4) == 8
     pickle.loads(code)
     assert (tmp_path / "made").exists(), "the bytes are hostile indeed"
 
