@@ -225,6 +225,14 @@ def test_what_cannot_be_had_is_said(
     caplog.clear()
 
 
+def test_an_unknown_word_is_refused_at_once_by_every_command() -> None:
+    run = subprocess.run(
+        [sys.executable, "-m", "trilight", "doctor", "--help"], capture_output=True, text=True,
+        env={**os.environ, confinement.VARIABLE: "maybe"}, check=False, cwd=ROOT,
+    )  # fmt: skip
+    assert (run.returncode, "'maybe'" in run.stderr) == (1, True)
+
+
 def test_very_many_folders_become_those_above_and_never_the_whole_disk() -> None:
     many = reach(files=(Path(f"/models/{number % 9}/{number}/a.obj") for number in range(900)))
     assert len(many.reads) <= confinement.MOST_FOLDERS
