@@ -132,7 +132,8 @@ class TracerRival:
         found: list[Mapping[Level, Price]] = []
         for scene in scenes:
             try:
-                found.append(self._open().call(preview_prices, scene, self._resolution, most_s))
+                prices = self._open().call(preview_prices, scene, self._resolution, most_s)
+                found.append(dict(prices))
             except (Rejected, ChildFailed):
                 continue
             except TrilightError as error:
@@ -217,7 +218,7 @@ def traced_view(scene: Scene, view: int, settings: PreviewSettings) -> NDArray[n
     return _show(PreviewRenderer(scene, settings), scene, view)
 
 
-def preview_prices(scene: Scene, resolution: int, most_s: float) -> dict[Level, Price]:
+def preview_prices(scene: Scene, resolution: int, most_s: float) -> Sequence[tuple[Level, Price]]:
     """Return what previews of a scene's first view take, once warm; runs in the child.
 
     Samples are doubled until the fast filter takes longer than `most_s` core-seconds; the last of
@@ -231,7 +232,7 @@ def preview_prices(scene: Scene, resolution: int, most_s: float) -> dict[Level, 
             found[level] = min((_priced(scene, settings) for _ in range(2)), key=_further)
         if found[spp, "fast"].further_s > most_s:
             break
-    return found
+    return tuple(found.items())
 
 
 def _further(price: Price) -> float:

@@ -26,6 +26,10 @@ def main() -> None:
     open_missing_streams()
     try:
         _require_usable_names()
+        if "TRILIGHT_CONFINE" in os.environ:  # at once, though no file may have to be read
+            from pipeline.isolation.confinement import wanted_confinement
+
+            wanted_confinement()
         app(extended(sys.argv[1:]))
         sys.stdout.flush()
     except CycloptsError as mistake:

@@ -115,13 +115,15 @@ def table_of(errors: Mapping[int, Errors], costs: Mapping[int, Costs], machine: 
     )
 
 
-def sampled_errors(scene: Scene, px: int, reference: RawReference) -> dict[Method, float]:
+def sampled_errors(
+    scene: Scene, px: int, reference: RawReference
+) -> Sequence[tuple[Method, float]]:
     """Return the error of each sampled picture of the first view; runs in a render child."""
-    everywhere, found = np.ones((px, px), np.bool_), {}
+    everywhere, errors = np.ones((px, px), np.bool_), []
     for method in ladder(px):
         picture = sampled_method(px, *method)(scene)(scene.c2w[0], float(scene.fov_deg[0]))
-        found[method] = true_error_db(picture, reference, log10_radiance, everywhere)[0]
-    return found
+        errors.append((method, true_error_db(picture, reference, log10_radiance, everywhere)[0]))
+    return errors
 
 
 @contextlib.contextmanager
@@ -144,7 +146,7 @@ def _errors_of(
     picture = renderer.view(renderer.prepare(scene), scene.c2w[0], float(scene.fov_deg[0]), px)
     everywhere = np.ones((px, px), np.bool_)
     error_db, _ = true_error_db(picture, reference, log10_radiance, everywhere)
-    return {NETWORK: error_db, **child.call(sampled_errors, scene, px, reference)}
+    return {NETWORK: error_db, **dict(child.call(sampled_errors, scene, px, reference))}
 
 
 def _costs_of(

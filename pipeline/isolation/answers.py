@@ -1,117 +1,105 @@
 """What a child answers to a call, and what its owner makes of that; no byte of it is run.
 
-A result has the type that the called function declares. Errors are sentences, and their types come
-from a list.
+Errors are sentences, and their types come from a list. The parts of an answer are
+
+    words   JSON: `["result"]`, or the kind of an error and its sentences
+    value   JSON: a dataclass by its fields, an array as `[number, dtype, shape, order]`
+    bytes   of each array, path and `bytes`, whose number from 0 stands in the value
 """
 
-import functools
+import dataclasses
 import json
+import os
 import re
-import typing
-from collections.abc import Callable, Iterable
-from typing import Any, NoReturn
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.isolation.deaths import ENDS, ChildFailed
-from pipeline.isolation.values import Bytes, Form, NotAsDeclared, form_of, pack
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 
+CLASS = ""
+"""Key of a dataclass's name among its fields: in a union two may have the same fields."""
 MOST_HEAD_BYTES = 16 << 20
-"""Of an answer without its arrays."""
-_LENGTH = 8
-
-_MISTAKES: dict[str, type[TrilightError]] = {
-    kind.__name__: kind for kind in (TrilightError, EnvironmentFailure)
-}
+"""Most bytes of an answer's words, and of its value."""
+_MISTAKES = {kind.__name__: kind for kind in (TrilightError, EnvironmentFailure)}
+_FAILURES = ("out_of_memory", "exception")
+assert set(_FAILURES) <= set(ENDS)
 _REASON = re.compile(r"[a-z][a-z0-9_]{0,63}")
 _MOST_CHARACTERS = 20_000
 
 
-@functools.cache
-def declared_form(function: Callable[..., Any]) -> Form:
-    """Return the form of what a function returns; nothing where it says nothing.
+def encode_result(value: Any) -> list[bytes | memoryview]:
+    """Return the parts of an answer; TypeError where a value is of no type that is known."""
+    parts: list[bytes | memoryview] = []
 
-    Raises:
-        TypeError: what it returns could not be checked.
-    """
-    said = hasattr(function, "__annotations__")  # builtins have none
-    kind: Any = typing.get_type_hints(function).get("return") if said else None
-    return form_of(None if kind is NoReturn else kind)
+    def put(part: bytes | memoryview) -> int:
+        parts.append(part)
+        return len(parts) - 1
 
+    def plain(held: Any) -> Any:
+        if isinstance(held, np.generic):
+            return held.item()
+        if isinstance(held, np.ndarray):
+            name, order = held.dtype.name, "F" if held.flags.fnc else "C"
+            rows = np.ascontiguousarray(held.T if held.flags.fnc else held, name)
+            return [put(rows.reshape(-1).view(np.uint8).data), name, held.shape, order]
+        if isinstance(held, bytes | Path):
+            return put(os.fsencode(held))
+        if isinstance(held, Mapping):
+            return dict(held)
+        names = [field.name for field in dataclasses.fields(held) if field.init]
+        return {CLASS: type(held).__name__} | {name: getattr(held, name) for name in names}
 
-def encode_result(value: Any, function: Callable[..., Any]) -> list[bytes | memoryview]:
-    """Return the parts of an answer; NotAsDeclared where the value is of another type."""
-    behind: list[memoryview] = []
-    head = _encode(["result", pack(declared_form(function), value, behind.append)])
-    if len(head) > MOST_HEAD_BYTES:
-        raise NotAsDeclared(f"{len(head)} bytes beside arrays; expected at most {MOST_HEAD_BYTES}")
-    return [len(head).to_bytes(_LENGTH, "little"), head, *behind]
+    head = json.dumps(value, default=plain, ensure_ascii=False, separators=(",", ":"))
+    return [b'["result"]', head.encode(errors="replace"), *parts]
 
 
 def encode_error(kind: str, *words: str) -> list[bytes | memoryview]:
     """Return the parts of an answer that is a failure: `rejected`, a mistake's class, or an end."""
-    head = _encode([kind, *(word[:_MOST_CHARACTERS] for word in words)])
-    return [len(head).to_bytes(_LENGTH, "little"), head]
+    return [json.dumps([kind, *(word[:_MOST_CHARACTERS] for word in words)]).encode()]
 
 
-def _encode(head: Any) -> bytes:
-    return json.dumps(head, separators=(",", ":")).encode()
-
-
-def decode_answer(message: memoryview, function: Callable[..., Any]) -> Any:
+def decode_answer(parts: list[NDArray[np.uint8]], function: Callable[..., Any]) -> Any:
     """Return the result of a call.
 
     Args:
-        message: any bytes.
+        parts: any bytes; the result's arrays lie in their memory.
         function: what was called.
 
     Raises:
         Rejected, TrilightError: as the function raised them.
         ChildFailed: it raised something else; or `nonsense`, where the bytes are no answer.
+        MemoryError: this process has no room for it.
     """
+    from pipeline.isolation.declared import first_wrong, result_reader  # children do without
+
     try:
-        kind, words, data, rest = _opened(message)
-        if kind == "result":
-            value = declared_form(function).unpack(data, rest)
-            rest.require_end()
-            return value
+        heads = [part.tobytes() for part in parts[:2] if len(part) <= MOST_HEAD_BYTES]
+        match json.loads(heads[0]):
+            case ["result"]:
+                return result_reader(function).validate_json(heads[1], context=parts[2:])
+            case ["rejected", str(reason), str(said)] if _REASON.fullmatch(reason):
+                failure: Exception = Rejected(reason, make_printable(said))
+            case [str(kind), str(said)] if kind in _MISTAKES:
+                failure = _MISTAKES[kind](make_printable(said))
+            case [str(kind), str(said)] if kind in _FAILURES:
+                failure = ChildFailed(kind, make_printable(said))
+            case _:
+                raise ValueError("expected a result or an error that is known")
+    except MemoryError:
+        raise
     except Exception as error:  # checks of a class that is made raise what they like
         name = f"{function.__module__}.{getattr(function, '__qualname__', function)}"
-        said = str(error) if isinstance(error, NotAsDeclared) else type(error).__name__
-        raise ChildFailed(
-            "nonsense", f"what came back from {name} is not what it returns ({_safe(said)})"
-        ) from error
-    raise _failure(kind, words)
+        wrong = f"what came back from {name} is not what it returns ({first_wrong(error)})"
+        raise ChildFailed("nonsense", make_printable(wrong)) from error
+    raise failure
 
 
-def _opened(message: memoryview) -> tuple[str, list[str], Any, Bytes]:
-    """Return kind, words of an error, data of a result, and the bytes behind the head."""
-    whole = Bytes(message)
-    length = int.from_bytes(whole.take(_LENGTH), "little")
-    if length > MOST_HEAD_BYTES:
-        raise NotAsDeclared(f"a head of {length} bytes; expected at most {MOST_HEAD_BYTES}")
-    match json.loads(bytes(whole.take(length))):
-        case ["result", data]:
-            return "result", [], data, whole
-        case ["rejected", str(reason), str(said)] if _REASON.fullmatch(reason):
-            return "rejected", [reason, _safe(said)], None, whole
-        case [str(kind), str(said)] if kind in _MISTAKES or kind in _FAILURES:
-            return kind, [_safe(said)], None, whole
-    raise NotAsDeclared("expected a result or an error that is known")
-
-
-_FAILURES = ("out_of_memory", "exception")
-assert set(_FAILURES) <= set(ENDS)
-
-
-def _failure(kind: str, words: Iterable[str]) -> Exception:
-    if kind == "rejected":
-        return Rejected(*words)
-    if kind in _MISTAKES:
-        return _MISTAKES[kind](*words)
-    return ChildFailed(kind, *words)
-
-
-def _safe(text: str) -> str:
+def make_printable(text: str) -> str:
     """Return a sentence that is shown to people without what would command a terminal."""
     shown = text[:_MOST_CHARACTERS]
     return "".join(sign if sign.isprintable() or sign == "\n" else "\ufffd" for sign in shown)

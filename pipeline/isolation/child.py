@@ -3,7 +3,7 @@
 A child runs calls one after another, so that slow imports and compiled kernels are paid once. It
 has limits on memory and on wall time, is replaced after a number of calls, ignores Ctrl-C (the
 parent decides), and dies with its owner even if that is killed with SIGKILL while native code holds
-the child: the kernel itself watches the pipe between the two, no thread of Python is needed.
+the child: the kernel ends it with its parent, the fork server, which ends with the owner.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pipeline.isolation.answers import declared_form, decode_answer
+from pipeline.isolation.answers import decode_answer, make_printable
 from pipeline.isolation.confinement import Reach, code_of, confine, confinement_wanted
 from pipeline.isolation.deaths import ChildFailed, Result, with_retries
 from pipeline.isolation.frames import TooLong, patient, receive, send
@@ -34,7 +34,7 @@ from storage.installation import child_environment, order_installed_first
 _START_UP_S = 180.0
 _LAUNCHES = 3
 _MOST_BYTES = 16 << 30
-"""Of one answer: more than any child on a processor may hold."""
+"""Most bytes of one answer; of a child with less memory no more than that."""
 _LONGEST_FOLDER = 70
 """Bytes: the name of a socket, which the fork server has there, must not be longer than 107."""
 _CRASHES = (signal.SIGABRT, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV, signal.SIGTRAP)
@@ -81,7 +81,11 @@ class IsolatedChild:
             setup_args: its arguments; they must survive the way into another process.
             confined_to: the files that it may use, beside libraries, where children can be
                 confined; `may` adds to them. None for a child that nothing confines.
+
+        Raises:
+            TrilightError: TRILIGHT_CONFINE is no word that is known, or asks for what is missing.
         """
+        self._is_confined = confined_to is not None and confinement_wanted()
         self._limits = limits
         self._setup = (setup, setup_args)
         self._process: Any = None
@@ -153,7 +157,7 @@ class IsolatedChild:
         self._process, self._connection = _launched(self._limits)
         try:
             files = loaded_files()
-            if self._reach is not None and confinement_wanted():  # while it has one thread
+            if self._is_confined:  # while it has one thread
                 own = {Path(path).parent for path, _ in files} | code_of(self._setup[0])
                 self._exchange(confine, (self._reach, self._code | own), _START_UP_S)
             if files:  # first: what follows may be made of what they define
@@ -170,18 +174,22 @@ class IsolatedChild:
     def _exchange(
         self, function: Callable[..., Result], args: tuple[Any, ...], wall_s: float
     ) -> Result:
+        from pipeline.isolation.declared import result_reader  # children do without
+
         assert self._connection is not None
-        declared_form(function)  # before anything is done, whether the answer could be read
+        result_reader(function)  # before anything is done, whether the answer could be read
         file, wait = self._connection.fileno(), patient(CallTime(self._process.pid, wall_s))
         try:
             send(file, [ForkingPickler.dumps((function, args))], wait)
-            answer = receive(file, wait, _MOST_BYTES)
+            answer = receive(file, wait, min(self._limits.memory_bytes, _MOST_BYTES))
+            result: Result = decode_answer(answer, function)
+            return result
         except TooLong as error:
             raise ChildFailed("nonsense", f"its answer would have {error}") from error
+        except MemoryError as error:
+            raise ChildFailed("out_of_memory", "this process has no memory for the call") from error
         except (EOFError, OSError) as error:
             raise self._death() from error
-        result: Result = decode_answer(answer, function)
-        return result
 
     def _death(self) -> ChildFailed:
         self._process.join(10)
@@ -217,24 +225,35 @@ def _launched(limits: ChildLimits) -> tuple[Any, Connection]:
     context = multiprocessing.get_context("forkserver")
     for tries_left in reversed(range(_LAUNCHES)):
         ours, theirs = context.Pipe()
+        heard, words = context.Pipe(duplex=False)
         process = context.Process(
-            target=serve, args=(theirs, limits.memory_bytes, limits.cpu_s), daemon=True
+            target=serve, args=(theirs, words, limits.memory_bytes, limits.cpu_s), daemon=True
         )
         try:
             with _without_main(), _apart_from_working_folder():
                 process.start()
         except (EOFError, OSError) as error:
             ours.close()
+            heard.close()
             if not tries_left:
                 raise EnvironmentFailure(
                     f"a child process cannot be started ({error}); see `trilight doctor`."
                 ) from error
         else:
             os.set_blocking(ours.fileno(), False)
+            threading.Thread(target=_print_words, args=(heard,), daemon=True).start()
             return process, ours
         finally:
             theirs.close()
+            words.close()
     raise AssertionError("unreachable: the last try returns or raises")
+
+
+def _print_words(heard: Connection) -> None:
+    """Print to standard error what a child prints, without what would command a terminal."""
+    with heard, contextlib.suppress(OSError):
+        while words := os.read(heard.fileno(), 1 << 14):
+            os.write(2, make_printable(words.decode(errors="replace")).encode())
 
 
 @contextlib.contextmanager

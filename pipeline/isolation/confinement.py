@@ -5,6 +5,8 @@ parser is held by these: no other file, no network, no program, no other process
 the kernel has it. How a file is read changes by none of them, thus no byte that is made of it.
 """
 
+import functools
+import logging
 import mimetypes
 import os
 import site
@@ -18,6 +20,8 @@ from pipeline.isolation.landlock import give_up_privileges, landlock_version, re
 from pipeline.isolation.seccomp import refuse_calls, seccomp_works
 from storage.errors import EnvironmentFailure, TrilightError, expected_one_of
 from storage.installation import FILES_ROOT, IMPORT_ROOT
+
+log = logging.getLogger("trilight.children")
 
 VARIABLE = "TRILIGHT_CONFINE"
 """Environment variable: `auto`, `off`, or `required`, which stops where a part is missing."""
@@ -95,6 +99,8 @@ def missing_parts() -> list[str]:
 def confinement_wanted() -> bool:
     """Return whether children that read files are to be confined, as TRILIGHT_CONFINE says.
 
+    A part that this machine lacks is a warning, once.
+
     Raises:
         EnvironmentFailure: it is `required`, and this machine lacks something.
         TrilightError: it is no word that is known.
@@ -105,7 +111,17 @@ def confinement_wanted() -> bool:
             f"{VARIABLE} is required, but this machine lacks {' and '.join(missing)}; expected "
             f"both. Run elsewhere, or set {VARIABLE}=auto."
         )
+    if missing and wanted == "auto":
+        _warn(" and ".join(missing))
     return wanted != "off"
+
+
+@functools.cache
+def _warn(missing: str) -> None:
+    log.warning(
+        "what reads strangers' files is not wholly confined: this machine lacks %s. Run "
+        "`trilight doctor`, or set %s=off to accept that.", missing, VARIABLE,
+    )  # fmt: skip
 
 
 def code_of(*functions: Callable[..., object]) -> frozenset[Path]:
@@ -127,6 +143,7 @@ def confine(allowed: Reach, code: frozenset[Path]) -> None:
         EnvironmentFailure: the kernel refuses what it says it has.
     """
     try:
+        os.setsid()
         if sys.platform == "linux":
             give_up_privileges()
         if landlock_version():

@@ -1,4 +1,4 @@
-"""Messages between a child and its owner: eight bytes with the length, then so many bytes.
+"""Messages between a child and its owner: parts, whose number and lengths stand before them.
 
 The owner waits for each piece within the time of one call, so that a child that says half a
 message, or reads none, holds it no longer than one that says nothing.
@@ -6,13 +6,15 @@ message, or reads none, holds it no longer than one that says nothing.
 
 import os
 import select
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.isolation.waiting import CallTime
 
-_LENGTH = 8
+_LENGTH = np.dtype("<u8")
+MOST_PARTS = 1 << 17
 
 Wait = Callable[[int, int], None]
 """Returns when a file can be read or written: its number and the event of `select.poll`."""
@@ -37,37 +39,41 @@ def patient(patience: CallTime) -> Wait:
     return wait
 
 
-def send(file: int, parts: Iterable[bytes | memoryview], wait: Wait) -> None:
+def send(file: int, parts: Sequence[bytes | memoryview], wait: Wait) -> None:
     """Write one message; OSError where nobody reads it any more."""
-    views = [memoryview(part) for part in parts]
-    length = sum(len(view) for view in views)
-    for view in (memoryview(length.to_bytes(_LENGTH, "little")), *views):
+    table = np.array([len(parts), *map(len, parts)], _LENGTH).tobytes()
+    for part in (table, *parts):
+        view = memoryview(part)
         while view:
             wait(file, select.POLLOUT)
             view = view[os.write(file, view) :]
 
 
-def receive(file: int, wait: Wait, most: int) -> memoryview:
-    """Return one message.
+def receive(file: int, wait: Wait, most: int) -> list[NDArray[np.uint8]]:
+    """Return the parts of one message, each in memory of its own.
 
     Args:
         file: number of the open file.
         wait: how to.
-        most: bytes that it may have.
+        most: bytes that all parts may have.
 
     Raises:
         EOFError: the other side has ended.
-        TooLong: it claims to have more bytes.
+        TooLong: it claims to have more bytes, or more than `MOST_PARTS`.
+        MemoryError: this process has no room for it.
     """
-    length = int.from_bytes(_exactly(file, _LENGTH, wait), "little")
-    if length > most:
-        raise TooLong(f"{length} bytes; expected at most {most}")
-    return _exactly(file, length, wait)
+    (count,) = _exactly(file, _LENGTH.itemsize, wait).view(_LENGTH).tolist()
+    if count > MOST_PARTS:
+        raise TooLong(f"{count} parts; expected at most {MOST_PARTS}")
+    lengths = _exactly(file, count * _LENGTH.itemsize, wait).view(_LENGTH).tolist()
+    if sum(lengths) > most:
+        raise TooLong(f"{sum(lengths)} bytes; expected at most {most}")
+    return [_exactly(file, length, wait) for length in lengths]
 
 
-def _exactly(file: int, count: int, wait: Wait) -> memoryview:
-    whole = np.zeros(count, np.uint8).data  # which takes memory only as it is filled
-    rest = whole
+def _exactly(file: int, count: int, wait: Wait) -> NDArray[np.uint8]:
+    whole = np.zeros(count, np.uint8)  # which takes memory only as it is filled
+    rest = whole.data
     while rest:
         wait(file, select.POLLIN)
         read = os.readv(file, [rest])

@@ -1,9 +1,7 @@
 """What happens inside a child: it keeps its limits, answers calls, and dies with its owner."""
 
 import ctypes
-import fcntl
 import math
-import multiprocessing
 import os
 import resource
 import signal
@@ -19,7 +17,6 @@ from pipeline.isolation.frames import receive, send, wait_forever
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 
 _PR_SET_PDEATHSIG = 1
-_F_SETSIG = 10  # Linux; Python's fcntl module does not name it
 
 
 def die_with_parent() -> None:
@@ -28,35 +25,31 @@ def die_with_parent() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _die_with_owner() -> None:
-    """Ask the kernel to kill this child when the process that owns it ends.
+def _leave_owner(connection: Connection, words: Connection) -> None:
+    """Have of all that was open in the owner and its servers nothing but the way to it.
 
-    A child's direct parent is the fork server, which lives on while it has children, so that
-    `die_with_parent` would wait forever. What ends with the owner is the sentinel pipe that
-    multiprocessing gives every child: its end sends SIGIO, which is turned into SIGKILL here.
-    Elsewhere than on Linux a child only notices its owner's end when its call returns.
+    So a child has no terminal. And the fork server, which no child holds open then, ends with the
+    owner, whatever ends that, and its children with it.
     """
-    if sys.platform != "linux":
-        return
-    owner = multiprocessing.parent_process()
-    assert owner is not None
-    sentinel = owner.sentinel
-    fcntl.fcntl(sentinel, fcntl.F_SETOWN, os.getpid())
-    fcntl.fcntl(sentinel, _F_SETSIG, signal.SIGKILL)
-    fcntl.fcntl(sentinel, fcntl.F_SETFL, fcntl.fcntl(sentinel, fcntl.F_GETFL) | os.O_ASYNC)
-    if not owner.is_alive():
-        os._exit(1)
+    nothing = os.open(os.devnull, os.O_RDWR)
+    kept = {1, 2, nothing, connection.fileno()}
+    for standard in (1, 2):
+        os.dup2(words.fileno(), standard)
+    for file in set(map(int, os.listdir("/dev/fd"))) - kept:
+        os.dup2(nothing, file, inheritable=file == 0)  # closed, another file would get its number
+    die_with_parent()
 
 
-def serve(connection: Connection, memory_bytes: int, cpu_s: int | None) -> None:
+def serve(connection: Connection, words: Connection, memory_bytes: int, cpu_s: int | None) -> None:
     """Answer calls until the owner closes the connection; ignores Ctrl-C: the owner decides.
 
     Args:
         connection: to the owner.
+        words: takes what is printed here.
         memory_bytes: most address space.
         cpu_s: most processor seconds of one call, or None for no limit.
     """
-    _die_with_owner()
+    _leave_owner(connection, words)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     most = resource.getrlimit(resource.RLIMIT_AS)[1]
@@ -67,7 +60,8 @@ def serve(connection: Connection, memory_bytes: int, cpu_s: int | None) -> None:
     while True:
         try:
             # our owner's own words, which are trusted; of ours it trusts none
-            function, args = ForkingPickler.loads(receive(file, wait_forever, sys.maxsize))
+            (asked,) = receive(file, wait_forever, sys.maxsize)
+            function, args = ForkingPickler.loads(asked.data)
         except EOFError:
             os._exit(0)  # the parent has died: skip the destructors of native libraries
         _allow_cpu(cpu_s)
@@ -85,7 +79,7 @@ def _allow_cpu(seconds: int | None) -> None:
 
 def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> list[bytes | memoryview]:
     try:
-        return encode_result(function(*args), function)
+        return encode_result(function(*args))
     except Rejected as rejection:
         return encode_error("rejected", rejection.reason, rejection.message)
     except EnvironmentFailure as failure:

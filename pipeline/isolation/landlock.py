@@ -17,6 +17,10 @@ _CREATE, _ADD_RULE, _RESTRICT = 444, 445, 446  # on every architecture
 _ASK_VERSION = 1
 _PATH_BENEATH = 1
 _NO_NEW_PRIVILEGES = 38
+_CAPABILITIES = 0x20080522
+"""Version of the structures of `capget`: two times what is effective, permitted, inherited."""
+_OF_FILES = 1 << 1 | 1 << 2
+"""Capabilities to read and write what another account owns, where Landlock lets one."""
 
 _EXECUTE, _WRITE_FILE, READ_FILE, LIST = (1 << bit for bit in range(4))
 _TRUNCATE, _DEVICE_CALLS = 1 << 14, 1 << 15
@@ -38,8 +42,16 @@ def landlock_version() -> int:
 
 
 def give_up_privileges() -> None:
-    """See to it that no program that is started from here has more rights; OSError if refused."""
+    """Give up what root may more than others, but for files, and all ways to get that back.
+
+    Raises:
+        OSError: the kernel refuses.
+    """
     _require(_libc().prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0))
+    head, sets = struct.pack("=Ii", _CAPABILITIES, 0), ctypes.create_string_buffer(24)
+    _require(_libc().capget(head, sets))
+    effective, permitted, *_ = (held & _OF_FILES for held in struct.unpack("=6I", sets.raw))
+    _require(_libc().capset(head, struct.pack("=6I", effective, permitted, 0, 0, 0, 0)))
 
 
 def restrict_files(

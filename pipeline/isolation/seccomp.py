@@ -1,7 +1,8 @@
 """Seccomp: a process gives up calls of Linux that reading a file never needs.
 
-Refused are sockets, programs to start, other processes' memory, mounts, and parts of the kernel
-that were a way out before. A refused call returns EPERM, so that a library can go on without it.
+Refused are sockets, new processes and programs, whatever reaches other processes, rights and times
+of files, and parts of the kernel that were a way out before. A refused call returns EPERM, so that
+a library can go on without it.
 """
 
 import ctypes
@@ -11,53 +12,70 @@ import platform
 import struct
 import sys
 from collections.abc import Mapping
+from typing import Literal
 
-_NUMBERS: Mapping[str, tuple[int, int]] = {
-    "socket": (41, 198),
-    "connect": (42, 203),
-    "bind": (49, 200),
-    "listen": (50, 201),
+_NUMBERS: Mapping[str, tuple[int | None, int | None]] = {
+    "socket": (41, 198), "connect": (42, 203), "bind": (49, 200), "listen": (50, 201),
     "sendto": (44, 206),
-    "execve": (59, 221),
-    "execveat": (322, 281),
-    "ptrace": (101, 117),
-    "process_vm_readv": (310, 270),
-    "process_vm_writev": (311, 271),
-    "pidfd_getfd": (438, 438),
-    "mount": (165, 40),
-    "umount2": (166, 39),
-    "pivot_root": (155, 41),
-    "chroot": (161, 51),
-    "unshare": (272, 97),
-    "setns": (308, 268),
-    "fsopen": (430, 430),
-    "open_tree": (428, 428),
-    "move_mount": (429, 429),
-    "open_by_handle_at": (304, 265),
-    "bpf": (321, 280),
-    "perf_event_open": (298, 241),
-    "userfaultfd": (323, 282),
-    "io_uring_setup": (425, 425),
-    "io_uring_enter": (426, 426),
-    "add_key": (248, 217),
-    "request_key": (249, 218),
-    "keyctl": (250, 219),
-    "init_module": (175, 105),
-    "finit_module": (313, 273),
-    "kexec_load": (246, 104),
-    "reboot": (169, 142),
-}
-"""What is refused, with its number on x86_64 and on aarch64."""
+    "execve": (59, 221), "execveat": (322, 281), "fork": (57, None), "vfork": (58, None),
+    "ptrace": (101, 117), "process_vm_readv": (310, 270), "process_vm_writev": (311, 271),
+    "process_madvise": (440, 440), "process_mrelease": (448, 448), "kcmp": (312, 272),
+    "migrate_pages": (256, 238), "move_pages": (279, 239), "pidfd_getfd": (438, 438),
+    "tkill": (200, 130), "rt_sigqueueinfo": (129, 138), "rt_tgsigqueueinfo": (297, 240),
+    "pidfd_send_signal": (424, 424),
+    "setpriority": (141, 140), "ioprio_set": (251, 30), "sched_setaffinity": (203, 122),
+    "sched_setscheduler": (144, 119), "sched_setparam": (142, 118), "sched_setattr": (314, 274),
+    "chmod": (90, None), "fchmod": (91, 52), "fchmodat": (268, 53), "fchmodat2": (452, 452),
+    "chown": (92, None), "lchown": (94, None), "fchown": (93, 55), "fchownat": (260, 54),
+    "utime": (132, None), "utimes": (235, None), "futimesat": (261, None), "utimensat": (280, 88),
+    "setxattr": (188, 5), "lsetxattr": (189, 6), "fsetxattr": (190, 7), "setxattrat": (463, 463),
+    "removexattr": (197, 14), "lremovexattr": (198, 15), "fremovexattr": (199, 16),
+    "removexattrat": (466, 466), "file_setattr": (469, 469),
+    "shmget": (29, 194), "shmat": (30, 196), "shmctl": (31, 195),
+    "semget": (64, 190), "semop": (65, 193), "semtimedop": (220, 192), "semctl": (66, 191),
+    "msgget": (68, 186), "msgsnd": (69, 189), "msgrcv": (70, 188), "msgctl": (71, 187),
+    "mq_open": (240, 180), "mq_unlink": (241, 181),
+    "inotify_add_watch": (254, 27), "fanotify_init": (300, 262), "syslog": (103, 116),
+    "mount": (165, 40), "umount2": (166, 39), "pivot_root": (155, 41), "chroot": (161, 51),
+    "unshare": (272, 97), "setns": (308, 268), "fsopen": (430, 430), "open_tree": (428, 428),
+    "move_mount": (429, 429), "open_by_handle_at": (304, 265),
+    "bpf": (321, 280), "perf_event_open": (298, 241), "userfaultfd": (323, 282),
+    "io_uring_setup": (425, 425), "io_uring_enter": (426, 426),
+    "add_key": (248, 217), "request_key": (249, 218), "keyctl": (250, 219),
+    "init_module": (175, 105), "finit_module": (313, 273), "kexec_load": (246, 104),
+    "reboot": (169, 142), "clock_settime": (227, 112), "sethostname": (170, 161),
+    "setdomainname": (171, 162),
+}  # fmt: skip
+"""What is refused, with its number on x86_64 and on aarch64, where there is one."""
 
+_OWN = -1
+"""Stands for the number of this process."""
+_Test = Literal["one of", "none of", "has"]
+_BY_ARGUMENT: Mapping[str, tuple[int, int, int, _Test, tuple[int, ...]]] = {
+    # type into a terminal; have signals sent; change a file's flags
+    "ioctl": (16, 29, 1, "none of",
+              (0x5412, 0x541C, 0x8901, 0x8902, 0x40086602, 0x40046602, 0x401C5820)),
+    "fcntl": (72, 25, 1, "none of", (8, 10, 15)),  # have signals sent: F_SETOWN and its kin
+    "prctl": (157, 167, 0, "none of", (1,)),  # PR_SET_PDEATHSIG: outlive the owner
+    "prlimit64": (302, 261, 0, "one of", (0, _OWN)),
+    "kill": (62, 129, 0, "one of", (_OWN,)),
+    "tgkill": (234, 131, 0, "one of", (_OWN,)),
+    "clone": (56, 220, 0, "has", (0x10000,)),  # CLONE_THREAD: threads, and no new process
+}  # fmt: skip
+"""What is allowed by the low 32 bits, which the kernel looks at, of an argument: numbers of the
+call, place of the argument, and what that must be."""
+
+_CLONE3 = 435
+"""As if it were unknown, since its arguments lie in memory: libraries call `clone` instead."""
 _MACHINES = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}
-"""Column of `_NUMBERS`, and how the kernel calls the architecture."""
+"""Column of numbers, and how the kernel calls the architecture."""
 _OTHER_NUMBERS = 0x40000000  # x86_64's second set of calls, for 32-bit pointers
 
-_LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06
-_CALL_NUMBER_AT, _ARCHITECTURE_AT = 0, 4
-_ALLOW, _REFUSE = 0x7FFF0000, 0x00050000 | 1  # EPERM
+_LOAD, _EQUAL, _AT_LEAST, _HAS, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
+_CALL_NUMBER_AT, _ARCHITECTURE_AT, _ARGUMENTS_AT = 0, 4, 16
+_ALLOW, _REFUSE, _UNKNOWN = 0x7FFF0000, 0x00050000 | 1, 0x00050000 | 38  # EPERM, ENOSYS
 
-_SET_SECCOMP, _GET_SECCOMP, _FILTER = 22, 21, 2
+_SET_SECCOMP, _FILTER = 22, 2
 _Step = tuple[int, int, int, int]
 
 
@@ -77,7 +95,7 @@ def refuse_calls() -> None:
     Raises:
         OSError: the kernel refuses; privileges must have been given up before.
     """
-    steps = _program(platform.machine())
+    steps = _program(platform.machine(), os.getpid())
     packed = b"".join(struct.pack("=HBBI", *step) for step in steps)
     program = ctypes.create_string_buffer(packed, len(packed))
     given = struct.pack("HxxxxxxP", len(steps), ctypes.addressof(program))
@@ -86,18 +104,30 @@ def refuse_calls() -> None:
         raise OSError(code, os.strerror(code))
 
 
-def _program(machine: str) -> list[_Step]:
+def _program(machine: str, process_id: int) -> list[_Step]:
     """Return the kernel's steps: by another architecture's number nothing may be called at all."""
     column, architecture = _MACHINES[machine]
-    numbers = sorted(row[column] for row in _NUMBERS.values())
-    tests: list[tuple[int, int]] = [(_AT_LEAST, _OTHER_NUMBERS)]
-    tests += [(_EQUAL, number) for number in numbers]
-    refuse = len(tests) + 1  # behind the step that allows
-    return [
+    steps = [
         (_LOAD, 0, 0, _ARCHITECTURE_AT),
-        (_EQUAL, 0, refuse + 1, architecture),
-        (_LOAD, 0, 0, _CALL_NUMBER_AT),
-        *((test, refuse - 1 - at, 0, value) for at, (test, value) in enumerate(tests)),
-        (_RETURN, 0, 0, _ALLOW),
+        (_EQUAL, 1, 0, architecture),
         (_RETURN, 0, 0, _REFUSE),
+        (_LOAD, 0, 0, _CALL_NUMBER_AT),
+        *_where(_AT_LEAST, _OTHER_NUMBERS, (_RETURN, 0, 0, _REFUSE)),
+        *_where(_EQUAL, _CLONE3, (_RETURN, 0, 0, _UNKNOWN)),
     ]
+    for row in _NUMBERS.values():
+        if (number := row[column]) is not None:
+            steps += _where(_EQUAL, number, (_RETURN, 0, 0, _REFUSE))
+    for *numbers, place, test, values in _BY_ARGUMENT.values():
+        held, other = (_REFUSE, _ALLOW) if test == "none of" else (_ALLOW, _REFUSE)
+        by_value = [(_LOAD, 0, 0, _ARGUMENTS_AT + 8 * place)]
+        for value in values:
+            asked = process_id if value == _OWN else value
+            by_value += _where(_HAS if test == "has" else _EQUAL, asked, (_RETURN, 0, 0, held))
+        steps += _where(_EQUAL, numbers[column], *by_value, (_RETURN, 0, 0, other))
+    return [*steps, (_RETURN, 0, 0, _ALLOW)]
+
+
+def _where(test: int, value: int, *then: _Step) -> list[_Step]:
+    """Return steps that are made where what was loaded passes a test, and are passed over else."""
+    return [(test, 0, len(then), value), *then]

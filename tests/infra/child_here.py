@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from pipeline.exchange import reader
@@ -36,8 +37,10 @@ class ChildHere:
                 setup(*setup_args)
                 self._setup = None
             # as between processes: an answer of another type than declared is a failure
-            answer = b"".join(encode_result(function(*args), function))
-            return cast(Result, decode_answer(memoryview(answer), function))
+            answer = [
+                np.frombuffer(part, np.uint8).copy() for part in encode_result(function(*args))
+            ]
+            return cast(Result, decode_answer(answer, function))
         except (Rejected, TrilightError):
             raise
         except Exception as error:

@@ -148,12 +148,14 @@ def _new_layer(path: Path, root: str) -> Any:
 
 
 def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
-    suffix = ".usda" if path.suffix.lower() == ".usda" else ".usdc"
     with tempfile.TemporaryDirectory(dir=path.parent if path.parent.is_dir() else None) as folder:
-        plain = Path(folder) / f"scene{suffix}"
-        if not layer.Export(str(plain)):
+        plain = Path(folder) / "scene.usdc"
+        if path.suffix.lower() == ".usda":  # whose Export changes rights, as no confined child may
+            data = layer.ExportToString().encode()
+        elif layer.Export(str(plain)):
+            data = plain.read_bytes()
+        else:
             raise TrilightError(f"{path.name}: USD could not write the scene.")
-        data = plain.read_bytes()
     if path.suffix.lower() == ".usdz":
         write_atomically(path, packaged(data, files))
         return

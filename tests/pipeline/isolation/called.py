@@ -3,10 +3,8 @@
 import ctypes
 import os
 import signal
-import socket
 import stat
-import subprocess
-import sys
+import threading
 import time
 from pathlib import Path
 
@@ -128,8 +126,7 @@ def taken_over(pieces: list[bytes], pause_s: float) -> int:
 
 def deaf(answer: bytes) -> int:
     """Answer, then read nothing more."""
-    child_side = next(filter(is_socket, range(3, 40)))
-    os.write(child_side, len(answer).to_bytes(8, "little") + answer)
+    os.write(next(filter(is_socket, range(3, 40))), answer)
     time.sleep(60)
     return 0
 
@@ -157,28 +154,10 @@ def refused_paths(paths: list[Path], writing: bool) -> list[Path]:
     return refused
 
 
-def refused_sockets(families: list[int]) -> list[int]:
-    """Return the families of which neither streams nor datagrams may be had."""
-    refused = []
-    for family in families:
-        try:
-            socket.socket(family, socket.SOCK_STREAM).close()
-        except PermissionError:
-            try:
-                socket.socket(family, socket.SOCK_DGRAM).close()
-            except PermissionError:
-                refused.append(family)
-    return refused
-
-
-def start_program() -> None:
-    subprocess.run([sys.executable, "-c", ""], check=True)
-
-
-def end_process(number: int) -> None:
-    os.kill(number, signal.SIGTERM)
-
-
-def call_kernel(number: int) -> int:
-    libc = ctypes.CDLL(None, use_errno=True)
-    return ctypes.get_errno() if libc.syscall(number, 0, 0, 0, 0, 0) < 0 else 0
+def thread() -> int:
+    """Return the number of a thread that was started here."""
+    numbers: list[int] = []
+    started = threading.Thread(target=lambda: numbers.append(threading.get_native_id()))
+    started.start()
+    started.join()
+    return numbers[0]

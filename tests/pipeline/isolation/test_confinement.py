@@ -1,9 +1,12 @@
 """A child that a file has taken over, or that dies: its tries are refused, its end is judged."""
 
 import os
+import shutil
 import signal
-import socket
-from collections.abc import Iterator
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,13 +23,17 @@ from pipeline.isolation import (
     deaths,
     is_passing,
     reach,
+    seccomp,
 )
 from pipeline.isolation.deaths import ENDS, with_retries
 from pipeline.isolation.landlock import landlock_version
-from pipeline.isolation.seccomp import _NUMBERS, _program, seccomp_works
+from pipeline.isolation.seccomp import seccomp_works
+from pipeline.making.prepare_isolated import asset_child
 from storage.errors import EnvironmentFailure, TrilightError
+from tests.conftest import ROOT
 from tests.for_each import for_each
-from tests.pipeline.isolation import called
+from tests.pipeline.isolation import called, probes
+from tests.pipeline.isolation.probes import PROBES
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=20, calls_per_child=100)
 needs_landlock = pytest.mark.skipif(not landlock_version(), reason="no Landlock here")
@@ -76,25 +83,92 @@ def test_inputs_are_read_outputs_written_and_nothing_outside(
     assert (place / "in" / "file").read_text() == "in"
 
 
+WALLS = ("rights", "seccomp", *(f"landlock {number}" for number in (1, 2, 3, 5, 6)), "all")
+
+
+def _holds(wall: str, by: str) -> bool:
+    """Return whether a wall is among those that hold a probe; a later Landlock holds more."""
+    kind, _, version = wall.partition(" ")
+    known = dict(each.partition(" ")[::2] for each in by.split(", "))
+    return kind in known and int(version or 0) >= int(known[kind] or 0)
+
+
+def _tried(place: Path, wall: str) -> Mapping[str, bool | None]:
+    shutil.rmtree(place / "probed", ignore_errors=True)
+    (place / "probed").mkdir()
+    for name in PROBES:
+        (place / "probed" / name).write_text(name)
+    with (
+        subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as victim,
+        closing(IsolatedChild(limits=LIMITS, setup=called.nothing)) as child,
+    ):
+        refused = child.call(probes.try_all, wall, place, victim.pid)
+        victim.kill()
+        return refused
+
+
+@needs_landlock
 @needs_seccomp
-def test_nothing_is_connected_to_and_no_program_started(child: IsolatedChild) -> None:
-    families = [int(each) for each in (socket.AF_INET, socket.AF_INET6, socket.AF_UNIX)]
-    assert child.call(called.refused_sockets, families) == families
-    _refused(child, called.start_program)
+def test_each_wall_holds_what_the_page_says_of_it_and_no_more(place: Path) -> None:
+    let_in = {name for name, refused in _tried(place, "").items() if refused is False}
+    known = [wall for wall in WALLS if int(wall.partition(" ")[2] or 0) <= landlock_version()]
+    for wall in known:
+        walls = [*known[:2], f"landlock {landlock_version()}"] if wall == "all" else [wall]
+        held = {name for name, (by, _) in PROBES.items() if any(_holds(one, by) for one in walls)}
+        refused = {name for name, is_refused in _tried(place, wall).items() if is_refused}
+        assert held & let_in <= refused, wall
+        if wall != "rights":  # without these the kernel itself refuses more
+            assert refused & let_in <= held, wall
 
 
-@pytest.mark.skipif(landlock_version() < 6, reason="Landlock of Linux 6.12 is needed")
-def test_no_signal_reaches_another_process(child: IsolatedChild) -> None:
-    _refused(child, called.end_process, os.getpid())
+TERMINAL = """
+from pipeline.isolation import ChildLimits, IsolatedChild, reach
+from tests.pipeline.isolation import called, probes
+limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
+child = IsolatedChild(limits=limits, setup=called.nothing, confined_to=reach())
+print("terminals:", child.call(probes.open_terminals))
+"""
 
 
-@needs_seccomp
-@pytest.mark.skipif(os.uname().machine != "x86_64", reason="numbers of x86_64")
-@for_each("name", ["ptrace", "mount", "bpf", "unshare", "keyctl", "io_uring_setup"])
-def test_ways_around_are_refused(child: IsolatedChild, name: str) -> None:
-    assert child.call(called.call_kernel, _NUMBERS[name][0]) == 1  # EPERM
-    assert child.call(called.call_kernel, _NUMBERS[name][0] | 0x40000000) == 1  # by the second set
-    assert child.call(called.call_kernel, 39) == 0  # getpid
+def test_a_child_has_no_terminal_and_what_it_prints_arrives_without_commands() -> None:
+    ours, theirs = os.openpty()
+    command = [sys.executable, "-c", TERMINAL]
+    subprocess.run(command, cwd=ROOT, stdin=theirs, stdout=theirs, stderr=theirs, check=True)
+    os.close(theirs)
+    shown = os.read(ours, 1 << 16).decode()
+    assert "terminals: []" in shown and "said\ufffd]0;title\ufffd" in shown
+    os.close(ours)
+
+
+OWNER = """
+import pathlib, sys
+from pipeline.isolation import ChildLimits, IsolatedChild, reach
+from tests.pipeline.isolation import called, probes
+path = pathlib.Path(sys.argv[1])
+limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
+files = reach(writes=[path.parent]) if len(sys.argv) > 2 else None
+child = IsolatedChild(limits=limits, setup=called.nothing, confined_to=files)
+child.call(probes.stay, path, files is not None)
+"""
+
+
+@for_each("more", [(), ("confined",)])
+def test_a_child_dies_with_an_owner_that_is_killed_though_it_would_not(
+    tmp_path: Path, more: tuple[str, ...]
+) -> None:
+    said = tmp_path / "child"
+    with subprocess.Popen([sys.executable, "-c", OWNER, str(said), *more], cwd=ROOT) as owner:
+        _until(lambda: said.exists() and bool(said.read_text()), 60)
+        owner.kill()
+    process = Path(f"/proc/{said.read_text()}/stat")
+    _until(lambda: not process.exists() or process.read_text().split()[2] == "Z", 10)
+
+
+def _until(happened: Callable[[], bool], most_s: float) -> None:
+    deadline_s = time.monotonic() + most_s
+    while not happened():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
 
 
 @needs_landlock
@@ -134,15 +208,29 @@ def test_off_confines_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> N
     [("no", TrilightError, "auto"), ("required", EnvironmentFailure, "lacks Landlock")],
 )
 def test_what_cannot_be_had_is_said(
-    monkeypatch: pytest.MonkeyPatch, word: str, error: type[Exception], said: str
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    word: str,
+    error: type[Exception],
+    said: str,
 ) -> None:
     monkeypatch.setenv(confinement.VARIABLE, word)
     monkeypatch.setattr(confinement, "landlock_version", lambda: 0)
-    child = confined(reach())
-    with pytest.raises(error, match=said):
-        child.call(called.double, 2)
+    with pytest.raises(error, match=said):  # at once: no child may be needed where all is cached
+        asset_child()
     monkeypatch.setenv(confinement.VARIABLE, "auto")
-    assert confinement.confinement_wanted()
+    confinement._warn.cache_clear()
+    assert confinement.confinement_wanted() and confinement.confinement_wanted()
+    assert [record.getMessage().count("lacks Landlock") for record in caplog.records] == [1]
+    caplog.clear()
+
+
+def test_an_unknown_word_is_refused_at_once_by_every_command() -> None:
+    run = subprocess.run(
+        [sys.executable, "-m", "trilight", "doctor", "--help"], capture_output=True, text=True,
+        env={**os.environ, confinement.VARIABLE: "maybe"}, check=False, cwd=ROOT,
+    )  # fmt: skip
+    assert (run.returncode, "'maybe'" in run.stderr) == (1, True)
 
 
 def test_very_many_folders_become_those_above_and_never_the_whole_disk() -> None:
@@ -155,14 +243,31 @@ def test_very_many_folders_become_those_above_and_never_the_whole_disk() -> None
     assert Path("/") not in wide.reads
 
 
-@for_each("machine", ["x86_64", "aarch64"])
-def test_every_jump_of_the_filter_ends_at_its_last_two_steps(machine: str) -> None:
-    steps = _program(machine)
-    assert [step[0] for step in steps[-2:]] == [0x06, 0x06]
-    for at, (_, taken, other, _) in enumerate(steps[3:-2], start=3):
-        assert at + 1 + taken == len(steps) - 1
-        assert other == 0
-    assert 1 + 1 + steps[1][2] == len(steps) - 1  # another architecture
+def _decide(machine: str, call: int, argument: int = 0) -> int:
+    """Return what the filter answers to a call whose arguments are all the same."""
+    data = {0: call, 4: seccomp._MACHINES[machine][1], 16: argument, 24: argument}
+    steps, at, loaded = seccomp._program(machine, 77), 0, 0
+    passes = {0x15: int.__eq__, 0x35: int.__ge__, 0x45: int.__and__}
+    while steps[at][0] != 0x06:
+        code, then, otherwise, value = steps[at]
+        loaded = data[value] if code == 0x20 else loaded
+        at += 1 + (code != 0x20 and (then if passes[code](loaded, value) else otherwise))
+    return steps[at][3]
+
+
+@for_each(("machine", "column"), [("x86_64", 0), ("aarch64", 1)])
+def test_the_filter_refuses_calls_by_number_and_by_argument(machine: str, column: int) -> None:
+    allow, refuse = 0x7FFF0000, 0x50001
+    numbers = [row[column] for row in seccomp._NUMBERS.values() if row[column] is not None]
+    assert {_decide(machine, each) for each in (*numbers, 63 | 0x40000000)} == {refuse}  # type: ignore[arg-type]
+    assert (_decide(machine, 63), _decide(machine, 435)) == (allow, 0x50026)
+    for name, kept, given_up in (
+        ("ioctl", 0x5401, 0x5412), ("fcntl", 4, 8), ("kill", 77, 78), ("tgkill", 77, 0),
+        ("prlimit64", 0, 1), ("clone", 0x3D0F00, 0x1200011), ("prctl", 15, 1),
+    ):  # fmt: skip
+        number = seccomp._BY_ARGUMENT[name][:2][column]
+        assert _decide(machine, number, kept) == allow, name
+        assert _decide(machine, number, given_up) == refuse, name
 
 
 PATIENT = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=9)
