@@ -11,13 +11,13 @@ import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from pipeline.shards.pack import pack_shard
+from pipeline.shards.pack import grow_shard, pack_shard
 from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder, numbered
-from storage.dataset.manifest import ShardEntry
+from storage.dataset.manifest import ShardEntry, read_head
 from storage.dataset.scene_logs import log_scene
 from storage.dataset.settings import SplitSettings
-from storage.dataset.splits import scenes_of_shard, shard_name, split_of_shard
+from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, split_of_shard
 from storage.dataset.staging import is_staged, stage_scene
 from storage.records.objects import Failure
 from storage.records.profiles import Profile
@@ -32,8 +32,7 @@ class UnfinishedShard:
     def __init__(self, folder: DatasetFolder, splits: SplitSettings, shard_index: int) -> None:
         self.name = shard_name(shard_index, splits)
         self.split = split_of_shard(shard_index, splits)
-        self._folder = folder
-        self._scenes = scenes_of_shard(shard_index, splits)
+        self._folder, self._index, self._splits = folder, shard_index, splits
         self._staged = folder.staged_shard(self.name)
         self._packing = self._staged / "pack.claim"
 
@@ -76,14 +75,20 @@ class UnfinishedShard:
         Returns:
             The shard, where this call packed it.
         """
-        if self._folder.has_shard(self.name):
+        scenes, held = self._planned(), self._held()
+        if self._is_packed() or not all(is_staged(self._staged, at) for at in scenes[held or 0 :]):
             return None
-        if not all(is_staged(self._staged, index) for index in self._scenes):
-            return None
-        with claimed(self._packing) as ours:
-            if not ours or self._folder.has_shard(self.name):
+        with contextlib.ExitStack() as stack:
+            if not stack.enter_context(claimed(self._packing)):
                 return None
-            shard = pack_shard(self._folder, self.name, self._scenes)
+            if held is not None or scenes != scenes_of_shard(self._index, self._splits):
+                stack.enter_context(self._folder.turn("manifest"))  # the plan stays for so long
+            if self._is_packed() or (scenes, held) != (self._planned(), self._held()):
+                return None
+            if held is None:
+                shard = pack_shard(self._folder, self.name, scenes)
+            elif (shard := grow_shard(self._folder, self.name, scenes, held)) is None:
+                return None
         log.info("%s: packed, %d scenes, %d bytes", self.name, shard.num_samples, shard.num_bytes)
         return shard
 
@@ -93,8 +98,9 @@ class UnfinishedShard:
         This look claims each missing scene for a moment. Whoever wants that scene just then leaves
         it to us, so a caller that gets True must go and make it.
         """
-        missing = [index for index in self._scenes if not is_staged(self._staged, index)]
-        if self._folder.has_shard(self.name):  # looked at last: packing empties the staging folder
+        scenes = self._planned()[self._held() or 0 :]
+        missing = [index for index in scenes if not is_staged(self._staged, index)]
+        if self._is_packed():  # looked at last: packing empties the staging folder
             return False
         claims: Iterable[Path] = map(self._claim, missing) if missing else [self._packing]
         return any(map(_is_unclaimed, claims))
@@ -103,7 +109,22 @@ class UnfinishedShard:
         return self._staged / numbered(scene_index, f"{sample_key(scene_index)}.claim")
 
     def _is_done(self, scene_index: int) -> bool:
-        return self._folder.has_shard(self.name) or is_staged(self._staged, scene_index)
+        held = scenes_of_shard(self._index, self._splits)[: self._held() or 0]
+        return scene_index in held or is_staged(self._staged, scene_index) or self._is_packed()
+
+    def _is_packed(self) -> bool:
+        return self._folder.has_shard(self.name) and self._held() is None
+
+    def _planned(self) -> range:
+        """Return the scenes of the shard that are planned now."""
+        num_scenes = read_head(self._folder.manifest).num_scenes
+        return scenes_of_shard(self._index, cut_splits(num_scenes, self._splits))
+
+    def _held(self) -> int | None:
+        """Return how many scenes the shard holds that is there and grows; None where none does."""
+        if self._folder.is_sent(self.name) or not self._folder.shard(self.name).exists():
+            return None
+        return read_head(self._folder.manifest).growing.get(self.name)
 
 
 def _is_unclaimed(claim: Path) -> bool:

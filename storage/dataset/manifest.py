@@ -66,6 +66,9 @@ class Manifest:
     """Digest of `objects.lock.jsonl`; empty until the objects are prepared."""
     shards: tuple[ShardEntry, ...]
     """The finished shards by number; none while they are made."""
+    growing: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """How many scenes are packed in each shard that is to hold more: it was the last one, and is
+    packed again when the others are made."""
     schema_version: int = MANIFEST_VERSION
     """Version that was read; what is written has MANIFEST_VERSION."""
     extensions: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -124,8 +127,9 @@ def write_manifest(path: Path, manifest: Manifest) -> None:
     record = _fields(manifest) | {"schema_version": MANIFEST_VERSION}
     record["totals"] = {"samples": manifest.num_samples, "bytes": manifest.num_bytes}
     record["dataset_digest"] = manifest.dataset_digest
-    if not manifest.extensions:  # as manifests are that were written before there were any
-        del record["extensions"]
+    for later in ("extensions", "growing"):  # as manifests were written before there were any
+        if not record[later]:
+            del record[later]
     record["shards"] = []
     head, mark, tail = json.dumps(record, indent=1, sort_keys=True).partition(
         '\n "shards": ['
@@ -226,6 +230,8 @@ def _manifest(found: Iterable[tuple[str, Any]], place: str) -> Manifest:
     record.pop("totals", None)
     if not all(isinstance(sha256, str) for sha256 in record.get("extensions", {}).values()):
         raise ValueError("extensions without digests")
+    if not all(type(held) is int and held >= 0 for held in record.get("growing", {}).values()):
+        raise ValueError("growing without numbers of scenes")
     return Manifest(shards=tuple(shards), **record)
 
 

@@ -3,7 +3,7 @@
 from storage.dataset.derived import derivation_of
 from storage.dataset.manifest import Manifest
 from storage.dataset.settings import SplitSettings
-from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
+from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, shards_for
 from storage.errors import TrilightError
 from storage.settings.described import from_record
 
@@ -16,11 +16,16 @@ def planned_shards(manifest: Manifest) -> dict[str, int]:
     """
     if derivation_of(manifest.settings):  # it only ever appears whole
         return {entry.name: entry.num_samples for entry in manifest.shards}
-    splits = _splits(manifest)
+    splits = cut_splits(manifest.num_scenes, _splits(manifest))
     return {
         shard_name(index, splits): len(scenes_of_shard(index, splits))
         for index in range(shards_for(manifest.num_scenes, splits))
     }
+
+
+def is_whole(manifest: Manifest, num_listed: int) -> bool:
+    """Return whether a manifest with so many finished shards has all, none of which still grows."""
+    return not manifest.growing and num_listed >= num_planned(manifest)
 
 
 def num_planned(manifest: Manifest) -> int:

@@ -4,6 +4,7 @@ Any process may read it. The rate is that of the logs (storage.dataset.scene_log
 """
 
 import contextlib
+import dataclasses
 import functools
 import json
 import os
@@ -17,7 +18,7 @@ from storage.dataset.asked import read_asked
 from storage.dataset.dataset import Dataset, LocalFiles, open_listed
 from storage.dataset.layout import DatasetFolder, numbered, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
-from storage.dataset.planned import num_planned, planned_shards
+from storage.dataset.planned import is_whole, planned_shards
 from storage.dataset.scene_logs import (
     LookedAt,
     SceneLog,
@@ -135,7 +136,7 @@ def _views_at_work(folder: DatasetFolder) -> float:
 def _plan_of(manifest: Path, mtime_ns: int, num_bytes: int) -> tuple[int, int, Mapping[str, int]]:
     """Return scenes, views of each, and shards of a manifest, known by the time and size of it."""
     found = read_manifest(manifest)
-    return found.num_scenes, found.num_views, planned_shards(found)
+    return found.num_scenes, found.num_views, planned_shards(found) | found.growing
 
 
 def shards_there(folder: DatasetFolder) -> set[str]:
@@ -162,8 +163,10 @@ def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
     return listed
 
 
-def missing_shards(url: str) -> list[int]:
+def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
     """Return the indices of the shards that are not there, of a dataset that is begun.
+
+    Of more scenes than were planned so far, also what those need.
 
     Where all are there and the dataset is still not finished, its first shard counts as missing:
     whoever makes it finishes the dataset.
@@ -172,15 +175,21 @@ def missing_shards(url: str) -> list[int]:
         TrilightError: there is no readable manifest, or the URL is refused.
     """
     dataset = open_listed(url)
-    planned = list(planned_shards(dataset.manifest))
-    there = _finished_names(dataset, planned)
-    missing = [index for index, name in enumerate(planned) if name not in there]
+    manifest, before = dataset.manifest, planned_shards(dataset.manifest)
+    more = dataclasses.replace(manifest, num_scenes=max(num_scenes, manifest.num_scenes))
+    planned = planned_shards(more)
+    there = _finished_names(dataset, planned) - manifest.growing.keys()
+    missing = [
+        index
+        for index, (name, scenes) in enumerate(planned.items())
+        if name not in there or before.get(name) != scenes
+    ]
     return missing or ([] if _is_finished(dataset) else [0])
 
 
 def _is_finished(dataset: Dataset) -> bool:
     """Return whether every shard is listed, and the documents are there."""
-    listed = len(dataset.manifest.shards) >= num_planned(dataset.manifest)
+    listed = is_whole(dataset.manifest, len(dataset.manifest.shards))
     return listed and dataset.files.read("README.md") is not None
 
 
@@ -189,7 +198,7 @@ def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
 
     Args:
         folder: of the dataset.
-        planned: what `planned_shards` says of it.
+        planned: how many scenes each of its shards holds once it is there.
     """
     there = shards_there(folder) & planned.keys()
     return sum(planned[name] for name in there) + _num_waiting(folder)
@@ -262,14 +271,15 @@ def read_status(url: str) -> DatasetStatus:
     local = DatasetFolder(dataset.files.root) if isinstance(dataset.files, LocalFiles) else None
     planned = planned_shards(manifest)
     names = _finished_names(dataset, planned)
-    done = sum(planned[name] for name in names) + (_num_waiting(local) if local else 0)
+    held = planned | manifest.growing
+    done = sum(held[name] for name in names) + (_num_waiting(local) if local else 0)
     looked, share = (look_at_logs(local), 1.0) if local else _sampled_logs(dataset)
     last, core_s = looked.last, looked.core_s
     views_per_hour, remaining_s = _rate(last, share, manifest, manifest.num_scenes - done)
     return DatasetStatus(
         shown=dataset.shown,
         build=manifest.build,
-        shards_done=len(names),
+        shards_done=len(names - manifest.growing.keys()),
         shards_planned=len(planned),
         scenes_done=done,
         scenes_planned=manifest.num_scenes,
