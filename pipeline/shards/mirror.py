@@ -18,10 +18,11 @@ import contextlib
 import dataclasses
 import io
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import BinaryIO
 
-from storage.atomic import write_atomically
+from storage.atomic import atomic_writer, write_atomically
 from storage.claims import claimed
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles, read_beside
 from storage.dataset.layout import DatasetFolder, place_of_part
@@ -33,9 +34,12 @@ from storage.dataset.manifest import (
     decode_manifest,
     index_stream,
     read_head,
+    read_manifest,
     write_manifest,
 )
+from storage.dataset.planned import planned_scenes_of
 from storage.dataset.scene_logs import log_name
+from storage.dataset.settings import MOST_SCENES
 from storage.dataset.shard_notes import (
     ShardNote,
     encode_note,
@@ -93,12 +97,16 @@ class Mirror:
         Raises:
             TrilightError: the bucket cannot be read.
         """
-        folder, theirs = self._folder, self._head()
-        if theirs is None or _identity(self._own_head()) != _identity(theirs):
+        folder, theirs, own = self._folder, self._head(), self._own_head()
+        if theirs is None or _identity(own) != _identity(theirs):
+            own = None
             _clear(folder)
         shutil.rmtree(folder.staged_sent, ignore_errors=True)  # `look_at` looks again
         if theirs is None:
             return
+        self.plan(theirs.num_scenes)
+        if own and own.num_scenes >= theirs.num_scenes:  # what is planned here, shards here hold
+            theirs = dataclasses.replace(theirs, num_scenes=own.num_scenes, growing=own.growing)
         self._take_lock(theirs.objects_lock_sha256)
         if not theirs.objects_lock_sha256:
             self._take_failures()
@@ -182,19 +190,54 @@ class Mirror:
         if not path.exists() and (data := self._files.read(self._name(path))) is not None:
             write_atomically(path, data)
 
-    def planned(self) -> int:
-        """Return how many scenes somebody has planned at most."""
+    def plans(self) -> set[int]:
+        """Return how many scenes somebody has planned, each number that was asked for."""
         names = (name.removeprefix(_PLANNED) for name in self._bucket.names_in(_PLANNED))
-        return max((int(text) for text in names if text.isdecimal()), default=0)
+        return {int(text) for text in names if text.isdecimal()}
 
-    def look_at(self, part: int) -> None:
-        """Note which shards of a part of the dataset are finished in the bucket."""
+    def look_at(self, part: int, ends: Mapping[str, int]) -> None:
+        """Note which shards of a part of the dataset are finished in the bucket.
+
+        Args:
+            part: which part.
+            ends: shards that may hold fewer scenes than the number of them that is planned; those
+                come here, to be packed again.
+        """
         place = place_of_part(part)
         notes = self._bucket.names_in(f"{self._name(self._folder.staged_entries)}/{place}")
         for name in filter(SHARD_NAME.fullmatch, self._bucket.names_in(place)):
             noted = self._name(note_of(self._folder, name)) in notes
-            if not self._folder.is_sent(name) and (noted or name in self._listed()):
-                self._mark(name)
+            if self._folder.is_sent(name) or not (noted or name in self._listed()):
+                continue
+            note = (self._noted(name) or self._note_of_list(name)) if name in ends else None
+            if note and (note.scenes or MOST_SCENES) < ends[name]:
+                self._take_growing(note)
+                continue
+            self._mark(name)
+            if note:  # another machine has let it grow
+                note_shard(self._folder, note)
+                with self._growing() as growing:
+                    if growing.pop(name, None) is not None:
+                        self._folder.shard(name).unlink(missing_ok=True)
+
+    def _take_growing(self, note: ShardNote) -> None:
+        """Bring a shard here that is to hold more scenes, if its bytes are the noted ones."""
+        name, path = note.shard.name, self._folder.shard(note.shard.name)
+        if path.exists() or self._indexed(name) != note.shard:
+            return
+        with self._growing() as growing:
+            growing[name] = note.scenes or 0
+        with self._opened(name) as stream, atomic_writer(path) as copy:
+            shutil.copyfileobj(stream, copy)
+
+    @contextlib.contextmanager
+    def _growing(self) -> Iterator[dict[str, int]]:
+        """Change in turn what the folder's manifest says of shards that grow."""
+        with self._folder.turn("manifest"):
+            own = read_manifest(self._folder.manifest)
+            yield (growing := dict(own.growing))
+            if growing != own.growing:
+                write_manifest(self._folder.manifest, dataclasses.replace(own, growing=growing))
 
     def _listed(self) -> set[str]:
         """Return the shards that the manifest lists: those of a set that grows, or was copied."""
@@ -233,45 +276,91 @@ class Mirror:
 
         Returns:
             The note on the shard that is in the bucket then, ours or that of the first writer;
-            None where another process of this machine sends it, or has sent it.
+            None where another maker sends it, another process of this machine has sent it, or it
+            grows.
         """
         folder, path = self._folder, self._folder.shard(name)
         with claimed(folder.staging / "sending" / f"{name}.claim") as ours:
-            if not ours or not path.exists():
+            own = read_head(folder.manifest)
+            if not ours or not path.exists() or name in own.growing:
                 return None
-            note = made = noted_shard(folder, name)
+            made = noted_shard(folder, name)
+            made = dataclasses.replace(made, scenes=planned_scenes_of(own, made.shard))
+            note: ShardNote | None = made
             if not folder.is_sent(name):
                 note = self._put(made)
+                if note is None:
+                    return None
                 self._mark(name)
             if note.shard == made.shard:
                 shard_cache().keep(path, self._files.url.child(name), made.shard.sha256)
             path.unlink(missing_ok=True)
         return note
 
-    def _put(self, made: ShardNote) -> ShardNote:
+    def _put(self, made: ShardNote) -> ShardNote | None:
         """Put a shard and what stands beside it into the bucket; return the note that is there.
 
         A worker that was not first takes over the first writer's note. Where that is missing, the
-        first writer was killed, and ours says what was rejected instead.
+        first writer was killed, and ours says what was rejected instead. A shard of more scenes
+        takes the place of one that could grow; None where another machine is at that.
         """
         name, here = made.shard.name, self._folder
         log, note = here.root / log_name(name), self._name(note_of(here, name))
-        if self._bucket.create(name, here.shard(name)):
+        scenes = made.scenes or MOST_SCENES
+        first = self._bucket.create(name, here.shard(name))
+        found = None if first and made.scenes is None else self._noted(name)
+        if not first and found is None:
+            found = dataclasses.replace(made, shard=self._indexed(name))
+            if found.shard.num_samples < made.shard.num_samples:
+                found = dataclasses.replace(found, scenes=0)
+            elif not self._bucket.create(note, encode_note(found)):
+                found = self._noted(name)
+        if found and (found.scenes is None or found.scenes >= scenes):
+            note_shard(here, found)
+            return found
+        with contextlib.ExitStack() as stack:
+            if not first:
+                ours = stack.enter_context(self._claims.claimed(note))
+                again = self._noted(name)
+                if not ours or (again and again != found):  # another machine is at it, or was
+                    return None
+                self._bucket.write(name, here.shard(name))
+                self._list_again(made.shard)
             if log.exists():
                 self._bucket.write(self._name(log), log)
             self._bucket.write(note, encode_note(made))
-            return made
-        found = dataclasses.replace(made, shard=self._indexed(name))
-        if not self._bucket.create(note, encode_note(found)):
-            (found,) = fetched_notes(self._files.read, [note], here.shown)
-        note_shard(here, found)
-        return found
+        return made
+
+    def _list_again(self, shard: ShardEntry) -> None:
+        """Have the bucket's manifest list a shard as it is now, where that was listed."""
+        theirs = self._manifest()
+        shards = tuple(shard if entry.name == shard.name else entry for entry in theirs.shards)
+        if shards != theirs.shards:
+            path = self._folder.staging / "relisted.json"
+            write_manifest(path, dataclasses.replace(theirs, shards=shards))
+            self._bucket.write("manifest.json", path)
+
+    def _noted(self, name: str) -> ShardNote | None:
+        """Return the note on a shard that is in the bucket, if there is one."""
+        data = self._files.read(note := self._name(note_of(self._folder, name)))
+        if data is None:
+            return None
+        return fetched_notes(lambda _: data, [note], self._folder.shown)[0]
+
+    def _note_of_list(self, name: str) -> ShardNote:
+        """Return what the manifest says of a shard without a note, as in a set that was copied."""
+        theirs = self._manifest()
+        (shard,) = (entry for entry in theirs.shards if entry.name == name)
+        return ShardNote(shard=shard, failures=(), scenes=planned_scenes_of(theirs, shard))
 
     def _indexed(self, name: str) -> ShardEntry:
         """Return the entry of a shard of the bucket by reading it."""
-        url = self._files.url.child(name)
-        with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
+        with self._opened(name) as stream:
             return index_stream(stream, Path(name).name)
+
+    def _opened(self, name: str) -> BinaryIO:
+        url = self._files.url.child(name)
+        return shard_cache().open(url, num_bytes=None, sha256=None)
 
     def send_file(self, path: Path) -> None:
         """Put a file of the folder into the bucket, in place of one that is there."""

@@ -31,6 +31,8 @@ class ShardNote:
     """What the manifest says of it."""
     failures: tuple[Failure, ...]
     """Its scenes that were given up, and attempts that were rejected."""
+    scenes: int | None = None
+    """In a bucket, for how many scenes it stands where that is not a whole shard."""
 
 
 def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:
@@ -52,7 +54,8 @@ def note_shard(folder: DatasetFolder, note: ShardNote) -> None:
 def encode_note(note: ShardNote) -> bytes:
     """Return the file of a note."""
     failures = encode_failures(note.failures).decode()
-    return canonical_json({"shard": shard_row(note.shard), "failures": failures})
+    cut = {} if note.scenes is None else {"scenes": note.scenes}
+    return canonical_json({"shard": shard_row(note.shard), "failures": failures, **cut})
 
 
 def decode_note(data: bytes) -> ShardNote:
@@ -63,7 +66,10 @@ def decode_note(data: bytes) -> ShardNote:
     """
     record = json.loads(data)
     failures = decode_failures(record.get("failures", "").encode())
-    return ShardNote(shard=shard_of_row(record.get("shard", record)), failures=tuple(failures))
+    shard, scenes = shard_of_row(record.get("shard", record)), record.get("scenes")
+    if scenes is not None and type(scenes) is not int:
+        raise ValueError(f"scenes {scenes!r}")
+    return ShardNote(shard=shard, failures=tuple(failures), scenes=scenes)
 
 
 NOT_A_NOTE = (OSError, ValueError, KeyError, TypeError, AttributeError)

@@ -2,20 +2,20 @@
 
 import contextlib
 import os
-import random
 import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.making import pipeline
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset, prepare_dataset
-from storage.dataset.dataset import open_dataset
+from storage.dataset.dataset import open_dataset, open_listed
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.dataset.progress import missing_shards, read_progress, read_status
@@ -25,9 +25,10 @@ from storage.dataset.verify import verify_dataset
 from storage.records.objects import Failure
 from storage.records.sample import sample_key
 from tests.for_each import case
-from tests.pipeline.making.bucket_kit import Killed
+from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, Writes
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
+SMOKE = named_build("smoke").splits
 GIVEN_UP = (1, 6, 7)
 """Of shards of four: in the middle of one, and at the end of one."""
 
@@ -49,11 +50,11 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
     return count
 
 
-def order(root: Path, scenes: int, **changes: Any) -> DatasetOrder:
+def order(root: Path | str, scenes: int, **changes: Any) -> DatasetOrder:
     return tiny_order(out=str(root), scenes=scenes, failure_budget=1.0, **changes)
 
 
-def make(root: Path, scenes: int, **changes: Any) -> str:
+def make(root: Path | str, scenes: int, **changes: Any) -> str:
     return make_dataset(order(root, scenes, **changes), Undocumented()).digest
 
 
@@ -64,9 +65,9 @@ def files(root: Path) -> dict[str, bytes]:
 
 
 def test_any_growth_ends_as_the_set_made_at_once(tmp_path: Path, made: Counter[int]) -> None:
-    rng, sets = random.Random(7), 0
+    rng, sets = np.random.default_rng(7), 0
     walks = [[1, 2, 3, 4, 5], [3, 20], [5, 6, 7, 8], [2, 3, 9, 9, 5]]
-    walks += [sorted(rng.choices(range(1, 23), k=rng.randint(2, 5))) for _ in range(6)]
+    walks += [sorted(map(int, rng.integers(1, 23, rng.integers(2, 6)))) for _ in range(6)]
     for steps in walks:
         with case(steps):
             root, sets = tmp_path / f"grown-{sets}", sets + 1
@@ -162,6 +163,50 @@ def test_a_shard_that_grows_is_missing_and_readable(tmp_path: Path, made: Counte
     shutil.rmtree(root / ".staging")
     assert make(root, 9, shards="0:1") == whole
     assert verify_dataset(root).problems == []
+
+
+def test_a_bucket_grows_whoever_dies_when(
+    tmp_path: Path,
+    made: Counter[int],
+    bucket: Any,
+    machines: Machines,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The n-th write of each run never happens; three machines take turns until one is through."""
+    machines.use("plain")
+    whole, writes, runs = make(tmp_path / "whole", 11), Writes(monkeypatch), 0
+    for scenes in (3, 6, 11):
+        for number in range(100):
+            writes.left, runs = number // 2, runs + 1
+            machines.use("abc"[number % 3])
+            with case((scenes, number)), contextlib.suppress(Killed):
+                make(OUT, scenes)
+                break
+            if bucket.exists("shards/set/manifest.json"):
+                listed = open_listed(OUT).manifest
+                assert len(listed.shards) in (0, shards_for(listed.num_scenes, SMOKE))
+        assert open_listed(OUT).manifest.num_scenes == scenes
+    assert runs > 30
+    assert open_dataset(OUT).digest == whole
+    assert verify_dataset(OUT).problems == []
+    for name, data in files(tmp_path / "whole").items():
+        assert bucket.cat_file(f"shards/set/{name}") == data, name
+
+
+def test_a_bucket_without_notes_grows(
+    tmp_path: Path, made: Counter[int], bucket: Any, machines: Machines
+) -> None:
+    """A finished set that was copied, grown by two machines to two numbers of scenes."""
+    machines.use("plain")
+    whole = make(tmp_path / "whole", 7)
+    make(tmp_path / "small", 5)
+    bucket.put(str(tmp_path / "small"), "shards/set", recursive=True)
+    bucket.rm("shards/set/.staging", recursive=True)
+    machines.use("a")
+    make(OUT, 6)
+    machines.use("b")
+    assert make(OUT, 7) == whole
+    assert verify_dataset(OUT).problems == []
 
 
 def test_every_preset_makes_one_scene() -> None:
