@@ -86,6 +86,14 @@ def shards_for(num_scenes: int, settings: "SplitSettings") -> int:
     return -(-num_scenes // settings.scenes_per_shard)
 
 
+def lacks_validation(num_scenes: int, settings: "SplitSettings") -> str:
+    """Say that no shard of new scenes is for validation, where that is so; empty otherwise."""
+    if settings.one_split or settings.listed_shards or settings.listed_scenes is not None:
+        return ""
+    least = VALIDATION_SLOT * settings.scenes_per_shard + 1
+    return "" if num_scenes >= least else f"none for validation before --scenes {least}"
+
+
 def require_objects(num_by_split: Mapping[str, int], needed: set[str]) -> None:
     """Raise TrilightError where a split that is needed has no object to draw from."""
     empty = [split for split in SPLITS if split in needed and not num_by_split.get(split)]
