@@ -40,7 +40,7 @@ class BucketPublication(Publication):
     ) -> None:
         super().__init__(folder, manifest, splits)
         self._mirror = mirror
-        self._ends: dict[str, int] = {}
+        self._ends: dict[str, range] = {}
         """Shards in which a plan has ended, with the scenes that they are to hold now."""
 
     def dataset(self) -> Dataset:
@@ -149,9 +149,7 @@ class BucketPublication(Publication):
                 self.extend(max(planned, self.manifest.num_scenes))
         splits, each = self.splits, self._splits.scenes_per_shard
         last = () if splits.listed_shards else {plan // each for plan in plans if plan % each}
-        self._ends = {
-            shard_name(index, splits): len(scenes_of_shard(index, splits)) for index in last
-        }
+        self._ends = {shard_name(at, splits): scenes_of_shard(at, splits) for at in last}
         return news
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.shards.pack import unpack_here
 from storage.atomic import write_atomically
 from storage.claims import claimed
 from storage.dataset.dataset import Dataset, open_dataset
@@ -217,7 +218,7 @@ class Publication:
                 shards |= {note.shard.name: note.shard for note in notes}
                 every = tuple(sorted(shards.values(), key=number_of_shard))
                 self._add_failures(failure for note in notes for failure in note.failures)
-                listed = dataclasses.replace(listed, shards=every, growing={})
+                listed = dataclasses.replace(listed, shards=every, growing=())
                 write_manifest(self.folder.manifest, listed)
             for staged in (self.folder.staged_entries, self.folder.staged_failures):
                 shutil.rmtree(staged, ignore_errors=True)
@@ -237,16 +238,17 @@ class Publication:
         """Plan more scenes; call in the turn of the manifest.
 
         A last shard that is there with fewer scenes than fit grows from now on: in the turn, each
-        shard of a folder holds what is planned for it, or else the manifest says what it holds.
+        shard of a folder holds what is planned for it, or else the manifest says that it grows.
         """
-        growing, index = dict(self.manifest.growing), self.num_shards - 1
-        name, held = shard_name(index, self._splits), self._num_scenes([index])
-        if held < len(scenes_of_shard(index, self._splits)):
+        growing, last = set(self.manifest.growing), self.num_shards - 1
+        name, scenes = shard_name(last, self._splits), scenes_of_shard(last, self._splits)
+        if self._num_scenes([last]) < len(scenes):
             (self.folder.staged_sent / name).unlink(missing_ok=True)  # of a bucket: looked at again
             if self.folder.shard(name).exists():
-                self._add_failures(noted_shard(self.folder, name).failures)
-                growing.setdefault(name, held)
-        self._write(num_scenes=num_scenes, growing=growing)
+                listed = read_manifest(self.folder.manifest).shards
+                unpack_here(self.folder, name, scenes, listed)
+                growing.add(name)
+        self._write(num_scenes=num_scenes, growing=tuple(sorted(growing)))
 
     def add_failures(self, failures: Iterable[Failure]) -> None:
         """Add rows to `failures.jsonl`; a row that is there already stays single."""

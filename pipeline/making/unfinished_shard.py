@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from pipeline.shards.pack import grow_shard, pack_shard
+from pipeline.shards.pack import pack_shard
 from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder, numbered
 from storage.dataset.manifest import ShardEntry, read_head
@@ -75,20 +75,17 @@ class UnfinishedShard:
         Returns:
             The shard, where this call packed it.
         """
-        scenes, held = self._planned(), self._held()
-        if self._is_packed() or not all(is_staged(self._staged, at) for at in scenes[held or 0 :]):
+        scenes, grows = self._plan()
+        if self._is_packed() or not all(is_staged(self._staged, index) for index in scenes):
             return None
         with contextlib.ExitStack() as stack:
             if not stack.enter_context(claimed(self._packing)):
                 return None
-            if held is not None or scenes != scenes_of_shard(self._index, self._splits):
+            if grows or scenes != scenes_of_shard(self._index, self._splits):
                 stack.enter_context(self._folder.turn("manifest"))  # the plan stays for so long
-            if self._is_packed() or (scenes, held) != (self._planned(), self._held()):
+            if self._is_packed() or self._plan() != (scenes, grows):
                 return None
-            if held is None:
-                shard = pack_shard(self._folder, self.name, scenes)
-            elif (shard := grow_shard(self._folder, self.name, scenes, held)) is None:
-                return None
+            shard = pack_shard(self._folder, self.name, scenes, grows=grows)
         log.info("%s: packed, %d scenes, %d bytes", self.name, shard.num_samples, shard.num_bytes)
         return shard
 
@@ -98,8 +95,7 @@ class UnfinishedShard:
         This look claims each missing scene for a moment. Whoever wants that scene just then leaves
         it to us, so a caller that gets True must go and make it.
         """
-        scenes = self._planned()[self._held() or 0 :]
-        missing = [index for index in scenes if not is_staged(self._staged, index)]
+        missing = [index for index in self._plan()[0] if not is_staged(self._staged, index)]
         if self._is_packed():  # looked at last: packing empties the staging folder
             return False
         claims: Iterable[Path] = map(self._claim, missing) if missing else [self._packing]
@@ -109,22 +105,17 @@ class UnfinishedShard:
         return self._staged / numbered(scene_index, f"{sample_key(scene_index)}.claim")
 
     def _is_done(self, scene_index: int) -> bool:
-        held = scenes_of_shard(self._index, self._splits)[: self._held() or 0]
-        return scene_index in held or is_staged(self._staged, scene_index) or self._is_packed()
+        return is_staged(self._staged, scene_index) or self._is_packed()
 
     def _is_packed(self) -> bool:
-        return self._folder.has_shard(self.name) and self._held() is None
+        is_sent = self._folder.is_sent(self.name)
+        return is_sent or (self._folder.shard(self.name).exists() and not self._plan()[1])
 
-    def _planned(self) -> range:
-        """Return the scenes of the shard that are planned now."""
-        num_scenes = read_head(self._folder.manifest).num_scenes
-        return scenes_of_shard(self._index, cut_splits(num_scenes, self._splits))
-
-    def _held(self) -> int | None:
-        """Return how many scenes the shard holds that is there and grows; None where none does."""
-        if self._folder.is_sent(self.name) or not self._folder.shard(self.name).exists():
-            return None
-        return read_head(self._folder.manifest).growing.get(self.name)
+    def _plan(self) -> tuple[range, bool]:
+        """Return the scenes that are planned now, and whether a shard of fewer is to grow."""
+        head = read_head(self._folder.manifest)
+        scenes = scenes_of_shard(self._index, cut_splits(head.num_scenes, self._splits))
+        return scenes, self.name in head.growing
 
 
 def _is_unclaimed(claim: Path) -> bool:

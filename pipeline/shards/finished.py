@@ -55,10 +55,10 @@ def open_finished(place: str) -> FinishedDataset:
     folder = DatasetFolder(Path(place))
     manifest = read_manifest(folder.manifest)
     if not is_whole(manifest, len(manifest.shards)):
-        done, planned = len(manifest.shards) - len(manifest.growing), num_planned(manifest)
+        done = {entry.name for entry in manifest.shards}.difference(manifest.growing)
         raise TrilightError(
-            f"{place}: {done} of {planned} shards are there; expected a finished dataset. "
-            "Run the same `trilight generate` again to finish it."
+            f"{place}: {len(done)} of {num_planned(manifest)} shards are there; expected a "
+            "finished dataset. Run the same `trilight generate` again to finish it."
         )
     lock = folder.objects_lock
     if not lock.exists() or sha256_of_file(lock) != manifest.objects_lock_sha256:

@@ -22,7 +22,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from storage.atomic import atomic_writer, write_atomically
+from pipeline.shards.pack import unpack_shard
+from storage.atomic import write_atomically
 from storage.claims import claimed
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles, read_beside
 from storage.dataset.layout import DatasetFolder, place_of_part
@@ -34,7 +35,6 @@ from storage.dataset.manifest import (
     decode_manifest,
     index_stream,
     read_head,
-    read_manifest,
     write_manifest,
 )
 from storage.dataset.planned import planned_scenes_of
@@ -75,6 +75,7 @@ class Mirror:
         self._files = RemoteDatasetFiles(url)
         self._claims = BucketClaims(self._bucket, folder.staging / "worker")
         self._names_listed: set[str] | None = None
+        self._unpacked = set[str]()
 
     def names(self) -> set[str]:
         """Return the names of all files of the dataset."""
@@ -105,7 +106,7 @@ class Mirror:
         if theirs is None:
             return
         self.plan(theirs.num_scenes)
-        if own and own.num_scenes >= theirs.num_scenes:  # what is planned here, shards here hold
+        if own and own.num_scenes >= theirs.num_scenes:  # as the shards here were packed
             theirs = dataclasses.replace(theirs, num_scenes=own.num_scenes, growing=own.growing)
         self._take_lock(theirs.objects_lock_sha256)
         if not theirs.objects_lock_sha256:
@@ -195,13 +196,13 @@ class Mirror:
         names = (name.removeprefix(_PLANNED) for name in self._bucket.names_in(_PLANNED))
         return {int(text) for text in names if text.isdecimal()}
 
-    def look_at(self, part: int, ends: Mapping[str, int]) -> None:
+    def look_at(self, part: int, ends: Mapping[str, range]) -> None:
         """Note which shards of a part of the dataset are finished in the bucket.
 
         Args:
             part: which part.
-            ends: shards that may hold fewer scenes than the number of them that is planned; those
-                come here, to be packed again.
+            ends: shards that may hold fewer scenes than these, which are planned; the scenes of
+                one that does are staged here.
         """
         place = place_of_part(part)
         notes = self._bucket.names_in(f"{self._name(self._folder.staged_entries)}/{place}")
@@ -209,35 +210,21 @@ class Mirror:
             noted = self._name(note_of(self._folder, name)) in notes
             if self._folder.is_sent(name) or not (noted or name in self._listed()):
                 continue
-            note = (self._noted(name) or self._note_of_list(name)) if name in ends else None
-            if note and (note.scenes or MOST_SCENES) < ends[name]:
-                self._take_growing(note)
-                continue
+            if scenes := ends.get(name):
+                note = self._noted(name) or self._note_of_list(name)
+                if note.scenes is not None and note.scenes < len(scenes):
+                    self._unpack(note, scenes)
+                    continue
+                note_shard(self._folder, note)  # another machine may have let it grow
             self._mark(name)
-            if note:  # another machine has let it grow
-                note_shard(self._folder, note)
-                with self._growing() as growing:
-                    if growing.pop(name, None) is not None:
-                        self._folder.shard(name).unlink(missing_ok=True)
 
-    def _take_growing(self, note: ShardNote) -> None:
-        """Bring a shard here that is to hold more scenes, if its bytes are the noted ones."""
-        name, path = note.shard.name, self._folder.shard(note.shard.name)
-        if path.exists() or self._indexed(name) != note.shard:
-            return
-        with self._growing() as growing:
-            growing[name] = note.scenes or 0
-        with self._opened(name) as stream, atomic_writer(path) as copy:
-            shutil.copyfileobj(stream, copy)
-
-    @contextlib.contextmanager
-    def _growing(self) -> Iterator[dict[str, int]]:
-        """Change in turn what the folder's manifest says of shards that grow."""
-        with self._folder.turn("manifest"):
-            own = read_manifest(self._folder.manifest)
-            yield (growing := dict(own.growing))
-            if growing != own.growing:
-                write_manifest(self._folder.manifest, dataclasses.replace(own, growing=growing))
+    def _unpack(self, note: ShardNote, scenes: range) -> None:
+        """Stage the scenes of a shard of the bucket here, if its bytes are the noted ones."""
+        name = note.shard.name
+        if name not in self._unpacked and self._indexed(name) == note.shard:
+            with self._opened(name) as stream:
+                unpack_shard(self._folder, note, scenes, stream)
+        self._unpacked.add(name)
 
     def _listed(self) -> set[str]:
         """Return the shards that the manifest lists: those of a set that grows, or was copied."""
@@ -276,8 +263,7 @@ class Mirror:
 
         Returns:
             The note on the shard that is in the bucket then, ours or that of the first writer;
-            None where another maker sends it, another process of this machine has sent it, or it
-            grows.
+            None where another maker sends it or has sent it, or it grows.
         """
         folder, path = self._folder, self._folder.shard(name)
         with claimed(folder.staging / "sending" / f"{name}.claim") as ours:
@@ -286,12 +272,10 @@ class Mirror:
                 return None
             made = noted_shard(folder, name)
             made = dataclasses.replace(made, scenes=planned_scenes_of(own, made.shard))
-            note: ShardNote | None = made
-            if not folder.is_sent(name):
-                note = self._put(made)
-                if note is None:
-                    return None
-                self._mark(name)
+            note = made if folder.is_sent(name) else self._put(made)
+            if note is None:
+                return None
+            self._mark(name)
             if note.shard == made.shard:
                 shard_cache().keep(path, self._files.url.child(name), made.shard.sha256)
             path.unlink(missing_ok=True)
@@ -306,24 +290,21 @@ class Mirror:
         """
         name, here = made.shard.name, self._folder
         log, note = here.root / log_name(name), self._name(note_of(here, name))
-        scenes = made.scenes or MOST_SCENES
         first = self._bucket.create(name, here.shard(name))
-        found = None if first and made.scenes is None else self._noted(name)
-        if not first and found is None:
-            found = dataclasses.replace(made, shard=self._indexed(name))
-            if found.shard.num_samples < made.shard.num_samples:
-                found = dataclasses.replace(found, scenes=0)
-            elif not self._bucket.create(note, encode_note(found)):
-                found = self._noted(name)
-        if found and (found.scenes is None or found.scenes >= scenes):
-            note_shard(here, found)
-            return found
-        with contextlib.ExitStack() as stack:
-            if not first:
-                ours = stack.enter_context(self._claims.claimed(note))
-                again = self._noted(name)
-                if not ours or (again and again != found):  # another machine is at it, or was
-                    return None
+        theirs = None if first else self._noted(name)
+        if not first and theirs is None:
+            theirs = dataclasses.replace(made, shard=self._indexed(name))
+            if theirs.shard.num_samples < made.shard.num_samples:
+                theirs = dataclasses.replace(theirs, scenes=0)
+            elif not self._bucket.create(note, encode_note(theirs)):
+                theirs = self._noted(name)
+        if theirs and (theirs.scenes is None or theirs.scenes >= (made.scenes or MOST_SCENES)):
+            note_shard(here, theirs)
+            return theirs
+        with self._claims.claimed(note) if theirs else contextlib.nullcontext(True) as ours:
+            if theirs and not (ours and self._noted(name) in (theirs, None)):
+                return None
+            if theirs:
                 self._bucket.write(name, here.shard(name))
                 self._list_again(made.shard)
             if log.exists():
@@ -343,9 +324,7 @@ class Mirror:
     def _noted(self, name: str) -> ShardNote | None:
         """Return the note on a shard that is in the bucket, if there is one."""
         data = self._files.read(note := self._name(note_of(self._folder, name)))
-        if data is None:
-            return None
-        return fetched_notes(lambda _: data, [note], self._folder.shown)[0]
+        return data and fetched_notes(lambda _: data, [note], self._folder.shown)[0]
 
     def _note_of_list(self, name: str) -> ShardNote:
         """Return what the manifest says of a shard without a note, as in a set that was copied."""
@@ -359,8 +338,7 @@ class Mirror:
             return index_stream(stream, Path(name).name)
 
     def _opened(self, name: str) -> BinaryIO:
-        url = self._files.url.child(name)
-        return shard_cache().open(url, num_bytes=None, sha256=None)
+        return shard_cache().open(self._files.url.child(name), num_bytes=None, sha256=None)
 
     def send_file(self, path: Path) -> None:
         """Put a file of the folder into the bucket, in place of one that is there."""

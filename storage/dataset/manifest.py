@@ -66,9 +66,8 @@ class Manifest:
     """Digest of `objects.lock.jsonl`; empty until the objects are prepared."""
     shards: tuple[ShardEntry, ...]
     """The finished shards by number; none while they are made."""
-    growing: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """How many scenes are packed in each shard that is to hold more: it was the last one, and is
-    packed again when the others are made."""
+    growing: tuple[str, ...] = ()
+    """Shards that are there, and are packed again when they have all scenes: each was the last."""
     schema_version: int = MANIFEST_VERSION
     """Version that was read; what is written has MANIFEST_VERSION."""
     extensions: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -218,7 +217,11 @@ def _decoding(place: str) -> Iterator[None]:
 def _manifest(found: Iterable[tuple[str, Any]], place: str) -> Manifest:
     record: dict[str, Any] = {}
     shards: list[ShardEntry] = []
+    growing: list[str] = []
     for name, value in found:
+        if name == "growing":  # a list comes entry by entry
+            growing.append(str(value))
+            continue
         if name == "shards":
             shards.append(shard_of_row(value))
             continue
@@ -230,9 +233,7 @@ def _manifest(found: Iterable[tuple[str, Any]], place: str) -> Manifest:
     record.pop("totals", None)
     if not all(isinstance(sha256, str) for sha256 in record.get("extensions", {}).values()):
         raise ValueError("extensions without digests")
-    if not all(type(held) is int and held >= 0 for held in record.get("growing", {}).values()):
-        raise ValueError("growing without numbers of scenes")
-    return Manifest(shards=tuple(shards), **record)
+    return Manifest(shards=tuple(shards), growing=tuple(growing), **record)
 
 
 def shard_of_row(row: dict[str, Any]) -> ShardEntry:

@@ -136,7 +136,10 @@ def _views_at_work(folder: DatasetFolder) -> float:
 def _plan_of(manifest: Path, mtime_ns: int, num_bytes: int) -> tuple[int, int, Mapping[str, int]]:
     """Return scenes, views of each, and shards of a manifest, known by the time and size of it."""
     found = read_manifest(manifest)
-    return found.num_scenes, found.num_views, planned_shards(found) | found.growing
+    packed = {
+        name: each for name, each in planned_shards(found).items() if name not in found.growing
+    }
+    return found.num_scenes, found.num_views, packed
 
 
 def shards_there(folder: DatasetFolder) -> set[str]:
@@ -146,13 +149,14 @@ def shards_there(folder: DatasetFolder) -> set[str]:
 
 
 def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
-    """Return the names of the planned shards that are there, listed or not.
+    """Return the names of the planned shards that are there, listed or not, and do not grow.
 
     A bucket is asked what it holds, where it may be asked and something is not listed yet: a shard
     is finished there when it and the note on it have come (pipeline.shards.mirror).
     """
     if isinstance(dataset.files, LocalFiles):
-        return shards_there(DatasetFolder(dataset.files.root)) & set(planned)
+        there = shards_there(DatasetFolder(dataset.files.root)) & set(planned)
+        return there - set(dataset.manifest.growing)
     listed = {entry.name for entry in dataset.manifest.shards} & set(planned)
     unlisted = set(planned) - listed
     if not unlisted or dataset.files.url.scheme not in WRITABLE:
@@ -175,15 +179,10 @@ def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
         TrilightError: there is no readable manifest, or the URL is refused.
     """
     dataset = open_listed(url)
-    manifest, before = dataset.manifest, planned_shards(dataset.manifest)
-    more = dataclasses.replace(manifest, num_scenes=max(num_scenes, manifest.num_scenes))
-    planned = planned_shards(more)
-    there = _finished_names(dataset, planned) - manifest.growing.keys()
-    missing = [
-        index
-        for index, (name, scenes) in enumerate(planned.items())
-        if name not in there or before.get(name) != scenes
-    ]
+    own, more = dataset.manifest, max(num_scenes, dataset.manifest.num_scenes)
+    planned, before = planned_shards(dataclasses.replace(own, num_scenes=more)), planned_shards(own)
+    there = {(name, before.get(name)) for name in _finished_names(dataset, planned)}
+    missing = [index for index, shard in enumerate(planned.items()) if shard not in there]
     return missing or ([] if _is_finished(dataset) else [0])
 
 
@@ -198,7 +197,7 @@ def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
 
     Args:
         folder: of the dataset.
-        planned: how many scenes each of its shards holds once it is there.
+        planned: what `planned_shards` says of it, without those that grow.
     """
     there = shards_there(folder) & planned.keys()
     return sum(planned[name] for name in there) + _num_waiting(folder)
@@ -271,15 +270,14 @@ def read_status(url: str) -> DatasetStatus:
     local = DatasetFolder(dataset.files.root) if isinstance(dataset.files, LocalFiles) else None
     planned = planned_shards(manifest)
     names = _finished_names(dataset, planned)
-    held = planned | manifest.growing
-    done = sum(held[name] for name in names) + (_num_waiting(local) if local else 0)
+    done = sum(planned[name] for name in names) + (_num_waiting(local) if local else 0)
     looked, share = (look_at_logs(local), 1.0) if local else _sampled_logs(dataset)
     last, core_s = looked.last, looked.core_s
     views_per_hour, remaining_s = _rate(last, share, manifest, manifest.num_scenes - done)
     return DatasetStatus(
         shown=dataset.shown,
         build=manifest.build,
-        shards_done=len(names - manifest.growing.keys()),
+        shards_done=len(names),
         shards_planned=len(planned),
         scenes_done=done,
         scenes_planned=manifest.num_scenes,
