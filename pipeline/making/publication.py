@@ -241,12 +241,11 @@ class Publication:
         shard of a folder holds what is planned for it, or else the manifest says that it grows.
         """
         growing, last = set(self.manifest.growing), self.num_shards - 1
-        name, scenes = shard_name(last, self._splits), scenes_of_shard(last, self._splits)
-        if self._num_scenes([last]) < len(scenes):
+        name, scenes = shard_name(last, self._splits), scenes_of_shard(last, self.splits)
+        if scenes != scenes_of_shard(last, self._splits):
             (self.folder.staged_sent / name).unlink(missing_ok=True)  # of a bucket: looked at again
-            if self.folder.shard(name).exists():
-                listed = read_manifest(self.folder.manifest).shards
-                unpack_here(self.folder, name, scenes, listed)
+            if self.folder.shard(name).exists() and name not in growing:
+                unpack_here(self.folder, name, scenes, read_manifest(self.folder.manifest))
                 growing.add(name)
         self._write(num_scenes=num_scenes, growing=tuple(sorted(growing)))
 

@@ -106,7 +106,7 @@ class Mirror:
         if theirs is None:
             return
         self.plan(theirs.num_scenes)
-        if own and own.num_scenes >= theirs.num_scenes:  # as the shards here were packed
+        if own:  # as the shards here were packed
             theirs = dataclasses.replace(theirs, num_scenes=own.num_scenes, growing=own.growing)
         self._take_lock(theirs.objects_lock_sha256)
         if not theirs.objects_lock_sha256:
@@ -201,8 +201,7 @@ class Mirror:
 
         Args:
             part: which part.
-            ends: shards that may hold fewer scenes than these, which are planned; the scenes of
-                one that does are staged here.
+            ends: shards that may hold fewer scenes than these; those of one that does come here.
         """
         place = place_of_part(part)
         notes = self._bucket.names_in(f"{self._name(self._folder.staged_entries)}/{place}")
@@ -213,9 +212,11 @@ class Mirror:
             if scenes := ends.get(name):
                 note = self._noted(name) or self._note_of_list(name)
                 if note.scenes is not None and note.scenes < len(scenes):
-                    self._unpack(note, scenes)
+                    self._unpack(note, scenes[: note.scenes])
                     continue
                 note_shard(self._folder, note)  # another machine may have let it grow
+                if name in read_head(self._folder.manifest).growing:
+                    self._folder.shard(name).unlink(missing_ok=True)
             self._mark(name)
 
     def _unpack(self, note: ShardNote, scenes: range) -> None:
@@ -324,7 +325,9 @@ class Mirror:
     def _noted(self, name: str) -> ShardNote | None:
         """Return the note on a shard that is in the bucket, if there is one."""
         data = self._files.read(note := self._name(note_of(self._folder, name)))
-        return data and fetched_notes(lambda _: data, [note], self._folder.shown)[0]
+        if data is None:
+            return None
+        return fetched_notes(lambda _: data, [note], self._folder.shown)[0]
 
     def _note_of_list(self, name: str) -> ShardNote:
         """Return what the manifest says of a shard without a note, as in a set that was copied."""
@@ -396,6 +399,7 @@ class Mirror:
         path = self._folder.staged_sent / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
+        self._unpacked.discard(name)
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self._folder.root).as_posix()

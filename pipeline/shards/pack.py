@@ -1,14 +1,15 @@
 """Stage "shards": the staged scenes of a shard become its tar file."""
 
+import contextlib
 import dataclasses
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
 from storage.atomic import atomic_writer, write_atomically
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import (
+    Manifest,
     ShardEntry,
     index_shard,
     index_stream,
@@ -26,7 +27,7 @@ from storage.dataset.shard_notes import (
 from storage.dataset.staging import read_staged_scene, stage_members
 from storage.errors import TrilightError
 from storage.records.map_references import MAP_NAME
-from storage.records.objects import Failure, read_failures, write_failures
+from storage.records.objects import Failure, write_failures
 from storage.records.sample import sample_key
 
 
@@ -57,10 +58,8 @@ def pack_shard(
         try:
             staged = read_staged_scene(staged_folder, index)
         except FileNotFoundError:
-            if (
-                folder.shard(name).exists() and not grows
-            ):  # another machine was first, beyond the reach of claims
-                return index_shard(folder.shard(name))
+            if folder.shard(name).exists() and not grows:
+                return index_shard(folder.shard(name))  # another machine was first, without claims
             raise
         failures.extend(staged.failures)
         if staged.members:
@@ -88,19 +87,13 @@ def pack_shard(
     return shard
 
 
-def unpack_here(
-    folder: DatasetFolder, name: str, scenes: range, listed: Sequence[ShardEntry]
-) -> None:
+def unpack_here(folder: DatasetFolder, name: str, scenes: range, manifest: Manifest) -> None:
     """Stage the scenes of a shard of the folder as `unpack_shard`, unless it is damaged."""
-    try:
-        note = noted_shard(folder, name)
-    except TrilightError:  # its scenes are made again
-        return
-    known = [entry for entry in listed if entry.name == name]
-    if note_of(folder, name).exists() or not known:
-        known = [note.shard]
-    with folder.shard(name).open("rb") as stream:
-        if index_stream(stream, folder.shard(name).name) in known:
+    with contextlib.suppress(TrilightError), folder.shard(name).open("rb") as stream:
+        note, known = noted_shard(folder, name), {each.name: each for each in manifest.shards}
+        if not note_of(folder, name).exists():  # it is listed, or as it is on the disk
+            note = dataclasses.replace(note, shard=known.get(name, note.shard))
+        if index_stream(stream, folder.shard(name).name) == note.shard:
             unpack_shard(folder, note, scenes, stream)
 
 
@@ -110,18 +103,15 @@ def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: 
     Args:
         folder: the dataset.
         note: what is known of the shard.
-        scenes: those that fit into it; one that it neither holds nor was given up stays missing.
+        scenes: those for which it stands; one that it does not hold was given up.
         stream: the shard.
     """
-    samples, staged = (
-        dict(samples_of(stream, note.shard.name)),
-        folder.staged_shard(note.shard.name),
-    )
-    rejected = [*note.failures, *read_failures(folder.failures)]
+    name = note.shard.name
+    samples = dict(samples_of(stream, name))
     for index in scenes:
-        failures = [each for each in rejected if each.item == sample_key(index)]
-        if failures or sample_key(index) in samples:
-            stage_members(staged, index, samples.get(sample_key(index), {}), failures)
+        key = sample_key(index)
+        failures = [failure for failure in note.failures if failure.item == key]
+        stage_members(folder.staged_shard(name), index, samples.get(key, {}), failures)
 
 
 def remove_staged(staged_folder: Path) -> None:
