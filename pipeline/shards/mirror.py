@@ -20,7 +20,6 @@ import io
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 from pipeline.shards.pack import unpack_shard
 from storage.atomic import write_atomically
@@ -99,9 +98,9 @@ class Mirror:
             TrilightError: the bucket cannot be read.
         """
         folder, theirs, own = self._folder, self._head(), self._own_head()
-        if theirs is None or _identity(own) != _identity(theirs):
+        if not (theirs and own and own.identity == theirs.identity):
             own = None
-            _clear(folder)
+            folder.clear()
         shutil.rmtree(folder.staged_sent, ignore_errors=True)  # `look_at` looks again
         if theirs is None:
             return
@@ -199,9 +198,7 @@ class Mirror:
     def look_at(self, part: int, ends: Mapping[str, range]) -> None:
         """Note which shards of a part of the dataset are finished in the bucket.
 
-        Args:
-            part: which part.
-            ends: shards that may hold fewer scenes than these; those of one that does come here.
+        Scenes of one that holds fewer than are planned, which `ends` names, are staged here.
         """
         place = place_of_part(part)
         notes = self._bucket.names_in(f"{self._name(self._folder.staged_entries)}/{place}")
@@ -211,7 +208,7 @@ class Mirror:
                 continue
             if scenes := ends.get(name):
                 note = self._noted(name) or self._note_of_list(name)
-                if note.scenes is not None and note.scenes < len(scenes):
+                if (note.scenes or MOST_SCENES) < len(scenes):
                     self._unpack(note, scenes[: note.scenes])
                     continue
                 note_shard(self._folder, note)  # another machine may have let it grow
@@ -221,11 +218,13 @@ class Mirror:
 
     def _unpack(self, note: ShardNote, scenes: range) -> None:
         """Stage the scenes of a shard of the bucket here, if its bytes are the noted ones."""
-        name = note.shard.name
-        if name not in self._unpacked and self._indexed(name) == note.shard:
-            with self._opened(name) as stream:
-                unpack_shard(self._folder, note, scenes, stream)
-        self._unpacked.add(name)
+        if note.shard.name not in self._unpacked:
+            with (
+                contextlib.suppress(TrilightError),
+                self._files.open(note.shard, checked=True) as tar,
+            ):
+                unpack_shard(self._folder, note, scenes, tar)
+        self._unpacked.add(note.shard.name)
 
     def _listed(self) -> set[str]:
         """Return the shards that the manifest lists: those of a set that grows, or was copied."""
@@ -316,10 +315,9 @@ class Mirror:
     def _list_again(self, shard: ShardEntry) -> None:
         """Have the bucket's manifest list a shard as it is now, where that was listed."""
         theirs = self._manifest()
-        shards = tuple(shard if entry.name == shard.name else entry for entry in theirs.shards)
-        if shards != theirs.shards:
+        if theirs.with_grown(shard) != theirs:
             path = self._folder.staging / "relisted.json"
-            write_manifest(path, dataclasses.replace(theirs, shards=shards))
+            write_manifest(path, theirs.with_grown(shard))
             self._bucket.write("manifest.json", path)
 
     def _noted(self, name: str) -> ShardNote | None:
@@ -332,16 +330,14 @@ class Mirror:
     def _note_of_list(self, name: str) -> ShardNote:
         """Return what the manifest says of a shard without a note, as in a set that was copied."""
         theirs = self._manifest()
-        (shard,) = (entry for entry in theirs.shards if entry.name == name)
+        shard = {entry.name: entry for entry in theirs.shards}[name]
         return ShardNote(shard=shard, failures=(), scenes=planned_scenes_of(theirs, shard))
 
     def _indexed(self, name: str) -> ShardEntry:
         """Return the entry of a shard of the bucket by reading it."""
-        with self._opened(name) as stream:
+        url = self._files.url.child(name)
+        with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
             return index_stream(stream, Path(name).name)
-
-    def _opened(self, name: str) -> BinaryIO:
-        return shard_cache().open(self._files.url.child(name), num_bytes=None, sha256=None)
 
     def send_file(self, path: Path) -> None:
         """Put a file of the folder into the bucket, in place of one that is there."""
@@ -403,21 +399,3 @@ class Mirror:
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self._folder.root).as_posix()
-
-
-def _identity(manifest: Manifest | None) -> object:
-    """Return what scenes that are not in a shard yet depend on."""
-    if manifest is None:
-        return None
-    frozen = manifest.objects_lock_sha256
-    return (manifest.settings, manifest.environment, frozen, manifest.extensions)
-
-
-def _clear(folder: DatasetFolder) -> None:
-    """Delete everything in a folder except the locks of its workers."""
-    kept = {folder.staging, folder.staging / "lock", folder.staging / "turns"}
-    for path in {*folder.root.iterdir(), *folder.staging.iterdir()} - kept:
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink()

@@ -2,25 +2,24 @@
 
 import contextlib
 import dataclasses
+import os
 import shutil
 from pathlib import Path
 from typing import BinaryIO
 
-from storage.atomic import atomic_writer, write_atomically
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import (
     Manifest,
     ShardEntry,
     index_shard,
-    index_stream,
     read_manifest,
     write_manifest,
 )
-from storage.dataset.shard import samples_of, write_shard, write_tar
+from storage.dataset.shard import samples_of, write_shard
 from storage.dataset.shard_notes import (
     ShardNote,
-    encode_note,
     note_of,
+    note_shard,
     noted_shard,
     rejections_of_shard,
 )
@@ -66,23 +65,20 @@ def pack_shard(
             for member in filter(MAP_NAME.fullmatch, staged.members):  # in memory once
                 staged.members[member] = maps.setdefault(member, staged.members[member])
             samples.append((sample_key(index), staged.members))
-    write_failures(rejections_of_shard(folder, name), failures)
-    path = folder.shard(name)
+    path, rejections = folder.shard(name), rejections_of_shard(folder, name)
+    write_failures(rejections, failures)
     if not grows:
         write_shard(path, samples)
         remove_staged(staged_folder)
         return index_shard(path)
-    with atomic_writer(path) as stream:  # the old one can be read until then
-        write_tar(stream, samples)
-        stream.flush()
-        with Path(stream.name).open("rb") as written:
-            shard = index_stream(written, path.name)
-        note = encode_note(ShardNote(shard=shard, failures=tuple(failures)))
-        write_atomically(note_of(folder, name), note)  # holds as soon as the shard has its name
-    own = read_manifest(folder.manifest)
-    shards = tuple(shard if entry.name == name else entry for entry in own.shards)
-    growing = tuple(each for each in own.growing if each != name)
-    write_manifest(folder.manifest, dataclasses.replace(own, shards=shards, growing=growing))
+    written = folder.staging / path.name
+    written.unlink(missing_ok=True)
+    write_shard(written, samples)
+    shard = index_shard(written)
+    note_shard(folder, ShardNote(shard=shard, failures=tuple(failures)))  # until it has the name,
+    os.replace(written, path)  # the old one can be read
+    write_failures(rejections, failures)
+    write_manifest(folder.manifest, read_manifest(folder.manifest).with_grown(shard))
     remove_staged(staged_folder)
     return shard
 
@@ -93,7 +89,7 @@ def unpack_here(folder: DatasetFolder, name: str, scenes: range, manifest: Manif
         note, known = noted_shard(folder, name), {each.name: each for each in manifest.shards}
         if not note_of(folder, name).exists():  # it is listed, or as it is on the disk
             note = dataclasses.replace(note, shard=known.get(name, note.shard))
-        if index_stream(stream, folder.shard(name).name) == note.shard:
+        if index_shard(folder.shard(name)) == note.shard:
             unpack_shard(folder, note, scenes, stream)
 
 

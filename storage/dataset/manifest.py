@@ -83,6 +83,17 @@ class Manifest:
         return sum(shard.num_bytes for shard in self.shards)
 
     @property
+    def identity(self) -> object:
+        """What scenes that are not in a shard yet depend on."""
+        return (self.settings, self.environment, self.objects_lock_sha256, self.extensions)
+
+    def with_grown(self, shard: ShardEntry) -> "Manifest":
+        """Return the manifest once a shard has grown: where it is listed, by its new entry."""
+        shards = tuple(shard if entry.name == shard.name else entry for entry in self.shards)
+        growing = tuple(name for name in self.growing if name != shard.name)
+        return dataclasses.replace(self, shards=shards, growing=growing)
+
+    @property
     def dataset_digest(self) -> str:
         """sha256 over the sorted shard digests, the object lock and the settings."""
         shards = sorted([shard.name, shard.sha256] for shard in self.shards)
