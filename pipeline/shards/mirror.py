@@ -218,12 +218,10 @@ class Mirror:
 
     def _unpack(self, note: ShardNote, scenes: range) -> None:
         """Stage the scenes of a shard of the bucket here, if its bytes are the noted ones."""
-        if note.shard.name not in self._unpacked:
-            with (
-                contextlib.suppress(TrilightError),
-                self._files.open(note.shard, checked=True) as tar,
-            ):
-                unpack_shard(self._folder, note, scenes, tar)
+        with contextlib.suppress(TrilightError):  # else its scenes are made again
+            if note.shard.name not in self._unpacked:
+                with self._files.open(note.shard, checked=True) as tar:
+                    unpack_shard(self._folder, note, scenes, tar)
         self._unpacked.add(note.shard.name)
 
     def _listed(self) -> set[str]:
