@@ -22,8 +22,11 @@ from pipeline.making.pipeline import make_task, prepare_dataset
 from pipeline.making.render_children import close_children
 from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece
 from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import read_manifest
+from storage.dataset.progress import read_progress
+from storage.dataset.scene_logs import look_at_logs
 from storage.dataset.shard import contents_of
-from storage.dataset.splits import planned_scenes, shard_name, shards_for
+from storage.dataset.splits import lacks_validation, planned_scenes, shard_name, shards_for
 from storage.dataset.staging import read_staged_scene
 from storage.records.safe_read import open_plain
 from storage.records.sample import sample_key
@@ -70,11 +73,11 @@ class Prediction:
     """What a dataset will take."""
 
     num_scenes: int
-    """Scenes, of whole shards."""
+    """Scenes."""
     num_shards: int
     """Shards."""
     scenes_per_shard: int
-    """Scenes in each."""
+    """Scenes in each but the last, which may have fewer."""
     core_hours: Interval
     """Cores times hours."""
     hours: Interval
@@ -162,6 +165,34 @@ def predict(
         notes=(),
     )
     return dataclasses.replace(found, notes=tuple(_notes(found)))
+
+
+def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
+    """Return what a run is going to make, and how long it takes as far as earlier scenes tell.
+
+    Empty where files or another dataset say which scenes there are.
+    """
+    settings = _settings(order)
+    if order.scenes_from or order.revisits or settings.revisit:
+        return ""
+    scenes, said = _num_scenes(order), "; how long that takes is known after the first scenes"
+    if folder.manifest.exists():
+        manifest, last = read_manifest(folder.manifest), look_at_logs(folder).last
+        scenes = max(scenes, manifest.num_scenes)
+        left, cores = max(scenes - read_progress(folder).scenes_done, 0), cores_owned()
+        if last:
+            core_s = [row.seconds * row.cores for row in last]
+            minutes = _total(core_s, left / cores / 60).shown("{:,.1f}")
+            said = f"; {left} of them are still to make: {minutes} minutes on {cores} cores"
+        if sizes := [
+            each.num_bytes / each.num_samples for each in manifest.shards if each.num_samples
+        ]:
+            said = f", about {_total(sizes, scenes / 1e9).value:,.3f} GB{said}"
+    shards, lacking = shards_for(scenes, settings.splits), lacks_validation(scenes, settings.splits)
+    noun, lacking = "shard" if shards == 1 else "shards", f" ({lacking})" if lacking else ""
+    part = f", of which this run makes {order.shards}" if order.shards else ""
+    views = f"{settings.scenes.num_views} views each"
+    return f"{scenes} scenes of {views} in {shards} {noun}{lacking}{part}{said}"
 
 
 def _notes(found: Prediction) -> Iterator[str]:

@@ -38,6 +38,10 @@ def make(order: DatasetOrder, runner: ExecutorChoice, shown: Shown) -> None:
     folder, started = dataset_folder(order.place), time.monotonic()
     first_words(f"Making {folder.shown} with the build {order.build}", silent=shown.json)
     executor = find_executor(runner.runner, runner.address, order.workers)
+    from infra.planning import describe_run  # slow: every stage
+
+    if not shown.json and (text := describe_run(order, folder)):
+        first_words(text)
     if (text := choose_variant().note) and not shown.json:
         note(f"{text}; see trilight doctor")
     with watched(folder, silent=shown.json):

@@ -65,7 +65,7 @@ def plan(
             (f"hours on {cores} cores", found.hours.shown("{:,.1f}")),
             ("USD", found.usd.shown("{:,.2f}")),
             ("GB", found.gigabytes.shown("{:,.2f}")),
-            ("shards", f"{found.num_shards} of {found.scenes_per_shard} scenes"),
+            ("shards", f"{found.num_shards} of up to {found.scenes_per_shard} scenes"),
             ("a shard", found.shard_hours.shown("{:,.2f} core-hours")),
             ("Prefect's task runs", f"{found.num_tasks} of {found.task_minutes:.1f} minutes"),
             ("Prefect's database", f"{found.database_mb:.0f} MB"),

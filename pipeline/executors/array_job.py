@@ -91,7 +91,8 @@ def array_job(
     scenes = order.scenes or BUILDS.find(order.build).num_scenes
     splits = changed(named_build(order.build), order.changes).splits
     planned = shards_for(scenes, splits)
-    missing = missing_shards(order.place) if _is_begun(order.place) else list(range(planned))
+    begun = _is_begun(order.place)
+    missing = missing_shards(order.place, scenes) if begun else list(range(planned))
     each = per_task or -(-planned // MOST_TASKS)
     tasks = sorted({shard // each for shard in missing})
     if tasks and tasks[-1] >= MOST_TASKS:

@@ -63,7 +63,7 @@ def _watched(order: DatasetByArray, shown: "ShownArray") -> DatasetStatus:
     before, changed_s = None, time.monotonic()
     while True:
         status = _status(order.place)
-        if status is not None and status.finished and not missing_shards(order.place):
+        if status and status.finished and not missing_shards(order.place, order.scenes or 0):
             return status  # a shard of a finished dataset may be gone, and made anew
         there = (status.shards_done, status.scenes_done) if status else None
         if there != before:

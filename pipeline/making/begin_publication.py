@@ -24,7 +24,7 @@ def begin(
 ) -> Publication:
     """Begin a dataset, or go on with the one that is there.
 
-    The number of scenes is rounded up to whole shards, and never falls.
+    The number of scenes never falls.
 
     Raises:
         TrilightError: the dataset was begun with other settings, or in another environment and
@@ -32,19 +32,19 @@ def begin(
     """
     if num_scenes < 1:
         raise TrilightError(f"scenes is {num_scenes}; expected at least 1.")
-    whole = planned_scenes(num_scenes, settings.splits)
+    wanted = planned_scenes(num_scenes, settings.splits)
     with folder.turn("manifest"):
         if folder.manifest.exists():
             manifest = read_head(folder.manifest)
             _require_same_dataset(folder, manifest, settings, environment, accept_environment)
-            whole = max(whole, manifest.num_scenes)
+            wanted = max(wanted, manifest.num_scenes)
         else:
             require_free(folder, _names_in(folder))
             manifest = Manifest(
                 build=settings.build,
                 settings=settings.as_json(),
                 environment=environment,
-                num_scenes=whole,
+                num_scenes=wanted,
                 num_views=settings.scenes.num_views,
                 objects_lock_sha256="",
                 shards=(),
@@ -52,8 +52,8 @@ def begin(
             )
             write_manifest(folder.manifest, manifest)
         publication = Publication(folder, manifest, settings.splits)
-        if whole != manifest.num_scenes:
-            publication.extend(whole)
+        if wanted != manifest.num_scenes:
+            publication.extend(wanted)
     return publication
 
 

@@ -16,7 +16,7 @@ from storage.dataset.layout import DatasetFolder, parts_of, shard_names_in, shar
 from storage.dataset.manifest import Manifest, read_head, read_manifest
 from storage.dataset.settings import SplitSettings
 from storage.dataset.shard_notes import ShardNote, note_shard, noted_names
-from storage.dataset.splits import shard_name
+from storage.dataset.splits import scenes_of_shard, shard_name
 from storage.errors import TrilightError
 from storage.records.objects import LockedObject, encode_objects_lock
 from storage.remote.bucket import Bucket
@@ -40,6 +40,8 @@ class BucketPublication(Publication):
     ) -> None:
         super().__init__(folder, manifest, splits)
         self._mirror = mirror
+        self._ends: dict[str, range] = {}
+        """Shards in which a plan has ended, with the scenes that they are to hold now."""
 
     def dataset(self) -> Dataset:
         return self._mirror.dataset(read_manifest(self.folder.manifest))
@@ -85,7 +87,7 @@ class BucketPublication(Publication):
 
     def _shards_there(self, shards: range) -> set[str]:
         for part in parts_of(shards):
-            self._mirror.look_at(part)
+            self._mirror.look_at(part, self._ends)
         sent = self.folder.staged_sent
         return {name for part in parts_of(shards) for name in shard_names_in_part(sent, part)}
 
@@ -141,12 +143,15 @@ class BucketPublication(Publication):
 
     def learn_plan(self) -> bool:
         """Take notice of how many scenes others have planned; say whether there are more."""
-        planned = self._mirror.planned()
-        if planned <= self.manifest.num_scenes:
-            return False
-        with self._turn():
-            self.extend(max(planned, self.manifest.num_scenes))
-        return True
+        plans = self._mirror.plans()
+        planned = max(plans, default=0)
+        if news := planned > self.manifest.num_scenes:
+            with self._turn():
+                self.extend(max(planned, self.manifest.num_scenes))
+        splits, each = self.splits, self._splits.scenes_per_shard
+        last = () if splits.listed_shards else {plan // each for plan in plans if plan % each}
+        self._ends = {shard_name(at, splits): scenes_of_shard(at, splits) for at in last}
+        return news
 
 
 def begin_dataset(

@@ -37,7 +37,8 @@ class DatasetOrder:
     by default data/BUILD. Machines that write to one bucket at the same time should make different
     shards, or they make the same scenes twice."""
     scenes: Annotated[int | None, Within(1, MOST_SCENES, unit="scenes")] = None
-    """Number of scenes, rounded up to whole shards; by default the build's."""
+    """Number of scenes; by default the build's. With a larger number, the same command lets the
+    dataset grow."""
     seed: Seed | None = None
     """Seed of objects, scenes, cameras and samples; by default the build's."""
     resolution: Resolution | None = None

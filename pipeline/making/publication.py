@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.shards.pack import unpack_here
 from storage.atomic import write_atomically
 from storage.claims import claimed
 from storage.dataset.dataset import Dataset, open_dataset
@@ -35,7 +36,7 @@ from storage.dataset.shard_notes import (
     noted_shard,
     rejections_of_shard,
 )
-from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
+from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, shards_for
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import (
@@ -86,6 +87,11 @@ class Publication:
         self.left_to_others = False
         """Whether another machine has just listed the shards, and writes the documents."""
         self._splits = splits
+
+    @property
+    def splits(self) -> SplitSettings:
+        """How scenes are divided, as far as they are planned: the last shard may hold fewer."""
+        return cut_splits(self.manifest.num_scenes, self._splits)
 
     def dataset(self) -> Dataset:
         """Return what is public, for whoever reads it."""
@@ -138,7 +144,7 @@ class Publication:
         self._count(note)
 
     def _count(self, note: ShardNote) -> None:
-        num_scenes = len(scenes_of_shard(number_of_shard(note.shard), self._splits))
+        num_scenes = self._num_scenes([number_of_shard(note.shard)])
         self.failures += note.failures
         self.done = dataclasses.replace(
             self.done,
@@ -148,10 +154,11 @@ class Publication:
         )
 
     def missing_shards(self, wanted: range | None = None) -> list[int]:
-        """Return which of the wanted shards are still to make; of all by default.
+        """Return which of the wanted shards are still to make or to grow; of all by default.
 
         What that costs depends on what is wanted alone.
         """
+        self.refresh()  # somebody may have planned more
         every = range(self.num_shards)
         asked = every if wanted is None else every[wanted.start : wanted.stop]
         missing = self._missing(asked)
@@ -169,19 +176,22 @@ class Publication:
         return [index for index in shards if shard_name(index, self._splits) not in there]
 
     def _num_scenes(self, shards: Iterable[int]) -> int:
-        return sum(len(scenes_of_shard(index, self._splits)) for index in shards)
+        splits = self.splits
+        return sum(len(scenes_of_shard(index, splits)) for index in shards)
 
     def _shards_there(self, shards: range) -> set[str]:
-        """Return names of shards that are where the dataset is, at least those that are asked."""
+        """Return names of whole shards where the dataset is, at least those that are asked."""
         return {
             name
             for part in parts_of(shards)
             for name in shard_names_in_part(self.folder.root, part)
+            if name not in self.manifest.growing
         }
 
     def num_shards_there(self) -> int:
         """Return how many shards are there, as far as is known here."""
-        return sum(1 for _ in shard_names_in(self.folder.root))
+        names = shard_names_in(self.folder.root)
+        return sum(name not in self.manifest.growing for name in names)
 
     def _are_all_there(self) -> bool:
         """Return whether every shard is there; looks part by part, up to the first that is not."""
@@ -196,18 +206,19 @@ class Publication:
         Raises:
             TrilightError: a shard is damaged, or the folder cannot be written.
         """
+        self.refresh()
         if not self._are_all_there():
             return None
         with self._turn():  # somebody may have planned more
             if not self._are_all_there():
                 return None
             listed = read_manifest(self.folder.manifest)
-            if notes := self._unlisted(listed):
+            if (notes := self._unlisted(listed)) or listed.growing:
                 shards = {entry.name: entry for entry in listed.shards}
                 shards |= {note.shard.name: note.shard for note in notes}
                 every = tuple(sorted(shards.values(), key=number_of_shard))
                 self._add_failures(failure for note in notes for failure in note.failures)
-                listed = dataclasses.replace(listed, shards=every, documents={})
+                listed = dataclasses.replace(listed, shards=every, growing=(), documents={})
                 write_manifest(self.folder.manifest, listed)
             for staged in (self.folder.staged_entries, self.folder.staged_failures):
                 shutil.rmtree(staged, ignore_errors=True)
@@ -224,8 +235,19 @@ class Publication:
         return [noted_shard(self.folder, name) for name in every if name not in known]
 
     def extend(self, num_scenes: int) -> None:
-        """Plan more scenes; call in the turn of the manifest."""
-        self._write(num_scenes=num_scenes, documents={})
+        """Plan more scenes; call in the turn of the manifest.
+
+        A last shard that is there with fewer scenes than fit grows from now on: in the turn, each
+        shard of a folder holds what is planned for it, or else the manifest says that it grows.
+        """
+        growing, last = set(self.manifest.growing), self.num_shards - 1
+        name, scenes = shard_name(last, self._splits), scenes_of_shard(last, self.splits)
+        if scenes != scenes_of_shard(last, self._splits):
+            (self.folder.staged_sent / name).unlink(missing_ok=True)  # of a bucket: looked at again
+            if self.folder.shard(name).exists() and name not in growing:
+                unpack_here(self.folder, name, scenes, read_manifest(self.folder.manifest))
+                growing.add(name)
+        self._write(num_scenes=num_scenes, growing=tuple(sorted(growing)), documents={})
 
     def add_failures(self, failures: Iterable[Failure]) -> None:
         """Add rows to `failures.jsonl`; a row that is there already stays single."""

@@ -19,6 +19,7 @@ from pipeline.objects.sources import look_at_source
 from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry
+from storage.dataset.splits import lacks_validation
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 from storage.records.objects import Failure
@@ -70,6 +71,9 @@ class Run:
             notes = (*self.accepted.files.notes, *listed.notes(self.settings.scenes.num_views))
         elif statistics and self.order.revisits is None:
             notes = frozen_note(self.order.build, statistics)
+            splits, num_scenes = self.settings.splits, publication.manifest.num_scenes
+            if lacking := lacks_validation(num_scenes, splits):
+                notes += (f"of its shards there is {lacking}",)
         return Outcome(
             digest=finished.dataset_digest if finished else "",
             num_objects_found=self.accepted.num_found,

@@ -159,7 +159,7 @@ def rounds(run: Run, at_once: int) -> Iterator[Round]:
     """
     sizes, tasks, pause_s = TaskSizes(), TasksLeft(), _FIRST_PAUSE_S
     while missing := run.missing_shards():
-        this = Round(tasks.cut(missing, run.settings.splits, sizes, at_once=at_once), sizes)
+        this = Round(tasks.cut(missing, run.publication.splits, sizes, at_once=at_once), sizes)
         yield this
         if this.made_anything:
             pause_s = _FIRST_PAUSE_S
@@ -174,11 +174,12 @@ def _wait_for_others(run: Run, pause_s: float) -> float:
 
     No tasks are handed out meanwhile: each would be a row of a scheduler's database.
     """
-    publication, splits = run.publication, run.settings.splits
+    publication = run.publication
     while True:
         time.sleep(pause_s)
         pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
         missing = run.missing_shards()
+        splits = run.settings.splits
         shards = (UnfinishedShard(publication.folder, splits, index) for index in missing)
         if not missing or any(shard.is_free() for shard in shards):
             return pause_s

@@ -14,10 +14,10 @@ from pathlib import Path
 from pipeline.shards.pack import pack_shard
 from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder, numbered
-from storage.dataset.manifest import ShardEntry
+from storage.dataset.manifest import ShardEntry, read_head
 from storage.dataset.scene_logs import log_scene
 from storage.dataset.settings import SplitSettings
-from storage.dataset.splits import scenes_of_shard, shard_name, split_of_shard
+from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, split_of_shard
 from storage.dataset.staging import is_staged, stage_scene
 from storage.records.objects import Failure
 from storage.records.profiles import Profile
@@ -32,8 +32,7 @@ class UnfinishedShard:
     def __init__(self, folder: DatasetFolder, splits: SplitSettings, shard_index: int) -> None:
         self.name = shard_name(shard_index, splits)
         self.split = split_of_shard(shard_index, splits)
-        self._folder = folder
-        self._scenes = scenes_of_shard(shard_index, splits)
+        self._folder, self._index, self._splits = folder, shard_index, splits
         self._staged = folder.staged_shard(self.name)
         self._packing = self._staged / "pack.claim"
 
@@ -76,14 +75,17 @@ class UnfinishedShard:
         Returns:
             The shard, where this call packed it.
         """
-        if self._folder.has_shard(self.name):
+        scenes, grows = self._plan()
+        if self._is_packed() or not all(is_staged(self._staged, index) for index in scenes):
             return None
-        if not all(is_staged(self._staged, index) for index in self._scenes):
-            return None
-        with claimed(self._packing) as ours:
-            if not ours or self._folder.has_shard(self.name):
+        with contextlib.ExitStack() as stack:
+            if not stack.enter_context(claimed(self._packing)):
                 return None
-            shard = pack_shard(self._folder, self.name, self._scenes)
+            if grows or scenes != scenes_of_shard(self._index, self._splits):
+                stack.enter_context(self._folder.turn("manifest"))  # the plan stays for so long
+            if self._is_packed() or self._plan() != (scenes, grows):
+                return None
+            shard = pack_shard(self._folder, self.name, scenes, grows=grows)
         log.info("%s: packed, %d scenes, %d bytes", self.name, shard.num_samples, shard.num_bytes)
         return shard
 
@@ -93,8 +95,8 @@ class UnfinishedShard:
         This look claims each missing scene for a moment. Whoever wants that scene just then leaves
         it to us, so a caller that gets True must go and make it.
         """
-        missing = [index for index in self._scenes if not is_staged(self._staged, index)]
-        if self._folder.has_shard(self.name):  # looked at last: packing empties the staging folder
+        missing = [index for index in self._plan()[0] if not is_staged(self._staged, index)]
+        if self._is_packed():  # looked at last: packing empties the staging folder
             return False
         claims: Iterable[Path] = map(self._claim, missing) if missing else [self._packing]
         return any(map(_is_unclaimed, claims))
@@ -103,7 +105,17 @@ class UnfinishedShard:
         return self._staged / numbered(scene_index, f"{sample_key(scene_index)}.claim")
 
     def _is_done(self, scene_index: int) -> bool:
-        return self._folder.has_shard(self.name) or is_staged(self._staged, scene_index)
+        return is_staged(self._staged, scene_index) or self._is_packed()
+
+    def _is_packed(self) -> bool:
+        is_sent = self._folder.is_sent(self.name)
+        return is_sent or (self._folder.shard(self.name).exists() and not self._plan()[1])
+
+    def _plan(self) -> tuple[range, bool]:
+        """Return the scenes that are planned now, and whether a shard of fewer is to grow."""
+        head = read_head(self._folder.manifest)
+        scenes = scenes_of_shard(self._index, cut_splits(head.num_scenes, self._splits))
+        return scenes, self.name in head.growing
 
 
 def _is_unclaimed(claim: Path) -> bool:

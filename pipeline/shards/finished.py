@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 from pipeline.shards.scene_values import asked_values
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, index_shard, read_manifest
-from storage.dataset.planned import num_planned
+from storage.dataset.planned import is_whole, num_planned
 from storage.dataset.shard import ShardContents, contents_of
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
@@ -55,11 +55,11 @@ def open_finished(place: str) -> FinishedDataset:
         raise TrilightError(f"{safe_url(place)}: expected the folder of a dataset on this machine.")
     folder = DatasetFolder(Path(place))
     manifest = read_manifest(folder.manifest)
-    planned = num_planned(manifest)
-    if len(manifest.shards) < planned:
+    if not is_whole(manifest, len(manifest.shards)):
+        done = {entry.name for entry in manifest.shards}.difference(manifest.growing)
         raise TrilightError(
-            f"{place}: {len(manifest.shards)} of {planned} shards are there; expected a finished "
-            "dataset. Run the same `trilight generate` again to finish it."
+            f"{place}: {len(done)} of {num_planned(manifest)} shards are there; expected a "
+            "finished dataset. Run the same `trilight generate` again to finish it."
         )
     lock = folder.objects_lock
     if not lock.exists() or sha256_of_file(lock) != manifest.objects_lock_sha256:

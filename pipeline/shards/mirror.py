@@ -18,9 +18,10 @@ import contextlib
 import dataclasses
 import io
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from pipeline.shards.pack import unpack_shard
 from storage.atomic import write_atomically
 from storage.claims import claimed
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles, read_beside
@@ -35,7 +36,9 @@ from storage.dataset.manifest import (
     read_head,
     write_manifest,
 )
+from storage.dataset.planned import planned_scenes_of
 from storage.dataset.scene_logs import log_name
+from storage.dataset.settings import MOST_SCENES
 from storage.dataset.shard_notes import (
     ShardNote,
     encode_note,
@@ -71,6 +74,7 @@ class Mirror:
         self._files = RemoteDatasetFiles(url)
         self._claims = BucketClaims(self._bucket, folder.staging / "worker")
         self._names_listed: set[str] | None = None
+        self._unpacked = set[str]()
 
     def names(self) -> set[str]:
         """Return the names of all files of the dataset."""
@@ -93,12 +97,16 @@ class Mirror:
         Raises:
             TrilightError: the bucket cannot be read.
         """
-        folder, theirs = self._folder, self._head()
-        if theirs is None or _identity(self._own_head()) != _identity(theirs):
-            _clear(folder)
+        folder, theirs, own = self._folder, self._head(), self._own_head()
+        if not (theirs and own and own.identity == theirs.identity):
+            own = None
+            folder.clear()
         shutil.rmtree(folder.staged_sent, ignore_errors=True)  # `look_at` looks again
         if theirs is None:
             return
+        self.plan(theirs.num_scenes)
+        if own:  # as the shards here were packed
+            theirs = dataclasses.replace(theirs, num_scenes=own.num_scenes, growing=own.growing)
         self._take_lock(theirs.objects_lock_sha256)
         if not theirs.objects_lock_sha256:
             self._take_failures()
@@ -182,19 +190,39 @@ class Mirror:
         if not path.exists() and (data := self._files.read(self._name(path))) is not None:
             write_atomically(path, data)
 
-    def planned(self) -> int:
-        """Return how many scenes somebody has planned at most."""
+    def plans(self) -> set[int]:
+        """Return how many scenes somebody has planned, each number that was asked for."""
         names = (name.removeprefix(_PLANNED) for name in self._bucket.names_in(_PLANNED))
-        return max((int(text) for text in names if text.isdecimal()), default=0)
+        return {int(text) for text in names if text.isdecimal()}
 
-    def look_at(self, part: int) -> None:
-        """Note which shards of a part of the dataset are finished in the bucket."""
+    def look_at(self, part: int, ends: Mapping[str, range]) -> None:
+        """Note which shards of a part of the dataset are finished in the bucket.
+
+        Scenes of one that holds fewer than are planned, which `ends` names, are staged here.
+        """
         place = place_of_part(part)
         notes = self._bucket.names_in(f"{self._name(self._folder.staged_entries)}/{place}")
         for name in filter(SHARD_NAME.fullmatch, self._bucket.names_in(place)):
             noted = self._name(note_of(self._folder, name)) in notes
-            if not self._folder.is_sent(name) and (noted or name in self._listed()):
-                self._mark(name)
+            if self._folder.is_sent(name) or not (noted or name in self._listed()):
+                continue
+            if scenes := ends.get(name):
+                note = self._noted(name) or self._note_of_list(name)
+                if (note.scenes or MOST_SCENES) < len(scenes):
+                    self._unpack(note, scenes[: note.scenes])
+                    continue
+                note_shard(self._folder, note)  # another machine may have let it grow
+                if name in read_head(self._folder.manifest).growing:
+                    self._folder.shard(name).unlink(missing_ok=True)
+            self._mark(name)
+
+    def _unpack(self, note: ShardNote, scenes: range) -> None:
+        """Stage the scenes of a shard of the bucket here, if its bytes are the noted ones."""
+        with contextlib.suppress(TrilightError):  # else its scenes are made again
+            if note.shard.name not in self._unpacked:
+                with self._files.open(note.shard, checked=True) as tar:
+                    unpack_shard(self._folder, note, scenes, tar)
+        self._unpacked.add(note.shard.name)
 
     def _listed(self) -> set[str]:
         """Return the shards that the manifest lists: those of a set that grows, or was copied."""
@@ -233,39 +261,75 @@ class Mirror:
 
         Returns:
             The note on the shard that is in the bucket then, ours or that of the first writer;
-            None where another process of this machine sends it, or has sent it.
+            None where another maker sends it or has sent it, or it grows.
         """
         folder, path = self._folder, self._folder.shard(name)
         with claimed(folder.staging / "sending" / f"{name}.claim") as ours:
-            if not ours or not path.exists():
+            own = read_head(folder.manifest)
+            if not ours or not path.exists() or name in own.growing:
                 return None
-            note = made = noted_shard(folder, name)
-            if not folder.is_sent(name):
-                note = self._put(made)
-                self._mark(name)
+            made = noted_shard(folder, name)
+            made = dataclasses.replace(made, scenes=planned_scenes_of(own, made.shard))
+            note = made if folder.is_sent(name) else self._put(made)
+            if note is None:
+                return None
+            self._mark(name)
             if note.shard == made.shard:
                 shard_cache().keep(path, self._files.url.child(name), made.shard.sha256)
             path.unlink(missing_ok=True)
         return note
 
-    def _put(self, made: ShardNote) -> ShardNote:
+    def _put(self, made: ShardNote) -> ShardNote | None:
         """Put a shard and what stands beside it into the bucket; return the note that is there.
 
         A worker that was not first takes over the first writer's note. Where that is missing, the
-        first writer was killed, and ours says what was rejected instead.
+        first writer was killed, and ours says what was rejected instead. A shard of more scenes
+        takes the place of one that could grow; None where another machine is at that.
         """
         name, here = made.shard.name, self._folder
         log, note = here.root / log_name(name), self._name(note_of(here, name))
-        if self._bucket.create(name, here.shard(name)):
+        first = self._bucket.create(name, here.shard(name))
+        theirs = None if first else self._noted(name)
+        if not first and theirs is None:
+            theirs = dataclasses.replace(made, shard=self._indexed(name))
+            if theirs.shard.num_samples < made.shard.num_samples:
+                theirs = dataclasses.replace(theirs, scenes=0)
+            elif not self._bucket.create(note, encode_note(theirs)):
+                theirs = self._noted(name)
+        if theirs and (theirs.scenes is None or theirs.scenes >= (made.scenes or MOST_SCENES)):
+            note_shard(here, theirs)
+            return theirs
+        with self._claims.claimed(note) if theirs else contextlib.nullcontext(True) as ours:
+            if theirs and not (ours and self._noted(name) in (theirs, None)):
+                return None
+            if theirs:
+                self._bucket.write(name, here.shard(name))
+                self._list_again(made.shard)
             if log.exists():
                 self._bucket.write(self._name(log), log)
             self._bucket.write(note, encode_note(made))
-            return made
-        found = dataclasses.replace(made, shard=self._indexed(name))
-        if not self._bucket.create(note, encode_note(found)):
-            (found,) = fetched_notes(self._files.read, [note], here.shown)
-        note_shard(here, found)
-        return found
+        return made
+
+    def _list_again(self, shard: ShardEntry) -> None:
+        """Have the bucket's manifest list a shard as it is now, where that was listed."""
+        theirs = self._manifest()
+        if theirs.with_grown(shard) != theirs:
+            path = self._folder.staging / "relisted.json"
+            write_manifest(path, theirs.with_grown(shard))
+            self._bucket.write("manifest.json", path)
+
+    def _noted(self, name: str) -> ShardNote | None:
+        """Return the note on a shard that is in the bucket, if there is one."""
+        data = self._files.read(note := self._name(note_of(self._folder, name)))
+        if data is None:
+            return None
+        return fetched_notes(lambda _: data, [note], self._folder.shown)[0]
+
+    def _note_of_list(self, name: str) -> ShardNote:
+        """Return what the manifest says of a shard without a note, as in a set that was copied."""
+        theirs = self._manifest()
+        shard = {entry.name: entry for entry in theirs.shards}[name]
+        return ShardNote(shard=shard, failures=(), scenes=planned_scenes_of(theirs, shard))
 
     def _indexed(self, name: str) -> ShardEntry:
         """Return the entry of a shard of the bucket by reading it."""
@@ -329,24 +393,7 @@ class Mirror:
         path = self._folder.staged_sent / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
+        self._unpacked.discard(name)
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self._folder.root).as_posix()
-
-
-def _identity(manifest: Manifest | None) -> object:
-    """Return what scenes that are not in a shard yet depend on."""
-    if manifest is None:
-        return None
-    frozen = manifest.objects_lock_sha256
-    return (manifest.settings, manifest.environment, frozen, manifest.extensions)
-
-
-def _clear(folder: DatasetFolder) -> None:
-    """Delete everything in a folder except the locks of its workers."""
-    kept = {folder.staging, folder.staging / "lock", folder.staging / "turns"}
-    for path in {*folder.root.iterdir(), *folder.staging.iterdir()} - kept:
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink()

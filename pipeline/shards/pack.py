@@ -1,30 +1,50 @@
 """Stage "shards": the staged scenes of a shard become its tar file."""
 
+import contextlib
+import dataclasses
+import os
 import shutil
 from pathlib import Path
+from typing import BinaryIO
 
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import ShardEntry, index_shard
-from storage.dataset.shard import write_shard
-from storage.dataset.shard_notes import rejections_of_shard
-from storage.dataset.staging import read_staged_scene
+from storage.dataset.manifest import (
+    Manifest,
+    ShardEntry,
+    index_shard,
+    read_manifest,
+    write_manifest,
+)
+from storage.dataset.shard import samples_of, write_shard
+from storage.dataset.shard_notes import (
+    ShardNote,
+    note_of,
+    note_shard,
+    noted_shard,
+    rejections_of_shard,
+)
+from storage.dataset.staging import read_staged_scene, stage_members
+from storage.errors import TrilightError
 from storage.records.map_references import MAP_NAME
 from storage.records.objects import Failure, write_failures
 from storage.records.sample import sample_key
 
 
-def pack_shard(folder: DatasetFolder, name: str, scene_indices: range) -> ShardEntry:
+def pack_shard(
+    folder: DatasetFolder, name: str, scene_indices: range, *, grows: bool = False
+) -> ShardEntry:
     """Write a shard from its staged scenes and return its manifest entry.
 
     The rejections are written before the shard, so that every reader of the shard finds them, and
     the staged scenes are deleted after it: a kill in between loses nothing and repeats little.
 
-    Where the shard is there already, it stays: the first writer wins.
+    Where the shard is there already, it stays: the first writer wins. One that grows is replaced.
 
     Args:
         folder: the dataset.
         name: file name of the shard.
         scene_indices: its scenes, all of which are staged.
+        grows: whether the manifest says so; call in its turn then.
 
     Raises:
         TrilightError: the disk is full or the folder cannot be written.
@@ -37,19 +57,57 @@ def pack_shard(folder: DatasetFolder, name: str, scene_indices: range) -> ShardE
         try:
             staged = read_staged_scene(staged_folder, index)
         except FileNotFoundError:
-            if folder.shard(name).exists():  # another machine was first, beyond the reach of claims
-                return index_shard(folder.shard(name))
+            if folder.shard(name).exists() and not grows:
+                return index_shard(folder.shard(name))  # another machine was first, without claims
             raise
         failures.extend(staged.failures)
         if staged.members:
             for member in filter(MAP_NAME.fullmatch, staged.members):  # in memory once
                 staged.members[member] = maps.setdefault(member, staged.members[member])
             samples.append((sample_key(index), staged.members))
-    write_failures(rejections_of_shard(folder, name), failures)
-    path = folder.shard(name)
-    write_shard(path, samples)
+    path, rejections = folder.shard(name), rejections_of_shard(folder, name)
+    write_failures(rejections, failures)
+    if not grows:
+        write_shard(path, samples)
+        remove_staged(staged_folder)
+        return index_shard(path)
+    written = folder.staging / path.name
+    written.unlink(missing_ok=True)
+    write_shard(written, samples)
+    shard = index_shard(written)
+    note_shard(folder, ShardNote(shard=shard, failures=tuple(failures)))  # until it has the name,
+    os.replace(written, path)  # the old one can be read
+    write_failures(rejections, failures)
+    write_manifest(folder.manifest, read_manifest(folder.manifest).with_grown(shard))
     remove_staged(staged_folder)
-    return index_shard(path)
+    return shard
+
+
+def unpack_here(folder: DatasetFolder, name: str, scenes: range, manifest: Manifest) -> None:
+    """Stage the scenes of a shard of the folder as `unpack_shard`, unless it is damaged."""
+    with contextlib.suppress(TrilightError), folder.shard(name).open("rb") as stream:
+        note, known = noted_shard(folder, name), {each.name: each for each in manifest.shards}
+        if not note_of(folder, name).exists():  # it is listed, or as it is on the disk
+            note = dataclasses.replace(note, shard=known.get(name, note.shard))
+        if index_shard(folder.shard(name)) == note.shard:
+            unpack_shard(folder, note, scenes, stream)
+
+
+def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: BinaryIO) -> None:
+    """Stage the scenes of a shard again, byte for byte, so that it can be packed with more.
+
+    Args:
+        folder: the dataset.
+        note: what is known of the shard.
+        scenes: those for which it stands; one that it does not hold was given up.
+        stream: the shard.
+    """
+    name = note.shard.name
+    samples = dict(samples_of(stream, name))
+    for index in scenes:
+        key = sample_key(index)
+        failures = [failure for failure in note.failures if failure.item == key]
+        stage_members(folder.staged_shard(name), index, samples.get(key, {}), failures)
 
 
 def remove_staged(staged_folder: Path) -> None:

@@ -13,6 +13,7 @@ import contextlib
 import fcntl
 import os
 import re
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -209,6 +210,15 @@ class DatasetFolder:
             yield
         finally:
             os.close(descriptor)
+
+    def clear(self) -> None:
+        """Delete everything except the locks of workers."""
+        kept = {self.staging, self.staging / "lock", self.staging / "turns"}
+        for path in {*self.root.iterdir(), *self.staging.iterdir()} - kept:
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
 
     def _clean(self) -> None:
         looked = self.staging / "cleaned"

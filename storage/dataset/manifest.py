@@ -33,7 +33,7 @@ from storage.typed_json import DROPPED, FINITE, Sha256, ShortText, Spelled, read
 SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.tar")
 """Names are relative to the manifest and cannot leave its folder."""
 
-
+ShardName = Annotated[str, Spelled(SHARD_NAME.pattern, "the name of a shard")]
 DocumentName = Annotated[
     str, Spelled(r"(LICENSE|README)\.md|attribution\.csv|croissant\.json", "a document's name")
 ]
@@ -52,7 +52,7 @@ Bytes = Annotated[int, Within(0, 2**63 - 1, unit="bytes")]
 class ShardEntry:
     """One shard as the manifest describes it."""
 
-    name: Annotated[str, Spelled(SHARD_NAME.pattern, "the name of a shard")]
+    name: ShardName
     """File name beside the manifest, or in one of the parts of its folder
     (storage.dataset.layout)."""
     split: Annotated[str, Spelled("|".join(SPLITS), "train, validation or test")]
@@ -88,6 +88,8 @@ class _Fields:
     extensions: Mapping[str, Sha256] = dataclasses.field(default_factory=dict)
     """The sha256 of each extension that took part in making it, by its file name; nothing that is
     named here is ever imported (storage.extensions)."""
+    growing: tuple[ShardName, ...] = ()
+    """Shards that are there, and are packed again when they have all scenes: each was the last."""
     documents: Mapping[DocumentName, Sha256] = dataclasses.field(default_factory=dict)
     """The sha256 of each document by name; empty until they are written, and in older manifests."""
     shards: tuple[ShardEntry, ...]
@@ -137,6 +139,17 @@ class Manifest(_Fields):
         storage = self.settings.get("storage")
         names = storage.get("passes") if isinstance(storage, Mapping) else None
         return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
+
+    @property
+    def identity(self) -> object:
+        """What scenes that are not in a shard yet depend on."""
+        return (self.settings, self.environment, self.objects_lock_sha256, self.extensions)
+
+    def with_grown(self, shard: ShardEntry) -> "Manifest":
+        """Return the manifest once a shard has grown: where it is listed, by its new entry."""
+        shards = tuple(shard if entry.name == shard.name else entry for entry in self.shards)
+        growing = tuple(name for name in self.growing if name != shard.name)
+        return dataclasses.replace(self, shards=shards, growing=growing)
 
     @property
     def dataset_digest(self) -> str:
@@ -193,7 +206,7 @@ def _encoded(manifest: Manifest, seal: str) -> Iterator[bytes]:
     record |= {"schema_version": MANIFEST_VERSION, "manifest_sha256": seal, "shards": []}
     record["totals"] = {"samples": manifest.num_samples, "bytes": manifest.num_bytes}
     record["dataset_digest"] = manifest.dataset_digest
-    for name in ("extensions", "documents"):  # as manifests were before there were any
+    for name in ("extensions", "documents", "growing"):  # as manifests were before there were any
         if not record[name]:
             del record[name]
     head, mark, tail = json.dumps(record, indent=1, sort_keys=True).partition(

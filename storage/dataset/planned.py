@@ -1,9 +1,9 @@
 """Which shards a dataset will have, from its manifest alone."""
 
 from storage.dataset.derived import derivation_of
-from storage.dataset.manifest import Manifest
+from storage.dataset.manifest import Manifest, ShardEntry, number_of_shard
 from storage.dataset.settings import SplitSettings
-from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
+from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, shards_for
 from storage.errors import TrilightError
 from storage.settings.described import from_record
 
@@ -16,11 +16,23 @@ def planned_shards(manifest: Manifest) -> dict[str, int]:
     """
     if derivation_of(manifest.settings):  # it only ever appears whole
         return {entry.name: entry.num_samples for entry in manifest.shards}
-    splits = _splits(manifest)
+    splits = cut_splits(manifest.num_scenes, _splits(manifest))
     return {
         shard_name(index, splits): len(scenes_of_shard(index, splits))
         for index in range(shards_for(manifest.num_scenes, splits))
     }
+
+
+def planned_scenes_of(manifest: Manifest, shard: ShardEntry) -> int | None:
+    """Return how many scenes a shard is to hold; None for as many as fit into it."""
+    splits, number = _splits(manifest), number_of_shard(shard)
+    cut = scenes_of_shard(number, cut_splits(manifest.num_scenes, splits))
+    return len(cut) if cut != scenes_of_shard(number, splits) else None
+
+
+def is_whole(manifest: Manifest, num_listed: int) -> bool:
+    """Return whether a manifest with so many finished shards has all, none of which still grows."""
+    return not manifest.growing and num_listed >= num_planned(manifest)
 
 
 def num_planned(manifest: Manifest) -> int:

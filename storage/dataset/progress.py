@@ -4,6 +4,7 @@ Any process may read it. The rate is that of the logs (storage.dataset.scene_log
 """
 
 import contextlib
+import dataclasses
 import functools
 import json
 import os
@@ -17,7 +18,7 @@ from storage.dataset.asked import read_asked
 from storage.dataset.dataset import Dataset, LocalFiles, open_listed
 from storage.dataset.layout import DatasetFolder, numbered, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
-from storage.dataset.planned import num_planned, planned_shards
+from storage.dataset.planned import is_whole, planned_shards
 from storage.dataset.scene_logs import (
     LookedAt,
     SceneLog,
@@ -135,7 +136,10 @@ def _views_at_work(folder: DatasetFolder) -> float:
 def _plan_of(manifest: Path, mtime_ns: int, num_bytes: int) -> tuple[int, int, Mapping[str, int]]:
     """Return scenes, views of each, and shards of a manifest, known by the time and size of it."""
     found = read_manifest(manifest)
-    return found.num_scenes, found.num_views, planned_shards(found)
+    packed = {
+        name: each for name, each in planned_shards(found).items() if name not in found.growing
+    }
+    return found.num_scenes, found.num_views, packed
 
 
 def shards_there(folder: DatasetFolder) -> set[str]:
@@ -145,13 +149,14 @@ def shards_there(folder: DatasetFolder) -> set[str]:
 
 
 def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
-    """Return the names of the planned shards that are there, listed or not.
+    """Return the names of the planned shards that are there, listed or not, and do not grow.
 
     A bucket is asked what it holds, where it may be asked and something is not listed yet: a shard
     is finished there when it and the note on it have come (pipeline.shards.mirror).
     """
     if isinstance(dataset.files, LocalFiles):
-        return shards_there(DatasetFolder(dataset.files.root)) & set(planned)
+        there = shards_there(DatasetFolder(dataset.files.root)) & set(planned)
+        return there - set(dataset.manifest.growing)
     listed = {entry.name for entry in dataset.manifest.shards} & set(planned)
     unlisted = set(planned) - listed
     if not unlisted or dataset.files.url.scheme not in WRITABLE:
@@ -162,8 +167,10 @@ def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
     return listed
 
 
-def missing_shards(url: str) -> list[int]:
+def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
     """Return the indices of the shards that are not there, of a dataset that is begun.
+
+    Of more scenes than were planned so far, also what those need.
 
     Where all are there and the dataset is still not finished, its first shard counts as missing:
     whoever makes it finishes the dataset.
@@ -172,15 +179,16 @@ def missing_shards(url: str) -> list[int]:
         TrilightError: there is no readable manifest, or the URL is refused.
     """
     dataset = open_listed(url)
-    planned = list(planned_shards(dataset.manifest))
-    there = _finished_names(dataset, planned)
-    missing = [index for index, name in enumerate(planned) if name not in there]
+    own, more = dataset.manifest, max(num_scenes, dataset.manifest.num_scenes)
+    planned, before = planned_shards(dataclasses.replace(own, num_scenes=more)), planned_shards(own)
+    there = {(name, before.get(name)) for name in _finished_names(dataset, planned)}
+    missing = [index for index, shard in enumerate(planned.items()) if shard not in there]
     return missing or ([] if _is_finished(dataset) else [0])
 
 
 def _is_finished(dataset: Dataset) -> bool:
     """Return whether every shard is listed, and the documents are there."""
-    listed = len(dataset.manifest.shards) >= num_planned(dataset.manifest)
+    listed = is_whole(dataset.manifest, len(dataset.manifest.shards))
     return listed and dataset.files.read("README.md") is not None
 
 
@@ -189,7 +197,7 @@ def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
 
     Args:
         folder: of the dataset.
-        planned: what `planned_shards` says of it.
+        planned: what `planned_shards` says of it, without those that grow.
     """
     there = shards_there(folder) & planned.keys()
     return sum(planned[name] for name in there) + _num_waiting(folder)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from storage.atomic import write_atomically
 from storage.dataset.layout import DatasetFolder, shard_names_in
-from storage.dataset.manifest import ShardEntry, index_shard, shard_row
+from storage.dataset.manifest import Scenes, ShardEntry, index_shard, shard_row
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures, encode_failures, read_failures
@@ -32,6 +32,8 @@ class ShardNote:
     """What the manifest says of it."""
     failures: tuple[Failure, ...]
     """Its scenes that were given up, and attempts that were rejected."""
+    scenes: int | None = None
+    """In a bucket, for how many scenes it stands where that is not a whole shard."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +44,8 @@ class _Note:
     """The shard's row of the manifest."""
     failures: str = ""
     """Lines of failures.jsonl."""
+    scenes: Scenes | None = None
+    """As in ShardNote."""
 
 
 def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:
@@ -63,13 +67,15 @@ def note_shard(folder: DatasetFolder, note: ShardNote) -> None:
 def encode_note(note: ShardNote) -> bytes:
     """Return the file of a note."""
     failures = encode_failures(note.failures).decode()
-    return canonical_json({"shard": shard_row(note.shard), "failures": failures})
+    cut = {} if note.scenes is None else {"scenes": note.scenes}
+    return canonical_json({"shard": shard_row(note.shard), "failures": failures, **cut})
 
 
 def decode_note(data: bytes, source: str) -> ShardNote:
     """Return the note of a file; raises TrilightError, naming `source`, where it is none."""
     note = read_json(data, _Note, source)
-    return ShardNote(shard=note.shard, failures=tuple(decode_failures(note.failures.encode())))
+    failures = tuple(decode_failures(note.failures.encode()))
+    return ShardNote(shard=note.shard, failures=failures, scenes=note.scenes)
 
 
 def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:

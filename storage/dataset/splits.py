@@ -6,6 +6,7 @@ dataset begins with exactly the scenes of a shorter one. Where the shards are li
 those of another dataset, the list says both.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -65,12 +66,17 @@ def scenes_of_shard(shard_index: int, settings: "SplitSettings") -> range:
 
 
 def planned_scenes(num_scenes: int, settings: "SplitSettings") -> int:
-    """Return how many scenes are made when `num_scenes` are wanted: those of whole shards."""
+    """Return how many scenes are made when `num_scenes` are wanted: those, unless files say it."""
     if settings.listed_shards:
         return settings.first_scenes[-1]
-    if settings.listed_scenes is not None:
-        return settings.listed_scenes
-    return shards_for(num_scenes, settings) * settings.scenes_per_shard
+    return num_scenes if settings.listed_scenes is None else settings.listed_scenes
+
+
+def cut_splits(num_scenes: int, settings: "SplitSettings") -> "SplitSettings":
+    """Return settings whose last shard ends with the last of `num_scenes` scenes."""
+    if settings.listed_shards:
+        return settings
+    return dataclasses.replace(settings, listed_scenes=planned_scenes(num_scenes, settings))
 
 
 MOST_SHARDS = 1_000_000
@@ -92,6 +98,14 @@ def shards_for(num_scenes: int, settings: "SplitSettings") -> int:
             f"expected at most {MOST_SHARDS}. Raise splits.scenes_per_shard, or make fewer scenes."
         )
     return count
+
+
+def lacks_validation(num_scenes: int, settings: "SplitSettings") -> str:
+    """Say that no shard of new scenes is for validation, where that is so; empty otherwise."""
+    if settings.one_split or settings.listed_shards or settings.listed_scenes is not None:
+        return ""
+    least = VALIDATION_SLOT * settings.scenes_per_shard + 1
+    return "" if num_scenes >= least else f"none for validation before --scenes {least}"
 
 
 def require_objects(num_by_split: Mapping[str, int], needed: set[str]) -> None:

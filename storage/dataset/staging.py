@@ -36,7 +36,13 @@ def stage_scene(
     profile: Profile,
 ) -> None:
     """Write what became of a scene into the staging folder of its shard, packed as it will stay."""
-    members = encode_sample(sample, profile) if sample else {}
+    stage_members(folder, scene_index, encode_sample(sample, profile) if sample else {}, failures)
+
+
+def stage_members(
+    folder: Path, scene_index: int, members: dict[str, bytes], failures: list[Failure]
+) -> None:
+    """Write a finished scene as `stage_scene`, from the members of its sample."""
     stream = io.BytesIO()
     write_tar(
         stream, [(sample_key(scene_index), {**members, _FAILURES: encode_failures(failures)})]

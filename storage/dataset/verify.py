@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from storage.dataset.dataset import Dataset, LocalFiles, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, index_stream
-from storage.dataset.planned import num_planned
+from storage.dataset.planned import is_whole, num_planned
 from storage.dataset.shard import contents_of, samples_of
 from storage.digests import seal_of, sha256_hex
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
@@ -122,7 +122,7 @@ def verify_dataset(
         num_samples=manifest.num_samples,
         bad_shards=bad,
         num_shards_planned=num_planned(manifest),
-        is_finished=dataset.num_listed >= num_planned(manifest),
+        is_finished=is_whole(manifest, dataset.num_listed),
     )
 
 

@@ -6,13 +6,15 @@ from pathlib import Path
 import pytest
 
 from infra import doctor
-from infra.planning import MeasuredScenes, measure_scenes, predict
+from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict
+from pipeline.executors.threads import ThreadRunner
 from pipeline.isolation import confinement
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.machine import cores_owned
 from pipeline.making.pipeline import make_dataset
 from pipeline.making.tasks import MOST_TASKS
 from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import DatasetFolder
 from storage.dataset.shard import scan_members
 from tests.for_each import case
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
@@ -104,6 +106,20 @@ def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
     assert measured.num_bytes == tuple(expected[:10])
     found = predict(measured, order, cores=1, usd_per_core_hour=1)
     assert found.core_hours.value == pytest.approx(24 * cores * 5 / 3600)  # floating point only
+
+
+def test_what_a_run_will_make_is_said_before_it_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_rendering(monkeypatch)
+    order, folder = tiny_order(out=str(tmp_path), scenes=3), DatasetFolder(tmp_path)
+    lacking = "1 shard (none for validation before --scenes 9)"
+    unknown = "how long that takes is known after the first scenes"
+    assert describe_run(order, folder) == f"3 scenes of 2 views each in {lacking}; {unknown}"
+    assert f"of its shards there is {lacking[9:-1]}" in make_dataset(order, ThreadRunner()).notes
+    said = describe_run(dataclasses.replace(order, scenes=9, shards="1:3"), folder)
+    assert said.startswith("9 scenes of 2 views each in 3 shards, of which this run makes 1:3")
+    assert "; 6 of them are still to make: 0.0 (0.0 to 0.0) minutes on" in said
 
 
 def _responds(name: str, code: str, *, found: str, **_: str) -> doctor.Finding:

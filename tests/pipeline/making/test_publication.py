@@ -103,11 +103,12 @@ def test_growing_keeps_the_shards(tmp_path: Path) -> None:
     assert len(read_failures(again.folder.failures)) == 12
 
 
-def test_scenes_are_rounded_up_to_whole_shards(tmp_path: Path) -> None:
+def test_as_many_scenes_are_planned_as_are_asked_for(tmp_path: Path) -> None:
     publication = _begin(tmp_path, _build(), 5)
-    assert publication.manifest.num_scenes == 8
+    assert publication.manifest.num_scenes == 5
     assert publication.missing_shards() == [0, 1]
-    assert (publication.done.shards, publication.done.shards_asked) == (0, 2)
+    done = publication.done
+    assert (done.shards, done.shards_asked, done.scenes_asked) == (0, 2, 5)
 
 
 def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Path) -> None:
@@ -261,7 +262,8 @@ def test_the_first_shards_stay_where_the_design_has_them() -> None:
 def test_a_dataset_in_parts_is_whole(tmp_path: Path) -> None:
     """Shards, rejections and logs move together; reading and verifying find them."""
     publication = _dataset(tmp_path, scenes=20)
-    names = [shard.name for shard in publication.manifest.shards]
+    shards = publication.manifest.shards
+    names = [shard.name for shard in shards]
     assert names == [
         "train-000000.tar", "train-000001.tar", "part-0001/validation-000002.tar",
         "part-0001/train-000003.tar", "part-0002/train-000004.tar",
@@ -280,7 +282,7 @@ def test_a_dataset_in_parts_is_whole(tmp_path: Path) -> None:
     assert verify_dataset(tmp_path).problems == ["part-0001/train-000003.tar: missing"]
     assert publication.missing_shards() == [3]
     moved.rename(path)
-    assert index_shard(path) == publication.manifest.shards[3]
+    assert index_shard(path) == shards[3]
     path.with_name("train-000009.tar").write_bytes(b"")
     assert verify_dataset(tmp_path).problems == ["part-0001/train-000009.tar: not in the manifest"]
 

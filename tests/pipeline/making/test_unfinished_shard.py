@@ -53,6 +53,12 @@ class FakeChild:
         return SceneAttempt(sample=_sample(scene_index), failures=[])
 
 
+@pytest.fixture(autouse=True)
+def _begun(tmp_path: Path) -> None:
+    """Begin the dataset whose shard this is."""
+    begin_tiny(tmp_path, 4)
+
+
 def _make(root: Path, first: int, last: int, made: "Counter[int]", broken: int = -1) -> Any:
     child = cast(IsolatedChild, FakeChild(made, broken))
     piece = Piece(shard_index=0, first=first, last=last)
