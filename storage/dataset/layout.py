@@ -10,7 +10,6 @@ folder of this machine before it.
 """
 
 import contextlib
-import fcntl
 import os
 import re
 import time
@@ -20,7 +19,7 @@ from pathlib import Path
 
 from storage.atomic import remove_leftovers
 from storage.cache import cache_folder
-from storage.claims import claimed, flock_now, open_lock
+from storage.claims import claimed, open_lock, take_lock
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.remote.bucket import WRITABLE
@@ -202,10 +201,10 @@ class DatasetFolder:
         """
         descriptor = open_lock(self._lock)
         try:
-            if flock_now(descriptor):
+            if take_lock(descriptor):
                 self._clean()
                 when_alone()
-            fcntl.flock(descriptor, fcntl.LOCK_SH)
+            take_lock(descriptor, shared=True, wait=True)
             yield
         finally:
             os.close(descriptor)
