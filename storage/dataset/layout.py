@@ -238,8 +238,6 @@ def dataset_folder(out: str) -> DatasetFolder:
         TrilightError: the URL is refused (storage.remote.url), is none that can be written to only
             once, or has a query.
     """
-    if "://" not in out and not out.startswith("pipe:"):
-        return DatasetFolder(Path(out))
     place = parse_url(out, what="out")
     if isinstance(place, Path):
         return DatasetFolder(place)
