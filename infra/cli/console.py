@@ -137,7 +137,7 @@ def _is_drawn(task: Task) -> bool:
 def progress_bars() -> Bars:
     """Return progress bars with count, rate, elapsed time and ETA; silent without a terminal."""
     return Bars(
-        TextColumn("{task.description:<8}"),
+        TextColumn("{task.description:<8}", markup=False),
         BarColumn(bar_width=20),
         MofNCompleteColumn(),
         RateColumn(table_column=Column(no_wrap=True)),
