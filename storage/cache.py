@@ -9,15 +9,26 @@ from storage.errors import TrilightError
 
 
 def cache_folder(name: str) -> Path:
-    """Return a folder of the user's cache: below TRILIGHT_CACHE, or ~/.cache/trilight."""
-    root = os.environ.get("TRILIGHT_CACHE")
+    """Return a folder of the user's cache: below TRILIGHT_CACHE, or ~/.cache/trilight.
+
+    Raises:
+        TrilightError: there is no home directory, or something else is where the cache would be.
+    """
+    given = os.environ.get("TRILIGHT_CACHE")
     try:
-        return (Path(root) if root else Path.home() / ".cache" / "trilight") / name
+        root = Path(given) if given else Path.home() / ".cache" / "trilight"
     except RuntimeError as error:  # neither HOME nor an entry of /etc/passwd
         raise TrilightError(
             f"user {os.getuid()} has no home directory; expected one for the cache. Set "
             "TRILIGHT_CACHE to a folder of your own."
         ) from error
+    there = next((place for place in (root, *root.parents) if os.path.lexists(place)), root)
+    if os.path.lexists(there) and not os.path.isdir(there):
+        raise TrilightError(
+            f"the cache {str(root)!r}: {str(there)!r} is no folder; expected one, or a name that "
+            "is free. Set TRILIGHT_CACHE to a folder of your own."
+        )
+    return root / name
 
 
 def private_folder(path: Path) -> Path:

@@ -1,21 +1,39 @@
 """Claims: locks that tell processes in a shared folder which work is taken.
 
 A claim is a lock on a small file. It ends with the process that holds it, however that ends, so
-nothing has to be cleaned up after a kill. Claims only avoid that work is done twice. Where a file
-system does not carry locks between machines, two of them may make the same scene, of the same
-bytes. Correct files come from storage.atomic: the first finished writer of a shard wins.
+nothing has to be cleaned up after a kill. The file says who holds it, for those who wait. Claims
+only avoid that work is done twice. Where a file system carries no locks, or none between machines,
+two processes may make the same scene, of the same bytes. Correct files come from storage.atomic:
+the first finished writer of a shard wins.
 """
 
 import contextlib
 import fcntl
+import itertools
+import logging
 import os
+import socket
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from storage.atomic import write_error
+from storage.remote.safe_url import printable
+
+log = logging.getLogger("trilight.claims")
 
 _MOST_TRIES = 100
 """To create a lock in a folder that others delete."""
+
+_SILENT_S = 10.0
+"""Time until a wait is announced; it is again each time that it has become three times as long."""
+
+_HOLDER_BYTES = 300
+"""Most that is read of what a claim says of its holder."""
+
+_unlocked = itertools.count()
+"""Counts the locks that a file system refused to carry: the first one is a warning."""
 
 
 @contextlib.contextmanager
@@ -59,27 +77,128 @@ def open_lock(path: Path) -> int:
                 raise write_error(path, error) from error
 
 
-def flock_now(descriptor: int) -> bool:
-    """Take an exclusive lock without waiting; return whether it is ours."""
+def take_lock(descriptor: int, *, shared: bool = False, wait: bool = False) -> bool:
+    """Take the lock of an open file; return whether it is ours.
+
+    A file system that carries no locks grants every lock; the first time is a warning.
+
+    Args:
+        descriptor: of the file.
+        shared: beside other shared ones; else it excludes every other lock.
+        wait: until it is free, so that it always becomes ours.
+    """
+    operation = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, operation if wait else operation | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
+    except OSError as error:  # ENOSYS, ENOLCK, EOPNOTSUPP, EIO: each system has its own
+        if next(_unlocked) == 0:
+            log.warning(
+                "%s: the file system carries no locks (%s). Processes that work there at once may "
+                "do the same work twice, with the same result; start one at a time.",
+                printable(os.path.realpath(f"/proc/self/fd/{descriptor}")),
+                error.strerror,
+            )
     return True
+
+
+def is_claimed(path: Path) -> bool:
+    """Return whether another holds a claim; to look, this takes a free one for a moment."""
+    try:
+        descriptor = os.open(path, os.O_RDWR)
+    except OSError:
+        return False
+    try:
+        return not take_lock(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def describe_holder(path: Path) -> str:
+    """Return who holds a claim and since when, as far as its file says."""
+    try:
+        host, process_id, since_s = _read_holder(path)
+        since = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(int(since_s)))
+        return f"process {int(process_id)} of {printable(host)}, at it since {since}"
+    except (OSError, OverflowError, ValueError):  # as gmtime refuses
+        return "another process"
+
+
+class WaitNotice:
+    """Says for whom a wait lasts, first after `_SILENT_S` and then after ever longer times."""
+
+    def __init__(self) -> None:
+        """Begin the wait."""
+        self._began_s, self._next_s = time.monotonic(), _SILENT_S
+
+    def update(self, claim: Path) -> None:
+        """Take notice that the wait still lasts, for the holder of a claim."""
+        waited_s = time.monotonic() - self._began_s
+        if waited_s < self._next_s:
+            return
+        self._next_s = 3 * waited_s
+        log.warning(
+            "%s: waiting for %.0f s for %s. The work goes on when that process finishes or ends.",
+            printable(str(claim)),
+            waited_s,
+            describe_holder(claim),
+        )
 
 
 def _locked(path: Path, wait: bool) -> int | None:
     """Return the descriptor that holds the lock, or None where another process holds it."""
     while True:
         descriptor = open_lock(path)
-        if wait:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        elif not flock_now(descriptor):
-            os.close(descriptor)
-            return None
+        if not take_lock(descriptor):
+            if not wait:
+                os.close(descriptor)
+                return None
+            with _announced(path):
+                take_lock(descriptor, wait=True)
         if _is(path, descriptor):
+            _write_holder(descriptor)
             return descriptor
         os.close(descriptor)  # its last owner deleted it while we waited
+
+
+@contextlib.contextmanager
+def _announced(path: Path) -> Iterator[None]:
+    """Announce from a thread how long the block waits for a claim."""
+    notice, ended = WaitNotice(), threading.Event()
+
+    def announce() -> None:
+        while not ended.wait(_SILENT_S / 4):
+            if _read_holder(path)[:2] != _identity():  # a thread of ours ends by itself
+                notice.update(path)
+
+    threading.Thread(target=announce, daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
+
+
+def _identity() -> list[str]:
+    return [socket.gethostname(), str(os.getpid())]
+
+
+def _write_holder(descriptor: int) -> None:
+    text = " ".join([*_identity(), f"{time.time():.0f}"])
+    with contextlib.suppress(OSError):  # a full disk: the claim is ours all the same
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, text.encode(), 0)
+
+
+def _read_holder(path: Path) -> list[str]:
+    """Return host, process and time of a claim's holder; nothing where the file does not say it."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    except OSError:
+        return []
+    with os.fdopen(descriptor, "rb", buffering=0) as stream, contextlib.suppress(OSError):
+        return stream.read(_HOLDER_BYTES).decode(errors="replace").split(" ")
+    return []
 
 
 def _is(path: Path, descriptor: int) -> bool:

@@ -1,7 +1,16 @@
-"""Where things are in the folder of a run."""
+"""Where things are in the folder of a run, and the claim of the trainer that writes them."""
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from storage.claims import claimed, describe_holder
+from storage.errors import TrilightError
+
+if TYPE_CHECKING:
+    from train.loop.crew import Crew
 
 
 @dataclass(frozen=True)
@@ -55,3 +64,41 @@ class RunFolder:
     def summary(self) -> Path:
         """The result as JSON."""
         return self.root / "summary.json"
+
+    @property
+    def claim(self) -> Path:
+        """Lock of the trainer at work; absent while nobody trains, but after a kill."""
+        return self.root / "train.claim"
+
+
+@contextlib.contextmanager
+def claim_run(folder: RunFolder, crew: "Crew") -> Iterator[None]:
+    """Keep other trainers out of a run's folder for the block; all processes must call it.
+
+    The first process holds the claim. A folder that is empty afterwards is as it was.
+
+    Raises:
+        TrilightError: another trainer has the folder, or it cannot be written.
+    """
+    new = [place for place in (folder.root, *folder.root.parents) if not place.exists()]
+    problem: TrilightError | None = None
+    with contextlib.ExitStack() as held:
+        if crew.is_first:
+            try:
+                if not held.enter_context(claimed(folder.claim)):
+                    problem = TrilightError(
+                        f"{folder.root}: {describe_holder(folder.claim)}, trains there; expected a "
+                        "folder for this trainer alone. Wait until it has ended, or choose another "
+                        "--out."
+                    )
+            except TrilightError as error:
+                problem = error
+        if crew.any(problem is not None):
+            raise problem or TrilightError(f"{folder.root}: the first process cannot train there.")
+        try:
+            yield
+        finally:
+            if crew.is_first:
+                for remove in (folder.claim.unlink, *(place.rmdir for place in new)):
+                    with contextlib.suppress(OSError):
+                        remove()

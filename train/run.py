@@ -22,7 +22,7 @@ from train.data.unusable import Unusable, first_samples
 from train.data.workers import fitting_workers, this_machine
 from train.evaluation.judge import Judge
 from train.evaluation.rivals import median_picture
-from train.folder import RunFolder
+from train.folder import RunFolder, claim_run
 from train.loop.checkpoints import saved_steps
 from train.loop.crew import Crew
 from train.loop.recorder import Recorder
@@ -85,11 +85,34 @@ def train_run(
             checkpoint that is missing or of another run, LPIPS without its weights, a start that
             went dead, too little memory, or a signal that asked to stop.
     """
-    began, watched = time.monotonic(), watched or WatchSettings()
-    require_wandb(watched.wandb)
-    start, crew = start or Start(), crew or Crew(device=torch.device("cpu"))
-    progress = progress if progress is not None and crew.is_first else TrainProgress()
-    opened, folder = open_mixture(data), RunFolder(out)
+    require_wandb((watched or WatchSettings()).wandb)
+    crew, folder = crew or Crew(device=torch.device("cpu")), RunFolder(out)
+    with claim_run(folder, crew):
+        return _train(
+            settings,
+            data=data,
+            folder=folder,
+            start=start or Start(),
+            crew=crew,
+            workers=workers,
+            watched=watched or WatchSettings(),
+            progress=progress if progress is not None and crew.is_first else TrainProgress(),
+        )
+
+
+def _train(
+    settings: TrainSettings,
+    *,
+    data: Sequence[str],
+    folder: RunFolder,
+    start: Start,
+    crew: Crew,
+    workers: int | None,
+    watched: WatchSettings,
+    progress: TrainProgress,
+) -> TrainResult | None:
+    """Train and judge in a folder that is claimed; as `train_run`."""
+    began, opened = time.monotonic(), open_mixture(data)
     start = _decided(start, folder, crew)
     early = _EarlyNotes(progress)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):

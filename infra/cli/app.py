@@ -1,5 +1,6 @@
 """The command `trilight`: what it does with a mistake, and with Ctrl-C."""
 
+import logging
 import os
 import resource
 import shlex
@@ -11,7 +12,7 @@ from cyclopts import CycloptsError
 
 from infra.cli.commands import app, complaint
 from infra.cli.extending import extended
-from infra.cli.leaving import leave, open_missing_streams
+from infra.cli.leaving import InertFormatter, leave, open_missing_streams
 from storage.errors import EnvironmentFailure, TrilightError
 
 _ENOUGH_BYTES = 2 << 30
@@ -24,6 +25,8 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     signal.signal(signal.SIGINT, _interrupted)
     open_missing_streams()
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(InertFormatter())
     try:
         _require_usable_names()
         if "TRILIGHT_CONFINE" in os.environ:  # at once, though no file may have to be read

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Literal
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -19,10 +19,33 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.segment import Segment
 from rich.table import Column, Table
 from rich.text import Text
 
-console = Console(stderr=False, highlight=False)
+_OBEYED = dict.fromkeys(
+    [
+        *(number for number in range(32) if chr(number) not in "\t\n"),
+        *range(0x7F, 0xA0),
+        *(0x61C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)),
+    ]
+)
+"""Characters that a terminal obeys instead of showing them, such as ESC, and those that turn the
+direction of writing; none has a width."""
+
+
+class _TextConsole(Console):
+    """Prints text as it is: names of strangers' files hold no colors, emojis or commands."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            inert = segment.text.translate(_OBEYED)
+            yield segment if segment.control else segment._replace(text=inert)
+
+
+console = _TextConsole(stderr=False, highlight=False, markup=False, emoji=False)
 
 _LEAST_RATED_S = 1.0
 """No rate is printed for tasks that are shorter."""
@@ -114,7 +137,7 @@ def _is_drawn(task: Task) -> bool:
 def progress_bars() -> Bars:
     """Return progress bars with count, rate, elapsed time and ETA; silent without a terminal."""
     return Bars(
-        TextColumn("{task.description:<8}"),
+        TextColumn("{task.description:<8}", markup=False),
         BarColumn(bar_width=20),
         MofNCompleteColumn(),
         RateColumn(table_column=Column(no_wrap=True)),
@@ -122,7 +145,7 @@ def progress_bars() -> Bars:
         TextColumn("left"),
         # a shard's scenes end together, so that the speed of the last seconds says little
         TimeRemainingColumn(compact=True),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
         console=console,
         speed_estimate_period=300,
     )

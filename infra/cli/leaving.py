@@ -1,6 +1,7 @@
 """Leaving at once, without waiting for threads, children or libraries."""
 
 import contextlib
+import logging
 import os
 import shutil
 import sys
@@ -8,6 +9,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
+
+from storage.remote.safe_url import printable
 
 _SHOW_CURSOR = "\x1b[?25h"
 _temporary: set[Path] = set()
@@ -22,6 +25,17 @@ def open_missing_streams() -> None:
             setattr(sys, f"__{name}__", stream)
 
 
+class InertFormatter(logging.Formatter):
+    """Formats warnings without what a terminal would obey."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return _inert(super().format(record))
+
+
+def _inert(text: str) -> str:
+    return "\n".join(map(printable, text.split("\n")))
+
+
 def leave(message: str, status: int) -> NoReturn:
     """End at once: every child ends with its parent, and every file is whole or absent."""
     out, errors = sys.__stdout__ or sys.stdout, sys.__stderr__ or sys.stderr
@@ -32,7 +46,7 @@ def leave(message: str, status: int) -> NoReturn:
     if out.isatty():  # a progress bar hides the cursor, which stands behind it
         os.write(out.fileno(), f"{_SHOW_CURSOR}\n".encode())
     with contextlib.suppress(OSError):
-        os.write(errors.fileno(), f"{message}\n".encode(errors="backslashreplace"))
+        os.write(errors.fileno(), f"{_inert(message)}\n".encode())
     for folder in _temporary:
         shutil.rmtree(folder, ignore_errors=True)
     os._exit(status)

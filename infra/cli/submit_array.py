@@ -72,7 +72,7 @@ def _submit_slurm(job: ArrayJob, asked: ArrayAsked, *, as_json: bool) -> None:
         return
     _say(job, number, dry_run=asked.dry_run)
     if asked.dry_run:
-        console.print(_slurm_line(job, asked.sbatch), soft_wrap=True, markup=False)
+        console.print(_slurm_line(job, asked.sbatch), soft_wrap=True)
     else:
         _say_how_to_go_on(job)
 
@@ -96,7 +96,7 @@ def _submit_kubernetes(
         return
     _say(job, name, dry_run=asked.dry_run)
     if asked.dry_run:
-        console.print(shlex.join(words), soft_wrap=True, markup=False)
+        console.print(shlex.join(words), soft_wrap=True)
     else:
         _say_how_to_go_on(job)
 

@@ -203,14 +203,16 @@ def _judged(result: "TrainResult") -> list[tuple[str, str]]:
     scores, rival, lead = result.scores, result.median_scores, result.lead
     if scores is None or rival is None or lead is None:
         return [("validation", "none: the data has no validation split")]
-    ahead = lead.log_l1 / rival["log_l1"]
-    chance = "one scene" if lead.error is None else f"chance {2 * lead.error / rival['log_l1']:.1%}"
+    # of a median picture without any error there is no percentage
+    unit, form = (rival["log_l1"], ".1%") if rival["log_l1"] else (1.0, ".4f")
+    ahead = f"{lead.log_l1 / unit:+{form}}"
+    chance = "one scene" if lead.error is None else f"chance {2 * lead.error / unit:{form}}"
     verdict = "beats it" if result.beats_median else "is not shown to beat it"
     return [
         (
             "validation log L1",
             f"{scores['log_l1']:.4f}; the median picture of the training views scores "
-            f"{rival['log_l1']:.4f}: the network {verdict} ({ahead:+.1%}, {chance})",
+            f"{rival['log_l1']:.4f}: the network {verdict} ({ahead}, {chance})",
         ),
         (
             "validation PSNR",

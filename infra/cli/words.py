@@ -1,5 +1,6 @@
 """Words of the command line as the values of fields, by their types; the classes check them."""
 
+import os
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -7,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from infra.cli.changes import parse_changes
+from storage.remote.url import parse_local_path
 
 
 class FileName(Path):
@@ -34,10 +36,11 @@ def value_of(words: bool | str | Sequence[str], hint: Any) -> Any:
 
 
 def _one(word: str, hint: Any) -> Any:
-    for kind in (int, float, Path):
+    word = os.path.expanduser(word)  # a shell leaves the ~ of --out=~/x as it is
+    for kind, parse in ((int, int), (float, float), (Path, parse_local_path)):
         if kind in _kinds(hint):
             try:
-                return kind(word)
+                return parse(word)
             except ValueError:
                 pass
     return word

@@ -7,12 +7,15 @@ whose name was pointed here, or that guesses the port, gets nothing.
 
 import hmac
 import secrets
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from http import HTTPStatus
 
 HOST = "127.0.0.1"
 """Where the server listens: this machine alone."""
+
+_ONCE = ("host", "origin", "sec-fetch-site", "sec-fetch-dest", "content-length")
+"""Headers that decide about a request: of two, another program might believe the other one."""
 
 MAX_PATH = 4096
 """Most characters of a path with its query."""
@@ -48,21 +51,24 @@ class Refusal:
 
 
 def refusal(
-    method: str, path: str, headers: Mapping[str, str], *, port: int, word: str
+    method: str, path: str, pairs: Iterable[tuple[str, str]], *, port: int, word: str
 ) -> Refusal | None:
     """Return why a request is refused, or None where it may pass.
 
     Args:
         method: GET or POST.
         path: as it was sent, with its query.
-        headers: of the request; names in any case.
+        pairs: headers of the request, names in any case.
         port: at which the server listens.
         word: password of the address.
     """
     here = f"{HOST}:{port}"
-    headers = {name.lower(): value for name, value in headers.items()}
+    pairs = [(name.lower(), value) for name, value in pairs]
+    headers = dict(pairs)
     if len(path) > MAX_PATH:
         return Refusal(status=HTTPStatus.REQUEST_URI_TOO_LONG, sentence="The address is too long.")
+    if any([name for name, _ in pairs].count(name) > 1 for name in _ONCE):
+        return Refusal(status=HTTPStatus.BAD_REQUEST, sentence="A header is there twice.")
     if headers.get("host") != here:
         return _forbidden(f"Only http://{here} is answered, and no other name of this machine.")
     origin, site = headers.get("origin"), headers.get("sec-fetch-site", "none")

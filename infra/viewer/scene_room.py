@@ -15,7 +15,7 @@ from infra.viewer.easel import Easel, Job, agreement_db
 from infra.viewer.painters import Painter
 from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
 from infra.viewer.server import Answer, NotThere, Question, Route, json_answer
-from infra.viewer.wanted import wanted_of
+from infra.viewer.wanted import edits_of, wanted_of
 from pipeline.documents.png import encode_png
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.formats import FORMATS
@@ -151,7 +151,7 @@ class SceneRoom:
 
     def _export(self, question: Question) -> Answer:
         body = question.body if isinstance(question.body, dict) else {}
-        suffix, edits = str(body.get("form")), body.get("edits") or {}
+        suffix, edits = str(body.get("form")), edits_of(body)
         if suffix not in EXPORTS or not _is_written(suffix):
             raise TrilightError(f"form {suffix:.20}: expected one of {' '.join(EXPORTS)}.")
         key = sha256_hex(canonical_json(edits))[:24]

@@ -1,7 +1,11 @@
 """The server of a page: answers guarded requests from a table of routes, on this machine alone."""
 
+import contextlib
 import json
+import math
+import socket
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -9,14 +13,23 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qsl, unquote
 
-from infra.viewer.guard import HOST, MAX_BODY_BYTES, SAFE_HEADERS, new_word, refusal
+from infra.viewer.guard import HOST, SAFE_HEADERS, new_word, refusal
 from storage.errors import TrilightError
 
 MOST_CONNECTIONS = 32
 """Requests that are answered at a time; a browser opens six, and more wait."""
 
+_REQUEST_S = 15.0
+"""Time in which a whole request must arrive; a connection without one is closed then."""
+
+_MOST_AWAITED = 64
+"""Connections without a whole request; for each further one, the oldest of them is closed."""
+
 _STALLED_S = 30.0
-"""A browser that sends nothing for so long is left."""
+"""A browser that takes nothing for so long is left."""
+
+_MOST_DIGITS = 300
+"""Digits of the longest whole number in a request."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +94,8 @@ class PageServer(ThreadingHTTPServer):
         """
         self.gets, self.posts, self.word = gets, posts, new_word()
         self.places = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        self._awaited: dict[socket.socket, float] = {}
+        self._changing = threading.Lock()
         try:
             super().__init__((HOST, port), _Handler)
         except OSError as error:
@@ -93,6 +108,41 @@ class PageServer(ThreadingHTTPServer):
     def address(self) -> str:
         """URL with the password."""
         return f"http://{HOST}:{self.server_port}/{self.word}/"
+
+    def await_request(self, connection: socket.socket) -> None:
+        """Take notice that a connection has no request yet; of too many, close the oldest."""
+        with self._changing:
+            self._awaited[connection] = time.monotonic()
+            if len(self._awaited) > _MOST_AWAITED:
+                self._end(next(iter(self._awaited)))
+
+    def note_arrival(self, connection: socket.socket) -> None:
+        """Take notice that a connection has a whole request, or has ended."""
+        with self._changing:
+            self._awaited.pop(connection, None)
+
+    def service_actions(self) -> None:
+        """Close connections whose request takes too long; called twice a second."""
+        with self._changing:
+            before = time.monotonic() - _REQUEST_S
+            for connection in [key for key, began in self._awaited.items() if began < before]:
+                self._end(connection)
+
+    def _end(self, connection: socket.socket) -> None:
+        """Wake the thread that reads from a connection, which closes it."""
+        del self._awaited[connection]
+        with contextlib.suppress(OSError):
+            connection.shutdown(socket.SHUT_RDWR)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Await the first request of a connection, in a thread of its own."""
+        self.await_request(request)
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        self.note_arrival(request)
+        super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing: a browser that goes away in the middle of an answer is no news."""
@@ -116,38 +166,37 @@ class _Handler(BaseHTTPRequestHandler):
         """Say nothing: the path holds the password."""
 
     def _answer(self, method: str) -> None:
-        refused = refusal(
-            method,
-            self.path,
-            dict(self.headers.items()),
-            port=self.server.server_port,
-            word=self.server.word,
-        )
+        port, word = self.server.server_port, self.server.word
+        refused = refusal(method, self.path, self.headers.items(), port=port, word=word)
         if refused is not None:
             self.close_connection = True
             self._say(refused.status, refused.sentence)
             return
+        data = self.rfile.read(int(self.headers["Content-Length"])) if method == "POST" else b""
+        self.server.note_arrival(self.connection)
+        status = HTTPStatus.OK
         with self.server.places:
             try:
-                self._send(HTTPStatus.OK, self._routed(method))
+                answer = self._routed(method, data)
             except NotThere as error:
-                self._say(HTTPStatus.NOT_FOUND, str(error))
+                status, sentence = HTTPStatus.NOT_FOUND, str(error)
             except TrilightError as error:
-                self._say(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+                status, sentence = HTTPStatus.UNPROCESSABLE_ENTITY, str(error)
+            except Exception as error:
+                status = HTTPStatus.INTERNAL_SERVER_ERROR
+                sentence = f"The viewer cannot answer this ({type(error).__name__})."
+        if status == HTTPStatus.OK:
+            self._send(status, answer)
+        else:
+            self._say(status, sentence)
+        self.server.await_request(self.connection)
 
-    def _routed(self, method: str) -> Answer:
+    def _routed(self, method: str, data: bytes) -> Answer:
         path, _, query = self.path.partition("?")
         below = unquote(path.removeprefix(f"/{self.server.word}")).removeprefix("/")
-        body = self._body() if method == "POST" else None
+        body = _parse_body(data) if method == "POST" else None
         question = Question(path=below, query=dict(parse_qsl(query)), body=body)
         return routed(self.server.posts if method == "POST" else self.server.gets, question)
-
-    def _body(self) -> Any:
-        data = self.rfile.read(min(int(self.headers["Content-Length"]), MAX_BODY_BYTES))
-        try:
-            return json.loads(data)
-        except (ValueError, RecursionError) as error:
-            raise TrilightError("the request is no JSON.") from error
 
     def _say(self, status: HTTPStatus, sentence: str) -> None:
         """Send a sentence: to a script as JSON, to a person as text."""
@@ -163,3 +212,26 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(answer.body)
+
+
+def _parse_body(data: bytes) -> Any:
+    """Return the JSON of a request; raises TrilightError for anything else, NaN and infinities."""
+    try:
+        return json.loads(
+            data, parse_float=_parse_number, parse_constant=_parse_number, parse_int=_parse_whole
+        )
+    except (ValueError, RecursionError) as error:
+        raise TrilightError("the request is no JSON with finite numbers.") from error
+
+
+def _parse_number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
+
+
+def _parse_whole(text: str) -> int:
+    if len(text) > _MOST_DIGITS:  # beyond what a float holds
+        raise ValueError(text)
+    return int(text)

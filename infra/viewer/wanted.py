@@ -69,17 +69,22 @@ def wanted_of(body: Any, engines: Mapping[str, Any], views: int) -> Wanted:
         )
     if view is not None and not (isinstance(view, int) and 0 <= view < views):
         raise TrilightError(f"view is {view!r:.20}; expected 0 to {views - 1}, or none.")
-    edits = body.get("edits") or {}
-    if not isinstance(edits, Mapping):
-        raise TrilightError("edits: expected a JSON object.")
     return Wanted(
         engine=engine,
         camera=_camera(body),
         view=view,
         resolution=int(width),
-        edits=edits,
+        edits=edits_of(body),
         error_db=_number(body.get("error_db", 45), "error_db", 10, 60),
     )
+
+
+def edits_of(body: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the changes of the scene that a request states; raises TrilightError for no object."""
+    edits = body.get("edits")
+    if edits is not None and not isinstance(edits, Mapping):
+        raise TrilightError(f"edits: {edits!r:.20} is no JSON object; expected one, or null.")
+    return edits or {}
 
 
 def _camera(body: Mapping[str, Any]) -> ShotCamera:

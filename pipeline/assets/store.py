@@ -7,9 +7,7 @@ uses it; then it is made again.
 """
 
 import contextlib
-import fcntl
 import json
-import os
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -17,7 +15,8 @@ from pathlib import Path
 
 from pipeline.assets.recipe import READERS, RECIPE
 from pipeline.assets.settings import AssetSettings
-from storage.atomic import TEMPORARY_SUFFIX, write_atomically, write_error
+from storage.atomic import TEMPORARY_SUFFIX, write_atomically
+from storage.claims import claimed
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
 from storage.records.asset import Asset, encode_asset
@@ -78,17 +77,8 @@ class AssetStore:
         Raises:
             TrilightError: the store cannot be written.
         """
-        path = self.root / "locks" / key[:_LOCKS]
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise write_error(path, error) from error
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        with claimed(self.root / "locks" / key[:_LOCKS], wait=True):
             yield
-        finally:
-            os.close(descriptor)
 
     def _unread_path(self, key: str) -> Path:
         return self.asset_path(key).with_suffix(".unread.json")

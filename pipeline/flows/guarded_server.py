@@ -15,6 +15,7 @@ browser sends this password of its own accord, as it is no cookie.
 """
 
 import argparse
+import asyncio
 import contextlib
 import ipaddress
 import os
@@ -31,6 +32,8 @@ from storage.errors import TrilightError
 
 NAMES = "TRILIGHT_HOST_NAMES"
 """Variable with the names, between commas, by which the server is known beside localhost."""
+REQUEST_S = 15.0
+"""Time in which the head of a request must arrive."""
 _UNFRAMED = (b"content-security-policy", b"frame-ancestors 'none'")
 
 Scope = MutableMapping[str, Any]
@@ -103,6 +106,32 @@ async def _refuse(kind: str, refusal: str, send: Send) -> None:
     await send({"type": "http.response.body", "body": refusal.encode()})
 
 
+def impatient_protocol() -> type[asyncio.Protocol]:
+    """Return uvicorn's HTTP protocol with a limit of time for requests, which it lacks.
+
+    A connection without a whole head of a request for REQUEST_S, or once that long after an
+    answer, is closed.
+    """
+    from uvicorn.protocols.http.auto import AutoHTTPProtocol
+
+    class ImpatientProtocol(AutoHTTPProtocol):  # type: ignore[misc, valid-type]
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            self._look(idle_since=object())
+
+        def _look(self, idle_since: object) -> None:
+            is_idle = self.cycle is None or self.cycle.response_complete
+            if self.transport.is_closing() or self.transport.get_protocol() is not self:
+                return  # ended, or a websocket by now
+            if is_idle and self.cycle is idle_since:
+                self.transport.close()
+                return
+            seen = self.cycle if is_idle else object()
+            self.loop.call_later(REQUEST_S, self._look, seen)
+
+    return ImpatientProtocol
+
+
 def serve(host: str, port: int) -> None:
     """Serve Prefect at an address until this process is told to end.
 
@@ -133,6 +162,7 @@ def serve(host: str, port: int) -> None:
     settings = get_current_settings()
     uvicorn.run(
         Door(create_app(final=True), names),
+        http=impatient_protocol(),
         host=host,
         port=port,
         log_level=settings.server.logging_level.lower(),

@@ -7,7 +7,6 @@ served deployment, a team's server) that server is used instead.
 """
 
 import contextlib
-import fcntl
 import http.client
 import io
 import json
@@ -25,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from storage.cache import cache_folder, open_private, private_folder
+from storage.claims import claimed
 from storage.errors import TrilightError
 from storage.installation import IMPORT_ROOT, child_environment
 from storage.remote.safe_url import safe_text
@@ -166,8 +166,9 @@ def prefect_server() -> Iterator[str]:
         return
     home = private_folder(Path(os.environ["PREFECT_HOME"]))
     password = new_password()
-    with (home / "start.lock").open("w") as lock, open_private(home / _LOG_NAME, "ab") as log:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # two first starts at once would both migrate the database
+    with contextlib.ExitStack() as starting, open_private(home / _LOG_NAME, "ab") as log:
+        # two first starts at once would both migrate the database
+        starting.enter_context(claimed(home / "start.lock", wait=True))
         port = _free_port()
         server = subprocess.Popen(
             [*SERVER, "--port", str(port), "--with-parent"],
@@ -180,7 +181,7 @@ def prefect_server() -> Iterator[str]:
         url = f"http://127.0.0.1:{port}/api"
         try:
             wait_until_healthy(url, server, home / _LOG_NAME)
-            fcntl.flock(lock, fcntl.LOCK_UN)
+            starting.close()
             os.environ |= {"PREFECT_API_URL": url, CLIENT_PASSWORD: password}
             load_prefect()
             with prefect_client():

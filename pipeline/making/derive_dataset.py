@@ -40,7 +40,7 @@ def derive_dataset(
     Raises:
         TrilightError: as `pipeline.shards.derive.derive_shards`, or `out` holds something.
     """
-    out = out.resolve()
+    out = Path(os.path.realpath(out))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise TrilightError(
             f"{out}: is there already; expected a new folder. Choose another --out."

@@ -26,6 +26,7 @@ from pipeline.making.publication import Publication
 from pipeline.objects.listing import SUFFIXES, Fetched
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
+from storage.claims import WaitNotice
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import least_triangles_in
@@ -112,6 +113,7 @@ class ObjectBatch:
         name = work.name(records, are_here=work.fetch is None)
         self._file = work.publication.folder.staged_batches / name
         """Beside the dataset, for its other workers."""
+        self.claim_file = self._file.with_suffix(".claim")  # as Publication.claim has it
         self._kept = cache_folder(_CACHE) / name if work.fetch is None else None
         """In the user's cache; of objects to fetch, it is known once they are here."""
         self._by_uid = {record.uid: record for record in records}
@@ -249,7 +251,7 @@ def prepare_in_batches(
     at_once = 1 + -(-workers // _NUM_OBJECTS)  # no child waits for the last object of a batch
     # children end first: after Ctrl-C no thread waits for the objects that it has in hand
     with ThreadPoolExecutor(at_once) as threads, MeshWork(work.settings, workers) as meshes:
-        pause_s = _PAUSES_S[0]
+        pause_s, notice = _PAUSES_S[0], WaitNotice()
         while True:
             for number, batch in enumerate(batches):
                 if number not in results and (result := batch.result()) is not None:
@@ -263,8 +265,9 @@ def prepare_in_batches(
             made = [number for number, is_ours in tried if is_ours]
             ours.update(made)
             if made:
-                pause_s = _PAUSES_S[0]
+                pause_s, notice = _PAUSES_S[0], WaitNotice()
             else:  # others are at them
+                notice.update(batches[missing[0]].claim_file)
                 time.sleep(pause_s)
                 pause_s = min(2 * pause_s, _PAUSES_S[1])
     ordered = [result for _, result in sorted(results.items())]

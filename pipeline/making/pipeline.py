@@ -23,10 +23,12 @@ batches of objects (storage.remote.claims) and what is finished (pipeline.shards
 """
 
 import contextlib
+import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 from pipeline.builds.named import object_source
 from pipeline.builds.settings import BuildSettings
@@ -106,7 +108,7 @@ def prepare_dataset(order: DatasetOrder) -> Run:
 def _begun(order: DatasetOrder) -> Iterator[Run]:
     """Join the makers of a dataset, and have its objects frozen by whoever comes first."""
     folder = dataset_folder(order.place)
-    folder = replace(folder, root=folder.root.resolve())
+    folder = replace(folder, root=Path(os.path.realpath(folder.root)))
     settings, listed = settings_of(order, folder)  # refuses an order before anything is written
     with joined(folder):
         own = map_folders(order, settings)

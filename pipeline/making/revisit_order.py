@@ -1,5 +1,6 @@
 """What `trilight revisit` was asked for, as settings of the new dataset."""
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import field
@@ -88,7 +89,7 @@ def revisit_order(asked: Revisit) -> DatasetOrder:
     )
     return DatasetOrder(
         build=asked.build or manifest.build,
-        revisits=str(Path(asked.dataset).resolve()),
+        revisits=os.path.realpath(asked.dataset),
         out=asked.out,
         seed=asked.seed,
         resolution=asked.resolution,

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from pipeline.making.run import Run, TaskOutcome
 from pipeline.making.unfinished_shard import UnfinishedShard
+from storage.claims import WaitNotice
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure
@@ -174,15 +175,16 @@ def _wait_for_others(run: Run, pause_s: float) -> float:
 
     No tasks are handed out meanwhile: each would be a row of a scheduler's database.
     """
-    publication = run.publication
+    publication, notice = run.publication, WaitNotice()
     while True:
         time.sleep(pause_s)
         pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
         missing = run.missing_shards()
         splits = run.settings.splits
-        shards = (UnfinishedShard(publication.folder, splits, index) for index in missing)
+        shards = [UnfinishedShard(publication.folder, splits, index) for index in missing]
         if not missing or any(shard.is_free() for shard in shards):
             return pause_s
+        notice.update(shards[0].wanted_claims()[0])
 
 
 def shard_ranges(num_shards: int, parts: int) -> list[str]:

@@ -8,11 +8,11 @@ the process that holds it, so that nothing has to be cleaned up after a kill.
 import contextlib
 import logging
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline.shards.pack import pack_shard
-from storage.claims import claimed
+from storage.claims import claimed, is_claimed
 from storage.dataset.layout import DatasetFolder, numbered
 from storage.dataset.manifest import ShardEntry, read_head
 from storage.dataset.scene_logs import log_scene
@@ -95,11 +95,15 @@ class UnfinishedShard:
         This look claims each missing scene for a moment. Whoever wants that scene just then leaves
         it to us, so a caller that gets True must go and make it.
         """
-        missing = [index for index in self._plan()[0] if not is_staged(self._staged, index)]
+        claims = self.wanted_claims()
         if self._is_packed():  # looked at last: packing empties the staging folder
             return False
-        claims: Iterable[Path] = map(self._claim, missing) if missing else [self._packing]
-        return any(map(_is_unclaimed, claims))
+        return not all(map(is_claimed, claims))
+
+    def wanted_claims(self) -> list[Path]:
+        """Return the claims on what the shard lacks: its missing scenes, or else its packing."""
+        missing = [index for index in self._plan()[0] if not is_staged(self._staged, index)]
+        return [*map(self._claim, missing)] or [self._packing]
 
     def _claim(self, scene_index: int) -> Path:
         return self._staged / numbered(scene_index, f"{sample_key(scene_index)}.claim")
@@ -116,8 +120,3 @@ class UnfinishedShard:
         head = read_head(self._folder.manifest)
         scenes = scenes_of_shard(self._index, cut_splits(head.num_scenes, self._splits))
         return scenes, self.name in head.growing
-
-
-def _is_unclaimed(claim: Path) -> bool:
-    with claimed(claim) as ours:
-        return ours

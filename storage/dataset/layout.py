@@ -10,7 +10,6 @@ folder of this machine before it.
 """
 
 import contextlib
-import fcntl
 import os
 import re
 import shutil
@@ -21,7 +20,7 @@ from pathlib import Path
 
 from storage.atomic import remove_leftovers
 from storage.cache import cache_folder
-from storage.claims import claimed, flock_now, open_lock
+from storage.claims import claimed, open_lock, take_lock
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.remote.bucket import WRITABLE
@@ -203,10 +202,10 @@ class DatasetFolder:
         """
         descriptor = open_lock(self._lock)
         try:
-            if flock_now(descriptor):
+            if take_lock(descriptor):
                 self._clean()
                 when_alone()
-            fcntl.flock(descriptor, fcntl.LOCK_SH)
+            take_lock(descriptor, shared=True, wait=True)
             yield
         finally:
             os.close(descriptor)
@@ -249,8 +248,6 @@ def dataset_folder(out: str) -> DatasetFolder:
         TrilightError: the URL is refused (storage.remote.url), is none that can be written to only
             once, or has a query.
     """
-    if "://" not in out and not out.startswith("pipe:"):
-        return DatasetFolder(Path(out))
     place = parse_url(out, what="out")
     if isinstance(place, Path):
         return DatasetFolder(place)

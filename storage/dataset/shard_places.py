@@ -1,6 +1,7 @@
 """Places of single shards: paths and URLs, one by one or as brace patterns."""
 
 import itertools
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from storage.errors import TrilightError
 from storage.records.safe_read import open_plain
 from storage.remote.cache import shard_cache
 from storage.remote.safe_url import printable, safe_text
-from storage.remote.url import RemoteUrl, parse_url
+from storage.remote.url import RemoteUrl, parse_local_path, parse_url
 
 MAX_SHARDS = 100_000
 """Maximum number of shards in a list, and of names that one brace pattern expands to."""
@@ -77,7 +78,12 @@ def listed_shards(patterns: Sequence[str]) -> list[ShardPlace]:
 
 
 def expanded(pattern: str, what: str = "shards") -> list[str]:
-    """Return what a brace pattern of `what` stands for; raises as `listed_shards`."""
+    """Return what a brace pattern of `what` stands for; raises as `listed_shards`.
+
+    A file or folder of that very name is no pattern.
+    """
+    if "://" not in pattern and os.path.exists(parse_local_path(pattern)):
+        return [pattern]
     named = f"{what} {_shown(pattern)}"
     groups = [_alternatives(group[1], named) for group in _GROUP.finditer(pattern)]
     fixed = _GROUP.split(pattern)[::2]

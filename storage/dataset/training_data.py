@@ -1,5 +1,6 @@
 """What `--data` means: a dataset by its root, or shards by a list."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ from storage.dataset.shard_places import listed_shards
 from storage.dataset.shard_set import KeysSeen, ListedShards, ManifestShards, ShardSet
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
+from storage.remote.url import parse_local_path
 
 NO_MANIFEST = (
     "the shards come from a list, without a manifest: no hash is checked, sample counts are found "
@@ -85,8 +87,9 @@ def open_training_data(data: Sequence[str]) -> TrainingData:
 
 
 def is_shards(text: str) -> bool:
-    """Return whether a place names shards, and not a dataset."""
-    return text.partition("?")[0].endswith((".tar", "}"))
+    """Return whether a place names shards; a folder is a dataset, whatever its name."""
+    is_folder = "://" not in text and os.path.isdir(parse_local_path(text))
+    return not is_folder and text.partition("?")[0].endswith((".tar", "}"))
 
 
 def _of_dataset(root: str) -> TrainingData:

@@ -6,7 +6,6 @@ process fetches a shard while the others wait for it. Locks die with the process
 """
 
 import contextlib
-import fcntl
 import os
 import time
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import BinaryIO
 
 from storage.atomic import TEMPORARY_SUFFIX, atomic_writer
 from storage.cache import cache_folder
-from storage.claims import claimed
+from storage.claims import claimed, take_lock
 from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.remote.fetch import download, facts_of, unreadable
@@ -159,7 +158,8 @@ def _open_shared(path: Path) -> BinaryIO | None:
         stream = path.open("rb")
     except (FileNotFoundError, NotADirectoryError):
         return None
-    fcntl.flock(stream, fcntl.LOCK_SH)  # what is removed before this stays readable all the same
+    # what is removed before this stays readable all the same
+    take_lock(stream.fileno(), shared=True, wait=True)
     with contextlib.suppress(OSError):
         os.utime(path)
     return stream
@@ -169,7 +169,8 @@ def _remove_unread(path: Path) -> bool:
     """Remove a shard unless a process reads it; return whether its bytes are free."""
     try:
         with path.open("rb") as stream:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not take_lock(stream.fileno()):
+                return False
             path.unlink(missing_ok=True)
         return True
     except OSError:

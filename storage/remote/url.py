@@ -85,7 +85,7 @@ def parse_url(source: str, *, what: str) -> RemoteUrl | Path:
         raise TrilightError(f"{what} {shown!r} is chained with '::'; {_ADMITTED}, on its own.")
     match = _SCHEME.match(source)
     if match is None:
-        return Path(source).expanduser()
+        return parse_local_path(source)
     scheme, rest = match[1].lower(), match[2]
     if scheme == "file":
         return _local(rest, what, shown)
@@ -96,6 +96,15 @@ def parse_url(source: str, *, what: str) -> RemoteUrl | Path:
     if scheme in ("http", "https"):
         return _http(scheme, rest, what)
     return _bucket(scheme, rest, what, shown)
+
+
+def parse_local_path(text: str) -> Path:
+    """Return a path as people type it: `~` is the home directory, `./~` a folder of that name.
+
+    The text of the result means the same path again.
+    """
+    path = Path(os.path.expanduser(text))
+    return path.absolute() if str(path).startswith("~") else path
 
 
 def open_driver(url: RemoteUrl) -> Any:

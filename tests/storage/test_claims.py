@@ -1,9 +1,13 @@
 """Claims: one holder at a time, free again when the holder ends, and the first writer wins."""
 
 import errno
+import fcntl
+import itertools
 import os
+import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -11,13 +15,20 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
+from pipeline.assets.store import AssetStore
+from storage import claims
 from storage.atomic import atomic_writer, write_error
-from storage.claims import claimed
+from storage.claims import claimed, describe_holder, is_claimed
 from storage.dataset.layout import DatasetFolder
 from storage.errors import EnvironmentFailure, TrilightError
+from storage.remote.cache import ShardCache
+from storage.remote.url import RemoteUrl, parse_url
 from tests.conftest import ROOT
 from tests.for_each import for_each
+from train.folder import RunFolder, claim_run
+from train.loop.crew import Crew
 
 HOLD = """
 import sys, time
@@ -117,3 +128,78 @@ def test_a_folder_that_can_never_be_made_is_said_at_once() -> None:
     """Where /proc says of a folder that it does not exist, as a deleted one would, waiting ends."""
     with pytest.raises(TrilightError, match="/proc/nowhere"), claimed(Path("/proc/nowhere/lock")):
         pass
+
+
+@for_each("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EIO, errno.EINVAL])
+def test_without_locks_everything_goes_on_after_one_warning(
+    number: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def refuse(descriptor: int, operation: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    caplog.clear()
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    monkeypatch.setattr(claims, "_unlocked", itertools.count())
+    folder, cache = DatasetFolder(tmp_path / "set"), ShardCache(tmp_path / "cache", 1 << 20)
+    with folder.joined(), folder.turn("manifest") as ours, folder.locked():
+        with claimed(tmp_path / "a") as first, claimed(tmp_path / "a", wait=True) as second:
+            assert ours and first and second and not is_claimed(tmp_path / "a")
+    with AssetStore(tmp_path / "store").making("abc"):
+        pass
+    with claim_run(RunFolder(tmp_path / "run"), Crew(device=torch.device("cpu"))):
+        pass
+    shard = tmp_path / "shard"
+    shard.write_bytes(b"bytes")
+    url = parse_url("http://127.0.0.1/a.tar", what="shard")
+    assert isinstance(url, RemoteUrl)
+    cache.keep(shard, url, "0" * 64)
+    with cache.open(url, num_bytes=5, sha256="0" * 64) as stream:
+        assert stream.read() == b"bytes"
+    (warning,) = caplog.messages
+    assert (
+        f"/set/.staging/lock: the file system carries no locks ({os.strerror(number)})" in warning
+    )
+
+
+def test_one_function_takes_every_lock() -> None:
+    packages = ("infra", "model", "pipeline", "scene_templates", "storage", "train", "trilight")
+    files = [path for name in packages for path in (ROOT / name).rglob("*.py")]
+    takers = [path for path in files if re.search(r"\b(flock|lockf|F_SETLKW?)\(", path.read_text())]
+    assert takers == [ROOT / "storage" / "claims.py"]
+
+
+def test_who_waits_says_for_whom_and_since_when(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Once, and again after ever longer times; of a thread of the same process never."""
+    monkeypatch.setattr(claims, "_SILENT_S", 0.1)
+    path = tmp_path / "a\x1b]0;b.claim"
+    command = [sys.executable, "-c", HOLD.replace("sleep(60)", "sleep(1.5)"), str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as holder:
+        assert holder.stdout is not None and holder.stdout.readline()
+        assert is_claimed(path)
+        with claimed(path, wait=True):
+            waiter = threading.Thread(target=lambda: claimed(path, wait=True).__enter__())
+            waiter.start()
+            said = len(caplog.messages)
+            time.sleep(0.5)
+        waiter.join(20)
+    assert 2 <= said == len(caplog.messages) <= 4
+    since = r"at it since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC"
+    holding = f"process {holder.pid} of {re.escape(socket.gethostname())}, {since}"
+    assert re.search(rf"a\\x1b\]0;b.claim: waiting for \d+ s for {holding}", caplog.messages[0])
+
+
+@for_each(
+    "text",
+    ["", "x", "h 1", "h x 5", "h 1 9999999999999999999", "h 1 nan", "\x1b[1m 1 5", "a b c d"],
+)
+def test_a_claim_that_says_nothing_readable_is_anothers(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a").write_text(text)
+    assert describe_holder(tmp_path / "a").isprintable()
+    os.mkfifo(tmp_path / "fifo")
+    for name in ("fifo", "none", "."):
+        assert describe_holder(tmp_path / name) == "another process"

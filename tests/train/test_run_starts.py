@@ -7,8 +7,10 @@ import dataclasses
 import json
 import os
 import signal
+import socket
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -249,3 +251,39 @@ def test_the_budget_of_damage_is_the_run_s_and_not_the_process_s(
     flip_a_bit(second)
     flip_a_bit(first)
     assert len(trained(settings, [str(root)], out, resume=True).unusable) == 1
+
+
+def test_a_second_trainer_is_refused_and_changes_nothing(dataset: Dataset, tmp_path: Path) -> None:
+    """However it begins; who reads the run meanwhile may, and a kill leaves the folder free."""
+    out, said = tmp_path / "run", list[str]()
+
+    def files() -> dict[Path, bytes]:
+        return {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+    class Second(Heard):
+        def advance(self, *, step: int, **_: Any) -> None:
+            if step == 6:
+                before = files()
+                for start in (
+                    Start(),
+                    Start(resume=True),
+                    Start(restartable=True),
+                    Start(resume=True, decisions={"learning_rate": 1e-5}),
+                ):
+                    with pytest.raises(TrilightError) as refused:
+                        trained(tiny_run(), dataset, out, start=start)
+                    said.append(str(refused.value))
+                open_network(out, network_of_run)
+                assert files() == before
+                raise Killed
+
+    with pytest.raises(Killed):
+        trained(tiny_run(), dataset, out, progress=Second())
+    holder = f"{out}: process {os.getpid()} of {socket.gethostname()}, at it since "
+    assert len(said) == 4 and all(text.startswith(holder) for text in said), said
+    (out / "train.claim").write_text("as a process leaves it that is killed")
+    trained(tiny_run(), dataset, out, resume=True)
+    assert not (out / "train.claim").exists()
+    with pytest.raises(TrilightError, match="no manifest.json here"):
+        trained(tiny_run(), [str(tmp_path / "none")], tmp_path / "a" / "b")
+    assert not (tmp_path / "a").exists()

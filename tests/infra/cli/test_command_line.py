@@ -1,6 +1,8 @@
 """What every command has in common: help that says all, completion, a version, near names."""
 
+import io
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -11,6 +13,7 @@ from typing import Annotated, Any, Literal, Optional
 
 import pytest
 
+from infra.cli import console
 from infra.cli.commands import COMMANDS
 from infra.cli.options import ALIASES
 from infra.cli.words import choices_of, is_repeated, takes_names, value_of
@@ -241,3 +244,32 @@ def test_the_page_of_quantities_names_what_a_condition_can_ask() -> None:
     assert len(shown) == 3
     for text in shown:
         condition(text)
+
+
+def test_what_is_printed_tells_the_terminal_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Strangers' names hold no escapes, no colors of rich and no emojis, however they are shown."""
+    obeyed = [*range(9), *range(11, 32), *range(0x7F, 0xA0), 0x202E, 0x2066, 0x200F]
+    for code in obeyed:
+        name = f"a{chr(code)}]0;b [/x] [red]c :bomb:"
+        out = io.StringIO()
+        shown = console._TextConsole(
+            file=out, width=200, force_terminal=True, markup=False, emoji=False
+        )
+        monkeypatch.setattr(console, "console", shown)
+        with case(code):
+            shown.print(name)
+            console.print_rows(name, [(name, name)])
+            console.print_table(name, [{name: name}])
+            console.note(name)
+            console.first_words(name)
+            console.look_at(name)
+            console.next_step([name])
+            with console.progress_bars() as bars:
+                bars.update(bars.add_task(name, total=2, note=name), completed=1)
+                bars.console.print(f"{name}")
+            text = out.getvalue()
+            assert f"{chr(code)}]0" not in text
+            plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)
+            assert (
+                plain.count("a]0;b [/x] [red]c :bomb:") >= 8
+            )  # some are cut where the terminal ends

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import pytest
@@ -18,7 +19,7 @@ from infra.cli.changes import Shared, all_changes
 from infra.cli.console import progress_bars
 from infra.cli.dataset_changes import with_shared
 from infra.cli.settings_file import read_settings_file
-from infra.cli.train import _BarProgress, _QuietProgress
+from infra.cli.train import _BarProgress, _judged, _QuietProgress
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.making.dataset_order import DatasetOrder
 from storage.dataset.manifest import read_manifest
@@ -30,6 +31,7 @@ from tests.conftest import ROOT
 from tests.for_each import case
 from tests.pipeline.making.test_publication import begin_tiny
 from tests.train.toy import write_toy_dataset
+from train.evaluation.scores import Lead
 from train.loop.checkpoints import saved_steps
 from train.loop.interrupts import SAVED_STATUS
 from train.runs import RUNS, named_run
@@ -378,3 +380,14 @@ def test_licences_are_allowed_beside_those_of_a_file(tmp_path: Path) -> None:
         found = with_shared(order, Shared(settings=_file(tmp_path, text)))
         settings = named_build("smoke", allow_licences=found.allow_licences, changes=found.changes)
         assert settings.allowed_licences == tuple(sorted({*others, "CC-BY-NC-4.0"}))
+
+
+def test_a_median_picture_without_error_divides_nothing() -> None:
+    scores = {"log_l1": 0.0, "psnr_log_db_median": 99.0, "psnr_linear_db_median": 99.0}
+    for log_l1, says in ((0.0, "(-0.0123, chance 0.0020)"), (0.1, "(-12.3%, chance 2.0%)")):
+        median = scores | {"log_l1": log_l1}
+        lead = Lead(log_l1=-0.0123, error=0.001)
+        result: Any = SimpleNamespace(
+            scores=scores, median_scores=median, lead=lead, beats_median=False
+        )
+        assert says in _judged(result)[0][1]

@@ -1,15 +1,18 @@
 """Who is answered, what the pages are made of, and a page that waits for what it shows."""
 
+import contextlib
 import hashlib
 import re
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from infra.setup.sbom import THREE_SHA256, THREE_VERSION
+from infra.viewer import server as viewer_server
 from infra.viewer.guard import MAX_BODY_BYTES, MAX_PATH, refusal
 from infra.viewer.later import LaterRoom, page_of
 from infra.viewer.server import Answer, NotThere, PageServer, Question, Route, json_answer
@@ -38,6 +41,8 @@ class EchoRoom:
     def _echo(self, question: Question) -> Answer:
         if "mistake" in question.query:
             raise TrilightError("that is a mistake.")
+        if "bug" in question.query:
+            raise ZeroDivisionError
         return json_answer({"path": question.path, "body": question.body})
 
 
@@ -79,7 +84,12 @@ def test_who_may_ask() -> None:
     for passes, method, path, headers in QUESTIONS:
         with case((passes, method, path, headers)):
             asked = {"Host": HERE, **headers}
-            assert (refusal(method, path, asked, port=PORT, word=WORD) is None) == passes
+            assert (refusal(method, path, asked.items(), port=PORT, word=WORD) is None) == passes
+            for name, value in asked.items() if passes else ():
+                for twice in ([(name, "x")], [(name.upper(), value)]):
+                    pairs = [*asked.items(), *twice], [*twice, *asked.items()]
+                    for both in pairs:
+                        assert refusal(method, path, both, port=PORT, word=WORD) is not None
 
 
 def test_a_stranger_gets_one_sentence_and_no_header_that_lets_others_read(asker: Asker) -> None:
@@ -138,6 +148,51 @@ def test_no_other_verb_is_known_and_a_body_that_is_no_json_is_a_sentence(asker: 
     text = "[" * 100_000
     head = f"Origin: http://{asker.here}\r\nContent-Length: {len(text)}\r\n"
     assert "the request is no JSON" in sent(asker, "POST", head, text)
+    for value in ("NaN", "-Infinity", "1e999", "-1e999", "9" * 400, "9" * 5000):
+        for text in (value, f'{{"edits": {{"lamps": {{"0": {{"gain": [{value}]}}}}}}}}'):
+            head = f"Origin: http://{asker.here}\r\nContent-Length: {len(text)}\r\n"
+            assert "no JSON with finite numbers" in sent(asker, "POST", head, text), value
+    assert asker.ask("api/echo?bug=1")[0] == 500
+
+
+def test_half_requests_end_and_hold_nobody_up(
+    asker: Asker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Idle ones, half of a head, half of a body with the password, and a slow drip."""
+    head = f"POST /{asker.word}/api/echo HTTP/1.1\r\nHost: {asker.here}\r\n"
+    head += f"Origin: http://{asker.here}\r\nContent-Length: 1000\r\n\r\n"
+    halves = [b"", b"GET / HTTP/1.1\r\nHost: x\r\n", head.encode()]
+    lines = list[socket.socket]()
+    try:
+        for number in range(150):
+            lines.append(socket.create_connection(("127.0.0.1", asker.port), timeout=20))
+            lines[-1].sendall(halves[number % 3])
+            if number % 10 == 9:
+                assert asker.ask("api/below/a")[0] == 200
+        assert _count_open(lines) <= 64, "the oldest are closed"
+        monkeypatch.setattr(viewer_server, "_REQUEST_S", 0.3)
+        began = time.monotonic()
+        while _count_open(lines):
+            assert time.monotonic() - began < 20
+            for line in lines:
+                with contextlib.suppress(OSError):
+                    line.sendall(b"x")
+            time.sleep(0.05)
+    finally:
+        for line in lines:
+            line.close()
+
+
+def _count_open(lines: list[socket.socket]) -> int:
+    def is_open(line: socket.socket) -> bool:
+        try:
+            return bool(line.recv(1 << 16, socket.MSG_DONTWAIT))
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+
+    return sum(map(is_open, lines))
 
 
 def test_it_listens_on_this_machine_alone_and_says_which_port_is_taken() -> None:

@@ -7,6 +7,7 @@ import stat
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import MutableMapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,10 +16,12 @@ from uuid import UUID, uuid4
 
 import httpx
 import pytest
+import uvicorn
 from prefect.client.schemas.objects import FlowRun
 from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.states import Completed, Failed, Running, Scheduled, State
 
+from pipeline.flows import guarded_server
 from pipeline.flows.dataset_flows import generate_scenes
 from pipeline.flows.guarded_server import Door
 from pipeline.flows.prefect_server import (
@@ -234,6 +237,33 @@ def test_pages_of_other_origins_are_refused(origin: str) -> None:
 
 def test_a_request_without_a_host_is_refused() -> None:
     assert _answer()[0]["status"] == 403
+
+
+def test_half_requests_are_closed_and_slow_answers_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guarded_server, "REQUEST_S", 0.3)
+
+    async def answer_slowly(scope: Any, receive: Any, send: Any) -> None:
+        await asyncio.sleep(1.2)
+        await _application(scope, receive, send)
+
+    http = guarded_server.impatient_protocol()
+    config = uvicorn.Config(answer_slowly, port=0, http=http, lifespan="off", log_level="error")
+    served = uvicorn.Server(config)
+    thread = threading.Thread(target=served.run, daemon=True)
+    thread.start()
+    while not served.started:
+        time.sleep(0.01)
+    address = served.servers[0].sockets[0].getsockname()
+    whole = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
+    try:
+        for begins in (b"", b"GET", whole[:-2], whole, whole + whole[:-2]):
+            with socket.create_connection(address, timeout=20) as line, case(begins):
+                line.sendall(begins)
+                answer = b"".join(iter(lambda: line.recv(1 << 16), b""))
+                assert (b"200 OK" in answer and b"inner" in answer) == (whole in begins)
+    finally:
+        served.should_exit = True
+        thread.join(20)
 
 
 def test_without_a_password_there_is_no_server() -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -23,6 +24,7 @@ from pipeline.making.run import Run, ShardJob, TaskOutcome
 from pipeline.making.tasks import Piece
 from pipeline.making.unfinished_shard import UnfinishedShard
 from pipeline.shards.pack import pack_shard
+from storage import claims
 from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry, index_shard
@@ -109,6 +111,22 @@ def test_what_somebody_else_is_making_is_left_to_them(tmp_path: Path) -> None:
         assert _make(tmp_path, 0, 4, made) is None
     assert made == {0: 1, 2: 1, 3: 1}
     assert _make(tmp_path, 0, 4, made) is not None  # they died; now it is free
+
+
+def test_who_waits_for_others_says_for_whom(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(claims, "_SILENT_S", 0.0)
+    folder, missing = DatasetFolder(tmp_path), [[0], [0], []]
+    publication = SimpleNamespace(folder=folder)
+    settings = SimpleNamespace(splits=_build().splits)
+    run: Any = SimpleNamespace(
+        publication=publication, settings=settings, missing_shards=lambda: missing.pop(0)
+    )
+    _make(tmp_path, 1, 4, Counter())
+    with claimed(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
+        tasks._wait_for_others(run, 0.0)
+    assert f"{sample_key(0)}.claim: waiting for 0 s for process {os.getpid()} of" in caplog.text
 
 
 def test_a_shard_that_is_packed_while_one_looks_is_not_free(

@@ -1,5 +1,6 @@
 """Lists and brace patterns of shards: what they stand for, and what is never opened or run."""
 
+import os
 import shutil
 import sys
 import tarfile
@@ -10,12 +11,17 @@ from typing import Any
 
 import pytest
 
+from infra.cli.words import value_of
+from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import dataset_folder
+from storage.dataset.mixed_data import open_mixture
 from storage.dataset.shard import write_shard
 from storage.dataset.shard_places import expanded, listed_shards
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
-from tests.for_each import for_each
+from storage.remote.url import parse_local_path
+from tests.for_each import case, for_each
 from tests.pipeline.documents.dataset_by_hand import five_scenes
 from tests.scenes_by_hand import tiny_sample
 
@@ -72,6 +78,35 @@ def test_a_list_reads_the_same_samples(tmp_path: Path) -> None:
             assert shards.num_samples(number) == entry.num_samples
             read = [encode_sample(shard.sample(row)) for row in range(len(shard.keys))]
         assert read == [encode_sample(sample) for sample in dataset.read_shard(entry)]
+
+
+def test_a_folder_is_a_dataset_whatever_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Made, read and trained on alike: as a pattern, a shard, or what a shell makes of `~`."""
+    five_scenes(tmp_path / "home")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    for name in ("{000..003}", "{a", "x.tar", "./~", "~/x.tar", "~no such user", "~", "$HOME"):
+        with case(name):
+            root = dataset_folder(name).root
+            if name != "~":
+                shutil.copytree(tmp_path / "home", root, ignore=shutil.ignore_patterns("x.tar"))
+            assert value_of(name, Path) == root == parse_local_path(str(root))
+            for text in (name, str(root), str(value_of(name, str))):
+                assert os.path.samefile(open_dataset(text).folder.root, root)
+                assert open_mixture([text]).digest == open_dataset(text).digest
+    assert sorted(os.listdir()) == [
+        "$HOME",
+        "home",
+        "x.tar",
+        "{000..003}",
+        "{a",
+        "~",
+        "~no such user",
+    ]
+    Path("{1,2}.json").touch()
+    assert expanded("{1,2}.json") == ["{1,2}.json"]
 
 
 def test_roots_and_shards_are_not_mixed(tmp_path: Path) -> None:
