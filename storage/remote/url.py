@@ -85,7 +85,7 @@ def parse_url(source: str, *, what: str) -> RemoteUrl | Path:
         raise TrilightError(f"{what} {shown!r} is chained with '::'; {_ADMITTED}, on its own.")
     match = _SCHEME.match(source)
     if match is None:
-        return Path(source).expanduser()
+        return Path(os.path.expanduser(source))
     scheme, rest = match[1].lower(), match[2]
     if scheme == "file":
         return _local(rest, what, shown)
