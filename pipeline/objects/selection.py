@@ -112,9 +112,7 @@ def say_unread(names: Sequence[str], objects: Sequence[str]) -> None:
 
 def drop_scenes(root: Path, names: Sequence[str]) -> list[str]:
     """Return object files without USD and GLB files of whole scenes that Trilight wrote."""
-    scenes = [
-        name for name in names if _suffix(name) in (*_USD, "glb") and _is_scene(root / name)
-    ]
+    scenes = [name for name in names if _suffix(name) in (*_USD, "glb") and _is_scene(root / name)]
     if scenes:
         shown = f"{printable(scenes[0])}{_and_more(len(scenes) - 1)}"
         say_once(f"left out as scenes that Trilight wrote: {shown}")

@@ -177,7 +177,7 @@ def read_bindings(prim: Any, time: Any) -> Iterator[tuple[Any, NDArray[np.int64]
     yield _find_material(prim), None
     for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
         bound = _find_material(subset.GetPrim())
-        if bound:
+        if bound and subset.GetElementTypeAttr().Get(time) == "face":
             yield bound, as_array(subset.GetIndicesAttr().Get(time), np.int64, (-1,))
 
 

@@ -70,6 +70,9 @@ def test_what_a_shell_leaves_a_run_is_one_sentence_or_works(tmp_path: Path) -> N
         f"{program} verify none <&- >&-": (1, "none: no manifest.json here"),
         f"cd a; rmdir ../a; {program} doctor": (1, "the working folder cannot be used (No such"),
         f"{program} verify $(printf '\\377')": (1, r"the name '\udcff' is no text in utf-8;"),
+        f"COLUMNS=0 MPLBACKEND=none PYTHONIOENCODING=ascii {program} convert s.json ö.glb | "
+        r"grep -q '\\xf6.glb'": (0, ""),
+        f"{program} assets '~nobody-of-this-name/x' --out o": (1, "does not exist"),
         f"ulimit -n 9; {program} convert s.json s.glb": (1, "Too many open files); see"),
         f"ulimit -v 4000000; TMPDIR=$PWD/{'t' * 120} {program} convert s.json s.glb": (0, ""),
     }
