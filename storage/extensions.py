@@ -66,7 +66,7 @@ def load_extension(file: str | Path, *, sha256: str | None = None) -> Extension:
         TrilightError: there is no such file, it is not Python or raises something, it registers a
             name that is taken, another one has its name, or it is not what was loaded before.
     """
-    path = Path(os.path.abspath(Path(file).expanduser()))
+    path = Path(os.path.abspath(os.path.expanduser(file)))
     known = _loaded.get(path.name)
     if known is None:
         data = _read(path, str(file))

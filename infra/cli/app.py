@@ -23,6 +23,10 @@ def main() -> None:
     # torch's threads would wait for each other in busy loops, which beside other work made training
     # twelve times slower; read when torch is imported, and a setting of the user's own wins
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of caches
+    os.environ["MPLBACKEND"] = "agg"  # a notebook's, or one that is not there, ends the import
+    if not os.environ.get("COLUMNS", "80").strip("0"):  # rich prints nothing in no columns
+        del os.environ["COLUMNS"]
     signal.signal(signal.SIGINT, _interrupted)
     open_missing_streams()
     if logging.lastResort is not None:

@@ -60,5 +60,8 @@ def convert(asked: Conversion, shown: Shown) -> None:
         return
     for text in found.notes:
         note(text)
-    written = str(found.files[0]) if len(found.files) == 1 else f"{len(found.files)} files"
+    more = len(found.files) - 1
+    written = f"{found.files[0]}" + (
+        f" and {more} {'files' if more > 1 else 'file'} more" if more else ""
+    )
     print_rows("Converted", [("written", written), ("triangles", f"{found.triangles}")])

@@ -1,6 +1,7 @@
 """Leaving at once, without waiting for threads, children or libraries."""
 
 import contextlib
+import io
 import logging
 import os
 import shutil
@@ -17,12 +18,17 @@ _temporary: set[Path] = set()
 
 
 def open_missing_streams() -> None:
-    """Open /dev/null for each standard stream that was closed, whose number a file would get."""
+    """Open /dev/null for each standard stream that was closed, whose number a file would get.
+
+    What the encoding of an open one does not have is written as an escape.
+    """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             stream = open(os.devnull, mode)
             setattr(sys, name, stream)
             setattr(sys, f"__{name}__", stream)
+        elif mode == "w" and isinstance(stream := getattr(sys, name), io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 class InertFormatter(logging.Formatter):

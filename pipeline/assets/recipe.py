@@ -38,7 +38,7 @@ RECIPE = (
 )
 """What asset files and their names in the asset store say of how they were made."""
 
-READERS = 2
+READERS = 3
 """Number of what readers make of files: it is in the names of what caches keep, and in no asset, so
 that a mended reader reads again."""
 

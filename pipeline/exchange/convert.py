@@ -121,7 +121,7 @@ def _one(source: SceneSource, target: Path, budget: int | None) -> Converted:
     loaded = _loaded(source, budget, pictures=_form_of(target).holds_pictures)
     lost = write_scene(target, loaded.scene, loaded.radiance_rgb)
     notes = (*loaded.notes, *_said(target, lost))
-    return Converted(files=(target,), triangles=loaded.scene.num_triangles, notes=notes)
+    return Converted(files=_list_files(target), triangles=loaded.scene.num_triangles, notes=notes)
 
 
 def _said(target: Path, lost: Iterable[str]) -> Iterator[str]:
@@ -145,7 +145,12 @@ def _many(
             yield str(key), carried_scene(loaded.scene, form.carried)
 
     form.write_many(target, scenes())
-    return Converted(files=(target,), triangles=triangles, notes=tuple(notes))
+    return Converted(files=_list_files(target), triangles=triangles, notes=tuple(notes))
+
+
+def _list_files(target: Path) -> tuple[Path, ...]:
+    named = _form_of(target).named_files
+    return (target, *(() if named is None else named(target)))
 
 
 def _loaded(source: SceneSource, budget: int | None, *, pictures: bool = False) -> LoadedScene:

@@ -107,6 +107,8 @@ class SceneFormat:
     """Writes a scene that passes `Scene.check`, and returns what of `carried` got lost."""
     write_many: Callable[[Path, Iterable[tuple[str, Scene]]], None] | None = None
     """Writes scenes with their keys into one file."""
+    named_files: Callable[[Path], Sequence[Path]] | None = None
+    """Returns the files beside a written one that it names."""
     carried: Collection[str] = frozenset()
     """Members of a scene that it holds (pipeline.exchange.formats); of others in use the loss is
     noted."""
@@ -138,6 +140,15 @@ def _usd_keys(source: SceneSource) -> list[str | None]:
 def _write_usd(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
     write_usd(target, scene)
     return ()
+
+
+def _list_usd_pictures(target: Path) -> Sequence[Path]:
+    from pxr import UsdUtils
+
+    if target.suffix.lower() == ".usdz":
+        return []
+    names = UsdUtils.ComputeAllDependencies(str(target))[1]
+    return [target.parent / Path(name).name for name in sorted(names)]
 
 
 def _write_many_usd(target: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
@@ -237,6 +248,7 @@ _USD = SceneFormat(
     keys=_usd_keys,
     write=_write_usd,
     write_many=_write_many_usd,
+    named_files=_list_usd_pictures,
     carried=usd.CARRIED,
 )
 

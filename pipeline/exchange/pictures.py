@@ -73,6 +73,8 @@ def _plain(data: bytes, name: str) -> Pixels | None:
             _require_size(image.width, image.height, name)
             if image.mode.startswith("I;16") or image.mode == "I":
                 return (np.asarray(image, np.float32) / np.float32(65535))[..., None]
+            if image.mode == "F":
+                return np.asarray(image, np.float32)[..., None]
             mode = image.mode if image.mode in ("L", "RGB", "RGBA") else "RGB"
             values: NDArray[np.uint8] = np.asarray(image.convert(mode), np.uint8)
     except TrilightError:

@@ -123,6 +123,8 @@ def _list_spellings(name: str) -> Iterator[str]:
         for encoding in _ENCODINGS if not name.isascii() else ():
             with contextlib.suppress(UnicodeDecodeError):
                 yield code.decode(encoding)
+    yield unquote(name)
+    yield name.partition(" #")[0].rstrip()  # a comment behind it
     last = name.rpartition("/")[2]
     if _WINDOWS_ROOT.match(name):  # a path of the machine on which the file was written
         yield last

@@ -59,7 +59,7 @@ def decode_colors(codes: NDArray) -> NDArray[np.float64]:
     if codes.dtype == np.uint8:
         return linear_from_srgb8()[codes].astype(np.float64)
     coded = np.nan_to_num(codes.astype(np.float64))
-    if codes.dtype == np.uint16:
+    if codes.dtype == np.uint16 and codes.max(initial=0) > 255:
         coded /= 65535
     elif coded.size and coded.max() > 1:
         coded /= 255

@@ -26,7 +26,7 @@ def read_mtl(data: bytes) -> dict[str, Fields]:
         key, value = decode_name(words[0]).lower(), decode_name(b"".join(words[1:]))
         if key == "newmtl":
             fields = materials[unquote_name(value)] = {}
-        else:
+        elif value or not key.startswith("map_"):  # exporters name maps that are not there
             fields[key] = value
     return materials
 

@@ -46,7 +46,7 @@ def read_obj(data: bytes) -> FileMesh:
     numbers = _Numbers(lines, kinds)
     points, width = numbers.read_rows(_V, 3)
     unread = _name_others(lines, np.flatnonzero(kinds == _OTHER))
-    if points.shape[1] > 3 and (points[(width == 4) | (width == 7), 3] != 1).any():
+    if points.shape[1] > 3 and (points[width == 4, 3] != 1).any():
         unread["weights of vertices"] = 1
     faces = np.flatnonzero(kinds == _F)
     counts = lines.counts[faces] - 1
@@ -70,7 +70,9 @@ def read_obj(data: bytes) -> FileMesh:
     if (used >= len(places)).any() or (used < -1).any():
         unread["texture coordinates that the file does not hold"] = 1
         used = np.where((used < 0) | (used >= len(places)), -1, used)
-    colors = _decode_colors(points, width)
+    colors = _decode_colors(points, width, unread)
+    if colors is None:
+        colors = _read_polypaint(text, len(points))
     return FileMesh(
         mesh=TriangleMesh(positions=points[chosen[first, 0], :3], faces=vertex.reshape(-1, 3)),
         material=material[polygon],
@@ -216,16 +218,31 @@ def _read_materials(
 
 
 def _decode_colors(
-    points: NDArray[np.float64], width: NDArray[np.int64]
+    points: NDArray[np.float64], width: NDArray[np.int64], unread: Counter[str]
 ) -> NDArray[np.float64] | None:
-    """Return the linear colors [V, 3] of vertices, white where one has none."""
-    has = (width == 6) | (width == 7)
+    """Return the linear colors [V, 3] of vertices, white where one has none.
+
+    Of four numbers more, the last one is alpha, or else the first one a weight of 1.
+    """
+    has, wide = (width == 6) | (width == 7), points[width == 7, 3:7]
     if not has.any():
         return None
-    column = width[has, None] - 3 + np.arange(3)
-    colors = np.ones((len(points), 3))
-    colors[has] = decode_colors(np.take_along_axis(points[has], column, axis=1))
+    is_weighted = len(wide) and (wide[:, 0] == 1).all() and (wide[:, 3] != 1).any()
+    if len(wide) and not is_weighted and (wide[:, 3] != 1).any():
+        unread["transparency of colors"] = 1
+    colors, first = np.ones((len(points), 3)), 3 + (is_weighted & (width[has, None] == 7))
+    colors[has] = decode_colors(np.take_along_axis(points[has], first + np.arange(3), axis=1))
     return colors
+
+
+def _read_polypaint(text: bytes, count: int) -> NDArray[np.float64] | None:
+    """Return the linear colors [V, 3] that ZBrush writes as comments, if there are as many."""
+    codes = b"".join(re.findall(rb"(?m)^#MRGB ((?:[0-9a-fA-F]{8})+)", text))
+    if not codes or len(codes) != 8 * count:
+        return None
+    return decode_colors(
+        np.frombuffer(bytes.fromhex(codes.decode()), np.uint8).reshape(-1, 4)[:, 1:]
+    )
 
 
 def _read_value(line: bytes, key: bytes) -> str | None:

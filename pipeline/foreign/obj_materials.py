@@ -55,7 +55,8 @@ def obj_materials(
         Rejected: no_materials where it has none, materials_unreadable, or as reading a picture.
     """
     if not used or not files.libraries:
-        raise Rejected("no_materials", "the OBJ names no materials")
+        why = "no mtllib says where they are" if used else "the OBJ names none"
+        raise Rejected("no_materials", f"there are no materials: {why}")
     known: dict[str, Fields] = {}
     for library in files.libraries:
         if library in files.data:
@@ -175,6 +176,8 @@ def _list_unread(fields: Fields) -> Iterator[str]:
             yield from (f"option {name[:24]!r} of {key}" for name in unknown)
         elif value.startswith("spectral"):
             yield f"spectral curve of {key}"
+        elif key in ("kd", "ks") and _is_over(value.removeprefix("xyz"), 1.001):
+            yield f"{key} above 1"
 
 
 def _rgb(fields: Fields, name: str, default: float) -> RGB:

@@ -34,6 +34,7 @@ _MAX_BYTES = 3 << 30
 _TILED = 0x200
 
 _GREY, _CHROMA, _COLOR = ("Y",), ("BY", "RY", "Y"), ("R", "G", "B")
+_LETTERS = {"RED": "R", "GREEN": "G", "BLUE": "B", "ALPHA": "A"}
 _MAIN_LAYERS = ("combined", "beauty", "rgba", "rgb", "color", "colour", "c")
 """Last words of the names of layers that are the picture itself."""
 
@@ -170,12 +171,14 @@ def _choices(headers: Sequence[Mapping[str, Any]]) -> Iterator[_Choice]:
     for part, header in enumerate(headers):
         for channel in header["channels"]:
             layer, _, letter = str(channel.name).rpartition(".")
-            layers[part, layer][letter.upper()] = str(channel.name)
+            letter = _LETTERS.get(letter.upper(), letter.upper())
+            layers[part, layer][letter] = str(channel.name)
     for wanted in (_COLOR, _CHROMA, _GREY, None):
-        for (part, _), names in layers.items():
+        for (part, layer), names in layers.items():
             letters = wanted or tuple(set(names) - {"A"})  # one channel of any name is grey
-            if letters == ("Z",) or (letters == _GREY and "X" in names):
-                continue  # depth, or CIE XYZ
+            is_depth = letters == ("Z",) or layer.lower().endswith(("depth", "mist"))
+            if is_depth or (letters == _GREY and "X" in names):
+                continue  # or CIE XYZ
             if set(letters) <= set(names) and len(letters) == len(wanted or _GREY):
                 alpha = ("A",) if "A" in names else ()
                 called = tuple(names[letter] for letter in (*letters, *alpha))

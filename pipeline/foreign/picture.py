@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from pipeline.foreign.light_pictures import read_linear_picture
 from storage.conventions import linear_from_srgb, linear_from_srgb8
@@ -75,6 +75,9 @@ def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
         large = error.reason in ("texture_too_large", "too_many_pixels")
         reason = "texture_too_large" if large else "texture_unreadable"
         raise Rejected(reason, f"{name!r:.80}: {error.message}") from error
+    except UnidentifiedImageError as error:
+        why = f"it is no picture that is read; expected {', '.join(FORMATS)} or OpenEXR"
+        raise Rejected("texture_unreadable", f"{name!r:.80}: {why}") from error
     except Image.DecompressionBombError as error:
         raise Rejected("texture_too_large", f"{name!r:.80}: it has too many pixels") from error
     except Exception as error:  # decoders of other people's files fail in every way
@@ -108,6 +111,8 @@ def _unit_values(values: NDArray[np.float32]) -> NDArray[np.float16]:
 
 
 def _values(image: Image.Image) -> NDArray:
+    if image.mode == "F":
+        return _unit_values(np.asarray(image, np.float32)[..., None])
     if image.mode.startswith("I"):
         grey = np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
         return np.stack([grey, grey, grey, np.full_like(grey, 65535)], axis=-1)

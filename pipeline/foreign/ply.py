@@ -149,7 +149,7 @@ def _read_property(words: Sequence[bytes]) -> _Property:
     if None in kinds or len(kinds) != 1 + is_list or (is_list and kinds[0] in ("f4", "f8")):
         raise Rejected("load_error", f"the PLY has a property {b' '.join(words)[:60]!r}")
     return _Property(
-        name=decode_name(words[-1]),
+        name=decode_name(words[-1]).lower(),
         kind=np.dtype(kinds[-1]),
         count=np.dtype(kinds[0]) if is_list else None,
     )

@@ -97,8 +97,9 @@ def _header(data: bytes) -> _Header:
         elif name in ("EXPOSURE", "COLORCORR"):
             factors = factors * _numbers(value, 1 if name == "EXPOSURE" else 3, name)
         elif name == "PRIMARIES":
-            primaries = tuple(_numbers(value, 8, name))
-        elif name == "PIXASPECT" and (_numbers(value, 1, name) == 1).all():
+            stated = tuple(_numbers(value, 8, name))
+            primaries = stated if any(stated) else primaries  # Photoshop states none as zeros
+        elif name in ("PIXASPECT", "GAMMA") and (_numbers(value, 1, name) == 1).all():
             continue
         elif name not in _SAYS_NOTHING:
             unread[f"header variable {name:.40}"] = None

@@ -6,18 +6,17 @@ from collections import Counter
 import numpy as np
 
 from pipeline.foreign.mesh import FileMesh, TriangleMesh
-from pipeline.foreign.text import list_some, parse_numbers, plain_text, split_lines
+from pipeline.foreign.polygons import cut_polygons
+from pipeline.foreign.text import list_some, parse_numbers, plain_text
 from storage.errors import Rejected
 
 _HEADER_BYTES = 84
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_FACET_BEGINS = re.compile(rb"\sfacet\s+normal\s+[-+.\d]")
-_WORDS = {
-    **{0: b"facet", 1: b"normal", 5: b"outer", 6: b"loop", 7: b"vertex"},
-    **{11: b"vertex", 15: b"vertex", 19: b"endloop", 20: b"endfacet"},
-}
-"""Key words of a facet by their place among its 21 words."""
-_NUM_WORDS = 21
+_FACET_BEGINS = re.compile(rb"\sfacet\s+normal(?:\s+[-+.\da-z#()]+){3}(?=\s+outer\s|\s*$)")
+_LOOP = re.compile(rb"outer\s+loop((?:\s+vertex(?:\s+\S+){3})+)\s+endloop\s")
+_AROUND_LOOP = re.compile(rb"facet(?:\s+normal(?:\s+(?!endfacet)\S+){0,3})?\s+endfacet\s")
+_ENDS = re.compile(rb"(?m)^([ \t]*)end[ \t]+(?=(?:facet|loop|solid)\b)")
+_WORDS = {b"facet", b"outer", b"loop", b"vertex"}
 _MOST_INDENT = 4096
 """Bytes that are looked at before a solid begins or ends."""
 
@@ -29,20 +28,26 @@ def read_stl(data: bytes) -> FileMesh:
         Rejected: load_error, header_size_mismatch or cut_off.
     """
     count = int.from_bytes(data[80:_HEADER_BYTES], "little")
-    if len(data) == _HEADER_BYTES + _FACET.itemsize * count:
-        return _read_binary(data)
+    more = len(data) - _HEADER_BYTES - _FACET.itemsize * count
+    if more == 0:
+        return _read_binary(data, count)
     text = plain_text(data)
-    if text.lstrip()[:5].lower() != b"solid" or b"\0" in text[:_HEADER_BYTES]:
-        raise Rejected(
-            "header_size_mismatch",
-            f"the STL header counts {count} facets, which {len(data)} bytes do not hold",
-        )
-    return _read_text(text.lower())
+    if text.lstrip()[:5].lower() == b"solid" and b"\0" not in text[:_HEADER_BYTES]:
+        return _read_text(text.lower())
+    if count and 0 < more < _FACET.itemsize:
+        return _read_binary(data, count)
+    raise Rejected(
+        "header_size_mismatch",
+        f"the STL is no text, which begins with solid, and its header counts {count} facets, "
+        f"for which its {len(data)} bytes are {abs(more)} too {'many' if more > 0 else 'few'}",
+    )
 
 
-def _read_binary(data: bytes) -> FileMesh:
-    facets = np.frombuffer(data, _FACET, offset=_HEADER_BYTES)
+def _read_binary(data: bytes, count: int) -> FileMesh:
+    facets = np.frombuffer(data, _FACET, count, _HEADER_BYTES)
     unread = Counter[str]()
+    if len(data) > _HEADER_BYTES + facets.nbytes:
+        unread["bytes after the last facet"] = 1
     if facets["attribute"].any():
         unread["attributes of facets, which often are colors"] = 1
     if b"COLOR=" in data[:80]:
@@ -80,18 +85,18 @@ def _strip_names(text: bytes) -> tuple[bytes, bool]:
 
 
 def _read_text(text: bytes) -> FileMesh:
-    text, is_closed = _strip_names(text)
-    lines = split_lines(text)
-    words = lines.words
-    if len(words) % _NUM_WORDS or not is_closed:
+    text, is_closed = _strip_names(_ENDS.sub(rb"\1end", text) + b"\n")
+    loops = _LOOP.findall(text)
+    rest = _AROUND_LOOP.sub(b" ", _LOOP.sub(b" ", text)).strip(b"\0\x1a \n").split()
+    if not is_closed:
         raise Rejected("cut_off", "the STL ends within a facet, or without endsolid")
-    facets = words.reshape(-1, _NUM_WORDS)
-    for column, word in _WORDS.items():
-        places = facets[:, column, None] + np.arange(len(word) + 1)
-        codes = lines.codes[places]
-        if (codes[:, :-1] != np.frombuffer(word, np.uint8)).any() or (codes[:, -1] > 32).any():
-            raise Rejected("load_error", f"the STL lacks {word.decode()!r} in a facet")
-    begins, ends = facets[:, 7].tolist(), facets[:, 19].tolist()
-    loops = b" ".join(lines.text[low:high] for low, high in zip(begins, ends, strict=True))
-    numbers = parse_numbers(loops.replace(b"vertex", b" "), 9 * len(facets), np.float64)
-    return FileMesh(mesh=_build_mesh(numbers.reshape(-1, 3)))
+    broken = next((word for word in rest if word.removeprefix(b"end") in _WORDS), None)
+    if broken is not None:
+        why = f"the STL has {broken.decode()!r} where a facet is not complete"
+        raise Rejected("load_error", why)
+    counts = np.array([loop.count(b"vertex") for loop in loops], np.int64)
+    numbers = b" ".join(loops).replace(b"vertex", b" ")
+    points = parse_numbers(numbers, 3 * int(counts.sum()), np.float64).reshape(-1, 3)
+    cut = cut_polygons(points, counts, np.arange(len(points)), Counter())
+    unread = {f"statement {rest[0].decode('latin-1')[:24]!r}": 1} if rest else {}
+    return FileMesh(mesh=_build_mesh(points[cut.vertices.ravel()]), unread=list_some(unread))

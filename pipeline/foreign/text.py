@@ -115,14 +115,16 @@ def parse_numbers(text: bytes, count: int, dtype: type[T]) -> NDArray[T]:
     except (ValueError, DeprecationWarning):
         values = np.zeros(0, dtype)
     if len(values) != count:
-        word = next((word for word in text.split() if not _is_number(word)), b"")
-        raise Rejected("load_error", f"{word[:40]!r} stands where a number is expected")
+        kind = int if np.issubdtype(dtype, np.integer) else float
+        word = next((word for word in text.split() if not _is_number(word, kind)), b"nothing")
+        wanted = "a whole number" if kind is int else "a number"
+        raise Rejected("load_error", f"{word[:40]!r} stands where {wanted} is expected")
     return values
 
 
-def _is_number(word: bytes) -> bool:
+def _is_number(word: bytes, kind: type) -> bool:
     try:
-        float(word)
+        kind(word)
     except ValueError:
         return False
     return b"_" not in word

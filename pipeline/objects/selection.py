@@ -29,6 +29,8 @@ _MESH_OF_SCENE = re.compile(r"\d+_.*_\d+\.obj")
 
 _SCENE = b"trilight:sceneSha256"
 """What every USD file of a scene of ours holds."""
+_GLB_SCENE = (b'"generator": "trilight"', b'"cameras": [')
+"""What every GLB of a scene of ours holds, and no object of ours."""
 _MOST_HEAD, _MOST_TAIL = 1 << 14, 1 << 20
 
 _MESH = re.compile(r".*-[0-9a-f]{8}\.(?:ply|glb)")
@@ -109,8 +111,8 @@ def say_unread(names: Sequence[str], objects: Sequence[str]) -> None:
 
 
 def drop_scenes(root: Path, names: Sequence[str]) -> list[str]:
-    """Return object files without USD files of whole scenes that Trilight wrote."""
-    scenes = [name for name in names if _suffix(name) in _USD and _is_scene(root / name)]
+    """Return object files without USD and GLB files of whole scenes that Trilight wrote."""
+    scenes = [name for name in names if _suffix(name) in (*_USD, "glb") and _is_scene(root / name)]
     if scenes:
         shown = f"{printable(scenes[0])}{_and_more(len(scenes) - 1)}"
         say_once(f"left out as scenes that Trilight wrote: {shown}")
@@ -122,6 +124,9 @@ def _is_scene(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             head = file.read(_MOST_HEAD)
+            if head.startswith(b"glTF"):
+                tree = head + file.read(_MOST_TAIL)
+                return all(mark in tree for mark in _GLB_SCENE)
             file.seek(max(0, path.stat().st_size - _MOST_TAIL))
             return _SCENE in head or (not head.startswith(b"#usda") and _SCENE in file.read())
     except OSError:

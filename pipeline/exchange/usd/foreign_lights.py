@@ -76,6 +76,8 @@ def radiance(
     if placed.prim.GetAttribute("inputs:normalize").Get(time):
         area = _area(triangles.astype(np.float64)) / placed.metres**2
         found = found / max(area, 1e-30)
+    if (found < 0).any():
+        lost.append(f"{placed.prim.GetPath()}: a light below zero; it emits nothing")
     found = np.maximum(found, 0)
     return np.where(np.isfinite(found), found, 0).astype(np.float32)
 

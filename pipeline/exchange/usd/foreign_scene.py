@@ -60,10 +60,10 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
     sky = _environment(placed, time, opened, licence)
     is_lit = sky is not None and sky.radiance_rgb.any()
     if not is_lit and not any(one.piece.entry.kind == "emitter" for one in pieces):
-        unread = "; ".join(note for note in opened.lost if "Light" in note) or "there is none"
+        unread = "; ".join(note for note in opened.lost if "light" in note.lower())
         raise TrilightError(
-            f"no light that can be carried over ({unread:.200}); expected an emissive material, or "
-            "a rectangle, disk, sphere, cylinder, mesh or dome light."
+            f"no light that can be carried over ({unread or 'none is seen':.200}); expected an "
+            "emissive material, or a rectangle, disk, sphere, cylinder, mesh or dome light."
         )
     materials = sum(len(one.piece.materials) for one in pieces)
     if materials > MAX_ROWS:

@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote_to_bytes, urlsplit
 
+from pipeline.foreign.material_files import find_in_any_case
 from pipeline.foreign.numbers import Malformed
 from storage.errors import Rejected
 
 _MAX_JSON_BYTES = 64_000_000
 _HEADER = struct.Struct("<4sII")
 _CHUNK = struct.Struct("<I4s")
+_BASE64 = bytes.maketrans(b"-_", b"+/")
+"""From the base64 of URLs to that of files."""
 
 
 def read_container(data: bytes, suffix: str) -> tuple[dict[str, Any], memoryview | None]:
@@ -108,7 +111,7 @@ def data_uri_bytes(uri: str) -> bytes:
     plain = unquote_to_bytes(body)
     if not head.lower().endswith(";base64"):
         return plain
-    packed = b"".join(plain.split())
+    packed = b"".join(plain.split()).translate(_BASE64)
     return base64.b64decode(packed.rstrip(b"=") + b"=" * (-len(packed.rstrip(b"=")) % 4))
 
 
@@ -121,7 +124,7 @@ def local_path(uri: str, folder: Path) -> Path:
     """Return the file below a folder that a relative URI names, escaped or as it is.
 
     Raises:
-        Rejected: external_uri.
+        Rejected: external_uri or missing_file.
     """
     root = folder.resolve()
     try:
@@ -134,4 +137,9 @@ def local_path(uri: str, folder: Path) -> Path:
     targets = [(root / name).resolve() for name in (plain, uri, plain.replace("\\", "/"))]
     if not all(target.is_relative_to(root) for target in targets):
         raise Rejected("external_uri", f"{uri[:80]!r} lies outside of the file's folder")
-    return next((target for target in targets if target.is_file()), targets[0])
+    if target := next((target for target in targets if target.is_file()), None):
+        return target
+    target = find_in_any_case(root, plain, root)
+    if target.is_relative_to(root) and target.is_file():
+        return target
+    raise Rejected("missing_file", f"the buffer {uri[:80]!r} is not beside the file")

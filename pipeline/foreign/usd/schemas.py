@@ -26,6 +26,13 @@ def list_unread(prim: Any, time: Any, kinds: Collection[str]) -> Iterator[str]:
     kind = str(prim.GetTypeName())
     if not (kind in kinds or kind in _SILENT or kind.startswith(_OF_OTHERS)):
         yield kind
+    for relation in prim.GetRelationships():
+        if relation.GetName().startswith("material:binding"):
+            targets = relation.GetForwardedTargets()
+            if any(
+                path.IsPrimPath() and not prim.GetStage().GetPrimAtPath(path) for path in targets
+            ):
+                yield "binding of a material that is not there"
     applied = prim.GetMetadata("apiSchemas")
     names = {} if applied is None else dict.fromkeys(map(str, applied.ApplyOperations([])))
     for name in dict.fromkeys(name.partition(":")[0] for name in names):

@@ -177,7 +177,7 @@ def read_bindings(prim: Any, time: Any) -> Iterator[tuple[Any, NDArray[np.int64]
     yield _find_material(prim), None
     for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
         bound = _find_material(subset.GetPrim())
-        if bound:
+        if bound and subset.GetElementTypeAttr().Get(time) == "face":
             yield bound, as_array(subset.GetIndicesAttr().Get(time), np.int64, (-1,))
 
 
@@ -345,6 +345,8 @@ class _Reader:
 def parse_color(stated: Any) -> NDArray[np.float32] | None:
     """Return a number or color as a color [3]; None for anything else."""
     value = np.array(stated, np.float32)  # None becomes no number
+    if value.shape == (4,):  # alpha is an input of its own
+        value = value[:3]
     if value.shape not in ((), (3,)) or not np.isfinite(value).all():
         return None
     return np.broadcast_to(value, 3).astype(np.float32)

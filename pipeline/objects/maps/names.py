@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 _WORDS: Mapping[str, str] = {
-    "base": r"base[-_ ]?(?:colou?r|map)|albedo(?:[-_ ]?transparency)?|alb|diff|dif|"
+    "base": r"base(?:[-_ ]?(?:colou?r|map))?|albedo(?:[-_ ]?transparency)?|alb|diff|dif|"
     r"diffuse(?:[-_ ]?colou?r)?|colou?r|col|bc|basecolou?r[-_ ]opacity|b-o",
     "specular": r"specular(?:[-_ ]?colou?r)?|spec|refl|reflection",
     "roughness": r"roughness|rough|rgh",
@@ -66,10 +66,12 @@ _LATER = (".webp", ".exr")
 
 _BETWEEN = "[-_. ]+"
 _SIZE = r"\d{1,2}k(?:[-_](?:jpe?g|png|tiff?|exr))?|\d{3,5}(?:x\d{3,5})?(?:px)?|(?:hi|low)[-_]?res"
+_NOTHING = r"tex(?:ture)?|map|v\d{1,3}|\(\d{1,3}\)|copy|final"
+"""Words behind that of a part that say nothing of it."""
 _TAIL = (
     rf"(?:{_BETWEEN}(?:srgb|raw|linear|acescg))?"
     rf"(?P<kind>(?:{_BETWEEN}(?:var)?\d{{1,2}})?)"
-    rf"(?P<tail>(?:{_BETWEEN}(?:{_SIZE}))*(?:{_BETWEEN}(?:metalness|specular|lod\d))?)"
+    rf"(?P<tail>(?:{_BETWEEN}(?:{_SIZE}|{_NOTHING}))*(?:{_BETWEEN}(?:metalness|specular|lod\d))?)"
 )
 _PARTS = "|".join(f"(?P<{part}>{words})" for part, words in _WORDS.items())
 _NAME = re.compile(rf"(?i)(?:(?P<set>.+?){_BETWEEN})?(?:{_PARTS}){_TAIL}")
@@ -82,8 +84,14 @@ _FOLDERS = re.compile(
 """Folders of one part each, whose files have the names of textures."""
 _CAMEL = re.compile(
     "(?<=[a-z0-9])(?=(?:Roughness|Normal|Albedo|BaseColou?r|Metallic|Metalness|Specular|Diffuse|"
-    "Displacement|Height|AmbientOcclusion|Glossiness|Opacity|Emissive)(?![a-z]))"
+    "Displacement|Height|AmbientOcclusion|Glossiness|Opacity|Emissive|Colou?r|Rough)(?![a-z]))"
 )
+_NO_COLOR = re.compile(
+    r"(?i)(?:.*[-_. (])?(?:normals?(?:map)?|nrm|nmap|roughness|metallic|metalness|displacement|"
+    r"ao|height(?:map)?|specular|glossiness|opacity|emissive|d3d|dx(?:9|11)?|directx|opengl)"
+    r"(?:[-_. )].*)?"
+)
+"""Names that say somewhere that they are no color."""
 
 
 @dataclass(frozen=True)
@@ -168,6 +176,7 @@ class _Bare:
             if name in named:
                 continue
             is_alone = stem.rpartition("/")[0] not in folders and not name.lower().endswith(".exr")
+            is_alone &= not _NO_COLOR.fullmatch(stem.rpartition("/")[2])
             if is_alone or (stem in keys and stem not in with_color):
                 self.colors[name] = stem
             else:
@@ -196,7 +205,7 @@ def _named(path: str) -> _Named | None:
 
 
 def _add_letters(stems: Mapping[str, str], named: dict[str, _Named]) -> None:
-    """Add files whose names end in a letter, where letters of one set say a color and more."""
+    """Add files whose names end in a letter, where one set or the color beside it says what."""
     letters: dict[str, dict[str, tuple[str, str]]] = defaultdict(dict)
     for name, stem in stems.items():
         match = _LETTER.fullmatch(stem) if name not in named else None
@@ -204,10 +213,12 @@ def _add_letters(stems: Mapping[str, str], named: dict[str, _Named]) -> None:
             key = f"{match['set']}{match['tail']}"
             letters[key][name] = match["letter"].lower(), f"{match['set']}{match['tail']}"
     others = {entry.key for entry in named.values()}
+    bare = {stem for name, stem in stems.items() if name not in named}
     for key, files in letters.items():
         said = {letter for letter, _ in files.values()}
         is_set = said <= {*_LETTERS, *_UNCLEAR} and len(said & {"b", "c", "d"}) == 1
-        if is_set and ("n" in said or key in others):
+        beside_color = key in bare and said <= {"n", "s", "r", "h", "e"}
+        if beside_color or (is_set and ("n" in said or key in others)):
             for name, (letter, stem) in files.items():
                 named[name] = _Named(key, stem, _LETTERS.get(letter, "other"))
 

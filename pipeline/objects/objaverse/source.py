@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import os
 import re
 import threading
 from collections.abc import Sequence
@@ -139,7 +140,7 @@ def _text(row: dict[str, Any], field: str) -> str:
 def _uids(text: str, source: str) -> list[str]:
     if _UIDS.fullmatch(text):
         return [uid.strip().lower() for uid in text.split(",")]
-    path = Path(text).expanduser()
+    path = Path(os.path.expanduser(text))
     if not text or not path.is_file():
         raise TrilightError(f"objects {printable(source)!r} names no file and no uid; {_FORMS}.")
     try:

@@ -73,6 +73,9 @@ def test_what_a_shell_leaves_a_run_is_one_sentence_or_works(tmp_path: Path) -> N
         f"ln -s l l; {program} generate smoke --out l": (1, "l/.staging: cannot write lock (Too"),
         f"TRILIGHT_CACHE=/dev/null/x {program} generate smoke --out o": (1, "'/dev/null' is no"),
         f"{program} verify \"$(printf 'e\\033]0')\"": (1, r"e\x1b]0: no manifest.json here"),
+        f"COLUMNS=0 MPLBACKEND=none PYTHONIOENCODING=ascii {program} convert s.json ö.glb | "
+        r"grep -q '\\xf6.glb'": (0, ""),
+        f"{program} assets '~nobody-of-this-name/x' --out o": (1, "does not exist"),
         f"ulimit -n 9; {program} convert s.json s.glb": (1, "Too many open files); see"),
         f"ulimit -v 4000000; TMPDIR=$PWD/{'t' * 120} {program} convert s.json s.glb": (0, ""),
     }

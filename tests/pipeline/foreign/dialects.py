@@ -69,12 +69,13 @@ def write_obj(mesh: Polygons, rng: Rng) -> bytes:
     """Return an OBJ whose materials are called by the rows of its colors."""
     space, colored = rng.choice([" ", "\t", "  "]), rng.random() < 0.5
     form = rng.choice(["{v}", "{v}/{v}", "{v}//{n}", "{v}/{v}/{n}", "{v}/"])
-    interleaved, weighted = rng.random() < 0.5, rng.random() < 0.3
+    interleaved, wide = rng.random() < 0.5, rng.choice(["", "", "weight", "alpha"])
     lines, faces = ["# ends with \\", "mtllib m.mtl", "vn 0 0 1"], list[str]()
     for row, (ring, face) in enumerate(zip(mesh.rings, mesh.faces, strict=True)):
         for point in ring:
             more = [repr(code / 255) for code in mesh.colors[row]] if colored else []
-            more = ["1.0", *more] if weighted else more
+            more = ["1.0", *more] if wide == "weight" else more
+            more += ["1.0"] if wide == "alpha" and colored else []
             lines.append(space.join(["v", *_words(point), *more]))
             lines.append(space.join(["vt", *_words(point[:2])]))
         total = sum(len(other) for other in mesh.rings[: row + 1])

@@ -188,6 +188,8 @@ def test_what_is_not_read_is_named_and_an_environment_fills_its_data() -> None:
     stream = io.BytesIO()
     OpenEXR.File(parts).write(stream)
     assert read(stream.getvalue()).unread == ("channels 'Z'",)
+    named = {name: noise(2, 4) for name in ("red", "green", "blue")}
+    np.testing.assert_array_equal(read(of_library(dict(named))).values[..., 0], named["red"])
 
 
 def test_files_of_openexr_that_are_not_read_say_why() -> None:
@@ -203,6 +205,7 @@ def test_files_of_openexr_that_are_not_read_say_why() -> None:
         (of_library(dict.fromkeys("RGB", deep), **deep_header), "it is deep"),
         (of_library(layers), "its layers 'a', 'b' are pictures each"),
         (of_library({"Z": noise(4, 4)}), "its channels are Z; expected R, G and B"),
+        (of_library({"a.Depth.V": noise(4, 4)}), "its channels are a.Depth.V; expected"),
         (of_library({"X": noise(4, 4), "Y": noise(4, 4), "Z": noise(4, 4)}), "are X, Y, Z"),
         (of_library({"RGB": rgb}, envmap=OpenEXR.ENVMAP_CUBE), "it is a cube map"),
         (of_library({"RGB": rgb}, colorInteropID="srgb_rec709_scene"), "'srgb_rec709_scene'"),
@@ -311,7 +314,9 @@ def test_every_orientation_shows_the_same_picture(order: tuple[str, str, bool]) 
 def test_factors_of_the_header_are_divided_out_and_ones_change_nothing() -> None:
     texels = _texels(3, 16)
     plain = _radiance(texels)
-    one = "EXPOSURE=1\nEXPOSURE= 1.000000e+00\nCOLORCORR=1 1 1\nPIXASPECT=1\nSOFTWARE=x\n"
+    one = "EXPOSURE=1\nEXPOSURE= 1.000000e+00\nCOLORCORR=1 1 1\nPIXASPECT=1\nSOFTWARE=x\nGAMMA=1\n"
+    plain_too = read(radiance_hdr(texels, header=one + "PRIMARIES=0 0 0 0 0 0 0 0\n"))  # Photoshop
+    np.testing.assert_array_equal(plain_too.values, plain)
     one += "PRIMARIES=0.640 0.330 0.290 0.600 0.150 0.060 0.333 0.333\n"
     picture = read(radiance_hdr(texels, header=one))
     np.testing.assert_array_equal(picture.values, plain)

@@ -108,6 +108,14 @@ READ: dict[str, tuple[str, int, str | bytes, tuple[str, ...]]] = {
                "property list int int vertex_indices\nend_header\n"
                "0 0 0\n1 0 0\n0 1 0\n1 1 0\n8 0 1 2 3 -1 2 1 0\n", ()),
     "no header": ("off", 1, "3 1 0 0 0 0 1 0 0\n0 1 0 3 0\n1 2\n", ()),
+    "colors with alpha": ("obj", 1, "v 0 0 0 1 0 0 .5\nv 1 0 0 0 0 0 1\nv 0 1 0 0 0 0 1\nf 1 2 3\n",
+                          ("transparency of colors",)),
+    "loose stl": ("stl", 3, "solid a\ncolor 1 0 0\nfacet normal\nouter loop\nvertex 0 0 0\n"
+                  "vertex 1 0 0\nvertex 1 1 0\nvertex 0 1 0\nvertex -1 .5 0\nend loop\nend facet\n"
+                  "end solid\nfrom a mill", ("statement 'color'",)),
+    "stl with a tail": ("stl", 1, b"solid".ljust(80) + b"\1\0\0\0" + bytes(12)
+                        + np.eye(3, dtype="<f4").tobytes() + b"\0\0\n",
+                        ("bytes after the last facet",)),
     "stl attributes": ("stl", 1, b"COLOR=".ljust(80) + b"\1\0\0\0" + bytes(12) + np.eye(
         3, dtype="<f4").tobytes() + b"\1\x80",
         ("attributes of facets, which often are colors", "color of the header")),
@@ -135,6 +143,10 @@ REFUSED = {
     "obj no number": ("obj", "load_error", TRIANGLE + "f 1 2 3x\n"),
     "obj of MeshLab": ("obj", "cut_off", BY_MESHLAB + TRIANGLE),
     "obj of curves": ("obj", "no_faces", TRIANGLE + "curv 0 1 1 2\n"),
+    "obj float index": ("obj", "b'1.0' stands where a whole number", TRIANGLE + "f 1.0 2 3\n"),
+    "stl of half a facet": ("stl", "'facet' where a facet is not complete",
+                            "solid a\nfacet normal 0 0 1\nvertex 0 0 0\nendfacet\nendsolid a\n"),
+    "stl of other bytes": ("stl", "its header counts 538976288 facets", "# " + " " * 99),
     "stl without end": ("stl", "cut_off", "solid a\n"),
     "off binary": ("off", "load_error", "OFF BINARY\n3 1 0\n"),
     "off of four dimensions": ("off", "load_error", "nOFF 4\n3 1 0\n"),
@@ -147,7 +159,22 @@ def test_what_is_refused(name: str) -> None:
     kind, reason, text = REFUSED[name]
     with pytest.raises(Rejected) as refusal:
         load_mesh(source(kind, text.encode()))
-    assert refusal.value.reason == reason
+    assert reason in f"{refusal.value.reason}: {refusal.value.message}"
+
+
+def test_colors_of_zbrush_and_of_ply_in_other_codes_are_read() -> None:
+    red = tuple(linear_from_srgb8()[[200, 30, 30]].tolist())
+    codes = {"float": "200.0 30.0 30.0", "ushort": "200 30 30", "int": "200 30 30"}
+    files = [
+        ("ply", "ply\nformat ascii 1.0\nelement vertex 3\nproperty float X\nproperty float Y\n"
+         f"property float Z\nproperty {kind} Red\nproperty {kind} Green\nproperty {kind} Blue\n"
+         "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+         f"0 0 0 {code}\n1 0 0 {code}\n0 1 0 {code}\n3 0 1 2\n") for kind, code in codes.items()
+    ]  # fmt: skip
+    files.append(("obj", TRIANGLE + "#MRGB " + "ffc81e1e" * 3 + "\nf 1 2 3\n"))
+    for kind, text in files:
+        color = source(kind, text.encode()).contents.color
+        assert color is not None and color[0, 0] == pytest.approx(red, abs=1e-6)
 
 
 @for_each("count", [40, 3000])
@@ -163,6 +190,7 @@ def test_a_comb_is_cut_as_it_is(count: int) -> None:
 
 
 MTL = "Kd xyz 0.4124 0.2126 0.0193\nillum 2 # x\nd -halo 0.5\nsharpness 60\nsparkle 1\nTr 0\n"
+MTL += "map_Ks\nKs .5 .5 1.1\n"
 
 
 def placed(folder: Path, obj: bytes, files: dict[str, bytes]) -> Path:
@@ -183,6 +211,8 @@ SPELLINGS: dict[str, tuple[bytes, str]] = {
     "as it is": (b"map_Kd a b.png", "a b.png"),
     "quoted": (b'map_Kd "a b.png"', "a b.png"),
     "options": (b"map_Kd -blendu on -mm 0 1 -o 0 0 0 -s 1 -texres 4 -cc off a  b.png", "a  b.png"),
+    "a comment": (b"map_Kd a.png # x", "a.png"),
+    "escaped": (b"map_Kd a%20b.png", "a b.png"),
     "another case": (b"map_Kd Maps\\A.PNG", "maps/a.png"),
     "of another machine": (b"map_Kd C:\\Users\\x\\a.png", "a.png"),
     "above": (b"map_Kd ..\\images\\a.png", "../images/a.png"),
@@ -223,7 +253,7 @@ def test_statements_of_an_mtl_are_read_or_named(tmp_path: Path) -> None:
     path = placed(tmp_path, b"usemtl m #1\nmtllib m.mtl\n", files)
     made = prepare_asset(path, kit.KEEP, "meshoptimizer")
     assert made.asset.materials is not None and made.asset.materials.lost == ("transparency",)
-    assert made.unread == ("statement 'sparkle'",)
+    assert made.unread == ("statement 'sparkle'", "ks above 1")
     red, green, blue = kit.seen_at(made.asset, 0, 0)
     assert red > 0.9 and max(green, blue) < 0.02
 

@@ -12,6 +12,8 @@ from pipeline.objects.maps.listing import find_maps
 from pipeline.objects.selection import drop_copies, drop_outputs, drop_scenes, say_once
 from storage.records.objects import TEXTURE
 from tests.for_each import for_each
+from tests.scenes_by_hand import tiny_scene
+from trilight import write_scene
 
 OUTPUTS = [
     "clean/assets.json clean/objects.jsonl clean/meshes/a-0123abcd.ply clean/quality.html",
@@ -53,6 +55,7 @@ def test_the_named_folder_may_be_an_output_and_scenes_of_ours_are_no_objects(
     assert drop_outputs(names) == names
     (tmp_path / "ours.usda").write_bytes(b'#usda 1.0\n custom string trilight:sceneSha256 = "a"')
     (tmp_path / "ours.usdc").write_bytes(b"PXR-USDC" + bytes(1 << 15) + b"trilight:sceneSha256")
+    write_scene(tiny_scene(), tmp_path / "ours.glb")
     (tmp_path / "theirs.usda").write_bytes(b"#usda 1.0\n")
     assert drop_scenes(tmp_path, sorted(p.name for p in tmp_path.iterdir())) == ["theirs.usda"]
 

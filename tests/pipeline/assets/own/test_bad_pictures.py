@@ -161,6 +161,7 @@ DEEP = GREY.astype(np.uint16) * 257
 FORMS: dict[str, bytes] = {
     "grey": kit.picture_bytes(GREY),
     "16 bits": kit.picture_bytes(DEEP),
+    "floats": kit.picture_bytes(linear_from_srgb8()[GREY].astype(np.float32), "TIFF"),
     "alpha": kit.picture_bytes(GREY, mode="LA"),
     "palette": kit.picture_bytes(GREY, mode="P"),
     "RGBA": kit.picture_bytes(GREY, mode="RGBA"),

@@ -211,6 +211,20 @@ def test_a_stage_without_light_or_camera(tmp_path: Path) -> None:
     stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
     with pytest.raises(TrilightError, match="no light that can be carried over"):
         read(tmp_path / "a.usda")
+    lamps = [UsdLux.SphereLight.Define(stage, f"/{name}") for name in ("None", "Below")]
+    lamps[0].CreateRadiusAttr(0.0)
+    lamps[1].CreateIntensityAttr(-1.0)
+    stage.GetPrimAtPath("/L").CreateRelationship("material:binding").AddTarget("/Gone")
+    stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
+    with pytest.raises(
+        TrilightError, match="/None: a light without an area; /Below: a light below"
+    ):
+        read(tmp_path / "a.usda")
+    lamps[0].CreateRadiusAttr(1.0)
+    stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
+    assert any(
+        "binding of a material that is not there" in t for t in read(tmp_path / "a.usda").lost
+    )
     path = write_stage(tmp_path)
     whole = Usd.Stage.Open(str(path))
     whole.RemovePrim("/W/cam")

@@ -64,6 +64,12 @@ def _find(folder: Path, kind: str = TEXTURE, licence: str | None = None) -> Foun
             Plate_METALNESS_2K_METALNESS      Plate_2K_METALNESS       metallic
             Plate_COL_2K_METALNESS            Plate_2K_METALNESS       base
             Wood_Base_Color                   Wood                     base
+            wood_base                         wood                     base
+            Wood_Normal_(2)                   Wood_(2)                 normal
+            wood_color_v2                     wood_v2                  base
+            wood_norm_tex                     wood_tex                 normal
+            wood_diffuse_map                  wood_map                 base
+            WoodColor                         Wood                     base
             Wood_Normal_OpenGL                Wood                     normal
             Wood_Roughness_Raw_2k             Wood_2k                  roughness
             Wood_Mixed_AO                     Wood                     occlusion
@@ -124,6 +130,10 @@ def test_sets_are_found_and_the_rest_is_said(tmp_path: Path) -> None:
         ("x/basecolor.png x/diffuse.png x/roughness.png x/normal.png",
          {"x/basecolor": "x/basecolor.png x/roughness.png"},
          "x/diffuse.png:name_clash x/normal.png:map_not_used"),
+        ("m.png m_n.png m_s.png", {"m": "m.png"}, "m_n.png:map_not_used m_s.png:map_not_used"),
+        ("Albedo_W.png Normal_W.png rock_n_dx11.png", {"Albedo_W": "Albedo_W.png"},
+         "Normal_W.png:unknown_map rock_n_dx11.png:unknown_map"),
+        ("rough_wall.png metal.png", {"metal": "metal.png", "rough_wall": "rough_wall.png"}, ""),
         ("albedo/o.png roughness/o.png", {"albedo/o": "albedo/o.png roughness/o.png"}, ""),
         ("o_diff.exr o_diff.png o_rough.exr o.png", {"o": "o_diff.png o_rough.exr"},
          "o.png:unknown_map o_diff.exr:name_clash"),
