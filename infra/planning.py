@@ -47,9 +47,9 @@ class Interval:
     high: float
     """95th percentile."""
 
-    def shown(self, form: str) -> str:
-        """Return the figure and its interval, each in a format such as `{:.1f}`."""
-        return f"{form.format(self.value)} ({form.format(self.low)} to {form.format(self.high)})"
+    def shown(self, form: Callable[[float], str]) -> str:
+        """Return the figure and its interval, each as `form` writes it."""
+        return f"{form(self.value)} ({form(self.low)} to {form(self.high)})"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from infra.cli.commands import app, complaint
 from infra.cli.extending import extended
 from infra.cli.leaving import leave, open_missing_streams
 from storage.errors import TrilightError
+from storage.extensions import mistake_in_extension
 
 
 def main() -> None:
@@ -29,13 +30,22 @@ def main() -> None:
         leave(f"trilight: {complaint(mistake)}", 2)
     except TrilightError as mistake:
         leave(f"trilight: {mistake}", mistake.exit_status)
-    except OSError as error:
-        try:
-            os.write(sys.stdout.fileno(), b"\n")
-        except OSError:
-            said = f"what is printed cannot be written ({error.strerror}); choose another place"
-            leave(f"trilight: {said}. What was finished is safe.", 1)
+    except Exception as error:
+        its_author = mistake_in_extension(error)
+        if its_author is not None:
+            leave(f"trilight: {its_author}", 1)
+        if isinstance(error, OSError):
+            _blame_output(error)
         raise
+
+
+def _blame_output(error: OSError) -> None:
+    """Leave where nothing can be printed any more."""
+    try:
+        os.write(sys.stdout.fileno(), b"\n")
+    except OSError:
+        said = f"what is printed cannot be written ({error.strerror}); choose another place"
+        leave(f"trilight: {said}. What was finished is safe.", 1)
 
 
 def _require_usable_names() -> None:

@@ -1,6 +1,7 @@
 """`trilight assets`: objects to clean meshes, with a report."""
 
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -88,8 +89,10 @@ def assets(asked: Meshes, shown: Shown) -> None:
         )
     if shown.json:
         print_json(report.as_json())
-        return
-    _tell(report, asked, settings, folder)
+    else:
+        _tell(report, asked, settings, folder)
+    if not report.rows:
+        sys.exit(1)
 
 
 def _tell(
@@ -108,7 +111,7 @@ def _tell(
         *_unread_rows(report, folder),
         ("meshes, catalogue", f"{folder.meshes}, {folder.catalogue}"),
     ]
-    print_rows("Assets finished", rows)
+    print_rows("Assets finished" if report.rows else "No object can be used", rows)
     look_at(f"Look at {folder.page}")
     if report.rows:
         next_step(
