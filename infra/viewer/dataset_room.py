@@ -136,7 +136,9 @@ class DatasetRoom:
         (sample,) = self._dataset.read_samples(shard, [key])
         floors = [view.noise_floor_db for view in sample.views]
         target = TargetPainter(sample.radiance_rgb, floors)
+        is_here = isinstance(self._dataset.files, LocalFiles)
         return SceneRoom(
+            source=f"{Path(self._source) / shard.name}::{key}" if is_here else "",
             name=f"scene {key}, {row.split}",
             scene=sample.scene,
             notes=(),

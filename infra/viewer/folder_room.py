@@ -133,13 +133,23 @@ class FolderRoom:
         number = int(key)
         if number >= len(self._found.names):
             raise NotThere("the folder has no such file.")
+        name = self._found.names[number]
         return scene_room(
-            self._found.names[number], self._loaded(number), self._tracer, self._checkpoint
+            name,
+            self._loaded(number),
+            self._tracer,
+            self._checkpoint,
+            source=str(self._found.root / name),
         )
 
 
 def scene_room(
-    name: str, loaded: LoadedScene, tracer: ProgressiveTracer, checkpoint: str | None
+    name: str,
+    loaded: LoadedScene,
+    tracer: ProgressiveTracer,
+    checkpoint: str | None,
+    *,
+    source: str,
 ) -> SceneRoom:
     """Return the room of a scene that was read from a file; it leaves the tracer to its owner."""
     target = None
@@ -151,4 +161,5 @@ def scene_room(
         notes=loaded.notes,
         painters=painters_of(tracer, target, checkpoint),
         target_px=None if target is None else target.width_px,
+        source=source,
     )

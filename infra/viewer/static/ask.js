@@ -41,4 +41,19 @@ export function element(tag, attributes = {}, ...content) {
   return made;
 }
 
+export async function copy(code, button) {
+  try {
+    await navigator.clipboard.writeText(code.textContent);
+    button.textContent = "Copied";
+  } catch {
+    getSelection().selectAllChildren(code);
+    button.textContent = "Selected: press Ctrl-C";
+  }
+  setTimeout(() => { button.textContent = "Copy"; }, 2500);
+}
+
+export function download(name, url) {
+  element("a", { href: url, download: name }).click();
+}
+
 export const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
