@@ -11,6 +11,7 @@ from infra.viewer.open_rooms import OpenRooms
 from infra.viewer.painters import TargetPainter, painters_of
 from infra.viewer.scene_room import SceneRoom
 from infra.viewer.server import Answer, NotThere, Question, Route, json_answer
+from pipeline.documents.exposure import preview_gain
 from pipeline.documents.png import encode_png
 from pipeline.documents.scene_page import preview
 from pipeline.making.progressive_tracer import ProgressiveTracer
@@ -128,7 +129,7 @@ class DatasetRoom:
             samples = scan_samples(stream, shard.name)
             members = next(members for key, members in samples if key == row.key)
             radiance_rgb = decode_exr(read_member(stream, members[f"{view}.exr"]))
-        return encode_png(preview(radiance_rgb, width))
+        return encode_png(preview(radiance_rgb * preview_gain(radiance_rgb), width))
 
     def _opened(self, key: str) -> SceneRoom:
         row = self.index.row(key)

@@ -16,6 +16,7 @@ from infra.viewer.painters import MOST_SPP, TargetPainter, painters_of
 from infra.viewer.scene_list import SceneList
 from infra.viewer.scene_room import SceneRoom
 from infra.viewer.server import Answer, NotThere, Question, Route, json_answer
+from pipeline.documents.exposure import preview_gain
 from pipeline.documents.png import encode_png
 from pipeline.documents.scene_page import preview
 from pipeline.exchange.formats import LoadedScene
@@ -93,7 +94,8 @@ class FolderRoom:
         png = self._thumbnails.get(number)
         if png is None:
             radiance_rgb = self._small_picture(number, self._loaded(number))
-            png = self._thumbnails[number] = encode_png(preview(radiance_rgb, THUMBNAIL_PX))
+            exposed = radiance_rgb * preview_gain(radiance_rgb)
+            png = self._thumbnails[number] = encode_png(preview(exposed, THUMBNAIL_PX))
             while len(self._thumbnails) > _MOST_THUMBNAILS:
                 self._thumbnails.popitem(last=False)
         return Answer(body=png, kind="image/png")

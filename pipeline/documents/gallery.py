@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
+from pipeline.documents.exposure import preview_gain
 from pipeline.documents.gallery_controls import (
     CardFacts,
     card_attributes,
@@ -65,7 +66,8 @@ def write_gallery(
 
 
 def _card(sample: Sample, split: str) -> Markup:
-    picture = image(png_uri(preview(sample.radiance_rgb[0], _CARD_PX)), f"scene {sample.key}")
+    exposed = sample.radiance_rgb[0] * preview_gain(sample.radiance_rgb)
+    picture = image(png_uri(preview(exposed, _CARD_PX)), f"scene {sample.key}")
     template = sample.scene.provenance.get("template", "")
     num_objects = sum(entry.kind == "object" for entry in sample.scene.objects)
     caption = f"{template}, {num_objects} {'object' if num_objects == 1 else 'objects'}"
