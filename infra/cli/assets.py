@@ -105,7 +105,7 @@ def _tell(
         ("accepted", f"{len(report.rows)}, of which {report.num_repaired} repaired"),
         ("decimated", f"{len(decimated)}; the others are within the budget as they are"),
         *_epsilon_rows(report, settings),
-        *_material_rows(report, settings),
+        *_material_rows(report, settings, folder),
         ("rejected", f"{len(report.failures)}"),
         *(("", f"{count} x {reason}") for _, reason, count in count_by_reason(report.failures)),
         *_unread_rows(report, folder),
@@ -143,13 +143,18 @@ def _epsilon_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[
     ]
 
 
-def _material_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[str, str]]:
+def _material_rows(
+    report: "AssetReport", settings: AssetSettings, folder: "AssetFolder"
+) -> list[tuple[str, str]]:
     if not settings.own_materials.keep:
         return []
+    from pipeline.making.unread import format_unread
+
     kept = sum(row.colours is not None for row in report.rows)
-    found = [row.materials.reason for row in report.rows if row.materials and row.materials.reason]
-    reasons = [f"{found.count(reason)} x {reason}" for reason in sorted(set(found))]
-    return [("in their own materials", ", ".join([f"{kept} of {len(report.rows)}", *reasons]))]
+    found = {row.uid: row.materials.reason for row in report.rows if row.materials}
+    lost = format_unread({uid: (why,) for uid, why in found.items() if why}, folder.page)
+    lines = [f"{kept} of {len(report.rows)}", *lost]
+    return [("" if row else "in their own materials", line) for row, line in enumerate(lines)]
 
 
 def _settings(asked: Meshes) -> AssetSettings:

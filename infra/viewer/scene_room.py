@@ -144,9 +144,11 @@ class SceneRoom:
     def _repeated(self, job: Job) -> Mapping[str, Any]:
         """Return the command that makes a picture, and its camera in a form that `render` reads."""
         wanted, camera = job.wanted, job.wanted.camera
-        place = ["--view", str(wanted.view)] if wanted.view is not None else ["--cameras", CAMERA]
+        place = ["--view", str(wanted.view), "--out", "view.exr"]
+        if wanted.view is None:  # of a file of cameras come many pictures, into a folder
+            place = ["--cameras", CAMERA, "--out", "view"]
         words = ["trilight", "render", EDITED if wanted.edits else self.source, *place]
-        words += ["--resolution", str(wanted.resolution), "--out", "view.exr"]
+        words += ["--resolution", str(wanted.resolution)]
         command = shlex.join([*words, *render_words(self.painters[wanted.engine], wanted)])
         camera_file = json.dumps({"cameras": [camera_entry(camera.c2w, camera.fov_deg)]})
         return {"command": command if self.source else "", "camera": camera_file}

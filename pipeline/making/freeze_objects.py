@@ -198,18 +198,18 @@ def _warn_of(source: str, passing: list[Failure]) -> None:
         )
 
 
-def _tell_of_materials(source: str, prepared: list[PreparedObject]) -> None:
-    """Say which objects get drawn materials although their own were asked for."""
-    reasons = Counter(asset.without_own for asset in prepared if asset.without_own)
-    if reasons:
-        counts = ", ".join(f"{count} x {why}" for why, count in reasons.most_common())
+def _tell_of_materials(source: str, prepared: list[PreparedObject], logs: Path) -> None:
+    """Say which objects get drawn materials although their own were asked for, and write it."""
+    drawn = {each.record.uid: (each.without_own,) for each in prepared if each.without_own}
+    path = write_unread(logs, drawn, "drawn_materials")
+    if drawn:
         log.warning(
-            "objects %r: %d of %d have no materials of their own at every level (%s) and get drawn "
-            "ones there. `trilight assets --own-materials` says what was found in each.",
+            "objects %r: %d of %d have no materials of their own at every level and get drawn "
+            "ones there. `trilight assets --own-materials` says what was found in each:\n%s",
             source,
-            sum(reasons.values()),
+            len(drawn),
             len(prepared),
-            counts,
+            "\n".join(format_unread(drawn, path)),
         )
 
 

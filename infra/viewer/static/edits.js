@@ -50,7 +50,7 @@ export class Edits {
       const short = name.replace(/( …)+$/, " and others").slice(0, 50);
       const entries = all.length > MOST_OF_ONE ? [all] : all.map((row) => [row]);
       for (const entry of entries) {
-        const label = entry.length > 1 ? `${entry.length} of ${short}, all alike` : `${entry[0]}: ${short}`;
+        const label = entry.length > 1 ? `${short}: ${entry.length} materials at once` : `${entry[0]}: ${short}`;
         byId("material").append(new Option(label, entry.join(" ")));
       }
     }

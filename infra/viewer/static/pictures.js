@@ -131,7 +131,7 @@ export class Pictures {
     waiting.hidden = Boolean(told && told.shown);
     const { ev, tone } = this.look();
     const developed = (ev ? ` --exposure ${ev}` : "") + (tone === "plain" ? "" : ` --tone-map ${tone}`);
-    document.getElementById("command-part").hidden = !told;
+    document.getElementById("command-part").hidden = !(told && told.shown);
     const command = document.getElementById("command");
     command.parentElement.hidden = !(told && told.command);
     command.textContent = told ? told.command + developed : "";
