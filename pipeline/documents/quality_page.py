@@ -160,7 +160,17 @@ def _materials_of(row: AssetRow) -> str:
 
 def _accepted(rows: Sequence[AssetRow]) -> Markup:
     asked = any(row.materials for row in rows)
-    head = ("object", "licence", "method", *(["materials"] if asked else []), "read", "triangles", "p99 %", "normals", "open edges")
+    head = (
+        "object",
+        "licence",
+        "method",
+        *(["materials"] if asked else []),
+        "read",
+        "triangles",
+        "p99 %",
+        "normals",
+        "open edges",
+    )
     cells = [
         (
             row.uid,

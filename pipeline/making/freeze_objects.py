@@ -1,7 +1,6 @@
 """The objects of a dataset, frozen: what its scenes draw from, the same for all its makers."""
 
 import logging
-from collections import Counter
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -83,7 +82,7 @@ def freeze_objects(
     if frozen is None:
         _require_enough(objects, settings, publication, shown)
         _warn_of(shown, passing)
-        _tell_of_materials(shown, prepared)
+        _tell_of_materials(shown, prepared, publication.folder.logs)
         _tell_of_unread(shown, prepared, publication.folder.logs)
         publication.lock_objects(locked)
     else:

@@ -1,11 +1,11 @@
 // The page of a dataset: any number of scenes, of which only those in sight are fetched.
 
-import { askJson, copy, element, say, sleep } from "./ask.js";
+import { askJson, copy, element, KeptForm, say, sleep } from "./ask.js";
 
 const byId = (name) => document.getElementById(name);
 const form = byId("filters");
 const LOOK_AGAIN_MS = 700;
-const KEPT = "filters";
+const kept = new KeptForm(form);
 let rows = [];
 let generation = 0;
 
@@ -17,7 +17,7 @@ function query(first) {
 
 async function show(first) {
   const mine = first ? generation : ++generation;
-  if (!kept.size) sessionStorage.setItem(KEPT, JSON.stringify([...new FormData(form)]));
+  kept.keep();
   try {
     const found = await askJson(`api/rows?${query(first)}`);
     if (mine !== generation) return;
@@ -78,18 +78,7 @@ function fill(name, values) {
   const select = form.elements[name];
   const known = new Set([...select.options].map((option) => option.value));
   for (const value of values) if (!known.has(value)) select.append(new Option(value, value));
-  restore();
-}
-
-// What was chosen before this page was left; a choice may come later than the page.
-const kept = new Map(JSON.parse(sessionStorage.getItem(KEPT) || "[]"));
-function restore() {
-  for (const [name, value] of kept) {
-    const field = form.elements[name];
-    if (field.options && ![...field.options].some((each) => each.value === value)) continue;
-    field.value = value;
-    kept.delete(name);
-  }
+  kept.restore();
 }
 
 // While the index is read, the page grows with it.
