@@ -88,7 +88,7 @@ def test_a_scene_is_shown_so_dark_that_few_pixels_are_white() -> None:
     pictures = np.random.default_rng(0).uniform(0, 1, (2, 16, 16, 3)).astype(np.float32)
     assert preview_gain(pictures) == 1
     shown = preview_srgb8(50 * pictures * preview_gain(50 * pictures))
-    assert 0 < (shown == 255).any(axis=-1).mean() < 0.06 and np.median(shown) > 60
+    assert 0 < (shown == 255).any(axis=-1).mean() < 0.1 and np.median(shown) > 60
 
 
 def test_nothing_is_loaded_from_elsewhere() -> None:
