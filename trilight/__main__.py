@@ -3,16 +3,9 @@
 import os
 import signal
 import sys
-from typing import NoReturn
 
-
-def _interrupted(*_: object) -> NoReturn:
-    """Leave on Ctrl-C while libraries are loaded; `main` has words of its own."""
-    os.write(2, b"trilight: interrupted; nothing was begun.\n")
-    os._exit(130)
-
-
-signal.signal(signal.SIGINT, _interrupted)
+# while libraries are loaded nothing is begun; `main` has words of its own
+signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
 from storage.installation import order_installed_first  # noqa: E402
 

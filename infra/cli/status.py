@@ -59,7 +59,8 @@ def status(watched: StatusOrder, core: CorePrice, shown: Shown) -> None:
         return
     rows = [
         ("shards", f"{found.shards_done} of {found.shards_planned}"),
-        ("scenes", f"{found.scenes_done} of {found.scenes_planned}{_given_up(found)}"),
+        ("scenes", f"{found.scenes_done} of {found.scenes_planned}"),
+        *([("given up", f"{found.scenes_given_up} scenes")] if found.scenes_given_up else []),
         ("views", f"{found.scenes_done * found.num_views}"),
         *_speed(found),
         *(("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in found.failures),
@@ -92,10 +93,6 @@ def _print_missing(watched: StatusOrder, *, as_json: bool) -> None:
         console.file.writelines(f"{shards}\n" for shards in ranges)
     elif tasks:
         console.print(number_ranges(tasks), soft_wrap=True)
-
-
-def _given_up(found: DatasetStatus) -> str:
-    return f"; {found.scenes_given_up} given up" if found.scenes_given_up else ""
 
 
 def _next(found: DatasetStatus) -> str:

@@ -11,10 +11,10 @@ from infra.viewer.open_rooms import OpenRooms
 from infra.viewer.painters import TargetPainter, painters_of
 from infra.viewer.scene_room import SceneRoom
 from infra.viewer.server import Answer, NotThere, Question, Route, json_answer
-from pipeline.documents.exposure import preview_gain
 from pipeline.documents.png import encode_png
 from pipeline.documents.scene_page import preview
 from pipeline.making.progressive_tracer import ProgressiveTracer
+from storage.conventions import preview_gain
 from storage.dataset.dataset import Dataset, LocalFiles, reading
 from storage.dataset.shard import read_member, scan_samples
 from storage.errors import TrilightError

@@ -16,7 +16,6 @@ from infra.viewer.painters import MOST_SPP, TargetPainter, painters_of
 from infra.viewer.scene_list import SceneList
 from infra.viewer.scene_room import SceneRoom
 from infra.viewer.server import Answer, NotThere, Question, Route, json_answer
-from pipeline.documents.exposure import preview_gain
 from pipeline.documents.png import encode_png
 from pipeline.documents.scene_page import preview
 from pipeline.exchange.formats import LoadedScene
@@ -25,6 +24,7 @@ from pipeline.exchange.reader import SceneReader
 from pipeline.making.progressive_tracer import ProgressiveTracer
 from pipeline.renders.results import GrowingPicture, Sampling
 from pipeline.renders.settings import one_picture
+from storage.conventions import preview_gain
 from storage.records.lights import num_lights
 
 THUMBNAIL_PX, THUMBNAIL_SPP = 128, 4
@@ -135,14 +135,9 @@ class FolderRoom:
         number = int(key)
         if number >= len(self._found.names):
             raise NotThere("the folder has no such file.")
-        name = self._found.names[number]
-        return scene_room(
-            name,
-            self._loaded(number),
-            self._tracer,
-            self._checkpoint,
-            source=str(self._found.root / name),
-        )
+        name, loaded = self._found.names[number], self._loaded(number)
+        place = str(self._found.root / name)
+        return scene_room(name, loaded, self._tracer, self._checkpoint, place)
 
 
 def scene_room(
@@ -150,7 +145,6 @@ def scene_room(
     loaded: LoadedScene,
     tracer: ProgressiveTracer,
     checkpoint: str | None,
-    *,
     source: str,
 ) -> SceneRoom:
     """Return the room of a scene that was read from a file; it leaves the tracer to its owner."""

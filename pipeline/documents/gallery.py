@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 
 from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
-from pipeline.documents.exposure import preview_gain
 from pipeline.documents.gallery_controls import (
     CardFacts,
     card_attributes,
@@ -13,6 +12,7 @@ from pipeline.documents.gallery_controls import (
 from pipeline.documents.html import Markup, element, image, joined, png_uri
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, preview
 from storage.atomic import write_atomically
+from storage.conventions import preview_gain
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError

@@ -160,17 +160,8 @@ def _materials_of(row: AssetRow) -> str:
 
 def _accepted(rows: Sequence[AssetRow]) -> Markup:
     asked = any(row.materials for row in rows)
-    head = (
-        "object",
-        "licence",
-        "method",
-        *(["materials"] if asked else []),
-        "read",
-        "triangles",
-        "p99 %",
-        "normals",
-        "open edges",
-    )
+    texts = ("object", "licence", "method", *(["materials"] if asked else []))
+    head = (*texts, "read", "triangles", "p99 %", "normals", "open edges")
     cells = [
         (
             row.uid,

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.documents.exposure import preview_gain
 from pipeline.documents.html import (
     Cell,
     Markup,
@@ -23,7 +22,7 @@ from pipeline.documents.html import (
 from pipeline.documents.pass_colours import id_colours
 from pipeline.documents.scene_maps import MAPS_STYLE, maps_section
 from pipeline.documents.scene_passes import PASSES_STYLE, passes_section
-from storage.conventions import preview_srgb8, srgb8
+from storage.conventions import preview_gain, preview_srgb8, srgb8
 from storage.records.material import DIFFUSE
 from storage.records.objects import Failure
 from storage.records.sample import Sample

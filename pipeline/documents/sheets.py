@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.documents.chosen import choose_scenes, read_chosen
-from pipeline.documents.exposure import preview_gain
 from pipeline.documents.png import encode_png
 from storage.atomic import write_atomically
-from storage.conventions import preview_srgb8
+from storage.conventions import preview_gain, preview_srgb8
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry

@@ -11,7 +11,6 @@ import matplotlib
 import numpy as np
 from PIL import Image
 
-from pipeline.documents.exposure import preview_gain
 from pipeline.documents.figures import (
     drawing,
     encoded,
@@ -39,7 +38,7 @@ from pipeline.documents.html import (
     table,
 )
 from pipeline.documents.quality_page import Pair, encode_quality_page
-from storage.conventions import preview_srgb8
+from storage.conventions import preview_gain, preview_srgb8
 from storage.records.asset import AssetRow
 from storage.records.objects import Failure
 from storage.records.skin import OwnMaterials
