@@ -8,11 +8,19 @@ BIN := $(VENV)/bin
 export PATH := $(abspath $(BIN)):$(PATH)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: setup setup-all dataset test test-slow test-elsewhere train release serve stop lint lock docs clean
+.PHONY: help setup setup-all dataset test test-slow test-elsewhere train release serve stop lint lock docs clean
+
+# of a target that was asked for by name, not of one that others need
+READY = $(if $(filter $@,$(or $(MAKECMDGOALS),setup)),@echo 'Installed into $(VENV). Next: . $(BIN)/activate && $(1)')
 
 setup: $(VENV)/.dataset-ready  ## what making data needs
+	$(call READY,make dataset)
 
 setup-all: $(VENV)/.all-ready  ## that, torch, and the tools of the tests
+	$(call READY,make dataset train)
+
+help:  ## these lines
+	@sed -nE 's/^([a-z-]+):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F '\t' '{ printf "make %-16s %s\n", $$1, $$2 }'
 
 SCENES := 24
 

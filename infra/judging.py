@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import itertools
+import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,13 +117,19 @@ def _tracing(contest: Contest, most_views: int) -> Iterator[tuple[Contest, Told]
         yield contest, lambda views: same_time(views, times, rival.which)
 
 
-def write_judgement(judgement: Judgement, out: str | Path) -> None:
+def write_judgement(judgement: Judgement, out: str | Path) -> Path:
     """Write evaluation.json, evaluation.md and sheets of pictures into a folder.
+
+    Returns:
+        The folder: `out`, or the first of out-2, out-3 ... without another network's report.
 
     Raises:
         TrilightError: the folder cannot be written.
     """
-    folder, found = Path(out), judgement.record
+    found = judgement.record
+    own = (None, found["about"]["network sha256"])
+    numbered = (f"{out}-{number}" if number > 1 else out for number in itertools.count(1))
+    folder = next(place for place in map(Path, numbered) if _network_of(place) in own)
     write_atomically(folder / "evaluation.json", pretty_json(found))
     write_atomically(folder / "evaluation.md", markdown(found).encode())
     contest, views = judgement.contest, list(judgement.views)
@@ -137,6 +144,18 @@ def write_judgement(judgement: Judgement, out: str | Path) -> None:
         title = (f"{name}, of {len(views)} views at {contest.resolution} pixels, by psnr_log_db",)
         sheet = drawn_sheet([next(shown) for _ in rows], title)
         write_picture(folder / f"{name.replace(' ', '_')}.png", sheet)
+    return folder
+
+
+def _network_of(folder: Path) -> str | None:
+    """Return the digest of the network whose report a folder holds; None where it holds none."""
+    try:
+        digest = json.loads((folder / "evaluation.json").read_bytes())["about"]["network sha256"]
+    except OSError:
+        return None
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return "unknown"
+    return str(digest)
 
 
 class _Counted:

@@ -51,9 +51,9 @@ class Interval:
     high: float
     """95th percentile."""
 
-    def shown(self, form: str) -> str:
-        """Return the figure and its interval, each in a format such as `{:.1f}`."""
-        return f"{form.format(self.value)} ({form.format(self.low)} to {form.format(self.high)})"
+    def shown(self, form: Callable[[float], str]) -> str:
+        """Return the figure and its interval, each as `form` writes it."""
+        return f"{form(self.value)} ({form(self.low)} to {form(self.high)})"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +182,7 @@ def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
         left, cores = max(scenes - read_progress(folder).scenes_done, 0), cores_owned()
         if last:
             core_s = [row.seconds * row.cores for row in last]
-            minutes = _total(core_s, left / cores / 60).shown("{:,.1f}")
+            minutes = _total(core_s, left / cores / 60).shown("{:,.1f}".format)
             said = f"; {left} of them are still to make: {minutes} minutes on {cores} cores"
         if sizes := [
             each.num_bytes / each.num_samples for each in manifest.shards if each.num_samples

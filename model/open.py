@@ -140,7 +140,8 @@ def find_network(place: str | Path, *finders: Finder) -> FoundNetwork:
 def _weights_file(source: str, path: Path) -> Path:
     """Return the safetensors file that is meant; raises as `find_network`."""
     if not path.exists():
-        if path.suffix in _PICKLES or not _HUB_NAME.fullmatch(source):
+        is_path = path.suffix in (*_PICKLES, ".safetensors") or source.startswith("runs/")
+        if is_path or not _HUB_NAME.fullmatch(source):
             raise TrilightError(
                 f"checkpoint {source}: no such file or folder; expected one, or a published name "
                 f"such as {PUBLISHED[0]}."

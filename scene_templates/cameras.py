@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.checks import OFFSET, SIZE, Range
+from scene_templates.checks import OFFSET, SIZE, Range, require
 from scene_templates.layout import CameraPose
 from storage.conventions import look_at_c2w
 from storage.settings.described import checked
@@ -24,6 +24,12 @@ class Sector:
     """Largest angle to either side of the azimuth; 180 is all around."""
     elevation_deg: tuple[float, float]
     """Least and greatest angle above the horizon."""
+
+    def __post_init__(self) -> None:
+        """Raise TrilightError for angles that no direction has."""
+        low, high = self.elevation_deg
+        require(-90 <= low <= high <= 90, "elevation_deg", (low, high), "two from -90 to 90")
+        require(0 <= self.half_width_deg <= 180, "half_width_deg", self.half_width_deg, "0 to 180")
 
     def direction_rand(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Draw a unit direction [3], uniform by solid angle."""

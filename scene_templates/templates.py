@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scene_templates.cameras import CameraSettings, Sector, camera_rand
+from scene_templates.checks import require
 from scene_templates.layout import (
     CameraPose,
     Emitter,
@@ -49,6 +50,13 @@ class Template:
     """Directions from which it is seen."""
     lights: Sector
     """Directions from which it is lit."""
+
+    def __post_init__(self) -> None:
+        """Raise TrilightError for parts that no room has."""
+        known = set(self.parts) <= set(SIDES) and len(set(self.parts)) == len(self.parts)
+        expected = f"floor first, then any of {', '.join(SIDES)}, each once"
+        name = f"parts of the template {self.name}"
+        require(known and tuple(self.parts[:1]) == ("floor",), name, self.parts, expected)
 
     @property
     def shell_triangles(self) -> int:

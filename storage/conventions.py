@@ -203,3 +203,11 @@ def preview_srgb8(radiance_rgb: ArrayLike) -> NDArray[np.uint8]:
     what a person sees is what the loss sees. It is not invertible: values above 1 are clipped.
     """
     return srgb8(np.log2(1.0 + np.maximum(np.asarray(radiance_rgb, np.float64), 0)))
+
+
+def preview_gain(radiance_rgb: NDArray[np.float32]) -> np.float32:
+    """Return the factor that shows all pictures [..., 3] of a scene darker; 1 for most scenes.
+
+    At most a twentieth of the pixels is white then. What is stored or measured knows none.
+    """
+    return np.float32(1 / max(1.0, np.percentile(radiance_rgb.max(axis=-1), 95)))

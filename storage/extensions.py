@@ -259,14 +259,26 @@ def _mistakes_of(path: Path) -> Iterator[None]:
     try:
         yield
     except (Exception, SystemExit) as error:
-        lines = [
-            frame.lineno
-            for frame in traceback.extract_tb(error.__traceback__)
-            if frame.filename == str(path)
-        ]
-        line = error.lineno if isinstance(error, SyntaxError) else next(reversed(lines), None)
-        where = f"extension {path.name}" + (f", line {line}" if line else "")
-        kind = "" if isinstance(error, TrilightError) else f"{type(error).__name__}: "
-        said = error.msg if isinstance(error, SyntaxError) else str(error)
-        text = " ".join(f"{kind}{said}".split()).rstrip(".:")
-        raise TrilightError(f"{where}: {text}.") from error
+        raise mistake_in_extension(error) or _mistake(path.name, None, error) from error
+
+
+def mistake_in_extension(error: BaseException) -> TrilightError | None:
+    """Return what code of an extension raised as its author's mistake, which names file and line.
+
+    None where no line of an extension took part.
+    """
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        if path.name in _loaded and _loaded[path.name].path == path:
+            return _mistake(path.name, frame.lineno, error)
+    return None
+
+
+def _mistake(name: str, line: int | None, error: BaseException) -> TrilightError:
+    if isinstance(error, SyntaxError):
+        line, said = error.lineno, error.msg
+    else:
+        said = str(error)
+    kind = "" if isinstance(error, TrilightError) else f"{type(error).__name__}: "
+    text = " ".join(f"{kind}{said}".split()).rstrip(".:")
+    return TrilightError(f"extension {name}{f', line {line}' if line else ''}: {text}.")

@@ -1,8 +1,13 @@
 """`python -m trilight`, also under torchrun: the command line."""
 
+import os
+import signal
 import sys
 
-from storage.installation import order_installed_first
+# while libraries are loaded nothing is begun; `main` has words of its own
+signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+
+from storage.installation import order_installed_first  # noqa: E402
 
 sys.path[:] = order_installed_first(sys.path)  # `python -m` puts the working folder first
 

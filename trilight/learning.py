@@ -133,11 +133,14 @@ def judge_network(
     )
 
 
-def write_judgement(judgement: "Judgement", out: str | os.PathLike[str]) -> None:
-    """Write evaluation.json, evaluation.md and sheets of pictures into the folder `out`."""
+def write_judgement(judgement: "Judgement", out: str | os.PathLike[str]) -> Path:
+    """Write evaluation.json, evaluation.md and sheets of pictures into a folder; return it.
+
+    It is `out`, or where another network's report is there, out-2, out-3 ...
+    """
     from infra import judging
 
-    judging.write_judgement(judgement, Path(out))
+    return judging.write_judgement(judgement, Path(out))
 
 
 def __getattr__(name: str) -> object:

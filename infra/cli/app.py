@@ -14,6 +14,7 @@ from infra.cli.commands import app, complaint
 from infra.cli.extending import extended
 from infra.cli.leaving import InertFormatter, leave, open_missing_streams
 from storage.errors import EnvironmentFailure, TrilightError
+from storage.extensions import mistake_in_extension
 
 _ENOUGH_BYTES = 2 << 30
 
@@ -43,15 +44,12 @@ def main() -> None:
         leave(f"trilight: {complaint(mistake)}", 2)
     except TrilightError as mistake:
         leave(f"trilight: {mistake}{_describe_limit()}", mistake.exit_status)
-    except OSError as error:
-        try:
-            os.write(sys.stdout.fileno(), b"\n")
-        except OSError:
-            said = f"what is printed cannot be written ({error.strerror}); choose another place"
-            leave(f"trilight: {said}. What was finished is safe.", 1)
-        _leave_without_memory(error)
-        raise
     except Exception as error:
+        its_author = mistake_in_extension(error)
+        if its_author is not None:
+            leave(f"trilight: {its_author}", 1)
+        if isinstance(error, OSError):
+            _blame_output(error)
         _leave_without_memory(error)
         raise
 
@@ -72,6 +70,15 @@ def _describe_limit() -> str:
         f" A process of this shell may take {limit >> 20} MiB of memory; expected "
         f"{_ENOUGH_BYTES >> 20} or more, since less may be the reason: raise `ulimit -v`."
     )
+
+
+def _blame_output(error: OSError) -> None:
+    """Leave where nothing can be printed any more."""
+    try:
+        os.write(sys.stdout.fileno(), b"\n")
+    except OSError:
+        said = f"what is printed cannot be written ({error.strerror}); choose another place"
+        leave(f"trilight: {said}. What was finished is safe.", 1)
 
 
 def _require_usable_names() -> None:

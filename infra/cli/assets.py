@@ -1,6 +1,7 @@
 """`trilight assets`: objects to clean meshes, with a report."""
 
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -88,8 +89,10 @@ def assets(asked: Meshes, shown: Shown) -> None:
         )
     if shown.json:
         print_json(report.as_json())
-        return
-    _tell(report, asked, settings, folder)
+    else:
+        _tell(report, asked, settings, folder)
+    if not report.rows:
+        sys.exit(1)
 
 
 def _tell(
@@ -102,13 +105,13 @@ def _tell(
         ("accepted", f"{len(report.rows)}, of which {report.num_repaired} repaired"),
         ("decimated", f"{len(decimated)}; the others are within the budget as they are"),
         *_epsilon_rows(report, settings),
-        *_material_rows(report, settings),
+        *_material_rows(report, settings, folder),
         ("rejected", f"{len(report.failures)}"),
         *(("", f"{count} x {reason}") for _, reason, count in count_by_reason(report.failures)),
         *_unread_rows(report, folder),
         ("meshes, catalogue", f"{folder.meshes}, {folder.catalogue}"),
     ]
-    print_rows("Assets finished", rows)
+    print_rows("Assets finished" if report.rows else "No object can be used", rows)
     look_at(f"Look at {folder.page}")
     if report.rows:
         next_step(
@@ -140,13 +143,18 @@ def _epsilon_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[
     ]
 
 
-def _material_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[str, str]]:
+def _material_rows(
+    report: "AssetReport", settings: AssetSettings, folder: "AssetFolder"
+) -> list[tuple[str, str]]:
     if not settings.own_materials.keep:
         return []
+    from pipeline.making.unread import format_unread
+
     kept = sum(row.colours is not None for row in report.rows)
-    found = [row.materials.reason for row in report.rows if row.materials and row.materials.reason]
-    reasons = [f"{found.count(reason)} x {reason}" for reason in sorted(set(found))]
-    return [("in their own materials", ", ".join([f"{kept} of {len(report.rows)}", *reasons]))]
+    found = {row.uid: row.materials.reason for row in report.rows if row.materials}
+    lost = format_unread({uid: (why,) for uid, why in found.items() if why}, folder.page)
+    lines = [f"{kept} of {len(report.rows)}", *lost]
+    return [("" if row else "in their own materials", line) for row, line in enumerate(lines)]
 
 
 def _settings(asked: Meshes) -> AssetSettings:

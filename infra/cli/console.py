@@ -1,10 +1,11 @@
 """What people see: first words, tables, progress bars with rate and ETA, and what to do next."""
 
 import json
+import os
 import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Literal
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -22,6 +23,8 @@ from rich.progress import (
 from rich.segment import Segment
 from rich.table import Column, Table
 from rich.text import Text
+
+from infra.cli.extending import extend_words
 
 _OBEYED = dict.fromkeys(
     [
@@ -46,6 +49,8 @@ class _TextConsole(Console):
 
 
 console = _TextConsole(stderr=False, highlight=False, markup=False, emoji=False)
+if not console.is_terminal and "COLUMNS" not in os.environ:
+    console.width = 1000  # of a log, which is searched by whole words
 
 _LEAST_RATED_S = 1.0
 """No rate is printed for tasks that are shorter."""
@@ -62,23 +67,38 @@ def first_words(text: str, *, silent: bool = False) -> None:
         console.print(Text(f"{text} ...", style="dim"), soft_wrap=True)
 
 
-def next_step(*commands: Sequence[str]) -> None:
+def next_step(*commands: Sequence[str], recorded: Mapping[str, str] = MappingProxyType({})) -> None:
     """Print commands that go on from here, one a line; each has to run as it is printed.
 
     Args:
         commands: the words of each without `trilight`; paths as they are, since they are quoted
             here.
+        recorded: extensions of the dataset, as its manifest lists them; those that are loaded here
+            are named anyway.
     """
     for row, words in enumerate(commands):
         lead = "     " if row else "\nNext:"
-        safe = [f"./{word}" if re.match("-[^-].*/", word) else word for word in words]
-        line = f"{lead} {shlex.join(['trilight', *safe])}"
+        line = f"{lead} {command_line(words, recorded)}"
         console.print(Text(line, style="bold"), soft_wrap=True)
+
+
+def command_line(words: Sequence[str], recorded: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return a command as it is typed, with the files of `extend_words`."""
+    safe = [f"./{word}" if re.match("-[^-].*/", word) else word for word in words]
+    return shlex.join(["trilight", *safe, *extend_words(recorded)])
 
 
 def look_at(text: str) -> None:
     """Print where to look, or what else there is to do that is no command."""
     console.print(Text(f"\n{text}", style="bold"), soft_wrap=True)
+
+
+def duration(seconds: float) -> str:
+    """Return a time in the unit that suits it."""
+    for unit, size_s in (("hours", 3600), ("minutes", 60)):
+        if seconds >= size_s:
+            return f"{seconds / size_s:,.1f} {unit}"
+    return f"{seconds:.0f} seconds"
 
 
 def note(text: str) -> None:

@@ -32,13 +32,13 @@ def evaluate(order: EvaluationOrder, shown: Shown) -> None:
             device=order.device,
             done=lambda now, total: bars.update(task, completed=now, total=total),
         )
-    first_words(f"Drawing the sheets of {order.out}", silent=shown.json)
+    first_words("Drawing the sheets", silent=shown.json)
     found = judgement.record
-    write_judgement(judgement, order.out)
+    out = write_judgement(judgement, order.place)
     if shown.json:
         print_json({name: found[name] for name in ("about", "contestants", "path tracer")})
     else:
-        _report(found, order.out)
+        _report(found, out)
 
 
 def _report(found: dict[str, Any], out: Path) -> None:

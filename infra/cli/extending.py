@@ -1,8 +1,14 @@
 """`--extend FILE.py`, anywhere on the line: files of the user's own, loaded before any command."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+from storage.atomic import write_atomically
+from storage.cache import cache_folder
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.extensions import (
     is_reference,
@@ -39,12 +45,31 @@ def extended(words: Sequence[str]) -> list[str]:
                 f"{OPTION}: names no file; expected {OPTION} FILE.py, a Python file of your own."
             )
         load_extension(file)
+    for path, sha256 in loaded_files():
+        with contextlib.suppress(TrilightError, OSError):  # it only helps to print a command
+            write_atomically(_place_of(sha256), path.encode())
     return left
 
 
-def extend_words() -> list[str]:
-    """Return the words that load what is loaded here, for a command that goes on from this one."""
-    return [word for path, _ in loaded_files() for word in (OPTION, path)]
+def _place_of(sha256: str) -> Path:
+    """Return the file of the user's cache that says where an extension was loaded last."""
+    return cache_folder("extensions") / sha256
+
+
+def extend_words(recorded: Mapping[str, str] = MappingProxyType({})) -> list[str]:
+    """Return the words that load what a command needs that goes on from this one.
+
+    Args:
+        recorded: sha256 of each extension that a dataset was made with, by its name: of those that
+            this user has never loaded, no file is named.
+    """
+    paths = dict.fromkeys(path for path, _ in loaded_files())
+    for sha256 in filter(str.isalnum, recorded.values()):
+        with contextlib.suppress(TrilightError, OSError, ValueError):
+            path = _place_of(sha256).read_text()
+            if sha256_hex(Path(path).read_bytes()) == sha256:
+                paths[path] = None
+    return [word for path in paths for word in (OPTION, path)]
 
 
 def registered(option: str, value: Any) -> Any:

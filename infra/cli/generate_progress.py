@@ -62,12 +62,14 @@ class _Drawn:
         if self._already is None:  # rate and ETA count what this run makes, not what it found
             self._already = now.views_done
             self._bars.reset(self._views)
-        # a scene that is given up counts as made, and one that is begun again does not go back
-        self._most = max(self._most, now.views_done - self._already)
+        total = (now.scenes_planned - now.scenes_given_up) * now.num_views - self._already
+        # a scene that is begun again does not go back
+        self._most = min(max(self._most, now.views_done - self._already), total)
+        given_up = f", {now.scenes_given_up} given up" if now.scenes_given_up else ""
         there = f", {self._already:.0f} views were there" if self._already else ""
         self._bars.update(
             self._views,
             completed=self._most,
-            total=now.scenes_planned * now.num_views - self._already,
-            note=f"scenes {now.scenes_done} of {now.scenes_planned}{there}",
+            total=total,
+            note=f"scenes {now.scenes_done} of {now.scenes_planned}{given_up}{there}",
         )

@@ -42,8 +42,10 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json
     rows += [
         ("wall time", f"{seconds:.0f} s"),
         ("shards, manifest", folder.shown),
-        ("why rejected", _place(folder, folder.failures)),
     ]
+    if rejected:
+        later = "" if statistics else ", once the dataset is finished"
+        rows.append(("why rejected", f"{_place(folder, folder.failures)}{later}"))
     _print_notes(outcome.notes)
     if statistics is None and outcome.digest:
         print_rows("Dataset finished by another machine, which writes its documents", rows)

@@ -1,11 +1,18 @@
 """`trilight status`: how far a dataset is, from its files alone."""
 
 import dataclasses
-import shlex
 import time
 from typing import Annotated
 
-from infra.cli.console import console, look_at, next_step, print_json, print_rows
+from infra.cli.console import (
+    command_line,
+    console,
+    duration,
+    look_at,
+    next_step,
+    print_json,
+    print_rows,
+)
 from infra.cli.options import Shown, command
 from pipeline.making.price import CorePrice
 from storage.dataset.progress import DatasetStatus, missing_shards, read_status
@@ -53,6 +60,7 @@ def status(watched: StatusOrder, core: CorePrice, shown: Shown) -> None:
     rows = [
         ("shards", f"{found.shards_done} of {found.shards_planned}"),
         ("scenes", f"{found.scenes_done} of {found.scenes_planned}"),
+        *([("given up", f"{found.scenes_given_up} scenes")] if found.scenes_given_up else []),
         ("views", f"{found.scenes_done * found.num_views}"),
         *_speed(found),
         *(("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in found.failures),
@@ -63,7 +71,7 @@ def status(watched: StatusOrder, core: CorePrice, shown: Shown) -> None:
     title = "finished" if found.finished else "unfinished"
     print_rows(f"{found.shown}: {found.build}, {title}", rows)
     if found.next_words:
-        next_step(found.next_words)
+        next_step(found.next_words, recorded=found.extensions)
     else:
         look_at(_next(found))
 
@@ -89,7 +97,7 @@ def _print_missing(watched: StatusOrder, *, as_json: bool) -> None:
 
 def _next(found: DatasetStatus) -> str:
     if found.next_words:
-        return shlex.join(["trilight", *found.next_words])
+        return command_line(found.next_words, found.extensions)
     return (
         f"To resume: trilight generate {found.build} --scenes {found.scenes_planned}, with the "
         "same other options as before."
@@ -99,9 +107,9 @@ def _next(found: DatasetStatus) -> str:
 def _speed(found: DatasetStatus) -> list[tuple[str, str]]:
     rows = []
     if found.views_per_hour is not None and found.remaining_s is not None:
-        left = f"{found.remaining_s / 3600:.1f} hours left at that rate"
+        left = f"{duration(found.remaining_s)} left at that rate"
         rows.append(("rate", f"{found.views_per_hour:.0f} views an hour; {left}"))
     if found.last_scene_unix_s is not None and not found.finished:
         ago = max(0.0, time.time() - found.last_scene_unix_s)
-        rows.append(("last scene", f"{ago / 60:.0f} minutes ago"))
+        rows.append(("last scene", f"{duration(ago)} ago"))
     return rows

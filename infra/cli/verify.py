@@ -74,7 +74,7 @@ def _print_repair(found: Verification, dataset: str) -> None:
     derivation = derivation_of(found.manifest.settings)
     if not found.is_finished:
         if asked is not None:
-            next_step((*asked, "--out", dataset))
+            next_step((*asked, "--out", dataset), recorded=found.manifest.extensions)
         else:
             look_at("To resume, run the trilight generate command that began it.")
     elif not found.problems:
@@ -95,7 +95,8 @@ def _print_repair(found: Verification, dataset: str) -> None:
         sources = ("--objects", "--scenes-from")
         given = [(option, value_of(asked or (), option)) for option in sources]
         named = [word for option, value in given if value for word in (option, value)]
-        next_step(("verify", dataset, "--repair", *named))
+        words = ("verify", dataset, "--repair", *named)
+        next_step(words, recorded=found.manifest.extensions)
 
 
 def _as_json(found: Verification) -> dict[str, object]:

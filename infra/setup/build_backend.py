@@ -1,6 +1,7 @@
 """What pip calls to build Trilight: setuptools, which builds wheels from the tree of wheel_tree.
 
-Editable installs see the checkout as it is. A wheel is an ordinary setuptools build of another
+Editable installs see the checkout as it is, by its path: beside a clone, whose folder is called as
+our package is, Python asks no import hook. A wheel is an ordinary setuptools build of another
 folder, so that neither metadata nor file list need to know of the move.
 """
 
@@ -13,7 +14,6 @@ from typing import Any
 
 from setuptools import build_meta
 from setuptools.build_meta import (
-    build_editable,
     build_sdist,
     get_requires_for_build_editable,
     get_requires_for_build_sdist,
@@ -33,6 +33,14 @@ __all__ = [
     "prepare_metadata_for_build_editable",
     "prepare_metadata_for_build_wheel",
 ]
+
+
+def build_editable(
+    wheel_directory: str, config_settings: Any = None, metadata_directory: str | None = None
+) -> str:
+    """Build what an editable install is into a folder and return its name (PEP 660)."""
+    settings = {"editable_mode": "compat", **(config_settings or {})}
+    return str(build_meta.build_editable(wheel_directory, settings, metadata_directory))
 
 
 def build_wheel(

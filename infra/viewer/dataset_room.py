@@ -14,6 +14,7 @@ from infra.viewer.server import Answer, NotThere, Question, Route, json_answer
 from pipeline.documents.png import encode_png
 from pipeline.documents.scene_page import preview
 from pipeline.making.progressive_tracer import ProgressiveTracer
+from storage.conventions import preview_gain
 from storage.dataset.dataset import Dataset, LocalFiles, reading
 from storage.dataset.shard import read_member, scan_samples
 from storage.errors import TrilightError
@@ -128,7 +129,7 @@ class DatasetRoom:
             samples = scan_samples(stream, shard.name)
             members = next(members for key, members in samples if key == row.key)
             radiance_rgb = decode_exr(read_member(stream, members[f"{view}.exr"]))
-        return encode_png(preview(radiance_rgb, width))
+        return encode_png(preview(radiance_rgb * preview_gain(radiance_rgb), width))
 
     def _opened(self, key: str) -> SceneRoom:
         row = self.index.row(key)
@@ -136,7 +137,9 @@ class DatasetRoom:
         (sample,) = self._dataset.read_samples(shard, [key])
         floors = [view.noise_floor_db for view in sample.views]
         target = TargetPainter(sample.radiance_rgb, floors)
+        is_here = isinstance(self._dataset.files, LocalFiles)
         return SceneRoom(
+            source=f"{Path(self._source) / shard.name}::{key}" if is_here else "",
             name=f"scene {key}, {row.split}",
             scene=sample.scene,
             notes=(),

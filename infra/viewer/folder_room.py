@@ -24,6 +24,7 @@ from pipeline.exchange.reader import SceneReader
 from pipeline.making.progressive_tracer import ProgressiveTracer
 from pipeline.renders.results import GrowingPicture, Sampling
 from pipeline.renders.settings import one_picture
+from storage.conventions import preview_gain
 from storage.records.lights import num_lights
 
 THUMBNAIL_PX, THUMBNAIL_SPP = 128, 4
@@ -93,7 +94,8 @@ class FolderRoom:
         png = self._thumbnails.get(number)
         if png is None:
             radiance_rgb = self._small_picture(number, self._loaded(number))
-            png = self._thumbnails[number] = encode_png(preview(radiance_rgb, THUMBNAIL_PX))
+            exposed = radiance_rgb * preview_gain(radiance_rgb)
+            png = self._thumbnails[number] = encode_png(preview(exposed, THUMBNAIL_PX))
             while len(self._thumbnails) > _MOST_THUMBNAILS:
                 self._thumbnails.popitem(last=False)
         return Answer(body=png, kind="image/png")
@@ -133,13 +135,17 @@ class FolderRoom:
         number = int(key)
         if number >= len(self._found.names):
             raise NotThere("the folder has no such file.")
-        return scene_room(
-            self._found.names[number], self._loaded(number), self._tracer, self._checkpoint
-        )
+        name, loaded = self._found.names[number], self._loaded(number)
+        place = str(self._found.root / name)
+        return scene_room(name, loaded, self._tracer, self._checkpoint, place)
 
 
 def scene_room(
-    name: str, loaded: LoadedScene, tracer: ProgressiveTracer, checkpoint: str | None
+    name: str,
+    loaded: LoadedScene,
+    tracer: ProgressiveTracer,
+    checkpoint: str | None,
+    source: str,
 ) -> SceneRoom:
     """Return the room of a scene that was read from a file; it leaves the tracer to its owner."""
     target = None
@@ -151,4 +157,5 @@ def scene_room(
         notes=loaded.notes,
         painters=painters_of(tracer, target, checkpoint),
         target_px=None if target is None else target.width_px,
+        source=source,
     )

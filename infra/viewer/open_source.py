@@ -35,7 +35,7 @@ def opened_room(source: str, *, checkpoint: str | None, threads: int | None) -> 
     with SceneReader() as reader:
         loaded = reader.load(found, pictures=True)
     tracer = _tracer(threads)
-    room = scene_room(found.name, loaded, tracer, checkpoint)
+    room = scene_room(found.name, loaded, tracer, checkpoint, source)
     room.tracer = tracer
     return room
 

@@ -107,7 +107,7 @@ class SamplesPainter:
 
     def __init__(self, tracer: ProgressiveTracer, scene_number: int, spp: int) -> None:
         """Take what `TracedPainter` takes, and the samples."""
-        self._tracer, self._number, self._spp = tracer, scene_number, spp
+        self._tracer, self._number, self.spp = tracer, scene_number, spp
         self.title = f"{spp} sample{'s' if spp > 1 else ''}, filtered"
         self.means = (
             f"{spp} path{'s' if spp > 1 else ''} a pixel, then Open Image Denoise "
@@ -120,7 +120,7 @@ class SamplesPainter:
 
         camera = (wanted.camera.c2w, wanted.camera.fov_deg)
         key, settings = (self._number, wanted.scene_key), _traced_settings(wanted)
-        self._tracer.paint(scene, key, camera, settings, shown, preview_spp=self._spp)
+        self._tracer.paint(scene, key, camera, settings, shown, preview_spp=self.spp)
 
 
 def _traced_settings(wanted: Wanted) -> RenderSettings:
@@ -148,7 +148,7 @@ class NetworkPainter:
 
     def __init__(self, checkpoint: str, title: str, means: str) -> None:
         self.title, self.means = title, means
-        self._checkpoint = checkpoint
+        self.checkpoint = checkpoint
         self._renderer: NeuralRenderer | None = None
         self._prepared: tuple[str, PreparedScene, float] | None = None
 
@@ -177,7 +177,7 @@ class NetworkPainter:
             from model.neural_renderer import NeuralRenderer
             from train.loop.checkpoints import network_of_run
 
-            self._renderer = NeuralRenderer.load(self._checkpoint, finders=[network_of_run])
+            self._renderer = NeuralRenderer.load(self.checkpoint, finders=[network_of_run])
         return self._renderer
 
 
@@ -227,6 +227,15 @@ class TargetPainter:
         floor_db = self._floors_db[wanted.view] if self._floors_db else None
         picture = self._pictures[wanted.view]
         show(Painted(radiance_rgb=picture, core_s=None, floor_db=floor_db, says="as it was stored"))
+
+
+def render_words(painter: Painter, wanted: Wanted) -> list[str]:
+    """Return the options by which `trilight render` goes the way of a painter; else it traces."""
+    if isinstance(painter, NetworkPainter):
+        return ["--engine", "neural", "--checkpoint", painter.checkpoint]
+    if isinstance(painter, SamplesPainter):
+        return ["--spp", str(painter.spp)]
+    return ["--noise-floor", f"{wanted.error_db:g}"]
 
 
 def painters_of(

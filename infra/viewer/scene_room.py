@@ -1,5 +1,7 @@
 """What the page of a scene may ask: the scene in 3D, pictures by every engine, and files of it."""
 
+import json
+import shlex
 import tempfile
 import threading
 from collections.abc import Mapping, Sequence
@@ -12,13 +14,14 @@ from numpy.typing import NDArray
 
 from infra.rendering.look import Look, ToneMap, tone_mapped
 from infra.viewer.easel import Easel, Job, agreement_db
-from infra.viewer.painters import Painter
+from infra.viewer.painters import Painter, render_words
 from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
 from infra.viewer.server import Answer, NotThere, Question, Route, json_answer
 from infra.viewer.wanted import edits_of, wanted_of
 from pipeline.documents.png import encode_png
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.formats import FORMATS
+from pipeline.exchange.renderformer_json import camera_entry
 from pipeline.making.progressive_tracer import ProgressiveTracer
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
@@ -35,6 +38,9 @@ EXPORTS = {
 }
 """Forms of one file that a page offers, as far as they can be written."""
 
+CAMERA, EDITED = "camera.json", "scene.safetensors"
+"""What the page saves, as the commands name it that it shows."""
+
 _OCTETS = "application/octet-stream"
 
 
@@ -50,6 +56,8 @@ class SceneRoom:
     painters: Mapping[str, Painter]
     target_px: int | None
     """Width of the pictures that the file holds."""
+    source: str = ""
+    """Scene as `trilight render` takes it; empty where it can take none."""
     tracer: ProgressiveTracer | None = None
     """Ends with the room, where it is of this room alone."""
     easel: Easel = field(init=False)
@@ -98,9 +106,15 @@ class SceneRoom:
                 "template": str(scene.provenance.get("template", "")),
                 "notes": list(self.notes),
                 "engines": engines,
-                "exports": [[suffix, EXPORTS[suffix]] for suffix in EXPORTS if _is_written(suffix)],
+                "exports": [pair for pair in EXPORTS.items() if self._is_offered(pair[0])],
             }
         )
+
+    def _is_offered(self, suffix: str) -> bool:
+        """Return whether a form of one file can be written; text has its pictures beside it."""
+        form, scene = FORMATS.get(suffix), self.scene
+        pictures = suffix == ".usda" and (scene.textures or scene.environment is not None)
+        return form is not None and form.write is not None and not pictures
 
     def _texture(self, question: Question) -> Answer:
         name = question.path.removeprefix("api/texture/")
@@ -125,7 +139,19 @@ class SceneRoom:
         after = question.query.get("after", "0")
         number = question.path.removeprefix("api/picture/")
         job = self.easel.news(number, int(after) if after.isdecimal() else 0)
-        return json_answer(_told(job, self.easel.truth(job)))
+        return json_answer({**_told(job, self.easel.truth(job)), **self._repeated(job)})
+
+    def _repeated(self, job: Job) -> Mapping[str, Any]:
+        """Return the command that makes a picture, and its camera in a form that `render` reads."""
+        wanted, camera = job.wanted, job.wanted.camera
+        place = ["--view", str(wanted.view), "--out", "view.exr"]
+        if wanted.view is None:  # of a file of cameras come many pictures, into a folder
+            place = ["--cameras", CAMERA, "--out", "view"]
+        words = ["trilight", "render", EDITED if wanted.edits else self.source, *place]
+        words += ["--resolution", str(wanted.resolution)]
+        command = shlex.join([*words, *render_words(self.painters[wanted.engine], wanted)])
+        camera_file = json.dumps({"cameras": [camera_entry(camera.c2w, camera.fov_deg)]})
+        return {"command": command if self.source else "", "camera": camera_file}
 
     def _shown(self, question: Question) -> Answer:
         job = self.easel.job(question.path.removeprefix("api/shown/"))
@@ -152,14 +178,12 @@ class SceneRoom:
     def _export(self, question: Question) -> Answer:
         body = question.body if isinstance(question.body, dict) else {}
         suffix, edits = str(body.get("form")), edits_of(body)
-        if suffix not in EXPORTS or not _is_written(suffix):
+        if suffix not in EXPORTS or not self._is_offered(suffix):
             raise TrilightError(f"form {suffix:.20}: expected one of {' '.join(EXPORTS)}.")
         key = sha256_hex(canonical_json(edits))[:24]
         with self._writing, tempfile.TemporaryDirectory(prefix="trilight-view-") as folder:
             path = Path(folder) / f"scene{suffix}"
             lost = write_scene(path, self.easel.scene(key, edits))
-            if len(list(Path(folder).iterdir())) > 1:
-                raise TrilightError(f"{suffix} takes several files here; expected .usdz.")
             data = path.read_bytes()
         said = "; ".join(lost).encode("ascii", "replace").decode()[:800]
         return Answer(body=data, kind=_OCTETS, headers={"X-Lost": said} if said else {})
@@ -203,8 +227,3 @@ def _toned(radiance_rgb: NDArray[np.float32], query: Mapping[str, str]) -> NDArr
         raise TrilightError(f"ev is {exposure_ev}; expected -32 to 32.")
     look = Look(tone_map=tone_map, exposure_ev=exposure_ev)
     return tone_mapped(radiance_rgb * np.float32(2.0**look.exposure_ev), look.tone_map)
-
-
-def _is_written(suffix: str) -> bool:
-    form = FORMATS.get(suffix)
-    return form is not None and form.write is not None

@@ -12,6 +12,7 @@ from pipeline.documents.gallery_controls import (
 from pipeline.documents.html import Markup, element, image, joined, png_uri
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, preview
 from storage.atomic import write_atomically
+from storage.conventions import preview_gain
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
@@ -65,7 +66,8 @@ def write_gallery(
 
 
 def _card(sample: Sample, split: str) -> Markup:
-    picture = image(png_uri(preview(sample.radiance_rgb[0], _CARD_PX)), f"scene {sample.key}")
+    exposed = sample.radiance_rgb[0] * preview_gain(sample.radiance_rgb)
+    picture = image(png_uri(preview(exposed, _CARD_PX)), f"scene {sample.key}")
     template = sample.scene.provenance.get("template", "")
     num_objects = sum(entry.kind == "object" for entry in sample.scene.objects)
     caption = f"{template}, {num_objects} {'object' if num_objects == 1 else 'objects'}"

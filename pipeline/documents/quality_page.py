@@ -152,13 +152,22 @@ def _unread(unread: Mapping[str, Sequence[str]]) -> Markup:
     return joined([heading, table(("object", "what its file holds beside that"), cells)])
 
 
+def _materials_of(row: AssetRow) -> str:
+    if row.colours is not None:
+        return "own"
+    return f"drawn: {row.materials.reason}" if row.materials else "drawn"
+
+
 def _accepted(rows: Sequence[AssetRow]) -> Markup:
-    head = ("object", "licence", "method", "read", "triangles", "p99 %", "normals", "open edges")
+    asked = any(row.materials for row in rows)
+    texts = ("object", "licence", "method", *(["materials"] if asked else []))
+    head = (*texts, "read", "triangles", "p99 %", "normals", "open edges")
     cells = [
         (
             row.uid,
             row.licence,
             row.method + (", repaired" if row.source.repaired else ""),
+            *([_materials_of(row)] if asked else []),
             f"{row.source.num_faces_read}",
             f"{row.num_faces}",
             f"{100 * row.quality.error_p99:.2f}",

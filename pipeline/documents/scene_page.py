@@ -22,7 +22,7 @@ from pipeline.documents.html import (
 from pipeline.documents.pass_colours import id_colours
 from pipeline.documents.scene_maps import MAPS_STYLE, maps_section
 from pipeline.documents.scene_passes import PASSES_STYLE, passes_section
-from storage.conventions import preview_srgb8, srgb8
+from storage.conventions import preview_gain, preview_srgb8, srgb8
 from storage.records.material import DIFFUSE
 from storage.records.objects import Failure
 from storage.records.sample import Sample
@@ -111,10 +111,11 @@ def _navigation(links: Neighbours) -> Markup:
 
 
 def _figures(sample: Sample) -> list[Markup]:
-    figures = []
+    figures, gain = [], preview_gain(sample.radiance_rgb)
     for view, (picture, record) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
-        uri = png_uri(preview(picture, _PICTURE_PX))
+        uri = png_uri(preview(picture * gain, _PICTURE_PX))
         mark = ", at the cap" if record.at_cap else ""
+        mark += f", shown {-np.log2(gain):.1f} stops darker" if gain < 1 else ""
         caption = f"view {view}: {float(record.noise_floor_db):.1f} dB, {record.spp} spp{mark}"
         figures.append(
             element("figure", enlargeable(uri, f"view {view}"), element("figcaption", caption))
@@ -155,13 +156,13 @@ def _parts(sample: Sample) -> list[Markup]:
     """Return the pictures of the parts that are stored, with their floors."""
     if sample.parts_rgb is None:
         return []
-    figures, rows = [], list[list[Cell]]()
+    figures, rows, gain = [], list[list[Cell]](), preview_gain(sample.radiance_rgb)
     for view, record in enumerate(sample.views):
         for part, floor in (record.parts or {}).items():
             picture = sample.parts_rgb[part][view]
             together = picture.sum(axis=0) if picture.ndim == 4 else picture
             name = f"view {view}, {part}"
-            shown = enlargeable(png_uri(preview(together, _PICTURE_PX)), name)
+            shown = enlargeable(png_uri(preview(together * gain, _PICTURE_PX)), name)
             figures.append(element("figure", shown, element("figcaption", name)))
             floors = (
                 floor.noise_floor_db,

@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 from pipeline.documents.chosen import choose_scenes, read_chosen
 from pipeline.documents.png import encode_png
 from storage.atomic import write_atomically
-from storage.conventions import preview_srgb8
+from storage.conventions import preview_gain, preview_srgb8
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry
@@ -54,7 +54,8 @@ def write_contact_sheet(
     values = dict(statistics.lines())
     title = f"{dataset.manifest.build}: {values['scenes']}, {values['views']} views"
     _write(sheet, _MARGIN_PX, 8, title, 20)
-    floors = f"noise floor {values['noise floor']}; at the cap {values['views at the cap']}"
+    floors = f"noise floor {values['noise floor']}; at the cap {values['views at the cap']}; "
+    floors += "bright scenes are shown darker"
     _write(sheet, _MARGIN_PX, 36, floors, 14, _FAINT)
     for number, (entry, sample) in enumerate(read_chosen(dataset, chosen)):
         row, column = divmod(number, per_row)
@@ -102,7 +103,8 @@ def write_template_sheet(
         for column, (key, shard) in enumerate(places.items()):
             left = _TEMPLATE_MARGIN_PX + column * (_TILE_PX + _TEMPLATE_MARGIN_PX)
             for sample in dataset.read_samples(shard, [key]):
-                sheet.paste(_tile(sample.radiance_rgb[0]), (left, top + _LABEL_PX))
+                picture = sample.radiance_rgb[0] * preview_gain(sample.radiance_rgb)
+                sheet.paste(_tile(picture), (left, top + _LABEL_PX))
     write_atomically((out or dataset.folder).template_sheet, encode_png(np.asarray(sheet)))
 
 
@@ -113,7 +115,8 @@ def _draw_cell(sheet: Image.Image, sample: Sample, split: str, left: int, top: i
     _write(sheet, left, top, f"{sample.key}  {split}{beyond}", 13)
     triangles = f"{origin['template']}  {sample.scene.num_triangles} triangles"
     _write(sheet, left, top + 16, triangles, 13)
-    for view, (picture, record) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
+    exposed = sample.radiance_rgb * preview_gain(sample.radiance_rgb)
+    for view, (picture, record) in enumerate(zip(exposed, sample.views, strict=True)):
         x = left + view * _TILE_PX
         sheet.paste(_tile(picture), (x, top + _CAPTION_PX))
         mark = " (cap)" if record.at_cap else ""

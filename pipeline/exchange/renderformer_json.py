@@ -244,7 +244,7 @@ def described_files(scene: Scene, stem: str) -> DescribedFiles:
             "scene_name": _printable(stem),
             "version": "1.0",
             "objects": objects,
-            "cameras": [_camera_entry(scene, view) for view in range(scene.num_views)],
+            "cameras": list(map(camera_entry, scene.c2w, scene.fov_deg)),
         }
     ).encode()
     _require_size(scene, data, len(objects))
@@ -321,13 +321,14 @@ def _object_entry(path: str, values: NDArray[np.float32], smooth: bool) -> dict[
     }
 
 
-def _camera_entry(scene: Scene, view: int) -> dict[str, Any]:
-    pose = scene.c2w[view].astype(np.float64)
+def camera_entry(c2w: NDArray[np.float32], fov_deg: float) -> dict[str, Any]:
+    """Return the entry of `cameras` for a pose [4, 4] and a full angle in degrees."""
+    pose = c2w.astype(np.float64)
     return {
         "position": pose[:3, 3].tolist(),
         "look_at": (pose[:3, 3] - pose[:3, 2]).tolist(),
         "up": pose[:3, 1].tolist(),
-        "fov": float(scene.fov_deg[view]),
+        "fov": float(fov_deg),
     }
 
 

@@ -133,7 +133,8 @@ class ShownArray:
 
     def _tell(self, status: DatasetStatus, key: str, rows: list[tuple[str, str]]) -> None:
         if self._progress is not None:
-            percent = 100.0 * status.scenes_done / max(status.scenes_planned, 1)
+            over = status.scenes_done + status.scenes_given_up
+            percent = 100.0 * over / max(status.scenes_planned, 1)
             update_progress_artifact(self._progress, percent)
         table = [{"what": name, "value": value} for name, value in rows]
         create_table_artifact(table, key, description=self._place)

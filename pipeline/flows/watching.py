@@ -87,6 +87,7 @@ class Watched:
         self._told = -_EVERY_S
         self._scenes = 0
         self._core_s = 0.0
+        self._run: Run | None = None
         self._progress: UUID | None = None
         self._log = get_run_logger()
         self._shown = Forgiving(self._log)
@@ -97,6 +98,7 @@ class Watched:
         now = time.monotonic()
         if self._began is None and outcome.scenes:
             self._began = now - outcome.seconds
+        self._run = run
         self._scenes += outcome.scenes
         self._core_s += outcome.core_s
         for shard in outcome.shards:
@@ -106,7 +108,9 @@ class Watched:
             self._shown(lambda: self._tell(run))
 
     def finished(self, outcome: Outcome) -> None:
-        """Tell the outcome."""
+        """Tell the outcome, and how far everything is then."""
+        if (run := self._run) is not None:
+            self._shown(lambda: self._tell(run))
         self._shown(lambda: self._sum_up(outcome))
         done, planned = outcome.num_shards, outcome.num_shards_planned
         self._log.info("%d of %d shards are there; digest %s", done, planned, outcome.digest)
@@ -138,7 +142,7 @@ class Watched:
             "progress",
             [
                 ("shards", f"{of.shards} of {of.shards_asked}"),
-                ("scenes in shards", f"{done} of {planned}"),
+                ("scenes in shards", f"{done - of.given_up} of {planned}"),
                 ("views an hour", f"{3600 * per_s * publication.manifest.num_views:.0f}"),
                 ("left, if nobody else helps", left),
             ],

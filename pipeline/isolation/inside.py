@@ -15,6 +15,7 @@ from typing import Any
 from pipeline.isolation.answers import encode_error, encode_result
 from pipeline.isolation.frames import receive, send, wait_forever
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
+from storage.extensions import mistake_in_extension
 
 _PR_SET_PDEATHSIG = 1
 
@@ -88,7 +89,10 @@ def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> list[bytes |
         return encode_error("TrilightError", str(mistake))
     except MemoryError:
         return encode_error("out_of_memory", "an allocation went over the limit of the child")
-    except Exception:
+    except Exception as error:
+        its_author = mistake_in_extension(error)
+        if its_author is not None:  # tried again, it stays
+            return encode_error("TrilightError", str(its_author))
         return encode_error("exception", _last_error())
 
 

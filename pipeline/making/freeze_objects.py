@@ -1,7 +1,6 @@
 """The objects of a dataset, frozen: what its scenes draw from, the same for all its makers."""
 
 import logging
-from collections import Counter
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -84,7 +83,7 @@ def freeze_objects(
     if frozen is None:
         _require_enough(objects, settings, publication, shown)
         _warn_of(shown, passing)
-        _tell_of_materials(shown, prepared)
+        _tell_of_materials(shown, prepared, publication.folder.logs)
         _tell_of_unread(shown, prepared, publication.folder.logs)
         publication.lock_objects(locked)
     else:
@@ -199,18 +198,18 @@ def _warn_of(source: str, passing: list[Failure]) -> None:
         )
 
 
-def _tell_of_materials(source: str, prepared: list[PreparedObject]) -> None:
-    """Say which objects get drawn materials although their own were asked for."""
-    reasons = Counter(asset.without_own for asset in prepared if asset.without_own)
-    if reasons:
-        counts = ", ".join(f"{count} x {why}" for why, count in reasons.most_common())
+def _tell_of_materials(source: str, prepared: list[PreparedObject], logs: Path) -> None:
+    """Say which objects get drawn materials although their own were asked for, and write it."""
+    drawn = {each.record.uid: (each.without_own,) for each in prepared if each.without_own}
+    path = write_unread(logs, drawn, "drawn_materials")
+    if drawn:
         log.warning(
-            "objects %r: %d of %d have no materials of their own at every level (%s) and get drawn "
-            "ones there. `trilight assets --own-materials` says what was found in each.",
+            "objects %r: %d of %d have no materials of their own at every level and get drawn "
+            "ones there. `trilight assets --own-materials` says what was found in each:\n%s",
             source,
-            sum(reasons.values()),
+            len(drawn),
             len(prepared),
-            counts,
+            "\n".join(format_unread(drawn, path)),
         )
 
 

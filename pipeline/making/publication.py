@@ -222,6 +222,7 @@ class Publication:
                 write_manifest(self.folder.manifest, listed)
             for staged in (self.folder.staged_entries, self.folder.staged_failures):
                 shutil.rmtree(staged, ignore_errors=True)
+            self.folder.staged_given_up.unlink(missing_ok=True)
         num_scenes, self.failures = self._num_scenes(range(self.num_shards)), []
         given_up = num_scenes - listed.num_samples
         self.manifest = listed

@@ -95,6 +95,7 @@ class Run:
         num_scenes, budget = publication.manifest.num_scenes, self.order.failure_budget
         given_up = publication.done.given_up
         if given_up > budget * num_scenes + (len(files.unusable) if files else 0):
+            publication.add_failures(publication.failures)
             raise TrilightError(
                 f"{publication.folder.shown}: {given_up} of {num_scenes} scenes could not be made, "
                 f"more than the failure budget of {budget:.0%}. The reasons are in "

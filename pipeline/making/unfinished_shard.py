@@ -15,6 +15,7 @@ from pipeline.shards.pack import pack_shard
 from storage.claims import claimed, is_claimed
 from storage.dataset.layout import DatasetFolder, numbered
 from storage.dataset.manifest import ShardEntry, read_head
+from storage.dataset.progress import count_given_up
 from storage.dataset.scene_logs import log_scene
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, split_of_shard
@@ -67,6 +68,8 @@ class UnfinishedShard:
         seconds, outcome = time.monotonic() - began, "made" if sample else "given up"
         log.info("%s: scene %09d %s in %.1f s", self.name, scene_index, outcome, seconds)
         folder, count = self._folder, len(failures)
+        if sample is None:
+            count_given_up(folder, scene_index)
         log_scene(folder, self.name, scene_index, seconds=seconds, cores=cores, num_rejected=count)
 
     def pack(self) -> ShardEntry | None:

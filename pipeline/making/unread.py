@@ -12,9 +12,9 @@ Unread = Mapping[str, tuple[str, ...]]
 _MOST_LINES = 5
 
 
-def write_unread(logs: Path, unread: Unread) -> Path:
+def write_unread(logs: Path, unread: Unread, name: str = "unread") -> Path:
     """Write `unread.json`, the sentences by uid; without any, remove an earlier one."""
-    path = logs / "unread.json"
+    path = logs / f"{name}.json"
     if unread:
         write_atomically(path, json.dumps(unread, indent=1, sort_keys=True).encode())
     else:

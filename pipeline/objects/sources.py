@@ -24,6 +24,7 @@ from pipeline.objects.listing import SUFFIXES, CountDone, Fetched, Listing
 from pipeline.objects.local.folder import list_folder
 from pipeline.objects.objaverse.source import list_objaverse
 from pipeline.objects.remote.source import list_remote
+from storage.cache import cache_folder
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
 from storage.registry import Registry
@@ -38,7 +39,7 @@ class SourceQuery:
     source: str
     """The source as it was written, such as `objaverse:category/chair`."""
     work_dir: Path
-    """Folder for files that a source makes."""
+    """Folder for files that a source makes: of the dataset, or of the user's cache."""
     licence: str | None
     """Licence that the user states for files without a statement of their own."""
     allowed_licences: Sequence[str]
@@ -259,13 +260,13 @@ def find_objects(
 def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
     """Find out whether a source is there and holds anything, before a dataset of it is begun.
 
-    Writes nothing except the cached listing of a server.
+    Writes nothing except into the user's cache.
 
     Raises:
         TrilightError: as `list_objects`.
     """
     with _said_by(source) as value:
-        _listed(value, Path(), licence, allowed_licences, only_look=True)
+        _listed(value, cache_folder("objects"), licence, allowed_licences, only_look=True)
 
 
 @contextlib.contextmanager

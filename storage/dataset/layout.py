@@ -145,6 +145,8 @@ class DatasetFolder:
     """How many object files are downloaded, and of how many."""
     staged_done = _Below(".staging/objects_done")
     """A byte for each object that is prepared or rejected."""
+    staged_given_up = _Below(".staging/given_up")
+    """A line for each scene that was given up and that the manifest does not stand for yet."""
     _lock = _Below(".staging/lock")
 
     @property

@@ -49,6 +49,8 @@ class Progress:
     """Objects to prepare."""
     scenes_done: int
     """Scenes in shards or waiting for their shard."""
+    scenes_given_up: int
+    """Scenes that no attempt could save."""
     scenes_planned: int
     """Scenes to make."""
     num_views: int
@@ -78,6 +80,19 @@ def count_object(folder: DatasetFolder, count: int = 1) -> None:
         raise write_error(path, error) from error
 
 
+def count_given_up(folder: DatasetFolder, scene_index: int) -> None:
+    """Record that a scene is given up; it only shows progress, so failing to write is no error."""
+    with contextlib.suppress(OSError), folder.staged_given_up.open("a") as stream:
+        stream.write(f"{scene_index}\n")
+
+
+def _scenes_given_up(folder: DatasetFolder) -> int:
+    """Return how many scenes are given up of which the manifest says nothing yet."""
+    with contextlib.suppress(OSError):
+        return len(set(folder.staged_given_up.read_text().split()))
+    return 0
+
+
 def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
     """Record how many views of an unfinished scene are done; the current one counts in part.
 
@@ -102,9 +117,11 @@ def read_progress(folder: DatasetFolder) -> Progress:
         scenes_planned, num_views, planned = _plan_of(
             folder.manifest, facts.st_mtime_ns, facts.st_size
         )
-        scenes_done = num_scenes_done(folder, planned)
+        given_up = _scenes_given_up(folder)
+        scenes_done = num_scenes_done(folder, planned) - given_up
+        given_up += max(scenes_planned - sum(planned.values()), 0)
     except (TrilightError, OSError):
-        scenes_planned = num_views = scenes_done = 0
+        scenes_planned = num_views = scenes_done = given_up = 0
     plan, downloads = folder.staged_plan, folder.staged_downloads
     objects = json.loads(plan.read_bytes())["objects"] if plan.exists() else 0
     counted = folder.staged_done.stat().st_size if folder.staged_done.exists() else 0
@@ -115,6 +132,7 @@ def read_progress(folder: DatasetFolder) -> Progress:
         objects_done=min(counted, objects),  # several makers count what all of them found done
         objects_planned=objects,
         scenes_done=scenes_done,
+        scenes_given_up=given_up,
         scenes_planned=scenes_planned,
         num_views=num_views,
         views_done=scenes_done * num_views + _views_at_work(folder),
@@ -225,7 +243,9 @@ class DatasetStatus:
     shards_planned: int
     """Shards of the finished dataset."""
     scenes_done: int
-    """Scenes in shards or waiting for theirs; given-up ones count."""
+    """Scenes in shards or waiting for theirs."""
+    scenes_given_up: int
+    """Scenes that no attempt could save; of a bucket, known once it is finished."""
     scenes_planned: int
     """Scenes of the finished dataset."""
     num_views: int
@@ -248,6 +268,8 @@ class DatasetStatus:
     digest: str
     """The dataset digest; empty while it is made."""
 
+    extensions: Mapping[str, str]
+    """The sha256 of each extension that it was begun with, by its name."""
     asked: Sequence[str] | None
     """Words of the command that makes it, without its place; None where they were not recorded."""
 
@@ -271,15 +293,20 @@ def read_status(url: str) -> DatasetStatus:
     planned = planned_shards(manifest)
     names = _finished_names(dataset, planned)
     done = sum(planned[name] for name in names) + (_num_waiting(local) if local else 0)
+    given_up = _scenes_given_up(local) if local else 0
+    done -= given_up
+    given_up += max(manifest.num_scenes - sum(planned.values()), 0)
     looked, share = (look_at_logs(local), 1.0) if local else _sampled_logs(dataset)
     last, core_s = looked.last, looked.core_s
-    views_per_hour, remaining_s = _rate(last, share, manifest, manifest.num_scenes - done)
+    left = manifest.num_scenes - done - given_up
+    views_per_hour, remaining_s = _rate(last, share, manifest, left)
     return DatasetStatus(
         shown=dataset.shown,
         build=manifest.build,
         shards_done=len(names),
         shards_planned=len(planned),
         scenes_done=done,
+        scenes_given_up=given_up,
         scenes_planned=manifest.num_scenes,
         num_views=manifest.num_views,
         finished=_is_finished(dataset),
@@ -289,6 +316,7 @@ def read_status(url: str) -> DatasetStatus:
         last_scene_unix_s=last[-1].finished_unix_s if last else None,
         failures=count_by_reason([*dataset.failures(), *(_noted_failures(local) if local else ())]),
         digest=dataset.digest if _is_finished(dataset) else "",
+        extensions=manifest.extensions,
         asked=read_asked(dataset),
     )
 

@@ -152,8 +152,9 @@ def write_failures(path: Path, failures: Iterable[Failure]) -> None:
 
 
 def count_by_reason(failures: Iterable[Failure]) -> list[tuple[str, str, int]]:
-    """Return (stage, reason, how many), the most frequent first."""
-    counts = Counter((failure.stage, failure.reason) for failure in failures)
+    """Return (stage, reason, how many), the most frequent first; equal rows are one."""
+    rows = dict.fromkeys(failures)
+    counts = Counter((failure.stage, failure.reason) for failure in rows)
     return [(stage, reason, count) for (stage, reason), count in counts.most_common()]
 
 

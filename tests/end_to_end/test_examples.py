@@ -108,7 +108,10 @@ def test_a_build_and_a_run_of_a_file(copied: Callable[[str], Path]) -> None:
         assert changed_run(run, {"seed": 4}, steps=60).warmup_steps == 10
 
 
-def test_a_source_lists_objects(copied: Callable[[str], Path], tmp_path: Path) -> None:
+def test_a_source_lists_objects(
+    copied: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And writes nothing into the folder that a person works in."""
     asked: dict[str, Any] = {"allowed_licences": ("CC0-1.0",)}
     with loaded(copied("object_source.py")):
         found = find_objects("dice:3", work_dir=tmp_path, **asked)
@@ -117,6 +120,11 @@ def test_a_source_lists_objects(copied: Callable[[str], Path], tmp_path: Path) -
             find_objects("dice:x", work_dir=tmp_path, **asked)
         with pytest.raises(TrilightError, match="dice: states the licence of every object"):
             look_at_source("dice:3", licence="MIT", **asked)
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+        before = set(tmp_path.rglob("*.ply"))
+        look_at_source("dice:3", licence=None, **asked)
+        assert {path.parts[-4] for path in set(tmp_path.rglob("*.ply")) - before} == {"cache"}
     with pytest.raises(TrilightError, match="'dice:3' does not exist"):
         look_at_source("dice:3", licence=None, **asked)
 

@@ -13,6 +13,7 @@ import pytest
 
 from infra.cli.leaving import temporary_folder
 from storage.dataset.manifest import read_manifest
+from tests.conftest import ROOT
 from tests.end_to_end.conftest import Trilight, command
 from tests.for_each import for_each
 
@@ -78,6 +79,17 @@ def test_words_come_first_and_ctrl_c_is_answered(
 def test_plan_leaves_no_scenes_behind_at_ctrl_c(tmp_path: Path) -> None:
     _leave(LONG["plan"], tmp_path, lambda: bool(list(tmp_path.glob("trilight-plan-*"))))
     assert not list(tmp_path.glob("trilight-plan-*"))
+
+
+def test_ctrl_c_while_libraries_are_loaded_leaves_no_traceback(tmp_path: Path) -> None:
+    (tmp_path / "cyclopts.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\n")
+    run = subprocess.run(
+        command("doctor"),
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
+    )
+    assert (run.returncode, run.stderr) == (130, "")
 
 
 def test_a_temporary_folder_is_gone_after_its_block() -> None:

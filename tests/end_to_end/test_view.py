@@ -2,6 +2,7 @@
 
 import contextlib
 import shlex
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from infra.release.page import write_page
 from pipeline.documents.distributions import dataset_distributions
@@ -177,6 +179,33 @@ def test_a_lamp_and_a_material_are_changed_and_saved(
     assert saved.materials[0, 6] == pytest.approx(0.25)
 
 
+def test_the_picture_and_the_camera_are_saved_beside_the_command_that_makes_them(
+    page: Browser, address: str, tmp_path: Path
+) -> None:
+    opened(page, f"{address}scene/000000001/")
+    page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    page.drag("#stage", 60, 20)
+    page.until("!viewer.pictures.told.size")
+    assert page.run("document.getElementById('waiting').textContent") in (
+        "Computing …",
+        "Opening …",
+    )
+    until_done(page, "hits")
+    page.until("document.getElementById('picture').src.includes('shown')")
+    for button in ("save-picture", "save-camera"):
+        page.run(f"document.getElementById('{button}').click()")
+        deadline = time.monotonic() + PATIENCE_S
+        while not (tmp_path / {"save-camera": "camera.json"}.get(button, "view.png")).exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+    words = shlex.split(page.run("document.getElementById('command').textContent"))
+    subprocess.run(command(*words[1:]), cwd=tmp_path, check=True)
+    made, saved = (np.asarray(Image.open(tmp_path / name).convert("RGB"), int)
+                   for name in ("view/000000.png", "view.png"))  # fmt: skip
+    step = len(made) // len(saved)  # small pictures are enlarged
+    assert np.abs(made[::step, ::step] - saved).max() <= 1
+
+
 def test_by_keyboard_alone(page: Browser, address: str) -> None:
     opened(page, f"{address}scene/000000000/")
     page.tab_to("#stage")
@@ -233,6 +262,12 @@ def test_a_dataset_is_filtered_enlarged_and_opened(
     page.until("document.body?.classList.contains('scene')")
     page.until("document.body?.classList.contains('ready')")
     assert page.run("document.getElementById('name').textContent").startswith("scene 00000000")
+    page.run("document.getElementById('back').click()")  # and what was chosen is still chosen
+    page.until("document.body?.classList.contains('dataset')")
+    page.until("document.querySelectorAll('#scenes .card').length === 2")
+    assert shlex.split(page.run("document.getElementById('command').textContent")) == words
+    page.run("document.querySelector('[type=reset]').click()")
+    page.until("document.querySelectorAll('#scenes .card').length === 6")
 
 
 @pytest.mark.parametrize(("size", "scheme"), [(DESKTOP, "dark"), (PHONE, "light")])

@@ -174,6 +174,13 @@ def _no_route(*words: Any, **named: Any) -> None:
     raise ConnectionError("no route to host\nand a page of advice")
 
 
+def test_a_name_that_is_plainly_a_path_asks_no_hub(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    for name in ("runs/nosuch", "mine/model.safetensors"):
+        with pytest.raises(TrilightError, match=f"checkpoint {name}: no such file or folder"):
+            find_network(name)
+
+
 def test_a_hub_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def download(repo_id: str, filename: str, local_files_only: bool) -> str:
         assert local_files_only  # else the library tries for half a minute, line by line

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from storage.settings.described import checked
 from storage.settings.ranges import Within
+from train.folder import RunFolder
 
 Width = Annotated[int, Within(1, 8192, unit="pixels")]
 """Pixels across a picture."""
@@ -41,5 +42,15 @@ class EvaluationOrder:
     and without either LPIPS is n/a."""
     device: Literal["cpu", "cuda"] | None = None
     """Device to compute on; by default cuda if there is one, else cpu."""
-    out: Path = Path("evaluation")
-    """Folder for the report."""
+    out: Path | None = None
+    """Folder for the report; by default evaluation, in the folder of a run or else here. Where the
+    report of another network is, a number is added."""
+
+    @property
+    def place(self) -> Path:
+        """Where the report goes, if no other network's is there."""
+        checkpoint = Path(self.checkpoint)
+        for folder in (checkpoint, *list(checkpoint.parents)[:2]):
+            if self.out is None and RunFolder(folder).settings.is_file():
+                return folder / "evaluation"
+        return self.out or Path("evaluation")

@@ -41,4 +41,42 @@ export function element(tag, attributes = {}, ...content) {
   return made;
 }
 
+export async function copy(code, button) {
+  try {
+    await navigator.clipboard.writeText(code.textContent);
+    button.textContent = "Copied";
+  } catch {
+    getSelection().selectAllChildren(code);
+    button.textContent = "Selected: press Ctrl-C";
+  }
+  setTimeout(() => { button.textContent = "Copy"; }, 2500);
+}
+
+export function download(name, url) {
+  element("a", { href: url, download: name }).click();
+}
+
+// What was chosen in a form before its page was left; a choice may come later than the page.
+export class KeptForm {
+  constructor(form) {
+    this.form = form;
+    this.left = new Map(JSON.parse(sessionStorage.getItem(location.pathname) || "[]"));
+    for (const done of ["input", "reset"]) form.addEventListener(done, () => this.left.clear());
+  }
+
+  restore() {
+    for (const [name, value] of this.left) {
+      const field = this.form.elements[name];
+      if (field.options && ![...field.options].some((each) => each.value === value)) continue;
+      field.value = value;
+      this.left.delete(name);
+    }
+  }
+
+  keep() {
+    if (this.left.size) return;
+    sessionStorage.setItem(location.pathname, JSON.stringify([...new FormData(this.form)]));
+  }
+}
+
 export const sleep = (ms) => new Promise((done) => setTimeout(done, ms));

@@ -1,10 +1,11 @@
 // The page of a dataset: any number of scenes, of which only those in sight are fetched.
 
-import { askJson, element, say, sleep } from "./ask.js";
+import { askJson, copy, element, KeptForm, say, sleep } from "./ask.js";
 
 const byId = (name) => document.getElementById(name);
 const form = byId("filters");
 const LOOK_AGAIN_MS = 700;
+const kept = new KeptForm(form);
 let rows = [];
 let generation = 0;
 
@@ -16,6 +17,7 @@ function query(first) {
 
 async function show(first) {
   const mine = first ? generation : ++generation;
+  kept.keep();
   try {
     const found = await askJson(`api/rows?${query(first)}`);
     if (mine !== generation) return;
@@ -72,22 +74,11 @@ function enlarge(at) {
 
 const move = (step) => enlarge(Number(byId("large").dataset.at) + step);
 
-async function copy() {
-  const text = byId("command").textContent;
-  try {
-    await navigator.clipboard.writeText(text);
-    byId("copy").textContent = "Copied";
-  } catch {
-    getSelection().selectAllChildren(byId("command"));
-    byId("copy").textContent = "Selected: press Ctrl-C";
-  }
-  setTimeout(() => { byId("copy").textContent = "Copy"; }, 2500);
-}
-
 function fill(name, values) {
   const select = form.elements[name];
   const known = new Set([...select.options].map((option) => option.value));
   for (const value of values) if (!known.has(value)) select.append(new Option(value, value));
+  kept.restore();
 }
 
 // While the index is read, the page grows with it.
@@ -117,7 +108,7 @@ form.addEventListener("input", () => {
 form.addEventListener("submit", (event) => event.preventDefault());
 form.addEventListener("reset", () => setTimeout(() => show(0)));
 byId("more").addEventListener("click", () => show(rows.length));
-byId("copy").addEventListener("click", copy);
+byId("copy").addEventListener("click", () => copy(byId("command"), byId("copy")));
 byId("close").addEventListener("click", () => byId("large").close());
 byId("before").addEventListener("click", () => move(-1));
 byId("after").addEventListener("click", () => move(1));

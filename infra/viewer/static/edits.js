@@ -3,6 +3,7 @@
 const encoded = (x) => (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055);
 const linear = (s) => (s <= 0.04045 ? s / 12.92 : ((s + 0.055) / 1.055) ** 2.4);
 const byId = (name) => document.getElementById(name);
+const MOST_OF_ONE = 12; // materials of one thing that are listed one by one
 
 export class Edits {
   constructor(head, changed) {
@@ -27,7 +28,8 @@ export class Edits {
       byId("lamp").value = object;
       this.#showLamp();
     } else {
-      byId("material").value = material;
+      const holds = ({ value }) => value.split(" ").includes(String(material));
+      byId("material").value = [...byId("material").options].find(holds)?.value ?? "";
       this.#showMaterial();
     }
   }
@@ -43,9 +45,14 @@ export class Edits {
       if (this.#emits(group.material)) continue;
       worn.set(group.material, worn.has(group.material) ? `${worn.get(group.material)} …` : name);
     }
-    for (const [row, name] of worn) {
-      const short = name.replace(/( …)+$/, " and others");
-      byId("material").append(new Option(`${row}: ${short}`.slice(0, 60), row));
+    const rows = Map.groupBy(worn.keys(), (row) => worn.get(row));
+    for (const [name, all] of rows) {
+      const short = name.replace(/( …)+$/, " and others").slice(0, 50);
+      const entries = all.length > MOST_OF_ONE ? [all] : all.map((row) => [row]);
+      for (const entry of entries) {
+        const label = entry.length > 1 ? `${short}: ${entry.length} materials at once` : `${entry[0]}: ${short}`;
+        byId("material").append(new Option(label, entry.join(" ")));
+      }
     }
     const far = Math.max(1, ...this.head.lamps.flatMap((lamp) => lamp.centre.map(Math.abs)));
     for (const input of document.querySelectorAll(".move")) {
@@ -90,7 +97,12 @@ export class Edits {
   }
 
   #dressed(which) {
-    const row = byId("material").value;
+    for (const row of byId("material").value.split(" ")) this.#dressedRow(row, which);
+    this.#showMaterial();
+    this.#tell();
+  }
+
+  #dressedRow(row, which) {
     const change = { ...this.materials[row] };
     if (which === "diffuse") change.diffuse = fromHex(byId("diffuse").value);
     if (which === "roughness") change.roughness = Number(byId("roughness").value);
@@ -99,12 +111,10 @@ export class Edits {
     const bounded = specular.map((value, axis) => Math.min(value, 1 - diffuse[axis]));
     if (bounded.some((value, axis) => value < specular[axis])) change.specular = bounded;
     this.materials[row] = change;
-    this.#showMaterial();
-    this.#tell();
   }
 
   #showMaterial() {
-    const row = byId("material").value;
+    const [row] = byId("material").value.split(" ");
     if (row === "") return;
     const now = { ...this.head.materials[row], ...this.materials[row] };
     byId("diffuse").value = toHex(now.diffuse);

@@ -1,9 +1,10 @@
 // The page of a folder of scene files: names at once, and of those in sight what they hold.
 
-import { askJson, element, say } from "./ask.js";
+import { askJson, element, KeptForm, say } from "./ask.js";
 
 const byId = (name) => document.getElementById(name);
 const form = byId("filters");
+const kept = new KeptForm(form);
 const PAGE = 100;
 let files = [];
 let shown = [];
@@ -81,6 +82,7 @@ function filter() {
     const name = files[number].toLowerCase();
     return name.includes(text) && name.endsWith(suffix);
   });
+  kept.keep();
   cards = queue.length = 0;
   byId("scenes").replaceChildren();
   more();
@@ -94,6 +96,7 @@ async function begin() {
   byId("facts").textContent = `A folder of scene files${
     facts.is_cut ? `, of which the first ${files.length.toLocaleString("en")} are listed` : ""}`;
   form.elements.form.append(...facts.forms.map((suffix) => new Option(suffix, suffix)));
+  kept.restore();
   filter();
   document.body.classList.add("ready");
 }

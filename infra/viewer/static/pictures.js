@@ -127,8 +127,14 @@ export class Pictures {
     const waiting = document.getElementById("waiting");
     const facts = this.engines.find((each) => each.name === this.engine);
     document.getElementById("picture-title").textContent = facts.title;
-    waiting.textContent = !told ? "…" : told.error;
+    waiting.textContent = (told && told.error) || "Computing …";
     waiting.hidden = Boolean(told && told.shown);
+    const { ev, tone } = this.look();
+    const developed = (ev ? ` --exposure ${ev}` : "") + (tone === "plain" ? "" : ` --tone-map ${tone}`);
+    document.getElementById("command-part").hidden = !(told && told.shown);
+    const command = document.getElementById("command");
+    command.parentElement.hidden = !(told && told.command);
+    command.textContent = told ? told.command + developed : "";
     document.getElementById("figures").textContent = told ? progress(told) : "";
     const wantsError = document.getElementById("error").checked;
     const judged = told && told.agreement_db != null;
@@ -197,13 +203,15 @@ export class Pictures {
     this.cards.get(next).focus();
   }
 
+  // Leaves the processor to others.
+  rest() {
+    this.generation += 1;
+    return ask("api/rest", {}).catch(() => {});
+  }
+
   #hidden() {
-    if (document.hidden) {
-      this.generation += 1;
-      ask("api/rest", {}).catch(() => {});
-    } else {
-      this.resume();
-    }
+    if (document.hidden) this.rest();
+    else this.resume();
   }
 }
 

@@ -1,7 +1,7 @@
 // The page of one scene: 3D on one side, the same view by every engine on the other.
 
 import { Matrix4, Vector3 } from "./three/three.module.min.js";
-import { ask, askJson, element, say } from "./ask.js";
+import { ask, askJson, copy, download, element, say } from "./ask.js";
 import { Edits } from "./edits.js";
 import { Orbit } from "./orbit.js";
 import { Pictures } from "./pictures.js";
@@ -83,18 +83,24 @@ function describe(facts) {
 async function save() {
   const form = byId("form").value;
   byId("exported").textContent = "Writing …";
+  await pictures.rest();
   try {
     const answer = await ask("api/export", { form, edits: edits.told });
     const blob = await answer.blob();
-    const link = element("a", { href: URL.createObjectURL(blob), download: `scene${form}` });
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+    saveAs(`scene${form}`, blob);
     const lost = answer.headers.get("X-Lost");
     byId("exported").textContent = `Saved scene${form}, ${(blob.size / 1e3).toFixed(0)} kB`
       + (lost ? `; it cannot hold ${lost}.` : ".");
   } catch (error) {
     byId("exported").textContent = error.message;
   }
+  pictures.resume();
+}
+
+function saveAs(name, blob) {
+  const url = URL.createObjectURL(blob);
+  download(name, url);
+  setTimeout(() => URL.revokeObjectURL(url), 60000);
 }
 
 function listen() {
@@ -109,6 +115,11 @@ function listen() {
   byId("all").addEventListener("change", () => pictures.resume());
   byId("error").addEventListener("change", () => pictures.show());
   byId("export").addEventListener("click", save);
+  byId("save-picture").addEventListener("click", () => download("view.png", byId("picture").src));
+  byId("save-camera").addEventListener("click", () => {
+    saveAs("camera.json", new Blob([pictures.told.get(pictures.engine).camera]));
+  });
+  byId("copy").addEventListener("click", () => copy(byId("command"), byId("copy")));
   let pressed = [0, 0];
   canvas.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; });
   canvas.addEventListener("click", (event) => {

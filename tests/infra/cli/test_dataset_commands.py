@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 
 from infra.cli.assets_next import generate_from_meshes
+from infra.cli.extending import extended
 from infra.repair import repair
 from infra.run_record import is_run, run_facts
 from storage.dataset.asked import write_asked
 from storage.dataset.dataset import open_dataset
+from storage.dataset.manifest import write_manifest
 from storage.dataset.scene_logs import log_scene
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.sample import PartFloor
 from tests.command_line import trilight
+from tests.extensions_kit import room_for_extensions, written
 from tests.for_each import case
 from tests.infra.run_by_hand import write_run
 from tests.pipeline.documents.dataset_by_hand import (
@@ -200,6 +203,27 @@ def test_words_that_do_not_print_are_not_repeated(tmp_path: Path) -> None:
         shown = trilight(["verify", str(tmp_path)], env=WIDE).output
         assert "Next:" not in shown
         assert "run the trilight generate command that began it" in shown
+
+
+def test_what_comes_next_names_the_extensions_that_a_dataset_was_made_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where this user has loaded them; no file that somebody else's manifest names."""
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    own, place = written(tmp_path, "VALUE = 7\n"), tmp_path / "set"
+    publication = begin_tiny(place, 12)
+    write_asked(publication.folder, ["generate", "smoke"])
+    recorded = {"own.py": sha256_hex(own.read_bytes()), "b.py": "0" * 64, "c.py": "../x"}
+    manifest = dataclasses.replace(publication.manifest, extensions=recorded)
+    write_manifest(publication.folder.manifest, manifest)
+    commands = [[name, str(place)] for name in ("status", "verify")]
+    begun = f"Next: trilight generate smoke --out {place}"
+    for shown in (trilight(words, env=WIDE).output for words in commands):
+        assert begun in shown and "--extend" not in shown
+    with room_for_extensions():
+        extended(["--extend", str(own)])
+    for shown in (trilight(words, env=WIDE).output for words in commands):
+        assert f"{begun} --extend {own}\n" in shown
 
 
 def test_status_says_how_far_and_what_next(tmp_path: Path) -> None:

@@ -6,10 +6,12 @@ import re
 import subprocess
 import sys
 import textwrap
+import zipfile
 from pathlib import Path
 
 import pytest
 
+from infra.setup.build_backend import build_editable
 from infra.setup.wheel_tree import CHECKOUT_ONLY, FACE, PACKAGES, with_prefix, write_wheel_tree
 from tests.conftest import ROOT
 from tests.for_each import case
@@ -137,3 +139,27 @@ def test_a_program_keeps_its_own_model_train_and_storage(tree: Path, tmp_path: P
             check=False,
         )
         assert ran.returncode == 0, ran.stderr
+
+
+@pytest.mark.filterwarnings("ignore::Warning")
+def test_beside_a_clone_our_package_is_found_and_not_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder without `__init__.py` hides what an import hook finds, and not what is on a path."""
+    clone, site = tmp_path / "trilight", tmp_path / "site"
+    (clone / "trilight").mkdir(parents=True)
+    (clone / "trilight" / "__init__.py").write_text("NAME = 'ours'\n")
+    project = (
+        "[project]\nname = 'trilight'\nversion = '1'\n[tool.setuptools]\npackages = ['trilight']"
+    )
+    (clone / "pyproject.toml").write_text(project)
+    site.mkdir()
+    monkeypatch.chdir(clone)
+    monkeypatch.setattr("sys.argv", ["setup.py"])
+    with zipfile.ZipFile(site / build_editable(str(site))) as wheel:
+        wheel.extractall(site)
+    script = tmp_path / "mine.py"
+    script.write_text(
+        f"import site; site.addsitedir({str(site)!r}); import trilight; trilight.NAME"
+    )
+    subprocess.run([sys.executable, "-S", "-E", str(script)], check=True, cwd=tmp_path)

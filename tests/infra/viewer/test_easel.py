@@ -1,10 +1,11 @@
 """One picture at a time, changes of its scene, and what a browser is given of it."""
 
+import dataclasses
 import io
 import json
 import struct
 import threading
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,7 +14,14 @@ from PIL import Image
 from infra.viewer import scene_bytes as module
 from infra.viewer.easel import Easel, Job, agreement_db
 from infra.viewer.edits import edited
-from infra.viewer.painters import Painted, Painter, Show, TargetPainter
+from infra.viewer.painters import (
+    NetworkPainter,
+    Painted,
+    Painter,
+    SamplesPainter,
+    Show,
+    TargetPainter,
+)
 from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
 from infra.viewer.scene_room import SceneRoom
 from infra.viewer.wanted import Wanted, wanted_of
@@ -317,3 +325,33 @@ def test_what_a_browser_cannot_draw_is_said(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(module, "MOST_GROUPS", 1)
     with pytest.raises(TrilightError, match="2 parts"):
         scene_bytes(tiny_scene())
+
+
+def test_the_page_shows_the_command_of_each_way() -> None:
+    """Of changes, that of the scene which is saved; of a free camera, that of the saved one."""
+    ways: dict[str, Painter] = {
+        "traced": GreyPainter(0.5),
+        "hits": NetworkPainter("a b.safetensors", "", ""),
+        "samples-4": SamplesPainter(cast(Any, None), 0, 4),
+    }
+    room = dataclasses.replace(room_of(ways), source="a set/x.tar::000000001")
+
+    def command(engine: str, **changes: Any) -> str:
+        job = Job(id="1", wanted=wanted(engine, **changes))
+        told = room._repeated(job)
+        assert json.loads(told["camera"])["cameras"][0]["fov"] == 45
+        return str(told["command"]).removeprefix("trilight render ")
+
+    traced = "--view 0 --out view.exr --resolution 16 --noise-floor 45"
+    assert command("traced") == f"'a set/x.tar::000000001' {traced}"
+    assert command("traced", edits={"lamps": {}}) == f"scene.safetensors {traced}"
+    free = "--cameras camera.json --out view --resolution 16"
+    network = "--engine neural --checkpoint 'a b.safetensors'"
+    assert command("hits", view=None) == f"'a set/x.tar::000000001' {free} {network}"
+    assert command("samples-4").endswith("--resolution 16 --spp 4")
+
+
+def test_only_forms_of_one_file_are_offered() -> None:
+    textured = dataclasses.replace(room_of({}), scene=textured_scene())
+    offered = [room._is_offered(".usda") for room in (room_of({}), textured)]
+    assert offered == [True, False] and textured._is_offered(".usdz")

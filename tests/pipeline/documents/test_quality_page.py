@@ -38,8 +38,10 @@ from pipeline.documents.html import (
     table,
 )
 from pipeline.documents.quality_page import Pair, encode_quality_page
+from storage.conventions import preview_gain, preview_srgb8
 from storage.records.asset import AssetRow
 from storage.records.objects import Failure
+from storage.records.skin import OwnMaterials
 from tests.pipeline.documents.dataset_by_hand import furnished, sample
 from tests.pipeline.documents.pages_read import HARM, Tags, read, text_of
 from tests.pipeline.documents.rows_by_hand import row
@@ -71,6 +73,21 @@ def test_text_from_outside_stays_text() -> None:
     assert not any(name.startswith("on") for name in tags.names)
     # uid in picture and table, licence in summary and table, item and message of the failure
     assert "".join(tags.text).count(HARM) == 6
+
+
+def test_whose_materials_an_object_has_is_told_where_it_was_asked() -> None:
+    lost = row("a", materials=OwnMaterials(reason="texture_missing"))
+    for rows, told in (([lost, row("b")], "drawn: texture_missing"), ([row("b")], "")):
+        text = "".join(quality_page(rows, []).text)
+        assert told in text and ("materials" in text) == bool(told)
+
+
+def test_a_scene_is_shown_so_dark_that_few_pixels_are_white() -> None:
+    """Most are shown as they are."""
+    pictures = np.random.default_rng(0).uniform(0, 1, (2, 16, 16, 3)).astype(np.float32)
+    assert preview_gain(pictures) == 1
+    shown = preview_srgb8(50 * pictures * preview_gain(50 * pictures))
+    assert 0 < (shown == 255).any(axis=-1).mean() < 0.1 and np.median(shown) > 60
 
 
 def test_nothing_is_loaded_from_elsewhere() -> None:

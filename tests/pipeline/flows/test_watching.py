@@ -21,6 +21,7 @@ from pipeline.flows.array_flow import make_by_array
 from pipeline.flows.prefect_runner import PrefectRunner
 from pipeline.flows.watching import Watched, report_url, small_picture, usd_per_core_hour
 from pipeline.making.dataset_order import DatasetOrder
+from pipeline.making.publication import Done
 from pipeline.making.run import TaskOutcome
 from storage.errors import TrilightError
 from tests.for_each import for_each
@@ -131,6 +132,24 @@ def test_a_page_shows_the_scenes_and_where_their_report_is(
         assert (kind, shown.format, shown.size) == (
             "data:image/jpeg;base64", "JPEG", (1024, 683)
         )  # fmt: skip
+
+
+def test_the_page_ends_with_how_far_everything_is(
+    tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watching.time, "monotonic", lambda: 0.0)
+    watched = Watched(DatasetOrder(out=str(tmp_path)))
+    done = Done(shards=1, scenes=4, shards_asked=2, scenes_asked=8)
+    publication = SimpleNamespace(done=done, manifest=SimpleNamespace(num_views=2))
+    run: Any = SimpleNamespace(publication=publication)
+    watched.task_done(run, _task(4, 1.0))
+    publication.done = Done(shards=2, scenes=8, shards_asked=2, scenes_asked=8, given_up=1)
+    watched.task_done(run, _task(4, 1.0))  # too soon for another table
+    outcome: Any = SimpleNamespace(num_shards=2, num_shards_planned=2, digest="d", statistics=None)
+    watched.finished(outcome)
+    assert [key for key, _ in tables] == ["progress", "progress", "summary"]
+    shown = [(rows["shards"], rows["scenes in shards"]) for _, rows in tables[:2]]
+    assert shown == [("1 of 2", "4 of 8"), ("2 of 2", "7 of 8")]
 
 
 def test_a_run_that_fails_says_so_in_its_summary(

@@ -12,6 +12,7 @@ from infra.repair import repair
 from pipeline.builds.named import BUILDS, named_build, typed_build
 from pipeline.exchange.reader import file_child
 from pipeline.executors.threads import ThreadRunner
+from pipeline.isolation import call_with_retries
 from pipeline.making.begin_publication import begin
 from pipeline.making.bucket_publication import joined
 from pipeline.making.dataset_order import DatasetOrder
@@ -24,6 +25,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest, write_manifest
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
+from storage.extensions import load_extension, mistake_in_extension
 from storage.removed import removal_message
 from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions, written
 from tests.for_each import for_each
@@ -93,6 +95,53 @@ def test_children_know_what_is_registered() -> None:
             child.retire()
     finally:
         child.close()
+
+
+BUG = """
+from trilight.extend import Sector, Template
+
+def sector(high=60):
+    return Sector(azimuth_deg=0, half_width_deg=9, elevation_deg=(3, high))
+
+def parts_of(name):
+    return {}[name]
+"""
+"""An extension with a bug in what is called later."""
+
+
+def test_a_bug_in_an_extension_is_its_authors_and_stops_at_once(tmp_path: Path) -> None:
+    """In a child too: it is neither tried again nor taken for a failure of the environment."""
+    child = file_child()
+    with room_for_extensions():
+        bug = load_extension(written(tmp_path, BUG)).module.parts_of
+        said = r"^extension own\.py, line 8: KeyError: 'floor'\.$"
+        with pytest.raises(TrilightError, match=said):
+            call_with_retries(child, bug, "floor")
+        child.close()
+        with pytest.raises(KeyError) as caught:
+            bug("floor")
+        assert re.match(said, str(mistake_in_extension(caught.value)))
+    with pytest.raises(ZeroDivisionError) as other:
+        divmod(1, 0)
+    assert mistake_in_extension(other.value) is None
+
+
+@for_each(
+    ("changed", "said"),
+    [
+        ('parts=("floor", "wall9")', "('floor', 'wall9'); expected floor first, then any of floor"),
+        ('parts=("wall0", "floor")', "('wall0', 'floor'); expected floor first"),
+        ('parts=("floor", "wall0", "wall0")', "'wall0'); expected floor first"),
+        ('parts=("floor",), lights=sector(99)', "elevation_deg is (3, 99); expected two from -90"),
+    ],
+)
+def test_a_template_is_checked_when_it_is_made(tmp_path: Path, changed: str, said: str) -> None:
+    text = f"Template(**dict(name='t', cameras=sector(), lights=sector()) | dict({changed}))"
+    with (
+        room_for_extensions(),
+        pytest.raises(TrilightError, match=rf"^extension own\.py, line \d+: .*{re.escape(said)}"),
+    ):
+        load_extension(written(tmp_path, f"{BUG}\n{text}\n"))
 
 
 @for_each("extended", [{}, {"trap.py": "0" * 64}])

@@ -211,6 +211,12 @@ def test_the_command_prints_json_and_nothing_else(few: Path, tmp_path: Path) -> 
     assert (out / "quality.html").exists()
 
 
+def test_where_nothing_can_be_used_the_command_says_so(few: Path, tmp_path: Path) -> None:
+    result = trilight(["assets", str(few / "bad"), "--out", str(tmp_path / "out")])
+    assert result.exit_code == 1 and "No object can be used" in result.stdout
+    assert "Next:" not in result.stdout
+
+
 @pytest.mark.slow("kills")
 def test_the_command_for_people(few: Path, tmp_path: Path) -> None:
     """Epsilon as a share in percent; the table names what was refused."""

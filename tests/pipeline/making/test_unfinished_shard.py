@@ -28,12 +28,13 @@ from storage import claims
 from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry, index_shard
+from storage.dataset.progress import read_progress, read_status
 from storage.dataset.shard import write_shard
 from storage.dataset.shard_notes import ShardNote, note_shard, noted_shard
 from storage.dataset.staging import is_staged, read_staged_scene, stage_scene
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
-from storage.records.objects import Failure
+from storage.records.objects import Failure, read_failures
 from storage.records.sample import sample_key
 from tests.pipeline.making.test_publication import _build, _sample, begin_tiny, make_tiny_shard
 from tests.pipeline.making.tiny_scenes_kit import shard_job
@@ -299,8 +300,32 @@ def test_a_rerun_does_not_escape_the_failure_budget(
         stage_scene(folder.staged_shard(NAME), scene, None, [failure], "lossless")
     run.publication.add_shard(pack_shard(folder, NAME, range(4)))
     monkeypatch.setattr(pipeline, "_begun", lambda order: contextlib.nullcontext(run))
-    with pytest.raises(TrilightError, match="4 of 4 scenes could not be made"):
+    with pytest.raises(TrilightError, match=r"4 of 4 .*The reasons are in failures\.jsonl"):
         make_dataset(run.order, Idle())
+    assert [row.item for row in read_failures(folder.failures)] == [*map(sample_key, range(4))]
+
+
+def test_scenes_that_are_given_up_are_not_counted_as_made(tmp_path: Path) -> None:
+    """While they wait, in a shard that is not listed, and in a finished dataset."""
+    run = _run(tmp_path, 4)
+    folder = run.publication.folder
+    shard = UnfinishedShard(folder, run.settings.splits, 0)
+    for scene in range(4):
+        made = _sample(scene) if scene else None
+        shard.stage(scene, made, [], "lossless", began=0.0, cores=1)
+    shard.stage(0, None, [], "lossless", began=0.0, cores=1)  # again, after a kill
+
+    def counts() -> set[tuple[int, int, int]]:
+        shown = read_progress(folder), read_status(str(folder.root))
+        return {(now.scenes_done, now.scenes_given_up, now.scenes_planned) for now in shown}
+
+    assert counts() == {(3, 1, 4)}
+    packed = shard.pack()
+    assert packed is not None
+    run.publication.add_shard(packed)
+    assert counts() == {(3, 1, 4)}
+    run.publication.finish()
+    assert counts() == {(3, 1, 4)}
 
 
 def test_only_children_that_nobody_uses_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:

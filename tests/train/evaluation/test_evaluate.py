@@ -3,12 +3,15 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import flip_evaluator
 import numpy as np
 import pytest
 from PIL import Image
 
+from infra import judging
 from infra.judging import _num_scenes, plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
@@ -37,6 +40,7 @@ from train.evaluation.evaluate import (
 from train.evaluation.judge import judged_scene, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, by_group, facts_of, summary
 from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
+from train.evaluation.order import EvaluationOrder
 from train.evaluation.published import BENCHMARK
 from train.evaluation.report import markdown, record
 from train.evaluation.rivals import MEDIAN, NEAREST, Rivals, median_picture
@@ -252,6 +256,33 @@ def test_as_many_scenes_are_announced_as_are_judged(dataset: Dataset) -> None:
     for most in (1, 3, 4, 99):  # of five scenes in two shards
         some = dataclasses.replace(every, most_scenes=most)
         assert _num_scenes(some) == len(list(some.samples())) == min(most, 5)
+
+
+def test_no_report_takes_the_place_of_another_networks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And that of a run is beside it."""
+    monkeypatch.setattr(judging, "markdown", str)
+    for name in ("worst_and_median", "worst_of_each_excursion", "sheet_views"):
+        monkeypatch.setattr(judging, name, lambda *more: {})
+
+    def written(digest: str) -> str:
+        about, idle = {"network sha256": digest}, SimpleNamespace(traced=None)
+        told: Any = SimpleNamespace(record={"about": about}, views=(), contest=idle)
+        return judging.write_judgement(told, tmp_path / "evaluation").name
+
+    assert [*map(written, "aba")] == ["evaluation", "evaluation-2", "evaluation"]
+    (tmp_path / "evaluation-2" / "evaluation.json").write_text("[" * 9)
+    assert written("b") == "evaluation-3"
+    run = tmp_path / "runs" / "mine"
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "settings.json").touch()
+    places = [
+        EvaluationOrder(checkpoint=str(checkpoint), data=("d",)).place
+        for checkpoint in (run, run / "model.safetensors", run / "checkpoints/9.safetensors")
+    ]
+    assert places == [run / "evaluation"] * 3
+    assert EvaluationOrder(checkpoint="builtin:", data=("d",)).place == Path("evaluation")
 
 
 def test_facts_come_from_the_scene() -> None:
