@@ -244,6 +244,8 @@ def test_what_is_lost_is_said_once(tmp_path: Path) -> None:
     )  # fmt: skip
     assert any("normal map" in note for note in files.notes)
     assert not any("cannot hold textures" in note for note in files.notes)
+    pictures = sorted(tmp_path.glob("texture-*.png"))
+    assert pictures and files.files == (tmp_path / "a.usda", *pictures)
 
 
 def test_a_missing_picture_leaves_the_factor(tmp_path: Path) -> None:
