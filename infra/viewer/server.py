@@ -28,9 +28,6 @@ _MOST_AWAITED = 64
 _STALLED_S = 30.0
 """A browser that takes nothing for so long is left."""
 
-_MOST_DIGITS = 300
-"""Digits of the longest whole number in a request."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
@@ -216,10 +213,9 @@ class _Handler(BaseHTTPRequestHandler):
 
 def _parse_body(data: bytes) -> Any:
     """Return the JSON of a request; raises TrilightError for anything else, NaN and infinities."""
+    parsers = dict.fromkeys(("parse_float", "parse_int", "parse_constant"), _parse_number)
     try:
-        return json.loads(
-            data, parse_float=_parse_number, parse_constant=_parse_number, parse_int=_parse_whole
-        )
+        return json.loads(data, **parsers)  # type: ignore[arg-type]
     except (ValueError, RecursionError) as error:
         raise TrilightError("the request is no JSON with finite numbers.") from error
 
@@ -228,10 +224,4 @@ def _parse_number(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(text)
-    return value
-
-
-def _parse_whole(text: str) -> int:
-    if len(text) > _MOST_DIGITS:  # beyond what a float holds
-        raise ValueError(text)
-    return int(text)
+    return int(text) if text.removeprefix("-").isdecimal() else value
