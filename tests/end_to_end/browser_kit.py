@@ -102,6 +102,13 @@ class Browser:
             assert time.monotonic() < deadline, (condition, self.run("document.body.innerText"))
             time.sleep(0.2)
 
+    def until_file(self, path: Path) -> None:
+        """Wait until a file is saved."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not path.exists():
+            assert time.monotonic() < deadline, path
+            time.sleep(0.1)
+
     def _holds(self, condition: str) -> bool:
         try:
             return bool(self.run(f"Boolean({condition})"))
