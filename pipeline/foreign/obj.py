@@ -46,8 +46,6 @@ def read_obj(data: bytes) -> FileMesh:
     numbers = _Numbers(lines, kinds)
     points, width = numbers.read_rows(_V, 3)
     unread = _name_others(lines, np.flatnonzero(kinds == _OTHER))
-    if points.shape[1] > 3 and (points[width == 4, 3] != 1).any():
-        unread["weights of vertices"] = 1
     faces = np.flatnonzero(kinds == _F)
     counts = lines.counts[faces] - 1
     if few := int((counts < 3).sum()):
@@ -70,9 +68,7 @@ def read_obj(data: bytes) -> FileMesh:
     if (used >= len(places)).any() or (used < -1).any():
         unread["texture coordinates that the file does not hold"] = 1
         used = np.where((used < 0) | (used >= len(places)), -1, used)
-    colors = _decode_colors(points, width, unread)
-    if colors is None:
-        colors = _read_polypaint(text, len(points))
+    colors = _decode_colors(text, points, width, unread)
     return FileMesh(
         mesh=TriangleMesh(positions=points[chosen[first, 0], :3], faces=vertex.reshape(-1, 3)),
         material=material[polygon],
@@ -218,15 +214,17 @@ def _read_materials(
 
 
 def _decode_colors(
-    points: NDArray[np.float64], width: NDArray[np.int64], unread: Counter[str]
+    text: bytes, points: NDArray[np.float64], width: NDArray[np.int64], unread: Counter[str]
 ) -> NDArray[np.float64] | None:
     """Return the linear colors [V, 3] of vertices, white where one has none.
 
     Of four numbers more, the last one is alpha, or else the first one a weight of 1.
     """
     has, wide = (width == 6) | (width == 7), points[width == 7, 3:7]
+    if points.shape[1] > 3 and (points[width == 4, 3] != 1).any():
+        unread["weights of vertices"] = 1
     if not has.any():
-        return None
+        return _read_polypaint(text, len(points))
     is_weighted = len(wide) and (wide[:, 0] == 1).all() and (wide[:, 3] != 1).any()
     if len(wide) and not is_weighted and (wide[:, 3] != 1).any():
         unread["transparency of colors"] = 1

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.scene_files import build_scene
+from pipeline.foreign.gltf.container import data_uri_bytes, local_path
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import FileMesh
@@ -333,3 +334,11 @@ def test_json_scenes_of_public_reports(shared: Path, name: str) -> None:
     corners = built.vertex_positions[built.faces[built.object_index == 0]].astype(np.float64)
     vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert np.linalg.norm(vectors, axis=1).sum() / 2 == pytest.approx(1.2, rel=1e-5)
+
+
+def test_buffers_are_found_in_any_case_and_in_both_base64s(tmp_path: Path) -> None:
+    (tmp_path / "My Mesh.bin").write_bytes(b"x")
+    assert local_path("my%20mesh.BIN", tmp_path) == tmp_path.resolve() / "My Mesh.bin"
+    with pytest.raises(Rejected, match="missing_file.*'gone.bin' is not beside"):
+        local_path("gone.bin", tmp_path)
+    assert data_uri_bytes("data:;base64,-_8") == data_uri_bytes("data:;base64,+/8=")

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from pipeline.assets.own.skin import _parts
 from pipeline.exchange.gltf.read import GltfScene, read_gltf
-from pipeline.foreign.gltf.container import data_uri_bytes, local_path
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.material import Seen, columns
@@ -394,11 +393,3 @@ def test_targets_shape_a_mesh_by_its_weights(tmp_path: Path) -> None:
 
     path = plain(shape).save(tmp_path, "glb")
     assert load_mesh(read_source(path, KEPT)).positions[:, 1].tolist() == [-2] * 4
-
-
-def test_buffers_are_found_in_any_case_and_in_both_base64s(tmp_path: Path) -> None:
-    (tmp_path / "My Mesh.bin").write_bytes(b"x")
-    assert local_path("my%20mesh.BIN", tmp_path) == tmp_path.resolve() / "My Mesh.bin"
-    with pytest.raises(Rejected, match="missing_file.*'gone.bin' is not beside"):
-        local_path("gone.bin", tmp_path)
-    assert data_uri_bytes("data:;base64,-_8") == data_uri_bytes("data:;base64,+/8=")
