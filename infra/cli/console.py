@@ -98,7 +98,7 @@ def duration(seconds: float) -> str:
     for unit, size_s in (("hours", 3600), ("minutes", 60)):
         if seconds >= size_s:
             return f"{seconds / size_s:,.1f} {unit}"
-    return f"{seconds:.0f} seconds"
+    return f"{seconds:.0f} s"
 
 
 def note(text: str) -> None:

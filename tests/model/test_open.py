@@ -175,7 +175,7 @@ def _no_route(*words: Any, **named: Any) -> None:
 
 
 def test_a_name_that_is_plainly_a_path_asks_no_hub(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    _stand_in_hub(monkeypatch, pytest.fail, pytest.fail)
     for name in ("runs/nosuch", "mine/model.safetensors"):
         with pytest.raises(TrilightError, match=f"checkpoint {name}: no such file or folder"):
             find_network(name)

@@ -299,10 +299,12 @@ def test_a_rerun_does_not_escape_the_failure_budget(
         failure = Failure(stage="scenes", item=sample_key(scene), reason="no", message="x")
         stage_scene(folder.staged_shard(NAME), scene, None, [failure], "lossless")
     run.publication.add_shard(pack_shard(folder, NAME, range(4)))
-    monkeypatch.setattr(pipeline, "_begun", lambda order: contextlib.nullcontext(run))
     with pytest.raises(TrilightError, match=r"4 of 4 .*The reasons are in failures\.jsonl"):
-        make_dataset(run.order, Idle())
+        run.require_within_budget()  # while it is made
     assert [row.item for row in read_failures(folder.failures)] == [*map(sample_key, range(4))]
+    monkeypatch.setattr(pipeline, "_begun", lambda order: contextlib.nullcontext(run))
+    with pytest.raises(TrilightError, match="4 of 4 scenes could not be made"):
+        make_dataset(run.order, Idle())
 
 
 def test_scenes_that_are_given_up_are_not_counted_as_made(tmp_path: Path) -> None:
