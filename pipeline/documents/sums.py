@@ -14,7 +14,7 @@ from storage.errors import TrilightError
 
 SUMS = "SHA256SUMS"
 
-UNPUBLISHED = ("logs/*", ".staging/*", ".cache/*", "*.part", "*.tmp")
+UNPUBLISHED = ("logs/*", ".staging/*", ".cache/*", "*.claim", "*.part", "*.tmp")
 """Never published: how the files came to be, and what is not finished."""
 
 _SHARD = ".tar"

@@ -163,7 +163,7 @@ def test_a_cache_that_cannot_be_written_is_named(
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "file"))
-    with pytest.raises(TrilightError, match="cannot write"):
+    with pytest.raises(TrilightError, match="is no folder; expected one"):
         read(server.url)
 
 
