@@ -11,24 +11,23 @@ from storage.settings.described import from_record
 def planned_shards(manifest: Manifest) -> dict[str, int]:
     """Return the names of the shards of the finished dataset, with their numbers of scenes.
 
-    Of a shard that is listed, that is how many it holds.
-
     Raises:
         TrilightError: the settings in the manifest do not say how the dataset is divided.
     """
     if derivation_of(manifest.settings):  # it only ever appears whole
         return {entry.name: entry.num_samples for entry in manifest.shards}
     splits = cut_splits(manifest.num_scenes, _splits(manifest))
-    planned = {
+    return {
         shard_name(index, splits): len(scenes_of_shard(index, splits))
         for index in range(shards_for(manifest.num_scenes, splits))
     }
-    held = {
-        entry.name: entry.num_samples
-        for entry in manifest.shards
-        if entry.name not in manifest.growing
-    }
-    return {name: held.get(name, count) for name, count in planned.items()}
+
+
+def expected_scenes(manifest: Manifest) -> dict[str, int]:
+    """Return `planned_shards`, less the scenes that were given up in the shards that are listed."""
+    listed = {entry.name: entry.num_samples for entry in manifest.shards}
+    grown = {name: count for name, count in listed.items() if name not in manifest.growing}
+    return {name: grown.get(name, count) for name, count in planned_shards(manifest).items()}
 
 
 def planned_scenes_of(manifest: Manifest, shard: ShardEntry) -> int | None:

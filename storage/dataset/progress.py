@@ -18,7 +18,7 @@ from storage.dataset.asked import read_asked
 from storage.dataset.dataset import Dataset, LocalFiles, open_listed
 from storage.dataset.layout import DatasetFolder, numbered, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
-from storage.dataset.planned import is_whole, planned_shards
+from storage.dataset.planned import expected_scenes, is_whole, planned_shards
 from storage.dataset.scene_logs import (
     LookedAt,
     SceneLog,
@@ -114,12 +114,12 @@ def read_progress(folder: DatasetFolder) -> Progress:
     """Count files; cheap enough to be called twice a second: a manifest is read when it changes."""
     try:
         facts = folder.manifest.stat()
-        scenes_planned, num_views, planned = _plan_of(
-            folder.manifest, facts.st_mtime_ns, facts.st_size
-        )
+        manifest, expected = _plan_of(folder.manifest, facts.st_mtime_ns, facts.st_size)
+        scenes_planned, num_views = manifest.num_scenes, manifest.num_views
         given_up = _scenes_given_up(folder)
-        scenes_done = num_scenes_done(folder, planned) - given_up
-        given_up += max(scenes_planned - sum(planned.values()), 0)
+        packed = {name: each for name, each in expected.items() if name not in manifest.growing}
+        scenes_done = num_scenes_done(folder, packed) - given_up
+        given_up += max(scenes_planned - sum(expected.values()), 0)
     except (TrilightError, OSError):
         scenes_planned = num_views = scenes_done = given_up = 0
     plan, downloads = folder.staged_plan, folder.staged_downloads
@@ -151,13 +151,10 @@ def _views_at_work(folder: DatasetFolder) -> float:
 
 
 @functools.lru_cache(maxsize=4)
-def _plan_of(manifest: Path, mtime_ns: int, num_bytes: int) -> tuple[int, int, Mapping[str, int]]:
-    """Return scenes, views of each, and shards of a manifest, known by the time and size of it."""
-    found = read_manifest(manifest)
-    packed = {
-        name: each for name, each in planned_shards(found).items() if name not in found.growing
-    }
-    return found.num_scenes, found.num_views, packed
+def _plan_of(path: Path, mtime_ns: int, num_bytes: int) -> tuple[Manifest, Mapping[str, int]]:
+    """Return a manifest and its expected scenes, known by the time and size of its file."""
+    manifest = read_manifest(path)
+    return manifest, expected_scenes(manifest)
 
 
 def shards_there(folder: DatasetFolder) -> set[str]:
@@ -215,7 +212,7 @@ def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
 
     Args:
         folder: of the dataset.
-        planned: what `planned_shards` says of it, without those that grow.
+        planned: its expected scenes, without the shards that grow.
     """
     there = shards_there(folder) & planned.keys()
     return sum(planned[name] for name in there) + _num_waiting(folder)
@@ -290,7 +287,7 @@ def read_status(url: str) -> DatasetStatus:
     dataset = open_listed(url)
     manifest = dataset.manifest
     local = DatasetFolder(dataset.files.root) if isinstance(dataset.files, LocalFiles) else None
-    planned = planned_shards(manifest)
+    planned = expected_scenes(manifest)
     names = _finished_names(dataset, planned)
     done = sum(planned[name] for name in names) + (_num_waiting(local) if local else 0)
     given_up = _scenes_given_up(local) if local else 0

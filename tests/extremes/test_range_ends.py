@@ -30,7 +30,7 @@ from scene_templates.rooms import SharedRoom
 from scene_templates.settings import SceneSettings, ViewLaws
 from storage.conventions import HALF_FLOAT_MAX
 from storage.dataset.settings import MOST_SCENES, SplitSettings
-from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
+from storage.dataset.splits import MOST_SHARDS, scenes_of_shard, shard_name, shards_for
 from storage.errors import Rejected, TrilightError
 from storage.settings.changes import changed
 from storage.settings.ranges import Declared
@@ -281,12 +281,13 @@ def test_the_strongest_augmentation_leaves_scenes_finite() -> None:
 @pytest.mark.parametrize("per_shard", [1, 1_000_000])
 @pytest.mark.parametrize("per_cycle", [6, 1_000_000])
 def test_shards_at_the_ends_hold_every_scene_once(per_shard: int, per_cycle: int) -> None:
-    """Up to the last of a billion scenes."""
+    """Up to the last of a billion scenes, or of a million shards."""
     splits = SplitSettings(scenes_per_shard=per_shard, shards_per_cycle=per_cycle)
-    count = shards_for(MOST_SCENES, splits)
-    assert scenes_of_shard(count - 1, splits).stop == MOST_SCENES
-    listed = dataclasses.replace(splits, listed_scenes=MOST_SCENES)
-    assert scenes_of_shard(count - 1, listed).stop == MOST_SCENES
+    most = min(MOST_SCENES, MOST_SHARDS * per_shard)
+    count = shards_for(most, splits)
+    assert scenes_of_shard(count - 1, splits).stop == most
+    listed = dataclasses.replace(splits, listed_scenes=most)
+    assert scenes_of_shard(count - 1, listed).stop == most
     names = {shard_name(index, splits).split("-")[0] for index in range(6)}
     assert names == {"train", "validation", "test"}
 
