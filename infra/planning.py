@@ -187,12 +187,17 @@ def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
         if sizes := [
             each.num_bytes / each.num_samples for each in manifest.shards if each.num_samples
         ]:
-            said = f", about {_total(sizes, scenes / 1e9).value:,.3f} GB{said}"
+            said = f", about {_total(sizes, scenes / 1e6).value:,.1f} MB{said}"
     shards, lacking = shards_for(scenes, settings.splits), lacks_validation(scenes, settings.splits)
-    noun, lacking = "shard" if shards == 1 else "shards", f" ({lacking})" if lacking else ""
+    lacking = f" ({lacking})" if lacking else ""
     part = f", of which this run makes {order.shards}" if order.shards else ""
     views = f"{settings.scenes.num_views} views each"
-    return f"{scenes} scenes of {views} in {shards} {noun}{lacking}{part}{said}"
+    counts = f"{_counted(scenes, 'scene')} of {views} in {_counted(shards, 'shard')}"
+    return f"{counts}{lacking}{part}{said}"
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def _notes(found: Prediction) -> Iterator[str]:

@@ -73,7 +73,7 @@ class Run:
             notes = frozen_note(self.order.build, statistics)
             splits, num_scenes = self.settings.splits, publication.manifest.num_scenes
             if lacking := lacks_validation(num_scenes, splits):
-                notes += (f"of its shards there is {lacking}",)
+                notes += (lacking,)
         return Outcome(
             digest=finished.dataset_digest if finished else "",
             num_objects_found=self.accepted.num_found,

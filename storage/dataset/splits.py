@@ -105,7 +105,7 @@ def lacks_validation(num_scenes: int, settings: "SplitSettings") -> str:
     if settings.one_split or settings.listed_shards or settings.listed_scenes is not None:
         return ""
     least = VALIDATION_SLOT * settings.scenes_per_shard + 1
-    return "" if num_scenes >= least else f"none for validation before --scenes {least}"
+    return "" if num_scenes >= least else f"no shard is for validation before --scenes {least}"
 
 
 def require_objects(num_by_split: Mapping[str, int], needed: set[str]) -> None:

@@ -113,10 +113,12 @@ def test_what_a_run_will_make_is_said_before_it_begins(
 ) -> None:
     without_rendering(monkeypatch)
     order, folder = tiny_order(out=str(tmp_path), scenes=3), DatasetFolder(tmp_path)
-    lacking = "1 shard (none for validation before --scenes 9)"
+    lacking = "no shard is for validation before --scenes 9"
     unknown = "how long that takes is known after the first scenes"
-    assert describe_run(order, folder) == f"3 scenes of 2 views each in {lacking}; {unknown}"
-    assert f"of its shards there is {lacking[9:-1]}" in make_dataset(order, ThreadRunner()).notes
+    assert (
+        describe_run(order, folder) == f"3 scenes of 2 views each in 1 shard ({lacking}); {unknown}"
+    )
+    assert lacking in make_dataset(order, ThreadRunner()).notes
     said = describe_run(dataclasses.replace(order, scenes=9, shards="1:3"), folder)
     assert said.startswith("9 scenes of 2 views each in 3 shards, of which this run makes 1:3")
     assert "; 6 of them are still to make: 0.0 (0.0 to 0.0) minutes on" in said
