@@ -193,8 +193,8 @@ def reading(dataset: str, shard: str) -> Iterator[None]:
             else f"not as expected ({type(error).__name__})"
         )
         raise TrilightError(
-            f"{shard}: {why.rstrip('.')}. The shard is damaged; run `trilight verify "
-            f"{shlex.quote(dataset)} --repair`."
+            f"{shard}: {why.rstrip('.')}. The shard is damaged; `trilight verify "
+            f"{shlex.quote(dataset)}` says how to repair it."
         ) from error
 
 

@@ -82,6 +82,15 @@ def test_a_read_only_dataset_is_summed_up(tmp_path: Path, monkeypatch: pytest.Mo
     assert not (tmp_path / "report.html").exists()
 
 
+def test_damage_of_the_same_length_is_named(tmp_path: Path) -> None:
+    five_scenes(tmp_path)
+    shard = sorted(tmp_path.glob("*.tar"))[0]
+    data = shard.read_bytes()
+    shard.write_bytes(data[:600] + bytes(len(data) - 1200) + data[-600:])
+    ended = trilight(["inspect", str(tmp_path)])
+    assert ended.exit_code == 1 and f"{shard.name}: " in str(ended.exception or ended.output)
+
+
 def test_parts_show_with_their_floors(tmp_path: Path) -> None:
     made = sample(0, furnished(["a"]))
     floors = {
