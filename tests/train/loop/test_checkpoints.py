@@ -313,8 +313,9 @@ def test_nothing_may_be_missing_and_no_bit_may_flip(tmp_path: Path) -> None:
     places = [0, 8, *range(9, end, end // 40), data.index(b"sha256") + 20]
     wrong = [b"", data[:100], data[:-1], b"PK\x03\x04" + data]
     for place in [*places, end, end + 4321, len(data) - 1]:
-        wrong.append(flipped := bytearray(data))
+        flipped = bytearray(data)
         flipped[place] ^= 1 << place % 8
+        wrong.append(bytes(flipped))
     for damaged in wrong:
         path.write_bytes(damaged)
         with pytest.raises(TrilightError, match=f"checkpoint {path} is not readable"):
