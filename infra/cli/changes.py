@@ -111,11 +111,12 @@ def run_record(shared: Shared) -> dict[str, Any]:
     """
     if shared.like is None:
         return {}
+    from storage.records.safe_read import read_plain
     from train.stored_settings import known_settings  # it brings the checker of settings along
 
     path = Path(shared.like) / "settings.json"
     try:
-        settings = dict(read_json(path.read_bytes(), dict[str, Any], str(path))["settings"])
+        settings = dict(read_json(read_plain(path), dict[str, Any], str(path))["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrilightError(
             f"--like {shared.like}: {path} cannot be read; expected the folder of a run."

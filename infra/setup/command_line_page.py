@@ -32,11 +32,6 @@ class Option:
     help: str
     """Sentence, and in brackets range, choices and default."""
 
-    @property
-    def is_switch(self) -> bool:
-        """Whether it takes no value."""
-        return not self.takes
-
 
 @dataclass(frozen=True)
 class Command:

@@ -30,22 +30,22 @@ def read_number(stated: Any, field: str, within: Within = FINITE) -> float:
     return float(stated)
 
 
-def read_numbers(stated: Any, count: int, field: str, within: Within = FINITE) -> tuple[float, ...]:
+def read_numbers(stated: Any, count: int, field: str) -> tuple[float, ...]:
     """Return so many numbers; raises Malformed as `read_number`, or where there are not so many."""
     rows = list(stated) if hasattr(stated, "__len__") else []
     if len(rows) != count:
         raise Malformed(f"{field} has {len(rows)} values; expected {count} numbers")
     names = [field] if count == 1 else [f"{field}[{at}]" for at in range(count)]
-    return tuple(read_number(row, name, within) for name, row in zip(names, rows, strict=True))
+    return tuple(read_number(row, name) for name, row in zip(names, rows, strict=True))
 
 
-def parse_number(word: str, field: str, within: Within = FINITE) -> float:
+def parse_number(word: str, field: str) -> float:
     """Return the number that a word of a text is; raises Malformed as `read_number`."""
     try:
         stated: Any = float(word)
     except ValueError:
         stated = word
-    return read_number(stated, field, within)
+    return read_number(stated, field)
 
 
 def read_count(row: Mapping[str, Any], name: str, default: int | None = None) -> int:

@@ -68,9 +68,9 @@ class SkyTexels:
         below = 1 + sharpness * (1 - dot(self.directions, towards))
         return self.of_unit_flux(1 / (below * below), towards)
 
-    def spot(self, towards: NDArray, radius_rows: float = SPOT_RADIUS) -> Numbers:
+    def spot(self, towards: NDArray) -> Numbers:
         """Return a spot of unit flux [H, 2H], brightest in the middle, 0 beyond its radius."""
-        reach = 1 - float(cosine(min(1.0, radius_rows / self.height) * np.pi))
+        reach = 1 - float(cosine(min(1.0, SPOT_RADIUS / self.height) * np.pi))
         inside = 1 - (1 - dot(self.directions, towards)) / reach
         found = np.maximum(inside, 0)
         return found / self.flux(found)

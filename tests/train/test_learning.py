@@ -40,8 +40,13 @@ from tests.sky_maps import smooth
 from tests.train.fake_card import CARD, card_process, fake_card
 from tests.train.kit import stepper, take, tiny_run, trained
 from tests.train.loss.test_objective import small_weights
-from tests.train.toy import toy_picture, toy_sample, toy_scene, write_toy_dataset
-from train.data.augment import with_views
+from tests.train.toy import (
+    toy_picture,
+    toy_sample,
+    toy_sample_of,
+    toy_scene,
+    write_toy_dataset,
+)
 from train.data.buckets import make_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.evaluate import Contest, judged_views, make_rivals
@@ -91,8 +96,9 @@ def score(state: TrainState, scene: TrainingScene, target: TrainingScene) -> flo
 @pytest.mark.slow("training")
 def test_one_picture_is_learned_by_heart() -> None:
     """64 x 64 pixels, one view; the toy's pictures have no noise."""
-    sample = toy_sample(0, resolution=64)
-    scene = with_views(training_scene(sample, 64), np.array([0]))
+    whole = toy_scene(0)
+    seen = whole.with_cameras(whole.c2w[:1], whole.fov_deg[:1])
+    scene = training_scene(toy_sample_of(seen, 0, 64), 64)
     state = memorised([scene], smoke_model(), steps=1200)
     assert score(state, scene, scene) > 40  # measured: 44.7, highlights and all
 

@@ -160,24 +160,6 @@ def with_vertices_turned(scene: TrainingScene, turn_T: np.ndarray) -> TrainingSc
     return dataclasses.replace(scene, tensors=tensors)
 
 
-def with_views(scene: TrainingScene, views: np.ndarray) -> TrainingScene:
-    """Return the scene seen by some of its cameras."""
-    old = scene.tensors
-    tensors = dataclasses.replace(
-        old,
-        c2w_V44=_tensor(old.c2w_V44.numpy()[views]),
-        fov_deg_V=_tensor(old.fov_deg_V.numpy()[views]),
-    )
-    lights = scene.lights_VLRR3
-    return dataclasses.replace(
-        scene,
-        tensors=tensors,
-        target_VRR3=_tensor(scene.target_VRR3.numpy()[views]),
-        noise_V=_tensor(scene.noise_V.numpy()[views]),
-        lights_VLRR3=None if lights is None else _tensor(lights.numpy()[views]),
-    )
-
-
 def _take_vertices(values_T33: Tensor, order_T3: NDArray[np.int64]) -> Tensor:
     return _tensor(np.take_along_axis(values_T33.numpy(), order_T3[..., None], axis=1))
 

@@ -126,13 +126,6 @@ def windows_from(
         epoch += 1
 
 
-def batches_from(
-    windows: Iterator[ShardWindow], first: int, batch_size: int
-) -> Iterator[tuple[Place, ...]]:
-    """Yield global batches without end; the first begins at position `first`."""
-    return batched(places_from(windows, first), batch_size)
-
-
 def places_from(windows: Iterator[ShardWindow], first: int) -> Iterator[Place]:
     """Yield places without end, from position `first` on."""
     return (place for window in windows for place in window.places if place.position >= first)

@@ -82,13 +82,6 @@ class _Header:
             )
 
 
-def save_checkpoint(
-    path: Path, state: TrainState, settings: TrainSettings, *, data_digest: str, world_size: int
-) -> None:
-    """Write the checkpoint; raises TrilightError where the folder is full or cannot be written."""
-    _write_sealed(path, _encoded(state, settings, data_digest, world_size))
-
-
 def _encoded(
     state: TrainState, settings: TrainSettings, data_digest: str, world_size: int
 ) -> bytes:

@@ -49,7 +49,7 @@ def test_every_option_says_what_it_is_and_its_default() -> None:
                 assert option.help[0].isupper() or ": " in option.help
                 facts = option.help.rpartition(" [")[2]
                 said = "default" in option.help or "required" in facts
-                assert said or option.is_switch, f"{option.names}: {option.help}"
+                assert said or not option.takes, f"{option.names}: {option.help}"
 
 
 def test_no_help_text_is_lost_at_80_columns() -> None:

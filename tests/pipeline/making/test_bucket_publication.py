@@ -16,7 +16,7 @@ from storage.dataset.progress import read_status
 from storage.dataset.staging import is_staged, stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from tests.pipeline.making.bucket_kit import OUT, Killed, Machines, Writes, other_shard
+from tests.pipeline.making.bucket_kit import OUT, Machines, other_shard
 from tests.pipeline.making.test_publication import (
     _build,
     _dataset,
@@ -58,33 +58,6 @@ def test_an_array_is_of_what_a_bucket_lacks(bucket: Any, machines: Machines) -> 
         bucket.rm_file(f"shards/set/.staging/entries/{FIRST}.json")  # as a kill before it leaves it
         assert open_dataset(OUT).manifest.shards == ()
         assert array_job(order, per_task=None, at_once=None).tasks == [0, 1]
-
-
-def test_a_kill_before_any_request_loses_nothing(
-    bucket: Any, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The n-th write of each run never happens; two machines take turns until one gets through."""
-    plain = _dataset(tmp_path / "plain")
-    writes, runs = Writes(monkeypatch), 0
-    while True:
-        writes.left, runs = runs // 2, runs + 1
-        try:
-            with machines.maker("ab"[runs % 2]) as publication:
-                make(publication, 0, 1)
-            break
-        except Killed:
-            there = names(bucket)
-            if "manifest.json" in there:
-                assert verify_dataset(OUT).problems == []
-            for name in there & {FIRST, SECOND}:
-                shard = bucket.cat_file(f"shards/set/{name}")
-                assert shard == plain.folder.shard(name).read_bytes()
-    assert runs > 10  # each run gets at least one write further than the one before
-    assert open_dataset(OUT).digest == plain.manifest.dataset_digest
-    for path in (plain.folder.manifest, plain.folder.failures, plain.folder.objects_lock):
-        assert bucket.cat_file(f"shards/set/{path.name}") == path.read_bytes(), path.name
-    for name in (FIRST, SECOND):
-        assert bucket.cat_file(f"shards/set/{name}") == plain.folder.shard(name).read_bytes()
 
 
 def test_the_first_writer_of_a_shard_wins(bucket: Any, machines: Machines) -> None:

@@ -24,7 +24,7 @@ from storage.dataset.splits import scenes_of_shard, shard_name
 from storage.dataset.staging import is_staged, stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.records.objects import Failure, LockedObject, read_failures
+from storage.records.objects import Failure, LockedObject
 from storage.records.sample import Sample, sample_key
 from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import locked
@@ -88,19 +88,6 @@ def test_the_digest_knows_nothing_of_place_or_order(tmp_path: Path) -> None:
     assert backwards.finish() == backwards.manifest
     assert backwards.manifest.dataset_digest == forwards.dataset_digest
     assert backwards.manifest == forwards
-
-
-def test_growing_keeps_the_shards(tmp_path: Path) -> None:
-    before = _dataset(tmp_path, 4).manifest
-    grown = _dataset(tmp_path, 12).manifest
-    assert grown.shards[0] == before.shards[0]
-    assert len(grown.shards) == 3
-    again = _begin(tmp_path, _build(), 4)  # asking for fewer takes nothing away
-    assert again.manifest == dataclasses.replace(grown, shards=())
-    assert again.finish() == grown
-    found = verify_dataset(tmp_path)
-    assert (found.problems, found.num_samples) == ([], 12)
-    assert len(read_failures(again.folder.failures)) == 12
 
 
 def test_as_many_scenes_are_planned_as_are_asked_for(tmp_path: Path) -> None:

@@ -36,7 +36,6 @@ from train.data.augment import (
     with_channels,
     with_light_scaled,
     with_vertices_turned,
-    with_views,
 )
 from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, _SceneMaker
@@ -63,7 +62,6 @@ SYMMETRIES: dict[str, Symmetry] = {
     "vertices": lambda scene: with_vertices_turned(
         scene, np.arange(scene.tensors.num_triangles) % 3
     ),
-    "views": lambda scene: with_views(scene, np.array([1])),
     "motion": lambda scene: moved(
         scene, rotation_rand("uniform", rng_for(0, "turn")), torch.tensor([3.0, -1.0, 0.5])
     ),

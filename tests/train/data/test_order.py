@@ -29,7 +29,8 @@ from train.data.order import (
     Place,
     RankShare,
     ShardWindow,
-    batches_from,
+    batched,
+    places_from,
     windows_from,
 )
 
@@ -98,7 +99,7 @@ def test_the_ranks_share_out_every_batch(sizes: list[int], first: int, window: i
     """Whatever their number: each place with one rank, equally many each, nobody left out."""
     chosen = OrderSettings(seed=1, window=window)
     stream = windows_from(len(sizes), lambda shard: sizes[shard], chosen, first)
-    for batch in itertools.islice(batches_from(stream, first, BATCH), 3):
+    for batch in itertools.islice(batched(places_from(stream, first), BATCH), 3):
         assert [place.position for place in batch] == list(range(first, first + BATCH))
         first += BATCH
         for world in WORLDS:
@@ -114,7 +115,7 @@ def test_each_rank_reads_few_shards_of_a_window() -> None:
     stream = windows_from(8, lambda shard: sizes[shard], chosen, 0)
     read: list[set[int]] = [set(), set()]
     samples: list[list[int]] = [[], []]
-    for batch in itertools.islice(batches_from(stream, 0, 64), 8):
+    for batch in itertools.islice(batched(places_from(stream, 0), 64), 8):
         for rank in range(2):
             mine = RankShare(rank=rank, world_size=2).of_batch(batch)
             read[rank] |= {place.shard for place in mine}

@@ -38,7 +38,6 @@ from train.loop.checkpoints import (
     read_checkpoint,
     resumed_checkpoint,
     resumed_state,
-    save_checkpoint,
     saved_steps,
 )
 from train.loop.crew import Crew
@@ -269,8 +268,9 @@ def equal_weights(one: TrainState, other: TrainState) -> bool:
     return all(torch.equal(ours[key], theirs[key]) for key in ours)
 
 
-def save(path: Path, state: TrainState, settings: TrainSettings | None = None) -> None:
-    save_checkpoint(path, state, settings or tiny_run(), data_digest=DIGEST, world_size=1)
+def save(folder: Path, state: TrainState) -> Path:
+    keep_checkpoint(folder, state, tiny_run(), data_digest=DIGEST, world_size=1)
+    return path_of_step(folder, state.step)
 
 
 def load(path: Path) -> TrainState:
@@ -282,9 +282,7 @@ def load(path: Path) -> TrainState:
 @for_each("steps", [0, 3])
 def test_a_loaded_state_goes_on_to_the_bit(tmp_path: Path, steps: int) -> None:
     state = stepped(steps)
-    path = tmp_path / "checkpoint"
-    save(path, state)
-    loaded = load(path)
+    loaded = load(save(tmp_path, state))
     assert (loaded.step, loaded.skipped_steps) == (state.step, state.skipped_steps)
     batch = make_batch([training_scene(toy_sample(1), 16)])
     for each in (state, loaded):
@@ -293,13 +291,11 @@ def test_a_loaded_state_goes_on_to_the_bit(tmp_path: Path, steps: int) -> None:
 
 
 def test_equal_states_give_equal_bytes_and_skipped_steps_are_no_updates(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        save(tmp_path / name, stepped())
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    one, other = (save(tmp_path / name, stepped()) for name in "ab")
+    assert one.read_bytes() == other.read_bytes()
     state = stepped(2)
     state.step, state.skipped_steps = 5, 3
-    save(tmp_path / "c", state)
-    loaded = load(tmp_path / "c")
+    loaded = load(save(tmp_path / "c", state))
     batch = make_batch([training_scene(toy_sample(1), 16)])
     one_step(loaded, batch)
     one_step(state, batch)
@@ -307,29 +303,22 @@ def test_equal_states_give_equal_bytes_and_skipped_steps_are_no_updates(tmp_path
     assert equal_weights(loaded, state)
 
 
-def test_a_missing_or_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
+def test_nothing_may_be_missing_and_no_bit_may_flip(tmp_path: Path) -> None:
+    """In the header, its sha256, the weights, the last byte: each would still be a weight."""
     with pytest.raises(TrilightError, match="no checkpoint here to resume from"):
         resumed_checkpoint(tmp_path / "checkpoints", ALONE, print)
-    save(tmp_path / "c", new_state(tiny_run()))
-    data = (tmp_path / "c").read_bytes()
-    for damaged in (b"", data[:100], data[:-1], b"PK\x03\x04" + data):
-        (tmp_path / "c").write_bytes(damaged)
-        with pytest.raises(TrilightError, match=f"checkpoint {tmp_path / 'c'} is not readable"):
-            load(tmp_path / "c")
-
-
-def test_no_bit_may_flip(tmp_path: Path) -> None:
-    """In the header, its sha256, the weights, the last byte: each would still be a weight."""
-    path = tmp_path / "c"
-    save(path, stepped(1))
+    path = save(tmp_path, stepped(1))
     data = path.read_bytes()
     end = 8 + int.from_bytes(data[:8], "little")
     places = [0, 8, *range(9, end, end // 40), data.index(b"sha256") + 20]
+    wrong = [b"", data[:100], data[:-1], b"PK\x03\x04" + data]
     for place in [*places, end, end + 4321, len(data) - 1]:
-        damaged = bytearray(data)
-        damaged[place] ^= 1 << place % 8
+        flipped = bytearray(data)
+        flipped[place] ^= 1 << place % 8
+        wrong.append(bytes(flipped))
+    for damaged in wrong:
         path.write_bytes(damaged)
-        with pytest.raises(TrilightError, match="is not readable"):
+        with pytest.raises(TrilightError, match=f"checkpoint {path} is not readable"):
             read_checkpoint(path)
     path.write_bytes(data)
     assert load(path).step == 1
@@ -347,10 +336,9 @@ def test_the_log_is_cut_back_to_the_checkpoint(tmp_path: Path) -> None:
 
 
 def test_a_run_of_an_extension_is_resumed_with_the_same_one_only(tmp_path: Path) -> None:
-    path = tmp_path / "checkpoint"
     size = EXAMPLES / "model_size.py"
     with loaded(size) as extension:
-        save(path, stepped(0))
+        path = save(tmp_path, stepped(0))
         load(path)
     assert read_checkpoint(path).header["extensions"] == {"model_size.py": extension.sha256}
     assert read_checkpoint(path).network().config == TINY_MODEL  # the network asks for no file
@@ -360,5 +348,5 @@ def test_a_run_of_an_extension_is_resumed_with_the_same_one_only(tmp_path: Path)
     with loaded(changed), pytest.raises(TrilightError, match=r"another extension model_size\.py"):
         load(path)
     with loaded(EXAMPLES / "metric.py"):  # judges, and decides no weight
-        save(path, stepped(0))
+        save(tmp_path, stepped(0))
     assert "extensions" not in read_checkpoint(path).header
