@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from storage.errors import TrilightError
+from storage.records.safe_read import read_plain
 from storage.settings.changes import changed, differences, json_or_word
 from storage.settings.described import checked, settings_record
 from storage.typed_json import read_json
@@ -115,7 +116,7 @@ def run_record(shared: Shared) -> dict[str, Any]:
 
     path = Path(shared.like) / "settings.json"
     try:
-        settings = dict(read_json(path.read_bytes(), dict[str, Any], str(path))["settings"])
+        settings = dict(read_json(read_plain(path), dict[str, Any], str(path))["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrilightError(
             f"--like {shared.like}: {path} cannot be read; expected the folder of a run."

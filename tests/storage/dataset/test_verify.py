@@ -66,6 +66,14 @@ def test_a_whole_dataset_has_no_fault_and_every_shard_is_looked_at(dataset: Data
         assert looked == [shard.name for shard in dataset.manifest.shards]
 
 
+def test_a_manifest_that_a_maker_writes_meanwhile_is_whole(dataset: Dataset) -> None:
+    write_manifest(dataset.folder.manifest, dataset.manifest)  # with a seal
+    dataset = open_dataset(str(dataset.folder.root))
+    write_manifest(dataset.folder.manifest, dataclasses.replace(dataset.manifest, num_scenes=9))
+    found = verify_dataset(dataset)
+    assert (found.problems, found.num_samples) == ([], 5)
+
+
 def test_every_bad_sample_of_every_bad_shard_is_named(dataset: Dataset) -> None:
     def spoil(key: str, members: dict[str, bytes]) -> None:
         if key in ("000000000", "000000001", "000000003"):
