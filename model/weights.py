@@ -62,7 +62,7 @@ def trained_range(metadata: Mapping[str, str]) -> TrainedRange | None:
         return TrainedRange(
             **{name: None if value is None else int(value) for name, value in known.items()}
         )
-    except (AttributeError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, TypeError, ValueError, RecursionError) as error:
         raise TrilightError(f"{RANGE_KEY}: not readable ({error}).") from error
 
 
@@ -254,7 +254,7 @@ def decode_config(text: str, source: str = "network") -> ModelConfig:
         return ModelConfig(**fields | lists)
     except TrilightError:
         raise
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, RecursionError) as error:
         raise TrilightError(
             f"{source}: its model configuration is not readable ({error})."
         ) from error

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from storage.errors import TrilightError
+from storage.records.safe_read import read_plain
 from storage.settings.changes import changed, differences, json_or_word
 from storage.settings.described import checked, settings_record
 from storage.typed_json import read_json

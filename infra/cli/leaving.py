@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
-from storage.remote.safe_url import printable
+from storage.remote.safe_url import escape_lines
 
 _SHOW_CURSOR = "\x1b[?25h"
 _temporary: set[Path] = set()
@@ -35,11 +35,7 @@ class InertFormatter(logging.Formatter):
     """Formats warnings without what a terminal would obey."""
 
     def format(self, record: logging.LogRecord) -> str:
-        return _inert(super().format(record))
-
-
-def _inert(text: str) -> str:
-    return "\n".join(map(printable, text.split("\n")))
+        return escape_lines(super().format(record))
 
 
 def leave(message: str, status: int) -> NoReturn:
@@ -52,7 +48,7 @@ def leave(message: str, status: int) -> NoReturn:
     if out.isatty():  # a progress bar hides the cursor, which stands behind it
         os.write(out.fileno(), f"{_SHOW_CURSOR}\n".encode())
     with contextlib.suppress(OSError):
-        os.write(errors.fileno(), f"{_inert(message)}\n".encode())
+        os.write(errors.fileno(), f"{escape_lines(message)}\n".encode())
     for folder in _temporary:
         shutil.rmtree(folder, ignore_errors=True)
     os._exit(status)

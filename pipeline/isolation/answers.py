@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from pipeline.isolation.deaths import ENDS, ChildFailed
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
+from storage.remote.safe_url import escape_lines
 
 CLASS = ""
 """Key of a dataclass's name among its fields: in a union two may have the same fields."""
@@ -100,6 +101,5 @@ def decode_answer(parts: list[NDArray[np.uint8]], function: Callable[..., Any]) 
 
 
 def make_printable(text: str) -> str:
-    """Return a sentence that is shown to people without what would command a terminal."""
-    shown = text[:_MOST_CHARACTERS]
-    return "".join(sign if sign.isprintable() or sign == "\n" else "\ufffd" for sign in shown)
+    """Return the first of a text, with escapes for what would command a terminal."""
+    return escape_lines(text[:_MOST_CHARACTERS])

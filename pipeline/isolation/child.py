@@ -21,7 +21,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pipeline.isolation.answers import decode_answer, make_printable
+from pipeline.isolation.answers import decode_answer
 from pipeline.isolation.confinement import Reach, code_of, confine, confinement_wanted
 from pipeline.isolation.deaths import ChildFailed, Result, with_retries
 from pipeline.isolation.frames import TooLong, patient, receive, send
@@ -30,6 +30,7 @@ from pipeline.isolation.waiting import CallTime
 from storage.errors import EnvironmentFailure
 from storage.extensions import load_same, loaded_files
 from storage.installation import child_environment, order_installed_first
+from storage.remote.safe_url import escape_lines
 
 _START_UP_S = 180.0
 _LAUNCHES = 3
@@ -253,7 +254,7 @@ def _print_words(heard: Connection) -> None:
     """Print to standard error what a child prints, without what would command a terminal."""
     with heard, contextlib.suppress(OSError):
         while words := os.read(heard.fileno(), 1 << 14):
-            os.write(2, make_printable(words.decode(errors="replace")).encode())
+            os.write(2, escape_lines(words.decode(errors="replace")).encode())
 
 
 @contextlib.contextmanager

@@ -159,7 +159,7 @@ def _facts(
             arrays_sha256=sha256_hex(unpack_arrays(members)),
             values=values,
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise TrilightError(
             f"{shard.name}: sample {key} is not as expected ({error!r}); run `trilight verify`."
         ) from error

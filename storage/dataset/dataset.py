@@ -15,7 +15,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest
 from storage.dataset.shard import ShardContents, contents_of, samples_of
 from storage.digests import sha256_of_stream
-from storage.errors import ShardMissing, TrilightError, Unreadable
+from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.records.held_maps import HeldMaps
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
 from storage.records.safe_read import open_plain
@@ -170,7 +170,7 @@ def dataset_files(url: str) -> DatasetFiles:
     return LocalFiles(place) if isinstance(place, Path) else RemoteDatasetFiles(place)
 
 
-_OF_DAMAGED_BYTES = (ValueError, LookupError, TypeError, EOFError, zlib.error)
+_OF_DAMAGED_BYTES = (ValueError, LookupError, TypeError, EOFError, RecursionError, zlib.error)
 
 
 @contextlib.contextmanager
@@ -182,10 +182,13 @@ def reading(dataset: str, shard: str) -> Iterator[None]:
         shard: its name.
 
     Raises:
-        TrilightError: the block raised one, or another error that damaged bytes cause.
+        TrilightError: the block raised one, or another error that damaged bytes cause; of what was
+            not read it says nothing more.
     """
     try:
         yield
+    except (EnvironmentFailure, ShardMissing, Unreadable):
+        raise
     except _OF_DAMAGED_BYTES as error:
         why = (
             str(error)

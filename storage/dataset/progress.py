@@ -29,7 +29,9 @@ from storage.dataset.scene_logs import (
 from storage.dataset.shard_notes import note_of, noted_names, noted_shard
 from storage.errors import TrilightError
 from storage.records.objects import Failure, count_by_reason
+from storage.records.safe_read import read_plain
 from storage.remote.bucket import WRITABLE, Bucket
+from storage.typed_json import T, read_json
 
 _AT_WORK_S = 600.0
 """Older notes on unfinished views were left by a kill: a pass of samples takes less time."""
@@ -122,10 +124,9 @@ def read_progress(folder: DatasetFolder) -> Progress:
         given_up += max(scenes_planned - sum(expected.values()), 0)
     except (TrilightError, OSError):
         scenes_planned = num_views = scenes_done = given_up = 0
-    plan, downloads = folder.staged_plan, folder.staged_downloads
-    objects = json.loads(plan.read_bytes())["objects"] if plan.exists() else 0
+    objects = _read_counts(folder.staged_plan, dict[str, int], {"objects": 0})["objects"]
     counted = folder.staged_done.stat().st_size if folder.staged_done.exists() else 0
-    done, total = json.loads(downloads.read_bytes()) if downloads.exists() else (0, 0)
+    done, total = _read_counts(folder.staged_downloads, tuple[int, int], (0, 0))
     return Progress(
         downloads_done=done,
         downloads_planned=total,
@@ -137,6 +138,13 @@ def read_progress(folder: DatasetFolder) -> Progress:
         num_views=num_views,
         views_done=scenes_done * num_views + _views_at_work(folder),
     )
+
+
+def _read_counts(path: Path, kind: type[T], none: T) -> T:
+    """Return what a file counts, which only shows progress; `none` where it is missing or wrong."""
+    with contextlib.suppress(OSError, TrilightError):
+        return read_json(read_plain(path), kind, str(path))
+    return none
 
 
 def _views_at_work(folder: DatasetFolder) -> float:

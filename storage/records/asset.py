@@ -196,7 +196,7 @@ def least_triangles_in(path: Path) -> int:
         return min(
             int(array["shape"][0]) for name, array in header.items() if name.startswith("faces_")
         )
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, LookupError, TypeError, ValueError, RecursionError) as error:
         raise TrilightError(
             f"{path}: is no asset ({error}); expected a file of the asset store. Delete it, and it "
             "is made anew."

@@ -210,7 +210,7 @@ class ObjectIndex:
                 for name, entry in header.items()
                 if name != "__metadata__"
             }
-        except (OSError, KeyError, TypeError, ValueError) as error:
+        except (OSError, LookupError, TypeError, ValueError, RecursionError) as error:
             raise TrilightError(
                 f"{path}: is no index of objects ({error}); delete it, and it is made anew."
             ) from error

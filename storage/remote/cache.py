@@ -168,7 +168,7 @@ def _open_shared(path: Path) -> BinaryIO | None:
 def _remove_unread(path: Path) -> bool:
     """Remove a shard unless a process reads it; return whether its bytes are free."""
     try:
-        with path.open("rb") as stream:
+        with path.open("r+b") as stream:  # NFS gives a lock of one's own to writers alone
             if not take_lock(stream.fileno()):
                 return False
             path.unlink(missing_ok=True)

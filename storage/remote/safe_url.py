@@ -71,6 +71,11 @@ def printable(text: str) -> str:
     )
 
 
+def escape_lines(text: str) -> str:
+    """Return text of several lines as `printable` does, with its line feeds."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
 def _escape(character: str) -> str:
     code = ord(character)
     if 0xDC80 <= code <= 0xDCFF:

@@ -144,7 +144,8 @@ def test_what_it_was_trained_on_goes_round_through_metadata() -> None:
     for known in (TrainedRange(max_triangles=1536), TrainedRange(resolution=64), TrainedRange()):
         assert trained_range(known.as_metadata()) == known
     assert trained_range({}) is None
-    for text in ("", "[]", '{"max_triangles": "many"}'):
+    lies = ("", "[]", '{"max_triangles": "many"}', '{"resolution": Infinity}', "[" * 100_000)
+    for text in lies:
         with pytest.raises(TrilightError, match="trilight_trained_range: not readable"):
             trained_range({RANGE_KEY: text})
 

@@ -136,7 +136,7 @@ def test_a_child_has_no_terminal_and_what_it_prints_arrives_without_commands() -
     subprocess.run(command, cwd=ROOT, stdin=theirs, stdout=theirs, stderr=theirs, check=True)
     os.close(theirs)
     shown = os.read(ours, 1 << 16).decode()
-    assert "terminals: []" in shown and "said\ufffd]0;title\ufffd" in shown
+    assert "terminals: []" in shown and "said\\x1b]0;title\\x07" in shown
     os.close(ours)
 
 

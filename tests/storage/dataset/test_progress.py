@@ -47,6 +47,10 @@ def test_downloads_and_objects_are_counted_from_the_start_of_each_run(tmp_path: 
     announce_objects(folder, 7)
     now = read_progress(folder)
     assert (now.objects_done, now.objects_planned) == (0, 7)
+    folder.staged_plan.write_bytes(b'{"objects": "many"}')
+    folder.staged_downloads.write_bytes(b"[1")
+    now = read_progress(folder)
+    assert (now.objects_planned, now.downloads_planned) == (0, 0)
 
 
 def test_a_manifest_is_read_when_it_changes_and_not_twice_a_second(

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.dataset import Dataset, open_dataset, reading
 from storage.dataset.manifest import index_shard, read_manifest, write_manifest
 from storage.dataset.shard import write_shard
 from storage.dataset.verify import Verification, verify_dataset
 from storage.digests import sha256_hex, sha256_of_file
-from storage.errors import TrilightError
+from storage.errors import TrilightError, Unreadable
 from storage.records.map_references import map_member
 from storage.records.packed_maps import pack_environment, pack_texture
 from storage.records.sample import encode_sample, sample_key
@@ -64,6 +64,21 @@ def test_a_whole_dataset_has_no_fault_and_every_shard_is_looked_at(dataset: Data
         found = verify_dataset(dataset.folder.root, fast=fast, shard_done=looked.append)
         assert (found.problems, found.bad_shards, found.num_samples) == ([], [], 5)
         assert looked == [shard.name for shard in dataset.manifest.shards]
+
+
+def test_a_manifest_that_a_maker_writes_meanwhile_is_whole(dataset: Dataset) -> None:
+    write_manifest(dataset.folder.manifest, dataset.manifest)  # with a seal
+    dataset = open_dataset(str(dataset.folder.root))
+    write_manifest(dataset.folder.manifest, dataclasses.replace(dataset.manifest, num_scenes=9))
+    found = verify_dataset(dataset)
+    assert (found.problems, found.num_samples) == ([], 5)
+
+
+def test_only_what_was_read_is_called_damaged() -> None:
+    for error, is_damage in ((RecursionError(), True), (Unreadable("no answer."), False)):
+        with pytest.raises(TrilightError) as caught, reading("set", "a.tar"):
+            raise error
+        assert ("is damaged" in str(caught.value)) == is_damage
 
 
 def test_every_bad_sample_of_every_bad_shard_is_named(dataset: Dataset) -> None:
