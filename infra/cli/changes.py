@@ -112,7 +112,6 @@ def run_record(shared: Shared) -> dict[str, Any]:
     """
     if shared.like is None:
         return {}
-    from storage.records.safe_read import read_plain
     from train.stored_settings import known_settings  # it brings the checker of settings along
 
     path = Path(shared.like) / "settings.json"

@@ -15,6 +15,7 @@ from storage.dataset.manifest import (
     read_manifest,
     write_manifest,
 )
+from storage.dataset.progress import count_given_up
 from storage.dataset.shard import samples_of, write_shard
 from storage.dataset.shard_notes import (
     ShardNote,
@@ -107,6 +108,8 @@ def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: 
     for index in scenes:
         key = sample_key(index)
         failures = [failure for failure in note.failures if failure.item == key]
+        if key not in samples:
+            count_given_up(folder, index)
         stage_members(folder.staged_shard(name), index, samples.get(key, {}), failures)
 
 

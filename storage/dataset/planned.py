@@ -30,6 +30,13 @@ def expected_scenes(manifest: Manifest) -> dict[str, int]:
     return {name: grown.get(name, count) for name, count in planned_shards(manifest).items()}
 
 
+def listed_scenes(manifest: Manifest) -> set[int]:
+    """Return the scenes of the shards that are listed and do not grow, made or given up."""
+    splits = cut_splits(manifest.num_scenes, _splits(manifest))
+    whole = (entry for entry in manifest.shards if entry.name not in manifest.growing)
+    return {scene for entry in whole for scene in scenes_of_shard(number_of_shard(entry), splits)}
+
+
 def planned_scenes_of(manifest: Manifest, shard: ShardEntry) -> int | None:
     """Return how many scenes a shard is to hold; None for as many as fit into it."""
     splits, number = _splits(manifest), number_of_shard(shard)

@@ -18,7 +18,7 @@ from storage.dataset.asked import read_asked
 from storage.dataset.dataset import Dataset, LocalFiles, open_listed
 from storage.dataset.layout import DatasetFolder, numbered, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
-from storage.dataset.planned import expected_scenes, is_whole, planned_shards
+from storage.dataset.planned import expected_scenes, is_whole, listed_scenes, planned_shards
 from storage.dataset.scene_logs import (
     LookedAt,
     SceneLog,
@@ -88,10 +88,11 @@ def count_given_up(folder: DatasetFolder, scene_index: int) -> None:
         stream.write(f"{scene_index}\n")
 
 
-def _scenes_given_up(folder: DatasetFolder) -> int:
-    """Return how many scenes are given up of which the manifest says nothing yet."""
-    with contextlib.suppress(OSError):
-        return len(set(folder.staged_given_up.read_text().split()))
+def _scenes_given_up(folder: DatasetFolder, manifest: Manifest) -> int:
+    """Return how many scenes are given up of shards that are not listed, or that grow."""
+    with contextlib.suppress(OSError, ValueError):
+        scenes = set(map(int, folder.staged_given_up.read_text().split()))
+        return len(scenes - listed_scenes(manifest))
     return 0
 
 
@@ -118,7 +119,7 @@ def read_progress(folder: DatasetFolder) -> Progress:
         facts = folder.manifest.stat()
         manifest, expected = _plan_of(folder.manifest, facts.st_mtime_ns, facts.st_size)
         scenes_planned, num_views = manifest.num_scenes, manifest.num_views
-        given_up = _scenes_given_up(folder)
+        given_up = _scenes_given_up(folder, manifest)
         packed = {name: each for name, each in expected.items() if name not in manifest.growing}
         scenes_done = num_scenes_done(folder, packed) - given_up
         given_up += max(scenes_planned - sum(expected.values()), 0)
@@ -298,7 +299,7 @@ def read_status(url: str) -> DatasetStatus:
     planned = expected_scenes(manifest)
     names = _finished_names(dataset, planned)
     done = sum(planned[name] for name in names) + (_num_waiting(local) if local else 0)
-    given_up = _scenes_given_up(local) if local else 0
+    given_up = _scenes_given_up(local, manifest) if local else 0
     done -= given_up
     given_up += max(manifest.num_scenes - sum(planned.values()), 0)
     looked, share = (look_at_logs(local), 1.0) if local else _sampled_logs(dataset)
