@@ -41,8 +41,7 @@ def read_parts(source: SourceFile, decode: Decode, *, emission: bool) -> Texture
         return build_parts(dataclasses.replace(contents, material=None), [], SourceMaterial())
     else:
         of_ply = " and no picture with texture coordinates" if source.kind == "ply" else ""
-        why = f"has no colors of vertices or faces{of_ply}"
-        raise Rejected("no_materials", f"the {source.kind.upper()} {why}")
+        raise Rejected("no_materials", f"the {source.kind.upper()} has no colors{of_ply}")
     if contents.color is not None:
         source.notes.append("colors, where materials or pictures are read")
     return build_parts(dataclasses.replace(contents, color=None), materials, SourceMaterial())

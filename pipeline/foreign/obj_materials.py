@@ -55,8 +55,9 @@ def obj_materials(
         Rejected: no_materials where it has none, materials_unreadable, or as reading a picture.
     """
     if not used or not files.libraries:
-        why = "no mtllib says where they are" if used else "the OBJ names none"
-        raise Rejected("no_materials", f"there are no materials: {why}")
+        # records hold these words, and digests hold records
+        why = "names no file of its materials (mtllib)" if used else "names no materials"
+        raise Rejected("no_materials", f"the OBJ {why}")
     known: dict[str, Fields] = {}
     for library in files.libraries:
         if library in files.data:
