@@ -17,6 +17,7 @@ from storage.errors import EnvironmentFailure, TrilightError
 from storage.extensions import mistake_in_extension
 
 _ENOUGH_BYTES = 2 << 30
+_ROOM = [bytearray(16 << 20)]  # given back where memory lacks, so that it can be said
 
 
 def main() -> None:
@@ -45,6 +46,7 @@ def main() -> None:
     except TrilightError as mistake:
         leave(f"trilight: {mistake}{_describe_limit()}", mistake.exit_status)
     except Exception as error:
+        _ROOM.clear()
         its_author = mistake_in_extension(error)
         if its_author is not None:
             leave(f"trilight: {its_author}", 1)
