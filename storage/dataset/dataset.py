@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest
+from storage.dataset.manifest import MAX_BESIDE_BYTES, Manifest, ShardEntry, decode_manifest
 from storage.dataset.shard import ShardContents, contents_of, samples_of
 from storage.digests import sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
@@ -25,9 +25,6 @@ from storage.remote.cache import shard_cache
 from storage.remote.fetch import download, facts_of, unreadable
 from storage.remote.tries import TransferFailed, is_missing
 from storage.remote.url import RemoteUrl, parse_url
-
-MAX_BESIDE_BYTES = 1 << 30
-"""Largest file beside the shards: a manifest takes 230 bytes a shard, a lock 400 an object."""
 
 
 def _unopened(path: Path, error: OSError) -> TrilightError:

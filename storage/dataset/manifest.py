@@ -39,8 +39,8 @@ DocumentName = Annotated[
 ]
 """Document that a manifest vouches for: rights hang on it."""
 
-MAX_BYTES = 1 << 30
-"""Maximum size of a manifest: a shard takes 220 bytes."""
+MAX_BESIDE_BYTES = 1 << 30
+"""Largest file beside the shards: a manifest takes 220 bytes a shard, a lock 400 an object."""
 _HEAD_BYTES, _ROW_BYTES = 1 << 22, 1 << 17
 """Maximum sizes of a manifest without its shards, and of a shard in it."""
 
@@ -262,7 +262,7 @@ def decode_manifest(stream: BinaryIO, place: str) -> Manifest:
     Raises:
         TrilightError: as `read_manifest`.
     """
-    return _manifest(stream.read(MAX_BYTES), place)
+    return _manifest(stream.read(MAX_BESIDE_BYTES), place)
 
 
 def decode_head(stream: BinaryIO, place: str) -> Manifest:
