@@ -9,8 +9,8 @@ All of the network that is used here is in `_encode` and `_decode`.
 import dataclasses
 import functools
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from model.light_groups import LightGroup, light_groups
 from model.open import Finder, find_network
 from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
+from model.replayed import Replayed
 from model.scene_tensors import Cameras, batch_scenes, converted, scene_tensors
 from model.weights import MAX_LIGHTS, TrainedRange, network_digest
 from storage.errors import TrilightError
@@ -40,6 +41,8 @@ class PreparedScene:
     """Each group of lights and its share of the picture (model.light_groups)."""
     notes: tuple[str, ...]
     """What a person should know of this scene and this network."""
+    views: dict[int, Callable[[Tensor, Tensor], Tensor]] = field(default_factory=dict)
+    """By resolution: camera and angle -> picture, where the network is."""
 
 
 class NeuralRenderer:
@@ -172,11 +175,12 @@ class NeuralRenderer:
         self.require_resolution(resolution)
         c2w_44 = torch.as_tensor(np.asarray(c2w, np.float32), device=self.device)
         angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
-        total = torch.zeros(resolution, resolution, 3, dtype=torch.float64)
-        for encoded, share in prepared.groups:
-            log10_RR3 = _decode(self._model, encoded, c2w_44, angle, resolution)
-            total += share * radiance(log10_RR3.double().cpu()).clamp(min=0)
-        picture: NDArray[np.float32] = total.numpy().astype(np.float32)
+        views = prepared.views
+        if resolution not in views:
+            decode = functools.partial(_picture, self._model, prepared.groups, resolution)
+            on_card = any(scene.lit.place for each, _ in prepared.groups for scene in each.traced)
+            views[resolution] = Replayed(decode) if on_card else decode
+        picture: NDArray[np.float32] = views[resolution](c2w_44, angle).cpu().numpy()
         return picture
 
     def require_resolution(self, resolution: int) -> None:
@@ -251,6 +255,21 @@ def _encode(model: RenderFormer, scene: Scene, device: torch.device) -> EncodedS
     """Return one scene after the view-independent stage."""
     batch = batch_scenes([scene_tensors(scene, model.config.material_columns)])
     return model.encode(converted(batch, lambda tensor: tensor.to(device)))
+
+
+def _picture(
+    model: RenderFormer,
+    groups: tuple[tuple[EncodedScene, float], ...],
+    resolution: int,
+    c2w_44: Tensor,
+    fov_deg: Tensor,
+) -> Tensor:
+    """Return linear radiance [R, R, 3] of at least 0, the sum over groups of lights."""
+    total = torch.zeros(resolution, resolution, 3, dtype=torch.float64, device=c2w_44.device)
+    for encoded, share in groups:
+        log10_RR3 = _decode(model, encoded, c2w_44, fov_deg, resolution)
+        total += share * radiance(log10_RR3.double()).clamp(min=0)
+    return total.float()
 
 
 def _decode(

@@ -15,7 +15,6 @@ from model.hits.tracing import (
     TracedScene,
     like,
     lit_scenes,
-    sides_of,
     traced_batch,
     traced_cameras,
 )
@@ -85,14 +84,12 @@ class RenderFormer(nn.Module):
             surfaces = lit_scenes(batch) if self.config.demodulated else ()
             return self._encoded(batch, surfaces=surfaces)
         scenes = traced_batch(batch)
-        lights = [scene.light for scene in scenes]
         longest = batch.triangles_BT33.shape[1]
-        sides = [pad(sides_of(light), (0, 0, 0, longest - light.num_triangles)) for light in lights]
-        units = [torch.from_numpy(light.mean_3) for light in lights]
+        sides = [pad(each.sides_T12, (0, 0, 0, longest - len(each.sides_T12))) for each in scenes]
         sides_BT12 = like(torch.stack(sides), batch.triangles_BT33)
-        return self._encoded(
-            batch, scenes, sides_BT12, like(torch.stack(units), batch.triangles_BT33)
-        )
+        units_B3 = like(torch.stack([each.unit_3 for each in scenes]), batch.triangles_BT33)
+        scenes = tuple(each.on(batch.triangles_BT33.device) for each in scenes)
+        return self._encoded(batch, scenes, sides_BT12, units_B3)
 
     def _encoded(
         self,

@@ -57,7 +57,7 @@ def require_readable(
 
 def alpha_ggx(roughness: ArrayLike) -> NDArray:
     """Return the GGX width of a roughness: alpha = roughness^2, as in Blender and USD."""
-    return np.square(np.asarray(roughness))
+    return np.square(roughness)
 
 
 ALONG_THE_VIEW = 1e-9
@@ -88,7 +88,7 @@ def look_at_c2w(*, eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[
 
 def focal_px(fov_deg: ArrayLike, resolution: int) -> NDArray[np.float64]:
     """Return the focal length in pixels of a square picture `resolution` pixels wide."""
-    return 0.5 * resolution / np.tan(np.radians(np.asarray(fov_deg, np.float64)) / 2)
+    return 0.5 * resolution / np.tan(np.radians(fov_deg, dtype=np.float64) / 2)
 
 
 def camera_rays(

@@ -55,19 +55,23 @@ def gathered_at(
         gather_rays: of each anchor; 0 gives 0.
         seed: of the noise.
     """
-    total = np.zeros((3, len(anchor)), np.float32)
+    total = np.zeros_like(rays.origin, shape=(3, len(anchor)))
     if not gather_rays:
         return total.T
-    shift = rng_for(seed, "gather").random((5, len(anchor)), np.float32)
-    waiting = np.arange(len(anchor))
-    for turn in range(rays.turns):
-        points, met = scene.first_points(rays.origin, rays.direction(turn, anchor[waiting]))
-        if len(met):
-            total[:, waiting[met]] = _gathered(
-                scene, light, points, shift[:, waiting[met]], gather_rays
-            )
-        waiting = np.delete(waiting, met)
-    return np.ascontiguousarray(total.T)
+    shift = scene.here(rng_for(seed, "gather").random((5, len(anchor)), np.float32))
+    direction = rays.direction(0, anchor)
+    found = scene.first_hits(rays.origin, direction)
+    triangle, uv = found.triangle, found.uv
+    for turn in range(1, rays.turns):
+        other = rays.direction(turn, anchor)
+        found, waits = scene.first_hits(rays.origin, other), triangle < 0
+        triangle = np.where(waits, found.triangle, triangle)
+        uv, direction = np.where(waits, found.uv, uv), np.where(waits, other, direction)
+    met = np.flatnonzero(triangle >= 0)
+    if len(met):
+        points = scene.points(np.maximum(triangle[met], 0), uv[:, met], direction[:, met])
+        total[:, met] = _gathered(scene, light, points, shift[:, met], gather_rays)
+    return total.T.copy()
 
 
 def _gathered(
@@ -84,12 +88,12 @@ def _gathered(
     ).reshape(4, -1)
     u_lamp = np.tile(shift[4], gather_rays) + np.repeat(_van_der_corput(gather_rays), count)
     u_lamp -= np.floor(u_lamp)
-    total = np.zeros((3, count * gather_rays), np.float32)
-    for part in blocks(count * gather_rays):
+    total = np.zeros_like(u, shape=(3, count * gather_rays))
+    for part in blocks(scene, count * gather_rays):
         here = points.only(owner[part])
         direction = cosine_direction(u[:2, part], here.normal, here.edge)
         beyond, met = scene.meet(scene.everything, here.start(direction), direction)
-        spreads = np.zeros(met.shape, np.bool_)
+        spreads = np.zeros_like(met)
         found = brought(scene, light, beyond, u_lamp[part], u[2:, part], spreads)
         total[:, part] = np.where(met, found, np.float32(0))
     return total.reshape(3, gather_rays, count).mean(axis=1)

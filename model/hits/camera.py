@@ -11,12 +11,12 @@ class Rays:
     """rays_a_side^2 rays through every pixel, on a regular grid over its area."""
 
     def __init__(
-        self, c2w: NDArray[np.float32], fov_deg: float, resolution: int, rays_a_side: int
+        self, c2w: Floats, fov_deg: float | Floats, resolution: int, rays_a_side: int
     ) -> None:
         self.resolution, self.turns = resolution, rays_a_side**2
-        self.origin = np.ascontiguousarray(c2w[:3, 3], np.float32)
+        self.origin = c2w[:3, 3].astype(np.float32)
         self._axes = c2w[:3, :3].astype(np.float32)
-        self._focal = np.float32(focal_px(fov_deg, resolution))
+        self._focal = focal_px(fov_deg, resolution).astype(np.float32)
         self._a_side = rays_a_side
 
     def direction(self, turn: int, pixels: NDArray[np.int64] | slice = slice(None)) -> Floats:

@@ -22,6 +22,7 @@ from torch.nn.functional import silu, softplus
 from model.attention import Keys, attend
 from model.config import ModelConfig
 from model.encoded_scene import EncodedScene, KeysValues, TokenPlaces
+from model.hits.second_hits import DEVICE_BLOCK
 from model.hits.lie import FARTHEST, NEIGHBOURS, PLACE, Lie, lies_to
 from model.hits.light_filter import LightFilter, filter_flops
 from model.hits.traced import INPUTS, Traced
@@ -318,7 +319,8 @@ def _blocks(told: Tensor, parts: int) -> Iterator[slice]:
         return
     step = parts
     if not torch.is_grad_enabled():
-        step = max(1, BLOCK_PIXELS * parts // told.shape[2] ** 2)
+        pixels = BLOCK_PIXELS if told.device.type == "cpu" else DEVICE_BLOCK
+        step = max(1, pixels * parts // told.shape[2] ** 2)
     for view in range(count):
         for first in range(0, parts, step):
             yield slice(view * parts + first, view * parts + min(first + step, parts))
@@ -372,7 +374,7 @@ def _whole(values_VMPK: Tensor, side: int) -> Tensor:
 def _around(values_VAK: Tensor, side: int) -> Tensor:
     """[V, A, K] -> [V, A, 9, K]: the anchors of the parts around; at the rim, the nearest ones."""
     grid = torch.arange(side, device=values_VAK.device)
-    near = (grid[:, None] + torch.tensor([-1, 0, 1], device=grid.device)).clamp(0, side - 1)
+    near = (grid[:, None] + torch.arange(-1, 2, device=grid.device)).clamp(0, side - 1)
     rows = near[:, None, :, None] * side + near[None, :, None, :]
     return values_VAK[:, rows.reshape(side * side, NEIGHBOURS)]
 

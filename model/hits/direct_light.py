@@ -92,7 +92,7 @@ def _add(
         value, density = lobe(gloss, points, to_lamp, cosine)
         specular = value * solid / (1 + np.square(lobe_rays * density * solid))
     useful = np.flatnonzero(diffuse if specular is None else (diffuse > 0) | (specular > 0))
-    is_free = np.zeros(diffuse.shape, np.float32)
+    is_free = np.zeros_like(diffuse)
     is_free[useful] = _is_free(scene, points, place, to_lamp, useful)
     emission = scene.emission[:, lamp, None]
     np.add(light.open_diffuse, diffuse * emission, out=light.open_diffuse)
@@ -132,7 +132,8 @@ def lamp_chances(scene: LitScene, points: Points, gloss: Gloss) -> Floats:
     In proportion to what its middle would send on without shadows, with a share for all: so few
     rays are spent on lamps that are far away or not where a narrow lobe looks.
     """
-    odds = np.zeros((len(scene.lamps), points.position.shape[1]), np.float32)
+    shape = len(scene.lamps), points.position.shape[1]
+    odds = np.zeros_like(points.position, shape=shape)
     albedo = scene.diffuse.mean(axis=0)[points.triangle] * _INV_PI
     colour = gloss.colour.mean(axis=0)
     for number, lamp in enumerate(scene.lamps):
@@ -172,7 +173,7 @@ def chosen_lamp_light(
     lamps = scene.lamps
     number = (u_lamp > np.cumsum(chances, axis=0)).sum(axis=0).clip(0, len(lamps) - 1)
     chance = np.maximum(np.take_along_axis(chances, number[None], axis=0)[0], np.float32(1e-12))
-    lamp = lamps[number]
+    lamp = scene.here(lamps)[number]
     place = _on_triangle(scene, lamp, on_lamp)
     to_lamp = place - points.position
     square = np.maximum(dot(to_lamp, to_lamp), np.float32(1e-12))
@@ -184,7 +185,7 @@ def chosen_lamp_light(
     albedo = scene.diffuse_at(points)
     reflected = albedo * (np.maximum(cosine, 0) * _INV_PI) + gloss.colour * value
     useful = np.flatnonzero(brightest(reflected) > 0)
-    is_free = np.zeros(solid.shape, np.float32)
+    is_free = np.zeros_like(solid)
     is_free[useful] = _is_free(scene, points, place, to_lamp, useful)
     return np.take(scene.emission, lamp, axis=1) * reflected * (solid * is_free)
 

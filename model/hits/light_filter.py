@@ -101,7 +101,7 @@ def _mixed(alike_VCRR: Tensor, near_9: Tensor, both_V6RR: Tensor, step: int) -> 
     frame = (step, step, step, step)
     trust = torch.exp(-softplus(-alike_VCRR[:, _ALIKE:]).clamp(max=_MOST_DOUBT))
     around = pad(torch.cat([alike_VCRR[:, :_ALIKE], trust, both_V6RR], dim=1), frame)
-    rows = height if torch.is_grad_enabled() else _ROWS
+    rows = _ROWS if around.device.type == "cpu" and not torch.is_grad_enabled() else height
     return torch.cat(
         [
             _mixed_rows(around[:, :, first : first + rows + 2 * step], near_9, step)

@@ -1,11 +1,16 @@
 """`LitScene`: the triangles of a scene as rays need them, with their lobes and their emission."""
 
+import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.hits.device_arrays import DeviceArray, Place
+from model.hits.device_textures import DeviceTextures
 from model.hits.textures import SurfaceTextures
 from model.hits.vectors import Floats, as_rows, brightest, dot, unit
 from model.sky.drawn import DrawnSky
@@ -104,6 +109,9 @@ def off_surface(position: Floats, plane: Floats, direction: Floats) -> Floats:
 class LitScene:
     """Tables of T triangles, components first: [3, T] and [T]."""
 
+    place: Place | None = None
+    """Where its tables are, as `DeviceArray`s; None: on the CPU."""
+
     def __init__(
         self,
         corners_T33: Floats,
@@ -142,6 +150,25 @@ class LitScene:
     @property
     def num_triangles(self) -> int:
         return len(self.area)
+
+    def on(self, place: Place, caster: Callable[..., Any]) -> "LitScene":
+        """Return the scene, which has no sky, on a device, where `caster` prepares its rays."""
+        moved = copy.copy(self)
+        for name, table in vars(self).items():
+            if isinstance(table, np.ndarray) and name not in ("lamps", "_corner_rows"):
+                setattr(moved, name, place.array(table))
+        moved.place = place
+        if self.textures is not None:
+            moved.textures = DeviceTextures(self.textures, place)
+        moved.seen = caster(self._corner_rows, np.flatnonzero(~self.emits), place)
+        moved.everything = caster(self._corner_rows, np.arange(self.num_triangles), place)
+        return moved
+
+    def here(self, array: NDArray) -> Floats:
+        """Return an array of the host where the scene's tables are."""
+        if self.place is None:
+            return array
+        return DeviceArray(self.place.tensor(array), self.place)
 
     @cached_property
     def drawn_sky(self) -> DrawnSky:
@@ -224,13 +251,7 @@ class LitScene:
     def first_hits(self, origin: Floats, direction: Floats) -> MetSurfaces:
         """Return what rays [3, P] from one camera [3] see first."""
         start = np.broadcast_to(origin, (direction.shape[1], 3))
-        return self.seen.met(np.ascontiguousarray(start), as_rows(direction))
-
-    def first_points(self, origin: Floats, direction: Floats) -> tuple[Points, NDArray[np.intp]]:
-        """Return what rays [3, P] from one camera [3] see first, and which of them see anything."""
-        found = self.first_hits(origin, direction)
-        rows = np.flatnonzero(found.triangle >= 0)
-        return self.points(found.triangle[rows], found.uv[:, rows], direction[:, rows]), rows
+        return self.seen.met(start.copy(), as_rows(direction))
 
     def meet(self, among: Triangles, start: Floats, direction: Floats) -> tuple[Points, NDArray]:
         """Return the points that rays [3, P] meet first among triangles, and which rays do.

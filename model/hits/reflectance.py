@@ -51,7 +51,7 @@ def gloss_at(scene: LitScene, points: Points, least_alpha: Floats | None = None)
     cosine = dot(points.normal, points.toward)
     seen = np.maximum(cosine, _LEAST_COSINE)
     stretch = stretched(seen, alpha)
-    albedo = np.maximum(_albedo(seen / stretch, alpha), np.float32(1e-3))
+    albedo = np.maximum(_albedo(scene, seen / stretch, alpha), np.float32(1e-3))
     lost = (1 - albedo) / albedo
     specular, again = scene.specular_at(points), scene.again_at(points)
     return Gloss(
@@ -121,9 +121,9 @@ def drawn(gloss: Gloss, points: Points, u: Floats) -> tuple[Floats, Floats]:
     return direction, np.where(goes, weight, np.float32(0))
 
 
-def _albedo(stretched_cosine: Floats, alpha: Floats) -> Floats:
+def _albedo(scene: LitScene, stretched_cosine: Floats, alpha: Floats) -> Floats:
     """Return the directional albedo [P] between the entries of the table."""
-    table = _table()
+    table = scene.here(_table())
     u = np.sqrt(stretched_cosine) * np.float32(X_STEPS - 1)
     v = np.sqrt(alpha) * np.float32(ROUGHNESS_STEPS - 1)
     column = np.minimum(u.astype(np.int32), X_STEPS - 2)

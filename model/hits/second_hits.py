@@ -34,6 +34,9 @@ MIRRORS = 2
 BLOCK = 2**13
 """Points that are computed at a time: their numbers stay in the processor's cache."""
 
+DEVICE_BLOCK = 2**18
+"""On a card: as many as fit its memory."""
+
 
 def brought(
     scene: LitScene,
@@ -72,7 +75,7 @@ def brought(
     if len(scene.lamps):
         sent += chosen_lamp_light(scene, points, gloss, chances, u_lamp, on_lamp, has_lobe_ray)
     rows = np.flatnonzero(is_mirror)
-    if len(rows):
+    if mirrors and len(rows):
         sent[:, rows] += _mirrored(
             scene, light, points, rows, chances, (u_lamp, on_lamp), is_sharp[rows], mirrors
         )
@@ -113,7 +116,8 @@ def _mirrored(
     return gloss.colour * arrives
 
 
-def blocks(count: int) -> Iterator[slice]:
+def blocks(scene: LitScene, count: int) -> Iterator[slice]:
     """Yield the parts of `count` points that are computed at a time."""
-    for first in range(0, count, BLOCK):
-        yield slice(first, min(first + BLOCK, count))
+    step = BLOCK if scene.place is None else DEVICE_BLOCK
+    for first in range(0, count, step):
+        yield slice(first, min(first + step, count))

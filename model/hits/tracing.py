@@ -1,13 +1,18 @@
 """Scenes as the network has them -> what is traced of them and of their views."""
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from model.config import ModelConfig
+from model.hits.device_arrays import DeviceArray, Place
+from model.hits.device_rays import DeviceTriangles, compiled_kernel
 from model.hits.lit_scene import LitScene
 from model.hits.radiosity import SceneLight, scene_light
 from model.hits.textures import SurfaceTextures
@@ -20,22 +25,56 @@ from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
 
 
+MOST_LAMPS = 256
+"""Emitting triangles with which a scene's rays are traced by a card: each takes its kernels."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TracedScene:
     """A scene that can be asked for any view."""
 
     lit: LitScene
     light: SceneLight
+    sides_T12: Tensor
+    """Direct and indirect light of the front, then of the back, of each triangle."""
+    unit_3: Tensor
+    """The scene's mean light (model.hits.radiosity)."""
+
+    def on(self, device: torch.device) -> "TracedScene":
+        """Return the scene on a card that traces its rays; itself where none does.
+
+        Scenes with a sky, or with hundreds of lamps, stay with the CPU.
+        """
+        is_small = self.lit.sky is None and len(self.lit.lamps) <= MOST_LAMPS
+        if not is_small or compiled_kernel(device) is None:
+            return self
+        return self.on_place(Place(device), DeviceTriangles)
+
+    def on_place(self, place: Place, caster: Callable[..., Any]) -> "TracedScene":
+        """Return the scene there, with rays as `caster` prepares them."""
+        return TracedScene(
+            lit=self.lit.on(place, caster),
+            light=SceneLight(
+                **{
+                    name: None if table is None else place.array(table)
+                    for name, table in vars(self.light).items()
+                    if name in SceneLight.__dataclass_fields__
+                }
+            ),
+            sides_T12=self.sides_T12.to(place.device),
+            unit_3=self.unit_3.to(place.device),
+        )
 
     def view(
-        self, c2w_44: Tensor, fov_deg: float, resolution: int, config: ModelConfig, seed: int
+        self, c2w_44: Tensor, fov_deg: Tensor, resolution: int, config: ModelConfig, seed: int
     ) -> ViewInputs:
         """Return what is traced for one view."""
+        place = self.lit.place
         return view_inputs(
             self.lit,
             self.light,
-            c2w_44.detach().cpu().numpy(),
-            fov_deg,
+            c2w_44.detach().cpu().numpy() if place is None else DeviceArray(c2w_44, place),
+            float(fov_deg) if place is None else DeviceArray(fov_deg, place),
             resolution,
             rays_a_side=config.hit_rays,
             anchors_a_side=anchors_a_side(config, resolution),
@@ -74,7 +113,14 @@ def lit_scene(
 
 def traced_batch(batch: SceneBatch) -> tuple[TracedScene, ...]:
     """Return the scenes of a batch, without their padding, ready for rays."""
-    return tuple(TracedScene(lit=lit, light=scene_light(lit)) for lit in lit_scenes(batch))
+    return tuple(traced_scene(lit) for lit in lit_scenes(batch))
+
+
+def traced_scene(lit: LitScene) -> TracedScene:
+    """Return surfaces, with the light that they receive, ready for rays."""
+    light = scene_light(lit)
+    unit_3 = torch.from_numpy(light.mean_3)
+    return TracedScene(lit=lit, light=light, sides_T12=sides_of(light), unit_3=unit_3)
 
 
 def lit_scenes(batch: SceneBatch) -> tuple[LitScene, ...]:
@@ -103,8 +149,7 @@ def with_traced(
     `seed` is that of the noise: a network that saw one noise alone might learn it.
     """
     require_known(scene.sky, config)
-    lit = lit_scene_of(scene)
-    ready = TracedScene(lit=lit, light=scene_light(lit))
+    ready = traced_scene(lit_scene_of(scene))
     traced = traced_views(ready, scene.c2w_V44, scene.fov_deg_V, resolution, config, seed)
     return dataclasses.replace(scene, traced=traced)
 
@@ -149,19 +194,24 @@ def traced_views(
     config: ModelConfig,
     seed: int = 0,
 ) -> Traced:
-    """Return the tensors of some views of a scene, on the CPU."""
+    """Return the tensors of some views of a scene, where its rays are traced."""
     views = [
-        scene.view(c2w_44, float(fov_deg), resolution, config, seed)
+        scene.view(c2w_44, fov_deg, resolution, config, seed)
         for c2w_44, fov_deg in zip(c2w_V44, fov_deg_V, strict=True)
     ]
     return Traced(
-        sides_T12=sides_of(scene.light),
-        unit_3=torch.from_numpy(scene.light.mean_3),
-        pixels_VRRC=torch.from_numpy(np.stack([view.pixels for view in views])),
-        anchor_VA=torch.from_numpy(np.stack([view.anchor for view in views])),
-        gathered_VA3=torch.from_numpy(np.stack([view.gathered for view in views])),
-        given_VI=torch.ones(len(views), len(INPUTS)),
+        sides_T12=scene.sides_T12,
+        unit_3=scene.unit_3,
+        pixels_VRRC=_stacked([view.pixels for view in views]),
+        anchor_VA=_stacked([view.anchor for view in views]),
+        gathered_VA3=_stacked([view.gathered for view in views]),
+        given_VI=torch.ones(len(views), len(INPUTS), device=scene.unit_3.device),
     )
+
+
+def _stacked(arrays: list[NDArray | DeviceArray]) -> Tensor:
+    stacked = np.stack(arrays)
+    return stacked.tensor if isinstance(stacked, DeviceArray) else torch.from_numpy(stacked)
 
 
 def sides_of(light: SceneLight) -> Tensor:

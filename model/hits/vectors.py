@@ -38,7 +38,8 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 def as_rows(a: Floats) -> Floats:
     """Return [P, 3], as Embree reads rays."""
-    return np.ascontiguousarray(a.T)
+    rows: Floats = a.T.copy()
+    return rows
 
 
 def tangents(n: Floats, along: Floats) -> tuple[Floats, Floats]:

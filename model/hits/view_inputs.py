@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from model.hits.anchors import anchor_pixels, gathered_at
 from model.hits.camera import Rays
+from model.hits.device_arrays import Chosen, DeviceArray
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
 from model.hits.reflectance import Gloss, drawn, gloss_at, lobe
 from model.hits.second_hits import DIMMEST, SMOOTH_ALPHA, blocks, brought
 from model.hits.sky_light import add_sky_light, escaped_light
-from model.hits.vectors import brightest, dot, spread
+from model.hits.vectors import Floats, brightest, dot, spread
 from storage.seeds import rng_for
 
 
@@ -102,12 +103,12 @@ def view_inputs(
     """
     rays = Rays(c2w, fov_deg, resolution, rays_a_side)
     rng = rng_for(seed, "hits", resolution)
-    on_lamps = rng.random((2, len(scene.lamps), resolution**2), np.float32)
-    chance = rng.random((6, resolution**2), np.float32)
+    on_lamps = scene.here(rng.random((2, len(scene.lamps), resolution**2), np.float32))
+    chance = scene.here(rng.random((6, resolution**2), np.float32))
     to_sky = _towards_sky(scene, resolution, seed)
-    sums = np.zeros((NUM_CHANNELS, resolution**2), np.float32)
+    sums = np.zeros_like(chance, shape=(NUM_CHANNELS, resolution**2))
     directions = [rays.direction(turn) for turn in range(rays.turns)]
-    for part in blocks(resolution**2):
+    for part in blocks(scene, resolution**2):
         along = np.stack([direction[:, part] for direction in directions])
         shaded = _shaded(scene, rays.origin, along, chance[5, part])
         if len(shaded.pixel):
@@ -132,7 +133,7 @@ def view_inputs(
     pixels = _averaged(sums, rays.turns)
     anchor = anchor_pixels(pixels[0].reshape(resolution, resolution), anchors_a_side)
     return ViewInputs(
-        pixels=np.ascontiguousarray(pixels.T).reshape(resolution, resolution, NUM_CHANNELS),
+        pixels=pixels.T.copy().reshape(resolution, resolution, NUM_CHANNELS),
         anchor=anchor,
         gathered=gathered_at(scene, light, rays, anchor, gather_rays, seed),
     )
@@ -179,16 +180,19 @@ def _shaded(
     is_one = (triangle == triangle[0]).all(axis=0)
     if scene.textures is not None:
         is_one &= ~scene.textures.is_textured[triangle[0]]
-    turn, pixel = np.nonzero((triangle >= 0) & (alone | ~is_one))
+    stands = (triangle >= 0) & (alone | ~is_one)
+    turn, pixel = np.nonzero(stands)
     ray = turn * count + pixel
     points = scene.points(
-        found.triangle[ray], found.uv[:, ray], np.ascontiguousarray(along[turn, :, pixel].T)
+        np.maximum(found.triangle[ray], 0),
+        found.uv[:, ray],
+        along[turn, :, pixel].T.copy(),
     )
     return _Shaded(
         points=points,
         pixel=pixel,
         turn=turn,
-        weight=np.where(is_one[pixel], np.float32(turns), np.float32(1)),
+        weight=np.where(is_one[pixel], np.float32(turns), np.float32(1)) * stands[turn, pixel],
         chosen=alone[turn, pixel].astype(np.float32),
     )
 
@@ -210,10 +214,24 @@ class _Block:
         self, channel: slice, values: NDArray[np.float32], rows: NDArray[np.intp] | None = None
     ) -> None:
         """Add [channels, P], or of some rows of the points."""
+        if isinstance(self.sums, DeviceArray):
+            self._add_all(channel, values, rows)
+            return
         pixel = self.pixel if rows is None else self.pixel[rows]
         weighed = values * (self.weight if rows is None else self.weight[rows])
         for number, row in enumerate(range(channel.start, channel.stop)):
             self.sums[row] += np.bincount(pixel, weighed[number], self.sums.shape[1])
+
+    def _add_all(self, channel: slice, values: Floats, rows: Chosen | None) -> None:
+        """Add those of all rays of the block, turn after turn; where none count, nothing."""
+        weighed = np.zeros_like(values)
+        weighed[:, np.flatnonzero(self.weight)] = values * self.weight
+        if rows is not None:
+            kept = np.zeros_like(values)
+            kept[:, rows] = weighed
+            weighed = kept
+        shape = (len(values), -1, self.sums.shape[1])
+        self.sums[channel] += weighed.reshape(shape).sum(axis=1)
 
 
 def _add_surface(block: _Block, scene: LitScene, origin: NDArray[np.float32]) -> None:

@@ -1,0 +1,262 @@
+"""`DeviceArray`: a torch tensor that answers to numpy's functions, so that one code traces on both.
+
+Rays on a processor are numpy. On a card the same functions get `DeviceArray`s, which numpy hands on
+to torch (NEP 13 and 18). Nothing is read back and all shapes are known beforehand, so that a view
+may be recorded as one graph: rows that a mask chooses are all rows, and what is done with those
+that it leaves out is dropped where it would be stored (`Chosen`).
+"""
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.lib.mixins import NDArrayOperatorsMixin
+from numpy.typing import NDArray
+from torch import Tensor
+
+_TYPES = {
+    np.dtype(np.float32): torch.float32,
+    np.dtype(np.float64): torch.float64,
+    np.dtype(np.int32): torch.int32,
+    np.dtype(np.int64): torch.int64,
+    np.dtype(np.bool_): torch.bool,
+}
+
+
+class Place:
+    """A device, and the arrays of the host that it holds: each is copied there once."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self._held: dict[tuple[object, ...], Tensor] = {}
+
+    def tensor(self, array: NDArray) -> Tensor:
+        """Return a small array of the host; equal ones share a tensor, which lives as this does."""
+        key = (array.dtype.str, array.shape, array.tobytes())
+        if key not in self._held:
+            copy = np.array(array, dtype=None if array.dtype in _TYPES else np.int64)
+            self._held[key] = torch.from_numpy(copy).to(self.device)
+        return self._held[key]
+
+    def array(self, array: NDArray) -> "DeviceArray":
+        """Return an array of the host there, held by nothing else."""
+        return DeviceArray(torch.tensor(array, device=self.device), self)
+
+
+class Chosen:
+    """Rows that a mask chooses: all of them, of which those that it leaves out do not count."""
+
+    def __init__(self, mask: Tensor, place: Place) -> None:
+        self.mask, self._place = mask, place
+
+    def __len__(self) -> int:
+        return len(self.mask)
+
+    def __getitem__(self, among: "Chosen") -> "Chosen":
+        return Chosen(self.mask & among.mask, self._place)
+
+
+class DeviceArray(NDArrayOperatorsMixin):
+    """A tensor in the place of a numpy array; its methods are those of numpy's that rays need."""
+
+    def __init__(self, tensor: Tensor, place: Place) -> None:
+        self.tensor, self.place = tensor, place
+
+    shape = property(lambda self: tuple(self.tensor.shape))
+    ndim = property(lambda self: self.tensor.ndim)
+    T = property(lambda self: self._like(self.tensor.movedim(-1, 0)))
+
+    def __len__(self) -> int:
+        return len(self.tensor)
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *given: Any, **named: Any) -> Any:
+        operation = _UFUNCS.get(ufunc.__name__)
+        if method != "__call__" or operation is None:
+            return NotImplemented
+        operands = [_operand(each, self.place) for each in given]
+        if "dtype" in named:
+            operands = [each.to(_TYPES[np.dtype(named["dtype"])]) for each in operands]
+        result = operation(*operands)
+        target = named.get("out", (None,))[0]
+        if target is None:
+            return self._like(result)
+        where = named.get("where", True)
+        if where is not True:
+            result = torch.where(where.tensor, result, target.tensor)
+        target.tensor = result.to(target.tensor.dtype)
+        return target
+
+    def __array_function__(self, function: Any, types: Any, given: Any, named: Any) -> Any:
+        operation = _FUNCTIONS.get(function)
+        if operation is None:
+            return NotImplemented
+        result = operation(self.place, *given, **named)
+        return self._like(result) if isinstance(result, Tensor) else result
+
+    def __getitem__(self, key: Any) -> "DeviceArray":
+        if isinstance(key, slice) and key.step == -1:
+            return self._like(self.tensor.flip(0))
+        return self._like(self.tensor[self._index(key)[0]])
+
+    def __setitem__(self, key: Any, values: Any) -> None:
+        index, mask = self._index(key)
+        values = _operand(values, self.place)
+        if mask is not None:
+            values = torch.where(mask, values, self.tensor[index])
+        self.tensor[index] = values
+
+    def _index(self, key: Any) -> tuple[Any, Tensor | None]:
+        """Return what torch is asked for, and which of its rows count."""
+        keys, mask = [], None
+        others = key if isinstance(key, tuple) else (key,)
+        gathers = any(isinstance(each, DeviceArray | np.ndarray) for each in others)
+        for each in others:
+            if isinstance(each, Chosen):
+                mask = each.mask
+                rows = np.arange(len(each))
+                keys.append(self.place.tensor(rows) if gathers else slice(None))
+            elif isinstance(each, DeviceArray | np.ndarray):
+                keys.append(_operand(each, self.place))
+            else:
+                keys.append(each)
+        return tuple(keys), mask
+
+    def _like(self, tensor: Tensor) -> "DeviceArray":
+        return DeviceArray(tensor, self.place)
+
+    def astype(self, dtype: Any) -> "DeviceArray":
+        return self._like(self.tensor.to(_TYPES[np.dtype(dtype)]))
+
+    def copy(self) -> "DeviceArray":
+        return self._like(self.tensor.clone(memory_format=torch.contiguous_format))
+
+    def reshape(self, *shape: Any) -> "DeviceArray":
+        return self._like(self.tensor.reshape(*shape))
+
+    def swapaxes(self, first: int, second: int) -> "DeviceArray":
+        return self._like(self.tensor.swapaxes(first, second))
+
+    def ravel(self) -> "DeviceArray":
+        return self._like(self.tensor.flatten())
+
+    def sum(self, axis: int) -> "DeviceArray":
+        return self._like(self.tensor.sum(dim=axis))
+
+    def mean(self, axis: int | None = None) -> "DeviceArray":
+        return self._like(self.tensor.mean() if axis is None else self.tensor.mean(dim=axis))
+
+    def max(self, axis: int) -> "DeviceArray":
+        return self._like(self.tensor.amax(dim=axis))
+
+    def argmax(self, axis: int) -> "DeviceArray":
+        return self._like(self.tensor.argmax(dim=axis))
+
+    def clip(self, least: float, most: float) -> "DeviceArray":
+        return self._like(self.tensor.clamp(least, most))
+
+    def all(self, axis: int) -> "DeviceArray":
+        return self._like(self.tensor.all(dim=axis))
+
+    def any(self) -> bool:
+        """Return True, without asking the device: some may be."""
+        return True
+
+
+def _operand(given: Any, place: Place) -> Any:
+    """Return a tensor, or a number of Python."""
+    if isinstance(given, DeviceArray):
+        return given.tensor
+    if isinstance(given, np.ndarray) and given.ndim:
+        return place.tensor(given)
+    return given.item() if isinstance(given, np.ndarray | np.generic) else given
+
+
+def _bounded(least: Callable, number: str) -> Callable:
+    """Return a maximum or minimum that takes numbers too."""
+
+    def of(a: Any, b: Any) -> Tensor:
+        if isinstance(a, Tensor) and isinstance(b, Tensor):
+            result: Tensor = least(a, b)
+            return result
+        tensor, limit = (a, b) if isinstance(a, Tensor) else (b, a)
+        return tensor.clamp(**{number: limit})
+
+    return of
+
+
+_UFUNCS: dict[str, Callable] = {
+    "add": operator.add,
+    "subtract": operator.sub,
+    "multiply": operator.mul,
+    "divide": operator.truediv,
+    "floor_divide": operator.floordiv,
+    "remainder": operator.mod,
+    "power": operator.pow,
+    "negative": operator.neg,
+    "matmul": operator.matmul,
+    "less": operator.lt,
+    "less_equal": operator.le,
+    "greater": operator.gt,
+    "greater_equal": operator.ge,
+    "equal": operator.eq,
+    "not_equal": operator.ne,
+    "bitwise_and": operator.and_,
+    "bitwise_or": operator.or_,
+    "invert": operator.invert,
+    "maximum": _bounded(torch.maximum, "min"),
+    "minimum": _bounded(torch.minimum, "max"),
+    "absolute": torch.abs,
+    "copysign": torch.copysign,
+    "cos": torch.cos,
+    "floor": torch.floor,
+    "radians": torch.deg2rad,
+    "sin": torch.sin,
+    "sqrt": torch.sqrt,
+    "square": torch.square,
+    "tan": torch.tan,
+}
+
+
+def _all(given: Any, place: Place) -> list[Tensor]:
+    return [_operand(each, place) for each in given]
+
+
+def _where(place: Place, condition: Any, a: Any, b: Any) -> Tensor:
+    return torch.where(*_all((condition, a, b), place))
+
+
+def _take(place: Place, array: Any, index: Any, axis: int = 0) -> Tensor:
+    dim = axis % array.ndim
+    return _operand(array, place)[(slice(None),) * dim + (_operand(index, place),)]
+
+
+def _interp(place: Place, x: Any, known: NDArray, values: NDArray) -> Tensor:
+    x, known, values = _all((x, known, values), place)
+    right = torch.searchsorted(known, x.contiguous()).clamp(1, len(known) - 1)
+    share = ((x - known[right - 1]) / (known[right] - known[right - 1])).clamp(0, 1)
+    return values[right - 1] + share * (values[right] - values[right - 1])
+
+
+def _nonzero(place: Place, mask: DeviceArray) -> tuple[NDArray, ...]:
+    """Return the places of all elements: those that the mask leaves out may be given no weight."""
+    return tuple(each.ravel() for each in np.indices(mask.shape))
+
+
+_FUNCTIONS: dict[Any, Callable] = {
+    np.broadcast_to: lambda place, a, shape: a.tensor.expand(shape),
+    np.concatenate: lambda place, given, axis=0: torch.cat(_all(given, place), dim=axis),
+    np.cumsum: lambda place, a, axis: a.tensor.cumsum(dim=axis),
+    np.flatnonzero: lambda place, mask: Chosen(mask.tensor != 0, place),
+    np.interp: _interp,
+    np.nonzero: _nonzero,
+    np.ones_like: lambda place, a: torch.ones_like(a.tensor),
+    np.searchsorted: lambda place, a, v: torch.searchsorted(*_all((a, v), place)),
+    np.stack: lambda place, given, axis=0: torch.stack(_all(given, place), dim=axis),
+    np.take: _take,
+    np.take_along_axis: lambda place, a, index, axis: a.tensor.gather(axis, index.tensor),
+    np.tile: lambda place, a, count: a.tensor.repeat(count),
+    np.where: _where,
+    np.zeros_like: lambda place, a, shape=None: a.tensor.new_zeros(shape or a.shape),
+}
