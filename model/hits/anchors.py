@@ -62,15 +62,20 @@ def gathered_at(
     direction = rays.direction(0, anchor)
     found = scene.first_hits(rays.origin, direction)
     triangle, uv = found.triangle, found.uv
+    first = np.where(triangle >= 0, 0, rays.turns)
     for turn in range(1, rays.turns):
         other = rays.direction(turn, anchor)
         found, waits = scene.first_hits(rays.origin, other), triangle < 0
         triangle = np.where(waits, found.triangle, triangle)
         uv, direction = np.where(waits, found.uv, uv), np.where(waits, other, direction)
-    met = np.flatnonzero(triangle >= 0)
-    if len(met):
-        points = scene.points(np.maximum(triangle[met], 0), uv[:, met], direction[:, met])
-        total[:, met] = _gathered(scene, light, points, shift[:, met], gather_rays)
+        first = np.where(waits & (triangle >= 0), turn, first)
+    # on a processor turn by turn: numpy's sums depend on how many stand side by side
+    turns = [first < rays.turns] if scene.place else [first == turn for turn in range(rays.turns)]
+    for stands in turns:
+        met = np.flatnonzero(stands)
+        if len(met):
+            points = scene.points(np.maximum(triangle[met], 0), uv[:, met], direction[:, met])
+            total[:, met] = _gathered(scene, light, points, shift[:, met], gather_rays)
     return total.T.copy()
 
 

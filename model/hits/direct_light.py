@@ -133,7 +133,7 @@ def lamp_chances(scene: LitScene, points: Points, gloss: Gloss) -> Floats:
     rays are spent on lamps that are far away or not where a narrow lobe looks.
     """
     shape = len(scene.lamps), points.position.shape[1]
-    odds = np.zeros_like(points.position, shape=shape)
+    odds = np.zeros_like(gloss.alpha, shape=shape)
     albedo = scene.diffuse.mean(axis=0)[points.triangle] * _INV_PI
     colour = gloss.colour.mean(axis=0)
     for number, lamp in enumerate(scene.lamps):
