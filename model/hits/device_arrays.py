@@ -46,16 +46,29 @@ class Place:
 
 
 class Chosen:
-    """Rows that a mask chooses: all of them, of which those that it leaves out do not count."""
+    """Rows that a mask chooses: all of them, of which those that it leaves out do not count.
 
-    def __init__(self, mask: Tensor, place: Place) -> None:
-        self.mask, self._place = mask, place
+    `within` are other rows [A] to ask, where it is known that the mask chooses only some of them.
+    """
+
+    def __init__(self, mask: Tensor, within: Tensor | None = None) -> None:
+        self.mask, self.within = mask, within
 
     def __len__(self) -> int:
         return len(self.mask)
 
     def __getitem__(self, among: "Chosen") -> "Chosen":
-        return Chosen(self.mask & among.mask, self._place)
+        return Chosen(self.mask & among.mask, among.within)
+
+    @property
+    def counts(self) -> Tensor:
+        """[A] which of the rows that are asked do count."""
+        return self.mask if self.within is None else self.mask[self.within]
+
+    def kept(self, values: "DeviceArray") -> "DeviceArray":
+        """Return the values [..., A] of the rows that are asked, 0 for those that do not count."""
+        zero = values.tensor.new_zeros(())
+        return DeviceArray(torch.where(self.counts, values.tensor, zero), values.place)
 
 
 class DeviceArray(NDArrayOperatorsMixin):
@@ -114,9 +127,10 @@ class DeviceArray(NDArrayOperatorsMixin):
         gathers = any(isinstance(each, DeviceArray | np.ndarray) for each in others)
         for each in others:
             if isinstance(each, Chosen):
-                mask = each.mask
-                rows = np.arange(len(each))
-                keys.append(self.place.tensor(rows) if gathers else slice(None))
+                mask, rows = each.counts, each.within
+                if rows is None and gathers:
+                    rows = self.place.tensor(np.arange(len(each)))
+                keys.append(slice(None) if rows is None else rows)
             elif isinstance(each, DeviceArray | np.ndarray):
                 keys.append(_operand(each, self.place))
             else:
@@ -140,6 +154,9 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     def ravel(self) -> "DeviceArray":
         return self._like(self.tensor.flatten())
+
+    def cross(self, other: "DeviceArray") -> "DeviceArray":
+        return self._like(torch.linalg.cross(self.tensor, other.tensor, dim=0))
 
     def sum(self, axis: int) -> "DeviceArray":
         return self._like(self.tensor.sum(dim=axis))
@@ -248,7 +265,7 @@ _FUNCTIONS: dict[Any, Callable] = {
     np.broadcast_to: lambda place, a, shape: a.tensor.expand(shape),
     np.concatenate: lambda place, given, axis=0: torch.cat(_all(given, place), dim=axis),
     np.cumsum: lambda place, a, axis: a.tensor.cumsum(dim=axis),
-    np.flatnonzero: lambda place, mask: Chosen(mask.tensor != 0, place),
+    np.flatnonzero: lambda place, mask: Chosen(mask.tensor.flatten() != 0),
     np.interp: _interp,
     np.nonzero: _nonzero,
     np.ones_like: lambda place, a: torch.ones_like(a.tensor),

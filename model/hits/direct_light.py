@@ -4,6 +4,7 @@ Unbiased: the mean over `turn`s and shifts is the integral, but for the specular
 part is left to rays that are drawn by the lobe (`lobe_ray_weight`).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,9 @@ from model.hits.reflectance import Gloss, lobe
 from model.hits.vectors import Floats, as_rows, brightest, dot
 
 _INV_PI = np.float32(1 / np.pi)
+
+TOGETHER = 2**21
+"""Pairs of points and lamps that a card computes at a time."""
 
 _SHORTENING = np.float32(1 - 1e-4)
 """Share of the way to a lamp that a shadow ray goes, as the renderer's."""
@@ -64,9 +68,18 @@ def direct_light(
             are better at finding is left to them (the power heuristic, Veach and Guibas 1995).
     """
     light = no_light(points)
-    for number, lamp in enumerate(scene.lamps):
-        _add(light, scene, points, gloss, int(lamp), on_lamps[:, number], lobe_rays)
+    for some in _some_lamps(scene, points):
+        _add(light, scene, points, gloss, some, on_lamps[:, some], lobe_rays)
     return light
+
+
+def _some_lamps(scene: LitScene, points: Points) -> Iterator[slice]:
+    """Yield which lamps are computed together: one by one, or on a card as many as its memory
+    likes."""
+    count = points.position.shape[1]
+    step = 1 if scene.place is None else max(1, TOGETHER // count)
+    for first in range(0, len(scene.lamps), step):
+        yield slice(first, min(first + step, len(scene.lamps)))
 
 
 def _add(
@@ -74,33 +87,42 @@ def _add(
     scene: LitScene,
     points: Points,
     gloss: Gloss | None,
-    lamp: int,
+    some: slice,
     on_lamp: Floats,
     lobe_rays: int,
 ) -> None:
-    place = _on_triangle(scene, lamp, on_lamp)
-    to_lamp = place - points.position
+    """Add the light of l lamps; arrays are [3, l, P] and [l, P]."""
+    lamps = scene.lamps[some]
+    here, gloss = points.only(None), None if gloss is None else gloss.only(None)
+    place = _on_triangle(scene, lamps[:, None], on_lamp)
+    to_lamp = place - here.position
     square = np.maximum(dot(to_lamp, to_lamp), np.float32(1e-12))
     to_lamp = to_lamp / np.sqrt(square)
-    cosine = dot(points.normal, to_lamp)
-    lamp_plane = scene.plane[:, lamp]
-    facing = np.abs(lamp_plane @ to_lamp)
-    solid = facing * scene.area[lamp] / square
+    cosine = dot(here.normal, to_lamp)
+    planes = [scene.plane[:, int(lamp)] for lamp in lamps]
+    facing = np.abs(np.stack([plane @ to_lamp[:, row] for row, plane in enumerate(planes)]))
+    solid = facing * scene.area[lamps][:, None] / square
     diffuse = np.maximum(cosine, 0) * solid * _INV_PI
     specular = None
     if gloss is not None:
-        value, density = lobe(gloss, points, to_lamp, cosine)
+        value, density = lobe(gloss, here, to_lamp, cosine)
         specular = value * solid / (1 + np.square(lobe_rays * density * solid))
     useful = np.flatnonzero(diffuse if specular is None else (diffuse > 0) | (specular > 0))
-    is_free = np.zeros_like(diffuse)
-    is_free[useful] = _is_free(scene, points, place, to_lamp, useful)
-    emission = scene.emission[:, lamp, None]
-    np.add(light.open_diffuse, diffuse * emission, out=light.open_diffuse)
-    np.add(light.diffuse, diffuse * is_free * emission, out=light.diffuse)
+    is_free = np.zeros_like(diffuse).reshape(-1)
+    is_free[useful] = _is_free(scene, here, place, to_lamp, useful)
+    is_free = is_free.reshape(diffuse.shape)
+    emission = scene.emission[:, lamps][:, :, None]
+    np.add(light.open_diffuse, _total(diffuse * emission), out=light.open_diffuse)
+    np.add(light.diffuse, _total(diffuse * is_free * emission), out=light.diffuse)
     if specular is not None and gloss is not None:
         coloured = gloss.colour * specular * emission
-        np.add(light.open_specular, coloured, out=light.open_specular)
-        np.add(light.specular, coloured * is_free, out=light.specular)
+        np.add(light.open_specular, _total(coloured), out=light.open_specular)
+        np.add(light.specular, _total(coloured * is_free), out=light.specular)
+
+
+def _total(of_lamps: Floats) -> Floats:
+    """Return [3, P] of [3, l, P]."""
+    return of_lamps[:, 0] if of_lamps.shape[1] == 1 else of_lamps.sum(axis=1)
 
 
 def lobe_ray_weight(
@@ -136,15 +158,18 @@ def lamp_chances(scene: LitScene, points: Points, gloss: Gloss) -> Floats:
     odds = np.zeros_like(gloss.alpha, shape=shape)
     albedo = scene.diffuse.mean(axis=0)[points.triangle] * _INV_PI
     colour = gloss.colour.mean(axis=0)
-    for number, lamp in enumerate(scene.lamps):
-        middle = scene.corners[:, :, lamp].mean(axis=0)
-        to_lamp = middle[:, None] - points.position
-        square = np.maximum(dot(to_lamp, to_lamp), scene.area[lamp])
+    here, gloss = points.only(None), gloss.only(None)
+    for some in _some_lamps(scene, points):
+        lamps = scene.lamps[some]
+        middle = scene.corners[:, :, lamps].mean(axis=0)
+        to_lamp = middle[:, :, None] - here.position
+        square = np.maximum(dot(to_lamp, to_lamp), scene.area[lamps][:, None])
         to_lamp = to_lamp / np.sqrt(square)
-        cosine = dot(points.normal, to_lamp)
-        value, _ = lobe(gloss, points, to_lamp, cosine)
+        cosine = dot(here.normal, to_lamp)
+        value, _ = lobe(gloss, here, to_lamp, cosine)
         sent = albedo * np.maximum(cosine, 0) + colour * value + _EVEN
-        odds[number] = sent * (scene.emission[:, lamp].mean() * scene.area[lamp]) / square
+        power = scene.emission[:, lamps].mean(axis=0) * scene.area[lamps]
+        odds[some] = sent * power[:, None] / square
     chances: Floats = odds / np.maximum(odds.sum(axis=0), np.float32(1e-30))
     return chances
 
@@ -196,19 +221,22 @@ def _is_free(
     """Return whether nothing stands between some of the points and their places on lamps."""
     if not len(rows):
         return np.zeros(0, np.bool_)
-    position, plane = points.position[:, rows], points.plane[:, rows]
-    start = off_surface(position, plane, to_lamp[:, rows])
-    way = place[:, rows] - start
+    position, plane, place, to_lamp = (
+        np.broadcast_to(each, place.shape).reshape(3, -1)[:, rows]
+        for each in (points.position, points.plane, place, to_lamp)
+    )
+    start = off_surface(position, plane, to_lamp)
+    way = place - start
     length = np.sqrt(np.maximum(dot(way, way), np.float32(1e-20)))
     return scene.everything.is_free(as_rows(start), as_rows(way / length), length * _SHORTENING)
 
 
-def _on_triangle(scene: LitScene, rows: NDArray[np.intp] | int, u: Floats) -> Floats:
-    """Return points [3, P], evenly spread over triangles for u [2, P] in the unit square."""
+def _on_triangle(scene: LitScene, rows: NDArray[np.intp], u: Floats) -> Floats:
+    """Return points [3, ...], evenly spread over triangles [...] for u [2, ...] in the unit square.
+    """
     root = np.sqrt(u[0])
-    weights = np.stack([1 - root, root * (1 - u[1]), root * u[1]])
     corners = scene.corners[:, :, rows]
-    if corners.ndim == 2:
-        corners = corners[:, :, None]
-    place: Floats = (corners * weights[:, None]).sum(axis=0)
+    place: Floats = corners[0] * (1 - root)
+    place += corners[1] * (root * (1 - u[1]))
+    place += corners[2] * (root * u[1])
     return place

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from model.hits.device_arrays import DeviceArray
+
 Floats = NDArray
 """float32: numpy's own annotations cannot follow it through arithmetic."""
 
@@ -13,6 +15,8 @@ _LEAST_SHARE = np.float32(1e-3)
 
 def dot(a: Floats, b: Floats) -> Floats:
     """Return [P] products."""
+    if isinstance(a, DeviceArray):
+        return (a * b).sum(axis=0)
     product: Floats = a[0] * b[0]
     product += a[1] * b[1]
     product += a[2] * b[2]
@@ -31,6 +35,8 @@ def unit(a: Floats) -> Floats:
 
 def cross(a: Floats, b: Floats) -> Floats:
     """Return [3, P]."""
+    if isinstance(a, DeviceArray):
+        return a.cross(b)
     return np.stack(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )

@@ -118,6 +118,7 @@ def view_inputs(
                 sums=sums[:, part],
                 pixel=shaded.pixel,
                 weight=shaded.weight,
+                of_pixels=shaded.of_pixels,
             )
             pixel, turn = shaded.pixel + part.start, shaded.turn
             _add_surface(block, scene, rays.origin)
@@ -161,6 +162,8 @@ class _Shaded:
     """[P] which of the pixel's rays it is."""
     weight: NDArray[np.float32]
     """[P] how many of the pixel's rays it stands for."""
+    of_pixels: Floats
+    """[pixels] of all rays of the block, counted turn by turn: the one drawn of each pixel."""
     chosen: NDArray[np.float32]
     """[P] 1 for one point of each pixel, drawn evenly from its rays; 0 for others."""
 
@@ -194,6 +197,7 @@ def _shaded(
         turn=turn,
         weight=np.where(is_one[pixel], np.float32(turns), np.float32(1)) * stands[turn, pixel],
         chosen=alone[turn, pixel].astype(np.float32),
+        of_pixels=drawn_turn * count + np.arange(count),
     )
 
 
@@ -209,6 +213,8 @@ class _Block:
     """[P] which of the block's pixels the points belong to."""
     weight: NDArray[np.float32]
     """[P] how many rays each stands for."""
+    of_pixels: Floats
+    """[pixels] on a card: the point of each pixel that stands for all in what one ray brings."""
 
     def add(
         self, channel: slice, values: NDArray[np.float32], rows: NDArray[np.intp] | None = None
@@ -224,12 +230,9 @@ class _Block:
 
     def _add_all(self, channel: slice, values: Floats, rows: Chosen | None) -> None:
         """Add those of all rays of the block, turn after turn; where none count, nothing."""
-        weighed = np.zeros_like(values)
-        weighed[:, np.flatnonzero(self.weight)] = values * self.weight
-        if rows is not None:
-            kept = np.zeros_like(values)
-            kept[:, rows] = weighed
-            weighed = kept
+        counts = np.flatnonzero(self.weight)
+        rows = counts if rows is None else counts[rows]
+        weighed = rows.kept(values * self.weight[rows])
         shape = (len(values), -1, self.sums.shape[1])
         self.sums[channel] += weighed.reshape(shape).sum(axis=1)
 
@@ -320,6 +323,8 @@ def _add_lobe_rays(
         block.add(Channel.OPEN_SPECULAR, escaped, some)
         block.add(Channel.DIRECT_SPECULAR, np.where(met, np.float32(0), escaped), some)
     asked = np.flatnonzero(met & (shading[some] > 0))
+    if isinstance(asked, Chosen):
+        asked = Chosen(asked.mask, block.of_pixels.tensor)
     if len(asked):
         rows = some[asked]
         is_sharp, seen = gloss.alpha[asked] < SMOOTH_ALPHA, beyond.only(asked)
