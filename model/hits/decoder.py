@@ -22,9 +22,9 @@ from torch.nn.functional import silu, softplus
 from model.attention import Keys, attend
 from model.config import ModelConfig
 from model.encoded_scene import EncodedScene, KeysValues, TokenPlaces
-from model.hits.second_hits import DEVICE_BLOCK
 from model.hits.lie import FARTHEST, NEIGHBOURS, PLACE, Lie, lies_to
 from model.hits.light_filter import LightFilter, filter_flops
+from model.hits.second_hits import DEVICE_BLOCK
 from model.hits.traced import INPUTS, Traced
 from model.hits.view_inputs import Channel
 from model.layers import (

@@ -40,8 +40,8 @@ class Place:
             self._held[key] = torch.from_numpy(copy).to(self.device)
         return self._held[key]
 
-    def array(self, array: NDArray) -> "DeviceArray":
-        """Return an array of the host there, held by nothing else."""
+    def array(self, array: NDArray) -> Any:
+        """Return a `DeviceArray` of an array of the host, held by nothing else."""
         return DeviceArray(torch.tensor(array, device=self.device), self)
 
 
@@ -241,7 +241,8 @@ def _all(given: Any, place: Place) -> list[Tensor]:
 
 
 def _where(place: Place, condition: Any, a: Any, b: Any) -> Tensor:
-    return torch.where(*_all((condition, a, b), place))
+    condition, a, b = _all((condition, a, b), place)
+    return torch.where(condition, a, b)
 
 
 def _take(place: Place, array: Any, index: Any, axis: int = 0) -> Tensor:
@@ -249,8 +250,8 @@ def _take(place: Place, array: Any, index: Any, axis: int = 0) -> Tensor:
     return _operand(array, place)[(slice(None),) * dim + (_operand(index, place),)]
 
 
-def _interp(place: Place, x: Any, known: NDArray, values: NDArray) -> Tensor:
-    x, known, values = _all((x, known, values), place)
+def _interp(place: Place, *given: Any) -> Tensor:
+    x, known, values = _all(given, place)
     right = torch.searchsorted(known, x.contiguous()).clamp(1, len(known) - 1)
     share = ((x - known[right - 1]) / (known[right] - known[right - 1])).clamp(0, 1)
     return values[right - 1] + share * (values[right] - values[right - 1])

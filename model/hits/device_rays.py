@@ -7,6 +7,7 @@ edge get the same number with opposite signs, so no ray slips between them.
 """
 
 import functools
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,7 +136,7 @@ def build_tree(corners_T33: Tensor, rows_T: Tensor) -> Tree:
         middles = middle_T3[order]
         longest = (middles.amax(dim=1) - middles.amin(dim=1)).argmax(dim=-1)
         along = middles.gather(2, longest[:, None, None].expand(-1, middles.shape[1], 1))
-        order = order.gather(1, along[..., 0].argsort(dim=1)).flatten()
+        order = order.gather(1, along[..., 0].argsort(dim=1, stable=True)).flatten()
     corners = corners_T33[order]
     least = corners.flatten(0, 1).unflatten(0, (-1, 3 * LEAF)).amin(dim=1)
     most = corners.flatten(0, 1).unflatten(0, (-1, 3 * LEAF)).amax(dim=1)
@@ -159,8 +160,12 @@ def compiled_kernel(device: torch.device) -> Any | None:
     """Return the kernel for a card; None where it cannot be compiled, and rays stay on the CPU."""
     if device.type != "cuda":
         return None
-    with torch.cuda.device(device):
-        return torch.cuda._compile_kernel(SOURCE, "trace")
+    try:
+        with torch.cuda.device(device):
+            return torch.cuda._compile_kernel(SOURCE, "trace")
+    except (AttributeError, OSError, RuntimeError) as error:
+        warnings.warn(f"the card's rays stay with the processor: {error}", stacklevel=2)
+        return None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -45,8 +45,7 @@ class DeviceTextures:
         return DeviceArray(rows, triangle.place)
 
     def _values(self, texture: Tensor, uv: Tensor) -> Tensor:
-        """Return the values [P, 3] of textures [P] at coordinates [P, 2], as storage.records.lookup
-        has them."""
+        """Return values [P, 3] of textures [P] at [P, 2], as storage.records.lookup has them."""
         first, height, width = self._sizes[texture].unbind(dim=1)
         x, y = (uv - uv.floor()).unbind(dim=1)
         x, y = x * width - 0.5, y * height - 0.5

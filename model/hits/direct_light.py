@@ -74,8 +74,7 @@ def direct_light(
 
 
 def _some_lamps(scene: LitScene, points: Points) -> Iterator[slice]:
-    """Yield which lamps are computed together: one by one, or on a card as many as its memory
-    likes."""
+    """Yield which lamps are computed together: one by one, or on a card many."""
     count = points.position.shape[1]
     step = 1 if scene.place is None else max(1, TOGETHER // count)
     for first in range(0, len(scene.lamps), step):
@@ -232,8 +231,7 @@ def _is_free(
 
 
 def _on_triangle(scene: LitScene, rows: NDArray[np.intp], u: Floats) -> Floats:
-    """Return points [3, ...], evenly spread over triangles [...] for u [2, ...] in the unit square.
-    """
+    """Return points [3, ...], evenly spread over triangles [...] for u [2, ...] from 0 to 1."""
     root = np.sqrt(u[0])
     corners = scene.corners[:, :, rows]
     place: Floats = corners[0] * (1 - root)

@@ -80,8 +80,8 @@ class Points:
     reflecting: Reflecting | None = None
     """How the points reflect, in textured scenes; None: as their triangles do in the mean."""
 
-    def only(self, rows: NDArray[np.intp]) -> "Points":
-        """Return some of the points."""
+    def only(self, rows: NDArray[np.intp] | None) -> "Points":
+        """Return some of the points; of None, all of them with an axis before that of points."""
         return Points(
             triangle=self.triangle[rows],
             position=self.position[:, rows],
@@ -90,7 +90,9 @@ class Points:
             toward=self.toward[:, rows],
             edge=self.edge[:, rows],
             back=self.back[rows],
-            reflecting=None if self.reflecting is None else self.reflecting.only(rows),
+            reflecting=None
+            if rows is None or self.reflecting is None
+            else self.reflecting.only(rows),
         )
 
     def start(self, direction: Floats) -> Floats:
@@ -140,7 +142,8 @@ class LitScene:
         means = reflecting(materials_TM)
         self.diffuse, self.specular, self.again = means.diffuse, means.specular, means.again
         self.alpha, self.roughness = means.alpha, means.roughness
-        self.textures, self._materials_TM = textures, materials_TM
+        self.textures: Any = textures  # on a card `DeviceTextures`
+        self._materials_TM = materials_TM
         self.sky = sky
         self.emission = np.ascontiguousarray(materials_TM[:, EMISSION].T.astype(np.float32))
         self._corner_rows = corners_T33
@@ -164,7 +167,7 @@ class LitScene:
         moved.everything = caster(self._corner_rows, np.arange(self.num_triangles), place)
         return moved
 
-    def here(self, array: NDArray) -> Floats:
+    def here(self, array: NDArray) -> Any:
         """Return an array of the host where the scene's tables are."""
         if self.place is None:
             return array

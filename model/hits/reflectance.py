@@ -32,8 +32,8 @@ class Gloss:
     faces: NDArray[np.bool_]
     """[P] whether the viewer is above the shading normal's horizon: below there is no lobe."""
 
-    def only(self, rows: NDArray[np.intp]) -> "Gloss":
-        """Return some of the points."""
+    def only(self, rows: NDArray[np.intp] | None) -> "Gloss":
+        """Return some of the points, as `Points.only`."""
         return Gloss(
             colour=self.colour[:, rows],
             alpha=self.alpha[rows],

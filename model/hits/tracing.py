@@ -24,7 +24,6 @@ from storage.conventions import radiance_from_log10
 from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
 
-
 MOST_LAMPS = 256
 """Emitting triangles with which a scene's rays are traced by a card: each takes its kernels."""
 
@@ -69,12 +68,15 @@ class TracedScene:
         self, c2w_44: Tensor, fov_deg: Tensor, resolution: int, config: ModelConfig, seed: int
     ) -> ViewInputs:
         """Return what is traced for one view."""
-        place = self.lit.place
+        camera: tuple[Any, Any]
+        if self.lit.place is None:
+            camera = c2w_44.detach().cpu().numpy(), float(fov_deg)
+        else:
+            camera = tuple(DeviceArray(each, self.lit.place) for each in (c2w_44, fov_deg))
         return view_inputs(
             self.lit,
             self.light,
-            c2w_44.detach().cpu().numpy() if place is None else DeviceArray(c2w_44, place),
-            float(fov_deg) if place is None else DeviceArray(fov_deg, place),
+            *camera,
             resolution,
             rays_a_side=config.hit_rays,
             anchors_a_side=anchors_a_side(config, resolution),
@@ -209,8 +211,8 @@ def traced_views(
     )
 
 
-def _stacked(arrays: list[NDArray | DeviceArray]) -> Tensor:
-    stacked = np.stack(arrays)
+def _stacked(arrays: list[NDArray]) -> Tensor:
+    stacked: Any = np.stack(arrays)
     return stacked.tensor if isinstance(stacked, DeviceArray) else torch.from_numpy(stacked)
 
 

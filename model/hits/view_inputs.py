@@ -6,6 +6,7 @@ anchors, a grid over the picture, and mirrored by one ray for each pixel.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,8 +79,8 @@ class ViewInputs:
 def view_inputs(
     scene: LitScene,
     light: SceneLight,
-    c2w: NDArray[np.float32],
-    fov_deg: float,
+    c2w: Floats,
+    fov_deg: Any,
     resolution: int,
     *,
     rays_a_side: int,
@@ -207,7 +208,7 @@ class _Block:
 
     points: Points
     gloss: Gloss
-    sums: NDArray[np.float32]
+    sums: Floats
     """[40, pixels of the block]"""
     pixel: NDArray[np.intp]
     """[P] which of the block's pixels the points belong to."""
@@ -228,9 +229,9 @@ class _Block:
         for number, row in enumerate(range(channel.start, channel.stop)):
             self.sums[row] += np.bincount(pixel, weighed[number], self.sums.shape[1])
 
-    def _add_all(self, channel: slice, values: Floats, rows: Chosen | None) -> None:
+    def _add_all(self, channel: slice, values: Any, rows: Any) -> None:
         """Add those of all rays of the block, turn after turn; where none count, nothing."""
-        counts = np.flatnonzero(self.weight)
+        counts: Any = np.flatnonzero(self.weight)
         rows = counts if rows is None else counts[rows]
         weighed = rows.kept(values * self.weight[rows])
         shape = (len(values), -1, self.sums.shape[1])

@@ -72,7 +72,9 @@ def _seen(lit: LitScene, targets: list[list[float]]) -> Points:
     """Return what rays from the eye meet first on their way to these places."""
     toward = np.array(targets, np.float32) - EYE
     rays = (toward / np.linalg.norm(toward, axis=1)[:, None]).T
-    points, met = lit.first_points(EYE, rays.astype(np.float32))
+    hits = lit.first_hits(EYE, rays.astype(np.float32))
+    met = np.flatnonzero(hits.triangle >= 0)
+    points = lit.points(hits.triangle[met], hits.uv[:, met], rays[:, met].astype(np.float32))
     assert len(met) == len(targets)
     return points
 
