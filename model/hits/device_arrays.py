@@ -3,7 +3,7 @@
 Rays on a processor are numpy. On a card the same functions get `DeviceArray`s, which numpy hands on
 to torch (NEP 13 and 18). Nothing is read back and all shapes are known beforehand, so that a view
 may be recorded as one graph: rows that a mask chooses are all rows, and what is done with those
-that it leaves out is dropped where it would be stored (`Chosen`).
+that it leaves out is dropped where it would be stored (`MaskedRows`).
 """
 
 import operator
@@ -25,7 +25,7 @@ _TYPES = {
 }
 
 
-class Place:
+class DevicePlace:
     """A device, and the arrays of the host that it holds: each is copied there once."""
 
     def __init__(self, device: torch.device) -> None:
@@ -45,7 +45,7 @@ class Place:
         return DeviceArray(torch.tensor(array, device=self.device), self)
 
 
-class Chosen:
+class MaskedRows:
     """Rows that a mask chooses: all of them, of which those that it leaves out do not count.
 
     `within` are other rows [A] to ask, where it is known that the mask chooses only some of them.
@@ -57,8 +57,8 @@ class Chosen:
     def __len__(self) -> int:
         return len(self.mask)
 
-    def __getitem__(self, among: "Chosen") -> "Chosen":
-        return Chosen(self.mask & among.mask, among.within)
+    def __getitem__(self, among: "MaskedRows") -> "MaskedRows":
+        return MaskedRows(self.mask & among.mask, among.within)
 
     @property
     def counts(self) -> Tensor:
@@ -74,7 +74,7 @@ class Chosen:
 class DeviceArray(NDArrayOperatorsMixin):
     """A tensor in the place of a numpy array; its methods are those of numpy's that rays need."""
 
-    def __init__(self, tensor: Tensor, place: Place) -> None:
+    def __init__(self, tensor: Tensor, place: DevicePlace) -> None:
         self.tensor, self.place = tensor, place
 
     shape = property(lambda self: tuple(self.tensor.shape))
@@ -126,7 +126,7 @@ class DeviceArray(NDArrayOperatorsMixin):
         others = key if isinstance(key, tuple) else (key,)
         gathers = any(isinstance(each, DeviceArray | np.ndarray) for each in others)
         for each in others:
-            if isinstance(each, Chosen):
+            if isinstance(each, MaskedRows):
                 mask, rows = each.counts, each.within
                 if rows is None and gathers:
                     rows = self.place.tensor(np.arange(len(each)))
@@ -181,7 +181,7 @@ class DeviceArray(NDArrayOperatorsMixin):
         return True
 
 
-def _operand(given: Any, place: Place) -> Any:
+def _operand(given: Any, place: DevicePlace) -> Any:
     """Return a tensor, or a number of Python."""
     if isinstance(given, DeviceArray):
         return given.tensor
@@ -236,28 +236,28 @@ _UFUNCS: dict[str, Callable] = {
 }
 
 
-def _all(given: Any, place: Place) -> list[Tensor]:
+def _all(given: Any, place: DevicePlace) -> list[Tensor]:
     return [_operand(each, place) for each in given]
 
 
-def _where(place: Place, condition: Any, a: Any, b: Any) -> Tensor:
+def _where(place: DevicePlace, condition: Any, a: Any, b: Any) -> Tensor:
     condition, a, b = _all((condition, a, b), place)
     return torch.where(condition, a, b)
 
 
-def _take(place: Place, array: Any, index: Any, axis: int = 0) -> Tensor:
+def _take(place: DevicePlace, array: Any, index: Any, axis: int = 0) -> Tensor:
     dim = axis % array.ndim
     return _operand(array, place)[(slice(None),) * dim + (_operand(index, place),)]
 
 
-def _interp(place: Place, *given: Any) -> Tensor:
+def _interp(place: DevicePlace, *given: Any) -> Tensor:
     x, known, values = _all(given, place)
     right = torch.searchsorted(known, x.contiguous()).clamp(1, len(known) - 1)
     share = ((x - known[right - 1]) / (known[right] - known[right - 1])).clamp(0, 1)
     return values[right - 1] + share * (values[right] - values[right - 1])
 
 
-def _nonzero(place: Place, mask: DeviceArray) -> tuple[NDArray, ...]:
+def _nonzero(place: DevicePlace, mask: DeviceArray) -> tuple[NDArray, ...]:
     """Return the places of all elements: those that the mask leaves out may be given no weight."""
     return tuple(each.ravel() for each in np.indices(mask.shape))
 
@@ -266,7 +266,7 @@ _FUNCTIONS: dict[Any, Callable] = {
     np.broadcast_to: lambda place, a, shape: a.tensor.expand(shape),
     np.concatenate: lambda place, given, axis=0: torch.cat(_all(given, place), dim=axis),
     np.cumsum: lambda place, a, axis: a.tensor.cumsum(dim=axis),
-    np.flatnonzero: lambda place, mask: Chosen(mask.tensor.flatten() != 0),
+    np.flatnonzero: lambda place, mask: MaskedRows(mask.tensor.flatten() != 0),
     np.interp: _interp,
     np.nonzero: _nonzero,
     np.ones_like: lambda place, a: torch.ones_like(a.tensor),

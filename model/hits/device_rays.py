@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.hits.device_arrays import DeviceArray, Place
+from model.hits.device_arrays import DeviceArray, DevicePlace
 from storage.records.surfaces import MISS
 
 LEAF = 4
@@ -181,7 +181,9 @@ class MetOnDevice:
 class DeviceTriangles:
     """Some triangles of many, as rays on a card meet them (as storage.records.surfaces)."""
 
-    def __init__(self, corners_T33: NDArray[np.float32], rows: NDArray[np.intp], place: Place):
+    def __init__(
+        self, corners_T33: NDArray[np.float32], rows: NDArray[np.intp], place: DevicePlace
+    ):
         """Take the corners of triangles, world space, and the rows of those that are there."""
         self._place = place
         corners = torch.tensor(corners_T33[rows], device=place.device)

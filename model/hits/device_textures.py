@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.hits.device_arrays import DeviceArray, Place
+from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.textures import SurfaceTextures
 from storage.records.material import laid_out
 from storage.records.texture import CONSTANT, TEXTURED
@@ -13,7 +13,7 @@ from storage.records.texture import CONSTANT, TEXTURED
 class DeviceTextures:
     """What `SurfaceTextures` says, in the same precision."""
 
-    def __init__(self, textures: SurfaceTextures, place: Place) -> None:
+    def __init__(self, textures: SurfaceTextures, place: DevicePlace) -> None:
         self.is_textured = place.array(textures.is_textured)
         self._uv_T32 = place.array(textures.uv_T32).tensor.double()
         self._rows_T3 = place.array(textures.rows_T3).tensor.long()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.device_arrays import DeviceArray, Place
+from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_textures import DeviceTextures
 from model.hits.textures import SurfaceTextures
 from model.hits.vectors import Floats, as_rows, brightest, dot, unit
@@ -111,7 +111,7 @@ def off_surface(position: Floats, plane: Floats, direction: Floats) -> Floats:
 class LitScene:
     """Tables of T triangles, components first: [3, T] and [T]."""
 
-    place: Place | None = None
+    place: DevicePlace | None = None
     """Where its tables are, as `DeviceArray`s; None: on the CPU."""
 
     def __init__(
@@ -154,7 +154,7 @@ class LitScene:
     def num_triangles(self) -> int:
         return len(self.area)
 
-    def on(self, place: Place, caster: Callable[..., Any]) -> "LitScene":
+    def on(self, place: DevicePlace, caster: Callable[..., Any]) -> "LitScene":
         """Return the scene, which has no sky, on a device, where `caster` prepares its rays."""
         moved = copy.copy(self)
         for name, table in vars(self).items():

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.config import ModelConfig
-from model.hits.device_arrays import DeviceArray, Place
+from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import DeviceTriangles, compiled_kernel
 from model.hits.lit_scene import LitScene
 from model.hits.radiosity import SceneLight, scene_light
@@ -47,19 +47,17 @@ class TracedScene:
         is_small = self.lit.sky is None and len(self.lit.lamps) <= MOST_LAMPS
         if not is_small or compiled_kernel(device) is None:
             return self
-        return self.on_place(Place(device), DeviceTriangles)
+        return self.on_place(DevicePlace(device), DeviceTriangles)
 
-    def on_place(self, place: Place, caster: Callable[..., Any]) -> "TracedScene":
+    def on_place(self, place: DevicePlace, caster: Callable[..., Any]) -> "TracedScene":
         """Return the scene there, with rays as `caster` prepares them."""
+        tables = {each.name: getattr(self.light, each.name) for each in fields(SceneLight)}
+        held: dict[str, Any] = {
+            name: place.array(table) for name, table in tables.items() if table is not None
+        }
         return TracedScene(
             lit=self.lit.on(place, caster),
-            light=SceneLight(
-                **{
-                    name: None if table is None else place.array(table)
-                    for name, table in vars(self.light).items()
-                    if name in SceneLight.__dataclass_fields__
-                }
-            ),
+            light=SceneLight(**held),
             sides_T12=self.sides_T12.to(place.device),
             unit_3=self.unit_3.to(place.device),
         )
@@ -72,11 +70,13 @@ class TracedScene:
         if self.lit.place is None:
             camera = c2w_44.detach().cpu().numpy(), float(fov_deg)
         else:
-            camera = tuple(DeviceArray(each, self.lit.place) for each in (c2w_44, fov_deg))
+            place = self.lit.place
+            camera = DeviceArray(c2w_44, place), DeviceArray(fov_deg, place)
         return view_inputs(
             self.lit,
             self.light,
-            *camera,
+            camera[0],
+            camera[1],
             resolution,
             rays_a_side=config.hit_rays,
             anchors_a_side=anchors_a_side(config, resolution),

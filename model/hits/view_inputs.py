@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from model.hits.anchors import anchor_pixels, gathered_at
 from model.hits.camera import Rays
-from model.hits.device_arrays import Chosen, DeviceArray
+from model.hits.device_arrays import DeviceArray, MaskedRows
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
@@ -324,8 +324,8 @@ def _add_lobe_rays(
         block.add(Channel.OPEN_SPECULAR, escaped, some)
         block.add(Channel.DIRECT_SPECULAR, np.where(met, np.float32(0), escaped), some)
     asked = np.flatnonzero(met & (shading[some] > 0))
-    if isinstance(asked, Chosen):
-        asked = Chosen(asked.mask, block.of_pixels.tensor)
+    if isinstance(asked, MaskedRows):
+        asked = MaskedRows(asked.mask, block.of_pixels.tensor)
     if len(asked):
         rows = some[asked]
         is_sharp, seen = gloss.alpha[asked] < SMOOTH_ALPHA, beyond.only(asked)

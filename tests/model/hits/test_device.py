@@ -11,7 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from model.hits.device_arrays import DeviceArray, Place
+from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import SOURCE, DeviceTriangles, MetOnDevice, build_tree
 from model.hits.tracing import traced_scene
 from model.neural_renderer import NeuralRenderer
@@ -29,7 +29,7 @@ needs_card = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA d
 class _OnHost:
     """Embree for tensors of the CPU."""
 
-    def __init__(self, corners: NDArray, rows: NDArray, place: Place) -> None:
+    def __init__(self, corners: NDArray, rows: NDArray, place: DevicePlace) -> None:
         self._embree, self._place = Triangles(corners, rows), place
 
     def met(self, origins: DeviceArray, directions: DeviceArray) -> MetOnDevice:
@@ -44,7 +44,7 @@ class _OnHost:
 @for_each("scene", [corner(), textured()])
 def test_a_view_of_tensors_is_numpys(scene: Scene) -> None:
     numpy_form = traced_scene(lit_scene(scene))
-    tensor_form = numpy_form.on_place(Place(CPU), _OnHost)
+    tensor_form = numpy_form.on_place(DevicePlace(CPU), _OnHost)
     camera = torch.tensor(scene.c2w[0]), torch.tensor(float(scene.fov_deg[0]))
     given = (*camera, 32, dataclasses.replace(hits_config(), hit_rays=2, gather_rays=4), 0)
     expected, got = numpy_form.view(*given), tensor_form.view(*given)
@@ -108,7 +108,7 @@ def test_a_card_shows_the_processors_picture() -> None:
     scene, card = textured(), torch.device("cuda")
     corners = _corners()
     starts, directions, _ = _rays(corners, 4000)
-    rows, place = np.arange(len(corners)), Place(card)
+    rows, place = np.arange(len(corners)), DevicePlace(card)
     met = DeviceTriangles(corners, rows, place).met(place.array(starts), place.array(directions))
     expected = Triangles(corners, rows).met(starts, directions).triangle
     assert (met.triangle.tensor.cpu().numpy() == expected).mean() > 0.99
