@@ -66,17 +66,14 @@ class TracedScene:
         self, c2w_44: Tensor, fov_deg: Tensor, resolution: int, config: ModelConfig, seed: int
     ) -> ViewInputs:
         """Return what is traced for one view."""
-        camera: tuple[Any, Any]
-        if self.lit.place is None:
-            camera = c2w_44.detach().cpu().numpy(), float(fov_deg)
-        else:
-            place = self.lit.place
-            camera = DeviceArray(c2w_44, place), DeviceArray(fov_deg, place)
+        place = self.lit.place
+        c2w: Any = c2w_44.detach().cpu().numpy() if place is None else DeviceArray(c2w_44, place)
+        angle: Any = float(fov_deg) if place is None else DeviceArray(fov_deg, place)
         return view_inputs(
             self.lit,
             self.light,
-            camera[0],
-            camera[1],
+            c2w,
+            angle,
             resolution,
             rays_a_side=config.hit_rays,
             anchors_a_side=anchors_a_side(config, resolution),
