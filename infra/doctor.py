@@ -234,7 +234,7 @@ def _orchestrator() -> Finding:
         "import prefect.server.api.server",
         found=f"prefect {metadata.version('prefect')}, fastapi {metadata.version('fastapi')}",
         consequence="no flow can run",
-        mend="make setup",
+        mend="make setup" if _has_home() else "export HOME=/a/folder/of/your/own",
     )
 
 
@@ -285,6 +285,15 @@ def _cache() -> Finding:
     )
 
 
+def _has_home() -> bool:
+    """Return whether this user has a home, which Prefect looks for when it is imported."""
+    try:
+        Path.home()
+    except RuntimeError:
+        return False
+    return True
+
+
 def _probe(name: str, code: str, *, found: str, consequence: str, mend: str) -> Finding:
     """Run code in a process of its own; a non-zero end, a crash or a hang is `missing`."""
     try:
@@ -300,6 +309,8 @@ def _probe(name: str, code: str, *, found: str, consequence: str, mend: str) -> 
         problem = "" if result.returncode == 0 else _last_line(result.stderr, result.returncode)
     except subprocess.TimeoutExpired:
         problem = f"no answer within {_PROBE_S} s"
+    except OSError as error:
+        problem = f"{sys.executable} cannot be started ({error.strerror})"
     if not problem:
         return Finding(name=name, state="ok", found=found)
     found = f"{found}: {problem}"

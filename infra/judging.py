@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import itertools
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,8 @@ from model.open import find_network
 from model.weights import network_digest
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
+from storage.errors import TrilightError
+from storage.typed_json import read_json
 from train.evaluation.evaluate import (
     Contest,
     judged_views,
@@ -150,12 +151,13 @@ def write_judgement(judgement: Judgement, out: str | Path) -> Path:
 def _network_of(folder: Path) -> str | None:
     """Return the digest of the network whose report a folder holds; None where it holds none."""
     try:
-        digest = json.loads((folder / "evaluation.json").read_bytes())["about"]["network sha256"]
+        data = (folder / "evaluation.json").read_bytes()
+        report = read_json(data, dict[str, Any], str(folder))
+        return str(report["about"]["network sha256"])
     except OSError:
         return None
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (TrilightError, KeyError, TypeError):
         return "unknown"
-    return str(digest)
 
 
 class _Counted:
