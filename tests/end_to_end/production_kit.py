@@ -157,6 +157,9 @@ def served(
         "PREFECT_API_DATABASE_CONNECTION_URL": database_url,
         "PATH": f"{Path(sys.executable).parent}:{base['PATH']}",
         "PYTHONPATH": str(ROOT),
+        # only their forms on the page need them
+        "PREFECT_SERVER_REGISTER_BLOCKS_ON_START": "false",
+        "PREFECT_SERVER_MEMOIZE_BLOCK_AUTO_REGISTRATION": "false",
     }
     try:
         start_served(environment)

@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+from infra.serving.deployments import read_deployments
+from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from storage.dataset.verify import verify_dataset
 from tests.end_to_end.browser_kit import Browser, browser
 from tests.end_to_end.production_kit import (
@@ -106,6 +108,16 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     finally:
         call(STOP, bare, START_S, checkout)
         assert not (checkout / "prefect.toml").is_symlink()
+
+
+def test_pool_limits_and_deployments_are_made(server: Server) -> None:
+    """Without its limit a flow takes as many graphics cards as there are runs."""
+    _, limits = server.ask("POST", "/api/v2/concurrency_limits/filter", {})
+    assert {DISK_LIMIT, GPU_LIMIT} <= {row["name"] for row in limits}
+    _, deployed = server.ask("POST", "/api/deployments/filter", {})
+    rows = [row for row in read_deployments() if row["name"] == "local"]
+    assert {row["entrypoint"] for row in deployed} == {row["entrypoint"] for row in rows}
+    assert {row["work_pool_name"] for row in deployed} == {"local"}
 
 
 WISHES: tuple[dict[str, Any], ...] = (
