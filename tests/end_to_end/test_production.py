@@ -17,6 +17,7 @@ from tests.conftest import ROOT
 from tests.end_to_end.array_kit import require_an_array_outlives_its_flow, with_a_cluster
 from tests.end_to_end.production_kit import (
     FEW_SAMPLES,
+    FEW_SAMPLES_CHANGES,
     START,
     STOP,
     Postgres,
@@ -33,7 +34,7 @@ MANY, FEW = 16, 8
 then starts a process, comes before the first has made them all; and two shards."""
 SMALL: dict[str, Any] = {
     "objects": "builtin:24", "scenes": MANY, "resolution": 64,
-    "changes": json.dumps({"scenes": {"num_views": 1}, "renders": {"min_spp": 16, "max_spp": 16}}),
+    "changes": json.dumps(FEW_SAMPLES_CHANGES),
 }  # fmt: skip
 """Tiny scenes, as wide as the smoke run's pictures."""
 OPTIONS = ("--objects", "builtin:24", "--resolution", "64", *FEW_SAMPLES)

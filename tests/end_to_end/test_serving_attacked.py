@@ -21,6 +21,7 @@ from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from storage.dataset.verify import verify_dataset
 from tests.end_to_end.browser_kit import Browser, browser
 from tests.end_to_end.production_kit import (
+    FEW_SAMPLES_CHANGES,
     START,
     START_S,
     STOP,
@@ -288,7 +289,11 @@ def test_the_lines_of_the_readme_need_nothing_exported(server: Server, tmp_path:
     """The server has started; a run ends as its documents say."""
     checkout = server.folder.parent
     run = documented_run(
-        objects="builtin:24", scenes=4, resolution=64, noise_floor_db=20, out=tmp_path / "mine"
+        objects="builtin:24",
+        scenes=4,
+        resolution=64,
+        changes=json.dumps(FEW_SAMPLES_CHANGES),
+        out=tmp_path / "mine",
     )
     call(run, server.environment, 900, checkout)
     assert verify_dataset(tmp_path / "mine").problems == []
