@@ -158,7 +158,7 @@ def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
         command = command.replace("/mine", "/readme")
         # set-up would lead the environment, which is lent, to the copy
         lent = "--old-file .venv/.dataset-ready"
-        command = command.replace("make dataset", f"make {lent} dataset SCENES=2")
+        command = command.replace("make dataset", f"make {lent} dataset SCENES=3")
         if command.startswith("trilight view"):
             _view(command, tmp_path)
         else:
