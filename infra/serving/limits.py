@@ -1,15 +1,9 @@
 """The limits of flows on what they share, wherever a server runs: of `make serve`, of the images.
 
 A flow takes a slot of a limit where it writes documents, and where it uses a graphics card. A limit
-that does not exist limits nothing, so every deployment makes them first:
-
-    python -m infra.serving.limits
-
-The server is the one that Prefect's settings name.
+that does not exist limits nothing, so infra.serving.deployments makes them first.
 """
 
-import os
-import sys
 from collections.abc import Mapping
 
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
@@ -34,16 +28,6 @@ def limits(environment: Mapping[str, str]) -> dict[str, int]:
     return {DISK_LIMIT: _DISK_SLOTS, GPU_LIMIT: _cards(environment)}
 
 
-def make_limits() -> None:
-    """Make the limits at the server, or set them anew; raises as `limits`."""
-    slots = limits(os.environ)
-    from prefect.client.orchestration import get_client
-
-    with get_client(sync_client=True) as client:
-        for name, number in slots.items():
-            client.upsert_global_concurrency_limit_by_name(name, number)
-
-
 def _cards(environment: Mapping[str, str]) -> int:
     """Return the cards, or 1 where there is none: a limit of 0 would let nothing begin."""
     text = environment.get("TRILIGHT_CARDS")
@@ -54,10 +38,3 @@ def _cards(environment: Mapping[str, str]) -> int:
             f"TRILIGHT_CARDS is {text!r}; expected a whole number from 1 to {_MOST_CARDS}."
         )
     return int(text)
-
-
-if __name__ == "__main__":
-    try:
-        make_limits()
-    except TrilightError as mistake:
-        sys.exit(f"trilight: {mistake}")

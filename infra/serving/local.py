@@ -45,7 +45,6 @@ from storage.cache import open_private
 from storage.errors import TrilightError
 
 POOL = "local"
-_TEMPLATE = ("--base-job-template", "infra/serving/pool.json")
 _FLOWS = {
     "PREFECT_LOGGING_EXTRA_LOGGERS": "trilight",
     "PREFECT_RESULTS_PERSIST_BY_DEFAULT": "false",
@@ -161,18 +160,9 @@ def running(*, without: str | None = None) -> list[int]:
 
 def _prepare(environment: Mapping[str, str]) -> None:
     """Make pool, limits and deployments; what is there already is replaced."""
-    prefect = [str(shutil.which("prefect")), "--no-prompt"]
-    pool = ["work-pool", "create", POOL, "--type", "process", "--overwrite", *_TEMPLATE]
-    limits = [sys.executable, "-m", f"{__package__}.limits"]
-    deployments = ["deploy", "--name", f"*/{POOL}"]
-    steps = {
-        f"the pool `{POOL}`": [*prefect, *pool],
-        "its limits": limits,
-        "the deployments": [*prefect, *deployments],
-    }
-    for what, command in steps.items():
-        _say(f"making {what}")
-        _call(command, environment)
+    _say(f"making the pool `{POOL}`, its limits and the deployments")
+    module = f"{__package__}.deployments"
+    _call([sys.executable, "-m", module, POOL, "infra/serving/pool.json"], environment)
 
 
 def _call(command: Sequence[str], environment: Mapping[str, str]) -> None:

@@ -1,7 +1,7 @@
 """Limits in Prefect of what flows share, by name.
 
 One that does not exist at the server limits nothing, so whatever sets a server up makes them
-(infra.serving.limits).
+(infra.serving.deployments).
 """
 
 DISK_LIMIT = "trilight-disk"

@@ -39,6 +39,12 @@ PASSWORD = "PREFECT_SERVER_API_AUTH_STRING"
 """Variable of a server with USER:PASSWORD, which every request must name."""
 CLIENT_PASSWORD = "PREFECT_API_AUTH_STRING"
 """Variable of who sends requests, with the same."""
+_NO_PAGE = {
+    "PREFECT_UI_ENABLED": "false",
+    "PREFECT_SERVER_REGISTER_BLOCKS_ON_START": "false",
+    "PREFECT_SERVER_MEMOIZE_BLOCK_AUTO_REGISTRATION": "false",
+}
+"""Of a server without its page: nor has it the blocks that are filled in there, which are slow."""
 _START_UP_S = 120.0
 _LOG_NAME = "server.log"
 SERVER = (sys.executable, "-m", f"{__package__}.guarded_server")
@@ -172,7 +178,7 @@ def prefect_server() -> Iterator[str]:
         port = _free_port()
         server = subprocess.Popen(
             [*SERVER, "--port", str(port), "--with-parent"],
-            env={**child_environment(), PASSWORD: password, "PREFECT_UI_ENABLED": "false"},
+            env={**child_environment(), PASSWORD: password, **_NO_PAGE},
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,

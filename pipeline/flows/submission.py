@@ -116,7 +116,7 @@ def submit(
     if not by_name:
         raise TrilightError(
             f"submit: the server knows no deployment of the flow {flow}. Run make serve, which "
-            "makes them, or prefect deploy in the checkout."
+            "makes them, or python -m infra.serving.deployments in the checkout."
         )
     name = deployment or ("local" if "local" in by_name else next(iter(by_name)))
     if name not in by_name or (deployment is None and len(by_name) > 1 and name != "local"):

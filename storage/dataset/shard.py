@@ -40,18 +40,16 @@ def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) 
 
 
 def write_tar(stream: BinaryIO, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
-    """Write samples to an open file with WebDataset's own writer, and with fixed metadata."""
-    from webdataset.writer import TarWriter  # not at the top: it is slow to import
-
+    """Write samples to an open file as WebDataset reads them, and with fixed metadata."""
     written = set[str]()
-    with TarWriter(stream, encoder=False, mtime=0, user="trilight", group="trilight") as writer:
+    with tarfile.open(fileobj=stream, mode="w|") as archive:
         for key, members in samples:
             for name in sorted(name for name in members if MAP_NAME.fullmatch(name)):
                 if name not in written:
-                    _add(writer.tarstream, name, members[name])
+                    _add(archive, name, members[name])
                     written.add(name)
-            of_sample = {name: data for name, data in members.items() if name not in written}
-            writer.write({"__key__": key, **of_sample})
+            for suffix in sorted(set(members) - written):
+                _add(archive, f"{key}.{suffix}", members[suffix])
 
 
 def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:

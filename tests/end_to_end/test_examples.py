@@ -26,6 +26,7 @@ from storage.records.scene_file import decode_scene_file, encode_scene
 from storage.seeds import rng_for
 from storage.settings.changes import changed
 from tests.end_to_end.conftest import Trilight
+from tests.end_to_end.production_kit import FEW_SAMPLES
 from tests.extensions_kit import EXAMPLES, loaded, room_for_extensions
 from tests.for_each import for_each
 from tests.scene_templates.balls import one_drawn
@@ -179,8 +180,7 @@ def test_an_executor_is_a_runner(copied: Callable[[str], Path]) -> None:
 
 
 TINY = (
-    "--resolution", "32", "--noise-floor", "20", "--set", "renders.max_spp=64",
-    "--set", "scenes.num_views=1", "--set", "splits.scenes_per_shard=1",
+    "--resolution", "32", *FEW_SAMPLES, "--set", "splits.scenes_per_shard=1",
 )  # fmt: skip
 
 

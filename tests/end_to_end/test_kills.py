@@ -30,6 +30,7 @@ from tests.end_to_end.conftest import (
 ARGUMENTS = (
     "generate", "smoke", "--objects", "builtin:24", "--scenes", "8",
     "--resolution", "32", "--noise-floor", "20", "--seed", "0",
+    "--set", "scenes.num_views=2", "--set", "renders.max_spp=64",
 )  # fmt: skip
 KILLS = 4
 
