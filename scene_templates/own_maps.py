@@ -73,7 +73,7 @@ NO_OWN_MAPS = OwnMaps()
 
 def drawn_own(
     rng: np.random.Generator,
-    own: Sequence[OwnMap[Made]],
+    user_maps: Sequence[OwnMap[Made]],
     share: float,
     licences: Sequence[str],
 ) -> OwnMap[Made] | None:
@@ -87,7 +87,7 @@ def drawn_own(
         share: probability of one.
         licences: of what is in the scene already.
     """
-    if not (share and own) or rng.random() >= share:
+    if not (share and user_maps) or rng.random() >= share:
         return None
-    meeting = [one for one in own if not mixed_share_alike([*licences, one.source.licence])]
+    meeting = [one for one in user_maps if not mixed_share_alike([*licences, one.source.licence])]
     return meeting[int(rng.integers(len(meeting)))] if meeting else None

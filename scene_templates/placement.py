@@ -127,8 +127,8 @@ def poses_rand(
         radii = rng.uniform(*object_scale, size=len(shapes)) / 4
         poses: dict[int, Pose] = {}
         for row in np.argsort(-radii, kind="stable").tolist():
-            others = [] if overlaps else [(shapes[other], at) for other, at in poses.items()]
-            pose = _pose_rand(rng, settings, space, shapes[row], float(radii[row]), others)
+            obstacles = [] if overlaps else [(shapes[other], at) for other, at in poses.items()]
+            pose = _pose_rand(rng, settings, space, shapes[row], float(radii[row]), obstacles)
             if pose is None:
                 break
             poses[row] = pose
@@ -143,7 +143,7 @@ def _pose_rand(
     space: ObjectSpace,
     shape: PlaceableShape,
     radius: float,
-    others: Sequence[tuple[PlaceableShape, Pose]],
+    obstacles: Sequence[tuple[PlaceableShape, Pose]],
 ) -> Pose | None:
     """Draw a place for an object clear of others, or None where none was found."""
     rotation = rotation_rand(rng, settings.orientation)
@@ -163,7 +163,7 @@ def _pose_rand(
         if settings.inside and not space.holds(points + centre):
             continue
         pose = Pose(centre=centre, radius=radius, rotation=rotation)
-        if not any(shape.meets(pose, other, at) for other, at in others):
+        if not any(shape.meets(pose, other, at) for other, at in obstacles):
             return pose
     return None
 

@@ -64,7 +64,7 @@ class TexturedLook:
 def draw_look(
     rng: np.random.Generator,
     settings: TextureSettings,
-    own: Sequence[OwnMap[OwnTexture]] = (),
+    user_textures: Sequence[OwnMap[OwnTexture]] = (),
     licences: Sequence[str] = (),
 ) -> TexturedLook | None:
     """Return the texture of a surface, or None where it has none.
@@ -81,7 +81,7 @@ def draw_look(
         return None
     tile_m, turns = rng.uniform(*settings.tile_m), int(rng.integers(4))
     shift_u, shift_v = rng.random(2)
-    chosen = drawn_own(rng, own, settings.own_share, licences)
+    chosen = drawn_own(rng, user_textures, settings.own_share, licences)
     if chosen is None:
         maps = draw_surface(rng, settings.surfaces)
     else:

@@ -31,8 +31,10 @@ def atomic_writer(path: Path, *, replace: bool = True) -> Iterator[BinaryIO]:
     Raises:
         TrilightError: the disk is full (an EnvironmentFailure), or the place cannot be written.
     """
-    own = f"{os.getpid()}-{os.urandom(4).hex()}"  # containers give all their processes number 1
-    temporary = path.with_name(f"{path.name}.{own}{TEMPORARY_SUFFIX}")
+    unique_suffix = (
+        f"{os.getpid()}-{os.urandom(4).hex()}"  # containers give all their processes number 1
+    )
+    temporary = path.with_name(f"{path.name}.{unique_suffix}{TEMPORARY_SUFFIX}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as stream:

@@ -47,7 +47,7 @@ def claimed(path: Path, *, wait: bool = False) -> Iterator[bool]:
     Raises:
         TrilightError: the folder cannot be written.
     """
-    descriptor = _locked(path, wait)
+    descriptor = _acquire_lock(path, wait)
     try:
         yield descriptor is not None
     finally:
@@ -146,7 +146,7 @@ class WaitNotice:
         )
 
 
-def _locked(path: Path, wait: bool) -> int | None:
+def _acquire_lock(path: Path, wait: bool) -> int | None:
     """Return the descriptor that holds the lock, or None where another process holds it."""
     while True:
         descriptor = open_lock(path)
@@ -154,7 +154,7 @@ def _locked(path: Path, wait: bool) -> int | None:
             if not wait:
                 os.close(descriptor)
                 return None
-            with _announced(path):
+            with _announce_wait(path):
                 take_lock(descriptor, wait=True)
         if _is(path, descriptor):
             _write_holder(descriptor)
@@ -163,7 +163,7 @@ def _locked(path: Path, wait: bool) -> int | None:
 
 
 @contextlib.contextmanager
-def _announced(path: Path) -> Iterator[None]:
+def _announce_wait(path: Path) -> Iterator[None]:
     """Announce from a thread how long the block waits for a claim."""
     notice, ended = WaitNotice(), threading.Event()
 

@@ -47,8 +47,8 @@ def require_readable(
 ) -> None:
     """Raise TrilightError unless `version` is among `versions`; `where` names the file."""
     if version not in versions:
-        *others, last = map(str, versions)
-        readable = f"{', '.join(others)} and {last}"
+        *earlier, last = map(str, versions)
+        readable = f"{', '.join(earlier)} and {last}"
         raise TrilightError(
             f"{where}: schema version {version}; this Trilight reads {readable}. Use the release "
             "that made it, or make it again with `trilight generate`."

@@ -137,7 +137,7 @@ def function_name(name: str) -> str:
 
 
 @contextmanager
-def opened(reference: str) -> Iterator[Any]:
+def load_reference(reference: str) -> Iterator[Any]:
     """Provide what the function of FILE.py:FUNCTION returns, while its file may register it.
 
     What is no function stands for itself.
@@ -156,18 +156,18 @@ def opened(reference: str) -> Iterator[Any]:
     extension = load_extension(file)
     members = vars(extension.module)
     if match["function"] not in members:
-        own = [
+        defined = [
             member
             for member, value in members.items()
             if getattr(value, "__module__", "") == extension.module.__name__
         ]
         raise TrilightError(
             f"{reference}: {extension.name} does not define {match['function']}; "
-            f"{expected_one_of(match['function'], own)}."
+            f"{expected_one_of(match['function'], defined)}."
         )
-    found = members[match["function"]]
+    member = members[match["function"]]
     with _as_loading(extension), _mistakes_of(extension.path):
-        yield found() if callable(found) else found
+        yield member() if callable(member) else member
 
 
 def recorded(part: Decided) -> dict[str, str]:
@@ -211,15 +211,19 @@ def require_same_extensions(what: str, before: Mapping[str, str], now: Mapping[s
         raise TrilightError(f"{what} {said}; {step}, or choose another --out.")
 
 
-def _read(path: Path, shown: str) -> bytes:
+def _read(path: Path, display_path: str) -> bytes:
     if path.suffix != ".py" or os.pathsep in str(path):
-        raise TrilightError(f"extension {shown}: not the name of a Python file; {_EXPECTED}.")
+        raise TrilightError(
+            f"extension {display_path}: not the name of a Python file; {_EXPECTED}."
+        )
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
-        raise TrilightError(f"extension {shown}: no such file; {_EXPECTED}.") from error
+        raise TrilightError(f"extension {display_path}: no such file; {_EXPECTED}.") from error
     except OSError as error:
-        raise TrilightError(f"extension {shown}: cannot be read ({error.strerror}).") from error
+        raise TrilightError(
+            f"extension {display_path}: cannot be read ({error.strerror})."
+        ) from error
 
 
 def _run(path: Path, data: bytes, digest: str) -> Extension:

@@ -66,18 +66,18 @@ def duties_of(licence: str) -> tuple[str, ...] | None:
     """
     if match := _CREATIVE_COMMONS.fullmatch(licence):
         parts = match[1].upper().split("-")
-        asked = {duty for part in parts for duty in _ELEMENTS[part]}
+        duties = {duty for part in parts for duty in _ELEMENTS[part]}
     elif licence.casefold() in _BY_FOLDED:
-        asked = set(_KNOWN[_BY_FOLDED[licence.casefold()]])
+        duties = set(_KNOWN[_BY_FOLDED[licence.casefold()]])
     else:
         return None
-    return tuple(duty for duty in DUTIES if duty in asked)
+    return tuple(duty for duty in DUTIES if duty in duties)
 
 
 def union_of_duties(licences: Iterable[str]) -> tuple[str, ...]:
     """Return what several licences ask for together; unknown ones add nothing."""
-    asked = {duty for licence in licences for duty in duties_of(licence) or ()}
-    return tuple(duty for duty in DUTIES if duty in asked)
+    duties = {duty for licence in licences for duty in duties_of(licence) or ()}
+    return tuple(duty for duty in DUTIES if duty in duties)
 
 
 def share_alike_camp(licence: str) -> str:

@@ -69,20 +69,20 @@ def scene_sky(
         family, radiance, source = "own", chosen.load(), chosen.source
     low, high = (math.log(bound) for bound in settings.over_lamps_log)
     over_lamps = math.exp(rng.uniform(low, high))
-    turn = float(rng.uniform(0, 2 * math.pi))
+    azimuth_rad = float(rng.uniform(0, 2 * math.pi))
     is_seen = bool(rng.random() < settings.seen_share)
     mean = _mean_radiance(radiance)
-    wanted = over_lamps * lamp_irradiance(emitters, radiance_rgb) / math.pi
+    target_radiance = over_lamps * lamp_irradiance(emitters, radiance_rgb) / math.pi
     environment = Environment(
-        radiance_rgb=(radiance * np.float32(wanted / mean)).astype(np.float32),
-        rotation=_about_z(turn),
+        radiance_rgb=(radiance * np.float32(target_radiance / mean)).astype(np.float32),
+        rotation=_about_z(azimuth_rad),
         is_seen=is_seen,
         source=source,
     )
     origin = {
         "family": family,
         "over_lamps": over_lamps,
-        "azimuth_deg": math.degrees(turn),
+        "azimuth_deg": math.degrees(azimuth_rad),
     }
     uid = chosen.uid if chosen else ""
     return SceneSky(environment=environment, origin=origin, uid=uid)
@@ -104,6 +104,6 @@ def _mean_radiance(radiance_rgb: NDArray[np.float32]) -> float:
     return float((grey * (edges[:-1] - edges[1:])).sum() / 2)
 
 
-def _about_z(turn: float) -> NDArray[np.float32]:
-    c, s = float(cosine(turn)), float(sine(turn))
+def _about_z(angle_rad: float) -> NDArray[np.float32]:
+    c, s = float(cosine(angle_rad)), float(sine(angle_rad))
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.float32)

@@ -72,8 +72,8 @@ class SkyTexels:
         """Return a spot of unit flux [H, 2H], brightest in the middle, 0 beyond its radius."""
         reach = 1 - float(cosine(min(1.0, SPOT_RADIUS / self.height) * np.pi))
         inside = 1 - (1 - dot(self.directions, towards)) / reach
-        found = np.maximum(inside, 0)
-        return found / self.flux(found)
+        falloff = np.maximum(inside, 0)
+        return falloff / self.flux(falloff)
 
     def pane(
         self,
@@ -134,19 +134,19 @@ def _directions(height: int) -> Numbers:
     azimuth = (0.5 - (np.arange(2 * height)[None, :] + 0.5) / (2 * height)) * 2 * np.pi
     flat = np.zeros((height, 2 * height))
     across = cosine(elevation)
-    found = np.stack(
+    directions = np.stack(
         [across * cosine(azimuth), across * sine(azimuth), sine(elevation) + flat], axis=-1
     )
-    found.setflags(write=False)
-    return found
+    directions.setflags(write=False)
+    return directions
 
 
 @functools.lru_cache(maxsize=2)
 def _solid_angle(height: int) -> Numbers:
     edges = sine((0.5 - np.arange(height + 1) / height) * np.pi)
-    found: Numbers = ((edges[:-1] - edges[1:]) * np.pi / height)[:, None]
-    found.setflags(write=False)
-    return found
+    solid_angle_sr: Numbers = ((edges[:-1] - edges[1:]) * np.pi / height)[:, None]
+    solid_angle_sr.setflags(write=False)
+    return solid_angle_sr
 
 
 def _sum(values: NDArray) -> Numbers:

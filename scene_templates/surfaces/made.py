@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.exact import Numbers, eased
+from scene_templates.exact import Numbers, smoothstep
 from scene_templates.surfaces.draws import RGB, GlossRanges, SurfaceDraws
 from scene_templates.surfaces.maps import Finish
 from scene_templates.surfaces.texels import TEXELS_PER_CELL, Texels
@@ -42,9 +42,9 @@ def rust(draws: SurfaceDraws, texels: Texels) -> Finish:
     eaten = texels.noise(draws.stream(), (cells, cells), octaves=6)
     tone = texels.noise(draws.stream(), (2 * cells, 2 * cells), octaves=5)
     scratched = texels.noise(draws.stream(), (4, 4), octaves=4)
-    covered = eased(0.5 + (eaten - exceeded_by(eaten, share)) / 0.12)
-    return under.rougher(0.15 * eased(0.5 + scratched)).covered(
-        fresh.covered(old, eased(0.5 + 0.9 * tone)), covered
+    covered = smoothstep(0.5 + (eaten - exceeded_by(eaten, share)) / 0.12)
+    return under.rougher(0.15 * smoothstep(0.5 + scratched)).covered(
+        fresh.covered(old, smoothstep(0.5 + 0.9 * tone)), covered
     )
 
 
@@ -70,8 +70,8 @@ def brushed_metal(draws: SurfaceDraws, texels: Texels) -> Finish:
     coarse, fine = ((1, 16), (2, 64)) if along == "u" else ((16, 1), (64, 2))
     lines = texels.noise(draws.stream(), coarse, octaves=2) + texels.noise(draws.stream(), fine)
     smudges = texels.noise(draws.stream(), (3, 3), octaves=4)
-    scratched = metal.dimmed(1 - depth * eased(0.5 + lines))
-    return scratched.rougher(0.1 * depth * lines + uneven * eased(0.5 + smudges))
+    scratched = metal.dimmed(1 - depth * smoothstep(0.5 + lines))
+    return scratched.rougher(0.1 * depth * lines + uneven * smoothstep(0.5 + smudges))
 
 
 def fabric(draws: SurfaceDraws, texels: Texels) -> Finish:
@@ -87,9 +87,9 @@ def fabric(draws: SurfaceDraws, texels: Texels) -> Finish:
     in_u = 2 * (texels.u * threads - column) - 1 + np.zeros((texels.size, 1))
     in_v = 2 * (texels.v * threads - row) - 1 + np.zeros((1, texels.size))
     rim, crown = np.where(over, in_u, in_v), np.where(over, in_v, in_u)
-    shown = min(1.0, texels.size / (TEXELS_PER_CELL * threads))
+    visible_fraction = min(1.0, texels.size / (TEXELS_PER_CELL * threads))
     # 0.3 is the mean of what is taken off: where threads are too fine to show, it alone is left
-    shade = 0.7 - shown * (0.7 * rim * rim + 0.2 * crown * crown - 0.3)
+    shade = 0.7 - visible_fraction * (0.7 * rim * rim + 0.2 * crown * crown - 0.3)
     random = draws.stream()
     uneven = np.where(over, *_of_threads(random, threads, column, row))
     fluff = texels.noise(draws.stream(), (32, 32), octaves=2)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scene_templates.exact import Numbers, mixed
+from scene_templates.exact import Numbers, lerp
 from storage.records.texture import MapSource
 
 MOST_ALBEDO = 0.95
@@ -79,11 +79,16 @@ class Finish:
         Albedos are area means; of the roughness, it is the mean of the GGX widths that counts.
         """
         part = np.asarray(share, np.float64)
-        own, others = np.clip(self.roughness, 0, 1), np.clip(other.roughness, 0, 1)
+        base_roughness, cover_roughness = (
+            np.clip(self.roughness, 0, 1),
+            np.clip(other.roughness, 0, 1),
+        )
         return Finish(
-            diffuse_rgb=mixed(self.diffuse_rgb, other.diffuse_rgb, part[..., None]),
-            specular_rgb=mixed(self.specular_rgb, other.specular_rgb, part[..., None]),
-            roughness=np.sqrt(mixed(own * own, others * others, part)),
+            diffuse_rgb=lerp(self.diffuse_rgb, other.diffuse_rgb, part[..., None]),
+            specular_rgb=lerp(self.specular_rgb, other.specular_rgb, part[..., None]),
+            roughness=np.sqrt(
+                lerp(base_roughness * base_roughness, cover_roughness * cover_roughness, part)
+            ),
         )
 
 
@@ -114,12 +119,12 @@ def surface_maps(
     parameters: Mapping[str, tuple[Any, ...]],
 ) -> SurfaceMaps:
     """Return the maps of a finish, rounded once."""
-    whole = np.zeros((size, size, 1))
-    roughness = np.clip(made_of.roughness[..., None] + whole, *roughness_clip)
+    full_size = np.zeros((size, size, 1))
+    roughness = np.clip(made_of.roughness[..., None] + full_size, *roughness_clip)
     return SurfaceMaps(
         family=family,
-        diffuse_rgb=(made_of.diffuse_rgb + whole).astype(np.float32),
-        specular_rgb=(made_of.specular_rgb + whole).astype(np.float32),
+        diffuse_rgb=(made_of.diffuse_rgb + full_size).astype(np.float32),
+        specular_rgb=(made_of.specular_rgb + full_size).astype(np.float32),
         roughness=roughness.astype(np.float32),
         parameters=parameters,
     )

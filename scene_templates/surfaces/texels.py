@@ -74,9 +74,9 @@ def _gradient_noise(
     """
     slopes = 2 * rng.random((cells[1], cells[0], 2)) - 1
     x, y = u * cells[0], v * cells[1]
-    left, below = np.floor(x), np.floor(y)
-    x, y = x - left, y - below
-    column, row = left.astype(np.int64), below.astype(np.int64)
+    floor_x, floor_y = np.floor(x), np.floor(y)
+    x, y = x - floor_x, y - floor_y
+    column, row = floor_x.astype(np.int64), floor_y.astype(np.int64)
     across, up = _fade(x), _fade(y)
 
     def corner(dx: int, dy: int) -> Numbers:

@@ -27,7 +27,7 @@ from storage.remote.tries import TransferFailed, is_missing
 from storage.remote.url import RemoteUrl, parse_url
 
 
-def _unopened(path: Path, error: OSError) -> TrilightError:
+def _open_error(path: Path, error: OSError) -> TrilightError:
     if isinstance(error, FileNotFoundError | NotADirectoryError):
         return ShardMissing(
             f"{path}: the shard is missing; run `trilight generate` again to make it."
@@ -75,7 +75,7 @@ class LocalFiles(_Files):
         try:
             return path.stat().st_size
         except OSError as error:
-            raise _unopened(path, error) from error
+            raise _open_error(path, error) from error
 
     def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
         """Open a shard for reading.
@@ -91,7 +91,7 @@ class LocalFiles(_Files):
         try:
             stream = open_plain(path)
         except OSError as error:
-            raise _unopened(path, error) from error
+            raise _open_error(path, error) from error
         if checked:
             self._check(path, stream, shard)
         return stream
@@ -289,8 +289,8 @@ class Dataset:
             contents = self._contents(stream, shard)
             for key in contents.samples:
                 with reading(self.shown, shard.name):
-                    found = contents.read(stream, key, lambda name: not name.endswith("exr"))
-                    record = decode_scene(key, found, held)
+                    members = contents.read(stream, key, lambda name: not name.endswith("exr"))
+                    record = decode_scene(key, members, held)
                     _require_lawful(record)
                 yield record
 

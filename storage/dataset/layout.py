@@ -84,8 +84,8 @@ def place_of_part(part: int) -> str:
 
 def _parts_in(root: Path) -> list[int]:
     with contextlib.suppress(FileNotFoundError):
-        found = (_PART.fullmatch(name) for name in os.listdir(root))
-        return [0, *sorted(int(match[1]) for match in found if match)]
+        matches = (_PART.fullmatch(name) for name in os.listdir(root))
+        return [0, *sorted(int(match[1]) for match in matches if match)]
     return []
 
 
@@ -214,8 +214,8 @@ class DatasetFolder:
 
     def clear(self) -> None:
         """Delete everything except the locks of workers."""
-        kept = {self.staging, self.staging / "lock", self.staging / "turns"}
-        for path in {*self.root.iterdir(), *self.staging.iterdir()} - kept:
+        lock_paths = {self.staging, self.staging / "lock", self.staging / "turns"}
+        for path in {*self.root.iterdir(), *self.staging.iterdir()} - lock_paths:
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             else:
@@ -253,10 +253,10 @@ def dataset_folder(out: str) -> DatasetFolder:
     place = parse_url(out, what="out")
     if isinstance(place, Path):
         return DatasetFolder(place)
-    shown = printable(safe_url(out))
+    url_text = printable(safe_url(out))
     if place.scheme not in WRITABLE:
-        raise TrilightError(f"out {shown!r} has the scheme {place.scheme!r}; {_ADMITTED}.")
+        raise TrilightError(f"out {url_text!r} has the scheme {place.scheme!r}; {_ADMITTED}.")
     if "?" in place.root or "#" in place.root:
-        raise TrilightError(f"out {shown!r} has a query or fragment; {_ADMITTED}, without one.")
+        raise TrilightError(f"out {url_text!r} has a query or fragment; {_ADMITTED}, without one.")
     name = sha256_hex(place.shown.encode())[:16]
     return DatasetFolder(cache_folder("outputs") / name, place.shown)

@@ -193,14 +193,14 @@ def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
 def write_manifest(path: Path, manifest: Manifest) -> None:
     """Write the manifest atomically, a shard a line; equal manifests give equal bytes."""
     seal = hashlib.sha256()
-    for piece in _encoded(manifest, ""):
+    for piece in _encode_rows(manifest, ""):
         seal.update(piece)
     with atomic_writer(path) as stream:
-        for piece in _encoded(manifest, seal.hexdigest()):
+        for piece in _encode_rows(manifest, seal.hexdigest()):
             stream.write(piece)
 
 
-def _encoded(manifest: Manifest, seal: str) -> Iterator[bytes]:
+def _encode_rows(manifest: Manifest, seal: str) -> Iterator[bytes]:
     """Yield the pieces of a manifest's file row by row: there may be a million."""
     record = {field.name: getattr(manifest, field.name) for field in dataclasses.fields(_Fields)}
     record |= {"schema_version": MANIFEST_VERSION, "manifest_sha256": seal, "shards": []}

@@ -68,7 +68,7 @@ def open_mixture(data: Sequence[str]) -> TrainingData:
     return TrainingData(
         shown=" and ".join(each.shown for each in opened),
         digest=MIXED + sha256_hex(canonical_json([each.digest for each in opened])),
-        splits={split: shards for split in SPLITS if (shards := _mixed(opened, split))},
+        splits={split: shards for split in SPLITS if (shards := _mix_split(opened, split))},
         num_views=_of_all([each.num_views for each in opened], min),
         max_triangles=_of_all([each.max_triangles for each in opened], max),
         notes=tuple(dict.fromkeys(note for each in opened for note in each.notes)),
@@ -76,7 +76,7 @@ def open_mixture(data: Sequence[str]) -> TrainingData:
     )
 
 
-def _mixed(opened: Sequence[TrainingData], split: str) -> MixedShards | None:
+def _mix_split(opened: Sequence[TrainingData], split: str) -> MixedShards | None:
     having = [row for row, each in enumerate(opened) if split in each.splits]
     if not having:
         return None

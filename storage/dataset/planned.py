@@ -33,8 +33,10 @@ def expected_scenes(manifest: Manifest) -> dict[str, int]:
 def listed_scenes(manifest: Manifest) -> set[int]:
     """Return the scenes of the shards that are listed and do not grow, made or given up."""
     splits = cut_splits(manifest.num_scenes, _splits(manifest))
-    whole = (entry for entry in manifest.shards if entry.name not in manifest.growing)
-    return {scene for entry in whole for scene in scenes_of_shard(number_of_shard(entry), splits)}
+    full_shards = (entry for entry in manifest.shards if entry.name not in manifest.growing)
+    return {
+        scene for entry in full_shards for scene in scenes_of_shard(number_of_shard(entry), splits)
+    }
 
 
 def planned_scenes_of(manifest: Manifest, shard: ShardEntry) -> int | None:

@@ -20,7 +20,7 @@ from storage.dataset.layout import DatasetFolder, numbered, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
 from storage.dataset.planned import expected_scenes, is_whole, listed_scenes, planned_shards
 from storage.dataset.scene_logs import (
-    LookedAt,
+    LogSample,
     SceneLog,
     decode_scene_log,
     log_name,
@@ -166,10 +166,10 @@ def _plan_of(path: Path, mtime_ns: int, num_bytes: int) -> tuple[Manifest, Mappi
     return manifest, expected_scenes(manifest)
 
 
-def shards_there(folder: DatasetFolder) -> set[str]:
+def existing_shards(folder: DatasetFolder) -> set[str]:
     """Return the names of the shards that are there under their final names, listed or not."""
-    here = set(shard_names_in(folder.root))
-    return here | set(shard_names_in(folder.staged_sent)) if folder.bucket else here
+    local_names = set(shard_names_in(folder.root))
+    return local_names | set(shard_names_in(folder.staged_sent)) if folder.bucket else local_names
 
 
 def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
@@ -179,15 +179,17 @@ def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
     is finished there when it and the note on it have come (pipeline.shards.mirror).
     """
     if isinstance(dataset.files, LocalFiles):
-        there = shards_there(DatasetFolder(dataset.files.root)) & set(planned)
-        return there - set(dataset.manifest.growing)
+        existing = existing_shards(DatasetFolder(dataset.files.root)) & set(planned)
+        return existing - set(dataset.manifest.growing)
     listed = {entry.name for entry in dataset.manifest.shards} & set(planned)
     unlisted = set(planned) - listed
     if not unlisted or dataset.files.url.scheme not in WRITABLE:
         return listed
     with contextlib.suppress(TrilightError):  # it may be read and not listed
-        names, here = Bucket(dataset.files.url).names(), DatasetFolder(Path())
-        listed |= {name for name in unlisted & names if note_of(here, name).as_posix() in names}
+        names, bucket_root = Bucket(dataset.files.url).names(), DatasetFolder(Path())
+        listed |= {
+            name for name in unlisted & names if note_of(bucket_root, name).as_posix() in names
+        }
     return listed
 
 
@@ -203,10 +205,13 @@ def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
         TrilightError: there is no readable manifest, or the URL is refused.
     """
     dataset = open_listed(url)
-    own, more = dataset.manifest, max(num_scenes, dataset.manifest.num_scenes)
-    planned, before = planned_shards(dataclasses.replace(own, num_scenes=more)), planned_shards(own)
-    there = {(name, before.get(name)) for name in _finished_names(dataset, planned)}
-    missing = [index for index, shard in enumerate(planned.items()) if shard not in there]
+    manifest, total_scenes = dataset.manifest, max(num_scenes, dataset.manifest.num_scenes)
+    planned, before = (
+        planned_shards(dataclasses.replace(manifest, num_scenes=total_scenes)),
+        planned_shards(manifest),
+    )
+    finished = {(name, before.get(name)) for name in _finished_names(dataset, planned)}
+    missing = [index for index, shard in enumerate(planned.items()) if shard not in finished]
     return missing or ([] if _is_finished(dataset) else [0])
 
 
@@ -223,8 +228,8 @@ def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
         folder: of the dataset.
         planned: its expected scenes, without the shards that grow.
     """
-    there = shards_there(folder) & planned.keys()
-    return sum(planned[name] for name in there) + _num_waiting(folder)
+    finished = existing_shards(folder) & planned.keys()
+    return sum(planned[name] for name in finished) + _num_waiting(folder)
 
 
 def _num_waiting(folder: DatasetFolder) -> int:
@@ -304,8 +309,8 @@ def read_status(url: str) -> DatasetStatus:
     given_up += max(manifest.num_scenes - sum(planned.values()), 0)
     looked, share = (look_at_logs(local), 1.0) if local else _sampled_logs(dataset)
     last, core_s = looked.last, looked.core_s
-    left = manifest.num_scenes - done - given_up
-    views_per_hour, remaining_s = _rate(last, share, manifest, left)
+    scenes_left = manifest.num_scenes - done - given_up
+    views_per_hour, remaining_s = _rate(last, share, manifest, scenes_left)
     return DatasetStatus(
         shown=dataset.shown,
         build=manifest.build,
@@ -338,7 +343,7 @@ def _noted_failures(folder: DatasetFolder) -> list[Failure]:
     return [failure for note in notes for failure in note.failures]
 
 
-def _sampled_logs(dataset: Dataset) -> tuple[LookedAt, float]:
+def _sampled_logs(dataset: Dataset) -> tuple[LogSample, float]:
     """Return what logs on a server say, and of what share of the listed scenes they are.
 
     A sample of the logs stands for all; where the first is missing, the dataset has none.
@@ -356,16 +361,16 @@ def _sampled_logs(dataset: Dataset) -> tuple[LookedAt, float]:
     share = scenes / max(dataset.manifest.num_samples, 1)
     core_s = sum(row.seconds * row.cores for row in rows) / share if share else None
     rows.sort(key=lambda row: row.finished_unix_s)
-    return LookedAt(last=rows, core_s=core_s), share
+    return LogSample(last=rows, core_s=core_s), share
 
 
 def _rate(
-    last: Sequence[SceneLog], share: float, manifest: Manifest, left: int
+    last: Sequence[SceneLog], fraction: float, manifest: Manifest, scenes_left: int
 ) -> tuple[float | None, float | None]:
     """Return views per hour and seconds left, from rows by time that are a share of the scenes."""
-    if left <= 0 or len(last) < 2:
-        return None, 0.0 if left <= 0 else None
+    if scenes_left <= 0 or len(last) < 2:
+        return None, 0.0 if scenes_left <= 0 else None
     # from the start of the first to the end of the last, over all who worked at the same time
     span_s = last[-1].finished_unix_s - (last[0].finished_unix_s - last[0].seconds)
-    per_s = len(last) / share / max(span_s, 1e-3)
-    return 3600 * per_s * manifest.num_views, left / per_s
+    per_s = len(last) / fraction / max(span_s, 1e-3)
+    return 3600 * per_s * manifest.num_views, scenes_left / per_s

@@ -106,7 +106,7 @@ def noted_names(folder: DatasetFolder) -> Iterator[str]:
 
 
 def fetched_notes(
-    read: Callable[[str], bytes | None], names: Iterable[str], shown: str
+    read: Callable[[str], bytes | None], names: Iterable[str], dataset_name: str
 ) -> list[ShardNote]:
     """Return notes that are on a server, many at a time.
 
@@ -119,17 +119,17 @@ def fetched_notes(
         TrilightError: one of them is no note, or as `read`.
     """
 
-    def fetched(name: str) -> ShardNote:
+    def fetch_note(name: str) -> ShardNote:
         try:
             note = decode_note(read(name) or b"", name)
             if not name.endswith(f"/{note.shard.name}{_SUFFIX}"):
                 raise TrilightError(note.shard.name)
         except TrilightError as error:
             raise TrilightError(
-                f"{shown}/{name}: not a note on its shard ({error}); delete both, and the shard is "
-                "made again."
+                f"{dataset_name}/{name}: not a note on its shard ({error}); delete both, and the "
+                "shard is made again."
             ) from error
         return note
 
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        return list(pool.map(fetched, names))
+        return list(pool.map(fetch_note, names))

@@ -55,12 +55,12 @@ class OpenShard:
         first = min(member.offset for member in members.values())
         end = max(member.offset + member.num_bytes for member in members.values())
         data = self._read(first, end - first)
-        own = {
+        contents = {
             suffix: data[member.offset - first : member.offset - first + member.num_bytes]
             for suffix, member in members.items()
         }
         return with_maps(
-            own, self._maps, lambda member: self._read(member.offset, member.num_bytes)
+            contents, self._maps, lambda member: self._read(member.offset, member.num_bytes)
         )
 
     def _read(self, offset: int, num_bytes: int) -> bytes:
@@ -75,7 +75,7 @@ class OpenShard:
         Raises:
             TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
         """
-        with self._named():
+        with self._name_errors():
             sample = decode_sample(self._samples[row][0], self.members(row), self._held)
             sample.check()
             return sample
@@ -86,11 +86,11 @@ class OpenShard:
         Raises:
             TrilightError: its scene is not readable or breaks a law; names shard and sample.
         """
-        with self._named():
+        with self._name_errors():
             return stored_sample(self._samples[row][0], self.members(row), self._held)
 
     @contextlib.contextmanager
-    def _named(self) -> Iterator[None]:
+    def _name_errors(self) -> Iterator[None]:
         try:
             yield
         except TrilightError as error:
@@ -139,7 +139,7 @@ class ManifestShards(ShardSet):
 
     def open(self, number: int) -> OpenShard:
         entry = self._entries[number]
-        shard = _opened(entry.name, self._files.open(entry, checked=True), self._held)
+        shard = _open_or_close(entry.name, self._files.open(entry, checked=True), self._held)
         if len(shard.keys) != entry.num_samples:
             shard.close()
             raise TrilightError(
@@ -185,7 +185,7 @@ def key_twice(shard: str, key: str) -> TrilightError:
     )
 
 
-def _opened(name: str, stream: BinaryIO, held: HeldMaps) -> OpenShard:
+def _open_or_close(name: str, stream: BinaryIO, held: HeldMaps) -> OpenShard:
     try:
         return OpenShard(name, stream, held)
     except BaseException:
@@ -197,7 +197,7 @@ class ListedShards(ShardSet):
     """Shards of a list: nothing is known of one before it was opened, and nothing is checked."""
 
     def __init__(self, places: Sequence[ShardPlace], seen: KeysSeen) -> None:
-        self.names = [place.shown for place in places]
+        self.names = [place.display_name for place in places]
         self._places = places
         self._seen = seen
         self._counts: dict[int, int] = {}
@@ -210,9 +210,9 @@ class ListedShards(ShardSet):
 
     def open(self, number: int) -> OpenShard:
         place = self._places[number]
-        shard = _opened(place.shown, place.open(), self._held)
+        shard = _open_or_close(place.display_name, place.open(), self._held)
         try:
-            self._seen.add(place.shown, shard.keys)
+            self._seen.add(place.display_name, shard.keys)
         except TrilightError:
             shard.close()
             raise

@@ -108,9 +108,9 @@ def lacks_validation(num_scenes: int, settings: "SplitSettings") -> str:
     return "" if num_scenes >= least else f"no shard is for validation before --scenes {least}"
 
 
-def require_objects(num_by_split: Mapping[str, int], needed: set[str]) -> None:
+def require_objects(num_by_split: Mapping[str, int], required_splits: set[str]) -> None:
     """Raise TrilightError where a split that is needed has no object to draw from."""
-    empty = [split for split in SPLITS if split in needed and not num_by_split.get(split)]
+    empty = [split for split in SPLITS if split in required_splits and not num_by_split.get(split)]
     if empty:
         total = sum(num_by_split.values())
         raise TrilightError(

@@ -97,14 +97,14 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
         with dataset.files.open(shard, checked=False) as stream, reading(dataset.shown, shard.name):
             _require_whole(dataset, shard)
             _count_shard(stream, shard, tally)
-    whole = len(read) == len(dataset.manifest.shards)
+    is_complete = len(read) == len(dataset.manifest.shards)
     return Statistics(
         num_scenes=dataset.manifest.num_samples,
         scenes_by_split=_by_split(dataset),
         num_scenes_read=sum(shard.num_samples for shard in read),
         scenes_by_template=tally.templates,
         scenes_by_excursion=tally.excursions,
-        scene_digest=digest_of_scenes(tally.scene_members) if whole else "",
+        scene_digest=digest_of_scenes(tally.scene_members) if is_complete else "",
         num_bytes=dataset.manifest.num_bytes,
         spp=np.asarray(tally.views["spp"], np.int64),
         noise_floor_db=np.asarray(tally.views["noise_floor_db"]),

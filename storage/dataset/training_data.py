@@ -55,10 +55,10 @@ class TrainingData:
     def split(self, name: str) -> ShardSet:
         """Return the shards of a split; raises TrilightError where it holds no scene."""
         if name not in self.splits:
-            there = ", ".join(self.splits) or "no split"
+            names = ", ".join(self.splits) or "no split"
             raise TrilightError(
                 f"{self.shown}: the {name} split holds no scene; expected at least one. There is "
-                f"{there}: choose it, or generate the dataset with more scenes; in a list, name "
+                f"{names}: choose it, or generate the dataset with more scenes; in a list, name "
                 f"shards {name}-....tar too."
             )
         return self.splits[name]
@@ -113,8 +113,8 @@ def _of_dataset(root: str) -> TrainingData:
 
 def _max_triangles(manifest: Manifest) -> int | None:
     scenes = manifest.settings.get("scenes")
-    found = scenes.get("max_triangles") if isinstance(scenes, Mapping) else None
-    return found if isinstance(found, int) else None
+    limit = scenes.get("max_triangles") if isinstance(scenes, Mapping) else None
+    return limit if isinstance(limit, int) else None
 
 
 def _of_list(patterns: Sequence[str]) -> TrainingData:
@@ -124,14 +124,14 @@ def _of_list(patterns: Sequence[str]) -> TrainingData:
         chosen = [place for place in places if place.split == split]
         if chosen:
             splits[split] = ListedShards(chosen, seen)
-    names = sorted(place.shown for place in places)
+    names = sorted(place.display_name for place in places)
     digest = f"list:{sha256_hex(canonical_json(names))}"
-    shown = f"the list of {len(places)} shards"
+    display_name = f"the list of {len(places)} shards"
     return TrainingData(
-        shown=shown,
+        shown=display_name,
         digest=digest,
         splits=splits,
         num_views=None,
-        sources=(DataSource(name=shown, digest=digest, num_views=None),),
+        sources=(DataSource(name=display_name, digest=digest, num_views=None),),
         notes=(NO_MANIFEST,),
     )

@@ -279,15 +279,17 @@ def _readable() -> Iterator[None]:
 
 def window_size(header: Header) -> tuple[int, int]:
     """Return height and width of the data window of a header."""
-    (left, top), (right, bottom) = np.asarray(header["dataWindow"]).tolist()
-    return bottom - top + 1, right - left + 1
+    (x_min, y_min), (x_max, y_max) = np.asarray(header["dataWindow"]).tolist()
+    return y_max - y_min + 1, x_max - x_min + 1
 
 
 def _check_pixels(header: Header, names: Collection[str]) -> None:
     """Refuse pixels that are not expected, or that take too much memory."""
-    found, wanted = sorted(channel.name for channel in header["channels"]), sorted(names)
-    if found != wanted:
-        raise TrilightError(f"picture: channels are {_listed(found)}; expected {_listed(wanted)}.")
+    stored, expected = sorted(channel.name for channel in header["channels"]), sorted(names)
+    if stored != expected:
+        raise TrilightError(
+            f"picture: channels are {_list_names(stored)}; expected {_list_names(expected)}."
+        )
     if header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
         raise TrilightError(f"picture: its storage is {header['type']}; expected lines or tiles.")
     size = window_size(header)
@@ -296,15 +298,15 @@ def _check_pixels(header: Header, names: Collection[str]) -> None:
             f"picture: the data window spans {list(size)} pixels; expected at most "
             f"{MAX_RESOLUTION} each way."
         )
-    most_bytes = 4 * len(found) * math.prod(size)
+    most_bytes = 4 * len(stored) * math.prod(size)
     if most_bytes > _MAX_BYTES:
         raise TrilightError(
-            f"picture: {len(found)} channels of {list(size)} pixels may take {most_bytes} bytes; "
+            f"picture: {len(stored)} channels of {list(size)} pixels may take {most_bytes} bytes; "
             f"expected at most {_MAX_BYTES}."
         )
 
 
-def _listed(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     if len(names) <= _MOST_LISTED:
         return ", ".join(names) or "none"
     return f"{', '.join(names[:_MOST_LISTED])} and {len(names) - _MOST_LISTED} more"

@@ -40,7 +40,9 @@ class HeldMaps:
         self.num_bytes = 0
         """Of the arrays that are held."""
 
-    def found(self, kind: type[Map], sha256: str, packed: bytes, unpack: Callable[[], Map]) -> Map:
+    def get_or_unpack(
+        self, kind: type[Map], sha256: str, packed: bytes, unpack: Callable[[], Map]
+    ) -> Map:
         """Return the map of some bytes: the held one, or what `unpack` returns, then held.
 
         Two threads that miss the same map both unpack it.

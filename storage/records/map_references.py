@@ -54,7 +54,7 @@ def maps_digest(record: Mapping[str, Any]) -> NDArray[np.uint8]:
 
     It stands among the arrays of the scene, whose digest so covers what its surfaces look like.
     """
-    kept = {
+    identity = {
         "textures": [entry["sha256"] for entry in record.get("textures", ())],
         "environment": {
             name: value
@@ -62,7 +62,7 @@ def maps_digest(record: Mapping[str, Any]) -> NDArray[np.uint8]:
             if name not in _SOURCE_FIELDS
         },
     }
-    return np.frombuffer(bytes.fromhex(sha256_hex(canonical_json(kept))), np.uint8)
+    return np.frombuffer(bytes.fromhex(sha256_hex(canonical_json(identity))), np.uint8)
 
 
 def referenced_maps(record: Any) -> list[str]:
@@ -146,9 +146,9 @@ def environment_entries(maps: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
 
 
 def _check_entry(entry: Any, name: str, more: Sequence[str]) -> None:
-    wanted = {"sha256", *_SOURCE_FIELDS, *more}
-    if not isinstance(entry, Mapping) or set(entry) != wanted:
-        wrong_map(name, entry, f"exactly the fields {', '.join(sorted(wanted))}")
+    fields = {"sha256", *_SOURCE_FIELDS, *more}
+    if not isinstance(entry, Mapping) or set(entry) != fields:
+        wrong_map(name, entry, f"exactly the fields {', '.join(sorted(fields))}")
     for field in ("sha256", *_SOURCE_FIELDS):
         if not isinstance(entry[field], str):
             wrong_map(f"{name}.{field}", entry[field], "text")

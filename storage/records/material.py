@@ -223,8 +223,10 @@ def _names_of(stated: str) -> tuple[str, ...]:
             f"scene: its material columns are {stated!r:.80}; expected names and widths."
         ) from error
     for name, width in pairs:
-        if (here := declared_column(name).width) != width:
-            _wrong(name, f"a width of {width} in the file", f"{here}, as it is declared here")
+        if (declared_width := declared_column(name).width) != width:
+            _wrong(
+                name, f"a width of {width} in the file", f"{declared_width}, as it is declared here"
+            )
     names = tuple(name for name, _ in pairs)
     if len(set(names)) != len(names):
         raise TrilightError(f"scene: its material columns are {stated:.80}; expected each once.")

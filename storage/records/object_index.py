@@ -178,9 +178,9 @@ class StoredColumn:
         start, stop, step = rows.indices(self._count)
         assert step == 1
         descriptor, dtype, position = self._place
-        wanted = max(0, stop - start) * dtype.itemsize
-        data = os.pread(descriptor, wanted, position + start * dtype.itemsize)
-        if len(data) != wanted:
+        num_bytes = max(0, stop - start) * dtype.itemsize
+        data = os.pread(descriptor, num_bytes, position + start * dtype.itemsize)
+        if len(data) != num_bytes:
             raise TrilightError(
                 f"objects.index: ends before row {stop}; expected it whole. Delete it, and it is "
                 "made anew."

@@ -76,9 +76,11 @@ def locked_uids(objects: Iterable[tuple[str, str]], provenance: Mapping[str, Any
         provenance: of the scene, perhaps from outside; what `maps` says counts where it is text.
     """
     maps = provenance.get("maps", ())
-    own = [uid for uid in maps if isinstance(uid, str)] if isinstance(maps, list | tuple) else []
+    map_uids = (
+        [uid for uid in maps if isinstance(uid, str)] if isinstance(maps, list | tuple) else []
+    )
     parts = (uid for kind, uid in objects if kind == OBJECT or (kind == EMITTER and uid))
-    return sorted({*parts, *own})
+    return sorted({*parts, *map_uids})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -94,14 +94,14 @@ def unpack_arrays(members: Mapping[str, bytes]) -> bytes:
     Raises:
         TrilightError: missing, there in both ways, damaged, or larger than MAX_ARRAY_BYTES.
     """
-    found = [suffix for suffix in (PLAIN, PACKED) if suffix in members]
-    if len(found) != 1:
+    forms = [suffix for suffix in (PLAIN, PACKED) if suffix in members]
+    if len(forms) != 1:
         raise TrilightError(
-            f"member {PLAIN} is {'there in two forms' if found else 'missing'}; expected it "
+            f"member {PLAIN} is {'there in two forms' if forms else 'missing'}; expected it "
             f"or {PACKED}."
         )
-    data = members[found[0]]
-    if found == [PLAIN]:
+    data = members[forms[0]]
+    if forms == [PLAIN]:
         return data
     unpacker = zlib.decompressobj(wbits=_GZIP)
     try:

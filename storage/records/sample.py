@@ -177,8 +177,8 @@ class Sample:
                 f"{len(self.views)} records; expected {views} of both, as many as cameras, square."
             )
         check_radiance(self.key, "", self.radiance_rgb)
-        apart = () if self.lights_rgb is None else np.moveaxis(self.lights_rgb, 1, 0)
-        for light, radiance_rgb in enumerate(apart):
+        light_pictures = () if self.lights_rgb is None else np.moveaxis(self.lights_rgb, 1, 0)
+        for light, radiance_rgb in enumerate(light_pictures):
             check_radiance(self.key, f" light {light}", radiance_rgb)
         for part, pictures in (self.parts_rgb or {}).items():
             for radiance_rgb in np.moveaxis(pictures, 1, 0) if pictures.ndim == 5 else [pictures]:
@@ -279,11 +279,11 @@ def _decode_parts(
     num = num_lights(record.scene) if lights_apart else None
     names = list(record.views[0].parts or ())
     size = radiance_rgb.shape[1], radiance_rgb.shape[2]
-    found = [
+    by_view = [
         decode_parts_exr(members[f"{view}.parts.exr"], names, size, num)
         for view in range(len(radiance_rgb))
     ]
-    return {name: np.stack([of_view[name] for of_view in found]) for name in names}
+    return {name: np.stack([of_view[name] for of_view in by_view]) for name in names}
 
 
 def decode_scene(

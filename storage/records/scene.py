@@ -184,7 +184,7 @@ def _check_arrays(scene: Scene) -> None:
         if array.dtype != dtype:
             broken_law(f"{name} has dtype {array.dtype}", f"{np.dtype(dtype)}")
         fits = array.ndim == len(shape) and all(
-            wanted in (None, got) for wanted, got in zip(shape, array.shape, strict=True)
+            expected in (None, got) for expected, got in zip(shape, array.shape, strict=True)
         )
         if not fits:
             broken_law(f"{name} has shape {array.shape}", f"{shape} with None for any length")
@@ -207,10 +207,12 @@ def _check_arrays(scene: Scene) -> None:
 
 def _check_columns(scene: Scene) -> None:
     """Check the width of a material row, and the ranges of the columns that were added to four."""
-    got, wanted = scene.materials.shape, material_width()
-    if got[1] != wanted:
+    got, expected = scene.materials.shape, material_width()
+    if got[1] != expected:
         names = ", ".join(column.name for column in material_columns())
-        broken_law(f"materials has shape {got}", f"(None, {wanted}), since its columns are {names}")
+        broken_law(
+            f"materials has shape {got}", f"(None, {expected}), since its columns are {names}"
+        )
     for column, part in laid_out():
         if column.name not in PUBLISHED_COLUMNS:
             holds = np.ones(got, np.bool_)
@@ -268,6 +270,6 @@ def _check_cameras(scene: Scene) -> None:
 
 
 def _same_length(scene: Scene, name: str, other: str) -> None:
-    got, wanted = len(getattr(scene, name)), len(getattr(scene, other))
-    if got != wanted:
-        broken_law(f"{name} has {got} rows", f"{wanted}, as {other} has")
+    got, expected = len(getattr(scene, name)), len(getattr(scene, other))
+    if got != expected:
+        broken_law(f"{name} has {got} rows", f"{expected}, as {other} has")

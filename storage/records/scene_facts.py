@@ -77,7 +77,7 @@ class CameraFacts:
 
 def surfaces(scene: Scene) -> list[SurfaceFacts]:
     """Return the objects and shell parts of a lawful scene that have triangles."""
-    found, textured = [], textured_objects(scene)
+    facts, textured = [], textured_objects(scene)
     for row, entry in enumerate(scene.objects):
         mine = scene.object_index == row
         if entry.kind == "emitter" or not mine.any():
@@ -86,7 +86,7 @@ def surfaces(scene: Scene) -> list[SurfaceFacts]:
         materials = scene.materials[rows].astype(np.float64)
         diffuse, specular = materials[:, DIFFUSE], materials[:, SPECULAR]
         faces = scene.faces[mine]
-        found.append(
+        facts.append(
             SurfaceFacts(
                 row=row,
                 kind=entry.kind,
@@ -100,12 +100,12 @@ def surfaces(scene: Scene) -> list[SurfaceFacts]:
                 roughness=float(materials[:, ROUGHNESS].mean()),
             )
         )
-    return found
+    return facts
 
 
 def lights(scene: Scene) -> list[Light]:
     """Return the emitters of a lawful scene that have triangles."""
-    found = []
+    facts = []
     for row, entry in enumerate(scene.objects):
         mine = scene.object_index == row
         if entry.kind != "emitter" or not mine.any():
@@ -117,18 +117,18 @@ def lights(scene: Scene) -> list[Light]:
         centre = np.average(corners.mean(axis=1), axis=0, weights=weights)
         radiance = scene.materials[scene.material_index[mine], EMISSION].mean(axis=0)
         area = float(areas.sum())
-        found.append(
+        facts.append(
             Light(row=row, radiance_rgb=_three(radiance), centre=_three(centre), area=area)
         )
-    return found
+    return facts
 
 
 def cameras(scene: Scene) -> list[CameraFacts]:
     """Return where the cameras of a scene stand; at the origin itself all angles are 0."""
-    found = []
+    facts = []
     for c2w, fov_deg in zip(scene.c2w, scene.fov_deg, strict=True):
         x, y, z = (float(value) for value in c2w[:3, 3])
-        found.append(
+        facts.append(
             CameraFacts(
                 position=(x, y, z),
                 distance=float(np.sqrt(x * x + y * y + z * z)),
@@ -137,7 +137,7 @@ def cameras(scene: Scene) -> list[CameraFacts]:
                 fov_deg=float(fov_deg),
             )
         )
-    return found
+    return facts
 
 
 def scene_values(record: SceneRecord) -> Mapping[str, Values]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.records.packed_maps import unpacked_texture
+from storage.records.packed_maps import unpack_texture
 from storage.records.texture import TEXTURED, Texture
 
 SkinTextures = tuple[Texture, Texture, Texture]
@@ -70,7 +70,7 @@ class LevelSkin:
     @cached_property
     def textures(self) -> SkinTextures:
         """Diffuse, specular and roughness, unpacked."""
-        first, second, third = map(unpacked_texture, self.packed, TEXTURED)
+        first, second, third = map(unpack_texture, self.packed, TEXTURED)
         return first, second, third
 
     @property
@@ -102,7 +102,7 @@ def read_skin(arrays: Mapping[str, NDArray], quality: Mapping[str, Any], name: s
     )
 
 
-def as_record(found: SkinQuality | OwnMaterials) -> dict[str, Any]:
+def as_record(quality: SkinQuality | OwnMaterials) -> dict[str, Any]:
     """Return it as JSON values."""
-    record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(found)))
+    record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(quality)))
     return record

@@ -69,7 +69,7 @@ class Texture:
         """Return the linear values of texels of this texture, of any shape."""
         if texels.dtype == np.float32:
             return texels
-        return _decoded(self.is_srgb)[texels]
+        return _decode_table(self.is_srgb)[texels]
 
     @cached_property
     def greatest(self) -> NDArray[np.float32]:
@@ -83,7 +83,7 @@ class Texture:
             return self.texels.mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
         planes = np.moveaxis(self.texels, -1, 0)
         counts = np.stack([np.bincount(plane.ravel(), minlength=256) for plane in planes])
-        table = _decoded(self.is_srgb).astype(np.float64)
+        table = _decode_table(self.is_srgb).astype(np.float64)
         means: NDArray[np.float64] = counts @ table / planes[0].size
         return means.astype(np.float32)
 
@@ -115,6 +115,6 @@ def content_digest(form: str, values: NDArray) -> str:
 
 
 @cache
-def _decoded(is_srgb: bool) -> NDArray[np.float32]:
+def _decode_table(is_srgb: bool) -> NDArray[np.float32]:
     """Return the linear value [256] of every 8-bit value."""
     return linear_from_srgb8() if is_srgb else (np.arange(256) / 255).astype(np.float32)

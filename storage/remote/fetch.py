@@ -40,10 +40,10 @@ def facts_of(url: RemoteUrl) -> Facts:
         TrilightError: the driver's package is missing.
     """
     driver = shared_driver(url)
-    found = with_tries(lambda: _fresh_info(driver, url))
-    if found.get("type") == "directory":
+    info = with_tries(lambda: _fresh_info(driver, url))
+    if info.get("type") == "directory":
         raise TransferFailed("download_failed", "is a folder, not a file")
-    return Facts(num_bytes=found.get("size"), version=version_of(found))
+    return Facts(num_bytes=info.get("size"), version=version_of(info))
 
 
 def _fresh_info(driver: Any, url: RemoteUrl) -> dict[str, Any]:
@@ -87,13 +87,13 @@ class _Expected:
         self.pace = pace
         self.version: dict[str, str] | None = None
 
-    def require(self, found: int) -> None:
+    def require(self, num_bytes: int) -> None:
         """Refuse a file that is announced with another size."""
-        if self.exact is not None and found != self.exact:
-            raise TransferFailed("download_failed", f"has {found} bytes; expected {self.exact}")
-        self.bound(found)
+        if self.exact is not None and num_bytes != self.exact:
+            raise TransferFailed("download_failed", f"has {num_bytes} bytes; expected {self.exact}")
+        self.require_limit(num_bytes)
 
-    def bound(self, reached: int) -> None:
+    def require_limit(self, reached: int) -> None:
         """Refuse to go on with a file that is longer than it may be."""
         if reached > self.most:
             message = f"is longer than {self.most} bytes"
@@ -104,9 +104,9 @@ class _Expected:
         before, self.version = self.version, dict(version)
         return before in (None, self.version)
 
-    def came(self, reached: int, whole: int | None) -> None:
+    def require_pace(self, reached: int, total: int | None) -> None:
         """Give up a file that comes too slowly; one that has come whole is not given up."""
-        if reached != whole:
+        if reached != total:
             self.pace.require()
 
     def require_all(self, reached: int) -> None:
@@ -132,7 +132,7 @@ def _fill_bucket(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expec
         if len(piece) != end - start:
             raise Interrupted from EOFError(f"got {len(piece)} of {end - start} bytes")
         stream.write(piece)
-        expected.came(stream.tell(), num_bytes)
+        expected.require_pace(stream.tell(), num_bytes)
     if num_bytes > PIECE_BYTES and not expected.is_same(version_of(_fresh_info(driver, url))):
         _start_over(stream)
         raise Interrupted from EOFError("the file changed while it was read")
@@ -165,13 +165,13 @@ async def _stream_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: 
         if not expected.is_same(version_of(answer.headers)) and stream.tell():
             _start_over(stream)
             raise Interrupted from EOFError("the file changed while it was read")
-        whole = None
+        total = None
         if answer.content_length is not None:
-            expected.require(whole := stream.tell() + answer.content_length)
+            expected.require(total := stream.tell() + answer.content_length)
         async for chunk in answer.content.iter_chunked(_CHUNK_BYTES):
-            expected.bound(stream.tell() + len(chunk))
+            expected.require_limit(stream.tell() + len(chunk))
             stream.write(chunk)
-            expected.came(stream.tell(), whole)
+            expected.require_pace(stream.tell(), total)
     expected.require_all(stream.tell())
 
 

@@ -44,11 +44,11 @@ class Within:
         """Let pydantic check the range after the type: of a number, or of each in a tuple."""
         from pydantic_core import core_schema  # readers of scenes do without pydantic
 
-        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+        return core_schema.no_info_after_validator_function(self._check, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         """Let forms show the range, at the number or at the entries of a list."""
-        return self._bounded(handler(schema))
+        return self._add_bounds(handler(schema))
 
     def __str__(self) -> str:
         """Return the range as the end of a sentence, such as `from 1 to 170 degrees`."""
@@ -60,7 +60,7 @@ class Within:
             end = f", up to {high}" if self.low_open else f" to {high}"
         return start + end + (f" {self.unit}" if self.unit else "")
 
-    def _checked(self, value: Any) -> Any:
+    def _check(self, value: Any) -> Any:
         from pydantic_core import PydanticCustomError
 
         numbers = value if isinstance(value, tuple) else (value,)
@@ -70,13 +70,13 @@ class Within:
             )
         return value
 
-    def _bounded(self, form: dict[str, Any]) -> dict[str, Any]:
+    def _add_bounds(self, form: dict[str, Any]) -> dict[str, Any]:
         """Return a JSON schema with the ends of the range, but for those that are no limit."""
         if "anyOf" in form:
-            return form | {"anyOf": [self._bounded(option) for option in form["anyOf"]]}
+            return form | {"anyOf": [self._add_bounds(option) for option in form["anyOf"]]}
         if form.get("type") == "array":  # pairs as lists too: forms know no tuples
             rest = {name: part for name, part in form.items() if name != "prefixItems"}
-            return rest | {"items": self._bounded(form.get("items") or form["prefixItems"][0])}
+            return rest | {"items": self._add_bounds(form.get("items") or form["prefixItems"][0])}
         if form.get("type") not in ("integer", "number"):
             return form
         bounds: dict[str, Any] = {}
@@ -99,9 +99,9 @@ class LowFirst:
         """Let pydantic check the order after the type."""
         from pydantic_core import core_schema
 
-        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+        return core_schema.no_info_after_validator_function(self._check, handler(source))
 
-    def _checked(self, pair: tuple[float, float]) -> tuple[float, float]:
+    def _check(self, pair: tuple[float, float]) -> tuple[float, float]:
         from pydantic_core import PydanticCustomError
 
         if pair[0] > pair[1]:
@@ -195,18 +195,18 @@ def shown_number(number: float) -> str:
 
 
 def _declarations_of(name: str, hint: Any) -> Iterator[Declared]:
-    optional, ordered, found = False, False, list[Within | Columns]()
+    optional, ordered, declarations = False, False, list[Within | Columns]()
     while True:
         if get_origin(hint) is Annotated:
             hint, *notes = get_args(hint)
-            found += [note for note in notes if isinstance(note, Within | Columns)]
+            declarations += [note for note in notes if isinstance(note, Within | Columns)]
             ordered = any(isinstance(note, LowFirst) for note in notes)
         elif get_origin(hint) in (typing.Union, types.UnionType) and type(None) in get_args(hint):
             optional = True
             hint = next(arg for arg in get_args(hint) if arg is not type(None))
         else:
             break
-    for note in found:
+    for note in declarations:
         kind, shape = _kind_and_shape(hint)
         yield Declared(
             name=name,

@@ -18,11 +18,11 @@ def motion_px(rays: PassRays) -> NDArray[np.float64]:
     """
     if rays.later is None:
         raise TrilightError("motion_px: no other moment is given; expected `then` or `then_view`.")
-    there, view = rays.later.scene, rays.later.view
+    later_scene, view = rays.later.scene, rays.later.view
     places = pixel_places(
         rays.hits.interpolated(rays.later.corners),
-        there.c2w[view],
-        float(there.fov_deg[view]),
+        later_scene.c2w[view],
+        float(later_scene.fov_deg[view]),
         rays.resolution,
     )
     return places - pixel_places(rays.hits.position, rays.c2w, rays.fov_deg, rays.resolution)
