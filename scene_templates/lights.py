@@ -84,7 +84,8 @@ def _spaced_direction(
     placed_directions: list[NDArray[np.float64]],
     spacing: float,
 ) -> NDArray[np.float64]:
-    best, best_gap = sector.direction_rand(rng), -1.0
+    best = sector.direction_rand(rng)
+    best_gap = -1.0
     for _ in range(SPACING_TRIES):
         candidate = sector.direction_rand(rng)
         distances = [
@@ -92,7 +93,8 @@ def _spaced_direction(
         ]
         gap = SPACING_RADIUS * min(distances, default=np.inf)
         if gap > best_gap:
-            best, best_gap = candidate, gap
+            best = candidate
+            best_gap = gap
         if gap > spacing:
             break
     return best

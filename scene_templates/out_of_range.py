@@ -15,7 +15,8 @@ from scene_templates.frozen_v1 import ONE_FAMILY_EACH, SCENES_V1
 from scene_templates.rooms import SharedRoom
 from scene_templates.settings import Excursion, SceneSettings
 
-_MEDIAN_EMISSION, _MEDIAN_SIZE = 3750.0, 2.25
+_MEDIAN_EMISSION = 3750.0
+_MEDIAN_SIZE = 2.25
 
 _SURFACES = (
     "checker", "stripes", "bricks", "tiles", "hexagons", "planks", "wood", "marble",

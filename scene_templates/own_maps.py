@@ -45,7 +45,8 @@ class OwnTexture:
         self, rng: np.random.Generator, source: MapSource, roughness_clip: tuple[float, float]
     ) -> SurfaceMaps:
         """Return it as a surface; a roughness that is missing is uniform in `roughness_clip`."""
-        rough, low_high = self.roughness, roughness_clip
+        rough = self.roughness
+        low_high = roughness_clip
         if rough is None:
             rough = np.full((*self.diffuse_rgb.shape[:2], 1), rng.uniform(*low_high), np.float32)
         return SurfaceMaps(

@@ -88,7 +88,8 @@ class ObjectSpace:
         low = np.clip(self.room.low, -0.5, 0.5) + radius / 2
         high = np.clip(self.room.high, -0.5, 0.5) - radius / 2
         for name in self.parts:
-            axis, lean = SIDES[name].axis, self.room.lean
+            axis = SIDES[name].axis
+            lean = self.room.lean
             if SIDES[name].sign > 0:
                 high[axis] = self.room.high[axis] - lean - points[:, axis].max()
             else:
@@ -149,11 +150,14 @@ def _pose_rand(
     rotation = rotation_rand(rng, settings.orientation)
     rests = bool(rng.random() < settings.resting_share)
     points = radius * rotated(shape.points, rotation)
-    low, high = np.full(3, -0.5), np.full(3, 0.5)
+    low = np.full(3, -0.5)
+    high = np.full(3, 0.5)
     if settings.inside:
         low, high = space.centre_range(points, radius)
         if rests:
-            low[2], high[2] = 0.0, 0.0  # it is set down below
+            # it is set down below
+            low[2] = 0.0
+            high[2] = 0.0
     if (low > high).any():
         return None
     for _ in range(PLACE_TRIES):

@@ -52,7 +52,8 @@ class TexturedLook:
 
     def uv(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return texture coordinates of places [..., 2] on a flat side: to the right and up."""
-        x, y = places_m[..., 0] / self.tile_m, places_m[..., 1] / self.tile_m
+        x = places_m[..., 0] / self.tile_m
+        y = places_m[..., 1] / self.tile_m
         for _ in range(self.quarter_turns):
             x, y = y, -x  # the picture turns counter-clockwise where coordinates turn clockwise
         rows, columns = self.maps.diffuse_rgb.shape[:2]
@@ -79,7 +80,8 @@ def draw_look(
     """
     if rng.random() >= settings.share:
         return None
-    tile_m, turns = rng.uniform(*settings.tile_m), int(rng.integers(4))
+    tile_m = rng.uniform(*settings.tile_m)
+    turns = int(rng.integers(4))
     shift_u, shift_v = rng.random(2)
     chosen = drawn_own(rng, user_textures, settings.own_share, licences)
     if chosen is None:

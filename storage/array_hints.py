@@ -11,7 +11,8 @@ def array_scalar(hint: Any) -> Any:
 
     Until numpy 2.4 NDArray[X] is ndarray[shape, dtype[X]]; from 2.5 on it is an alias that keeps X.
     """
-    origin, args = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    args = get_args(hint)
     if origin is np.ndarray:
         (scalar,) = get_args(args[1])
         return scalar

@@ -130,7 +130,8 @@ class WaitNotice:
 
     def __init__(self) -> None:
         """Begin the wait."""
-        self._began_s, self._next_s = time.monotonic(), _SILENT_S
+        self._began_s = time.monotonic()
+        self._next_s = _SILENT_S
 
     def update(self, claim: Path) -> None:
         """Take notice that the wait still lasts, for the holder of a claim."""
@@ -165,7 +166,8 @@ def _acquire_lock(path: Path, wait: bool) -> int | None:
 @contextlib.contextmanager
 def _announce_wait(path: Path) -> Iterator[None]:
     """Announce from a thread how long the block waits for a claim."""
-    notice, ended = WaitNotice(), threading.Event()
+    notice = WaitNotice()
+    ended = threading.Event()
 
     def announce() -> None:
         while not ended.wait(_SILENT_S / 4):

@@ -280,7 +280,8 @@ def mistake_in_extension(error: BaseException) -> TrilightError | None:
 
 def _mistake(name: str, line: int | None, error: BaseException) -> TrilightError:
     if isinstance(error, SyntaxError):
-        line, said = error.lineno, error.msg
+        line = error.lineno
+        said = error.msg
     else:
         said = str(error)
     kind = "" if isinstance(error, TrilightError) else f"{type(error).__name__}: "

@@ -18,7 +18,9 @@ DUTIES: Mapping[str, str] = {
 }
 """Everything that a licence may ask for, with what it means here, in the order of documents."""
 
-_NONE, _NOTICE, _NOTICE_CHANGES = (), ("notice",), ("changes", "notice")
+_NONE = ()
+_NOTICE = ("notice",)
+_NOTICE_CHANGES = ("changes", "notice")
 _SHARED_CODE = ("changes", "notice", "share-alike")
 
 _KNOWN: Mapping[str, tuple[str, ...]] = {

@@ -4,7 +4,8 @@ import numpy as np
 
 from scene_templates.exact import Numbers
 
-WARMEST_MIRED, COOLEST_MIRED = 500.0, 40.0
+WARMEST_MIRED = 500.0
+COOLEST_MIRED = 40.0
 """2,000 and 25,000 kelvin: colours of the Planckian locus that Rec.709 can show, by its fit."""
 
 _TO_REC709 = (

@@ -64,9 +64,13 @@ def scene_sky(
     chosen = drawn_own(place, own, settings.own_share, licences)
     if chosen is None:
         drawn = draw_sky(rng, settings.maps)
-        family, radiance, source = drawn.family, drawn.radiance_rgb, MapSource(name=drawn.family)
+        family = drawn.family
+        radiance = drawn.radiance_rgb
+        source = MapSource(name=drawn.family)
     else:
-        family, radiance, source = "own", chosen.load(), chosen.source
+        family = "own"
+        radiance = chosen.load()
+        source = chosen.source
     low, high = (math.log(bound) for bound in settings.over_lamps_log)
     over_lamps = math.exp(rng.uniform(low, high))
     azimuth_rad = float(rng.uniform(0, 2 * math.pi))
@@ -105,5 +109,6 @@ def _mean_radiance(radiance_rgb: NDArray[np.float32]) -> float:
 
 
 def _about_z(angle_rad: float) -> NDArray[np.float32]:
-    c, s = float(cosine(angle_rad)), float(sine(angle_rad))
+    c = float(cosine(angle_rad))
+    s = float(sine(angle_rad))
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.float32)

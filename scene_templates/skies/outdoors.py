@@ -12,7 +12,8 @@ from scene_templates.skies.colour import planckian_rgb
 from scene_templates.skies.draws import SkyDraws
 from scene_templates.skies.texels import SkyTexels
 
-LOW_SUN_MIRED, HIGH_SUN_MIRED = 420.0, 172.0
+LOW_SUN_MIRED = 420.0
+HIGH_SUN_MIRED = 172.0
 """2,400 K on the horizon and 5,800 K above: the light of a low sun has crossed more air."""
 
 
@@ -119,6 +120,7 @@ def _mean(rgb: Numbers) -> float:
 
 def shared_flux(texels: SkyTexels, one: Numbers, other: Numbers, share: float) -> Numbers:
     """Return the sum of two maps of which the first has `share` of the flux."""
-    first, second = _mean(texels.flux(one)), _mean(texels.flux(other))
+    first = _mean(texels.flux(one))
+    second = _mean(texels.flux(other))
     result: Numbers = one * (share / first) + other * ((1 - share) / second)
     return result

@@ -114,7 +114,8 @@ class SkyTexels:
             cells: of the first octave along a radius.
             octaves: how many, as far as texels can show them.
         """
-        total, gain = np.zeros((self.height, 2 * self.height)), NOISE_SCALE
+        total = np.zeros((self.height, 2 * self.height))
+        gain = NOISE_SCALE
         for _ in range(octaves):
             if TEXELS_PER_CELL * np.pi * cells > self.height:
                 break
@@ -167,7 +168,8 @@ def _axes(towards: NDArray, roll_rad: float) -> tuple[Numbers, Numbers]:
         ]
     )
     level, upright = (axis / np.sqrt(dot(axis, axis)) for axis in (level, upright))
-    turn_cos, turn_sin = float(cosine(roll_rad)), float(sine(roll_rad))
+    turn_cos = float(cosine(roll_rad))
+    turn_sin = float(sine(roll_rad))
     return turn_cos * level + turn_sin * upright, turn_cos * upright - turn_sin * level
 
 
@@ -181,7 +183,8 @@ def _noise_in_space(points: NDArray, rng: np.random.Generator) -> Numbers:
     total = np.zeros(points.shape[:-1])
     for steps in itertools.product((0, 1), repeat=3):
         place = np.zeros(total.shape, np.int64)
-        weight, height = np.ones_like(total), np.zeros_like(total)
+        weight = np.ones_like(total)
+        height = np.zeros_like(total)
         for corner, step, fade in zip(corners, steps, fades, strict=True):
             place = place * LATTICE + (corner.astype(np.int64) + step) % LATTICE
             weight = weight * (fade if step else 1 - fade)

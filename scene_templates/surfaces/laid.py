@@ -94,11 +94,10 @@ def lay_rows(texels: Texels, rows: int, columns: int, shifts: NDArray) -> Pieces
     row = below.astype(np.int64) % rows
     x = texels.u * columns + shifts[row]
     column = np.floor(x)
-    offset_u, offset_v = x - column, y - below
-    edge_u, edge_v = (
-        np.minimum(offset_u, 1 - offset_u) / columns,
-        np.minimum(offset_v, 1 - offset_v) / rows,
-    )
+    offset_u = x - column
+    offset_v = y - below
+    edge_u = np.minimum(offset_u, 1 - offset_u) / columns
+    edge_v = np.minimum(offset_v, 1 - offset_v) / rows
     everywhere = np.zeros((texels.size, texels.size), np.int64)
     return Pieces(
         row=row + everywhere,
@@ -121,7 +120,8 @@ def bricks(draws: SurfaceDraws, texels: Texels) -> Finish:
         "mortar", low=(0.3, 0.28, 0.25), high=(0.7, 0.68, 0.62), roughness=(0.8, 1.0)
     )
     random = draws.stream()
-    tones, loose = random.random((rows, columns)), random.random(rows)
+    tones = random.random((rows, columns))
+    loose = random.random(rows)
     running = 0.5 * (np.arange(rows) % 2)
     shifts = {"running": running, "stacked": np.zeros(rows), "random": loose}[bond]
     pieces = lay_rows(texels, rows, columns, shifts)
@@ -143,7 +143,8 @@ def tiles(draws: SurfaceDraws, texels: Texels) -> Finish:
     second = draws.finish("second tile", low=(0.02, 0.05, 0.1), high=(0.5, 0.5, 0.6), **glaze)
     grout = draws.finish("grout", low=(0.15, 0.15, 0.14), high=(0.7, 0.7, 0.68), roughness=(0.8, 1))
     random = draws.stream()
-    tones, picks = random.random((side, side)), random.random((side, side)) < 0.3
+    tones = random.random((side, side))
+    picks = random.random((side, side)) < 0.3
     pieces = lay_rows(texels, side, side, np.zeros(side))
     chequered = (np.arange(side)[:, None] + np.arange(side)) % 2 == 1
     which = {"plain": np.zeros_like(picks), "scattered": picks, "chequered": chequered}[pattern]
@@ -165,7 +166,8 @@ def hexagons(draws: SurfaceDraws, texels: Texels) -> Finish:
     second = draws.finish("second tile", low=(0.02, 0.05, 0.05), high=(0.6, 0.4, 0.4), **glaze)
     grout = draws.finish("grout", low=(0.1, 0.1, 0.1), high=(0.6, 0.6, 0.58), roughness=(0.8, 1))
     random = draws.stream()
-    tones, picks = random.random((rows, columns)), random.random((rows, columns)) < share
+    tones = random.random((rows, columns))
+    picks = random.random((rows, columns)) < share
     index, edge = _hexagon_of(texels, columns, rows)
     tile = first.covered(second, picks.ravel()[index]).toned(1 - 0.2 * tones.ravel()[index])
     return grout.covered(tile, ramp((edge - joint / 2) / columns * texels.size))
@@ -178,7 +180,8 @@ def _hexagon_of(texels: Texels, columns: int, rows: int) -> tuple[NDArray[np.int
     """
     pitch = math.sqrt(0.75)
     best = np.full((texels.size, texels.size), np.inf)
-    index, edge = np.zeros(best.shape, np.int64), best.copy()
+    index = np.zeros(best.shape, np.int64)
+    edge = best.copy()
     for row_parity in (0, 1):
         column = np.floor(texels.u * columns - row_parity / 2 + 0.5)
         row = 2 * np.floor((texels.v * rows - row_parity) / 2 + 0.5) + row_parity

@@ -8,7 +8,8 @@ from scene_templates.surfaces.draws import RGB, GlossRanges, SurfaceDraws
 from scene_templates.surfaces.maps import Finish
 from scene_templates.surfaces.texels import TEXELS_PER_CELL, Texels
 
-DARK_METAL, BRIGHT_METAL = (0.5, 0.42, 0.3), (0.95, 0.92, 0.9)
+DARK_METAL = (0.5, 0.42, 0.3)
+BRIGHT_METAL = (0.95, 0.92, 0.9)
 """From bronze to silver, roughly."""
 
 
@@ -82,11 +83,13 @@ def fabric(draws: SurfaceDraws, texels: Texels) -> Finish:
     cloth = GlossRanges(specular=(0.0, 0.06), roughness=(0.6, 1.0))
     along = draws.finish("warp", low=(0.05, 0.05, 0.06), high=(0.85, 0.75, 0.65), **cloth)
     across = draws.finish("weft", low=(0.05, 0.05, 0.06), high=(0.85, 0.8, 0.75), **cloth)
-    column, row = np.floor(texels.u * threads), np.floor(texels.v * threads)
+    column = np.floor(texels.u * threads)
+    row = np.floor(texels.v * threads)
     over = (column + row) % 2 < 1 if weave == "plain" else (column + row) % 4 < 2
     in_u = 2 * (texels.u * threads - column) - 1 + np.zeros((texels.size, 1))
     in_v = 2 * (texels.v * threads - row) - 1 + np.zeros((1, texels.size))
-    rim, crown = np.where(over, in_u, in_v), np.where(over, in_v, in_u)
+    rim = np.where(over, in_u, in_v)
+    crown = np.where(over, in_v, in_u)
     visible_fraction = min(1.0, texels.size / (TEXELS_PER_CELL * threads))
     # 0.3 is the mean of what is taken off: where threads are too fine to show, it alone is left
     shade = 0.7 - visible_fraction * (0.7 * rim * rim + 0.2 * crown * crown - 0.3)
@@ -101,7 +104,8 @@ def _of_threads(
     random: np.random.Generator, threads: int, column: NDArray, row: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Return a number in [0, 1] for the thread of each column and for that of each row."""
-    warp, weft = random.random(threads), random.random(threads)
+    warp = random.random(threads)
+    weft = random.random(threads)
     return warp[column.astype(np.int64) % threads], weft[row.astype(np.int64) % threads]
 
 

@@ -79,10 +79,8 @@ class Finish:
         Albedos are area means; of the roughness, it is the mean of the GGX widths that counts.
         """
         part = np.asarray(share, np.float64)
-        base_roughness, cover_roughness = (
-            np.clip(self.roughness, 0, 1),
-            np.clip(other.roughness, 0, 1),
-        )
+        base_roughness = np.clip(self.roughness, 0, 1)
+        cover_roughness = np.clip(other.roughness, 0, 1)
         return Finish(
             diffuse_rgb=lerp(self.diffuse_rgb, other.diffuse_rgb, part[..., None]),
             specular_rgb=lerp(self.specular_rgb, other.specular_rgb, part[..., None]),

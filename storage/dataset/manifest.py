@@ -41,7 +41,8 @@ DocumentName = Annotated[
 
 MAX_BESIDE_BYTES = 1 << 30
 """Largest file beside the shards: a manifest takes 220 bytes a shard, a lock 400 an object."""
-_HEAD_BYTES, _ROW_BYTES = 1 << 22, 1 << 17
+_HEAD_BYTES = 1 << 22
+_ROW_BYTES = 1 << 17
 """Maximum sizes of a manifest without its shards, and of a shard in it."""
 
 Scenes = Annotated[int, Within(0, 1_000_000_000, unit="scenes")]

@@ -22,7 +22,8 @@ class MixedShards(ShardSet):
     def __init__(self, sets: Mapping[str, ShardSet]) -> None:
         """Take the shards by what each dataset is called in messages."""
         self._at: list[tuple[ShardSet, int]] = []
-        names, parts = list[str](), list[range]()
+        names = list[str]()
+        parts = list[range]()
         for called, shards in sets.items():
             parts.append(range(len(names), len(names) + len(shards.names)))
             names += [f"{called}: {name}" for name in shards.names]

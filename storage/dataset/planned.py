@@ -41,7 +41,8 @@ def listed_scenes(manifest: Manifest) -> set[int]:
 
 def planned_scenes_of(manifest: Manifest, shard: ShardEntry) -> int | None:
     """Return how many scenes a shard is to hold; None for as many as fit into it."""
-    splits, number = _splits(manifest), number_of_shard(shard)
+    splits = _splits(manifest)
+    number = number_of_shard(shard)
     cut = scenes_of_shard(number, cut_splits(manifest.num_scenes, splits))
     return len(cut) if cut != scenes_of_shard(number, splits) else None
 

@@ -118,7 +118,8 @@ def read_progress(folder: DatasetFolder) -> Progress:
     try:
         facts = folder.manifest.stat()
         manifest, expected = _plan_of(folder.manifest, facts.st_mtime_ns, facts.st_size)
-        scenes_planned, num_views = manifest.num_scenes, manifest.num_views
+        scenes_planned = manifest.num_scenes
+        num_views = manifest.num_views
         given_up = _scenes_given_up(folder, manifest)
         packed = {name: each for name, each in expected.items() if name not in manifest.growing}
         scenes_done = num_scenes_done(folder, packed) - given_up
@@ -186,7 +187,8 @@ def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
     if not unlisted or dataset.files.url.scheme not in WRITABLE:
         return listed
     with contextlib.suppress(TrilightError):  # it may be read and not listed
-        names, bucket_root = Bucket(dataset.files.url).names(), DatasetFolder(Path())
+        names = Bucket(dataset.files.url).names()
+        bucket_root = DatasetFolder(Path())
         listed |= {
             name for name in unlisted & names if note_of(bucket_root, name).as_posix() in names
         }
@@ -205,11 +207,10 @@ def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
         TrilightError: there is no readable manifest, or the URL is refused.
     """
     dataset = open_listed(url)
-    manifest, total_scenes = dataset.manifest, max(num_scenes, dataset.manifest.num_scenes)
-    planned, before = (
-        planned_shards(dataclasses.replace(manifest, num_scenes=total_scenes)),
-        planned_shards(manifest),
-    )
+    manifest = dataset.manifest
+    total_scenes = max(num_scenes, dataset.manifest.num_scenes)
+    planned = planned_shards(dataclasses.replace(manifest, num_scenes=total_scenes))
+    before = planned_shards(manifest)
     finished = {(name, before.get(name)) for name in _finished_names(dataset, planned)}
     missing = [index for index, shard in enumerate(planned.items()) if shard not in finished]
     return missing or ([] if _is_finished(dataset) else [0])
@@ -308,7 +309,8 @@ def read_status(url: str) -> DatasetStatus:
     done -= given_up
     given_up += max(manifest.num_scenes - sum(planned.values()), 0)
     looked, share = (look_at_logs(local), 1.0) if local else _sampled_logs(dataset)
-    last, core_s = looked.last, looked.core_s
+    last = looked.last
+    core_s = looked.core_s
     scenes_left = manifest.num_scenes - done - given_up
     views_per_hour, remaining_s = _rate(last, share, manifest, scenes_left)
     return DatasetStatus(

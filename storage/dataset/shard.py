@@ -57,7 +57,10 @@ def write_tar(stream: BinaryIO, samples: Iterable[tuple[str, Mapping[str, bytes]
 def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
     """Add a member under its whole name, with the metadata that all members have."""
     info = tarfile.TarInfo(name)
-    info.size, info.mode, info.uname, info.gname = len(data), 0o444, "trilight", "trilight"
+    info.size = len(data)
+    info.mode = 0o444
+    info.uname = "trilight"
+    info.gname = "trilight"
     archive.addfile(info, io.BytesIO(data))
 
 
@@ -96,7 +99,8 @@ def scan_members(stream: BinaryIO, name: str) -> Iterator[Member]:
         TrilightError: the file is no complete tar, or holds a link, a folder, a path, an extended
             header, or a member that is larger than MAX_MEMBER_BYTES.
     """
-    end, position = stream.seek(0, 2), 0
+    end = stream.seek(0, 2)
+    position = 0
     while True:
         stream.seek(position)
         block = stream.read(tarfile.BLOCKSIZE)
@@ -137,7 +141,8 @@ def scan_samples(
                 yield current, members
             if member.key in seen:
                 raise TrilightError(f"{name}: sample {member.key} occurs twice.")
-            current, members = member.key, {}
+            current = member.key
+            members = {}
             if current:
                 seen.add(current)
         known = members if current else maps
@@ -261,7 +266,8 @@ def read_member(stream: BinaryIO, member: Member) -> bytes:
 def _parse_header(name: str, block: bytes, offset: int) -> Member:
     """Return the member that a header describes; `tarfile` would take six times as long."""
     block = block.ljust(tarfile.BLOCKSIZE, b"\xff")  # one that is cut has no right sum
-    num_bytes, stated = _number(block[124:136]), _number(block[148:156])
+    num_bytes = _number(block[124:136])
+    stated = _number(block[148:156])
     if num_bytes is None or stated != sum(block) - sum(block[148:156]) + 8 * ord(" "):
         raise TrilightError(f"{name}: not a readable shard (a header at byte {offset - 512}).")
     text = b"/".join(filter(None, map(_text, (block[345:500], block[:100]))))

@@ -87,7 +87,8 @@ def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:
     Raises:
         TrilightError: the file is not a whole shard.
     """
-    path, shard = note_of(folder, name), folder.shard(name)
+    path = note_of(folder, name)
+    shard = folder.shard(name)
     # a kill before the note leaves none; then, and where it is no note, the shard itself is read
     with contextlib.suppress(OSError, TrilightError):
         note = decode_note(read_plain(path), str(path))

@@ -110,7 +110,8 @@ def _alternatives(group: str, named: str) -> Sequence[str]:
     match = _RANGE.fullmatch(group)
     if match is None:
         return group.split(",")
-    first, last = int(match[1]), int(match[2])
+    first = int(match[1])
+    last = int(match[2])
     if not first <= last <= first + MAX_SHARDS:
         raise TrilightError(
             f"{named}: the range {group} is backwards or longer than {MAX_SHARDS}; expected such "

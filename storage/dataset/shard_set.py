@@ -38,7 +38,8 @@ class OpenShard:
             held: maps of this shard and others that were unpacked already.
         """
         self.name = name
-        self._stream, self._held = stream, held
+        self._stream = stream
+        self._held = held
         self._maps: dict[str, Member] = {}
         self._samples: list[tuple[str, Mapping[str, Member]]] = list(
             scan_samples(stream, name, self._maps)

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 JUDGED_SPLIT = "test"
 """Split of whole sets that are judged by, never learnt from."""
 
-VALIDATION_SLOT, TEST_SLOT = 2, 5
+VALIDATION_SLOT = 2
+TEST_SLOT = 5
 """Places in a cycle of shards: early, so that a small dataset has all three splits."""
 
 

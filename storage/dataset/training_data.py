@@ -99,7 +99,8 @@ def _of_dataset(root: str) -> TrainingData:
         entries = [shard for shard in dataset.shards_of(split) if shard.num_samples]
         if entries:
             splits[split] = ManifestShards(dataset, entries)
-    build, num_views = dataset.manifest.build, dataset.manifest.num_views
+    build = dataset.manifest.build
+    num_views = dataset.manifest.num_views
     return TrainingData(
         shown=dataset.shown,
         digest=dataset.digest,
@@ -118,7 +119,8 @@ def _max_triangles(manifest: Manifest) -> int | None:
 
 
 def _of_list(patterns: Sequence[str]) -> TrainingData:
-    places, seen = listed_shards(patterns), KeysSeen()
+    places = listed_shards(patterns)
+    seen = KeysSeen()
     splits: dict[str, ShardSet] = {}
     for split in SPLITS:
         chosen = [place for place in places if place.split == split]

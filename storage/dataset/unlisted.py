@@ -38,7 +38,8 @@ def with_unlisted(dataset: Dataset) -> Dataset:
 
 
 def _notes(dataset: Dataset) -> list[ShardNote]:
-    files, manifest = dataset.files, dataset.manifest
+    files = dataset.files
+    manifest = dataset.manifest
     if isinstance(files, LocalFiles):
         folder = DatasetFolder(files.root)
         noted = filter(SHARD_NAME.fullmatch, noted_names(folder))
@@ -46,7 +47,8 @@ def _notes(dataset: Dataset) -> list[ShardNote]:
     if files.url.scheme not in WRITABLE or len(manifest.shards) >= num_planned(manifest):
         return []
     with contextlib.suppress(TrilightError):  # it may be read and not listed
-        names, bucket_root = Bucket(files.url).names(), DatasetFolder(Path())
+        names = Bucket(files.url).names()
+        bucket_root = DatasetFolder(Path())
         listed = {shard.name for shard in manifest.shards}
         unlisted = sorted(filter(SHARD_NAME.fullmatch, names - listed))
         notes = (note_of(bucket_root, name).as_posix() for name in unlisted)

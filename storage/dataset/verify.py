@@ -257,7 +257,8 @@ def _check_content(
 ) -> None:
     if index_stream(stream, shard.name) != shard:
         findings.faults.append("sha256 or number of samples differs from the manifest")
-    unused, held = set(contents_of(stream, shard.name).maps), HeldMaps()
+    unused = set(contents_of(stream, shard.name).maps)
+    held = HeldMaps()
     for key, members in samples_of(stream, shard.name):
         findings.keys.append(key)
         unused -= members.keys()
@@ -322,7 +323,8 @@ def _check_parts(sample: Sample, names: tuple[str, ...]) -> Iterator[str]:
     stored = tuple(sample.parts_rgb or ())
     floors = {tuple(view.parts or ()) for view in sample.views}
     if stored != names or floors != {names}:
-        stored_text, expected_text = ", ".join(stored) or "none", ", ".join(names) or "none"
+        stored_text = ", ".join(stored) or "none"
+        expected_text = ", ".join(names) or "none"
         yield (
             f"sample {sample.key}: parts are {stored_text}; the settings and every view expect "
             f"{expected_text}"

@@ -49,7 +49,8 @@ class Environment:
 
     def check(self) -> None:
         """Raise TrilightError at the first broken law."""
-        radiance, name = self.radiance_rgb, "environment.radiance_rgb"
+        radiance = self.radiance_rgb
+        name = "environment.radiance_rgb"
         if radiance.dtype != np.float32:
             broken_law(f"{name} has dtype {radiance.dtype}", "float32")
         if radiance.ndim != 3 or radiance.shape[1:] != (2 * radiance.shape[0], 3):

@@ -241,7 +241,9 @@ def find_header_end(data: bytes) -> int:
         TrilightError: they have more attributes, channels or bytes than are read.
     """
     is_many = int.from_bytes(data[4:8], "little") & MANY_PARTS
-    at, attributes, channel_bytes = 8, 0, 0
+    at = 8
+    attributes = 0
+    channel_bytes = 0
     while data.startswith(MAGIC):
         while data[at : at + 1] not in (b"", b"\0"):  # name, type, size, value
             kind = data.find(0, at) + 1
@@ -285,7 +287,8 @@ def window_size(header: Header) -> tuple[int, int]:
 
 def _check_pixels(header: Header, names: Collection[str]) -> None:
     """Refuse pixels that are not expected, or that take too much memory."""
-    stored, expected = sorted(channel.name for channel in header["channels"]), sorted(names)
+    stored = sorted(channel.name for channel in header["channels"])
+    expected = sorted(names)
     if stored != expected:
         raise TrilightError(
             f"picture: channels are {_list_names(stored)}; expected {_list_names(expected)}."

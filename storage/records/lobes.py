@@ -37,8 +37,10 @@ class Lobes:
 def lobes_of(materials: NDArray[np.float32]) -> Lobes:
     """Return the lobes of material rows [T, 10 or more]; other columns are not read."""
     rows = materials.astype(np.float64)
-    diffuse, specular = rows[:, DIFFUSE], rows[:, SPECULAR]
-    d, s = diffuse.max(axis=1), specular.max(axis=1)
+    diffuse = rows[:, DIFFUSE]
+    specular = rows[:, SPECULAR]
+    d = diffuse.max(axis=1)
+    s = specular.max(axis=1)
     weight = np.divide(s, s + d, out=np.zeros_like(s), where=s + d > 0)
     alpha = np.maximum(alpha_ggx(rows[:, ROUGHNESS]), MIN_ALPHA)
     return Lobes(diffuse=diffuse, specular=specular, alpha=alpha, weight=weight)

@@ -34,7 +34,8 @@ def sky_facts(sky: Environment) -> SkyFacts:
     if not total > 0:
         return SkyFacts(mean_radiance=0.0, peak=0.0, half_light_deg=0.0)
     order = np.argsort(-grey, axis=None, kind="stable")
-    reached, solid = np.cumsum(light[order]), np.cumsum(angle[order])
+    reached = np.cumsum(light[order])
+    solid = np.cumsum(angle[order])
     half = np.interp(total / 2, np.append(0.0, reached), np.append(0.0, solid))
     return SkyFacts(
         mean_radiance=total / (4 * np.pi),

@@ -133,7 +133,8 @@ def environment_entries(maps: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
         return ()
     entry = maps["environment"]
     _check_entry(entry, "maps.environment", ("rotation", "is_seen"))
-    rotation, is_seen = entry["rotation"], entry["is_seen"]
+    rotation = entry["rotation"]
+    is_seen = entry["is_seen"]
     if type(is_seen) is not bool:
         wrong_map("maps.environment.is_seen", is_seen, "true or false")
     rows = rotation if isinstance(rotation, list) else []

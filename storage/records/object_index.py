@@ -145,7 +145,8 @@ def _split_rows(
     camp: NDArray[Any],
     camps: Sequence[str],
 ) -> dict[str, SplitRows]:
-    splits, start = {}, 0
+    splits = {}
+    start = 0
     for split, group in groupby(rows, key=attrgetter("locked.split")):
         stop = start + sum(1 for _ in group)
         sizes = {

@@ -46,7 +46,9 @@ class ObjectRecord(NamedObject):
     """Folder in which its pictures may lie anywhere; its own one where empty. Never published."""
 
 
-OBJECT, TEXTURE, SKY = "object", "texture", "sky"
+OBJECT = "object"
+TEXTURE = "texture"
+SKY = "sky"
 """Kinds of rows of a lock: objects, and what users bring for surfaces and for light."""
 
 

@@ -35,7 +35,9 @@ from storage.records.texture import MAX_MAPS_BYTES, Texture
 
 _ARRAY = "values"
 _FORM = "form"
-_SRGB, _LINEAR, _ENVIRONMENT = "srgb", "linear", "environment"
+_SRGB = "srgb"
+_LINEAR = "linear"
+_ENVIRONMENT = "environment"
 _DTYPES = {"U8": np.uint8, "F16": np.float16, "F32": np.float32}
 _MOST_HEADER = 1 << 10
 _GZIP = 31
@@ -101,7 +103,8 @@ def unpacked_maps(
         TrilightError: not of that form, a map is missing or damaged, all of them take more than
             MAX_MAPS_BYTES, or one has another content than its name says.
     """
-    entries, skies = texture_entries(maps), environment_entries(maps)
+    entries = texture_entries(maps)
+    skies = environment_entries(maps)
     packed: dict[str, bytes] = {}
     for entry in (*entries, *skies):
         if (name := map_member(entry["sha256"])) not in members:
@@ -161,12 +164,15 @@ class _PackedMap:
     """A packed map of which only the header was read: it says how many bytes there will be."""
 
     def __init__(self, data: bytes, name: str) -> None:
-        self.name, self._data = name, data
+        self.name = name
+        self._data = data
         header = safetensors_header(self._unpack(8 + _MOST_HEADER), _MOST_HEADER, name=name)
-        entry, metadata = header.get(_ARRAY), header.get("__metadata__")
+        entry = header.get(_ARRAY)
+        metadata = header.get("__metadata__")
         if set(header) != {_ARRAY, "__metadata__"} or not isinstance(entry, Mapping):
             wrong_map(name, sorted(header), f"one array {_ARRAY}")
-        shape, dtype = entry.get("shape"), entry.get("dtype")
+        shape = entry.get("shape")
+        dtype = entry.get("dtype")
         if (
             not isinstance(shape, list)
             or len(shape) != 3

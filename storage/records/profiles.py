@@ -34,7 +34,8 @@ DWA_LEVELS = (200.0, 100.0, 45.0, 20.0, 10.0)
 """What `compact` tries, from coarse to fine. Coarser ones flatten what the eye sees, though the law
 would let them."""
 
-PLAIN, PACKED = "scene.safetensors", "scene.safetensors.gz"
+PLAIN = "scene.safetensors"
+PACKED = "scene.safetensors.gz"
 """Suffixes of the member with a scene's arrays. WebDataset undoes `.gz` by itself."""
 
 MAX_ARRAY_BYTES = 1 << 28

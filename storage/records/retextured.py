@@ -31,7 +31,8 @@ def without_constant_textures(scene: AnyScene) -> AnyScene:
     }
     if not constants or scene.material_textures is None:
         return scene
-    materials, index = scene.materials.copy(), scene.material_textures.copy()
+    materials = scene.materials.copy()
+    index = scene.material_textures.copy()
     places = {column.name: part for column, part in laid_out()}
     for place, name in enumerate(TEXTURED):
         for row, value in constants.items():
@@ -109,7 +110,8 @@ def _with_means(
     textures: tuple[Texture, ...],
     material_textures: NDArray[np.int32],
 ) -> NDArray[np.float32]:
-    rows, places = materials.copy(), {column.name: part for column, part in laid_out()}
+    rows = materials.copy()
+    places = {column.name: part for column, part in laid_out()}
     for place, name in enumerate(TEXTURED):
         for row in np.flatnonzero(material_textures[:, place] != CONSTANT):
             rows[row, places[name]] = textures[material_textures[row, place]].mean

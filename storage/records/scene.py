@@ -207,7 +207,8 @@ def _check_arrays(scene: Scene) -> None:
 
 def _check_columns(scene: Scene) -> None:
     """Check the width of a material row, and the ranges of the columns that were added to four."""
-    got, expected = scene.materials.shape, material_width()
+    got = scene.materials.shape
+    expected = material_width()
     if got[1] != expected:
         names = ", ".join(column.name for column in material_columns())
         broken_law(
@@ -270,6 +271,7 @@ def _check_cameras(scene: Scene) -> None:
 
 
 def _same_length(scene: Scene, name: str, other: str) -> None:
-    got, expected = len(getattr(scene, name)), len(getattr(scene, other))
+    got = len(getattr(scene, name))
+    expected = len(getattr(scene, other))
     if got != expected:
         broken_law(f"{name} has {got} rows", f"{expected}, as {other} has")

@@ -77,14 +77,16 @@ class CameraFacts:
 
 def surfaces(scene: Scene) -> list[SurfaceFacts]:
     """Return the objects and shell parts of a lawful scene that have triangles."""
-    facts, textured = [], textured_objects(scene)
+    facts = []
+    textured = textured_objects(scene)
     for row, entry in enumerate(scene.objects):
         mine = scene.object_index == row
         if entry.kind == "emitter" or not mine.any():
             continue
         rows = scene.material_index[mine]
         materials = scene.materials[rows].astype(np.float64)
-        diffuse, specular = materials[:, DIFFUSE], materials[:, SPECULAR]
+        diffuse = materials[:, DIFFUSE]
+        specular = materials[:, SPECULAR]
         faces = scene.faces[mine]
         facts.append(
             SurfaceFacts(
@@ -147,7 +149,9 @@ def scene_values(record: SceneRecord) -> Mapping[str, Values]:
         TypeError, ValueError: a view's record holds something that is not a number.
     """
     scene = record.scene
-    reflecting, emitting, seen_from = surfaces(scene), lights(scene), cameras(scene)
+    reflecting = surfaces(scene)
+    emitting = lights(scene)
+    seen_from = cameras(scene)
     objects = [surface for surface in reflecting if surface.kind == "object"]
     skies = [] if scene.environment is None else [sky_facts(scene.environment)]
     values: Mapping[str, Sequence[float]] = {

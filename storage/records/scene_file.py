@@ -52,9 +52,12 @@ MAX_HEADER_BYTES = 8 << 20
 CARRIED = frozenset({*ARRAY_FIELDS, "objects", "provenance", "textures", "environment"})
 """What the form holds of a scene (pipeline.exchange.formats): all of it, added columns too."""
 
-_METADATA, _COLUMNS = "trilight_scene", "material_columns"
-_MAPS, _MAPS_DIGEST = "maps", "maps_sha256"
-_TEXTURE, _ENVIRONMENT = "texture.", "environment"
+_METADATA = "trilight_scene"
+_COLUMNS = "material_columns"
+_MAPS = "maps"
+_MAPS_DIGEST = "maps_sha256"
+_TEXTURE = "texture."
+_ENVIRONMENT = "environment"
 _IS_SRGB = "is_srgb"
 _DTYPE_NAMES: Mapping[type, str] = {
     np.float32: "F32",
@@ -255,7 +258,8 @@ def _maps(record: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> dict[str,
     """Return the fields `textures` and `environment` of what a file says, where it has any."""
     if _MAPS not in record:
         return {}
-    entries, fields = texture_entries(record[_MAPS]), dict[str, Any]()
+    entries = texture_entries(record[_MAPS])
+    fields = dict[str, Any]()
     is_srgb = record.get(_IS_SRGB, [])
     if not isinstance(is_srgb, list) or [type(each) for each in is_srgb] != [bool] * len(entries):
         _broken(_IS_SRGB, is_srgb, "true or false for each texture")

@@ -117,7 +117,8 @@ class Bucket:
             )
 
     def _put(self, name: str, content: Path | bytes, *, mode: str) -> None:
-        driver, target = shared_driver(self.url), self.url.child(name).root
+        driver = shared_driver(self.url)
+        target = self.url.child(name).root
         if isinstance(content, bytes):
             driver.pipe_file(target, content, mode=mode)
             return

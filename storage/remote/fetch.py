@@ -101,7 +101,8 @@ class _Expected:
 
     def is_same(self, version: Mapping[str, str]) -> bool:
         """Return whether the file is still the one that the bytes so far came from."""
-        before, self.version = self.version, dict(version)
+        before = self.version
+        self.version = dict(version)
         return before in (None, self.version)
 
     def require_pace(self, reached: int, total: int | None) -> None:

@@ -183,11 +183,13 @@ class Pace:
 
         To be called at every arrival and after every try: what is slow ends within two windows.
         """
-        now_s, reached = self._clock(), self._position()
+        now_s = self._clock()
+        reached = self._position()
         if now_s - self._begun[0] > self._patience.file_s:
             message = f"it did not come within {self._patience.file_s:.0f} s"
             raise TransferFailed("download_failed", message)
-        passed_s, moved = now_s - self._window[0], reached - self._window[1]
+        passed_s = now_s - self._window[0]
+        moved = reached - self._window[1]
         if passed_s < self._patience.window_s:
             return
         if moved < self._patience.least_bytes_per_s * passed_s:

@@ -86,7 +86,8 @@ def parse_url(source: str, *, what: str) -> RemoteUrl | Path:
     match = _SCHEME.match(source)
     if match is None:
         return parse_local_path(source)
-    scheme, rest = match[1].lower(), match[2]
+    scheme = match[1].lower()
+    rest = match[2]
     if scheme == "file":
         return _local(rest, what, url_text)
     if scheme not in PACKAGES:

@@ -157,7 +157,8 @@ def option_of(field: str) -> str:
 
 def expected_of(hint: Any) -> str:
     """Return what a value of a type without a range looks like, for a person."""
-    origin, args = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    args = get_args(hint)
     if origin is Annotated:
         stated = (getattr(note, "expected", "") for note in args[1:])
         return next(filter(None, stated), "") or expected_of(args[0])
@@ -302,11 +303,14 @@ def _complaint(
 
 def _place(steps: Sequence[str], kind: type) -> tuple[list[str], type, Described | None]:
     """Return the steps that a person knows, the class that holds the last, and its field."""
-    known_steps, holder, field = list[str](), kind, None
+    known_steps = list[str]()
+    holder = kind
+    field = None
     for step in steps:
         groups = {group.__name__: group for group in _groups(field.hint if field else None)}
         if step in groups:  # of a union of groups, the one that was tried
-            holder, field = groups[step], None
+            holder = groups[step]
+            field = None
             continue
         if len(groups) == 1 and not step.isdigit():
             (holder,) = groups.values()

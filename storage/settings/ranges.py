@@ -52,7 +52,8 @@ class Within:
 
     def __str__(self) -> str:
         """Return the range as the end of a sentence, such as `from 1 to 170 degrees`."""
-        low, high = shown_number(self.low), shown_number(self.high)
+        low = shown_number(self.low)
+        high = shown_number(self.high)
         start = f"above {low}" if self.low_open else f"from {low}"
         if self.high_open:
             end = f" and below {high}" if self.low_open else f" to below {high}"
@@ -195,7 +196,9 @@ def shown_number(number: float) -> str:
 
 
 def _declarations_of(name: str, hint: Any) -> Iterator[Declared]:
-    optional, ordered, declarations = False, False, list[Within | Columns]()
+    optional = False
+    ordered = False
+    declarations = list[Within | Columns]()
     while True:
         if get_origin(hint) is Annotated:
             hint, *notes = get_args(hint)

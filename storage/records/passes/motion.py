@@ -18,7 +18,8 @@ def motion_px(rays: PassRays) -> NDArray[np.float64]:
     """
     if rays.later is None:
         raise TrilightError("motion_px: no other moment is given; expected `then` or `then_view`.")
-    later_scene, view = rays.later.scene, rays.later.view
+    later_scene = rays.later.scene
+    view = rays.later.view
     places = pixel_places(
         rays.hits.interpolated(rays.later.corners),
         later_scene.c2w[view],

@@ -79,7 +79,8 @@ def _blocks(
     seen: SeenFrom, view: int, resolution: int, a_side: int, later: Later | None
 ) -> Iterator[tuple[PassRays, PassRays]]:
     """Yield the rays of some rows of pixels at a time: those of the centres, and all."""
-    c2w, fov_deg = seen.scene.c2w[view].astype(np.float64), float(seen.scene.fov_deg[view])
+    c2w = seen.scene.c2w[view].astype(np.float64)
+    fov_deg = float(seen.scene.fov_deg[view])
 
     def rays(first: int, last: int, a_side: int) -> PassRays:
         rows = slice(first * a_side, last * a_side)
