@@ -30,11 +30,9 @@ class ScenePlan:
     family: Family
     """The layout, and what goes into it."""
     num_objects: int
-    """How many objects."""
     num_lights: int
-    """How many emitters."""
     overlaps: bool
-    """Whether objects may run into each other."""
+    """True: objects may intersect."""
 
 
 def scene_plan(settings: SceneSettings, *, seed: int, scene_index: int) -> ScenePlan:

@@ -23,11 +23,11 @@ class OwnMap(Generic[Made]):
     """A texture or map that is read when it is drawn."""
 
     uid: str
-    """As objects.lock.jsonl names it."""
+    """Identifier in objects.lock.jsonl."""
     source: MapSource
-    """Its title and rights."""
+    """Title, URL and license."""
     load: Callable[[], Made]
-    """Reads it."""
+    """Function that reads the map."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,7 +37,7 @@ class OwnTexture:
     diffuse_rgb: NDArray[np.float32]
     """[H, W, 3] linear, the top row first."""
     specular_rgb: NDArray[np.float32]
-    """[H, W, 3]."""
+    """Linear specular albedo [H, W, 3]."""
     roughness: NDArray[np.float32] | None
     """[H, W, 1]; None where one number is to be drawn."""
 
@@ -64,7 +64,7 @@ class OwnMaps:
     """What the scenes of a split may take."""
 
     textures: Sequence[OwnMap[OwnTexture]] = ()
-    """Textures, sorted by uid."""
+    """The user's textures, sorted by uid."""
     skies: Sequence[OwnMap[NDArray[np.float32]]] = ()
     """Maps [H, 2H, 3] of linear radiance, sorted by uid."""
 

@@ -71,7 +71,6 @@ class ObjectSpace:
     parts: tuple[str, ...]
     """The shell parts that exist, the floor first."""
     planes: tuple[Plane, ...]
-    """Their planes."""
 
     @property
     def floor(self) -> Plane:

@@ -60,9 +60,9 @@ class PatchPlacement:
     reach: float
     """Half the side of the square; 1 fills the side of the nominal room exactly."""
     scale: tuple[float, float, float]
-    """Per axis."""
+    """Factor for each axis, applied first."""
     translation: tuple[float, float, float]
-    """Translation after scaling."""
+    """Translation after scaling, world units."""
 
 
 def patch(side: Side, placement: PatchPlacement) -> NDArray[np.float64]:
@@ -99,11 +99,11 @@ class Room:
     """The places of the shell parts, and the space between them."""
 
     patches: tuple[PatchPlacement, ...]
-    """One per shell part."""
+    """One placement for each shell part."""
     low: NDArray[np.float64]
     """[3] the lower corner of the upright room, world units."""
     high: NDArray[np.float64]
-    """[3] the upper corner."""
+    """Upper corner [3] in world units."""
     lean: float
     """How far a tilted wall may stand inside of these bounds at most."""
 

@@ -28,8 +28,8 @@ class StatedDraw:
     """Lowest and highest value; a probability; the two colours; the lowest and highest elevation in
     degrees; or the words."""
     values: list[Any] = field(default_factory=list)
-    """What was drawn, in order: one number, or as many as the sky or surface has such things; of a
-    shade, its place between the two colours."""
+    """Drawn values in order: one number, or one for each such thing of the sky or surface; a shade
+    holds its position between the two colors."""
 
     def __str__(self) -> str:
         """Return the distribution as the end of a sentence."""

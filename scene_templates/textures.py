@@ -40,15 +40,15 @@ class TexturedLook:
     """A texture, and how it lies on a surface."""
 
     maps: SurfaceMaps
-    """What repeats."""
+    """One repetition of the texture."""
     tile_m: float
-    """Its width."""
+    """Width of one repetition in meters."""
     quarter_turns: int
-    """0 to 3, counter-clockwise."""
+    """Quarter turns counter-clockwise, 0 to 3."""
     shift_uv: tuple[float, float]
     """Texture coordinates of the surface's own origin, each uniform in [0, 1)."""
     uid: str = ""
-    """Of a user's own, as objects.lock.jsonl names it."""
+    """Identifier of a user's texture in objects.lock.jsonl; empty for a procedural one."""
 
     def uv(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return texture coordinates of places [..., 2] on a flat side: to the right and up."""

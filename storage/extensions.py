@@ -35,13 +35,12 @@ class Extension:
     """A file that was loaded."""
 
     path: Path
-    """Its absolute path."""
     sha256: str
-    """Digest of its bytes."""
+    """Hexadecimal digest of the file's bytes."""
     module: ModuleType
-    """What it defines."""
+    """Module that the file became."""
     decides: set[Decided] = field(default_factory=set)
-    """What the tables decide in which it has registered something."""
+    """Results that depend on the tables to which it added entries."""
     undo: list[Callable[[], None]] = field(default_factory=list)
     """Takes back each entry that it has registered."""
 

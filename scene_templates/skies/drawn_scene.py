@@ -30,9 +30,9 @@ class SceneSky:
 
     environment: Environment
     origin: dict[str, Any]
-    """For the provenance of the scene: family, over_lamps and azimuth_deg."""
+    """Provenance entries: family, over_lamps and azimuth_deg."""
     uid: str = ""
-    """Of a user's own map, as objects.lock.jsonl names it."""
+    """Identifier of a user's map in objects.lock.jsonl; empty for a procedural one."""
 
 
 def scene_sky(

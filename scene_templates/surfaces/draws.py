@@ -16,9 +16,9 @@ class GlossRanges(TypedDict):
     """Ranges that several finishes share."""
 
     specular: tuple[float, float]
-    """Of the specular share."""
+    """Range of the specular albedo, from low to high."""
     roughness: tuple[float, float]
-    """Of the roughness."""
+    """Range of the roughness, from low to high."""
 
 
 LEAST_TINT = 0.88

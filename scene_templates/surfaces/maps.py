@@ -31,7 +31,7 @@ class SurfaceMaps:
     roughness: NDArray[np.float32]
     """[H, W, 1] roughness; the GGX width is its square."""
     parameters: Mapping[str, tuple[Any, ...]]
-    """What was drawn, by the names of the reference page of surfaces and skies."""
+    """Drawn values; the names are those of the reference page of surfaces and skies."""
     source: MapSource = field(default_factory=MapSource)
     """Whose it is; what is drawn is ours."""
 
@@ -45,7 +45,7 @@ class Finish:
     specular_rgb: Numbers
     """[3] or [N, N, 3]."""
     roughness: Numbers
-    """[] or [N, N]."""
+    """One roughness [] or one per texel [N, N]."""
 
     def toned(self, tone: ArrayLike) -> "Finish":
         """Return it with its diffuse albedo times a number in [0, 1], one or [N, N]."""

@@ -26,7 +26,7 @@ class Texels:
     """A square map's texels."""
 
     size: int
-    """Width and height."""
+    """Width and height in texels."""
 
     @property
     def u(self) -> Numbers:

@@ -20,9 +20,9 @@ class Derivation:
     """How a dataset was made of others."""
 
     operation: str
-    """merge, select or reshard."""
+    """One of merge, select and reshard."""
     arguments: Mapping[str, Any]
-    """What the user asked for."""
+    """Options of the command, by name."""
     sources: Sequence[Mapping[str, Any]]
     """Per source: build, num_scenes, digest, key_offset, settings."""
 

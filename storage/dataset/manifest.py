@@ -59,11 +59,10 @@ class ShardEntry:
     split: Annotated[str, Spelled("|".join(SPLITS), "train, validation or test")]
     """train, validation or test."""
     num_samples: Scenes
-    """Scenes in it."""
     num_bytes: Bytes
-    """Size of the file."""
+    """Size of the file in bytes."""
     sha256: Sha256
-    """Digest of the file."""
+    """Hexadecimal digest of the file's bytes."""
     members: Annotated[None, DROPPED] = dataclasses.field(default=None, compare=False, repr=False)
     """An index of its members in rows of before version 5, which is not kept."""
 
@@ -73,15 +72,15 @@ class _Fields:
     """Fields of a manifest, and of its file."""
 
     build: ShortText
-    """Name of the build."""
+    """Name of the dataset preset."""
     settings: Annotated[Mapping[str, Any], FINITE]
     """All settings of the build; a dataset keeps them for life."""
     environment: Annotated[Mapping[str, Any], FINITE]
-    """What the bytes depend on besides the settings: variant, processor, library versions."""
+    """Inputs of the bytes other than settings: variant, processor, library versions."""
     num_scenes: Scenes
-    """How many scenes were asked for so far; more extend the dataset."""
+    """Requested number of scenes so far; a larger one extends the dataset."""
     num_views: Annotated[int, Within(1, 1_000_000, unit="pictures")]
-    """Pictures per scene."""
+    """Pictures per scene, one per camera."""
     objects_lock_sha256: Sha256 | Literal[""]
     """Digest of `objects.lock.jsonl`; empty until the objects are prepared."""
     schema_version: int = MANIFEST_VERSION
@@ -102,9 +101,7 @@ class Totals:
     """Sums over the shards of a manifest."""
 
     samples: int
-    """Scenes in the shards."""
     bytes: int
-    """Sizes of the shards."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +121,7 @@ class Manifest(_Fields):
     """Content of `manifest.json`."""
 
     stored: StoredManifest | None = dataclasses.field(default=None, compare=False, repr=False)
-    """What the file says that was read, for `trilight verify`."""
+    """Digests and totals as the file states them, for `trilight verify`."""
 
     @property
     def num_samples(self) -> int:

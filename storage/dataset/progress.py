@@ -48,15 +48,12 @@ class Progress:
     objects_done: int
     """Objects that are prepared or rejected."""
     objects_planned: int
-    """Objects to prepare."""
     scenes_done: int
     """Scenes in shards or waiting for their shard."""
     scenes_given_up: int
     """Scenes that no attempt could save."""
     scenes_planned: int
-    """Scenes to make."""
     num_views: int
-    """Views of a scene."""
     views_done: float
     """Views of the finished scenes, and how far those of the scenes at work are."""
 
@@ -247,11 +244,11 @@ class DatasetStatus:
     """Status of a dataset, finished or not."""
 
     shown: str
-    """Its place, without secrets."""
+    """Path or URL without secrets."""
     build: str
-    """Name of its build."""
+    """Name of the dataset preset."""
     shards_done: int
-    """Shards that are there."""
+    """Finished shards, listed in the manifest or not."""
     shards_planned: int
     """Shards of the finished dataset."""
     scenes_done: int
@@ -261,7 +258,6 @@ class DatasetStatus:
     scenes_planned: int
     """Scenes of the finished dataset."""
     num_views: int
-    """Views of a scene."""
     finished: bool
     """Every shard is listed, and the documents are there."""
     views_per_hour: float | None

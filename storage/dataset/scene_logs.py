@@ -37,9 +37,8 @@ class SceneLog:
     """Log row of one finished scene."""
 
     scene: str = ""
-    """Key of the scene."""
     seconds: Seconds
-    """Wall time."""
+    """Wall time of the scene."""
     cores: Annotated[int, Within(0, 10**6, unit="cores")] = 1
     """Cores that the worker used for it; earlier versions did not say."""
     rejected_attempts: int = 0

@@ -29,11 +29,11 @@ class ShardNote:
     """What is known of a finished shard."""
 
     shard: ShardEntry
-    """What the manifest says of it."""
+    """The shard's row of the manifest."""
     failures: tuple[Failure, ...]
-    """Its scenes that were given up, and attempts that were rejected."""
+    """Scenes that were given up, and rejected attempts."""
     scenes: int | None = None
-    """In a bucket, for how many scenes it stands where that is not a whole shard."""
+    """Scenes so far of a shard in a bucket that still grows; None for a full shard."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,9 +43,9 @@ class _Note:
     shard: ShardEntry
     """The shard's row of the manifest."""
     failures: str = ""
-    """Lines of failures.jsonl."""
+    """Lines as in failures.jsonl."""
     scenes: Scenes | None = None
-    """As in ShardNote."""
+    """Same as `ShardNote.scenes`."""
 
 
 def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:

@@ -106,7 +106,7 @@ class ShardSet(ABC):
     """Shards by number."""
 
     names: Sequence[str]
-    """Their names for people."""
+    """Shard names as messages show them."""
 
     @property
     def parts(self) -> Sequence[range]:

@@ -25,7 +25,6 @@ class StagedScene:
     members: dict[str, bytes]
     """The members of its sample; empty where the scene was given up."""
     failures: list[Failure]
-    """The rejected attempts."""
 
 
 def stage_scene(

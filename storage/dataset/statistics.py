@@ -24,9 +24,7 @@ class Statistics:
     """Counts and distributions of a dataset."""
 
     num_scenes: int
-    """Scenes in all shards."""
     scenes_by_split: Mapping[str, int]
-    """Scenes per split."""
     scenes_by_template: Mapping[str, int]
     """Scenes that were read per layout template."""
     scenes_by_excursion: Mapping[str, int]
@@ -37,15 +35,14 @@ class Statistics:
     """sha256 over the keys and arrays of all scenes, without pictures: equal for equal scenes,
     whatever they were rendered and packed with; empty where a sample was read."""
     num_bytes: int
-    """Bytes of all shards."""
     spp: NDArray[np.int64]
-    """[views] samples per pixel."""
+    """Samples per pixel of each view [views]."""
     noise_floor_db: NDArray[np.float64]
-    """[views] psnr_log_db."""
+    """Stated error of each view [views] as psnr_log_db."""
     noise_floor_linear_db: NDArray[np.float64]
-    """[views] psnr_linear_db."""
+    """Stated error of each view [views] as psnr_linear_db."""
     object_noise_floor_db: NDArray[np.float64]
-    """[views] object_psnr_log_db."""
+    """Stated error of each view [views] as object_psnr_log_db."""
     at_cap: NDArray[np.bool_]
     """[views] whether sampling ended at the cap."""
     part_noise_floor_db: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)

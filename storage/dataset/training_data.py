@@ -24,9 +24,9 @@ class DataSource:
     """One dataset, as records name it."""
 
     name: str
-    """Its build; what it is called else."""
+    """Name of the dataset preset, or the display name of a list of shards."""
     digest: str
-    """As `TrainingData.digest`."""
+    """Same as `TrainingData.digest`."""
     num_views: int | None
     """Pictures per scene, where a manifest says it."""
 
@@ -36,9 +36,10 @@ class TrainingData:
     """The shards of every split that holds a sample, of one dataset or several."""
 
     shown: str
-    """Their place, for messages."""
+    """Paths or URLs as messages show them."""
     digest: str
-    """What a checkpoint remembers: the dataset digest; of a list, a digest of its names only."""
+    """Identity that a checkpoint stores: the dataset digest; for a list, a digest of its names
+    only."""
     splits: Mapping[str, ShardSet]
     """Shards by split; splits without a shard are left out."""
     num_views: int | None
@@ -48,7 +49,7 @@ class TrainingData:
     max_triangles: int | None = None
     """Most triangles of a scene, where a manifest says it."""
     notes: tuple[str, ...] = ()
-    """What the user should know, once."""
+    """Messages for the user, each printed once."""
     sources: tuple[DataSource, ...] = ()
     """The datasets, in the order of the parts of their splits (ShardSet.parts)."""
 

@@ -51,13 +51,13 @@ class Verification:
     problems: Sequence[str]
     """One line per fault, naming shard and sample; empty where the dataset is whole."""
     num_samples: int
-    """Samples that were checked."""
+    """Number of samples that were checked."""
     bad_shards: Sequence[str]
     """Names of the shards that are missing, or were read and are not what they should be."""
     num_shards_planned: int
     """Shards of the finished dataset."""
     is_finished: bool
-    """Whether the manifest lists every shard."""
+    """True: the manifest lists every shard."""
 
 
 @dataclass(kw_only=True)

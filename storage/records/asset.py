@@ -49,7 +49,7 @@ class SourceFacts:
     num_faces_turned: int
     """Triangles whose winding was reversed to face outward."""
     num_parts: int
-    """Connected pieces."""
+    """Number of connected mesh components."""
     open_edges: int
     """Edges with one face; 0 for a surface without border."""
     nonmanifold_edges: int
@@ -95,7 +95,7 @@ class LevelQuality:
     min_angle_p5_deg: float
     """5th percentile of the triangles' smallest angles."""
     open_edges: int
-    """Edges with one face."""
+    """Number of edges with only one face."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,6 @@ class LevelRecord:
     method: str
     """`source` (within budget as it was), or the name of the decimation."""
     quality: LevelQuality
-    """Its measures."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,13 +114,12 @@ class Level:
     """One mesh of an asset."""
 
     record: LevelRecord
-    """How it was made."""
     positions: NDArray[np.float32]
     """[V, 3] in the unit box."""
     faces: NDArray[np.uint32]
     """[F, 3], counter-clockwise from outside where the source has an outside."""
     skin: LevelSkin | None = None
-    """Its look in the source's own materials; None where they are not kept."""
+    """Textures of the source's materials; None where they are not kept."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -135,11 +133,10 @@ class Asset:
     recipe: str
     """Name and version of the recipe and of the libraries that made it."""
     source: SourceFacts
-    """What the file held."""
     levels: tuple[Level, ...]
-    """From the largest budget to the smallest."""
+    """Levels of detail, the largest triangle budget first."""
     materials: OwnMaterials | None = None
-    """What became of the source's own materials; None where nobody asked for them."""
+    """Result of reading the source's materials; None where they were not requested."""
 
 
 def encode_asset(asset: Asset) -> bytes:
@@ -235,17 +232,15 @@ class AssetRow(NamedObject):
     """An accepted object."""
 
     path: str
-    """Its mesh, below the folder."""
+    """Path of the mesh, relative to the folder."""
     num_faces: int
-    """Triangles of the mesh."""
     method: str
     """How it was made; `source` where nothing had to be left out."""
     quality: LevelQuality
     """How it compares with the source."""
     source: SourceFacts
-    """What the file held."""
     materials: OwnMaterials | None = None
-    """What became of its own materials; None where nobody asked for them."""
+    """Result of reading the source's materials; None where they were not requested."""
     colours: SkinQuality | None = None
     """How the colours of the mesh compare with the source's; None where it has none of its own."""
 

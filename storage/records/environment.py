@@ -33,9 +33,9 @@ class Environment:
     rotation: NDArray[np.float32] = field(default_factory=_identity_rotation)
     """[3, 3] from the axes of the map to those of the world."""
     is_seen: bool = False
-    """Whether cameras see it; it lights the scene in any case."""
+    """True: cameras see the map. It lights the scene in any case."""
     source: MapSource = field(default_factory=MapSource)
-    """What the map is called, and whose it is."""
+    """Name, URL and rights of the map."""
 
     @cached_property
     def sha256(self) -> str:

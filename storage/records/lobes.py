@@ -25,9 +25,9 @@ class Lobes:
     """Materials of T triangles, ready for a renderer."""
 
     diffuse: NDArray[np.float64]
-    """[T, 3] diffuse albedo."""
+    """Diffuse albedo of each triangle [T, 3]."""
     specular: NDArray[np.float64]
-    """[T, 3] specular albedo."""
+    """Specular albedo of each triangle [T, 3]."""
     alpha: NDArray[np.float64]
     """[T] GGX width, at least MIN_ALPHA."""
     weight: NDArray[np.float64]

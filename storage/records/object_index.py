@@ -41,13 +41,12 @@ class IndexedObject:
     """An object of a lock, as it is indexed."""
 
     locked: LockedObject
-    """Its row."""
     offset: int
     """Byte of the lock at which the row begins."""
     asset_name: str
     """32 hexadecimal digits, by which the asset store knows the prepared file."""
     least_triangles: int
-    """Of its coarsest level."""
+    """Triangles of the coarsest level of detail."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +54,6 @@ class CampSizes:
     """The objects of one share-alike camp, or of none."""
 
     count: int
-    """How many."""
     least: int
     """Triangles of the coarsest level of the simplest one."""
     most: int
@@ -67,9 +65,9 @@ class SplitRows:
     """The rows of one split."""
 
     start: int
-    """Of the first one in the index."""
+    """Index of the first row."""
     stop: int
-    """Behind the last one."""
+    """Index after the last row."""
     camps: Mapping[str, CampSizes]
     """Sizes by camp; "" is that of objects without one."""
 
@@ -79,9 +77,9 @@ class IndexFacts:
     """What an index is of."""
 
     lock_sha256: str
-    """Digest of the lock."""
+    """Hexadecimal digest of the lock's bytes."""
     lock_bytes: int
-    """Its size."""
+    """Size of the lock in bytes."""
     asked: str
     """Digest of what the source was asked for: another source is looked at again."""
     num_found: int
@@ -91,7 +89,7 @@ class IndexFacts:
     camps: tuple[str, ...]
     """Camps by their number in the column."""
     splits: Mapping[str, SplitRows]
-    """Rows by split."""
+    """Range of index rows of each split."""
 
     @property
     def num_objects(self) -> int:

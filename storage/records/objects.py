@@ -25,9 +25,9 @@ class NamedObject:
     uid: str
     """Unique in its source, and stable: it names the object in every later record."""
     title: str
-    """For people."""
+    """Name as documents and pages show it."""
     licence: str
-    """SPDX identifier, or `LicenseRef-...`."""
+    """SPDX identifier of the license, or `LicenseRef-...`."""
     licence_source: str
     """Where the licence is stated, and as of when; for the record of rights."""
     attribution: str
@@ -94,11 +94,11 @@ class Failure:
     item: str
     """uid of the object or key of the scene (with `.view` where a view was rejected)."""
     reason: str
-    """Stable code in snake_case."""
+    """Stable reason code in snake_case."""
     message: str
     """One sentence for a person."""
     attempt: int = 0
-    """Which attempt at the item this was, from 0."""
+    """Number of the attempt at the item, from 0."""
 
 
 def encode_objects_lock(objects: Iterable[LockedObject]) -> bytes:

@@ -60,7 +60,7 @@ class PartFloor:
     """How far to trust one part of a picture, of all lights together."""
 
     noise_floor_db: float
-    """Measured error as psnr_log_db."""
+    """Stated error in dB, as psnr_log_db."""
     noise_floor_linear_db: float
     """The same error as psnr_linear_db."""
     object_noise_floor_db: float
@@ -83,11 +83,11 @@ class ViewRecord:
     coverage: float
     """Share of the picture in which an object is seen first, from a coarse grid of rays."""
     at_cap: bool
-    """Whether sampling ended at the cap before the target was reached."""
+    """True: sampling hit the sample limit before the target error."""
     seed: int
     """Seed of the view's samples."""
     camera_attempt: int
-    """How many cameras were rejected before this one."""
+    """Number of cameras that were rejected before this one."""
     parts: Mapping[str, PartFloor] | None = None
     """Floors of the parts that are stored, by name (storage.records.parts); a record that has none
     is written without this field."""
@@ -100,9 +100,8 @@ class SceneRecord:
     key: str
     """The scene's index, nine digits."""
     scene: Scene
-    """What the pictures show."""
     views: tuple[ViewRecord, ...]
-    """One record per camera."""
+    """One record per camera, in their order."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,11 +111,10 @@ class Sample:
     key: str
     """The scene's index, nine digits."""
     scene: Scene
-    """What the pictures show."""
     radiance_rgb: NDArray[np.float32]
     """[C, R, R, 3] linear radiance, one picture per camera of the scene."""
     views: tuple[ViewRecord, ...]
-    """One record per camera."""
+    """One record per camera, in their order."""
     lights_rgb: NDArray[np.float32] | None = None
     """[C, L, R, R, 3] radiance of each emitter object alone, in the order of `scene.objects`; their
     sum is the picture (storage.records.lights). None where the build keeps lights together."""

@@ -88,7 +88,7 @@ class Scene:
     faces: Annotated[NDArray[np.uint32], Within(0, 2**32 - 1)]
     """[T, 3] rows of `vertex_positions`, counter-clockwise seen from outside."""
     material_index: Annotated[NDArray[np.uint16], Within(0, 2**16 - 1)]
-    """[T] row of `materials`."""
+    """Row of `materials` of each triangle [T]."""
     materials: Annotated[
         NDArray[np.float32],
         *(Columns(each.name, part, each.within) for each, part in laid_out(PUBLISHED_COLUMNS)),
@@ -96,7 +96,7 @@ class Scene:
     """[M, 10 or more] the declared columns: diffuse rgb, specular rgb, roughness, emission rgb, and
     those that were added (storage.records.material)."""
     object_index: Annotated[NDArray[np.uint16], Within(0, 2**16 - 1)]
-    """[T] row of `objects`."""
+    """Row of `objects` of each triangle [T]."""
     c2w: Annotated[NDArray[np.float32], FINITE]
     """[C, 4, 4] camera to world."""
     fov_deg: Annotated[
@@ -111,7 +111,7 @@ class Scene:
     """[3T, 2] texture coordinates of each corner of each triangle; None where nothing is textured.
     """
     textures: tuple[Texture, ...] = ()
-    """What materials are textured with; each is used, and each content is there once."""
+    """Textures of the materials; each is used, and each content is there once."""
     material_textures: Annotated[NDArray[np.int32], Within(CONSTANT, MAX_TEXTURES - 1)] | None = (
         None
     )

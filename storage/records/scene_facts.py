@@ -19,17 +19,16 @@ class SurfaceFacts:
     """One row of `Scene.objects` that reflects: an object, the floor or a wall."""
 
     row: int
-    """Row of `Scene.objects`."""
+    """Row index in `Scene.objects`."""
     kind: str
-    """object or shell."""
+    """Either `object` or `shell`."""
     num_triangles: int
-    """Number of its triangles."""
     smooth: bool
-    """Whether triangles share vertices, and with them normals; a flat face has its own three."""
+    """True: triangles share vertices and normals; a flat face has three of its own."""
     num_colours: int
     """Rows of the palette that it uses."""
     textured: bool
-    """Whether any of its triangles has a texture; the numbers below are then of the means."""
+    """True: a triangle has a texture, and the numbers below are its means."""
     diffuse: float
     """Largest channel of the diffuse albedo, mean over the triangles."""
     specular: float
@@ -37,7 +36,7 @@ class SurfaceFacts:
     albedo_sum: float
     """The same of both together."""
     roughness: float
-    """Mean over the triangles."""
+    """Mean roughness over the triangles."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +44,9 @@ class Light:
     """One emitter."""
 
     row: int
-    """Row of `Scene.objects`."""
+    """Row index in `Scene.objects`."""
     radiance_rgb: tuple[float, float, float]
-    """Mean over its triangles."""
+    """Mean radiance over the triangles, linear Rec.709."""
     centre: tuple[float, float, float]
     """Mean of its triangles' middles, weighted by area, world units."""
     area: float
@@ -64,15 +63,15 @@ class CameraFacts:
     """Where one camera stands, seen from the origin."""
 
     position: tuple[float, float, float]
-    """World units."""
+    """Camera position [3] in world units."""
     distance: float
-    """From the origin, world units."""
+    """Distance from the origin in world units."""
     elevation_deg: float
-    """Above the horizon."""
+    """Angle above the horizon in degrees."""
     azimuth_deg: float
-    """From +X towards +Y, in [0, 360)."""
+    """Angle from +X towards +Y in degrees, in [0, 360)."""
     fov_deg: float
-    """Full angle."""
+    """Full field of view in degrees."""
 
 
 def surfaces(scene: Scene) -> list[SurfaceFacts]:

@@ -30,7 +30,7 @@ class SkinQuality:
     """Mean difference of the linear diffuse colour between points spread evenly over the source and
     the nearest points of the level, over all channels."""
     colour_error_p95: float
-    """95th percentile of it."""
+    """95th percentile of the same error."""
     missed_cells: float
     """Share of the texels for which the source has no surface nearby that faces the same way: they
     show its nearest point."""
@@ -50,7 +50,7 @@ class OwnMaterials:
     message: str = ""
     """One sentence for a person."""
     lost: tuple[str, ...] = ()
-    """What the source says of its surfaces and nothing here can show, such as `emission`."""
+    """Properties of the source that this renderer cannot show, such as `emission`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,9 +60,9 @@ class LevelSkin:
     uv: NDArray[np.float32]
     """[F, 3, 2] texture coordinates of each corner of each face, within [0, 1], v up."""
     packed: tuple[bytes, bytes, bytes]
-    """Bytes of the textures."""
+    """Encoded bytes of the three textures."""
     quality: SkinQuality
-    """Measured against the source."""
+    """Errors measured against the source."""
     emission: NDArray[np.float32] | None = None
     """[F, 3] what each face emits, in the units of the source; None where nothing does, or where
     nobody asked."""

@@ -29,11 +29,10 @@ class StoredSample:
     key: str
     """The scene's index, nine digits."""
     scene: Scene
-    """What the pictures show."""
     views: tuple[ViewRecord, ...]
-    """One record per camera."""
+    """One record per camera, in their order."""
     members: Mapping[str, bytes]
-    """What the shard holds of it, by suffix."""
+    """Bytes of the sample's members in the shard, by suffix."""
 
     def pictures(self, views: Sequence[int]) -> Stored:
         """Return the pictures of some views [V, R, R, 3], at least one, as they are stored.

@@ -34,13 +34,13 @@ class MapSource:
     """Identity and rights of a texture or a map."""
 
     name: str = ""
-    """For people."""
+    """Name as documents and pages show it."""
     licence: str = "CC0-1.0"
     """SPDX identifier, or `LicenseRef-...`; what is drawn from a seed is ours, hence CC0."""
     attribution: str = ""
     """Whom to name, as the source states it."""
     source_url: str = ""
-    """Where it came from."""
+    """URL of the page or file it came from."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,9 +51,9 @@ class Texture:
     """[H, W, C] with C of 3 for a colour and 1 for a number, row 0 at the bottom; uint8 stands for
     [0, 1]."""
     is_srgb: bool = False
-    """Whether the 8-bit values are sRGB-encoded; float32 is always linear."""
+    """True: the 8-bit values are sRGB-encoded. float32 is always linear."""
     source: MapSource = field(default_factory=MapSource)
-    """What it is called, and whose it is."""
+    """Name, URL and rights of the texture."""
 
     @property
     def channels(self) -> int:

@@ -29,7 +29,7 @@ class Facts:
     num_bytes: int | None
     """Size; None where it is not said."""
     version: Mapping[str, str]
-    """What changes when the file does; may be empty."""
+    """Header values that change when the file does; may be empty."""
 
 
 def facts_of(url: RemoteUrl) -> Facts:

@@ -38,11 +38,11 @@ class RemoteUrl:
     """A folder or file on a server."""
 
     what: str = field(compare=False)
-    """What it is in messages, such as `objects`."""
+    """Name of the resource in messages, such as `objects`."""
     scheme: str
-    """A key of PACKAGES."""
+    """URL scheme, a key of PACKAGES."""
     root: str
-    """What the driver calls it: without secrets, query and final slash."""
+    """Path as the driver takes it: no secrets, query or final slash."""
     query: tuple[tuple[str, str], ...] = field(default=(), repr=False)
     """Sent with every request, since it may hold the key; http and https only."""
     user: str = field(default="", repr=False)

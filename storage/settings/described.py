@@ -86,19 +86,18 @@ class Described:
     """What is said of one field."""
 
     name: str
-    """Its name."""
     hint: Any
-    """Its type, with its notes."""
+    """Type annotation, with its notes."""
     default: Any
-    """Its default; dataclasses.MISSING where a value must be given."""
+    """Default value; dataclasses.MISSING where a value must be given."""
     sentence: str
     """The sentence under it, in one line."""
     within: Within | None
     """The range of its numbers."""
     expected: str
-    """What to write, for a person."""
+    """Description of valid values, for error messages."""
     is_execution: bool
-    """Whether it says how something is executed, and not what it means."""
+    """True: the field changes how something is executed, and not its meaning."""
 
 
 @functools.cache

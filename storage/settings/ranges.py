@@ -24,15 +24,15 @@ class Within:
     """Lowest and highest value; both are admitted unless that end is open."""
 
     low: float
-    """The least value."""
+    """Least value; see `low_open`."""
     high: float
-    """The greatest value."""
+    """Greatest value; see `high_open`."""
     low_open: bool = False
-    """Whether `low` itself is refused."""
+    """True: `low` itself is refused."""
     high_open: bool = False
-    """Whether `high` itself is refused."""
+    """True: `high` itself is refused."""
     unit: str = ""
-    """What is counted or measured, in the plural; empty for pure numbers."""
+    """Plural noun that is counted or measured; empty for pure numbers."""
 
     def holds(self, value: Any) -> Any:
         """Return whether a number is in the range, or of each number of an array; NaN is not."""
@@ -115,11 +115,11 @@ class Columns:
     """A range of some columns of an array."""
 
     name: str
-    """What the columns hold."""
+    """Noun for the columns in messages."""
     columns: slice
     """The columns, as a slice of the last axis."""
     within: Within
-    """Range of every value."""
+    """Range that holds for every value."""
 
 
 Share = Annotated[float, Within(0, 1)]
@@ -148,17 +148,16 @@ class Declared:
     """What a field, or some columns of one, may hold."""
 
     name: str
-    """Name of the field."""
     kind: type
     """int or float; a float may be given as an int."""
     shape: Shape
     """One number, a pair, a tuple of any length, or an array of numpy."""
     optional: bool
-    """Whether None is admitted."""
+    """True: None is allowed."""
     within: Within
-    """Range of every value."""
+    """Range that holds for every value."""
     ordered: bool = False
-    """Whether the lower number of a pair must come first."""
+    """True: the lower number of a pair comes first."""
     part: Columns | None = None
     """The columns that are meant, where it is not the whole array."""
 

@@ -32,7 +32,7 @@ class Pass:
     name: str
     """Lower case letters and underscores, with the unit where there is one."""
     means: str
-    """One sentence for people."""
+    """One sentence that documents the pass."""
     channels: tuple[str, ...]
     """Names of its numbers; a single number has none, and its picture no last axis."""
     averaging: Averaging
@@ -40,7 +40,7 @@ class Pass:
     frame: Frame = ""
     dtype: type = np.float64
     nothing: float = np.nan
-    """What stands where no surface is met."""
+    """Value of pixels that show no surface."""
     short: str = ""
     """A shorter word for it on the command line and in settings."""
     layer: str = ""
