@@ -1,4 +1,4 @@
-"""What a template returns: a shell, objects in their places, emitters, and surfaces.
+"""Results of a template: a shell, placed objects, emitters and surfaces.
 
 A layout holds no object meshes: an object has a pose, and `pipeline.scenes` puts its mesh there.
 """
@@ -15,7 +15,7 @@ RGB = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceLook:
-    """How a shell part or an object reflects, in linear colour."""
+    """Reflectance of a shell part or an object, in linear color."""
 
     diffuse_scale: float
     """Largest diffuse albedo that a channel may have; plus `specular_rgb` at most 1."""

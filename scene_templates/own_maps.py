@@ -32,7 +32,7 @@ class OwnMap(Generic[Made]):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OwnTexture:
-    """What a texture from outside says."""
+    """Reflectance maps of a user's texture."""
 
     diffuse_rgb: NDArray[np.float32]
     """[H, W, 3] linear, the top row first."""
@@ -61,7 +61,7 @@ class OwnTexture:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OwnMaps:
-    """What the scenes of a split may take."""
+    """User textures and skies that the scenes of a split may use."""
 
     textures: Sequence[OwnMap[OwnTexture]] = ()
     """The user's textures, sorted by uid."""

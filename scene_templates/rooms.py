@@ -52,7 +52,7 @@ SIDES = MappingProxyType(
 
 @dataclass(frozen=True, kw_only=True)
 class PatchPlacement:
-    """How a patch is brought from its side of the nominal room to its place."""
+    """Transform of a patch from its side of the nominal room."""
 
     rotation_deg: tuple[float, float, float]
     """About X, then Y, then Z, through the middle of the room; the angle about the side's own

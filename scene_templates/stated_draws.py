@@ -18,7 +18,7 @@ Kind = Literal["uniform", "whole number", "share", "colour", "shade", "direction
 
 @dataclass(frozen=True, kw_only=True)
 class StatedDraw:
-    """What one name was said to be drawn from, and what came out."""
+    """Stated distribution of one name, and the drawn values."""
 
     kind: Kind
     """Distribution: uniform in a range; uniform whole numbers; true with a probability; a colour
@@ -40,7 +40,7 @@ class RecordedSampler:
     """Draws from one generator, with + - * / and square roots only (scene_templates.exact)."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        """Draw from `rng`, which nobody else should use meanwhile."""
+        """Draw from `rng`, which no other code may use at the same time."""
         self._rng = rng
         self.made: dict[str, StatedDraw] = {}
 

@@ -1,4 +1,4 @@
-"""What an annotation says of an array: NDArray[X] is spelt in two ways by numpy."""
+"""Scalar types of array annotations: numpy spells NDArray[X] in two ways."""
 
 from typing import Any, get_args, get_origin
 

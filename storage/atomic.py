@@ -88,7 +88,7 @@ def write_error(path: Path, error: OSError) -> TrilightError:
         step = "set TRILIGHT_CACHE to" if path.is_relative_to(cache_folder("")) else step
     return kind(
         f"{path.parent}: cannot write {path.name} ({error.strerror}). What was finished is safe: "
-        f"{step} a writable folder or mend its permissions, and run the same command again."
+        f"{step} a writable folder or fix its permissions, and run the same command again."
     )
 
 

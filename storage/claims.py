@@ -126,7 +126,7 @@ def describe_holder(path: Path) -> str:
 
 
 class WaitNotice:
-    """Says for whom a wait lasts, first after `_SILENT_S` and then after ever longer times."""
+    """Logs the holder of a claim: first after `_SILENT_S`, then at ever longer intervals."""
 
     def __init__(self) -> None:
         """Begin the wait."""
@@ -134,7 +134,7 @@ class WaitNotice:
         self._next_s = _SILENT_S
 
     def update(self, claim: Path) -> None:
-        """Take notice that the wait still lasts, for the holder of a claim."""
+        """Log that the wait for the holder of a claim still lasts, if that is due."""
         waited_s = time.monotonic() - self._began_s
         if waited_s < self._next_s:
             return

@@ -46,7 +46,7 @@ class Extension:
 
     @property
     def name(self) -> str:
-        """What may be published: the file without its folder."""
+        """The file's name without its folder, which may be published."""
         return self.path.name
 
 
@@ -83,7 +83,7 @@ def load_extension(file: str | Path, *, sha256: str | None = None) -> Extension:
 
 
 def unload(extension: Extension) -> None:
-    """Take back what an extension has registered, so that its file can be loaded anew."""
+    """Take back what an extension has registered, so that its file can be loaded again."""
     for undo in extension.undo:
         undo()
     del _loaded[extension.name], sys.modules[extension.module.__name__]

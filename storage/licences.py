@@ -1,4 +1,4 @@
-"""What licences ask for: the only place that says so.
+"""Duties of each license; no other module states them.
 
 A licence is an SPDX identifier. What is not known here (`LicenseRef-...`, expressions such as
 `MIT OR Apache-2.0`) is said to be unknown, never guessed. This is a summary for people who choose

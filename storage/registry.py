@@ -83,7 +83,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             extension.undo.append(lambda: self._remove(name))
 
     def typed(self, reference: str, as_entry: Callable[[Any], Entry]) -> str:
-        """Return the name of an entry that a person typed on a command line, and nothing else did.
+        """Return the name of an entry that was typed on a command line.
 
         FILE.py:FUNCTION runs a file of their own and registers what the function returns as
         `FILE.py:FUNCTION` without the folder.

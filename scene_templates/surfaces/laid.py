@@ -73,7 +73,7 @@ def stripes(draws: SurfaceDraws, texels: Texels) -> Finish:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Which brick, tile or board a texel belongs to."""
+    """Index of the brick, tile or board of each texel."""
 
     row: NDArray[np.int64]
     """[size, size] from the bottom."""

@@ -103,7 +103,7 @@ def _fade(x: NDArray) -> Numbers:
 
 @dataclass(frozen=True, eq=False)
 class Stones:
-    """Which of many scattered points is nearest to each texel, on the torus."""
+    """Nearest of many scattered points to each texel, on the torus."""
 
     index: NDArray[np.int64]
     """[size, size] of the nearest point."""

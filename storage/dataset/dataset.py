@@ -366,7 +366,7 @@ def open_dataset(url: str) -> Dataset:
     if not _may_be_growing(dataset.files):
         return dataset
     from storage.dataset.unlisted import (
-        with_unlisted,  # slow: whoever streams a whole set needs none
+        with_unlisted,  # slow, and not needed to stream a whole set
     )
 
     return with_unlisted(dataset)

@@ -17,7 +17,7 @@ _SOURCE_FIELDS = {"build", "digest", "key_offset", "num_scenes", "settings"}
 
 @dataclass(frozen=True, kw_only=True)
 class Derivation:
-    """How a dataset was made of others."""
+    """Operation and sources of a dataset that was made of others."""
 
     operation: str
     """One of merge, select and reshard."""

@@ -151,7 +151,7 @@ class DatasetFolder:
 
     @property
     def shown(self) -> str:
-        """What people call the dataset."""
+        """The dataset's folder or URL, as messages show it."""
         return self.bucket or str(self.root)
 
     def staged_shard(self, name: str) -> Path:
@@ -207,6 +207,8 @@ class DatasetFolder:
             if take_lock(descriptor):
                 self._clean()
                 when_alone()
+            # flock converts a lock by releasing it first, so another worker may hold it exclusively
+            # in between and clean too. That is harmless: this worker has not begun its work yet.
             take_lock(descriptor, shared=True, wait=True)
             yield
         finally:

@@ -140,7 +140,7 @@ class Manifest(_Fields):
 
     @property
     def identity(self) -> object:
-        """What scenes that are not in a shard yet depend on."""
+        """Inputs on which scenes depend that are not in a shard yet."""
         return (self.settings, self.environment, self.objects_lock_sha256, self.extensions)
 
     def with_grown(self, shard: ShardEntry) -> "Manifest":

@@ -1,4 +1,4 @@
-"""Which shards a dataset will have, from its manifest alone."""
+"""Planned shards of a dataset, from its manifest alone."""
 
 from storage.dataset.derived import derivation_of
 from storage.dataset.manifest import Manifest, ShardEntry, number_of_shard

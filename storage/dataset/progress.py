@@ -105,7 +105,7 @@ def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
 
 
 def forget_views(folder: DatasetFolder, scene_index: int) -> None:
-    """Delete the note of `tell_views`: the scene is finished, or begun anew."""
+    """Delete the note of `tell_views`: the scene is finished, or starts again."""
     with contextlib.suppress(OSError):
         (folder.staged_at_work / numbered(scene_index, f"{scene_index:09d}")).unlink()
 
@@ -198,7 +198,7 @@ def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
     Of more scenes than were planned so far, also what those need.
 
     Where all are there and the dataset is still not finished, its first shard counts as missing:
-    whoever makes it finishes the dataset.
+    the worker that makes it finishes the dataset.
 
     Raises:
         TrilightError: there is no readable manifest, or the URL is refused.

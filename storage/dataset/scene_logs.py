@@ -97,7 +97,7 @@ def decode_scene_log(text: str) -> Iterator[SceneLog]:
 
 @dataclass(frozen=True, kw_only=True)
 class LogSample:
-    """What a look at the logs of a folder has found."""
+    """Rows and CPU time from a sample of a folder's logs."""
 
     last: Sequence[SceneLog]
     """The LAST_SCENES that were made last, by time."""

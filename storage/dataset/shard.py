@@ -5,8 +5,8 @@ bytes at a time: anything that is not a plain file is refused before it is read,
 header decides how much memory is taken.
 
 Textures and environment maps are no members of a sample: each stands once, between two samples,
-before the first one that uses it (storage.records.packed_maps). Whoever asks for the members of a
-sample gets with them those of its maps; writers take them in the same form.
+before the first one that uses it (storage.records.packed_maps). Readers
+return the members of a sample together with those of its maps; writers take the same form.
 """
 
 import io
@@ -155,7 +155,7 @@ def scan_samples(
 
 @dataclass(frozen=True, kw_only=True)
 class ShardContents:
-    """Where everything in a shard stands, as its headers say."""
+    """Positions of all members of a shard, from its headers."""
 
     samples: Mapping[str, Mapping[str, Member]]
     """Members by suffix of each sample by key, in the order of the file."""

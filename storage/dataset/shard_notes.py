@@ -1,7 +1,7 @@
 """Notes on finished shards that the manifest does not list yet: one small file for each.
 
-Whoever packs a shard writes its note, once, beside the staged scenes: what the manifest will say of
-the shard, and what was rejected on the way. So nobody's work grows with what others have made.
+The worker that packs a shard writes its note once, next to the staged scenes: the shard's row of
+the manifest, and the rejections. The work of one worker does not grow with that of the others.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ _AT_ONCE = 32
 
 @dataclass(frozen=True, kw_only=True)
 class ShardNote:
-    """What is known of a finished shard."""
+    """Contents of the note on a finished shard."""
 
     shard: ShardEntry
     """The shard's row of the manifest."""

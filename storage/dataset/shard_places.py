@@ -32,7 +32,7 @@ class ShardPlace:
 
     @property
     def display_name(self) -> str:
-        """The place for people, without secrets."""
+        """The path or URL without secrets, for messages."""
         return self.place.shown if isinstance(self.place, RemoteUrl) else printable(str(self.place))
 
     @property

@@ -1,4 +1,4 @@
-"""Which split an object and a scene belong to, from nothing but themselves.
+"""Splits of objects and scenes, each from its own identity alone.
 
 An object's split is a hash of its cleaned geometry: copies under other names stay together, and
 adding objects moves none. A scene's split is that of its shard, by the shard's number, so a longer

@@ -1,4 +1,4 @@
-"""What a dataset holds, without its pictures."""
+"""Statistics of a dataset, read without its pictures."""
 
 import json
 from array import array
@@ -53,7 +53,7 @@ class Statistics:
         return len(self.spp)
 
     def lines(self) -> Sequence[tuple[str, str]]:
-        """Return (name, value) rows for people."""
+        """Return (name, value) rows to print."""
         if not self.num_views:
             return [("scenes", "0")]
         excursions = _counts(self.scenes_by_excursion)

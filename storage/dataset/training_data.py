@@ -1,4 +1,4 @@
-"""What `--data` means: a dataset by its root, or shards by a list."""
+"""Data that `--data` names: a dataset by its root, or shards by a list."""
 
 import os
 from collections.abc import Mapping, Sequence

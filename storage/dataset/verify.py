@@ -44,7 +44,7 @@ everywhere."""
 
 @dataclass(frozen=True, kw_only=True)
 class Verification:
-    """What a check of a dataset found."""
+    """Result of a check of a dataset."""
 
     manifest: Manifest
     """The manifest that was checked."""
@@ -62,7 +62,7 @@ class Verification:
 
 @dataclass(kw_only=True)
 class _ShardFindings:
-    """What was found in one shard."""
+    """Keys and faults of one shard."""
 
     faults: list[str] = field(default_factory=list)
     unread: list[str] = field(default_factory=list)

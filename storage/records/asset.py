@@ -40,7 +40,7 @@ from storage.records.skin import (
 
 @dataclass(frozen=True, kw_only=True)
 class SourceFacts:
-    """What was found in the source file, and what cleaning did to it."""
+    """Measures of the source file, and the effects of cleaning."""
 
     num_faces_read: int
     """Triangles as the file has them, instances counted."""
@@ -59,18 +59,18 @@ class SourceFacts:
 
     @property
     def watertight(self) -> bool:
-        """Whether every edge has exactly two faces."""
+        """True: every edge has exactly two faces."""
         return self.open_edges == 0 and self.nonmanifold_edges == 0
 
     @property
     def repaired(self) -> bool:
-        """Whether triangles had to be dropped or turned around."""
+        """True: triangles were dropped or flipped."""
         return self.num_faces < self.num_faces_read or self.num_faces_turned > 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class LevelQuality:
-    """How a level compares with the cleaned source, and how good its triangles are.
+    """Distances of a level from the cleaned source, and the quality of its triangles.
 
     Distances are shares of the diagonal of the source's bounding box, and the larger of the two
     directions.
@@ -100,7 +100,7 @@ class LevelQuality:
 
 @dataclass(frozen=True, kw_only=True)
 class LevelRecord:
-    """How one level was made, and how far it is from the source."""
+    """Method of one level, and its distance from the source."""
 
     budget: int
     """The most triangles that the level was allowed."""

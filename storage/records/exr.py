@@ -29,7 +29,7 @@ at 4 bytes a value."""
 
 @dataclass(frozen=True, kw_only=True)
 class ExrCodec:
-    """How an OpenEXR file is packed."""
+    """Compression and number type of an OpenEXR file."""
 
     compression: str
     """OpenEXR's name, such as ZIP or DWAB; of what the library offers, this is all that can be
@@ -177,7 +177,7 @@ def unpacked(stored: Stored) -> NDArray[np.float32]:
 def decode_stored(data: bytes) -> Stored:
     """Return the picture [H, W, 3] of `decode_exr` as the file holds it.
 
-    Whoever wants a function of half floats, such as their logarithm, may look it up by their bits.
+    A function of half floats, such as their logarithm, can be looked up by these bits.
 
     Raises:
         TrilightError: as `decode_exr`.

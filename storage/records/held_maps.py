@@ -1,6 +1,6 @@
 """`HeldMaps`: maps that were unpacked and checked, for the next sample that uses them.
 
-They go by the very bytes that they were unpacked from, so that whoever asks again gets what
+They go by the very bytes that they were unpacked from, so that the next call returns what
 unpacking would give, in any order of samples and of shards: bytes that are refused once are refused
 again. Arrays may not be written to, since several samples share them.
 """

@@ -32,7 +32,7 @@ def encode_picture(
     layers_rgb: Mapping[str, NDArray[np.float32]],
     attributes: Attributes,
 ) -> bytes:
-    """Return the OpenEXR file of a picture [R, R, 3], with layers beside it.
+    """Return the OpenEXR file of a picture [R, R, 3] and of its layers.
 
     Raises:
         TrilightError: as `storage.records.exr.encode_exr`.
@@ -44,7 +44,7 @@ def encode_picture(
 
 
 def decode_picture(data: bytes, layers: Collection[str]) -> NDArray[np.float32]:
-    """Return the picture [H, W, 3] of a file, without the layers of these names beside it.
+    """Return the picture [H, W, 3] of a file, without its layers of these names.
 
     Raises:
         TrilightError: as `storage.records.exr.decode_exr`.

@@ -12,7 +12,7 @@ from storage.records.texture import CONSTANT, TEXTURED
 
 @dataclass(frozen=True, kw_only=True)
 class SkyFacts:
-    """How bright an environment map is, and how much of its light comes from one place."""
+    """Brightness of an environment map, and how concentrated its light is."""
 
     mean_radiance: float
     """Over the sphere and the three channels."""

@@ -1,4 +1,4 @@
-"""How a scene's record names the textures and maps that it uses: by their content.
+"""References of a scene's record to its textures and maps, by their content.
 
 The record has one entry `maps`: the sha256 of each, with its name and rights, and how the
 environment is turned. Bytes are elsewhere (storage.records.packed_maps).

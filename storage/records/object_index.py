@@ -74,7 +74,7 @@ class SplitRows:
 
 @dataclass(frozen=True, kw_only=True)
 class IndexFacts:
-    """What an index is of."""
+    """Identity and contents of an index of objects."""
 
     lock_sha256: str
     """Hexadecimal digest of the lock's bytes."""
@@ -93,7 +93,7 @@ class IndexFacts:
 
     @property
     def num_objects(self) -> int:
-        """How many objects are frozen."""
+        """Number of frozen objects."""
         return sum(rows.stop - rows.start for rows in self.splits.values())
 
 

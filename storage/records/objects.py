@@ -20,7 +20,7 @@ from storage.typed_json import read_json_lines
 
 @dataclass(frozen=True, kw_only=True)
 class NamedObject:
-    """What every row about an object says: which one it is, and the rights to it."""
+    """Identity and rights of an object, which every row about it states."""
 
     uid: str
     """Unique in its source, and stable: it names the object in every later record."""
@@ -31,7 +31,7 @@ class NamedObject:
     licence_source: str
     """Where the licence is stated, and as of when; for the record of rights."""
     attribution: str
-    """Whom to name, as the source states it."""
+    """Author to credit, as the source states it."""
     source_url: str
     """Where the object came from."""
 

@@ -1,4 +1,4 @@
-"""How samples are packed: two named profiles, chosen from measured figures (study S47).
+"""Packing of samples: two named profiles, chosen from measured figures (study S47).
 
 | profile | arrays | pictures |
 |---|---|---|

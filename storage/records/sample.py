@@ -57,7 +57,7 @@ _EXPECTED: Mapping[Any, str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class PartFloor:
-    """How far to trust one part of a picture, of all lights together."""
+    """Stated errors of one layer of a picture, for all lights together."""
 
     noise_floor_db: float
     """Stated error in dB, as psnr_log_db."""
@@ -69,7 +69,7 @@ class PartFloor:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewRecord:
-    """How one picture was made, and how far to trust it."""
+    """Sampling and stated errors of one picture."""
 
     spp: int
     """Samples per pixel that were spent; on each light where they are apart."""

@@ -56,7 +56,7 @@ COMPONENT = Within(-1 - UNIT_NORMAL_TOLERANCE, 1 + UNIT_NORMAL_TOLERANCE)
 
 @dataclass(frozen=True, kw_only=True)
 class SceneObject:
-    """What one row of `object_index` points to: identity and rights, no geometry."""
+    """Identity and rights of an object that `object_index` points to; no geometry."""
 
     name: str
     """Unique within the scene, for people and for exported files."""
@@ -67,13 +67,13 @@ class SceneObject:
     licence: str = "CC0-1.0"
     """SPDX identifier, or `LicenseRef-...`; shells and lamps are ours, hence CC0."""
     attribution: str = ""
-    """Whom to name, as the source states it."""
+    """Author to credit, as the source states it."""
     source_url: str = ""
     """Where the object came from."""
 
     @property
     def is_lamp(self) -> bool:
-        """Whether it is an emitter of the layout, and no part of an object that emits."""
+        """True: an emitter of the layout, not a component of an object that emits."""
         return self.kind == "emitter" and not self.uid
 
 

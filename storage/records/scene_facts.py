@@ -60,7 +60,7 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraFacts:
-    """Where one camera stands, seen from the origin."""
+    """Position and angles of one camera, seen from the origin."""
 
     position: tuple[float, float, float]
     """Camera position [3] in world units."""

@@ -1,4 +1,4 @@
-"""How a broken law of a scene is told: the field, the value found, what was expected, where."""
+"""Errors of unlawful scenes: the field, its value, the expected value, the index."""
 
 from typing import NoReturn
 

@@ -24,7 +24,7 @@ SkinTextures = tuple[Texture, Texture, Texture]
 
 @dataclass(frozen=True, kw_only=True)
 class SkinQuality:
-    """How far the colours of a level are from those of its source."""
+    """Color errors of a level against its source."""
 
     colour_error: float
     """Mean difference of the linear diffuse colour between points spread evenly over the source and
@@ -43,7 +43,7 @@ class SkinQuality:
 
 @dataclass(frozen=True, kw_only=True)
 class OwnMaterials:
-    """What became of the materials of a source."""
+    """Result of reading a source's materials."""
 
     reason: str = ""
     """Stable code of why the object goes without them; empty where it has them."""
@@ -64,8 +64,8 @@ class LevelSkin:
     quality: SkinQuality
     """Errors measured against the source."""
     emission: NDArray[np.float32] | None = None
-    """[F, 3] what each face emits, in the units of the source; None where nothing does, or where
-    nobody asked."""
+    """[F, 3] what each face emits, in the units of the source; None where nothing does, or
+    where it was not requested."""
 
     @cached_property
     def textures(self) -> SkinTextures:

@@ -38,7 +38,7 @@ class MapSource:
     licence: str = "CC0-1.0"
     """SPDX identifier, or `LicenseRef-...`; what is drawn from a seed is ours, hence CC0."""
     attribution: str = ""
-    """Whom to name, as the source states it."""
+    """Author to credit, as the source states it."""
     source_url: str = ""
     """URL of the page or file it came from."""
 

@@ -140,5 +140,5 @@ class Bucket:
             raise kind(
                 f"{self.url.what} {self.url.shown!r}: cannot be {what} ({error.message}); expected "
                 "a bucket that exists, and access that lets you list, read and write there. What "
-                "was finished is safe: mend it and run the same command again."
+                "was finished is safe: fix it and run the same command again."
             ) from error

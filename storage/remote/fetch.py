@@ -24,7 +24,7 @@ _VERSION_FIELDS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What a server says about a file."""
+    """Size and version of a file, as its server states them."""
 
     num_bytes: int | None
     """Size; None where it is not said."""
@@ -47,7 +47,7 @@ def facts_of(url: RemoteUrl) -> Facts:
 
 
 def _fresh_info(driver: Any, url: RemoteUrl) -> dict[str, Any]:
-    """Ask the server itself: one of the drivers keeps listings though it is told not to."""
+    """Ask the server itself: one driver caches listings although that is turned off."""
     driver.invalidate_cache()
     return dict(driver.info(url.root))
 
@@ -79,7 +79,7 @@ def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_byt
 
 
 class _Expected:
-    """What is known of a file before it has come, and how fast it comes."""
+    """Limits of a download: size, version and pace."""
 
     def __init__(self, exact: int | None, most: int, pace: Pace) -> None:
         self.exact = exact

@@ -146,7 +146,7 @@ def _chance() -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Patience:
-    """How long a file is waited for."""
+    """Time limits of a download."""
 
     least_bytes_per_s: float = 10_000.0
     """Mean rate below which a transfer ends: a shard of 100 MB would take three hours. The slowest

@@ -52,12 +52,12 @@ class RemoteUrl:
 
     @property
     def is_http(self) -> bool:
-        """Whether the scheme is http or https; file names in such URLs are quoted."""
+        """True: the scheme is http or https; file names in such URLs are quoted."""
         return self.scheme in ("http", "https")
 
     @property
     def shown(self) -> str:
-        """The URL for people, and for naming what is kept of it."""
+        """The URL without secrets, for messages and for the names of cached files."""
         return printable(self.root if self.is_http else f"{self.scheme}://{self.root}")
 
     def child(self, name: str) -> "RemoteUrl":

@@ -83,7 +83,7 @@ def checked(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Described:
-    """What is said of one field."""
+    """Description of one field of a class of settings."""
 
     name: str
     hint: Any

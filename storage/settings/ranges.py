@@ -145,7 +145,7 @@ _EXPECTED: dict[tuple[Shape, type], str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Declared:
-    """What a field, or some columns of one, may hold."""
+    """Declared range of a field, or of some of its columns."""
 
     name: str
     kind: type
@@ -163,7 +163,7 @@ class Declared:
 
     @property
     def expected(self) -> str:
-        """What to write, for a person; not of arrays."""
+        """Description of valid values, for messages; not for arrays."""
         order = ", the lower one first" if self.ordered else ""
         return f"{_EXPECTED[self.shape, self.kind]} {self.within}{order}"
 

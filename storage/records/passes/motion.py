@@ -1,4 +1,4 @@
-"""How points that are seen move in the picture, between two moments or two cameras."""
+"""Motion of visible points in the picture, between two moments or two cameras."""
 
 import numpy as np
 from numpy.typing import NDArray

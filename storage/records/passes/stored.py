@@ -1,4 +1,4 @@
-"""Passes as OpenEXR: what a sample may hold beside its pictures, and `trilight passes` writes.
+"""Passes as OpenEXR, as a sample may hold them and `trilight passes` writes them.
 
 All channels are float32, packed without loss: ids below 2^24 are exact in it, and Nuke and Blender
 turn every channel into it anyway. Names of channels are `Pass.exr_channels`. The channel A, which
