@@ -1,7 +1,7 @@
 """Places objects in the room: resting or floating, and clear of each other.
 
 Sizes and rotations are drawn first, then places, the largest object first and each several times
-over, before sizes are given up and drawn anew. Drawing whole arrangements until one fits would be
+over, before sizes are given up and drawn again. Drawing whole arrangements until one fits would be
 exactly uniform, but takes ten times as long and prefers small objects; here sizes stay near their
 stated range. What an object looks like is asked of its `PlaceableShape`; a template knows no
 meshes.
@@ -26,7 +26,7 @@ ARRANGEMENT_TRIES = 100
 """Draws of all sizes before the scene is given up."""
 
 PLACE_TRIES = 16
-"""Draws of one place before the sizes are drawn anew."""
+"""Draws of one place before the sizes are drawn again."""
 
 TOUCHING = 1e-9
 """World units below which a resting object still counts as inside: rounding of float64 sums."""

@@ -84,7 +84,7 @@ def take_lock(descriptor: int, *, shared: bool = False, wait: bool = False) -> b
 
     Args:
         descriptor: of the file.
-        shared: beside other shared ones; else it excludes every other lock.
+        shared: together with other shared locks; otherwise it excludes every other lock.
         wait: until it is free, so that it always becomes ours.
     """
     operation = fcntl.LOCK_SH if shared else fcntl.LOCK_EX

@@ -36,14 +36,14 @@ def _open_error(path: Path, error: OSError) -> TrilightError:
 
 
 class _Files(ABC):
-    """The files beside the shards."""
+    """The files next to the shards."""
 
     @abstractmethod
     def open_beside(self, name: str) -> BinaryIO | None:
-        """Open a file beside the shards, or return None where there is none."""
+        """Open a file next to the shards, or return None where there is none."""
 
     def read(self, name: str) -> bytes | None:
-        """Return a file beside the shards, or None where there is none."""
+        """Return a file next to the shards, or None where there is none."""
         stream = self.open_beside(name)
         if stream is None:
             return None
@@ -105,7 +105,7 @@ class LocalFiles(_Files):
             stream.close()
             raise TrilightError(
                 f"{path}: the bytes are not those of the manifest (sha256 differs). Delete the "
-                "file and run `trilight generate` again to make it anew."
+                "file and run `trilight generate` again to make it."
             )
         stream.seek(0)
         self._checked[shard.name] = seen

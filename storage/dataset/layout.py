@@ -243,7 +243,7 @@ def dataset_folder(out: str) -> DatasetFolder:
     """Return the folder of a dataset that is to be made.
 
     For a bucket that is a folder of the cache, the same one whenever the same URL is named, with
-    the scenes that are not in a shard yet and a copy of the files beside the shards.
+    the scenes that are not in a shard yet and a copy of the files next to the shards.
 
     Args:
         out: a folder, or a URL of WRITABLE.

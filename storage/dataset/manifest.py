@@ -40,7 +40,7 @@ DocumentName = Annotated[
 """Document that a manifest vouches for: rights hang on it."""
 
 MAX_BESIDE_BYTES = 1 << 30
-"""Largest file beside the shards: a manifest takes 220 bytes a shard, a lock 400 an object."""
+"""Largest file next to the shards: a manifest takes 220 bytes a shard, a lock 400 an object."""
 _HEAD_BYTES = 1 << 22
 _ROW_BYTES = 1 << 17
 """Maximum sizes of a manifest without its shards, and of a shard in it."""
@@ -54,7 +54,7 @@ class ShardEntry:
     """One shard as the manifest describes it."""
 
     name: ShardName
-    """File name beside the manifest, or in one of the parts of its folder
+    """File name next to the manifest, or in one of the parts of its folder
     (storage.dataset.layout)."""
     split: Annotated[str, Spelled("|".join(SPLITS), "train, validation or test")]
     """train, validation or test."""
@@ -133,7 +133,7 @@ class Manifest(_Fields):
 
     @property
     def passes(self) -> tuple[str, ...]:
-        """Names of the passes beside each picture; none where the settings do not name them."""
+        """Names of the passes of each picture; none where the settings do not name them."""
         storage = self.settings.get("storage")
         names = storage.get("passes") if isinstance(storage, Mapping) else None
         return tuple(map(str, names)) if isinstance(names, list | tuple) else ()

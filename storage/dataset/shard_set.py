@@ -67,7 +67,7 @@ class OpenShard:
     def _read(self, offset: int, num_bytes: int) -> bytes:
         data = os.pread(self._stream.fileno(), num_bytes, offset)
         if len(data) != num_bytes:
-            raise TrilightError(f"{self.name}: became shorter while it was read. Copy it anew.")
+            raise TrilightError(f"{self.name}: became shorter while it was read. Copy it again.")
         return data
 
     def sample(self, row: int) -> Sample:

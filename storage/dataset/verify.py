@@ -78,7 +78,7 @@ def verify_dataset(
     """Check a dataset, in a folder or on a server, against its manifest.
 
     Several shards are checked at once in threads: hashing and unpacking release Python's lock.
-    Shards of a server are fetched anew, past the cache, and not kept.
+    Shards of a server are fetched again, past the cache, and not kept.
 
     Args:
         root: the dataset, opened, or its path or URL.

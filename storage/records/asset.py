@@ -177,7 +177,7 @@ def decode_asset(data: bytes) -> Asset:
         raise TrilightError(
             f"asset: a safetensors file with arrays {', '.join(arrays) or 'none'} does not hold "
             f"one ({type(error).__name__}: {error}); expected a file of the asset store. Delete "
-            "it, and it is made anew."
+            "it, and it is made again."
         ) from error
 
 
@@ -196,7 +196,7 @@ def least_triangles_in(path: Path) -> int:
     except (OSError, LookupError, TypeError, ValueError, RecursionError) as error:
         raise TrilightError(
             f"{path}: is no asset ({error}); expected a file of the asset store. Delete it, and it "
-            "is made anew."
+            "is made again."
         ) from error
 
 

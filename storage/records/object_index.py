@@ -182,7 +182,7 @@ class StoredColumn:
         if len(data) != num_bytes:
             raise TrilightError(
                 f"objects.index: ends before row {stop}; expected it whole. Delete it, and it is "
-                "made anew."
+                "made again."
             )
         return np.frombuffer(data, dtype)
 
@@ -211,7 +211,7 @@ class ObjectIndex:
             }
         except (OSError, LookupError, TypeError, ValueError, RecursionError) as error:
             raise TrilightError(
-                f"{path}: is no index of objects ({error}); delete it, and it is made anew."
+                f"{path}: is no index of objects ({error}); delete it, and it is made again."
             ) from error
         self._data = 8 + int.from_bytes(head[:8], "little")
 

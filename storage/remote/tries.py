@@ -51,7 +51,7 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
     Args:
         function: what to try.
         pace: of the file that is on its way; where it came at the least rate since the last error,
-            the tries are counted anew.
+            the tries are counted again from 1.
 
     Raises:
         TransferFailed: as the function raised it, or `download_failed` for any other exception, or
@@ -154,7 +154,7 @@ class Patience:
     window_s: float = 300.0
     """Seconds over which the mean is taken; a link may be gone for nearly as long."""
     file_s: float = 86_400.0
-    """Seconds for all of one file, tries and beginnings anew included: a day, in which the least
+    """Seconds for all of one file, tries and restarts included: a day, in which the least
     rate brings 864 MB."""
 
 
@@ -170,7 +170,7 @@ class Pace:
         """Begin to watch.
 
         Args:
-            position: how many bytes have come; falls where a transfer begins anew.
+            position: how many bytes have come; falls where a transfer starts over.
             clock: seconds.
         """
         self._position = position
