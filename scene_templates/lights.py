@@ -81,16 +81,20 @@ def emitters_rand(
 def _spaced_direction(
     rng: np.random.Generator,
     sector: Sector,
-    others: list[NDArray[np.float64]],
+    placed_directions: list[NDArray[np.float64]],
     spacing: float,
 ) -> NDArray[np.float64]:
-    best, best_gap = sector.direction_rand(rng), -1.0
+    best = sector.direction_rand(rng)
+    best_gap = -1.0
     for _ in range(SPACING_TRIES):
         candidate = sector.direction_rand(rng)
-        away = [float(np.sqrt(np.sum(np.square(candidate - other)))) for other in others]
-        gap = SPACING_RADIUS * min(away, default=np.inf)
+        distances = [
+            float(np.sqrt(np.sum(np.square(candidate - other)))) for other in placed_directions
+        ]
+        gap = SPACING_RADIUS * min(distances, default=np.inf)
         if gap > best_gap:
-            best, best_gap = candidate, gap
+            best = candidate
+            best_gap = gap
         if gap > spacing:
             break
     return best

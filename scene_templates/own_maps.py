@@ -23,21 +23,21 @@ class OwnMap(Generic[Made]):
     """A texture or map that is read when it is drawn."""
 
     uid: str
-    """As objects.lock.jsonl names it."""
+    """Identifier in objects.lock.jsonl."""
     source: MapSource
-    """Its title and rights."""
+    """Title, URL and license."""
     load: Callable[[], Made]
-    """Reads it."""
+    """Function that reads the map."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OwnTexture:
-    """What a texture from outside says."""
+    """Reflectance maps of a user's texture."""
 
     diffuse_rgb: NDArray[np.float32]
     """[H, W, 3] linear, the top row first."""
     specular_rgb: NDArray[np.float32]
-    """[H, W, 3]."""
+    """Linear specular albedo [H, W, 3]."""
     roughness: NDArray[np.float32] | None
     """[H, W, 1]; None where one number is to be drawn."""
 
@@ -45,7 +45,8 @@ class OwnTexture:
         self, rng: np.random.Generator, source: MapSource, roughness_clip: tuple[float, float]
     ) -> SurfaceMaps:
         """Return it as a surface; a roughness that is missing is uniform in `roughness_clip`."""
-        rough, low_high = self.roughness, roughness_clip
+        rough = self.roughness
+        low_high = roughness_clip
         if rough is None:
             rough = np.full((*self.diffuse_rgb.shape[:2], 1), rng.uniform(*low_high), np.float32)
         return SurfaceMaps(
@@ -60,10 +61,10 @@ class OwnTexture:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OwnMaps:
-    """What the scenes of a split may take."""
+    """User textures and skies that the scenes of a split may use."""
 
     textures: Sequence[OwnMap[OwnTexture]] = ()
-    """Textures, sorted by uid."""
+    """The user's textures, sorted by uid."""
     skies: Sequence[OwnMap[NDArray[np.float32]]] = ()
     """Maps [H, 2H, 3] of linear radiance, sorted by uid."""
 
@@ -73,7 +74,7 @@ NO_OWN_MAPS = OwnMaps()
 
 def drawn_own(
     rng: np.random.Generator,
-    own: Sequence[OwnMap[Made]],
+    user_maps: Sequence[OwnMap[Made]],
     share: float,
     licences: Sequence[str],
 ) -> OwnMap[Made] | None:
@@ -87,7 +88,7 @@ def drawn_own(
         share: probability of one.
         licences: of what is in the scene already.
     """
-    if not (share and own) or rng.random() >= share:
+    if not (share and user_maps) or rng.random() >= share:
         return None
-    meeting = [one for one in own if not mixed_share_alike([*licences, one.source.licence])]
+    meeting = [one for one in user_maps if not mixed_share_alike([*licences, one.source.licence])]
     return meeting[int(rng.integers(len(meeting)))] if meeting else None

@@ -11,14 +11,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.exact import cosine, mixed, sine
+from scene_templates.exact import cosine, lerp, sine
 
 Kind = Literal["uniform", "whole number", "share", "colour", "shade", "direction", "choice"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class StatedDraw:
-    """What one name was said to be drawn from, and what came out."""
+    """Stated distribution of one name, and the drawn values."""
 
     kind: Kind
     """Distribution: uniform in a range; uniform whole numbers; true with a probability; a colour
@@ -28,50 +28,50 @@ class StatedDraw:
     """Lowest and highest value; a probability; the two colours; the lowest and highest elevation in
     degrees; or the words."""
     values: list[Any] = field(default_factory=list)
-    """What was drawn, in order: one number, or as many as the sky or surface has such things; of a
-    shade, its place between the two colours."""
+    """Drawn values in order: one number, or one for each such thing of the sky or surface; a shade
+    holds its position between the two colors."""
 
     def __str__(self) -> str:
         """Return the distribution as the end of a sentence."""
         return _row(self)
 
 
-class StatedDraws:
+class RecordedSampler:
     """Draws from one generator, with + - * / and square roots only (scene_templates.exact)."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        """Draw from `rng`, which nobody else should use meanwhile."""
+        """Draw from `rng`, which no other code may use at the same time."""
         self._rng = rng
         self.made: dict[str, StatedDraw] = {}
 
     def uniform(self, name: str, low: float, high: float) -> float:
         """Return a number uniform in [low, high]."""
-        return self._remembered(name, "uniform", (low, high), self._between(low, high))
+        return self._record(name, "uniform", (low, high), self._between(low, high))
 
     def whole(self, name: str, low: int, high: int) -> int:
         """Return a whole number; each from `low` to `high` is equally likely."""
-        return self._remembered(
+        return self._record(
             name, "whole number", (low, high), int(self._rng.integers(low, high + 1))
         )
 
     def holds(self, name: str, share: float) -> bool:
         """Return whether something holds, which it does with a probability of `share`."""
-        return self._remembered(name, "share", share, bool(self._rng.random() < share))
+        return self._record(name, "share", share, bool(self._rng.random() < share))
 
     def choice(self, name: str, words: Sequence[str]) -> str:
         """Return one of the words, each equally likely."""
         drawn = words[int(self._rng.integers(len(words)))]
-        return self._remembered(name, "choice", tuple(words), drawn)
+        return self._record(name, "choice", tuple(words), drawn)
 
     def colour(self, name: str, low: Sequence[float], high: Sequence[float]) -> NDArray[np.float64]:
         """Return a colour [3] whose channels are independent and uniform in their ranges."""
         drawn = np.array([self._between(*ends) for ends in zip(low, high, strict=True)])
-        return self._remembered(name, "colour", (tuple(low), tuple(high)), drawn)
+        return self._record(name, "colour", (tuple(low), tuple(high)), drawn)
 
     def shade(self, name: str, one: Sequence[float], other: Sequence[float]) -> NDArray[np.float64]:
         """Return a colour [3] on the straight line between two, uniform along it."""
-        share = self._remembered(name, "shade", (tuple(one), tuple(other)), self._between(0, 1))
-        return mixed(one, other, share)
+        share = self._record(name, "shade", (tuple(one), tuple(other)), self._between(0, 1))
+        return lerp(one, other, share)
 
     def direction(self, name: str, low_deg: float, high_deg: float) -> NDArray[np.float64]:
         """Return a unit vector [3] between two elevations, uniform by solid angle; +Z is up."""
@@ -80,7 +80,7 @@ class StatedDraws:
         azimuth = self._between(-np.pi, np.pi)
         across = np.sqrt(max(0.0, 1 - z * z))
         drawn = np.array([across * float(cosine(azimuth)), across * float(sine(azimuth)), z])
-        return self._remembered(name, "direction", (low_deg, high_deg), drawn)
+        return self._record(name, "direction", (low_deg, high_deg), drawn)
 
     def stream(self) -> np.random.Generator:
         """Return a generator of its own for a noise or the parts of a pattern.
@@ -100,7 +100,7 @@ class StatedDraws:
         # not rng.uniform, whose product and sum some compilers fuse and so round once less
         return float(low + (high - low) * self._rng.random())
 
-    def _remembered(self, name: str, kind: Kind, stated: Any, value: Any) -> Any:
+    def _record(self, name: str, kind: Kind, stated: Any, value: Any) -> Any:
         draw = self.made.setdefault(name, StatedDraw(kind=kind, stated=stated))
         if (draw.kind, draw.stated) != (kind, stated):
             raise ValueError(f"{name!r} is drawn from {stated} and from {draw.stated}")

@@ -27,7 +27,7 @@ from storage.remote.tries import TransferFailed, is_missing
 from storage.remote.url import RemoteUrl, parse_url
 
 
-def _unopened(path: Path, error: OSError) -> TrilightError:
+def _open_error(path: Path, error: OSError) -> TrilightError:
     if isinstance(error, FileNotFoundError | NotADirectoryError):
         return ShardMissing(
             f"{path}: the shard is missing; run `trilight generate` again to make it."
@@ -36,14 +36,14 @@ def _unopened(path: Path, error: OSError) -> TrilightError:
 
 
 class _Files(ABC):
-    """The files beside the shards."""
+    """The files next to the shards."""
 
     @abstractmethod
     def open_beside(self, name: str) -> BinaryIO | None:
-        """Open a file beside the shards, or return None where there is none."""
+        """Open a file next to the shards, or return None where there is none."""
 
     def read(self, name: str) -> bytes | None:
-        """Return a file beside the shards, or None where there is none."""
+        """Return a file next to the shards, or None where there is none."""
         stream = self.open_beside(name)
         if stream is None:
             return None
@@ -75,7 +75,7 @@ class LocalFiles(_Files):
         try:
             return path.stat().st_size
         except OSError as error:
-            raise _unopened(path, error) from error
+            raise _open_error(path, error) from error
 
     def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
         """Open a shard for reading.
@@ -91,7 +91,7 @@ class LocalFiles(_Files):
         try:
             stream = open_plain(path)
         except OSError as error:
-            raise _unopened(path, error) from error
+            raise _open_error(path, error) from error
         if checked:
             self._check(path, stream, shard)
         return stream
@@ -105,7 +105,7 @@ class LocalFiles(_Files):
             stream.close()
             raise TrilightError(
                 f"{path}: the bytes are not those of the manifest (sha256 differs). Delete the "
-                "file and run `trilight generate` again to make it anew."
+                "file and run `trilight generate` again to make it."
             )
         stream.seek(0)
         self._checked[shard.name] = seen
@@ -289,8 +289,8 @@ class Dataset:
             contents = self._contents(stream, shard)
             for key in contents.samples:
                 with reading(self.shown, shard.name):
-                    found = contents.read(stream, key, lambda name: not name.endswith("exr"))
-                    record = decode_scene(key, found, held)
+                    members = contents.read(stream, key, lambda name: not name.endswith("exr"))
+                    record = decode_scene(key, members, held)
                     _require_lawful(record)
                 yield record
 
@@ -366,7 +366,7 @@ def open_dataset(url: str) -> Dataset:
     if not _may_be_growing(dataset.files):
         return dataset
     from storage.dataset.unlisted import (
-        with_unlisted,  # slow: whoever streams a whole set needs none
+        with_unlisted,  # slow, and not needed to stream a whole set
     )
 
     return with_unlisted(dataset)

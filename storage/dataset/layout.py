@@ -84,8 +84,8 @@ def place_of_part(part: int) -> str:
 
 def _parts_in(root: Path) -> list[int]:
     with contextlib.suppress(FileNotFoundError):
-        found = (_PART.fullmatch(name) for name in os.listdir(root))
-        return [0, *sorted(int(match[1]) for match in found if match)]
+        matches = (_PART.fullmatch(name) for name in os.listdir(root))
+        return [0, *sorted(int(match[1]) for match in matches if match)]
     return []
 
 
@@ -151,7 +151,7 @@ class DatasetFolder:
 
     @property
     def shown(self) -> str:
-        """What people call the dataset."""
+        """The dataset's folder or URL, as messages show it."""
         return self.bucket or str(self.root)
 
     def staged_shard(self, name: str) -> Path:
@@ -207,6 +207,8 @@ class DatasetFolder:
             if take_lock(descriptor):
                 self._clean()
                 when_alone()
+            # flock converts a lock by releasing it first, so another worker may hold it exclusively
+            # in between and clean too. That is harmless: this worker has not begun its work yet.
             take_lock(descriptor, shared=True, wait=True)
             yield
         finally:
@@ -214,8 +216,8 @@ class DatasetFolder:
 
     def clear(self) -> None:
         """Delete everything except the locks of workers."""
-        kept = {self.staging, self.staging / "lock", self.staging / "turns"}
-        for path in {*self.root.iterdir(), *self.staging.iterdir()} - kept:
+        lock_paths = {self.staging, self.staging / "lock", self.staging / "turns"}
+        for path in {*self.root.iterdir(), *self.staging.iterdir()} - lock_paths:
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             else:
@@ -241,7 +243,7 @@ def dataset_folder(out: str) -> DatasetFolder:
     """Return the folder of a dataset that is to be made.
 
     For a bucket that is a folder of the cache, the same one whenever the same URL is named, with
-    the scenes that are not in a shard yet and a copy of the files beside the shards.
+    the scenes that are not in a shard yet and a copy of the files next to the shards.
 
     Args:
         out: a folder, or a URL of WRITABLE.
@@ -253,10 +255,10 @@ def dataset_folder(out: str) -> DatasetFolder:
     place = parse_url(out, what="out")
     if isinstance(place, Path):
         return DatasetFolder(place)
-    shown = printable(safe_url(out))
+    url_text = printable(safe_url(out))
     if place.scheme not in WRITABLE:
-        raise TrilightError(f"out {shown!r} has the scheme {place.scheme!r}; {_ADMITTED}.")
+        raise TrilightError(f"out {url_text!r} has the scheme {place.scheme!r}; {_ADMITTED}.")
     if "?" in place.root or "#" in place.root:
-        raise TrilightError(f"out {shown!r} has a query or fragment; {_ADMITTED}, without one.")
+        raise TrilightError(f"out {url_text!r} has a query or fragment; {_ADMITTED}, without one.")
     name = sha256_hex(place.shown.encode())[:16]
     return DatasetFolder(cache_folder("outputs") / name, place.shown)

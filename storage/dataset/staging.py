@@ -20,12 +20,11 @@ _FAILURES = "failures"
 
 @dataclass(frozen=True, kw_only=True)
 class StagedScene:
-    """What became of one scene."""
+    """Result of one scene: its sample, or its failures."""
 
     members: dict[str, bytes]
     """The members of its sample; empty where the scene was given up."""
     failures: list[Failure]
-    """The rejected attempts."""
 
 
 def stage_scene(

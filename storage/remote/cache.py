@@ -103,16 +103,16 @@ class ShardCache:
 
     def _make_room(self, num_bytes: int) -> None:
         """Remove the least recently read shards, until `num_bytes` more fit within the limit."""
-        found = []
+        shards = []
         for path in self.root.glob("*"):
             with contextlib.suppress(OSError):
                 stat = path.stat()
                 if path.suffix != TEMPORARY_SUFFIX:
-                    found.append((stat.st_mtime_ns, path, stat.st_size))
+                    shards.append((stat.st_mtime_ns, path, stat.st_size))
                 elif time.time() - stat.st_mtime > _STALE_S:  # a killed process left it
                     path.unlink()
-        taken = num_bytes + sum(size for _, _, size in found)
-        for _, path, size in sorted(found):
+        taken = num_bytes + sum(size for _, _, size in shards)
+        for _, path, size in sorted(shards):
             if taken <= self.max_bytes:
                 return
             if _remove_unread(path):

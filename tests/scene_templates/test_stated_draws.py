@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from pipeline.builds.named import named_build
-from scene_templates.exact import cosine, dot, eased, mixed, ramp, sine
+from scene_templates.exact import cosine, dot, lerp, ramp, sine, smoothstep
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.layout_rand import scene_plan
 from scene_templates.rotations import rotated, rotation_xyz, uniform_rotation
 from scene_templates.settings import SceneSettings
-from scene_templates.stated_draws import StatedDraws
+from scene_templates.stated_draws import RecordedSampler
 from storage.seeds import rng_for
 from tests.conftest import ROOT
 from tests.scene_templates.balls import DEFAULTS
@@ -24,8 +24,8 @@ from tests.scene_templates.statistics import implausible, require_plausible, sta
 MANY = 1000
 
 
-def _drawn() -> StatedDraws:
-    draws = StatedDraws(rng_for(0, "named draws"))
+def _drawn() -> RecordedSampler:
+    draws = RecordedSampler(rng_for(0, "named draws"))
     for _ in range(MANY):
         draws.uniform("number", -2.0, 5.0)
         draws.whole("count", 3, 9)
@@ -60,7 +60,7 @@ def test_directions_are_unit_vectors_between_the_elevations() -> None:
 
 
 def test_a_name_has_one_statement() -> None:
-    draws = StatedDraws(rng_for(0, "x"))
+    draws = RecordedSampler(rng_for(0, "x"))
     draws.uniform("number", 0, 1)
     with pytest.raises(ValueError, match="number"):
         draws.uniform("number", 0, 2)
@@ -68,7 +68,7 @@ def test_a_name_has_one_statement() -> None:
 
 def test_a_stream_leaves_what_is_drawn_after_it() -> None:
     def rest(taken: int) -> float:
-        draws = StatedDraws(rng_for(0, "x"))
+        draws = RecordedSampler(rng_for(0, "x"))
         draws.stream().random(taken)
         return draws.uniform("number", 0, 1)
 
@@ -76,7 +76,7 @@ def test_a_stream_leaves_what_is_drawn_after_it() -> None:
 
 
 def test_parameters_are_plain_values() -> None:
-    draws = StatedDraws(rng_for(0, "x"))
+    draws = RecordedSampler(rng_for(0, "x"))
     draws.colour("colour", (0, 0, 0), (1, 1, 1))
     draws.whole("count", 1, 1)
     found = draws.parameters()
@@ -162,12 +162,12 @@ def test_sine_and_cosine_are_those_of_the_library() -> None:
 
 
 def test_easing_and_ramps() -> None:
-    assert eased([-1, 0, 0.5, 1, 2]).tolist() == [0, 0, 0.5, 1, 1]
-    slope = np.diff(eased(np.linspace(0, 1, 1001)))
+    assert smoothstep([-1, 0, 0.5, 1, 2]).tolist() == [0, 0, 0.5, 1, 1]
+    slope = np.diff(smoothstep(np.linspace(0, 1, 1001)))
     # 3 s^2 of a first step of a thousandth: no kink at either end
     assert slope[0] < 4e-6 and slope[-1] < 4e-6 and (slope > 0).all()
     assert ramp([-2, -0.5, 0, 0.25, 0.5, 2]).tolist() == [0, 0, 0.5, 0.75, 1, 1]
-    assert mixed([0.0, 2.0], [1.0, 4.0], 0.5).tolist() == [0.5, 3.0]
+    assert lerp([0.0, 2.0], [1.0, 4.0], 0.5).tolist() == [0.5, 3.0]
     assert float(dot(np.array([1.0, 2, 3]), np.array([4.0, 5, 6]))) == 32
 
 
