@@ -70,7 +70,7 @@ class ModelConfig:
     """Width in ray bundles of the Swin windows of the view stage; with 0, every bundle attends to
     all others."""
     head: Head
-    """`dpt` mixes neighbouring bundles by convolution, `linear` reads each bundle alone."""
+    """`dpt` mixes neighboring bundles by convolution, `linear` reads each bundle alone."""
     dpt_features: Annotated[int, Within(0, 4096)] = 0
     """Width of the DPT's fusion path; 0 with a linear head."""
     dpt_channels: Annotated[tuple[int, ...], Within(1, 8192)] = ()

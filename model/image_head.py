@@ -1,7 +1,7 @@
 """Heads from bundle tokens to pixels: linear, or a dense prediction transformer (DPT).
 
 The linear head is smaller and as good for minutes of training; the DPT (Ranftl et al. 2021) mixes
-neighbouring bundles, so that their borders do not show. Both start at a black picture, or,
+neighboring bundles, so that their borders do not show. Both start at a black picture, or,
 where they predict light (model.demodulated), at equal dim light everywhere.
 """
 

@@ -129,7 +129,7 @@ def attend_packed(
     """Return softmax(q k^T / sqrt(D)) v, [Q, H, D], of each sequence to its own keys.
 
     Args:
-        q_QHD: queries, half precision on a card.
+        q_QHD: queries, half precision on a GPU.
         k_PHD, v_PHD: keys and values.
         queries: offsets of the queries.
         keys: offsets of the keys of the same sequences.

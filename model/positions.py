@@ -100,12 +100,12 @@ def to_camera(points_BT33: Tensor, c2w_BV44: Tensor) -> Tensor:
 
 def register_position(triangles_BT33: Tensor, is_triangle_BT: Tensor | None) -> Tensor:
     """Return the mean vertex of each scene, repeated three times, [B, 1, 3, 3]."""
-    centre_BT3 = triangles_BT33.mean(dim=-2)
+    center_BT3 = triangles_BT33.mean(dim=-2)
     if is_triangle_BT is None:
-        mean_B3 = centre_BT3.mean(dim=1)
+        mean_B3 = center_BT3.mean(dim=1)
     else:
-        weight_BT1 = is_triangle_BT[..., None].to(centre_BT3.dtype)
-        mean_B3 = (centre_BT3 * weight_BT1).sum(dim=1) / weight_BT1.sum(dim=1)
+        weight_BT1 = is_triangle_BT[..., None].to(center_BT3.dtype)
+        mean_B3 = (center_BT3 * weight_BT1).sum(dim=1) / weight_BT1.sum(dim=1)
     return mean_B3[:, None, None, :].expand(-1, 1, 3, 3)
 
 

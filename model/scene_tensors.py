@@ -35,7 +35,7 @@ class SceneTensors:
     """Input of the network for one scene; float32 unless converted."""
 
     triangles_T33: Tensor
-    """Vertices of each triangle, world space, metres."""
+    """Vertices of each triangle, world space, meters."""
     normals_T33: Tensor
     """Unit shading normals at those vertices, world space."""
     material_TM: Tensor

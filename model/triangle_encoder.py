@@ -51,7 +51,7 @@ class TriangleTokens(nn.Module):
 
         `light` is what the triangles' sides receive, in units of the scene's mean light, as an
         input of networks with the view stage `hits`. It is compressed to log1p(4 x), since it spans
-        orders of magnitude; the factor puts the logarithmic part of the curve below the mean.
+        orders of magnitude; the curve is linear below a quarter of the mean, and logarithmic above.
         """
         with as_given(material_BTM.device):
             material_BTW = self.material_norm(self.material(material_BTM))

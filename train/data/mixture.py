@@ -105,20 +105,20 @@ class Mixture:
 
 
 def mix_visits(
-    mixture: Mixture, places: Sequence[Iterator[Visit]], parts: Sequence[range], first: int
+    mixture: Mixture, visits: Sequence[Iterator[Visit]], parts: Sequence[range], first: int
 ) -> Iterator[Visit]:
     """Yield the visits of the stream without end, from position `first` on.
 
     Args:
         mixture: order of the datasets.
-        places: endless visits of each dataset, after the scenes of `mixture.counts_before`.
+        visits: endless visits of each dataset, after the scenes of `mixture.counts_before`.
         parts: shard numbers of each dataset among all.
         first: position of the stream.
     """
     for position, source in enumerate(mixture.sources_from(first), first):
-        place = next(places[source])
-        shard = parts[source].start + place.shard
-        yield dataclasses.replace(place, position=position, shard=shard, source=source)
+        visit = next(visits[source])
+        shard = parts[source].start + visit.shard
+        yield dataclasses.replace(visit, position=position, shard=shard, source=source)
 
 
 def plan_mixture(

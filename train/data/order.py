@@ -79,9 +79,9 @@ class RankShare:
     def of_batch(self, visits: Sequence[Visit]) -> list[Visit]:
         """Return this process's slice of a global batch, in the order of positions."""
         size = len(visits) // self.world_size
-        by_shard = sorted(visits, key=lambda place: (place.source, place.arrival, place.position))
+        by_shard = sorted(visits, key=lambda visit: (visit.source, visit.arrival, visit.position))
         mine = by_shard[self.rank * size : (self.rank + 1) * size]
-        return sorted(mine, key=lambda place: place.position)
+        return sorted(mine, key=lambda visit: visit.position)
 
 
 def shard_order(num_shards: int, settings: OrderSettings, epoch: int) -> list[int]:
@@ -128,7 +128,7 @@ def windows_from(
 
 def places_from(windows: Iterator[ShardWindow], first: int) -> Iterator[Visit]:
     """Yield endless visits, from position `first` on."""
-    return (place for window in windows for place in window.visits if place.position >= first)
+    return (visit for window in windows for visit in window.visits if visit.position >= first)
 
 
 def batched(visits: Iterator[Visit], batch_size: int) -> Iterator[tuple[Visit, ...]]:

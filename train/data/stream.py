@@ -122,9 +122,9 @@ def stream_batches(
                 for mine in batches:
                     waiting.append((mine, [decoders.submit(maker.scene, p) for p in mine]))
                     if len(waiting) > depth:
-                        places, scenes = waiting.popleft()
+                        visits, scenes = waiting.popleft()
                         ready = [scene.result() for scene in scenes]
-                        opened.mark_read(place.shard for place in places)
+                        opened.mark_read(visit.shard for visit in visits)
                         yield ready
         finally:
             decoders.shutdown(wait=True, cancel_futures=True)
@@ -180,12 +180,12 @@ def _plan_batches(
         for part, start in zip(counted.parts, begin, strict=True)
     ]
     if mixture is None:
-        places = streams[0]
+        visits = streams[0]
     else:
-        places = mix_visits(mixture, streams, counted.parts, position)
-    for batch in batched(places, settings.batch_size):
+        visits = mix_visits(mixture, streams, counted.parts, position)
+    for batch in batched(visits, settings.batch_size):
         mine = rank_slice.of_batch(batch)
-        opened.plan(place.shard for place in mine)
+        opened.plan(visit.shard for visit in mine)
         yield mine
 
 

@@ -102,7 +102,7 @@ class StackedMuon(torch.optim.Muon):
                 for pair in zip(weight.chunk(parts), direction.chunk(parts), strict=True):
                     by_shape[pair[0].shape].append(pair)
             for pairs in by_shape.values():
-                self._move([w for w, _ in pairs], [wanted for _, wanted in pairs], group)
+                self._move([w for w, _ in pairs], [direction for _, direction in pairs], group)
 
     def _move(
         self, weights: list[Tensor], directions: list[Tensor], group: Mapping[str, Any]
