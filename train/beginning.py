@@ -70,7 +70,7 @@ def plan_start(
     folder: RunFolder,
     data_digest: str,
     start: Start,
-    crew: Crew,
+    dist_context: Crew,
     progress: TrainProgress,
 ) -> StartPlan:
     """Read what the run starts or resumes with, without writing anything.
@@ -95,10 +95,11 @@ def plan_start(
     branch = None if start.resume or start.branch is None else Path(start.branch)
     if branch is None or branch.is_dir():
         checkpoints = (folder if branch is None else RunFolder(branch)).checkpoints
-        checkpoint = newest_checkpoint(checkpoints, crew, progress.noted)
+        checkpoint = newest_checkpoint(checkpoints, dist_context, progress.noted)
     else:
         checkpoint = read_checkpoint(branch)
-        crew.barrier()  # the first process soon writes into the folder that all have looked at
+        # the first process soon writes into the folder that all have looked at
+        dist_context.barrier()
     if settings.from_weights:
         config = decode_config(checkpoint.header["model"], str(branch or folder.root))
         settings = dataclasses.replace(settings, model=config)
@@ -109,7 +110,11 @@ def plan_start(
 
 
 def init_or_resume_state(
-    plan: StartPlan, folder: RunFolder, data: TrainingData, crew: Crew, progress: TrainProgress
+    plan: StartPlan,
+    folder: RunFolder,
+    data: TrainingData,
+    dist_context: Crew,
+    progress: TrainProgress,
 ) -> TrainState:
     """Create or restore the state before the run's next step, and record it on disk.
 
@@ -118,43 +123,43 @@ def init_or_resume_state(
     Raises:
         TrilightError: `data_weights` has another length than the list of datasets.
     """
-    precision = fitting_precision(crew)
+    precision = fitting_precision(dist_context)
     data_digest = data.digest
     header = None if plan.checkpoint is None else plan.checkpoint.header
     mixture = plan_mixture(data, plan.settings, header)
     if mixture is not None:
         progress.noted(f"the stream mixes {mixture}")
     if plan.checkpoint is None or plan.resume_plan is None:
-        state = new_state(plan.settings, crew.device, plan.network, precision)
+        state = new_state(plan.settings, dist_context.device, plan.network, precision)
         state.mixture = mixture
         digest = None
         if plan.network is not None:
             digest = sha256_hex(encode_weights(plan.network))
             header = _header_of(Path(plan.network_source)) | {"sha256": digest}
             state.history = (_origin(0, "weights", header),)
-        if crew.is_first:
+        if dist_context.is_first:
             more = {"begun_with_sha256": digest}
-            _write_settings(folder, plan.settings, state, data_digest, crew, more)
+            _write_settings(folder, plan.settings, state, data_digest, dist_context, more)
         return state
-    state = restore_state(plan.checkpoint, plan.resume_plan, crew.device, precision)
+    state = restore_state(plan.checkpoint, plan.resume_plan, dist_context.device, precision)
     state.mixture = mixture
     if plan.branch is not None:
         state.history += (_origin(state.step, "checkpoint", plan.checkpoint.header),)
     for note in plan.resume_plan.notes:
         progress.noted(note)
-    _record_execution_changes(plan.checkpoint, crew, state, progress)
-    if crew.is_first:
-        _write_resumed_run(plan, folder, state, data_digest, crew)
+    _record_execution_changes(plan.checkpoint, dist_context, state, progress)
+    if dist_context.is_first:
+        _write_resumed_run(plan, folder, state, data_digest, dist_context)
     return state
 
 
 def _write_resumed_run(
-    plan: StartPlan, folder: RunFolder, state: TrainState, data_digest: str, crew: Crew
+    plan: StartPlan, folder: RunFolder, state: TrainState, data_digest: str, dist_context: Crew
 ) -> None:
     """Write how a run resumes, so that a kill before its next checkpoint loses nothing."""
     if plan.branch is not None:
         _copy_log_of_parent(plan.branch, folder, state.step)
-    _write_settings(folder, plan.settings, state, data_digest, crew)
+    _write_settings(folder, plan.settings, state, data_digest, dist_context)
     if plan.branch is not None or (
         plan.resume_plan is not None and plan.resume_plan.changes_meaning
     ):
@@ -163,7 +168,7 @@ def _write_resumed_run(
             state,
             plan.settings,
             data_digest=data_digest,
-            world_size=crew.world_size,
+            world_size=dist_context.world_size,
         )
 
 
@@ -202,7 +207,7 @@ def _write_settings(
     settings: TrainSettings,
     state: TrainState,
     data_digest: str,
-    crew: Crew,
+    dist_context: Crew,
     more: Mapping[str, Any] | None = None,
 ) -> None:
     """Write settings.json: current settings, their history, and how the run started."""
@@ -211,7 +216,7 @@ def _write_settings(
         **({"extensions": extensions} if (extensions := recorded("weights")) else {}),
         "versions": {"torch": torch.__version__, "python": platform.python_version()},
         "threads": torch.get_num_threads(),
-        "processes": crew.world_size,
+        "processes": dist_context.world_size,
         "muon_precision": state.updater.muon_precision,
         **(more or {}),
     }
@@ -233,20 +238,20 @@ def _read_settings(folder: RunFolder) -> dict[str, Any]:
 
 
 def _record_execution_changes(
-    checkpoint: Checkpoint, crew: Crew, state: TrainState, progress: TrainProgress
+    checkpoint: Checkpoint, dist_context: Crew, state: TrainState, progress: TrainProgress
 ) -> None:
     """Report and record changed processes, threads and Muon precision."""
     header = checkpoint.header
     muon = state.updater.muon_precision
     now = {
-        "processes": (header["world_size"], crew.world_size),
+        "processes": (header["world_size"], dist_context.world_size),
         "threads": (header.get("threads"), torch.get_num_threads()),
         # the only one that there was
         "muon_precision": (header.get("muon_precision", "bfloat16"), muon),
     }
     descriptions = {
-        "processes": f"{crew.world_size} processes instead of {header['world_size']}: the same to "
-        "rounding, not to the bit",
+        "processes": f"{dist_context.world_size} processes instead of {header['world_size']}: "
+        "the same to rounding, not to the bit",
         "threads": f"{torch.get_num_threads()} threads instead of {header.get('threads')}: the "
         "same to rounding, not to the bit",
         "muon_precision": f"Muon's products in {muon} instead of {now['muon_precision'][0]}, which "

@@ -72,7 +72,7 @@ class RunFolder:
 
 
 @contextlib.contextmanager
-def claim_run(folder: RunFolder, crew: "Crew") -> Iterator[None]:
+def claim_run(folder: RunFolder, dist_context: "Crew") -> Iterator[None]:
     """Lock a run's folder against other trainers for the block; all processes must call it.
 
     The first process holds the lock. Folders that are empty afterwards are removed again.
@@ -83,7 +83,7 @@ def claim_run(folder: RunFolder, crew: "Crew") -> Iterator[None]:
     new = [place for place in (folder.root, *folder.root.parents) if not place.exists()]
     problem: TrilightError | None = None
     with contextlib.ExitStack() as stack:
-        if crew.is_first:
+        if dist_context.is_first:
             try:
                 if not stack.enter_context(claimed(folder.claim)):
                     problem = TrilightError(
@@ -93,12 +93,12 @@ def claim_run(folder: RunFolder, crew: "Crew") -> Iterator[None]:
                     )
             except TrilightError as error:
                 problem = error
-        if crew.any(problem is not None):
+        if dist_context.any(problem is not None):
             raise problem or TrilightError(f"{folder.root}: the first process cannot train there.")
         try:
             yield
         finally:
-            if crew.is_first:
+            if dist_context.is_first:
                 for remove in (folder.claim.unlink, *(place.rmdir for place in new)):
                     with contextlib.suppress(OSError):
                         remove()

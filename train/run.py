@@ -94,7 +94,7 @@ def train_run(
             data=data,
             folder=folder,
             start=start or Start(),
-            crew=crew,
+            dist_context=crew,
             workers=workers,
             watched=watched or WatchSettings(),
             progress=progress if progress is not None and crew.is_first else TrainProgress(),
@@ -107,7 +107,7 @@ def _train(
     data: Sequence[str],
     folder: RunFolder,
     start: Start,
-    crew: Crew,
+    dist_context: Crew,
     workers: int | None,
     watched: WatchSettings,
     progress: TrainProgress,
@@ -115,36 +115,36 @@ def _train(
     """Train and evaluate in a folder that is locked; arguments as in `train_run`."""
     began = time.monotonic()
     dataset = open_mixture(data)
-    start = _resolve_restart(start, folder, crew)
+    start = _resolve_restart(start, folder, dist_context)
     early_notes = _NoteBuffer(progress)
     for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
         early_notes.noted(note)
-    workers = _choose_workers(settings, crew, early_notes) if workers is None else workers
-    plan = plan_start(settings, folder, dataset.digest, start, crew, early_notes)
+    workers = _choose_workers(settings, dist_context, early_notes) if workers is None else workers
+    plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
     settings = plan.settings
-    lpips = crew.run_once_per_machine(partial(load_lpips, start.lpips))
-    objective = Objective(settings.loss, lpips).to(crew.device)
+    lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
+    objective = Objective(settings.loss, lpips).to(dist_context.device)
     _check_data(dataset, settings)
-    state = init_or_resume_state(plan, folder, dataset, crew, early_notes)
-    judge = _make_judge(dataset, settings, state.unusable) if crew.is_first else None
+    state = init_or_resume_state(plan, folder, dataset, dist_context, early_notes)
+    judge = _make_judge(dataset, settings, state.unusable) if dist_context.is_first else None
     recorder = None
-    if crew.is_first:
+    if dist_context.is_first:
         recorder = _recorder(state, settings, folder, judge, progress, watched)
-        _record_start(folder, state, crew, early_notes.texts, resumed=start.resume)
+        _record_start(folder, state, dist_context, early_notes.texts, resumed=start.resume)
     trainer = Trainer(
         state=state,
         settings=settings,
         objective=objective,
-        crew=crew,
+        dist_context=dist_context,
         folder=folder,
         data_digest=dataset.digest,
         recorder=recorder,
         watched=watched,
     )
-    with closing(_batches(dataset, settings, state, crew, workers)) as batches:
+    with closing(_batches(dataset, settings, state, dist_context, workers)) as batches:
         cost = partial(scene_flops, settings)
         most = settings.scenes_per_pass
-        with closing(step_scenes(batches, cost, most, crew.device)) as steps:
+        with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
             trainer.run(steps)
     if recorder is None:
         return None
@@ -152,40 +152,40 @@ def _train(
     return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
 
 
-def _choose_workers(settings: TrainSettings, crew: Crew, progress: TrainProgress) -> int:
+def _choose_workers(settings: TrainSettings, dist_context: Crew, progress: TrainProgress) -> int:
     """Return the number of decoding threads, and report the reason."""
     choice = choose_workers(
         detect_machine(),
         settings,
-        on_gpu=crew.device.type == "cuda",
+        on_gpu=dist_context.device.type == "cuda",
         busy_threads=torch.get_num_threads(),
     )
     progress.noted(choice.reason)
     return choice.threads
 
 
-def _resolve_restart(start: Start, folder: RunFolder, crew: Crew) -> Start:
+def _resolve_restart(start: Start, folder: RunFolder, dist_context: Crew) -> Start:
     """Decide in all processes alike whether a restartable run resumes.
 
     All processes must call it: torchrun counts restarts for each machine separately, and a network
     file system shows a new file to one machine before another.
     """
-    has_checkpoint = crew.any(start.restartable and bool(saved_steps(folder.checkpoints)))
+    has_checkpoint = dist_context.any(start.restartable and bool(saved_steps(folder.checkpoints)))
     return dataclasses.replace(start, resume=start.resume or has_checkpoint, restartable=False)
 
 
 def _batches(
-    data: TrainingData, settings: TrainSettings, state: TrainState, crew: Crew, workers: int
+    data: TrainingData, settings: TrainSettings, state: TrainState, dist_context: Crew, workers: int
 ) -> Generator[list[TrainingScene], None, None]:
     """Return the scenes of this process for each step, beginning with the state's step."""
     stream = dataclasses.replace(
-        stream_settings(settings), lookup_in_threads=not decodes_on_device(crew.device)
+        stream_settings(settings), lookup_in_threads=not decodes_on_device(dist_context.device)
     )
     return stream_batches(
         data.split("train"),
         stream,
         state.step,
-        share=crew.share,
+        share=dist_context.share,
         workers=workers,
         unusable=state.unusable,
         mixture=state.mixture,
@@ -207,15 +207,15 @@ class _NoteBuffer(TrainProgress):
 def _record_start(
     folder: RunFolder,
     state: TrainState,
-    crew: Crew,
+    dist_context: Crew,
     notes: Sequence[str],
     *,
     resumed: bool,
 ) -> None:
     """Write the start or resume of the trainer, and its notes so far, into notes.jsonl."""
     how = "went on" if resumed else "began"
-    many = "process" if crew.world_size == 1 else "processes"
-    for text in (f"{how} on {crew.device}, {crew.world_size} {many}", *notes):
+    many = "process" if dist_context.world_size == 1 else "processes"
+    for text in (f"{how} on {dist_context.device}, {dist_context.world_size} {many}", *notes):
         add_note(folder.notes, state.step, text)
 
 

@@ -227,12 +227,12 @@ def path_of_step(folder: Path, step: int) -> Path:
     return folder / f"{PREFIX}{step:09d}{SUFFIX}"
 
 
-def newest_checkpoint(folder: Path, crew: Crew, note: Callable[[str], None]) -> Checkpoint:
+def newest_checkpoint(folder: Path, dist_context: Crew, note: Callable[[str], None]) -> Checkpoint:
     """Return the newest checkpoint that is not damaged.
 
     Args:
         folder: folder of the checkpoints.
-        crew: the processes that resume together; all must call it.
+        dist_context: the processes that resume together; all must call it.
         note: called with a message if a damaged checkpoint was skipped.
 
     Raises:
@@ -246,7 +246,7 @@ def newest_checkpoint(folder: Path, crew: Crew, note: Callable[[str], None]) -> 
     checkpoint = _newest_readable(folder, steps, note)
     step = checkpoint.header["step"]
     # bit by bit: a float32 mean of large numbers is rounded, and all processes must agree
-    if any(0 < share < 1 for share in crew.mean([step >> bit & 1 for bit in range(32)])):
+    if any(0 < share < 1 for share in dist_context.mean([step >> bit & 1 for bit in range(32)])):
         raise TrilightError(
             f"{folder.parent}: the processes do not read the same checkpoint; this one reads that "
             f"of step {step}. Check that the folder is the same on every machine, and resume "

@@ -14,7 +14,7 @@ from train.loop.decision import Decision, defers_sync, move_along, move_towards
 from train.settings import Precision
 
 
-def fitting_precision(crew: Crew) -> Precision:
+def fitting_precision(dist_context: Crew) -> Precision:
     """Return the fastest precision of Muon's products that all processes support.
 
     bfloat16 on a GPU and on CPUs with AVX512_BF16, as all with AMX have. Elsewhere such a product
@@ -23,8 +23,8 @@ def fitting_precision(crew: Crew) -> Precision:
     equal in all processes, since each updates its own copy of the weights, and copies must not
     drift apart. All processes must call it.
     """
-    quick = crew.device.type != "cpu" or torch.cpu._is_avx512_bf16_supported()
-    return "float32" if crew.any(not quick) else "bfloat16"
+    quick = dist_context.device.type != "cpu" or torch.cpu._is_avx512_bf16_supported()
+    return "float32" if dist_context.any(not quick) else "bfloat16"
 
 
 def muon(

@@ -62,22 +62,24 @@ class Stepper:
     """Takes optimizer steps of a state's network, together with the other processes."""
 
     def __init__(
-        self, state: TrainState, settings: TrainSettings, objective: Objective, crew: Crew
+        self, state: TrainState, settings: TrainSettings, objective: Objective, dist_context: Crew
     ) -> None:
         self._state = state
         self._settings = settings
         self._objective = objective
-        self._crew = crew
-        self.defer_sync = defers_sync(crew.device)
+        self._dist_context = dist_context
+        self.defer_sync = defers_sync(dist_context.device)
         self._updates = torch.full(
-            (), float(state.updates), dtype=torch.float64, device=crew.device
+            (), float(state.updates), dtype=torch.float64, device=dist_context.device
         )
         self.activity = Activity()
         self.layers = LayerNorms(state.model)
-        self.is_compiled = compile_parts(state.model, objective, settings.compile, crew.device)
+        self.is_compiled = compile_parts(
+            state.model, objective, settings.compile, dist_context.device
+        )
         self.remarks: list[str] = []  # for the notes of the run
         self._net: nn.Module = state.model
-        if crew.world_size > 1:
+        if dist_context.world_size > 1:
             # Every weight is used. With find_unused_parameters=False torch would regroup the
             # gradients after the first step and sum them in another order from then on: a resumed
             # run would differ in the last bits.
@@ -121,7 +123,7 @@ class Stepper:
     def _leave_compiler(self, error: Exception) -> None:
         """Switch compilation off, before the weights have moved; raise if it was required."""
         reason = f"torch {torch.__version__} cannot compile the network ({type(error).__name__})"
-        if self._settings.compile == "yes" or self._crew.world_size > 1:
+        if self._settings.compile == "yes" or self._dist_context.world_size > 1:
             raise TrilightError(
                 f"training: {reason}; expected a version that can. Say --set compile=no, with "
                 "--resume where there is a checkpoint, or install another torch."
@@ -137,17 +139,19 @@ class Stepper:
         activity = self.activity
         state.updater.zero_grad()
         num_views = sum(batch.noise_BV.numel() for batch in batches)
-        sums = torch.zeros(4, dtype=torch.float64, device=self._crew.device)
+        sums = torch.zeros(4, dtype=torch.float64, device=self._dist_context.device)
         for index, batch in enumerate(batches):
             last = index == len(batches) - 1
             with contextlib.nullcontext() if last else self._without_exchange():
-                sums += self._add_gradient(batch.to(self._crew.device), num_views, last=last)
+                sums += self._add_gradient(
+                    batch.to(self._dist_context.device), num_views, last=last
+                )
         activity.begin("optimiser")
         self.layers.record_gradients()
         norm = nn.utils.clip_grad_norm_(state.model.parameters(), self._settings.grad_clip)
         activity.begin("exchange")
         stop_flag = torch.full_like(sums[:1], float(asked_to_stop))
-        means = self._crew.mean_on_device(torch.cat([sums / num_views, stop_flag]))
+        means = self._dist_context.mean_on_device(torch.cat([sums / num_views, stop_flag]))
         activity.begin("optimiser")
         applied = self._move(means[0], norm, learning_rate)
         activity.begin("other")
@@ -187,9 +191,11 @@ class Stepper:
         prediction = predict_log10(self._net, batch, resolution, self._settings.precision)
         losses = self._objective(prediction, batch.target_BVRR3, batch.noise_BV)
         self.activity.begin("backward")
-        if last and self._crew.world_size > 1:
+        if last and self._dist_context.world_size > 1:
             prediction.register_hook(self._note_exchange)
-        with quick_products(self._crew.device, wanted=self._settings.precision == "bfloat16"):
+        with quick_products(
+            self._dist_context.device, wanted=self._settings.precision == "bfloat16"
+        ):
             (losses.total_BV.sum() / num_views).backward()
         self.activity.begin("other")
         predicted_BV = prediction.detach().clamp(min=0).mean(dim=(2, 3, 4))

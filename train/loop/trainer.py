@@ -130,7 +130,7 @@ class Trainer:
         state: TrainState,
         settings: TrainSettings,
         objective: Objective,
-        crew: Crew,
+        dist_context: Crew,
         folder: RunFolder,
         data_digest: str,
         recorder: Recorder | None,
@@ -139,12 +139,12 @@ class Trainer:
         """Create the trainer; `recorder` is None in all processes but the first."""
         self.state = state
         self.settings = settings
-        self.crew = crew
+        self.dist_context = dist_context
         self.folder = folder
         self.data_digest = data_digest
         self.recorder = recorder
-        self.stepper = Stepper(state, settings, objective, crew)
-        self.copies = CopyStream(crew.device)
+        self.stepper = Stepper(state, settings, objective, dist_context)
+        self.copies = CopyStream(dist_context.device)
         self.dead_start = DeadStartDetector(settings)
         self.window = Window(state.reports)
         self.pending: list[_PendingStep] = []
@@ -158,7 +158,7 @@ class Trainer:
             settings,
             watched or WatchSettings(),
             self.stepper,
-            crew,
+            dist_context,
             folder,
             note=self._note,
             report_hang=progress.hung,
@@ -191,7 +191,7 @@ class Trainer:
         if self.state.step == 0 or not self._is_validation_due():
             return
         missing = self.recorder is not None and not self.recorder.has_validated(self.state.step)
-        if self.crew.any(missing):
+        if self.dist_context.any(missing):
             self._validate(asked_to_stop)
             self._stop_if_asked(asked_to_stop, together=True)
 
@@ -202,9 +202,9 @@ class Trainer:
         statistics of a step; with `together` they exchange it now, which waits.
         """
         stopping = self.asked_to_stop
-        if together or self.crew.world_size == 1:
+        if together or self.dist_context.world_size == 1:
             with self.watch.exchange():
-                stopping = self.crew.any(asked_to_stop())
+                stopping = self.dist_context.any(asked_to_stop())
         if stopping:
             self._save_and_raise(Stopped(self.state.step))
 
@@ -214,7 +214,7 @@ class Trainer:
                 self._save()
             self.writing.wait()
             # torchrun ends all processes with the first that ends, so wait for the file
-            self.crew.barrier()
+            self.dist_context.barrier()
         raise reason
 
     def _step(self, steps: Iterator[StepScenes], asked_to_stop: Callable[[], bool]) -> None:
@@ -340,7 +340,7 @@ class Trainer:
     ) -> None:
         for spike in spikes:
             recorder.row(spike)
-        peak = device_peak(self.crew.device, PRODUCTS[self.settings.precision])
+        peak = device_peak(self.dist_context.device, PRODUCTS[self.settings.precision])
         row = {
             "step": self.state.step,
             "learning_rate": learning_rate(self.state.step - 1, self.settings),
@@ -358,12 +358,12 @@ class Trainer:
     def _save(self) -> None:
         self._sync()
         self.saved_step = self.state.step
-        if self.crew.is_first:
+        if self.dist_context.is_first:
             save_checkpoint(
                 self.folder.checkpoints,
                 self.state,
                 self.settings,
                 data_digest=self.data_digest,
-                world_size=self.crew.world_size,
+                world_size=self.dist_context.world_size,
                 submit=self.writing.begin,
             )

@@ -18,9 +18,9 @@ LEAST_LOST_S = 0.05
 """Minimum seconds per step that a slow process costs before it is reported."""
 
 
-def exchange_values(crew: Crew, values: Mapping[str, Any]) -> list[dict[str, Any]]:
+def exchange_values(dist_context: Crew, values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the values of each process, by rank; all must call it."""
-    return [json.loads(text) for text in crew.gather_text(json.dumps(values))]
+    return [json.loads(text) for text in dist_context.gather_text(json.dumps(values))]
 
 
 def own_seconds(taken_s: Mapping[str, float], steps: int) -> float:

@@ -25,7 +25,7 @@ class ProcessMonitor:
         settings: TrainSettings,
         watched: WatchSettings,
         stepper: Stepper,
-        crew: Crew,
+        dist_context: Crew,
         folder: RunFolder,
         *,
         note: Callable[[str], None],
@@ -33,7 +33,7 @@ class ProcessMonitor:
     ) -> None:
         """Create the monitors; `note` and `report_hang` are as in `Watchdog`."""
         self._settings = settings
-        self._crew = crew
+        self._dist_context = dist_context
         self._activity = stepper.activity
         self._layers = stepper.layers
         self._spikes = SpikeDetector(watched.spike_bound)
@@ -41,10 +41,15 @@ class ProcessMonitor:
         self._steps = 0
         self._named_rank: int | None = None
         self._note = note
-        traced = watched.profile if crew.is_first else 0
-        self._profiler = StepProfiler(traced, crew.device, folder.monitoring, note)
+        traced = watched.profile if dist_context.is_first else 0
+        self._profiler = StepProfiler(traced, dist_context.device, folder.monitoring, note)
         self._watchdog = Watchdog(
-            watched, self._activity, crew, folder.monitoring, note=note, report_hang=report_hang
+            watched,
+            self._activity,
+            dist_context,
+            folder.monitoring,
+            note=note,
+            report_hang=report_hang,
         )
         self._step = 0
 
@@ -62,7 +67,7 @@ class ProcessMonitor:
         self._step = step
         self._watchdog.begin("step", step)
         self._profiler.begin_step(step)
-        self._layers.expect_update(self._crew.is_first and self.is_window_end(step))
+        self._layers.expect_update(self._dist_context.is_first and self.is_window_end(step))
 
     def end_step(self) -> None:
         """End the step on the host; a GPU may still work on it."""
@@ -100,7 +105,7 @@ class ProcessMonitor:
         taken_s = self._activity.pop_seconds()
         row: dict[str, Any] = {
             "time_s": {part: round(seconds, 4) for part, seconds in taken_s.items()},
-            "memory_mb": memory_mb(self._crew.device),
+            "memory_mb": memory_mb(self._dist_context.device),
             "layers": self._layers.pop_row(),
         }
         own_s = own_seconds(taken_s, self._steps)
@@ -109,8 +114,10 @@ class ProcessMonitor:
         self._spikes_found = []
         spikes = [asdict(spike) for spike in spikes_found]
         with self.exchange():
-            by_rank = exchange_values(self._crew, {"own_s": round(own_s, 4), "spikes": spikes})
-        if self._crew.world_size > 1:
+            by_rank = exchange_values(
+                self._dist_context, {"own_s": round(own_s, 4), "spikes": spikes}
+            )
+        if self._dist_context.world_size > 1:
             row["own_s"] = [said["own_s"] for said in by_rank]
             self._note_slow_rank(row["own_s"])
         return row, _merge_spikes([said["spikes"] for said in by_rank])

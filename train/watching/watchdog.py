@@ -76,7 +76,7 @@ class Watchdog:
         self,
         settings: WatchSettings,
         activity: Activity,
-        crew: Crew,
+        dist_context: Crew,
         folder: Path,
         *,
         note: Callable[[str], None],
@@ -87,14 +87,14 @@ class Watchdog:
         Args:
             settings: time limits, and the action on a hang.
             activity: current phase of the process.
-            crew: the processes that train together.
+            dist_context: the processes that train together.
             folder: folder of the stack files.
             note: called with a message about a hang, in the watchdog's thread.
             report_hang: called GRACE_S after a hang if the run is to stop on one.
         """
         self._settings = settings
         self._activity = activity
-        self._crew = crew
+        self._dist_context = dist_context
         self._folder = folder
         self._report_hang = report_hang
         self._note = note
@@ -152,7 +152,7 @@ class Watchdog:
             if now_s >= hang.next_s:
                 hang.next_s = stretch.since_s + 2 * (now_s - stretch.since_s)  # ever more rarely
                 self._report(hang, now_s)
-            if self._crew.is_first:
+            if self._dist_context.is_first:
                 self._forward_reports(hang, now_s)
                 self._stop_if_asked(hang, now_s)
 
@@ -160,10 +160,10 @@ class Watchdog:
         """Write the stacks, and report the current phase of this process."""
         stretch = hang.stretch
         doing = self._activity.now
-        path = self._path(stretch.step, self._crew.rank)
+        path = self._path(stretch.step, self._dist_context.rank)
         usual = "" if stretch.usual_s is None else f", where {stretch.usual_s:.2g} s is usual"
         line = (
-            f"process {self._crew.rank} of {self._crew.world_size}: {stretch.name} "
+            f"process {self._dist_context.rank} of {self._dist_context.world_size}: {stretch.name} "
             f"has taken {now_s - stretch.since_s:.1f} s{usual}; for "
             f"{now_s - doing.since_s:.1f} s it has been in: {PHASES[doing.phase]}"
         )
@@ -185,7 +185,7 @@ class Watchdog:
     def _forward_reports(self, hang: _Hang, now_s: float) -> None:
         """Report new stack files of the other processes about the same step."""
         began_unix_s = time.time() - (now_s - hang.stretch.since_s)
-        hang.passed_on.add(self._path(hang.stretch.step, self._crew.rank))
+        hang.passed_on.add(self._path(hang.stretch.step, self._dist_context.rank))
         pattern = self._path(hang.stretch.step, "*").name
         for path in sorted(set(self._folder.glob(pattern)) - hang.passed_on):
             with suppress(OSError):
