@@ -114,8 +114,7 @@ class Fusion(nn.Module):
         if self.skip is not None and coarse_MCHW is not None:
             grid_MCHW = coarse_MCHW + self.skip(grid_MCHW)
         fused = self.project(self.refine(grid_MCHW))
-        enlarged: Tensor = BilinearUpsample.apply(fused, size)
-        return enlarged
+        return BilinearUpsample.apply(fused, size)
 
 
 class DptHead(nn.Module):

@@ -119,8 +119,7 @@ class _Unpack(torch.autograd.Function):
 
 def pack_tokens(x_SNK: Tensor, packing: Packing) -> Tensor:
     """Return the valid tokens: [S, N, ...] -> [P, ...]."""
-    tokens: Tensor = _Pack.apply(x_SNK.flatten(0, 1), *packing[:3])
-    return tokens
+    return _Pack.apply(x_SNK.flatten(0, 1), *packing[:3])
 
 
 def attend_packed(

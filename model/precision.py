@@ -84,8 +84,7 @@ def as_given(device: torch.device) -> AbstractContextManager[None]:
     """Return a context without autocast, in which operations keep the types of their inputs."""
     if device.type == "meta":  # it has no autocast, and operations are only counted there
         return nullcontext()  # torch 2.11 cannot compile a check whether a device has it
-    context: AbstractContextManager[None] = torch.autocast(device.type, enabled=False)
-    return context
+    return torch.autocast(device.type, enabled=False)
 
 
 @contextmanager

@@ -178,8 +178,7 @@ def _flip_columns(pictures_VRR3: NDArray) -> NDArray:
     """Flip pictures horizontally; moving whole pixels takes half the time of single numbers."""
     pixel = np.dtype((np.void, 3 * pictures_VRR3.itemsize))
     pixels_VRR1 = np.ascontiguousarray(pictures_VRR3).view(pixel)
-    flipped: NDArray = np.ascontiguousarray(pixels_VRR1[:, :, ::-1]).view(pictures_VRR3.dtype)
-    return flipped
+    return np.ascontiguousarray(pixels_VRR1[:, :, ::-1]).view(pictures_VRR3.dtype)
 
 
 def _reorder_channels(pictures_VRR3: NDArray, order: NDArray[np.int64]) -> NDArray:

@@ -215,8 +215,7 @@ class Stepper:
     def _without_exchange(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context without the exchange of gradients, for all batches but the last."""
         if isinstance(self._net, DistributedDataParallel):
-            context: contextlib.AbstractContextManager[Any] = self._net.no_sync()
-            return context
+            return self._net.no_sync()
         return contextlib.nullcontext()
 
 

@@ -140,8 +140,7 @@ class Lpips(nn.Module):
         return distance_M
 
     def _features(self, picture_M3RR: Tensor) -> list[Tensor]:
-        taps: list[Tensor] = self.vgg16((2 * picture_M3RR - 1 - self.shift_311) / self.scale_311)
-        return taps
+        return self.vgg16((2 * picture_M3RR - 1 - self.shift_311) / self.scale_311)
 
 
 def _unit(x_MCHW: Tensor) -> Tensor:
