@@ -1,4 +1,4 @@
-"""The state with which a run begins or goes on, and settings.json, which says so."""
+"""Initial or resumed state of a run, and the settings.json that records it."""
 
 import dataclasses
 import json
@@ -20,19 +20,19 @@ from storage.errors import TrilightError
 from storage.extensions import recorded
 from storage.records.safe_read import read_plain
 from storage.typed_json import read_json
-from train.data.mixture import RECORD, mixture_of
+from train.data.mixture import RECORD, plan_mixture
 from train.folder import RunFolder
-from train.going_on import Event, GoingOn, event_records, going_on
+from train.going_on import Event, ResumePlan, event_records, plan_resume
 from train.loop.checkpoints import (
     HEADER_KEY,
     Checkpoint,
     is_checkpoint,
-    keep_checkpoint,
     network_of_run,
+    newest_checkpoint,
     path_of_step,
     read_checkpoint,
-    resumed_checkpoint,
-    resumed_state,
+    restore_state,
+    save_checkpoint,
     saved_steps,
 )
 from train.loop.crew import Crew
@@ -48,36 +48,36 @@ from train.watching.rows import read_rows
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Beginning:
-    """What a run begins or goes on with."""
+class StartPlan:
+    """Everything that a run starts or resumes with; nothing is written yet."""
 
     settings: TrainSettings
-    """The run's, as they are now."""
+    """Settings of the next step."""
     network: RenderFormer | None = None
-    """Whose weights it takes over; None where it goes on, or begins with random ones."""
-    network_place: str = ""
-    """Where that network was opened."""
+    """Network whose weights are copied; None for random weights or a checkpoint."""
+    network_source: str = ""
+    """Path or name from which that network was opened."""
     checkpoint: Checkpoint | None = None
-    """From which it goes on."""
-    going: GoingOn | None = None
-    """How it goes on."""
+    """Checkpoint that is restored; None for a new run."""
+    resume_plan: ResumePlan | None = None
+    """Changed settings and history of a resumed run; None for a new run."""
     branch: Path | None = None
-    """The checkpoint or run that it leaves for a folder of its own."""
+    """Checkpoint or run folder that a new folder continues; None otherwise."""
 
 
-def beginning(
+def plan_start(
     settings: TrainSettings,
     folder: RunFolder,
     data_digest: str,
     start: Start,
-    crew: Crew,
+    dist_context: Crew,
     progress: TrainProgress,
-) -> Beginning:
-    """Read what the run begins or goes on with; nothing is written yet.
+) -> StartPlan:
+    """Read what the run starts or resumes with, without writing anything.
 
     Raises:
-        TrilightError: the folder holds a run, or lacks one; a checkpoint that is damaged; settings
-            or data that are not the run's and were not decided on.
+        TrilightError: the folder holds a run already, or has none to resume; the checkpoint is
+            damaged; or settings or data differ from the run's without a recorded decision.
     """
     if not start.resume and saved_steps(folder.checkpoints):
         raise TrilightError(
@@ -86,84 +86,94 @@ def beginning(
         )
     start.check(settings)
     if not start.goes_on:
-        place = start.begin_with
-        if place is None:
-            return Beginning(settings=settings)
-        network = open_network(place, network_of_run)
+        source = start.begin_with
+        if source is None:
+            return StartPlan(settings=settings)
+        network = open_network(source, network_of_run)
         settings = dataclasses.replace(settings, model=network.config)
-        return Beginning(settings=settings, network=network, network_place=place)
+        return StartPlan(settings=settings, network=network, network_source=source)
     branch = None if start.resume or start.branch is None else Path(start.branch)
     if branch is None or branch.is_dir():
         checkpoints = (folder if branch is None else RunFolder(branch)).checkpoints
-        checkpoint = resumed_checkpoint(checkpoints, crew, progress.noted)
+        checkpoint = newest_checkpoint(checkpoints, dist_context, progress.noted)
     else:
         checkpoint = read_checkpoint(branch)
-        crew.any(False)  # a barrier: the first process soon writes what was just looked for
+        # the first process soon writes into the folder that all have looked at
+        dist_context.barrier()
     if settings.from_weights:
         config = decode_config(checkpoint.header["model"], str(branch or folder.root))
         settings = dataclasses.replace(settings, model=config)
-    going = going_on(checkpoint.header, settings, data_digest, start.decisions)
-    return Beginning(settings=going.settings, checkpoint=checkpoint, going=going, branch=branch)
+    resume_plan = plan_resume(checkpoint.header, settings, data_digest, start.decisions)
+    return StartPlan(
+        settings=resume_plan.settings, checkpoint=checkpoint, resume_plan=resume_plan, branch=branch
+    )
 
 
-def begun(
-    plan: Beginning, folder: RunFolder, data: TrainingData, crew: Crew, progress: TrainProgress
+def init_or_resume_state(
+    plan: StartPlan,
+    folder: RunFolder,
+    data: TrainingData,
+    dist_context: Crew,
+    progress: TrainProgress,
 ) -> TrainState:
-    """Return the state before the run's next step.
+    """Create or restore the state before the run's next step, and record it on disk.
 
-    A run that has just begun, branched or changed its meaning is on disk when this returns.
+    A run that has just started, branched or changed its meaning is on disk when this returns.
 
     Raises:
-        TrilightError: not as many weights of datasets as there are.
+        TrilightError: `data_weights` has another length than the list of datasets.
     """
-    precision, data_digest = fitting_precision(crew), data.digest
+    precision = fitting_precision(dist_context)
+    data_digest = data.digest
     header = None if plan.checkpoint is None else plan.checkpoint.header
-    mixture = mixture_of(data, plan.settings, header)
+    mixture = plan_mixture(data, plan.settings, header)
     if mixture is not None:
         progress.noted(f"the stream mixes {mixture}")
-    if plan.checkpoint is None or plan.going is None:
-        state = new_state(plan.settings, crew.device, plan.network, precision)
+    if plan.checkpoint is None or plan.resume_plan is None:
+        state = new_state(plan.settings, dist_context.device, plan.network, precision)
         state.mixture = mixture
         digest = None
         if plan.network is not None:
             digest = sha256_hex(encode_weights(plan.network))
-            header = _header_of(Path(plan.network_place)) | {"sha256": digest}
+            header = _header_of(Path(plan.network_source)) | {"sha256": digest}
             state.history = (_origin(0, "weights", header),)
-        if crew.is_first:
+        if dist_context.is_first:
             more = {"begun_with_sha256": digest}
-            _write_settings(folder, plan.settings, state, data_digest, crew, more)
+            _write_settings(folder, plan.settings, state, data_digest, dist_context, more)
         return state
-    state = resumed_state(plan.checkpoint, plan.going, crew.device, precision)
+    state = restore_state(plan.checkpoint, plan.resume_plan, dist_context.device, precision)
     state.mixture = mixture
     if plan.branch is not None:
         state.history += (_origin(state.step, "checkpoint", plan.checkpoint.header),)
-    for note in plan.going.notes:
+    for note in plan.resume_plan.notes:
         progress.noted(note)
-    _note_other_execution(plan.checkpoint, crew, state, progress)
-    if crew.is_first:
-        _write_down(plan, folder, state, data_digest, crew)
+    _record_execution_changes(plan.checkpoint, dist_context, state, progress)
+    if dist_context.is_first:
+        _write_resumed_run(plan, folder, state, data_digest, dist_context)
     return state
 
 
-def _write_down(
-    plan: Beginning, folder: RunFolder, state: TrainState, data_digest: str, crew: Crew
+def _write_resumed_run(
+    plan: StartPlan, folder: RunFolder, state: TrainState, data_digest: str, dist_context: Crew
 ) -> None:
-    """Write how a run goes on, so that a kill before its next checkpoint forgets nothing."""
+    """Write how a run resumes, so that a kill before its next checkpoint loses nothing."""
     if plan.branch is not None:
-        _take_log(plan.branch, folder, state.step)
-    _write_settings(folder, plan.settings, state, data_digest, crew)
-    if plan.branch is not None or (plan.going is not None and plan.going.has_decided):
-        keep_checkpoint(
+        _copy_log_of_parent(plan.branch, folder, state.step)
+    _write_settings(folder, plan.settings, state, data_digest, dist_context)
+    if plan.branch is not None or (
+        plan.resume_plan is not None and plan.resume_plan.changes_meaning
+    ):
+        save_checkpoint(
             folder.checkpoints,
             state,
             plan.settings,
             data_digest=data_digest,
-            world_size=crew.world_size,
+            world_size=dist_context.world_size,
         )
 
 
 def _origin(step: int, name: str, header: Mapping[str, Any]) -> Event:
-    """Return the event that says what a run began with, without the place where that lay."""
+    """Return the event of what a run started with; it holds no path of the user's machine."""
     settings = header.get("settings", {})
     after = {
         "run": settings.get("run"),
@@ -173,21 +183,21 @@ def _origin(step: int, name: str, header: Mapping[str, Any]) -> Event:
     return Event(step=step, kind="origin", name=name, after=after)
 
 
-def _header_of(place: Path) -> dict[str, Any]:
-    """Return the header of the checkpoint that weights are taken from; empty where it is none."""
-    if place.is_dir() and (steps := saved_steps(RunFolder(place).checkpoints)):
-        place = path_of_step(RunFolder(place).checkpoints, steps[-1])
-    if place.suffix != ".safetensors" or not place.is_file():
+def _header_of(path: Path) -> dict[str, Any]:
+    """Return the header of a checkpoint, or an empty one for other weights files."""
+    if path.is_dir() and (steps := saved_steps(RunFolder(path).checkpoints)):
+        path = path_of_step(RunFolder(path).checkpoints, steps[-1])
+    if path.suffix != ".safetensors" or not path.is_file():
         return {}
-    metadata = read_metadata(place)
+    metadata = read_metadata(path)
     return dict(json.loads(metadata[HEADER_KEY])) if is_checkpoint(metadata) else {}
 
 
-def _take_log(place: Path, folder: RunFolder, step: int) -> None:
-    """Begin the log of a branch with that of its run, up to the step where it leaves it."""
-    of_run = RunFolder(place if place.is_dir() else place.parent.parent)
+def _copy_log_of_parent(path: Path, folder: RunFolder, step: int) -> None:
+    """Copy the parent's metrics up to the step of the branch."""
+    parent = RunFolder(path if path.is_dir() else path.parent.parent)
     log = MetricsLog(folder.metrics, first_step=0)
-    for row in read_rows(of_run.metrics):
+    for row in read_rows(parent.metrics):
         if row["step"] <= step:
             log.append(row)
 
@@ -197,16 +207,16 @@ def _write_settings(
     settings: TrainSettings,
     state: TrainState,
     data_digest: str,
-    crew: Crew,
+    dist_context: Crew,
     more: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write settings.json: what the run is now, how it came to be so, and where it began."""
-    begun = {
+    """Write settings.json: current settings, their history, and how the run started."""
+    origin = {
         "begun_with_sha256": None,
-        **({"extensions": found} if (found := recorded("weights")) else {}),
+        **({"extensions": extensions} if (extensions := recorded("weights")) else {}),
         "versions": {"torch": torch.__version__, "python": platform.python_version()},
         "threads": torch.get_num_threads(),
-        "processes": crew.world_size,
+        "processes": dist_context.world_size,
         "muon_precision": state.updater.muon_precision,
         **(more or {}),
     }
@@ -216,31 +226,32 @@ def _write_settings(
         **({RECORD: state.mixture.record()} if state.mixture else {}),
         "history": event_records(state.history),
     }
-    write_atomically(folder.settings, pretty_json(begun | _read_settings(folder) | now))
+    write_atomically(folder.settings, pretty_json(origin | _read_settings(folder) | now))
 
 
 def _read_settings(folder: RunFolder) -> dict[str, Any]:
-    """Return what settings.json says of the run's beginning; nothing where there is none."""
+    """Return the stored settings.json, or an empty record if it is missing or damaged."""
     try:
         return read_json(read_plain(folder.settings), dict[str, Any], str(folder.settings))
     except (OSError, TrilightError):
         return {}
 
 
-def _note_other_execution(
-    checkpoint: Checkpoint, crew: Crew, state: TrainState, progress: TrainProgress
+def _record_execution_changes(
+    checkpoint: Checkpoint, dist_context: Crew, state: TrainState, progress: TrainProgress
 ) -> None:
-    """Note and record what differs in how the run is executed, beside its settings."""
-    header, muon = checkpoint.header, state.updater.muon_precision
+    """Report and record changed processes, threads and Muon precision."""
+    header = checkpoint.header
+    muon = state.updater.muon_precision
     now = {
-        "processes": (header["world_size"], crew.world_size),
+        "processes": (header["world_size"], dist_context.world_size),
         "threads": (header.get("threads"), torch.get_num_threads()),
         # the only one that there was
         "muon_precision": (header.get("muon_precision", "bfloat16"), muon),
     }
-    said = {
-        "processes": f"{crew.world_size} processes instead of {header['world_size']}: the same to "
-        "rounding, not to the bit",
+    descriptions = {
+        "processes": f"{dist_context.world_size} processes instead of {header['world_size']}: "
+        "the same to rounding, not to the bit",
         "threads": f"{torch.get_num_threads()} threads instead of {header.get('threads')}: the "
         "same to rounding, not to the bit",
         "muon_precision": f"Muon's products in {muon} instead of {now['muon_precision'][0]}, which "
@@ -249,6 +260,6 @@ def _note_other_execution(
     for name, (before, after) in now.items():
         if before is None or after is None or before == after:
             continue
-        progress.noted(f"the run goes on with {said[name]}")
+        progress.noted(f"the run goes on with {descriptions[name]}")
         event = Event(step=state.step, kind="execution", name=name, before=before, after=after)
         state.history += (event,)

@@ -1,8 +1,8 @@
-"""How a run goes on: as it was begun, with what was decided since, executed as it is asked now.
+"""Resume plan of a run: its stored settings, recorded changes, and today's execution settings.
 
-A command that resumes states the run as it was begun. What it says of execution is taken as it is.
-What it says of meaning has to be what the checkpoint was made with, but for the decisions that were
-named for it (`--change`), each of which the run records.
+A command that resumes states the run as it was started. Its execution settings are used as given.
+All other settings have to equal those of the checkpoint, except for named changes (`--change`),
+each of which the run records.
 """
 
 import dataclasses
@@ -14,126 +14,138 @@ from typing import Any, Literal
 from storage.errors import TrilightError
 from storage.settings.changes import changed, differences
 from storage.settings.described import described, from_record, settings_record
-from train.loop.schedule import decay_begins
+from train.loop.schedule import decay_start_step
 from train.settings import TrainSettings
 from train.stored_settings import known_settings
 
 DATA = "data"
-"""Name by which a decision names other data; its value is the start of their digest, behind
-`sha256:` for a dataset and `list:` for listed shards, so that no digits pass for a number."""
+"""Name of the change to other data. Its value is the start of their digest, after `sha256:` for a
+dataset and `list:` for listed shards, so that digits are never parsed as a number."""
 
 _FIXED = ("run", "from_weights", "model", "base_widths")
-"""Settings that no decision changes: with others it would be another run."""
+"""Settings that cannot change within a run."""
 
 _LEAST_DIGITS = 8
-"""So many of a digest name data; fewer could be those of others."""
+"""Minimum number of digits that identify a digest; fewer could match other data."""
 
 _EXECUTION = frozenset(field.name for field in described(TrainSettings) if field.is_execution)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """Something that happened to a run beside its steps."""
+    """Recorded change of a run between two steps."""
 
     step: int
-    """Steps that were done then."""
+    """Number of steps that were done by then."""
     kind: Literal["origin", "meaning", "execution", "earlier"]
-    """`origin`: what it began with; `meaning`: a decision; `execution`: it is executed otherwise;
-    `earlier`: the run is older than a setting, and stays as it was (`after`), whatever the command
-    says (`before`)."""
+    """`origin`: the weights or checkpoint of the start; `meaning`: a decision; `execution`: another
+    execution setting; `earlier`: the run is older than a setting and keeps its value (`after`),
+    whatever the command states (`before`)."""
     name: str
-    """The setting; `data`, `processes` or `threads`; of an origin, `weights` or `checkpoint`."""
+    """Name of the setting, or `data`, `processes`, `threads`; `weights` or `checkpoint` of an
+    origin."""
     before: Any = None
-    """Its value until then."""
+    """Value until that step; None of an origin."""
     after: Any = None
-    """Its value since; of an origin the run, its step, and the sha256 of what was taken over."""
+    """Value from that step on; of an origin the run, its step and the sha256 of its weights."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class GoingOn:
-    """A run that goes on."""
+class ResumePlan:
+    """Settings, history and messages of a run that resumes."""
 
     settings: TrainSettings
-    """Of the next step."""
+    """Settings of the next step."""
     history: tuple[Event, ...]
-    """What happened so far, what has just been decided included."""
+    """All events so far, oldest first, including those of this resume."""
     notes: tuple[str, ...]
-    """What its user should know."""
-    has_decided: bool
-    """Whether its meaning has just changed."""
+    """Messages for the user, one per change."""
+    changes_meaning: bool
+    """True if this resume changes a setting or the data that decide the weights."""
 
 
-def going_on(
+def plan_resume(
     header: Mapping[str, Any],
     typed: TrainSettings,
     data_digest: str,
     decisions: Mapping[str, Any],
-) -> GoingOn:
-    """Return how a run goes on from a checkpoint.
+) -> ResumePlan:
+    """Return the plan to resume a run from a checkpoint.
 
     Args:
-        header: of the checkpoint (train.loop.checkpoints).
-        typed: the run as the command states it, as it was begun or as it is now.
-        data_digest: of the data that is given.
-        decisions: settings by dotted name, and `data`, that are to change from here on.
+        header: header of the checkpoint (train.loop.checkpoints).
+        typed: the run as the command states it, as it was started or as it is now.
+        data_digest: digest of the data of this call.
+        decisions: settings by dotted name, and `data`, that change from here on.
 
     Raises:
-        TrilightError: settings or data that differ and are no decision; all are named, with both
-            values and both ways on. A decision that no run can take, or one of execution.
+        TrilightError: settings or data differ and were not decided on; the message names all of
+            them, both values and both remedies. A change that no run allows, or one of execution.
     """
     step = header["step"]
     before = from_record(TrainSettings, known_settings(header["settings"], "checkpoint"))
-    old, past = settings_record(before), events_of(header.get("history", ()))
-    named = {name: value for name, value in decisions.items() if name != DATA}
-    _require_meaning(named)
-    typed_otherwise = differences(old, settings_record(typed))
-    asked = {name: typed_otherwise[name] for name in typed_otherwise if name in _EXECUTION}
-    now = changed(before, asked | named)
-    new = differences(old, settings_record(now))
-    stated = _stated_before(past)
-    events, wrong = list[Event](), dict[str, Any]()
+    old_record = settings_record(before)
+    past_events = events_of(header.get("history", ()))
+    named_decisions = {name: value for name, value in decisions.items() if name != DATA}
+    _require_meaning(named_decisions)
+    typed_otherwise = differences(old_record, settings_record(typed))
+    execution_changes = {
+        name: typed_otherwise[name] for name in typed_otherwise if name in _EXECUTION
+    }
+    settings = changed(before, execution_changes | named_decisions)
+    new_values = differences(old_record, settings_record(settings))
+    stated = _original_values(past_events)
+    events = list[Event]()
+    undecided = dict[str, Any]()
     for name, value in typed_otherwise.items():
-        if name in new or value in stated.get(name, ()):
+        if name in new_values or value in stated.get(name, ()):
             continue
         if _lacks(header["settings"], name):
-            event = Event(step=step, kind="earlier", name=name, before=value, after=_at(old, name))
-            events.append(event)
+            stored = _value_at(old_record, name)
+            events.append(Event(step=step, kind="earlier", name=name, before=value, after=stored))
         else:
-            wrong[name] = value
-    if wrong:
-        raise _differing(old, wrong)
-    events += [
+            undecided[name] = value
+    if undecided:
+        raise _undecided_error(old_record, undecided)
+    events += _change_events(old_record, new_values, step)
+    events += _data_event(header, data_digest, decisions.get(DATA))
+    _require_possible(before, settings, step, events)
+    return ResumePlan(
+        settings=settings,
+        history=(*past_events, *events),
+        notes=tuple(_notes(before, settings, step, past_events, events)),
+        changes_meaning=any(event.kind == "meaning" for event in events),
+    )
+
+
+def _change_events(
+    old_record: Mapping[str, Any], new_values: Mapping[str, Any], step: int
+) -> list[Event]:
+    """Return the events of settings that change at a step."""
+    return [
         Event(
             step=step,
             kind="execution" if name in _EXECUTION else "meaning",
             name=name,
-            before=_at(old, name),
+            before=_value_at(old_record, name),
             after=value,
         )
-        for name, value in new.items()
+        for name, value in new_values.items()
     ]
-    events += _of_data(header, data_digest, decisions.get(DATA))
-    _require_possible(before, now, step, events)
-    return GoingOn(
-        settings=now,
-        history=(*past, *events),
-        notes=tuple(_notes(before, now, step, past, events)),
-        has_decided=any(event.kind == "meaning" for event in events),
-    )
 
 
 def events_of(records: Sequence[Mapping[str, Any]]) -> tuple[Event, ...]:
-    """Return the events of their records."""
+    """Return events from their JSON records."""
     return tuple(Event(**record) for record in records)
 
 
 def event_records(events: Sequence[Event]) -> list[dict[str, Any]]:
-    """Return events as JSON values, as checkpoints, settings.json and summary.json hold them."""
+    """Return events as the JSON records of checkpoints, settings.json and summary.json."""
     return [dataclasses.asdict(event) for event in events]
 
 
-def _stated_before(past: Sequence[Event]) -> dict[str, list[Any]]:
-    """Return by name what a command may say of a setting that has changed: how it was begun."""
+def _original_values(past: Sequence[Event]) -> dict[str, list[Any]]:
+    """Return, by setting, the earlier values that a command may still state."""
     stated: dict[str, list[Any]] = {}
     for event in past:
         values = [event.before, event.after] if event.kind == "earlier" else [event.before]
@@ -146,43 +158,44 @@ def _require_meaning(named: Mapping[str, Any]) -> None:
         if name in _EXECUTION:
             raise TrilightError(
                 f"--change {name}: it is execution, which is free when a run goes on; expected "
-                f"--set {name}={_shown(value)}."
+                f"--set {name}={_to_text(value)}."
             )
 
 
-def _of_data(header: Mapping[str, Any], digest: str, decided: Any) -> Iterator[Event]:
+def _data_event(header: Mapping[str, Any], digest: str, decided: Any) -> Iterator[Event]:
     before = header["data_digest"]
     if digest == before:
         return
-    given = _short(digest)
+    data_name = _short_digest(digest)
     if decided is None:
         raise TrilightError(
-            f"resume: the data are {given}, but the checkpoint was made with {_short(before)}. Go "
-            f"on with those by --data, or decide to go on with these by --change {DATA}={given}, "
-            "which the run records."
+            f"resume: the data are {data_name}, but the checkpoint was made with "
+            f"{_short_digest(before)}. Go on with those by --data, or decide to go on with these "
+            f"by --change {DATA}={data_name}, which the run records."
         )
     digits = str(decided).rpartition(":")[2]
-    if not _prefixed(digest).startswith(str(decided)) or len(digits) < _LEAST_DIGITS:
+    if not _with_prefix(digest).startswith(str(decided)) or len(digits) < _LEAST_DIGITS:
         raise TrilightError(
-            f"--change {DATA} is {decided}, but the data are {given}; expected that, or the other "
-            "data by --data."
+            f"--change {DATA} is {decided}, but the data are {data_name}; expected that, or the "
+            "other data by --data."
         )
     yield Event(step=header["step"], kind="meaning", name=DATA, before=before, after=digest)
 
 
-def _differing(old: Mapping[str, Any], wrong: Mapping[str, Any]) -> TrilightError:
-    """Return the error for settings that differ and were not decided on."""
+def _undecided_error(old: Mapping[str, Any], wrong: Mapping[str, Any]) -> TrilightError:
+    """Return the error that lists settings that differ without a decision."""
     said = ", and ".join(
-        f"{name} is {_shown(value)}, but the checkpoint was made with {_shown(_at(old, name))}"
+        f"{name} is {_to_text(value)}, but the checkpoint was made with "
+        f"{_to_text(_value_at(old, name))}"
         for name, value in wrong.items()
     )
-    back = " ".join(f"--set {name}={_shown(_at(old, name))}" for name in wrong)
+    back = " ".join(f"--set {name}={_to_text(_value_at(old, name))}" for name in wrong)
     if "num_steps" in wrong:
         back += " (and no --steps)"
     if fixed := [name for name in wrong if name.split(".")[0] in _FIXED]:
         other = f"begin another run in another folder, since {fixed[0]} is the run's for good"
     else:
-        change = " ".join(f"--change {name}={_shown(value)}" for name, value in wrong.items())
+        change = " ".join(f"--change {name}={_to_text(value)}" for name, value in wrong.items())
         other = f"decide on {change}, which the run records"
     return TrilightError(f"resume: {said}. Go on as it was with {back}, or {other}.")
 
@@ -217,7 +230,7 @@ def _notes(
     events: Sequence[Event],
 ) -> Iterator[str]:
     def value(event: Event, which: Any) -> str:
-        return _short(which) if event.name == DATA else _shown(which)
+        return _short_digest(which) if event.name == DATA else _to_text(which)
 
     standing = {event.name: event for event in past if event.kind == "meaning"}
     for event in standing.values():
@@ -227,12 +240,12 @@ def _notes(
         said = f"{event.name} is {value(event, event.after)}"
         if event.kind == "earlier":
             yield (
-                f"{said} and not {_shown(event.before)}, since the run is older than that setting; "
-                f"--change {event.name}={_shown(event.before)} changes it"
+                f"{said} and not {_to_text(event.before)}, since the run is older than that "
+                f"setting; --change {event.name}={_to_text(event.before)} changes it"
             )
         else:
             yield f"from step {step} on, {said} instead of {value(event, event.before)}"
-    begins = decay_begins(before)
+    begins = decay_start_step(before)
     if now.num_steps > before.num_steps and begins is not None and begins < step:
         yield (
             f"the rate had been falling since step {begins} and rises again; from the checkpoint "
@@ -240,23 +253,23 @@ def _notes(
         )
 
 
-def _shown(value: Any) -> str:
-    """Return a value as a person writes it behind `=`."""
+def _to_text(value: Any) -> str:
+    """Return a value as it is typed after `=`."""
     return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
 
 
-def _prefixed(digest: str) -> str:
+def _with_prefix(digest: str) -> str:
     return digest if ":" in digest else f"sha256:{digest}"
 
 
-def _short(digest: str) -> str:
-    """Return the start of a digest of data, enough to tell them apart."""
-    kind, _, digits = _prefixed(digest).partition(":")
+def _short_digest(digest: str) -> str:
+    """Return the first 12 digits of a digest of data, after its kind."""
+    kind, _, digits = _with_prefix(digest).partition(":")
     return f"{kind}:{digits[:12]}"
 
 
-def _at(record: Mapping[str, Any], name: str) -> Any:
-    """Return the value of a dotted name."""
+def _value_at(record: Mapping[str, Any], name: str) -> Any:
+    """Return the value at a dotted name."""
     value: Any = record
     for part in name.split("."):
         value = value[part]
@@ -265,7 +278,7 @@ def _at(record: Mapping[str, Any], name: str) -> Any:
 
 def _lacks(record: Mapping[str, Any], name: str) -> bool:
     try:
-        _at(record, name)
+        _value_at(record, name)
     except (KeyError, TypeError):
         return True
     return False

@@ -1,4 +1,4 @@
-"""How a training run begins: anew, from another's weights or checkpoint, or from its own."""
+"""Options of how a run starts: new, from weights, from a branch, or resumed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,37 +12,35 @@ _HOW = "--set from_weights"
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """How a run begins or goes on."""
+    """Options of how a run starts or resumes."""
 
     resume: bool = False
-    """Go on from the folder's newest checkpoint; the weights come out the same to the bit on the
-    CPU, for the same number of threads and processes. A finished run is judged again."""
+    """Resume from the folder's newest checkpoint. On the CPU, with the same number of threads and
+    processes, the weights are exactly those of an uninterrupted run. A finished run is judged
+    again."""
     restartable: bool = False
-    """Resume where the folder has a checkpoint, else begin: for whoever starts the same command
-    again without looking."""
+    """Resume if the folder has a checkpoint, else start: one command serves every restart."""
     branch: str | None = None
-    """Checkpoint, or folder of a run, from which a new folder goes on: with its steps, its
-    optimiser's memories and its place in the data. A run that resumes has branched and is not
-    asked."""
+    """Checkpoint or run folder whose state a new folder continues: steps, optimizer state and
+    position in the data. A run that resumes has branched already and ignores it."""
     decisions: Mapping[str, Any] = field(default_factory=dict)
-    """Settings by dotted name that change from the checkpoint on, and are recorded
-    (train.going_on)."""
+    """Settings by dotted name that change from the checkpoint on; the run records them."""
     begin_with: str | None = None
-    """Network whose weights and configuration a run with `from_weights` takes over."""
+    """Path or name of the network whose weights a run with `from_weights` starts with."""
     lpips: str | None = None
-    """Where LPIPS' weights are (train.loss.lpips.load_lpips)."""
+    """Source of the LPIPS weights (train.loss.lpips.load_lpips)."""
 
     @property
     def goes_on(self) -> bool:
-        """Whether it begins with a checkpoint, and not with weights alone."""
+        """True if the run starts from a checkpoint, not from weights alone."""
         return self.resume or self.branch is not None
 
     def check(self, settings: TrainSettings) -> None:
-        """Refuse a start that is not the run's; one that goes on has begun and is not asked.
+        """Raise if these options contradict the run's settings; a resumed run is not checked.
 
         Raises:
-            TrilightError: the run begins with given weights and none are named, or the reverse; a
-                branch with them; decisions about a run that has not begun.
+            TrilightError: `from_weights` and `begin_with` disagree; both a branch and weights are
+                given; or settings are changed of a run that has not started.
         """
         if self.branch is not None and self.begin_with is not None:
             raise TrilightError(

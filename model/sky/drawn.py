@@ -1,8 +1,8 @@
-"""`DrawnSky`: an environment map as rays use it: directions drawn by its light, and their odds.
+"""Importance sampling of an environment map.
 
-A texel is drawn in proportion to the light that comes through it, and a direction evenly within it
-by solid angle: a sun of one texel is found by most draws. Draws are made in the axes of the
-map, so that a scene turned together with its map has the same noise.
+A texel is sampled in proportion to its flux, and a direction within it uniformly by solid angle, so
+that most samples hit a sun of one texel. Samples are drawn in the axes of the map, so that a scene
+rotated together with its map has the same noise.
 """
 
 from functools import cached_property
@@ -17,29 +17,32 @@ from storage.records.lookup import environment_values
 from storage.records.sky_texels import row_solid_angles, texel_means
 
 _BLURRED_ROWS = 16
-"""Rows of the map that hardly any direction is worth a sharp look at: 11 degrees each."""
+"""Number of rows of the blurred map: 11 degrees each."""
 
 
 class DrawnSky:
-    """The map of a scene, which is not all black."""
+    """Sampler of an environment map that is not all black."""
 
     def __init__(self, sky: Environment) -> None:
         self.sky = sky
         height, width = sky.radiance_rgb.shape[:2]
         angles = row_solid_angles(height)[:, None]
         flux = texel_means(sky.radiance_rgb.mean(axis=-1, dtype=np.float64)) * angles
-        self._share = flux.ravel() / flux.sum()
-        self._below = np.cumsum(self._share)
-        self._density = flux / flux.sum() / angles
+        self._probability = flux.ravel() / flux.sum()
+        self._cumulative = np.cumsum(self._probability)
+        self._pdf = flux / flux.sum() / angles
         self._edges = np.cos(np.pi * np.arange(height + 1) / height)
-        self._height, self._width = height, width
+        self._height = height
+        self._width = width
 
     def drawn(self, u: Floats) -> Floats:
-        """Return unit directions [3, P] of the world from u [2, P] in the unit square."""
+        """Return unit world directions [3, P] for numbers u [2, P] in the unit square."""
         first = u[0].astype(np.float64)
-        texel = np.searchsorted(self._below, first, side="right").clip(0, self._share.size - 1)
-        share = self._share[texel]
-        along = (first - (self._below[texel] - share)) / np.maximum(share, 1e-300)
+        texel = np.searchsorted(self._cumulative, first, side="right").clip(
+            0, self._probability.size - 1
+        )
+        share = self._probability[texel]
+        along = (first - (self._cumulative[texel] - share)) / np.maximum(share, 1e-300)
         row, column = np.divmod(texel, self._width)
         z = self._edges[row] + (self._edges[row + 1] - self._edges[row]) * u[1]
         azimuth = (0.5 - (column + along.clip(0, 1)) / self._width) * 2 * np.pi
@@ -48,18 +51,18 @@ class DrawnSky:
         return (self.sky.rotation.astype(np.float64) @ local).astype(np.float32)
 
     def density(self, direction: Floats) -> Floats:
-        """Return with what density [P], per steradian, unit directions [3, P] are drawn."""
+        """Return the probability density [P] of unit directions [3, P], per steradian."""
         u, v = np.moveaxis(latlong_uv(self.sky.to_map(direction.T)), -1, 0)
         row = ((1 - v) * self._height).astype(np.intp).clip(0, self._height - 1)
         column = np.floor(u * self._width).astype(np.intp) % self._width
-        return self._density[row, column].astype(np.float32)
+        return self._pdf[row, column].astype(np.float32)
 
     def radiance(self, direction: Floats) -> Floats:
-        """Return the radiance [3, P] that comes from unit directions [3, P]."""
+        """Return the radiance [3, P] from unit directions [3, P]."""
         return environment_values(self.sky, as_rows(direction)).T.astype(np.float32)
 
     def blurred(self, direction: Floats) -> Floats:
-        """Return it from a map with few rows, which has as much light in all."""
+        """Return the radiance [3, P] of a blurred map with few rows and the same total flux."""
         return environment_values(self._coarse, as_rows(direction)).T.astype(np.float32)
 
     @cached_property

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from model.layers import CrossAttention, merge_heads, split_heads
-from model.positions import Rotation, camera_rotation, rotate, token_places, world_rotation
+from model.positions import Rotation, camera_rotation, rotate, token_positions, world_rotation
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes, converted
 from storage.errors import TrilightError
@@ -277,7 +277,7 @@ def test_registers_stand_where_the_published_divisor_puts_them(eps: float) -> No
     mask = torch.tensor([[True, True, False, False]])
     c2w = torch.eye(4, dtype=torch.float64)[None, None].clone()
     c2w[..., :3, 3] = torch.tensor([3.0, -2.0, 5.0])
-    places = token_places(padded, mask, num_registers=2, eps=eps)
+    places = token_positions(padded, mask, num_registers=2, eps=eps)
     expected_world = triangles.mean(dim=2).sum(dim=1) / (2 + eps)
     expected_camera = (triangles.mean(dim=2) - c2w[0, 0, :3, 3]).sum(dim=1) / (2 + eps)
     seen: list[Tensor] = []

@@ -18,7 +18,7 @@ from storage.removed import LAST_COMMIT
 from storage.settings.described import settings_record
 from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run
-from train.going_on import GoingOn, event_records, going_on
+from train.going_on import ResumePlan, event_records, plan_resume
 from train.runs import RUNS, changed_run, in_proportion, named_run
 from train.settings import AugmentationSettings, TrainSettings
 from train.stored_settings import known_settings, stored_settings
@@ -37,7 +37,7 @@ def header(settings: TrainSettings | None = None, *, step: int = 8, **more: Any)
     return json.loads(json.dumps(record | more))
 
 
-def following(before: dict[str, Any], going: GoingOn, step: int) -> dict[str, Any]:
+def following(before: dict[str, Any], going: ResumePlan, step: int) -> dict[str, Any]:
     """Return the header of a later checkpoint of a run that went on."""
     return header(going.settings, step=step, history=event_records(going.history)) | {
         "data_digest": before["data_digest"]
@@ -45,8 +45,8 @@ def following(before: dict[str, Any], going: GoingOn, step: int) -> dict[str, An
 
 
 def test_the_same_command_goes_on_and_nothing_happens() -> None:
-    going = going_on(header(), tiny_run(), DIGEST, {})
-    assert going == GoingOn(settings=tiny_run(), history=(), notes=(), has_decided=False)
+    going = plan_resume(header(), tiny_run(), DIGEST, {})
+    assert going == ResumePlan(settings=tiny_run(), history=(), notes=(), changes_meaning=False)
 
 
 def test_removed_settings_stand_in_checkpoints_where_they_stood() -> None:
@@ -59,7 +59,7 @@ def test_removed_settings_stand_in_checkpoints_where_they_stood() -> None:
     assert fields[fields.index("rope_max_freq") + 1] == "projected_freqs"
     assert fields[-3:] == ["texture_cells", "sky_cells", "sky_rays"]
     assert known_settings(stored, "resume") == settings_record(tiny_run())
-    going = going_on(header() | {"settings": stored}, tiny_run(), DIGEST, {})
+    going = plan_resume(header() | {"settings": stored}, tiny_run(), DIGEST, {})
     assert going.settings == tiny_run() and not going.history
 
 
@@ -73,7 +73,7 @@ def test_runs_that_use_what_was_removed_are_refused(group: str, name: str, value
         f"^checkpoint: {group}.{name} is {value!r}: removed since, and commit {LAST_COMMIT} is"
     )
     with pytest.raises(TrilightError, match=message):
-        going_on(begun, tiny_run(), DIGEST, {})
+        plan_resume(begun, tiny_run(), DIGEST, {})
 
 
 EXECUTED: dict[str, Any] = {
@@ -93,12 +93,12 @@ EXECUTED: dict[str, Any] = {
 def test_execution_is_free_and_noted() -> None:
     """All of it at once, since intervals have to fit each other, and back again."""
     typed = tiny_run(**EXECUTED)
-    going = going_on(header(), typed, DIGEST, {})
-    assert going.settings == typed and not going.has_decided
+    going = plan_resume(header(), typed, DIGEST, {})
+    assert going.settings == typed and not going.changes_meaning
     assert {event.name for event in going.history} == set(EXECUTED)
     assert {event.kind for event in going.history} == {"execution"}
     assert "from step 8 on, scenes_per_pass is 1 instead of 16" in going.notes
-    back = going_on(following(header(), going, 9), tiny_run(), DIGEST, {})
+    back = plan_resume(following(header(), going, 9), tiny_run(), DIGEST, {})
     assert back.settings == tiny_run() and len(back.history) == 2 * len(EXECUTED)
 
 
@@ -127,12 +127,14 @@ def test_other_meaning_is_refused_with_both_values_and_both_ways(
     changes: dict[str, object], message: str
 ) -> None:
     with pytest.raises(TrilightError, match=message):
-        going_on(header(), tiny_run(**changes), DIGEST, {})
+        plan_resume(header(), tiny_run(**changes), DIGEST, {})
 
 
 def test_a_decision_holds_from_its_step_and_is_not_typed_again() -> None:
-    first = going_on(header(), tiny_run(), DIGEST, {"learning_rate": 1e-3, "loss.noise_half": 0.5})
-    assert first.has_decided
+    first = plan_resume(
+        header(), tiny_run(), DIGEST, {"learning_rate": 1e-3, "loss.noise_half": 0.5}
+    )
+    assert first.changes_meaning
     assert (first.settings.learning_rate, first.settings.loss.noise_half) == (1e-3, 0.5)
     (event, _) = sorted(first.history, key=lambda event: event.name)
     assert dataclasses.asdict(event) == {
@@ -141,16 +143,16 @@ def test_a_decision_holds_from_its_step_and_is_not_typed_again() -> None:
     assert "from step 8 on, learning_rate is 0.001 instead of 0.002" in first.notes
     later = following(header(), first, 10)
     for typed in (tiny_run(), first.settings):  # as it was begun, or as it is
-        again = going_on(later, typed, DIGEST, {})
+        again = plan_resume(later, typed, DIGEST, {})
         assert again.settings == first.settings and again.history == first.history
-        assert not again.has_decided
+        assert not again.changes_meaning
         assert "as decided at step 8, learning_rate is 0.001" in again.notes
-    same = going_on(later, tiny_run(), DIGEST, {"learning_rate": 1e-3})
-    assert not same.has_decided and same.history == first.history
+    same = plan_resume(later, tiny_run(), DIGEST, {"learning_rate": 1e-3})
+    assert not same.changes_meaning and same.history == first.history
     with pytest.raises(TrilightError, match=r"is 0\.003, but the checkpoint was made with 0\.001"):
-        going_on(later, tiny_run(learning_rate=3e-3), DIGEST, {})
-    second = going_on(later, tiny_run(), DIGEST, {"learning_rate": 5e-4})
-    last = going_on(following(later, second, 11), tiny_run(), DIGEST, {})
+        plan_resume(later, tiny_run(learning_rate=3e-3), DIGEST, {})
+    second = plan_resume(later, tiny_run(), DIGEST, {"learning_rate": 5e-4})
+    last = plan_resume(following(later, second, 11), tiny_run(), DIGEST, {})
     assert last.settings.learning_rate == 5e-4
     assert [event.step for event in last.history] == [8, 8, 10]
 
@@ -171,26 +173,28 @@ def test_a_decision_holds_from_its_step_and_is_not_typed_again() -> None:
 )
 def test_what_cannot_be_decided_is_refused(decisions: dict[str, Any], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
-        going_on(header(), tiny_run(), DIGEST, decisions)
+        plan_resume(header(), tiny_run(), DIGEST, decisions)
 
 
 def test_other_data_is_a_decision_by_digest() -> None:
     with pytest.raises(TrilightError, match="the data are sha256:012345678901, .* sha256:dddddd"):
-        going_on(header(), tiny_run(), OTHER, {})
+        plan_resume(header(), tiny_run(), OTHER, {})
     with pytest.raises(TrilightError, match="--change data=sha256:012345678901, which"):
-        going_on(header(), tiny_run(), OTHER, {})
+        plan_resume(header(), tiny_run(), OTHER, {})
     for wrong in ("sha256:99999999999", "sha256:01", "new", 12):
         with pytest.raises(TrilightError, match="--change data is .* the data are sha256:0123456"):
-            going_on(header(), tiny_run(), OTHER, {"data": wrong})
-    going = going_on(header(), tiny_run(), OTHER, {"data": "sha256:012345678901"})
+            plan_resume(header(), tiny_run(), OTHER, {"data": wrong})
+    going = plan_resume(header(), tiny_run(), OTHER, {"data": "sha256:012345678901"})
     (event,) = going.history
     assert (event.name, event.before, event.after) == ("data", DIGEST, OTHER)
-    assert going.has_decided
+    assert going.changes_meaning
     assert "data is sha256:012345678901 instead of sha256:dddddddddddd" in going.notes[0]
-    listed = going_on(header(), tiny_run(), f"list:{OTHER}", {"data": "list:01234567"})
+    listed = plan_resume(header(), tiny_run(), f"list:{OTHER}", {"data": "list:01234567"})
     assert listed.history[0].after == f"list:{OTHER}"
     later = following(header(), going, 9) | {"data_digest": OTHER}
-    assert not going_on(later, tiny_run(), OTHER, {"data": "sha256:012345678901"}).has_decided
+    assert not plan_resume(
+        later, tiny_run(), OTHER, {"data": "sha256:012345678901"}
+    ).changes_meaning
 
 
 def test_a_run_from_before_a_setting_stays_as_it_was() -> None:
@@ -200,26 +204,26 @@ def test_a_run_from_before_a_setting_stays_as_it_was() -> None:
         del old["settings"][later]
     del old["settings"]["model"]["window_bundles"], old["history"]
     typed = tiny_run(schedule="wsd")
-    going = going_on(old, typed, DIGEST, {})
-    assert going.settings == tiny_run() and not going.has_decided
+    going = plan_resume(old, typed, DIGEST, {})
+    assert going.settings == tiny_run() and not going.changes_meaning
     assert going.notes == (
         "schedule is cosine and not wsd, since the run is older than that setting; --change "
         "schedule=wsd changes it",
     )
-    again = going_on(following(old, going, 9), typed, DIGEST, {})
+    again = plan_resume(following(old, going, 9), typed, DIGEST, {})
     assert again.settings == tiny_run() and again.history == going.history
-    decided = going_on(following(old, going, 9), typed, DIGEST, {"schedule": "wsd"})
-    assert decided.settings == typed and decided.has_decided
+    decided = plan_resume(following(old, going, 9), typed, DIGEST, {"schedule": "wsd"})
+    assert decided.settings == typed and decided.changes_meaning
     for either in ("wsd", "cosine"):
-        last = going_on(following(old, decided, 10), tiny_run(schedule=either), DIGEST, {})
+        last = plan_resume(following(old, decided, 10), tiny_run(schedule=either), DIGEST, {})
         assert last.settings == typed
 
 
 def test_a_rate_that_rises_again_is_said() -> None:
     begun = tiny_run(schedule="wsd", num_steps=20)
-    late = going_on(header(begun, step=18), begun, DIGEST, {"num_steps": 40})
+    late = plan_resume(header(begun, step=18), begun, DIGEST, {"num_steps": 40})
     assert any("the rate had been falling since step 16" in note for note in late.notes)
-    early = going_on(header(begun, step=16), begun, DIGEST, {"num_steps": 40})
+    early = plan_resume(header(begun, step=16), begun, DIGEST, {"num_steps": 40})
     assert not any("falling" in note for note in early.notes)
 
 

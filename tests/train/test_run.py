@@ -120,7 +120,7 @@ def test_a_signal_in_a_validation_or_while_saving_loses_nothing(
 ) -> None:
     """A validation that was left is not finished first; the resumed run makes up for it."""
     for number, (module, name, call, step) in enumerate((
-        (trainer, "keep_checkpoint", 1, 4),
+        (trainer, "save_checkpoint", 1, 4),
         # one call for the median picture, and one for each of two scenes
         (judge, "score_pictures", 2, 8),
         # two scenes of step 8 that are made up for, and the first of the last step
@@ -135,7 +135,7 @@ def test_a_signal_in_a_validation_or_while_saving_loses_nothing(
         assert (asked.calls, stopped.value.exit_status) == (call, 75), number
         rows = read_rows(tmp_path / "metrics.jsonl")
         left = [row["step"] for row in rows if "validation" in row]
-        assert (step in left) == (name == "keep_checkpoint"), number
+        assert (step in left) == (name == "save_checkpoint"), number
     trained(tiny_run(), dataset, tmp_path, resume=True)
     same_as_uninterrupted(tmp_path, whole)
     assert curve(tmp_path) == curve(whole.folder.root)

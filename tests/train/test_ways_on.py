@@ -24,7 +24,7 @@ from train.folder import RunFolder
 from train.loop import step as step_module
 from train.loop.checkpoints import network_of_run, path_of_step, read_checkpoint, saved_steps
 from train.loop.recorder import read_rows
-from train.loop.step import Stepper, Unread
+from train.loop.step import PendingStats, Stepper
 from train.progress import TrainProgress
 from train.result import TrainResult
 from train.settings import TrainSettings
@@ -149,7 +149,7 @@ def test_too_little_memory_goes_on_with_fewer_scenes_a_pass(
 ) -> None:
     settings = wsd(num_steps=6, scenes_per_step=4, checkpoint_every=2, checkpoints_kept=9)
     run(settings, dataset, tmp_path / "whole")
-    original, steps = step_module.predicted, [0]
+    original, steps = step_module.predict_log10, [0]
 
     def small_card(net: Any, batch: TrainingBatch, *rest: Any) -> Tensor:
         steps[0] += 1
@@ -157,7 +157,7 @@ def test_too_little_memory_goes_on_with_fewer_scenes_a_pass(
             raise torch.OutOfMemoryError("CUDA out of memory")
         return original(net, batch, *rest)
 
-    monkeypatch.setattr(step_module, "predicted", small_card)
+    monkeypatch.setattr(step_module, "predict_log10", small_card)
     with pytest.raises(TrilightError, match=r"too little memory in step \d+.*scenes_per_pass=2"):
         run(settings, dataset, tmp_path / "small")
     notes, step = Heard(), saved_steps(tmp_path / "small/checkpoints")[-1]
@@ -211,7 +211,7 @@ def test_ten_skipped_steps_go_on_by_a_decision(
 
     original = Stepper.take
 
-    def diverging(self: Stepper, *given: Any, **rest: Any) -> Unread:
+    def diverging(self: Stepper, *given: Any, **rest: Any) -> PendingStats:
         now = self._settings
         if self._state.step >= 4 and (now.learning_rate, now.seed) == (2e-3, 0):
             return torch.tensor([math.nan, math.nan, 0.0, 0.0, math.nan, 0.0, 0.0]).double()

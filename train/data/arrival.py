@@ -1,8 +1,7 @@
-"""The way of a step's scenes to the network: batched ahead in a thread, copied beside the kernels.
+"""Device prefetch of a step's scenes: batched ahead in a thread, copied while kernels run.
 
-On the CPU there is no way to go. A card copies beside its kernels only from memory that the system
-does not move (pinned), and in a stream of its own: the first batch of a step is waited for, the
-others arrive while it is computed.
+A CPU needs no copy. A GPU overlaps copies with kernels only from pinned memory and in a separate
+stream: the first batch of a step is waited for, the others are copied while it is computed.
 """
 
 import dataclasses
@@ -13,53 +12,55 @@ import torch
 
 from train.data.buckets import TrainingBatch, bucket_scenes
 from train.data.scenes import TrainingScene
-from train.data.stream import prefetched
+from train.data.stream import prefetch
 
 _AHEAD = 1
-"""Steps that are batched ahead."""
+"""Number of steps that are batched ahead."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StepScenes:
-    """The scenes of one step of this process."""
+    """Batches of one step of this process."""
 
     batches: list[TrainingBatch]
-    """All of them, those of similar length together."""
+    """Batches of scenes of similar length, each scene once."""
     keys: tuple[str, ...]
-    """Keys of their samples."""
+    """Sample keys of the step's scenes, in the order they were drawn."""
     num_triangles: tuple[int, ...]
-    """How large they are, in the same order."""
+    """Number of triangles of each scene, in the same order."""
 
 
-def looks_up_itself(device: torch.device) -> bool:
-    """Return whether a device looks targets up by itself, which spares the decoding threads."""
+def decodes_on_device(device: torch.device) -> bool:
+    """Return whether targets are looked up on the device, which saves work of decoding threads."""
     return device.type == "cuda"
 
 
 def step_scenes(
-    drawn: Iterator[list[TrainingScene]],
+    scenes_per_step: Iterator[list[TrainingScene]],
     cost: Callable[[int], float],
-    most: int,
+    max_scenes: int,
     device: torch.device,
 ) -> Generator[StepScenes, None, None]:
-    """Yield the scenes of each step, batched ahead in a thread; closing it ends the thread.
+    """Yield the batches of each step, made ahead in a thread; closing it ends the thread.
 
     Args:
-        drawn: the scenes of each step.
+        scenes_per_step: scenes of each step.
         cost: as in `bucket_scenes`.
-        most: as in `bucket_scenes`.
-        device: where they will be wanted.
+        max_scenes: as in `bucket_scenes`.
+        device: device of the network.
     """
     pins = _has_streams(device)
-    return prefetched((_batched(scenes, cost, most, pins) for scenes in drawn), _AHEAD)
+    return prefetch(
+        (_make_step_scenes(scenes, cost, max_scenes, pins) for scenes in scenes_per_step), _AHEAD
+    )
 
 
-def _batched(
-    scenes: Sequence[TrainingScene], cost: Callable[[int], float], most: int, pins: bool
+def _make_step_scenes(
+    scenes: Sequence[TrainingScene], cost: Callable[[int], float], max_scenes: int, pins: bool
 ) -> StepScenes:
-    batches = bucket_scenes(scenes, cost, most)
+    batches = bucket_scenes(scenes, cost, max_scenes)
     if pins:
-        batches = [batch.converted(torch.Tensor.pin_memory) for batch in batches]
+        batches = [batch.map_tensors(torch.Tensor.pin_memory) for batch in batches]
     return StepScenes(
         batches=batches,
         keys=tuple(scene.key for scene in scenes),
@@ -68,21 +69,23 @@ def _batched(
 
 
 class CopyStream:
-    """Sends batches to a card beside what it computes; to the CPU they are there already."""
+    """Copies batches to a GPU while it computes; on the CPU it returns them unchanged."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._stream = torch.cuda.Stream(device) if _has_streams(device) else None
 
     def send(self, batches: Sequence[TrainingBatch]) -> list[TrainingBatch]:
-        """Begin to copy pinned batches, one after the other; each `to` waits for its own."""
+        """Start copies of pinned batches in order; `TrainingBatch.to` waits for each."""
         if self._stream is None:
             return list(batches)
         sent = []
         with torch.cuda.stream(self._stream):
             for batch in batches:
-                there = batch.converted(lambda tensor: tensor.to(self._device, non_blocking=True))
-                sent.append(dataclasses.replace(there, arrived=self._stream.record_event()))
+                copied = batch.map_tensors(
+                    lambda tensor: tensor.to(self._device, non_blocking=True)
+                )
+                sent.append(dataclasses.replace(copied, arrived=self._stream.record_event()))
         return sent
 
 

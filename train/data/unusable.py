@@ -1,6 +1,6 @@
-"""Damaged data: stop at the first damaged sample, or count and replace up to a limit.
+"""Counter of damaged samples: stop at the first one, or replace samples up to a limit.
 
-The count belongs to the run: a checkpoint stores it, so that resuming often allows no more damage
+The count belongs to the run: a checkpoint stores it, so that frequent resumes allow no more damage
 than one uninterrupted run. Damaged samples are stored by a digest of their name, since names of
 listed shards may be paths of a user's machine.
 """
@@ -16,95 +16,97 @@ from storage.records.sample import Sample
 
 
 class Unusable:
-    """The damaged samples and shards that a run has met."""
+    """Counts the damaged samples and shards of a run, and stops it at a limit."""
 
     def __init__(
-        self, most: int, met: Mapping[str, int] | None = None, *, way_on: str = ""
+        self, limit: int, counts: Mapping[str, int] | None = None, *, advice: str = ""
     ) -> None:
-        """Remember the limit.
+        """Create the counter.
 
         Args:
-            most: samples that may be unusable; at 0 the first one ends the run.
-            met: the property `met` of the run that is resumed.
-            way_on: a sentence for whoever meets the limit.
+            limit: maximum number of unusable samples; at 0 the first one ends the run.
+            counts: property `counts` of the run that is resumed.
+            advice: sentence that the error at the limit ends with.
         """
-        self.most = most
-        self._way_on = way_on
-        self._met: dict[str, int] = dict(met or {})
+        self.limit = limit
+        self._advice = advice
+        self._counts: dict[str, int] = dict(counts or {})
         self._messages: dict[str, str] = {}
         self._lock = threading.Lock()
 
     @property
     def messages(self) -> Sequence[str]:
-        """What was wrong, one message for each damaged sample or shard that this process met."""
+        """Error messages, one for each damaged sample or shard that this process read."""
         return tuple(self._messages.values())
 
     @property
-    def met(self) -> Mapping[str, int]:
+    def counts(self) -> Mapping[str, int]:
         """Number of lost samples, by a digest of the name of the damaged sample or shard."""
         with self._lock:
-            return dict(sorted(self._met.items()))
+            return dict(sorted(self._counts.items()))
 
     def add(self, name: str, num_samples: int, error: TrilightError) -> None:
-        """Count a damaged sample or shard; one that is met again counts once.
+        """Count a damaged sample or shard; repeated calls count once.
 
         Args:
-            name: of the sample or shard.
-            num_samples: how many samples are lost with it.
-            error: what is wrong with it; names it.
+            name: name of the sample or shard.
+            num_samples: number of samples that are lost with it.
+            error: error of reading it, which includes the name.
 
         Raises:
-            TrilightError: what `error` says where none is allowed, or that the limit is passed.
+            TrilightError: the text of `error` if the limit is 0, or that the limit is exceeded.
         """
-        if not self.most:
-            raise TrilightError(" ".join(filter(None, [str(error), self._way_on]))) from error
+        if not self.limit:
+            raise TrilightError(" ".join(filter(None, [str(error), self._advice]))) from error
         with self._lock:
-            self._met.setdefault(sha256_hex(name.encode())[:16], num_samples)
+            self._counts.setdefault(sha256_hex(name.encode())[:16], num_samples)
             self._messages.setdefault(name, str(error))
-            count = sum(self._met.values())
-        if count > self.most:
+            count = sum(self._counts.values())
+        if count > self.limit:
             raise TrilightError(
-                f"data: {count} samples are unusable; expected at most {self.most}. The last: "
-                + " ".join(filter(None, [str(error), self._way_on]))
+                f"data: {count} samples are unusable; expected at most {self.limit}. The last: "
+                + " ".join(filter(None, [str(error), self._advice]))
             ) from error
 
 
 def first_samples(shards: ShardSet, limit: int, unusable: Unusable) -> Iterator[Sample]:
     """Yield the first usable samples of a split, at most `limit`, in the order of the shards.
 
-    Of several datasets each gives the same number, or all that it has.
+    Several datasets contribute equal numbers, or all that they have.
 
     Raises:
         TrilightError: more samples are damaged than `unusable` allows.
     """
     count = len(shards.parts)
     for row, part in enumerate(shards.parts):
-        yield from _first_of(shards, part, limit // count + (row < limit % count), unusable)
+        yield from _first_of_source(shards, part, limit // count + (row < limit % count), unusable)
 
 
-def _first_of(shards: ShardSet, part: range, limit: int, unusable: Unusable) -> Iterator[Sample]:
-    left = limit
+def _first_of_source(
+    shards: ShardSet, part: range, limit: int, unusable: Unusable
+) -> Iterator[Sample]:
+    remaining = limit
     for number in part:
-        if not left:
+        if not remaining:
             return
         try:
             shard = shards.open(number)
         except TrilightError as error:
-            unusable.add(shards.names[number], lost_with(shards, number), error)
+            unusable.add(shards.names[number], count_lost_samples(shards, number), error)
             continue
         with closing(shard):
-            for row, key in enumerate(shard.keys[:left]):
+            for row, key in enumerate(shard.keys[:remaining]):
                 try:
                     sample = shard.sample(row)
                 except TrilightError as error:
                     unusable.add(f"{shard.name}: sample {key}", 1, error)
                     continue
                 yield sample
-                left -= 1
+                remaining -= 1
 
 
-def lost_with(shards: ShardSet, number: int) -> int:
-    """Return how many samples a damaged shard holds; 1 where its index is damaged too."""
+def count_lost_samples(shards: ShardSet, number: int) -> int:
+    """Return the number of samples of a damaged shard; 1 if its index is damaged too."""
     try:
         return shards.num_samples(number)
     except TrilightError:

@@ -1,4 +1,4 @@
-"""`EvaluationOrder`: everything a user asks of an evaluation. Importing it loads no torch."""
+"""Options of an evaluation. Imports no torch."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -8,16 +8,16 @@ from storage.settings.ranges import Within
 from train.folder import RunFolder
 
 Width = Annotated[int, Within(1, 8192, unit="pixels")]
-"""Pixels across a picture."""
+"""Width of a picture in pixels."""
 SceneCount = Annotated[int, Within(1, 10**9, unit="scenes")]
 """Maximum number of scenes to evaluate."""
 TracedViews = Annotated[int, Within(0, 10**6, unit="views")]
-"""Maximum number of views that the path tracer is judged on too."""
+"""Maximum number of views for the path tracer."""
 
 
 @checked()
 class EvaluationOrder:
-    """Which network to evaluate, and on which data."""
+    """Network to evaluate, and the data to use."""
 
     checkpoint: str
     """Folder of a run, model.safetensors or a checkpoint; builtin: is the network that comes with
@@ -25,7 +25,7 @@ class EvaluationOrder:
     data: tuple[str, ...]
     """Dataset (a folder or a URL), or shards by name or pattern."""
     split: Literal["train", "validation", "test"] = "test"
-    """Split to evaluate on."""
+    """Split of the dataset to evaluate on."""
     train_data: tuple[str, ...] = ()
     """Datasets whose training pictures the baselines use; by default those of --data, if they have
     any."""
@@ -48,7 +48,7 @@ class EvaluationOrder:
 
     @property
     def place(self) -> Path:
-        """Where the report goes, if no other network's is there."""
+        """Folder of the report, unless it holds another network's report."""
         checkpoint = Path(self.checkpoint)
         for folder in (checkpoint, *list(checkpoint.parents)[:2]):
             if self.out is None and RunFolder(folder).settings.is_file():

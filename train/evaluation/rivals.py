@@ -14,17 +14,18 @@ from storage.conventions import log10_radiance, radiance_from_log10
 from storage.errors import TrilightError
 from train.data.scenes import TrainingScene
 
-MEDIAN, NEAREST = "median picture", "nearest training view"
+MEDIAN = "median picture"
+NEAREST = "nearest training view"
 
 COMPARED_PX = 32
-"""Pictures are compared at no more than so many pixels across."""
+"""Maximum width in pixels at which pictures are compared."""
 
 
 class Rivals:
-    """The pictures of some training scenes."""
+    """Baseline pictures from some training scenes."""
 
     def __init__(self, scenes: Iterable[TrainingScene]) -> None:
-        # half floats: a rival that is off by a thousandth is as good, and takes half the memory
+        # half floats take half the memory, and an error of a thousandth does not matter here
         named = [(scene.key, scene.target_VRR3.numpy().astype(np.float16)) for scene in scenes]
         self._keys_M = np.array([key for key, pictures in named for _ in pictures])
         self._log10_MRR3 = np.concatenate([pictures for _, pictures in named])
@@ -35,32 +36,32 @@ class Rivals:
         return median_picture([self._log10_MRR3])
 
     def pictures(self, target_rgb: NDArray) -> dict[str, NDArray[np.float64]]:
-        """Return what each rival shows in place of a target [R, R, 3], linear radiance."""
+        """Return each baseline's picture for a target [R, R, 3], linear radiance."""
         return {MEDIAN: self._median_RR3, NEAREST: self.nearest(target_rgb)}
 
     def nearest(self, target_rgb: NDArray, *, not_of: str = "") -> NDArray[np.float64]:
-        """Return the picture [R, R, 3] that is closest to a target, linear radiance.
+        """Return the training picture [R, R, 3] that is closest to a target, linear radiance.
 
         Args:
             target_rgb: [R, R, 3] linear radiance.
-            not_of: key of a scene whose own pictures do not count.
+            not_of: key of a scene whose pictures are excluded.
 
         Raises:
-            TrilightError: there is no picture of another scene.
+            TrilightError: all pictures are of that scene.
         """
         small = _small(log10_radiance(target_rgb)[None])
         distance_M = np.abs(self._small_MRR3 - small).mean(axis=(1, 2, 3))
-        others_M = self._keys_M != not_of
-        if not others_M.any():
+        is_other_M = self._keys_M != not_of
+        if not is_other_M.any():
             raise TrilightError(
                 f"nearest view: scene {not_of} is alone; expected a second scene to look up."
             )
-        nearest = int(np.where(others_M, distance_M, np.inf).argmin())
+        nearest = int(np.where(is_other_M, distance_M, np.inf).argmin())
         return radiance_from_log10(self._log10_MRR3[nearest].astype(np.float64))
 
 
 def median_picture(log10_pictures: Sequence[NDArray]) -> NDArray[np.float64]:
-    """Return the radiance [R, R, 3] that is, pixel by pixel, the median over all views.
+    """Return the per-pixel median radiance [R, R, 3] over all views.
 
     No other fixed picture has a smaller L1 error, in any monotonic space.
 
@@ -74,7 +75,7 @@ def median_picture(log10_pictures: Sequence[NDArray]) -> NDArray[np.float64]:
 def _small(log10_MRR3: NDArray) -> NDArray[np.float32]:
     count, resolution = log10_MRR3.shape[:2]
     factor = max(resolution // COMPARED_PX, 1)
-    kept = resolution // factor * factor
-    cut = log10_MRR3[:, :kept, :kept].astype(np.float32)
-    blocks = cut.reshape(count, kept // factor, factor, kept // factor, factor, 3)
+    cropped_px = resolution // factor * factor
+    cropped = log10_MRR3[:, :cropped_px, :cropped_px].astype(np.float32)
+    blocks = cropped.reshape(count, cropped_px // factor, factor, cropped_px // factor, factor, 3)
     return blocks.mean(axis=(2, 4))

@@ -1,7 +1,7 @@
-"""The processes that train together: one, or those that torchrun started.
+"""Processes that train together: one, or those that torchrun started.
 
-Each takes its part of every batch (train.data.order.RankShare); gradients are averaged by torch's
-DistributedDataParallel over nccl or gloo. The first process alone logs, judges and saves.
+Each takes its slice of every batch (train.data.order.RankShare); torch's DistributedDataParallel
+averages gradients over nccl or gloo. Only the first process logs, validates and saves.
 """
 
 import os
@@ -22,29 +22,29 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True, kw_only=True)
 class Crew:
-    """This process, and how many there are."""
+    """Rank and device of this process, and collective operations over all processes."""
 
     device: torch.device
-    """Where its network is."""
+    """Device of this process's copy of the network."""
     rank: int = 0
     """Number of this process, from 0."""
     world_size: int = 1
-    """How many train together."""
+    """Number of processes that train together."""
     local_rank: int = 0
     """Number of this process on its machine, from 0."""
 
     @property
     def is_first(self) -> bool:
-        """Whether it is the one that logs, judges and saves."""
+        """True in the process that logs, validates and saves."""
         return self.rank == 0
 
     @property
     def share(self) -> RankShare:
-        """This process's part of every batch."""
+        """Slice of every global batch that this process takes."""
         return RankShare(rank=self.rank, world_size=self.world_size)
 
     def mean(self, values: Sequence[float]) -> list[float]:
-        """Return the means over all processes, alike on each; all must call it."""
+        """Return the means over all processes, equal on each; all must call it."""
         if self.world_size == 1:
             return list(values)
         # float32, because nccl and gloo both have it everywhere
@@ -53,9 +53,9 @@ class Crew:
         return [float(value) / self.world_size for value in total]
 
     def mean_on_device(self, values: Tensor) -> Tensor:
-        """Return the means [N] over all processes, where they are: nobody waits; all must call it.
+        """Return the means [N] over all processes, on the device and without a wait.
 
-        With several processes they are float32, as those of `mean`.
+        All processes must call it. With several processes the means are float32, as in `mean`.
         """
         if self.world_size == 1:
             return values
@@ -64,15 +64,15 @@ class Crew:
         return total / self.world_size
 
     def gather_text(self, text: str) -> list[str]:
-        """Return what each process says, by rank, alike on each; all must call it."""
+        """Return the text of each process, by rank, equal on each; all must call it."""
         if self.world_size == 1:
             return [text]
-        own = torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
-        length = torch.tensor([len(own)], device=self.device)
+        encoded = torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
+        length = torch.tensor([len(encoded)], device=self.device)
         lengths = [torch.zeros_like(length) for _ in range(self.world_size)]
         dist.all_gather(lengths, length)
         padded = torch.zeros(max(map(int, lengths)), dtype=torch.uint8, device=self.device)
-        padded[: len(own)] = own.to(self.device)
+        padded[: len(encoded)] = encoded.to(self.device)
         texts = [torch.zeros_like(padded) for _ in range(self.world_size)]
         dist.all_gather(texts, padded)
         return [
@@ -80,19 +80,22 @@ class Crew:
             for said, count in zip(texts, lengths, strict=True)
         ]
 
-    def once_a_machine(self, make: Callable[[], Made]) -> Made:
-        """Return what each process makes, the first of each machine before the others.
+    def run_once_per_machine(self, make: Callable[[], Made]) -> Made:
+        """Call `make` in every process, in the first of each machine before the others.
 
-        For what leaves a copy on the machine that the others find, such as a download. All must
-        call it.
+        For work that leaves a file for the others, such as a download. All must call it.
         """
         made = [make()] if self.local_rank == 0 else []
-        self.any(False)  # a barrier
+        self.barrier()
         return made[0] if made else make()
 
     def any(self, flag: bool) -> bool:
-        """Return whether the flag is set in any process, alike on each; all must call it."""
+        """Return whether the flag is set in any process, equal on each; all must call it."""
         return self.mean([float(flag)])[0] > 0
+
+    def barrier(self) -> None:
+        """Wait until all processes have called it."""
+        self.any(False)
 
 
 @contextmanager
@@ -100,30 +103,30 @@ def join_crew(device: str | None = None) -> Iterator[Crew]:
     """Join the processes that torchrun started; without torchrun, train alone.
 
     Args:
-        device: `cpu` or `cuda`, or None for CUDA where there is any. With CUDA each process takes
-            the card of its LOCAL_RANK.
+        device: `cpu` or `cuda`; None picks CUDA if available. With CUDA each process takes the GPU
+            of its LOCAL_RANK.
 
     Raises:
-        TrilightError: CUDA was asked for and there is none, or too few cards.
+        TrilightError: CUDA was requested and there is no GPU, or fewer than processes.
     """
     world_size = int(os.environ.get("WORLD_SIZE", "1"))
     local_rank = int(os.environ.get("LOCAL_RANK", "0"))
-    chosen = choose_device(device, local_rank)
+    torch_device = choose_device(device, local_rank)
     if world_size == 1:
-        yield Crew(device=chosen)
+        yield Crew(device=torch_device)
         return
-    dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
+    dist.init_process_group("nccl" if torch_device.type == "cuda" else "gloo")
     try:
         yield Crew(
-            device=chosen, rank=dist.get_rank(), world_size=world_size, local_rank=local_rank
+            device=torch_device, rank=dist.get_rank(), world_size=world_size, local_rank=local_rank
         )
     finally:
         dist.destroy_process_group()
 
 
-def choose_device(wanted: str | None, local_rank: int = 0) -> torch.device:
+def choose_device(requested: str | None, local_rank: int = 0) -> torch.device:
     """Return the device of a process; see `join_crew`."""
-    kind = wanted or ("cuda" if torch.cuda.is_available() else "cpu")
+    kind = requested or ("cuda" if torch.cuda.is_available() else "cpu")
     if kind not in ("cpu", "cuda"):
         raise TrilightError(f"device {kind!r}; expected cpu or cuda.")
     if kind == "cpu":
@@ -131,7 +134,7 @@ def choose_device(wanted: str | None, local_rank: int = 0) -> torch.device:
     if local_rank >= torch.cuda.device_count():
         raise TrilightError(
             f"device cuda: process {local_rank} of this machine finds "
-            f"{torch.cuda.device_count()} cards; expected one for each. Start fewer processes, or "
+            f"{torch.cuda.device_count()} GPUs; expected one for each. Start fewer processes, or "
             "say --device cpu."
         )
     torch.cuda.set_device(local_rank)

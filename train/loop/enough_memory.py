@@ -1,4 +1,4 @@
-"""Too little memory for a step: one line that says what to do, and no traceback."""
+"""Error message with a remedy, in place of a traceback, when a step runs out of memory."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,16 +9,16 @@ from storage.errors import TrilightError
 from train.settings import TrainSettings
 
 _SAID_ON_CPU = "can't allocate memory"
-"""What torch says where the machine itself has too little; on a card it has a class of its own."""
+"""Text of torch's error on a CPU without enough memory; on a GPU the error has its own class."""
 
 
 @contextmanager
-def enough_memory(settings: TrainSettings, step: int) -> Iterator[None]:
-    """Raise a TrilightError with the ways on where a step finds too little memory.
+def explain_out_of_memory(settings: TrainSettings, step: int) -> Iterator[None]:
+    """Convert out-of-memory errors of the block into a TrilightError with remedies.
 
     Args:
-        settings: of the run.
-        step: steps that are done.
+        settings: settings of the run.
+        step: number of steps that are done.
     """
     try:
         yield
@@ -28,12 +28,12 @@ def enough_memory(settings: TrainSettings, step: int) -> Iterator[None]:
             raise
         raise TrilightError(
             f"training: too little memory in step {step + 1}; the newest checkpoint is safe. "
-            f"{_way_on(settings)}"
+            f"{_memory_advice(settings)}"
         ) from error
 
 
-def _way_on(settings: TrainSettings) -> str:
-    """Return what takes less memory and leaves the run what it is."""
+def _memory_advice(settings: TrainSettings) -> str:
+    """Return advice on execution settings that need less memory."""
     most = min(settings.scenes_per_pass, settings.scenes_per_step)
     if most > 1:
         return (

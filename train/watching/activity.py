@@ -1,11 +1,11 @@
-"""What a process is doing right now, and how long each part of its steps took."""
+"""Current phase of a training process, and the time spent in each phase."""
 
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-PARTS = {
+PHASES = {
     "data": "waiting for data",
     "forward": "forward pass and loss",
     "backward": "backward pass",
@@ -16,52 +16,54 @@ PARTS = {
     "saving": "saving a checkpoint",
     "other": "batching, counting and writing the log",
 }
-"""The parts of a step, and what each is called for people."""
+"""Description of each phase of training, by name."""
 
 
 @dataclass(frozen=True)
-class Doing:
-    """A part that is under way."""
+class ActivePhase:
+    """Phase in progress."""
 
-    part: str
-    """One of PARTS."""
+    phase: str
+    """Name of the phase, one of PHASES."""
     since_s: float
-    """time.monotonic() at its start."""
+    """Start of the phase, by time.monotonic()."""
 
 
 class Activity:
-    """A clock with one hand: each moment belongs to exactly one part.
+    """Timer of phases: each moment belongs to exactly one.
 
-    It is read on the host, and never waits for a device. On a processor a part is the time of its
-    work. A card works on after it was told what to do: `forward` and `backward` are then the time
-    it takes to tell it, and its work shows as `device`, where the host first needs a number of it
-    (with several processes also as `exchange`). `data` and `saving` mean the same everywhere.
+    It measures host time, and never waits for a device. On a CPU a phase is the time of its work. A
+    GPU works asynchronously: `forward` and `backward` are then the time to enqueue kernels, and
+    their work appears as `device`, where the host first waits for a result (with several processes
+    also as `exchange`). `data` and `saving` mean the same everywhere.
 
-    Another thread may read `now` while this one goes on.
+    Another thread may read `now` at any time.
     """
 
     def __init__(self) -> None:
-        self.now = Doing("other", time.monotonic())
-        self._taken_s = dict.fromkeys(PARTS, 0.0)
+        self.now = ActivePhase("other", time.monotonic())
+        self._taken_s = dict.fromkeys(PHASES, 0.0)
 
-    def begin(self, part: str) -> None:
-        """End the part that is under way, and begin another."""
-        moment_s, before = time.monotonic(), self.now
-        self._taken_s[before.part] += moment_s - before.since_s
-        self.now = Doing(part, moment_s)
+    def begin(self, phase: str) -> None:
+        """End the current phase, and begin another."""
+        moment_s = time.monotonic()
+        before = self.now
+        self._taken_s[before.phase] += moment_s - before.since_s
+        self.now = ActivePhase(phase, moment_s)
 
     @contextmanager
-    def during(self, part: str) -> Iterator[None]:
-        """Spend the time of a block on a part, and go back to the one before."""
-        before = self.now.part
-        self.begin(part)
+    def during(self, phase: str) -> Iterator[None]:
+        """Assign the time of a block to a phase, then return to the previous one."""
+        before = self.now.phase
+        self.begin(phase)
         try:
             yield
         finally:
             self.begin(before)
 
-    def taken(self) -> dict[str, float]:
-        """Return the seconds of each part since the last call."""
-        self.begin(self.now.part)
-        taken_s, self._taken_s = self._taken_s, dict.fromkeys(PARTS, 0.0)
+    def pop_seconds(self) -> dict[str, float]:
+        """Return the seconds of each phase since the last call, and reset them."""
+        self.begin(self.now.phase)
+        taken_s = self._taken_s
+        self._taken_s = dict.fromkeys(PHASES, 0.0)
         return taken_s

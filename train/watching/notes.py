@@ -1,4 +1,4 @@
-"""notes.jsonl: what happened to a run and when; unlike the log it is never cut back."""
+"""Writer of notes.jsonl, the dated notes of a run; unlike the log it is never truncated."""
 
 import json
 import time
@@ -11,9 +11,9 @@ def add_note(path: Path, step: int, text: str) -> None:
     """Append a sentence without its full stop.
 
     Args:
-        path: the file.
-        step: steps that were done by then.
-        text: what happened.
+        path: path of notes.jsonl.
+        step: number of steps that were done by then.
+        text: the sentence.
 
     Raises:
         TrilightError: the folder is full or cannot be written.

@@ -1,4 +1,4 @@
-"""Memory of a training process."""
+"""Memory use of a training process."""
 
 import os
 from pathlib import Path
@@ -9,17 +9,16 @@ _STATM = Path("/proc/self/statm")
 
 
 def memory_mb(device: torch.device) -> dict[str, float]:
-    """Return megabytes (1e6 bytes) by what they are.
+    """Return memory use in megabytes (1e6 bytes) by name.
 
-    `process`: what the process holds now, shared libraries included; on Linux alone.
-    `device_peak`: the most that tensors held on a card since the last call; the host has counted
-    them, so the card is not asked.
+    `process`: resident memory of the process, shared libraries included; on Linux only.
+    `device_peak`: peak of the tensors on a GPU since the last call, from the host's own counts.
     """
-    found = {}
+    megabytes = {}
     if _STATM.exists():
         pages = int(_STATM.read_text().split()[1])
-        found["process"] = round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 1)
+        megabytes["process"] = round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 1)
     if device.type == "cuda" and torch.cuda.is_initialized():
-        found["device_peak"] = round(torch.cuda.max_memory_allocated(device) / 1e6, 1)
+        megabytes["device_peak"] = round(torch.cuda.max_memory_allocated(device) / 1e6, 1)
         torch.cuda.reset_peak_memory_stats(device)
-    return found
+    return megabytes

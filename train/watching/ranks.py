@@ -1,4 +1,4 @@
-"""What the processes of a training tell each other once a window, and who of them is slow."""
+"""Statistics that processes exchange once a window, and detection of a slow process."""
 
 import json
 import statistics
@@ -7,32 +7,32 @@ from typing import Any
 
 from train.loop.crew import Crew
 
-OWN_PARTS = ("data", "forward", "backward", "device", "optimiser", "other")
-"""Parts of a step that do not wait for another process. On a card `device` does, since the exchange
-of gradients is the card's work: there only data and host tell a slow process."""
+OWN_PHASES = ("data", "forward", "backward", "device", "optimiser", "other")
+"""Phases that do not wait for another process. On a GPU `device` does, since the exchange of
+gradients is the GPU's work: there only `data` and host time reveal a slow process."""
 
 SLOW_FACTOR = 1.5
-"""How much longer than the others, in the median, a process takes that is named."""
+"""Multiple of the others' median time from which a process counts as slow."""
 
 LEAST_LOST_S = 0.05
-"""Seconds of a step that are worth naming."""
+"""Minimum seconds per step that a slow process costs before it is reported."""
 
 
-def told(crew: Crew, words: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return what each process says, by rank; all must call it."""
-    return [json.loads(text) for text in crew.gather_text(json.dumps(words))]
+def exchange_values(dist_context: Crew, values: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the values of each process, by rank; all must call it."""
+    return [json.loads(text) for text in dist_context.gather_text(json.dumps(values))]
 
 
 def own_seconds(taken_s: Mapping[str, float], steps: int) -> float:
-    """Return the time of a step that a process spent on its own work."""
-    return sum(taken_s[part] for part in OWN_PARTS) / max(steps, 1)
+    """Return the seconds per step that a process spent on its own work."""
+    return sum(taken_s[part] for part in OWN_PHASES) / max(steps, 1)
 
 
-def slowest(own_s: Sequence[float]) -> int | None:
-    """Return the rank that all others wait for, or None where none stands out."""
+def slowest_rank(own_s: Sequence[float]) -> int | None:
+    """Return the rank that all others wait for, or None if no process is slow."""
     if len(own_s) < 2:
         return None
     worst = max(range(len(own_s)), key=own_s.__getitem__)
-    others = statistics.median(value for rank, value in enumerate(own_s) if rank != worst)
-    stands_out = own_s[worst] > SLOW_FACTOR * others and own_s[worst] - others > LEAST_LOST_S
+    typical_s = statistics.median(value for rank, value in enumerate(own_s) if rank != worst)
+    stands_out = own_s[worst] > SLOW_FACTOR * typical_s and own_s[worst] - typical_s > LEAST_LOST_S
     return worst if stands_out else None

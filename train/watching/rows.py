@@ -1,4 +1,4 @@
-"""Reads metrics.jsonl: one JSON object a line."""
+"""Reader of metrics.jsonl: one JSON object per line."""
 
 from pathlib import Path
 from typing import Any
@@ -8,15 +8,15 @@ from storage.records.safe_read import read_plain
 from storage.typed_json import read_json_lines
 
 LAYER_COLUMNS = ("grad_norm", "weight_norm", "update_ratio")
-"""What a row tells of a layer: length of its gradient before clipping, length of its weights, and
-how far the update moved them as a share of that length."""
+"""Values of a layer in a row: norm of its gradient before clipping, norm of its weights, and norm
+of the update divided by that of the weights."""
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """Return the rows of a log, each with its `step`; a missing file has none.
 
     Raises:
-        TrilightError: a line before the last is no such row; of the last, a kill may have cut it.
+        TrilightError: a line before the last is invalid; the last may be incomplete after a kill.
     """
     if not path.exists():
         return []

@@ -1,4 +1,4 @@
-"""How a training run is watched: settings that decide no weight and may differ at every resume."""
+"""Monitoring settings of a run; they decide no weight and may differ at every resume."""
 
 from typing import Annotated, Literal
 
@@ -6,12 +6,12 @@ from storage.settings.described import checked
 from storage.settings.ranges import Within
 
 OnHang = Literal["wait", "stop"]
-"""What to do when a step does not end."""
+"""Action when a step does not end."""
 
 
 @checked("watch settings")
 class WatchSettings:
-    """How the run is watched; decides no weight."""
+    """Monitoring of a run; decides no weight."""
 
     hang_after_s: Annotated[float, Within(0.1, 1e6, unit="seconds")] = 120.0
     """Time after which a step may count as hanging; before three of its kind are known, five times
@@ -19,8 +19,8 @@ class WatchSettings:
     hang_factor: Annotated[float, Within(1, 1e6, unit="x the usual")] = 10.0
     """Multiple of the usual time from which on a step counts as hanging."""
     on_hang: OnHang = "wait"
-    """What to do then, besides saying so and writing the stacks of all threads: wait for it, or
-    stop the run, which --resume takes up again at the last checkpoint."""
+    """Action on a hang, after it is reported and the stacks of all threads are written: wait, or
+    stop the run, which --resume continues from the last checkpoint."""
     spike_bound: Annotated[float, Within(1, 1e6, unit="deviations")] = 8.0
     """Distance of a loss or gradient above the recent median, in robust standard deviations, from
     which on it is recorded with the scenes of its step."""

@@ -1,4 +1,4 @@
-"""Steps whose loss or gradient stands out, with the scenes that may be the reason."""
+"""Detection of spikes in loss and gradient norm, with the scenes that may cause them."""
 
 import math
 import statistics
@@ -9,40 +9,39 @@ from dataclasses import dataclass
 from train.loop.step import StepReport
 
 REMEMBERED = 200
-"""Steps that a new one is compared with."""
+"""Number of recent steps that a new one is compared with."""
 
 LEAST_REMEMBERED = 40
-"""Steps before which none stands out: a median of fewer says little."""
+"""Minimum number of recent steps; a median of fewer is unreliable."""
 
 LEAST_DEVIATION = 0.02
-"""Smallest standard deviation that is believed, as a share of the median: a loss that hardly moves
-would else spike at every breath."""
+"""Minimum standard deviation as a fraction of the median; otherwise a nearly constant loss would
+spike at the smallest change."""
 
 _MAD_TO_DEVIATION = 1.4826
-"""Standard deviation of normal numbers over their median absolute deviation."""
+"""Ratio of standard deviation to median absolute deviation of normal numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Spike:
-    """One figure of one step that stands out."""
+    """Loss or gradient norm of a step above its bound."""
 
     step: int
-    """The step, from 1."""
+    """Number of the step, from 1."""
     what: str
-    """`loss` or `grad_norm`."""
+    """Name of the value, `loss` or `grad_norm`."""
     value: float
-    """What it was."""
     bound: float
-    """What it would have had to stay below."""
+    """Upper bound that the value exceeds."""
     keys: tuple[str, ...]
-    """Keys of the scenes of the step that this process saw."""
+    """Sample keys of this process's scenes in the step."""
 
 
-class SpikeWatch:
-    """Compares each step with the median of those before it, in robust standard deviations.
+class SpikeDetector:
+    """Compares each step with the median of recent ones, in robust standard deviations.
 
-    Medians do not see a spike that they hold themselves, and a fall, as at the start of a training,
-    is none. Steps that were not finite are no spikes: they are skipped and named elsewhere.
+    A median is robust to earlier spikes, and a falling loss, as at the start of a training, is no
+    spike. Steps that are not finite are ignored here: they are skipped and reported elsewhere.
     """
 
     def __init__(self, deviations: float) -> None:
@@ -50,22 +49,22 @@ class SpikeWatch:
         self._recent = {what: deque[float](maxlen=REMEMBERED) for what in ("loss", "grad_norm")}
 
     def add(self, step: int, report: StepReport, keys: Sequence[str]) -> list[Spike]:
-        """Look at a step, from 1, and return what stands out of it."""
-        found = []
+        """Add a step, counted from 1, and return its spikes."""
+        spikes = []
         for what, recent in self._recent.items():
             value = getattr(report, what)
             if not math.isfinite(value):
                 continue
-            bound = bound_of(recent, self._deviations)
+            bound = spike_bound(recent, self._deviations)
             if bound is not None and value > bound:
                 spike = Spike(step=step, what=what, value=value, bound=bound, keys=tuple(keys))
-                found.append(spike)
+                spikes.append(spike)
             recent.append(value)
-        return found
+        return spikes
 
 
-def bound_of(recent: Sequence[float], deviations: float) -> float | None:
-    """Return the median and so many robust deviations; None of too few values."""
+def spike_bound(recent: Sequence[float], deviations: float) -> float | None:
+    """Return the median plus so many robust deviations, or None for too few values."""
     if len(recent) < LEAST_REMEMBERED:
         return None
     median = statistics.median(recent)

@@ -1,4 +1,4 @@
-"""Notices a step that does not end, and says where every process is while it still does not."""
+"""Watchdog that detects hung steps and reports the stacks of every process."""
 
 import faulthandler
 import statistics
@@ -12,28 +12,28 @@ from pathlib import Path
 
 from storage.errors import TrilightError
 from train.loop.crew import Crew
-from train.watching.activity import PARTS, Activity
+from train.watching.activity import PHASES, Activity
 from train.watching.settings import WatchSettings
 
-KNOWN = 3
-"""Number of stretches of a kind after which their usual time is known."""
+MIN_SAMPLES = 3
+"""Number of measured sections of a kind from which their usual time is known."""
 
 UNKNOWN_FACTOR = 5.0
-"""How much longer than `hang_after_s` a stretch may take whose usual time is not known."""
+"""Multiple of `hang_after_s` after which a section without a known usual time counts as hung."""
 
 POLL_S = 1.0
-"""How often the watching thread looks, unless `hang_after_s` is shorter than a few of these."""
+"""Interval of the watchdog's checks; shorter if `hang_after_s` is only a few of these."""
 
-MOST_FILES = 50
-"""Files of stacks that one process writes; later hangs are only told."""
+MAX_FILES = 50
+"""Maximum number of stack files of one process; later hangs are only reported."""
 
 GRACE_S = 5.0
-"""How long a run that is to stop waits for what the other processes write."""
+"""Time that a run waits for the other processes' files before it stops on a hang."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Stretch:
-    """A step, a validation or a saving that is under way."""
+    """A step, validation or saving in progress."""
 
     kind: str
     step: int
@@ -43,7 +43,7 @@ class _Stretch:
 
     @property
     def name(self) -> str:
-        """What it is called for people."""
+        """Display name in messages."""
         if self.kind == "step":
             return f"step {self.step}"
         return f"the {self.kind} after step {self.step}"
@@ -51,50 +51,53 @@ class _Stretch:
 
 @dataclass(kw_only=True)
 class _Hang:
-    """A stretch that hangs, and what was said of it."""
+    """A hung section, and what was reported about it."""
 
     stretch: _Stretch
     began_s: float
     next_s: float
-    """When to speak again."""
-    spoken: bool = False
-    """Whether this process has told of it."""
-    stopped: bool = False
-    """Whether the run was told to stop."""
-    told: set[Path] = field(default_factory=set)
-    """Files of other processes whose first line was passed on."""
+    """time.monotonic() of the next report."""
+    is_reported: bool = False
+    """True after this process has reported the hang."""
+    is_stopped: bool = False
+    """True after the run was asked to stop."""
+    passed_on: set[Path] = field(default_factory=set)
+    """Stack files of other processes whose first line was already reported."""
 
 
 class Watchdog:
-    """Watches the stretches of a training from a thread of its own, in every process.
+    """Monitors the duration of steps, validations and savings from a thread, in every process.
 
-    The first process tells the user; the others write files beside the stacks, of which the first
-    one tells the opening line. A thread that holds Python's lock in native code is not seen.
+    Every process writes its stacks to a file; the first process reports the first line of each to
+    the user. A hang in native code that holds Python's lock is not detected.
     """
 
     def __init__(
         self,
         settings: WatchSettings,
         activity: Activity,
-        crew: Crew,
+        dist_context: Crew,
         folder: Path,
         *,
-        noted: Callable[[str], None],
-        hung: Callable[[str], None],
+        note: Callable[[str], None],
+        report_hang: Callable[[str], None],
     ) -> None:
-        """Take what to watch.
+        """Create the watchdog.
 
         Args:
-            settings: from when on a stretch hangs, and what to do then.
-            activity: what the process does.
-            crew: the processes.
-            folder: for the files.
-            noted: is told of a hang, in the thread of the watchdog.
-            hung: is told of one if the run is to stop, after GRACE_S.
+            settings: time limits, and the action on a hang.
+            activity: current phase of the process.
+            dist_context: the processes that train together.
+            folder: folder of the stack files.
+            note: called with a message about a hang, in the watchdog's thread.
+            report_hang: called GRACE_S after a hang if the run is to stop on one.
         """
-        self._settings, self._activity, self._crew = settings, activity, crew
-        self._folder, self._hung = folder, hung
-        self._told = noted
+        self._settings = settings
+        self._activity = activity
+        self._dist_context = dist_context
+        self._folder = folder
+        self._report_hang = report_hang
+        self._note = note
         self._usual_s: dict[str, deque[float]] = {}
         self._stretch: _Stretch | None = None
         self._closed = threading.Event()
@@ -109,19 +112,20 @@ class Watchdog:
         self._closed.set()
         self._thread.join()
 
-    def begins(self, kind: str, step: int) -> None:
-        """End the stretch that is under way, and begin another.
+    def begin(self, kind: str, step: int) -> None:
+        """End the current section, and begin another.
 
         Args:
-            kind: those of one kind take about the same time.
-            step: the step that it belongs to, from 1.
+            kind: kind of the section; sections of one kind take about the same time.
+            step: step that the section belongs to, from 1.
         """
-        now_s, before = time.monotonic(), self._stretch
+        now_s = time.monotonic()
+        before = self._stretch
         if before is not None:
             known = self._usual_s.setdefault(before.kind, deque(maxlen=100))
             known.append(now_s - before.since_s)
         known = self._usual_s.get(kind, deque())
-        usual_s = statistics.median(known) if len(known) >= KNOWN else None
+        usual_s = statistics.median(known) if len(known) >= MIN_SAMPLES else None
         self._stretch = _Stretch(
             kind=kind, step=step, since_s=now_s, usual_s=usual_s, limit_s=self._limit_s(usual_s)
         )
@@ -135,9 +139,10 @@ class Watchdog:
     def _watch(self) -> None:
         hang: _Hang | None = None
         while not self._closed.wait(min(POLL_S, self._settings.hang_after_s / 5)):
-            now_s, stretch = time.monotonic(), self._stretch
+            now_s = time.monotonic()
+            stretch = self._stretch
             if hang is not None and stretch is not hang.stretch:
-                self._noted(f"{hang.stretch.name} went on after all")
+                self._note_safely(f"{hang.stretch.name} went on after all")
                 hang = None
             if stretch is None or now_s - stretch.since_s < stretch.limit_s:
                 continue
@@ -146,58 +151,61 @@ class Watchdog:
                 self._files += 1
             if now_s >= hang.next_s:
                 hang.next_s = stretch.since_s + 2 * (now_s - stretch.since_s)  # ever more rarely
-                self._tell(hang, now_s)
-            if self._crew.is_first:
-                self._pass_on(hang, now_s)
+                self._report(hang, now_s)
+            if self._dist_context.is_first:
+                self._forward_reports(hang, now_s)
                 self._stop_if_asked(hang, now_s)
 
-    def _tell(self, hang: _Hang, now_s: float) -> None:
-        """Write the stacks, and say in which part this process is."""
-        stretch, doing = hang.stretch, self._activity.now
-        path = self._path(stretch.step, self._crew.rank)
+    def _report(self, hang: _Hang, now_s: float) -> None:
+        """Write the stacks, and report the current phase of this process."""
+        stretch = hang.stretch
+        doing = self._activity.now
+        path = self._path(stretch.step, self._dist_context.rank)
         usual = "" if stretch.usual_s is None else f", where {stretch.usual_s:.2g} s is usual"
         line = (
-            f"process {self._crew.rank} of {self._crew.world_size}: {stretch.name} "
+            f"process {self._dist_context.rank} of {self._dist_context.world_size}: {stretch.name} "
             f"has taken {now_s - stretch.since_s:.1f} s{usual}; for "
-            f"{now_s - doing.since_s:.1f} s it has been in: {PARTS[doing.part]}"
+            f"{now_s - doing.since_s:.1f} s it has been in: {PHASES[doing.phase]}"
         )
         written = ""
-        if self._files <= MOST_FILES:
+        if self._files <= MAX_FILES:
             with suppress(OSError):
-                _write_stacks(path, line, again=hang.spoken)
+                _write_stacks(path, line, appends=hang.is_reported)
                 written = f". Stacks of its threads: {path}"
-        hang.spoken = True
-        self._noted(line + written)
+        hang.is_reported = True
+        self._note_safely(line + written)
 
-    def _noted(self, text: str) -> None:
-        with suppress(TrilightError):  # a full disk is no reason to end a thread that only watches
-            self._told(text)
+    def _note_safely(self, text: str) -> None:
+        with suppress(TrilightError):  # a full disk must not end the watchdog
+            self._note(text)
 
     def _path(self, step: int, rank: int | str) -> Path:
         return self._folder / f"hang-step-{step:09d}-rank-{rank}.txt"
 
-    def _pass_on(self, hang: _Hang, now_s: float) -> None:
-        """Tell what the other processes wrote of the same step, in this call of the trainer."""
+    def _forward_reports(self, hang: _Hang, now_s: float) -> None:
+        """Report new stack files of the other processes about the same step."""
         began_unix_s = time.time() - (now_s - hang.stretch.since_s)
-        hang.told.add(self._path(hang.stretch.step, self._crew.rank))
+        hang.passed_on.add(self._path(hang.stretch.step, self._dist_context.rank))
         pattern = self._path(hang.stretch.step, "*").name
-        for path in sorted(set(self._folder.glob(pattern)) - hang.told):
+        for path in sorted(set(self._folder.glob(pattern)) - hang.passed_on):
             with suppress(OSError):
                 lines = path.read_text().splitlines()
                 if lines and path.stat().st_mtime >= began_unix_s:
-                    hang.told.add(path)
-                    self._noted(f"{lines[0]}. Stacks of its threads: {path}")
+                    hang.passed_on.add(path)
+                    self._note_safely(f"{lines[0]}. Stacks of its threads: {path}")
 
     def _stop_if_asked(self, hang: _Hang, now_s: float) -> None:
-        asked = self._settings.on_hang == "stop" and not hang.stopped
-        if asked and now_s - hang.began_s >= GRACE_S:
-            hang.stopped = True
-            self._hung(f"training: {hang.stretch.name} hangs, and the run was asked to stop then")
+        should_stop = self._settings.on_hang == "stop" and not hang.is_stopped
+        if should_stop and now_s - hang.began_s >= GRACE_S:
+            hang.is_stopped = True
+            self._report_hang(
+                f"training: {hang.stretch.name} hangs, and the run was asked to stop then"
+            )
 
 
-def _write_stacks(path: Path, line: str, *, again: bool) -> None:
+def _write_stacks(path: Path, line: str, *, appends: bool) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a" if again else "w") as stream:
+    with path.open("a" if appends else "w") as stream:
         stream.write(f"{line}\n\n")
         stream.flush()
         faulthandler.dump_traceback(stream, all_threads=True)

@@ -1,4 +1,4 @@
-"""Weights & Biases beside TensorBoard, where it is asked for and installed."""
+"""Logging to Weights & Biases, if requested and installed."""
 
 import os
 from collections.abc import Mapping
@@ -12,19 +12,19 @@ from storage.errors import TrilightError
 from train.watching.scalars import scalars
 
 
-class BiasesBoard:
-    """Logs the rows of a run to a project; each call of the trainer is a run of its group.
+class WandbLogger:
+    """Logs the rows of a run to a project; each call of the trainer is one run in a group.
 
-    Nothing leaves the machine unless WANDB_MODE says `online`: `wandb sync` sends it later.
+    Nothing leaves the machine unless WANDB_MODE is `online`: `wandb sync` uploads it later.
     """
 
     def __init__(self, project: str, folder: Path, settings: Mapping[str, Any]) -> None:
-        """Begin a run.
+        """Start a run of the project.
 
         Args:
-            project: its project.
-            folder: of the training; files lie in `wandb/` in it, and its name is the group's.
-            settings: what is shown as the configuration.
+            project: name of the project.
+            folder: folder of the training, with files in `wandb/`; its name is that of the group.
+            settings: configuration of the run to display.
 
         Raises:
             TrilightError: the package is not installed.
@@ -38,13 +38,13 @@ class BiasesBoard:
             config=dict(settings),
             mode=os.environ.get("WANDB_MODE", "offline"),
         )
-        # rows of a spike come later than those of its step: the step is a number like the others
+        # a spike's row comes after later steps, so the step is logged as an ordinary value
         self._run.define_metric("*", step_metric="step")
 
     def scalars(self, row: Mapping[str, Any]) -> None:
         """Add a row of the log."""
-        if found := scalars(row):
-            self._run.log({**found, "step": row["step"]})
+        if numbers := scalars(row):
+            self._run.log({**numbers, "step": row["step"]})
 
     def sheet(self, step: int, sheet: Image.Image) -> None:
         """Add a sheet of validation pictures."""
@@ -56,10 +56,10 @@ class BiasesBoard:
 
 
 def require_wandb(project: str | None) -> None:
-    """Refuse a run that asks for the package where it is missing, before anything is read.
+    """Raise early if the package is requested and missing.
 
     Raises:
-        TrilightError: it is asked for and not installed.
+        TrilightError: a project is named and wandb is not installed.
     """
     if project is not None:
         _package()

@@ -13,7 +13,7 @@ from model.neural_renderer import NeuralRenderer
 from model.renderformer import radiance
 from model.scene_tensors import scene_tensors
 from model.sky.drawn import DrawnSky
-from model.sky.symmetries import behind_mirror, scaled, turned, with_channels
+from model.sky.symmetries import mirror_sky, permute_sky_channels, rotate_sky, scale_sky
 from scene_templates.rotations import uniform_rotation
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -114,17 +114,19 @@ HERE = environment_values(SKY, DIRECTIONS)
 def test_light_comes_from_where_a_symmetry_puts_it() -> None:
     """Rotations are kept in float32, by which this sky changes by less than 1e-6."""
     rotation, sides = uniform_rotation(np.random.default_rng(9)), np.array([-1, 1, 1], np.float32)
-    there = environment_values(turned(SKY, rotation), DIRECTIONS @ rotation.T)
+    there = environment_values(rotate_sky(SKY, rotation), DIRECTIONS @ rotation.T)
     assert np.abs(there - HERE).max() < 3e-6
-    mirrored = behind_mirror(SKY, sides)
+    mirrored = mirror_sky(SKY, sides)
     mirrored.check()
     assert np.abs(environment_values(mirrored, DIRECTIONS * sides) - HERE).max() < 3e-6
-    twice = behind_mirror(mirrored, sides)
+    twice = mirror_sky(mirrored, sides)
     assert np.array_equal(twice.radiance_rgb, SKY.radiance_rgb)
     assert np.array_equal(twice.rotation, SKY.rotation)
     order = np.array([1, 2, 0])
-    assert np.array_equal(environment_values(with_channels(SKY, order), DIRECTIONS), HERE[:, order])
-    assert np.abs(environment_values(scaled(SKY, 3.0), DIRECTIONS) - 3 * HERE).max() < 1e-6
+    assert np.array_equal(
+        environment_values(permute_sky_channels(SKY, order), DIRECTIONS), HERE[:, order]
+    )
+    assert np.abs(environment_values(scale_sky(SKY, 3.0), DIRECTIONS) - 3 * HERE).max() < 1e-6
 
 
 @for_each("config", [tiny_config(), hits_config()])

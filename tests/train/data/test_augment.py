@@ -31,8 +31,8 @@ from tests.train.toy import toy_picture, toy_sample
 from train.data.augment import (
     augmented,
     mirrored,
-    moved,
-    rotation_rand,
+    move_scene,
+    random_rotation,
     with_channels,
     with_light_scaled,
     with_vertices_turned,
@@ -62,8 +62,8 @@ SYMMETRIES: dict[str, Symmetry] = {
     "vertices": lambda scene: with_vertices_turned(
         scene, np.arange(scene.tensors.num_triangles) % 3
     ),
-    "motion": lambda scene: moved(
-        scene, rotation_rand("uniform", rng_for(0, "turn")), torch.tensor([3.0, -1.0, 0.5])
+    "motion": lambda scene: move_scene(
+        scene, random_rotation("uniform", rng_for(0, "turn")), torch.tensor([3.0, -1.0, 0.5])
     ),
     "light": lambda scene: with_light_scaled(scene, 2.5),
     "rotation of the recipe": lambda scene: augmented(
@@ -166,7 +166,7 @@ def test_uniform_rotations_favour_no_direction_and_the_recipe_favours_none_at_al
     """Of a rotation uniform on SO(3) the trace has mean 0 and variance 1; small turns raise it."""
     rng = rng_for(0, "rotations")
     traces = {
-        kind: np.array([float(rotation_rand(kind, rng).trace()) for _ in range(1500)])
+        kind: np.array([float(random_rotation(kind, rng).trace()) for _ in range(1500)])
         for kind in ("uniform", "recipe")
     }
     # five standard errors of 1500 draws: 5 / sqrt(1500) = 0.13
@@ -174,10 +174,10 @@ def test_uniform_rotations_favour_no_direction_and_the_recipe_favours_none_at_al
     assert abs(traces["uniform"].var() - 1) < 0.2  # fourth moment 3: 5 sqrt(2 / 1500) = 0.18
     assert traces["recipe"].mean() > 0.3
     for kind in ("uniform", "recipe"):
-        turned = rotation_rand(kind, rng)
+        turned = random_rotation(kind, rng)
         torch.testing.assert_close(turned @ turned.T, torch.eye(3).double())
         assert turned.det().item() == pytest.approx(1)
-    assert torch.equal(rotation_rand("none", rng), torch.eye(3).double())
+    assert torch.equal(random_rotation("none", rng), torch.eye(3).double())
 
 
 ORDER = np.array([2, 0, 1])
@@ -209,8 +209,8 @@ def test_a_sky_goes_through_the_symmetries_of_training(symmetry: str) -> None:
     )
     before = _direct(tensors)
     if symmetry == "moved":
-        rotation = rotation_rand("uniform", np.random.default_rng(0))
-        after = _direct(moved(training, rotation, torch.tensor([0.4, -0.1, 0.2])).tensors)
+        rotation = random_rotation("uniform", np.random.default_rng(0))
+        after = _direct(move_scene(training, rotation, torch.tensor([0.4, -0.1, 0.2])).tensors)
     elif symmetry == "mirrored":
         after = _direct(mirrored(training).tensors)[:, ::-1]
     elif symmetry == "channels":
@@ -246,7 +246,7 @@ def test_training_takes_skies_that_its_network_knows(config: object, is_known: b
     rng = np.random.default_rng(0)
     maker = _SceneMaker(None, None, settings, Unusable(0))  # type: ignore[arg-type]
     if is_known:
-        assert maker._drawn(_below_a_sky(), rng).tensors.sky is not None
+        assert maker._draw_views(_below_a_sky(), rng).tensors.sky is not None
         return
     with pytest.raises(TrilightError, match="this network does not know its light"):
-        maker._drawn(_below_a_sky(), rng)
+        maker._draw_views(_below_a_sky(), rng)

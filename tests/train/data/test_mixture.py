@@ -15,7 +15,7 @@ from tests.for_each import for_each
 from tests.train.data.test_stream import by_key, identity, same_batches
 from tests.train.kit import keys_of, take, tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.data.mixture import RECORD, Mixture, mixture_of
+from train.data.mixture import RECORD, Mixture, plan_mixture
 from train.data.scenes import TrainingScene
 from train.data.stream import StreamSettings
 from train.data.unusable import Unusable, first_samples
@@ -60,12 +60,12 @@ def test_every_stretch_has_its_shares_and_may_be_entered_anywhere(
     turns = list(itertools.islice(mixed.sources_from(0), 3000))
     for at in (0, 1, 17, 999, 2990):
         counts = tuple(turns[:at].count(source) for source in range(len(weights)))
-        assert mixed.taken(at) == counts
+        assert mixed.counts_before(at) == counts
         assert list(itertools.islice(mixed.sources_from(at), 10)) == turns[at : at + 10]
         for source, weight in enumerate(weights):
             assert abs(counts[source] - at * weight / sum(weights)) < len(weights)
     far = 10**15
-    assert sum(mixed.taken(far)) == far, "in the time of the first"
+    assert sum(mixed.counts_before(far)) == far, "in the time of the first"
 
 
 WEIGHTS = (2.0, 1.0)
@@ -119,20 +119,20 @@ def test_a_dataset_that_is_known_goes_on_where_it_was(roots: list[str], data: Tr
     run = tiny_run(scenes_per_step=BATCH)
     alone = [open_mixture([root]) for root in roots]
     header = {"step": 0, "settings": {"scenes_per_step": BATCH}, "data_digest": alone[0].digest}
-    assert mixture_of(alone[0], run, None) is None
-    assert mixture_of(alone[0], run, header | {"step": 5}) is None
-    two = mixture_of(data, run, header | {"step": 5})
+    assert plan_mixture(alone[0], run, None) is None
+    assert plan_mixture(alone[0], run, header | {"step": 5}) is None
+    two = plan_mixture(data, run, header | {"step": 5})
     assert two is not None and two.weights == (7.0, 3.0), "shares as their numbers of scenes"
     assert (two.first, two.before) == (20, (20, 0))
     later = header | {"step": 10, RECORD: two.record(), "data_digest": data.digest}
-    assert mixture_of(data, run, later) == two
+    assert plan_mixture(data, run, later) == two
     weighed = dataclasses.replace(run, data_weights=(1, 1))
-    other = mixture_of(data, weighed, later)
+    other = plan_mixture(data, weighed, later)
     assert other is not None and (other.first, other.before) == (40, (34, 6))
-    wider = mixture_of(data, tiny_run(scenes_per_step=2 * BATCH), later)
+    wider = plan_mixture(data, tiny_run(scenes_per_step=2 * BATCH), later)
     assert wider is not None and (wider.first, wider.before) == (80, (34, 6))
-    second = mixture_of(alone[1], run, later)
-    assert second is not None and second.before == (6,) and second.taken(44) == (10,)
+    second = plan_mixture(alone[1], run, later)
+    assert second is not None and second.before == (6,) and second.counts_before(44) == (10,)
 
 
 def test_mistakes_about_several_datasets(roots: list[str], data: TrainingData) -> None:
@@ -141,7 +141,7 @@ def test_mistakes_about_several_datasets(roots: list[str], data: TrainingData) -
     with pytest.raises(TrilightError, match="2 places of which 1 are shards"):
         open_mixture([roots[0], f"{roots[1]}/train-000000.tar"])
     with pytest.raises(TrilightError, match="3 numbers, but --data names 2 datasets"):
-        mixture_of(data, tiny_run(data_weights=(1.0, 1.0, 1.0)), None)
+        plan_mixture(data, tiny_run(data_weights=(1.0, 1.0, 1.0)), None)
     with pytest.raises(TrilightError, match="data_weights"):
         tiny_run(data_weights=(1.0, 0.0))
 

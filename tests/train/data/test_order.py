@@ -26,9 +26,9 @@ from tests.train.toy import toy_sample
 from train.data.open_shards import OpenShards
 from train.data.order import (
     OrderSettings,
-    Place,
     RankShare,
     ShardWindow,
+    Visit,
     batched,
     places_from,
     windows_from,
@@ -46,11 +46,11 @@ def windows(
     chosen = OrderSettings(seed=seed, window=window)
     stream = windows_from(len(sizes), lambda shard: sizes[shard], chosen, first)
     end = 2 * sum(sizes)
-    return list(itertools.takewhile(lambda one: one.places[0].position < end, stream))
+    return list(itertools.takewhile(lambda one: one.visits[0].position < end, stream))
 
 
-def places(found: list[ShardWindow]) -> list[Place]:
-    return [place for window in found for place in window.places]
+def places(found: list[ShardWindow]) -> list[Visit]:
+    return [place for window in found for place in window.visits]
 
 
 @settings(deadline=None)  # a busy machine is no failure
@@ -72,7 +72,7 @@ def test_samples_stay_within_their_window_of_shards(sizes: list[int], window: in
     for one in windows(sizes, window=window):
         assert len(one.shards) <= window
         held = {(shard, row) for shard in one.shards for row in range(sizes[shard])}
-        assert {(place.shard, place.row) for place in one.places} == held
+        assert {(place.shard, place.row) for place in one.visits} == held
 
 
 @settings(deadline=None)  # a busy machine is no failure
@@ -80,7 +80,7 @@ def test_samples_stay_within_their_window_of_shards(sizes: list[int], window: in
 def test_entering_later_gives_the_rest(sizes: list[int], data: st.DataObject) -> None:
     first = data.draw(st.integers(0, 2 * sum(sizes) - 1))
     whole = places(windows(sizes))
-    assert first in [place.position for place in windows(sizes, first)[0].places]
+    assert first in [place.position for place in windows(sizes, first)[0].visits]
     assert [p for p in places(windows(sizes, first)) if p.position >= first] == whole[first:]
 
 
@@ -173,10 +173,10 @@ def test_shards_are_open_from_their_first_sample_to_their_last_and_errors_come_t
         opened.plan([0, 0, 1])
         opened.plan([1, 2])
         assert [opened.read(number).name for number in (0, 1, 2)] == ["a", "b", "c"]
-        opened.done([0, 0, 1])
+        opened.mark_read([0, 0, 1])
         assert shards.closed == ["a"]
         assert opened.read(1).name == "b"
-        opened.done([1])
+        opened.mark_read([1])
         assert shards.closed == ["a", "b"]
         opened.plan([0])
         assert opened.read(0).name == "a"
@@ -187,7 +187,7 @@ def test_shards_are_open_from_their_first_sample_to_their_last_and_errors_come_t
         assert opened.read(0).name == "a"
         with pytest.raises(TrilightError, match="is broken"):
             opened.read(3)
-        opened.done([3])
+        opened.mark_read([3])
 
 
 SHARDS, PER_SHARD, RESOLUTION = 30, 8, 128

@@ -30,7 +30,7 @@ from train.evaluation.metrics import METRICS, noise_floors, picture_scores
 from train.evaluation.report import markdown, record
 from train.evaluation.rivals import median_picture
 from train.evaluation.same_time import CAPTION, TRACER, Times, TracerTimes, same_time, sentences
-from train.evaluation.scores import ViewScore, lead, score_view, share_better, summarise
+from train.evaluation.scores import ViewScore, fraction_better, lead, score_view, summarize_scores
 from train.evaluation.sheet import (
     NOISE_WHITE,
     SheetView,
@@ -113,12 +113,12 @@ def test_scores_are_those_of_storage_and_a_summary_shows_the_bad_ones() -> None:
     assert score.object_psnr_log_db == object_psnr_log_db(a, b, hits)
     assert score.log_l1 == pytest.approx(np.abs(log10_radiance(a) - log10_radiance(b)).mean())
     views = [view_score(float(value), float(value)) for value in range(101)]
-    summary = summarise(views)
+    summary = summarize_scores(views)
     assert summary["log_l1"] == 50.0
     assert summary["psnr_log_db_median"] == 50.0
     assert summary["object_psnr_log_db_p5"] == pytest.approx(5.0)
-    assert share_better(views, views) == 0
-    assert share_better(views, [view_score(25.5, 25.5)] * 101) == pytest.approx(26 / 101)
+    assert fraction_better(views, views) == 0
+    assert fraction_better(views, [view_score(25.5, 25.5)] * 101) == pytest.approx(26 / 101)
 
 
 def test_no_fixed_picture_has_less_l1_error_than_the_median() -> None:
@@ -269,6 +269,6 @@ def test_sheets_show_it_beside_the_prediction(
     shown = sheet_views(contest, views)
     # the target went through float32 logarithms
     np.testing.assert_allclose(
-        shown[1].beside_rgb[CAPTION], shown[1].target_rgb, rtol=1e-5, atol=1e-6
+        shown[1].extra_rgb[CAPTION], shown[1].target_rgb, rtol=1e-5, atol=1e-6
     )
     assert drawn_sheet(shown, ("title",)).width > alone.width

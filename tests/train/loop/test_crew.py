@@ -20,7 +20,7 @@ from tests.for_each import for_each
 from tests.train.kit import tiny_run, trained
 from train.folder import RunFolder
 from train.loop import checkpoints, interrupts
-from train.loop.background import Background
+from train.loop.background import BackgroundWriter
 from train.loop.checkpoints import read_checkpoint, saved_steps
 from train.loop.crew import Crew, choose_device, join_crew
 from train.loop.interrupts import deferred_interrupts
@@ -41,7 +41,7 @@ def test_without_torchrun_a_process_is_alone_and_no_missing_device_is_taken(
     with pytest.raises(TrilightError, match="device 'tpu'; expected cpu or cuda"):
         choose_device("tpu")
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    with pytest.raises(TrilightError, match="process 2 of this machine finds 2 cards"):
+    with pytest.raises(TrilightError, match="process 2 of this machine finds 2 GPUs"):
         choose_device("cuda", 2)
 
 
@@ -57,7 +57,7 @@ def test_the_first_process_of_each_machine_makes_a_thing_before_the_others(
 
     monkeypatch.setattr(Crew, "any", lambda *_: done.append("waited"))
     crew = Crew(device=torch.device("cpu"), rank=8, world_size=16, local_rank=local_rank)
-    assert crew.once_a_machine(made) == 7
+    assert crew.run_once_per_machine(made) == 7
     assert done == order.split()
 
 
@@ -108,7 +108,7 @@ def test_it_is_answered_while_the_main_thread_is_in_a_call_that_does_not_return(
 def test_a_second_signal_acts_as_it_did_before_but_not_what_torchrun_passes_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(interrupts, "ONE_ASKING_S", 0.0)
+    monkeypatch.setattr(interrupts, "ECHO_S", 0.0)
     with pytest.raises(KeyboardInterrupt), deferred_interrupts(lambda times: None) as asked:
         signal.raise_signal(signal.SIGINT)
         assert asked()
@@ -116,7 +116,7 @@ def test_a_second_signal_acts_as_it_did_before_but_not_what_torchrun_passes_on(
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
     # the terminal sends Ctrl-C to all processes, and torchrun sends it to its own once more
-    monkeypatch.setattr(interrupts, "ONE_ASKING_S", 3600.0)
+    monkeypatch.setattr(interrupts, "ECHO_S", 3600.0)
     answers: list[int] = []
     with deferred_interrupts(answers.append) as asked:
         for number in (signal.SIGINT, signal.SIGINT, signal.SIGTERM):
@@ -140,21 +140,21 @@ def test_work_is_done_in_order_and_its_errors_come_at_the_next_call() -> None:
         assert goes_on.wait(PATIENCE_S)
         done.append("first")
 
-    with Background() as background:
+    with BackgroundWriter() as background:
         background.begin(first)
         assert done == []
         goes_on.set()
         background.begin(lambda: done.append("second"))
         assert done[0] == "first"
     assert done == ["first", "second"]
-    background = Background()
+    background = BackgroundWriter()
     background.begin(full)
     with pytest.raises(TrilightError, match="the disk is full"):
         background.begin(lambda: None)
     background.wait()
-    with pytest.raises(TrilightError, match="the disk is full"), Background() as other:
+    with pytest.raises(TrilightError, match="the disk is full"), BackgroundWriter() as other:
         other.begin(full)
-    with pytest.raises(TrilightError, match="a loss") as error, Background() as background:
+    with pytest.raises(TrilightError, match="a loss") as error, BackgroundWriter() as background:
         background.begin(full)
         raise TrilightError("a loss is not finite")
     assert error.value.__notes__ == ["the disk is full"]

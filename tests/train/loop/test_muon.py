@@ -13,7 +13,7 @@ from torch import Tensor
 from tests.for_each import for_each
 from train.loop import muon as muon_file
 from train.loop.crew import Crew
-from train.loop.muon import fitting_precision, muon, orthogonal, shared_out
+from train.loop.muon import fitting_precision, muon, orthogonal, split_over_ranks
 
 JORDAN = (3.4445, -4.7750, 2.0315)
 SHAPES = [(24, 8), (24, 8), (8, 24), (12, 12), (12, 12), (12, 12), (1, 9), (9, 1), (1, 1)]
@@ -186,7 +186,7 @@ def test_processes_that_share_the_work_move_alike(
             monkeypatch.setattr(
                 muon_file.dist, "all_gather", lambda p, d, rank=rank: gather(p, d, rank)
             )
-            found = shared_out(list(several), work, torch.float32)
+            found = split_over_ranks(list(several), work, torch.float32)
         assert torch.equal(found, work(list(several))), "the last to be asked was told everything"
         told.clear()
 

@@ -31,15 +31,15 @@ from train.data.buckets import make_batch
 from train.data.scenes import training_scene
 from train.loop.state import new_state
 from train.loop.step import StepReport
-from train.watching.activity import PARTS, Activity
+from train.watching.activity import PHASES, Activity
 from train.watching.layers import LayerNorms, layer_of
 from train.watching.profiler import StepProfiler
-from train.watching.ranks import OWN_PARTS, own_seconds, slowest
+from train.watching.ranks import OWN_PHASES, own_seconds, slowest_rank
 from train.watching.rows import read_rows
 from train.watching.scalars import scalars
 from train.watching.settings import WatchSettings
-from train.watching.spikes import LEAST_REMEMBERED, Spike, SpikeWatch, bound_of
-from train.watching.weights_and_biases import BiasesBoard, require_wandb
+from train.watching.spikes import LEAST_REMEMBERED, Spike, SpikeDetector, spike_bound
+from train.watching.weights_and_biases import WandbLogger, require_wandb
 
 
 def test_the_parts_add_up_to_the_time_that_passed_and_end_with_an_error(
@@ -53,27 +53,27 @@ def test_the_parts_add_up_to_the_time_that_passed_and_end_with_an_error(
     now_s += 2
     with activity.during("validation"):
         now_s += 4
-        assert activity.now.part == "validation"
+        assert activity.now.phase == "validation"
     now_s += 8
     # sums of whole numbers below 2^53 are exact
     taken = {"other": 1, "data": 10, "validation": 4}
-    assert activity.taken() == dict.fromkeys(PARTS, 0.0) | taken
+    assert activity.pop_seconds() == dict.fromkeys(PHASES, 0.0) | taken
     now_s += 16
-    assert activity.taken()["data"] == 16, "what goes on counts up to now, and once"
+    assert activity.pop_seconds()["data"] == 16, "what goes on counts up to now, and once"
     activity.begin("data")
     with pytest.raises(ValueError, match="x"), activity.during("saving"):
         raise ValueError("x")
-    assert activity.now.part == "data"
+    assert activity.now.phase == "data"
 
 
 def test_a_process_stands_out_by_its_own_work_or_none_does() -> None:
-    assert slowest([0.1, 0.1, 0.5, 0.12]) == 2
-    assert slowest([0.5, 0.1]) == 0
-    assert slowest([1.0, 1.2, 1.1]) is None, "less than half more is no news"
-    assert slowest([0.001, 0.01]) is None, "milliseconds are no news"
-    assert slowest([1.0]) is None
-    assert set(PARTS) - set(OWN_PARTS) == {"exchange", "validation", "saving"}
-    assert own_seconds({**dict.fromkeys(PARTS, 0.0), "data": 3.0, "exchange": 9.0}, 2) == 1.5
+    assert slowest_rank([0.1, 0.1, 0.5, 0.12]) == 2
+    assert slowest_rank([0.5, 0.1]) == 0
+    assert slowest_rank([1.0, 1.2, 1.1]) is None, "less than half more is no news"
+    assert slowest_rank([0.001, 0.01]) is None, "milliseconds are no news"
+    assert slowest_rank([1.0]) is None
+    assert set(PHASES) - set(OWN_PHASES) == {"exchange", "validation", "saving"}
+    assert own_seconds({**dict.fromkeys(PHASES, 0.0), "data": 3.0, "exchange": 9.0}, 2) == 1.5
 
 
 @for_each("clip", [1e9, 1e-3])
@@ -83,9 +83,9 @@ def test_the_figures_are_those_of_an_update_before_clipping(clip: float) -> None
     watched = stepper(state, settings)
     batch = make_batch([training_scene(toy_sample(index), 16) for index in range(2)])
     before = copy.deepcopy(dict(state.model.named_parameters()))
-    watched.layers.expect(True)
+    watched.layers.expect_update(True)
     report = watched.step([batch], 3e-3)
-    row = watched.layers.row()
+    row = watched.layers.pop_row()
     squared: dict[str, np.ndarray] = {}
     for name, weight in state.model.named_parameters():
         old, new = (w.detach().double().numpy().ravel() for w in (before[name], weight))
@@ -100,20 +100,20 @@ def test_the_figures_are_those_of_an_update_before_clipping(clip: float) -> None
     whole = math.sqrt(sum((grad or 0) ** 2 for grad, _, _ in row.values()))
     assert whole == pytest.approx(report.grad_norm, rel=1e-3)
     watched.step([batch], 3e-3)
-    assert watched.layers.row() == {}, "nobody asked for this update"
+    assert watched.layers.pop_row() == {}, "nobody asked for this update"
 
 
 def test_a_gradient_that_is_not_finite_is_none_and_a_missing_one_is_nothing() -> None:
     model = nn.Sequential(nn.Linear(2, 1, bias=False), nn.Linear(1, 1, bias=False))
     layers = LayerNorms(model)
-    layers.expect(True)
+    layers.expect_update(True)
     model[0].weight.grad = torch.full((1, 2), math.inf)
-    layers.gradients()
-    layers.updated()
-    seen = layers.unread()
+    layers.record_gradients()
+    layers.record_update()
+    seen = layers.pending()
     assert seen is not None
-    layers.read(seen.flatten().tolist())
-    row = layers.row()
+    layers.set_values(seen.flatten().tolist())
+    row = layers.pop_row()
     assert row["0.weight"][0] is None
     assert row["1.weight"][0] == 0 == row["1.weight"][2]
 
@@ -122,9 +122,9 @@ def test_the_trace_holds_the_steps_and_the_note_says_how_to_open_it(tmp_path: Pa
     said: list[str] = []
     profiler = StepProfiler(2, CPU, tmp_path, said.append)
     for step in range(11, 18):
-        profiler.begins(step)
+        profiler.begin_step(step)
         torch.ones(3, 3) @ torch.ones(3, 3)
-        profiler.ends(step)
+        profiler.end_step(step)
     profiler.close(17)
     trace, table = tmp_path / "profile-steps-14-to-15.json.gz", "profile-steps-14-to-15.txt"
     with gzip.open(trace) as stream:
@@ -140,8 +140,8 @@ def test_what_was_not_reached_is_told(tmp_path: Path, asked: int, steps: int) ->
     told: list[str] = []
     profiler = StepProfiler(asked, CPU, tmp_path, told.append)
     for step in range(1, steps + 1):
-        profiler.begins(step)
-        profiler.ends(step)
+        profiler.begin_step(step)
+        profiler.end_step(step)
     profiler.close(steps)
     ended = "nothing was profiled: the run ended before step 4 of this call"
     assert told == ([ended] if asked else [])
@@ -152,7 +152,7 @@ REPORT = StepReport(loss=1.0, l1=1.0, brightness=1.0, grad_norm=0.1, applied=Tru
 
 
 def test_a_gradient_that_jumps_is_found_with_its_scenes_and_a_falling_loss_is_not() -> None:
-    watch, rng = SpikeWatch(8.0), rng_for(0, "spikes")
+    watch, rng = SpikeDetector(8.0), rng_for(0, "spikes")
     found = []
     for step in range(1, 401):
         noise = np.exp(rng.normal(0, 0.1, 2))
@@ -173,9 +173,9 @@ def test_a_gradient_that_jumps_is_found_with_its_scenes_and_a_falling_loss_is_no
 
 def test_a_bound_is_median_and_deviations_and_neither_a_breath_nor_infinity_spikes() -> None:
     values = [1.0, 2.0, 3.0, 4.0, 100.0] * 20
-    assert bound_of(values, 2.0) == 3.0 + 2 * 1.4826 * 1.0
-    assert bound_of(values[: LEAST_REMEMBERED - 1], 2.0) is None
-    watch = SpikeWatch(8.0)
+    assert spike_bound(values, 2.0) == 3.0 + 2 * 1.4826 * 1.0
+    assert spike_bound(values[: LEAST_REMEMBERED - 1], 2.0) is None
+    watch = SpikeDetector(8.0)
     for step in range(100):
         assert watch.add(step, REPORT, []) == []
     assert watch.add(100, replace(REPORT, loss=1.1), []) == []
@@ -215,7 +215,7 @@ def test_rows_and_sheets_of_a_run_are_logged_offline_or_as_the_user_says(
     board.define_metric.assert_called_once_with("*", step_metric="step")
     board.finish.assert_called_once_with()
     monkeypatch.setenv("WANDB_MODE", "online")
-    BiasesBoard("light", tmp_path, {})
+    WandbLogger("light", tmp_path, {})
     assert package.init.call_args.kwargs["mode"] == "online"
 
 

@@ -24,7 +24,7 @@ from train.loop.crew import Crew, join_crew
 from train.progress import TrainProgress
 from train.run import train_run
 from train.watching import spikes, watchdog
-from train.watching.activity import PARTS, Activity
+from train.watching.activity import PHASES, Activity
 from train.watching.rows import read_rows
 from train.watching.settings import WatchSettings
 from train.watching.watchdog import Watchdog
@@ -48,15 +48,15 @@ def test_a_loader_that_sleeps_is_named_with_its_stack(tmp_path: Path) -> None:
     settings = WatchSettings(hang_after_s=0.1, hang_factor=2)
     activity = Activity()
     dog = Watchdog(
-        settings, activity, ALONE, tmp_path / "watching", noted=said.append, hung=pytest.fail
+        settings, activity, ALONE, tmp_path / "watching", note=said.append, report_hang=pytest.fail
     )
     with dog:
         for step in range(1, 5):
-            dog.begins("step", step)
+            dog.begin("step", step)
         activity.begin("data")
-        dog.begins("step", 5)
+        dog.begin("step", 5)
         sleeping_loader(said, 2)
-        dog.begins("step", 6)
+        dog.begin("step", 6)
         until(lambda: "step 5 went on after all" in said)
     first, again = said[0], said[1]
     assert first.startswith("process 0 of 1: step 5 has taken ")
@@ -83,9 +83,9 @@ def test_words_of_other_processes_are_passed_on_and_the_run_stops_if_asked(
     os.utime(others, (time.time() + 60, time.time() + 60))  # written while it hangs
     os.utime(old, (0, 0))  # of an earlier call
     pair = Crew(device=CPU, world_size=2)
-    dog = Watchdog(settings, Activity(), pair, tmp_path, noted=said.append, hung=ended.append)
+    dog = Watchdog(settings, Activity(), pair, tmp_path, note=said.append, report_hang=ended.append)
     with dog:
-        dog.begins("validation", 7)
+        dog.begin("validation", 7)
         until(lambda: ended)
     assert "the validation after step 7 hangs" in ended[0] and len(ended) == 1
     passed_on = [text for text in said if text.startswith("process 1 of 2: in the loader")]
@@ -97,10 +97,15 @@ def test_a_full_disk_ends_no_watching(tmp_path: Path) -> None:
     (tmp_path / "watching").write_text("a file where the folder would be")
     settings = WatchSettings(hang_after_s=0.1)
     dog = Watchdog(
-        settings, Activity(), ALONE, tmp_path / "watching", noted=said.append, hung=pytest.fail
+        settings,
+        Activity(),
+        ALONE,
+        tmp_path / "watching",
+        note=said.append,
+        report_hang=pytest.fail,
     )
     with dog:
-        dog.begins("step", 1)
+        dog.begin("step", 1)
         until(lambda: said)
     assert "Stacks" not in said[0]
 
@@ -117,7 +122,7 @@ def test_a_row_tells_parts_memory_and_layers_and_spikes_name_their_scenes(
     windows = [row for row in rows if "loss" in row]
     assert [row["step"] for row in windows] == [2, 4, 6, 8, 10, 12]
     for row in windows:
-        assert set(row["time_s"]) == set(PARTS)
+        assert set(row["time_s"]) == set(PHASES)
         assert row["time_s"]["forward"] > 0 < row["time_s"]["backward"]
         assert row["memory_mb"].get("process", 100) > 50
         assert "decoder.head" in row["layers"] and "own_s" not in row
@@ -149,7 +154,7 @@ def test_of_two_processes_the_slow_one_and_the_hanging_one_are_named(
     assert re.search(first, done.stdout), done.stdout
     assert re.search(second, done.stdout), done.stdout
     assert "went on after all" in done.stdout
-    stacks = [path.read_text() for path in RunFolder(out).watching.glob("hang-*-rank-1.txt")]
+    stacks = [path.read_text() for path in RunFolder(out).monitoring.glob("hang-*-rank-1.txt")]
     assert any("test_watchdog.py" in text and "sleeping" in text for text in stacks)
     rows = [row for row in read_rows(RunFolder(out).metrics) if "loss" in row]
     fast, slow = (sum(row["own_s"][rank] for row in rows) for rank in range(2))
@@ -174,7 +179,7 @@ def slow_from(crew: Crew) -> None:
     """Let the second process's loader sleep a little at each scene, and once for long."""
     made, count = stream._SceneMaker.scene, 0
 
-    def sleeping(maker: stream._SceneMaker, place: stream.Place) -> TrainingScene:
+    def sleeping(maker: stream._SceneMaker, place: stream.Visit) -> TrainingScene:
         nonlocal count
         count += 1
         time.sleep(SLEEP_S if count == 12 else 0.2)
