@@ -209,14 +209,16 @@ def _mesh_filters() -> Finding:
 
 
 def _confinement() -> Finding:
-    wanted, missing = wanted_confinement(), missing_parts()
+    wanted = wanted_confinement()
+    missing = missing_parts()
     version = landlock_version()
     has = [f"Landlock {version}"] if version else []
     found = ", ".join([*has, *(["seccomp"] if seccomp_works() else [])]) or "nothing to confine by"
     if wanted != "off" and not missing:
         return Finding(name="confinement", state="ok", found=found)
     if wanted == "off":
-        found, mend = f"{found}; {VARIABLE}=off", f"unset {VARIABLE}"
+        found = f"{found}; {VARIABLE}=off"
+        mend = f"unset {VARIABLE}"
     else:
         mend = "run on Linux 5.13 or later, or read strangers' files in a container"
     return Finding(

@@ -84,11 +84,13 @@ def judge_network(
     """
     opened = open_training_data(data)
     rivals = opened if train_data is None else open_training_data(train_data)
-    found, shards = find_network(checkpoint, network_of_run), opened.split(split)
+    found = find_network(checkpoint, network_of_run)
+    shards = opened.split(split)
     if resolution is None:
         stored = stored_resolution(shards)
         resolution = min(found.trained.resolution or stored, stored)
-    place, distance = choose_device(device), load_lpips(lpips)
+    place = choose_device(device)
+    distance = load_lpips(lpips)
     contest = Contest(
         network=found.open().to(place),
         shards=shards,
@@ -133,7 +135,8 @@ def write_judgement(judgement: Judgement, out: str | Path) -> Path:
     folder = next(place for place in map(Path, numbered) if _network_of(place) in own)
     write_atomically(folder / "evaluation.json", pretty_json(found))
     write_atomically(folder / "evaluation.md", markdown(found).encode())
-    contest, views = judgement.contest, list(judgement.views)
+    contest = judgement.contest
+    views = list(judgement.views)
     chosen = worst_and_median(views)
     if excursions := worst_of_each_excursion(views):
         chosen["worst of each axis"] = excursions
@@ -164,7 +167,9 @@ class _Counted:
     """Reports the number of judged scenes and of all."""
 
     def __init__(self, done: Callable[[int, int], None], total: int) -> None:
-        self._done, self._total, self._now = done, total, 0
+        self._done = done
+        self._total = total
+        self._now = 0
         done(0, total)
 
     def one_more(self) -> None:

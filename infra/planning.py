@@ -119,7 +119,8 @@ def measure_scenes(
     run = prepare_dataset(dataclasses.replace(order, out=str(place), scenes=scenes))
     job = run.job(1)
     splits = run.settings.splits
-    core_s, sizes = [], []
+    core_s = []
+    sizes = []
     try:
         for scene in range(count):
             shard = scene // splits.scenes_per_shard
@@ -175,11 +176,14 @@ def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
     settings = _settings(order)
     if order.scenes_from or order.revisits or settings.revisit:
         return ""
-    scenes, said = _num_scenes(order), "; how long that takes is known after the first scenes"
+    scenes = _num_scenes(order)
+    said = "; how long that takes is known after the first scenes"
     if folder.manifest.exists():
-        manifest, last = read_manifest(folder.manifest), look_at_logs(folder).last
+        manifest = read_manifest(folder.manifest)
+        last = look_at_logs(folder).last
         scenes = max(scenes, manifest.num_scenes)
-        left, cores = max(scenes - read_progress(folder).scenes_done, 0), cores_owned()
+        left = max(scenes - read_progress(folder).scenes_done, 0)
+        cores = cores_owned()
         if last:
             core_s = [row.seconds * row.cores for row in last]
             minutes = _total(core_s, left / cores / 60).shown("{:,.1f}".format)
@@ -188,7 +192,8 @@ def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
             each.num_bytes / each.num_samples for each in manifest.shards if each.num_samples
         ]:
             said = f", about {_total(sizes, scenes / 1e6).value:,.1f} MB{said}"
-    shards, lacking = shards_for(scenes, settings.splits), lacks_validation(scenes, settings.splits)
+    shards = shards_for(scenes, settings.splits)
+    lacking = lacks_validation(scenes, settings.splits)
     lacking = f" ({lacking})" if lacking else ""
     part = f", of which this run makes {order.shards}" if order.shards else ""
     views = f"{settings.scenes.num_views} views each"

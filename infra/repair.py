@@ -57,9 +57,11 @@ def repair(
     manifest = opened.manifest
     _require_generated(manifest, scenes_from)
     require_same_extensions(str(root), manifest.extensions, recorded("data"))
-    changes, licence = _changes(manifest), _stated_licence(opened)
+    changes = _changes(manifest)
+    licence = _stated_licence(opened)
     asked = read_asked(opened) or ()
-    revisits, own = _revisited(opened, asked), _own_maps(opened, asked)
+    revisits = _revisited(opened, asked)
+    own = _own_maps(opened, asked)
     order = DatasetOrder(
         build=manifest.build,
         objects=None if scenes_from or revisits else objects,

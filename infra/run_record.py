@@ -45,7 +45,8 @@ def run_facts(root: Path) -> dict[str, Any]:
         place = str(folder.settings)
         settings = read_json(read_plain(folder.settings), dict[str, Any], place)["settings"]
         rows = read_rows(folder.metrics)
-        step, planned = max((row["step"] for row in rows), default=0), settings["num_steps"]
+        step = max((row["step"] for row in rows), default=0)
+        planned = settings["num_steps"]
         facts = {
             "run": settings.get("run"),
             "steps": step,

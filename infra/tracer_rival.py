@@ -160,7 +160,9 @@ class TracerRival:
 
     def shown(self, sample: Sample, view: int) -> NDArray[np.float32] | None:
         """Return the same of any view; None where it cannot be traced."""
-        scene, child, (spp, denoiser) = sample.scene, self._open(), self._level
+        scene = sample.scene
+        child = self._open()
+        (spp, denoiser) = self._level
         settings = PreviewSettings(resolution=self._resolution, spp=spp, denoiser=denoiser)
         try:
             return with_retries(lambda: child.call(traced_view, scene, view, settings))

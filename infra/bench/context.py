@@ -41,7 +41,8 @@ class BenchContext:
     def __init__(self, scale: BenchScale, options: BenchOptions) -> None:
         # before any child: pymeshlab takes a second to import, and would be counted as work
         preload_mesh_libraries()
-        self.scale, self.options = scale, options
+        self.scale = scale
+        self.options = options
         self.notes: list[str] = []
         """Notes that belong to the result."""
         self.cores = os.cpu_count() or 1

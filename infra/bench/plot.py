@@ -17,7 +17,9 @@ from infra.cost_charts import (
     plain_log,
 )
 
-_WIDE, _HIGH, _DPI = 7.0, 5.2, 110
+_WIDE = 7.0
+_HIGH = 5.2
+_DPI = 110
 """Inches of a panel, and the resolution of the file."""
 _FONT = 9
 _SPREAD = 20
@@ -75,7 +77,8 @@ def _draw_growth(plt: Any, experiment: Experiment, rows: Sequence[Row]) -> Any:
 def _draw_errors(plt: Any, experiment: Experiment, rows: Sequence[Row]) -> Any:
     """Draw errors against costs, each group in a panel and each kind in a color."""
     assert experiment.error is not None
-    error, costs = experiment.error.name, (experiment.cost.name, *experiment.also_cost)
+    error = experiment.error.name
+    costs = (experiment.cost.name, *experiment.also_cost)
     groups = defaultdict[str, list[SeriesPoint]](list)
     for row in rows:
         if error in row.values:

@@ -61,7 +61,8 @@ def rows_of(experiment: Experiment, run: Run) -> list[Row]:
 
 def table_of(experiment: Experiment, run: Run) -> Iterator[list[str]]:
     """Yield the headings, and the cells of every point with the range of its cost."""
-    rows, columns = rows_of(experiment, run), columns_of(experiment)
+    rows = rows_of(experiment, run)
+    columns = columns_of(experiment)
     has_front = experiment.error is not None and any(row.on_front is not None for row in rows)
     yield ["setting", *(column.name for column in columns), *(["front"] if has_front else [])]
     for row in rows:
@@ -96,7 +97,8 @@ _OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {
 
 
 def _values(experiment: Experiment, run: Run, point: Point) -> dict[str, float]:
-    whole, found = run.whole_trials(), {}
+    whole = run.whole_trials()
+    found = {}
     for column in columns_of(experiment):
         if column.over == "pair":
             figures, trials = _differences(column, run, point)
@@ -155,8 +157,10 @@ def _front(
     """Return which points of each group are on its front, by name."""
     if experiment.error is None:
         return {}
-    error, sign = experiment.error.name, -1 if experiment.better == "higher" else 1
-    costs, found = (experiment.cost.name, *experiment.also_cost), dict[str, bool]()
+    error = experiment.error.name
+    sign = -1 if experiment.better == "higher" else 1
+    costs = (experiment.cost.name, *experiment.also_cost)
+    found = dict[str, bool]()
     for group in dict.fromkeys(point.group for point in known):
         names = [
             point.name

@@ -105,7 +105,8 @@ def _measure(
     trial_done: TrialDone,
 ) -> None:
     """Measure the trials that a run lacks."""
-    missing, total = current.missing_trials(), len(current.plan["trials"])
+    missing = current.missing_trials()
+    total = len(current.plan["trials"])
     if experiment.warm_up and missing:
         for _ in experiment.measure(context, points, missing[0]):
             pass

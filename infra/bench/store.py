@@ -122,4 +122,5 @@ def _take(run: Run, record: Mapping[str, Any]) -> None:
     elif "left_out" in record:
         run.left_out[record["trial"]] = record["left_out"]
     else:
-        run.seconds, run.notes = record["seconds"], record["notes"]
+        run.seconds = record["seconds"]
+        run.notes = record["notes"]

@@ -23,7 +23,9 @@ from mathutils import Matrix
 
 _PREFIX = "trilight:"
 
-_GLOSS, _SUM, _LINEAR = "Trilight gloss", "Trilight sum", "Trilight linear"
+_GLOSS = "Trilight gloss"
+_SUM = "Trilight sum"
+_LINEAR = "Trilight linear"
 """Names of what a restored material has beside its Principled BSDF; of textures the beginning."""
 
 
@@ -68,7 +70,8 @@ def restore_sky() -> None:
 
 def restore_view() -> None:
     """Look through the first camera at square pictures of Cycles, where no camera is chosen yet."""
-    scene, first = bpy.context.scene, bpy.data.objects.get("camera_0")
+    scene = bpy.context.scene
+    first = bpy.data.objects.get("camera_0")
     scene.render.engine = "CYCLES"
     if first is not None and scene.camera in (None, first):
         scene.camera = first
@@ -103,7 +106,8 @@ def property_of(item: Any, name: str) -> Any:
 
 def restore_material(material: Any) -> None:
     """Take the gloss of a material out of its Principled BSDF, and add it beside it."""
-    nodes, link = material.node_tree.nodes, material.node_tree.links.new
+    nodes = material.node_tree.nodes
+    link = material.node_tree.links.new
     base = next((n for n in nodes if n.bl_idname == "ShaderNodeBsdfPrincipled"), None)
     if base is None or _GLOSS in nodes:
         return
@@ -141,7 +145,8 @@ def follow(material: Any, name: str, base: Any, gloss: Any) -> None:
         for channel, curve in enumerate(curves[:3] if is_color else [curves]):
             curve.driver.type = "AVERAGE"
             target = curve.driver.variables.new().targets[0]
-            target.id_type, target.id = "MATERIAL", material
+            target.id_type = "MATERIAL"
+            target.id = material
             part = f"[{channel}]" if is_color else ""
             target.data_path = f'["{_PREFIX}{name}"]{part}'
 
@@ -152,7 +157,9 @@ def show_linear_values(tree: Any, node: Any) -> None:
     if held is None:
         return
     shown = tree.nodes.new("ShaderNodeTexImage")
-    shown.name, shown.image, shown.extension = f"{_LINEAR} {node.name}", held, node.extension
+    shown.name = f"{_LINEAR} {node.name}"
+    shown.image = held
+    shown.extension = node.extension
     for known in node.inputs["Vector"].links:
         tree.links.new(known.from_socket, shown.inputs["Vector"])
     chosen = tree.nodes.new("ShaderNodeMix")  # Blender exports the first texture that it finds

@@ -68,7 +68,8 @@ class Meshes:
 @command("source")
 def assets(asked: Meshes, shown: Shown) -> None:
     settings = _settings(asked)
-    source, out = asked.source, asked.out
+    source = asked.source
+    out = asked.out
     first_words(f"Meshes of {safe_url(source)} to {out}", silent=shown.json)
     from pipeline.making.make_assets import AssetFolder, make_assets
 

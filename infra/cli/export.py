@@ -41,7 +41,8 @@ def export(asked: ExportAsked, shown: Shown) -> None:
 
         def written(num_views: int) -> None:
             nonlocal scenes, views
-            scenes, views = scenes + 1, views + num_views
+            scenes = scenes + 1
+            views = views + num_views
             bars.advance(task)
 
         notes = export_dataset(

@@ -35,7 +35,8 @@ def generate(order: DatasetOrder, shared: Shared, runner: ExecutorChoice, shown:
 
 def make(order: DatasetOrder, runner: ExecutorChoice, shown: Shown) -> None:
     """Make a dataset and say what came of it; raises TrilightError."""
-    folder, started = dataset_folder(order.place), time.monotonic()
+    folder = dataset_folder(order.place)
+    started = time.monotonic()
     first_words(f"Making {folder.shown} with the build {order.build}", silent=shown.json)
     executor = find_executor(runner.runner, runner.address, order.workers)
     from infra.planning import describe_run  # slow: every stage

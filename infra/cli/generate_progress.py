@@ -54,7 +54,8 @@ class _Drawn:
 
     def show(self, now: Progress) -> None:
         """Bring the bars up to date."""
-        downloads, objects = now.downloads_planned or None, now.objects_planned or None
+        downloads = now.downloads_planned or None
+        objects = now.objects_planned or None
         self._bars.update(self._downloads, completed=now.downloads_done, total=downloads)
         self._bars.update(self._objects, completed=now.objects_done, total=objects)
         if not now.scenes_planned or now.objects_done < now.objects_planned:

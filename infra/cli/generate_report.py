@@ -99,7 +99,8 @@ def _print_json(
         "seconds": round(seconds, 1),
     }
     if statistics:
-        row["scenes"], row["views"] = statistics.num_scenes, statistics.num_views
+        row["scenes"] = statistics.num_scenes
+        row["views"] = statistics.num_views
         row["bytes"] = statistics.num_bytes
     print_json(row)
 

@@ -44,7 +44,8 @@ def _row(standing: Any) -> dict[str, str]:
     from infra.leaderboard.page import interval
     from train.evaluation.pairs import METRIC
 
-    lead, scores = standing.lead, standing.scores[METRIC]
+    lead = standing.lead
+    scores = standing.scores[METRIC]
     ends = interval(lead, 1) if lead is not None else ""
     return {
         "": standing.name,

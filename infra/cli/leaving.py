@@ -40,7 +40,8 @@ class InertFormatter(logging.Formatter):
 
 def leave(message: str, status: int) -> NoReturn:
     """End at once: every child ends with its parent, and every file is whole or absent."""
-    out, errors = sys.__stdout__ or sys.stdout, sys.__stderr__ or sys.stderr
+    out = sys.__stdout__ or sys.stdout
+    errors = sys.__stderr__ or sys.stderr
     # A signal may arrive in the middle of a write, and Python refuses (RuntimeError) to write or
     # flush the same stream then: hence the descriptors, which no progress bar redraws either.
     with contextlib.suppress(RuntimeError, OSError):

@@ -110,7 +110,8 @@ def _as_json(
 
 
 def _report(name: str, workload: "Workload", counted: "Costs") -> None:
-    total, flops = sum(counted.parameters.values()), sum(counted.flops.values())
+    total = sum(counted.parameters.values())
+    flops = sum(counted.flops.values())
     rows = [("parameters", f"{total / 1e6:.2f} M")]
     rows += [(f"  {part}", f"{count / 1e6:.2f} M") for part, count in counted.parameters.items()]
     rows += [("work", f"{flops / 1e9:.1f} GFLOP")]

@@ -95,7 +95,8 @@ def _parameter(field: Described, group: Group, *, by_place: bool) -> inspect.Par
     required = field.default is MISSING or (by_place and field.default != ())
     several = is_repeated(field.hint) or takes_names(field.hint)
     choices = choices_of(field.hint)
-    kind, complete = kind_of(field.hint), _completer(field.name)
+    kind = kind_of(field.hint)
+    complete = _completer(field.name)
     word: Any = bool if kind is bool else str  # numbers are read when the class is made
     if kind is str and not (choices or complete or takes_names(field.hint)):
         word = FileName

@@ -50,7 +50,9 @@ def plan(
             "whole dataset of new scenes is predicted."
         )
     order = with_shared(order, shared)
-    build, samples, cores = order.build, prognosis.samples, prognosis.cores
+    build = order.build
+    samples = prognosis.samples
+    cores = prognosis.cores
     first_words(f"Measuring {samples} scenes of {build}", silent=shown.json)
     from infra.planning import measure_scenes, predict  # slow: every stage
 

@@ -94,7 +94,8 @@ def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
 
 
 def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
-    scene, width = done.scene, plan.resolution
+    scene = done.scene
+    width = plan.resolution
     factor = enlargement(width)
     enlarged = "" if factor == 1 else f"; in the PNG a pixel is {factor} x {factor}"
     rows: Rows = [
@@ -143,7 +144,8 @@ def _layers(settings: RenderSettings, facts: Facts) -> Rows:
 
 def _floor(settings: RenderSettings, facts: Facts, name: str, metric: str) -> str:
     """Return one floor of a picture, and what came of its target if there is one."""
-    floor_db, target_db = float(facts[name]), settings.targets_db.get(metric)
+    floor_db = float(facts[name])
+    target_db = settings.targets_db.get(metric)
     text = f"{floor_db:.1f} dB ({metric}{_MEANING.get(metric, '')}"
     if target_db is None:
         return f"{text})"
@@ -206,7 +208,8 @@ def _rounded(seconds: float | None) -> float | None:
 def _spread(name: str, values_db: Sequence[float], metric: str) -> Rows:
     if not values_db:
         return []
-    median, low = np.median(values_db), np.percentile(values_db, 5)
+    median = np.median(values_db)
+    low = np.percentile(values_db, 5)
     return [(name, f"median {median:.1f} dB, 5th percentile {low:.1f} dB ({metric})")]
 
 

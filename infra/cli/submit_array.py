@@ -81,7 +81,8 @@ def _submit_kubernetes(
     job: ArrayJob, asked: ArrayAsked, options: KubernetesOptions, *, as_json: bool
 ) -> None:
     manifest = (write_manifest if asked.dry_run else submit_job)(job, options)
-    name, words = manifest.parent.name, create_words(manifest)
+    name = manifest.parent.name
+    words = create_words(manifest)
     if as_json:
         print_json(
             {

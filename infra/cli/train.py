@@ -195,12 +195,15 @@ def _report(result: "TrainResult") -> None:
 
 
 def _said(event: "Event") -> str:
-    before, after = event.before, event.after
+    before = event.before
+    after = event.after
     return f"{event.name} from {before} to {after} at step {event.step}"
 
 
 def _judged(result: "TrainResult") -> list[tuple[str, str]]:
-    scores, rival, lead = result.scores, result.median_scores, result.lead
+    scores = result.scores
+    rival = result.median_scores
+    lead = result.lead
     if scores is None or rival is None or lead is None:
         return [("validation", "none: the data has no validation split")]
     # of a median picture without any error there is no percentage

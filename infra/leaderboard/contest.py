@@ -113,7 +113,10 @@ class _Turn:
     """One scene at one width."""
 
     def __init__(self, contest: BoardContest, sample: Sample, width: int, *, timed: bool) -> None:
-        self._contest, self._sample, self._width, self._timed = contest, sample, width, timed
+        self._contest = contest
+        self._sample = sample
+        self._width = width
+        self._timed = timed
         self._scene: JudgedScene | None = None
 
     def missing(self) -> list[Contestant]:
@@ -121,7 +124,8 @@ class _Turn:
         return [one for one in self._contest.present(self._width) if not self._has_all(one)]
 
     def _has_all(self, contestant: Contestant) -> bool:
-        rows, machine = self._contest.rows, self._contest.machine
+        rows = self._contest.rows
+        machine = self._contest.machine
         keys = [self._key(contestant, view) for view in self._views()]
         is_priced = not (self._timed and contestant.is_timed) or rows.price(keys[0], machine)
         return bool(is_priced) and all(rows.get(key) is not None for key in keys)
@@ -155,7 +159,8 @@ class _Turn:
 
     def judge_noise(self) -> None:
         """Add what the noise of the targets alone scores, with what is known of the scene."""
-        sample, facts = self._sample, facts_of(self._sample)
+        sample = self._sample
+        facts = facts_of(self._sample)
         for view in self._views():
             key = self._contest.row_key(self._width, NOISE, "", sample.key, view)
             if self._contest.rows.get(key) is None:

@@ -33,8 +33,10 @@ if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
     from train.evaluation.rivals import Rivals
 
-TRACED_LIGHT, TRACER = KINDS[1], KINDS[2]
-BASELINE, ELSEWHERE = "picture of another scene", "pictures made elsewhere"
+TRACED_LIGHT = KINDS[1]
+TRACER = KINDS[2]
+BASELINE = "picture of another scene"
+ELSEWHERE = "pictures made elsewhere"
 """Kinds of contestants, beside those of infra.rendering.methods."""
 
 _REPEATS = 1
@@ -116,7 +118,9 @@ class MethodContestant:
         notes: Sequence[str],
     ) -> None:
         """Take a method by its width; `weights` is the digest of what it has learned."""
-        self.name, self.kind, self.notes = name, kind_of(name), notes
+        self.name = name
+        self.kind = kind_of(name)
+        self.notes = notes
         self._method_of = functools.lru_cache(method_of)
         self._own = _digest_of(name="" if weights else name, weights=weights)
 
@@ -159,7 +163,8 @@ class NetworkContestant(MethodContestant):
 class SampledContestant:
     """Few samples a pixel with one denoise, in a child that traces on one thread."""
 
-    kind, is_timed = TRACER, True
+    kind = TRACER
+    is_timed = True
     notes: Sequence[str] = ()
 
     def __init__(
@@ -167,7 +172,8 @@ class SampledContestant:
     ) -> None:
         """Take samples a pixel with the filter; the child is asked for when it is needed."""
         self.name = samples_name(level)
-        self._level, self._child = level, child
+        self._level = level
+        self._child = child
         libraries = {name: metadata.version(name) for name in ("mitsuba", "pyoidn")}
         self._own = _digest_of(level=list(level), variant=variant.name, libraries=libraries)
 
@@ -198,7 +204,8 @@ class NearestContestant:
     better.
     """
 
-    kind, is_timed = BASELINE, False
+    kind = BASELINE
+    is_timed = False
 
     def __init__(
         self,
@@ -218,8 +225,11 @@ class NearestContestant:
             not_itself: whether the judged scenes are among them.
             notes: what a reader should know.
         """
-        self.name, self.notes, self._not_itself = name, notes, not_itself
-        self._rivals_of, self._own = functools.lru_cache(rivals_of), _digest_of(pool=pool)
+        self.name = name
+        self.notes = notes
+        self._not_itself = not_itself
+        self._rivals_of = functools.lru_cache(rivals_of)
+        self._own = _digest_of(pool=pool)
 
     def why_not(self, width: int) -> str:
         return ""

@@ -27,7 +27,8 @@ class FolderContestant:
     Values a little below 0, as networks of logarithms give them, count as 0; alpha is left out.
     """
 
-    kind, is_timed = ELSEWHERE, False
+    kind = ELSEWHERE
+    is_timed = False
 
     def __init__(self, folder: Path, views: Views, widths: Sequence[int]) -> None:
         """Look at the picture of every view.

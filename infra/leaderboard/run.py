@@ -59,7 +59,8 @@ USUAL_WIDTHS = (64, 256, 512)
 FILTER = "fast"
 """The filter of the path tracer's rows."""
 
-NEAREST_TRAINED, NEAREST_OTHER = "nearest training view", "nearest other scene"
+NEAREST_TRAINED = "nearest training view"
+NEAREST_OTHER = "nearest other scene"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -63,7 +63,8 @@ def orbit(scene: Scene, start: ShotCamera, count: int, arc_deg: float) -> list[S
         points = scene.vertex_positions
     middle = (points.min(axis=0).astype(np.float64) + points.max(axis=0)) / 2
     pose = start.c2w.astype(np.float64)
-    eye, forward = pose[:3, 3], -pose[:3, 2]
+    eye = pose[:3, 3]
+    forward = -pose[:3, 2]
     target = eye + forward * max(float(np.einsum("i,i->", middle - eye, forward)), 0.0)
     if arc_deg == 360:
         turns_deg = 360 * np.arange(count) / count
@@ -95,7 +96,8 @@ def camera_path(text: str, reader: SceneReader, view: int) -> list[ShotCamera]:
 
 def _turned(start: ShotCamera, target: NDArray[np.float64], turn: float) -> ShotCamera:
     """Return a camera that went around the vertical through `target`, as a rigid body."""
-    cos, sin = np.cos(turn), np.sin(turn)
+    cos = np.cos(turn)
+    sin = np.sin(turn)
     rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
     pose = start.c2w.astype(np.float64)
     pose[:3, :3] = np.einsum("ij,jk->ik", rotation, pose[:3, :3])

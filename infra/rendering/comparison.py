@@ -16,8 +16,11 @@ from storage.conventions import log10_radiance
 from storage.metrics import flicker_log_db, psnr_log_db
 from train.evaluation.error_colours import ERROR_WHITE, error_picture
 
-_CAPTION_PX, _GAP_PX, _FONT_PX = 24, 8, 14
-_INK, _PAPER = (30, 30, 30), (250, 250, 248)
+_CAPTION_PX = 24
+_GAP_PX = 8
+_FONT_PX = 14
+_INK = (30, 30, 30)
+_PAPER = (250, 250, 248)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,7 +76,8 @@ def comparison_sheet(
     )
     width = len(tiles[0][1])
     sheet = Image.new("RGB", (3 * width + 2 * _GAP_PX, width + _CAPTION_PX), _PAPER)
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=_FONT_PX)
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=_FONT_PX)
     for column, (caption, pixels) in enumerate(tiles):
         left = column * (width + _GAP_PX)
         sheet.paste(Image.fromarray(pixels), (left, _CAPTION_PX))

@@ -127,7 +127,8 @@ class MitsubaEngine:
     """A path tracer in a child process."""
 
     def __init__(self, tracer: "PathTracer", *, is_preview: bool = False) -> None:
-        self._tracer, self._is_preview = tracer, is_preview
+        self._tracer = tracer
+        self._is_preview = is_preview
         self.identity = tracer.identity
 
     def open(self, scene: Scene, name: str) -> OpenedScene:
@@ -207,7 +208,8 @@ class NeuralEngine:
         import torch
 
         renderer.require_resolution(plan.resolution)
-        self._renderer, self._plan = renderer, plan
+        self._renderer = renderer
+        self._plan = plan
         self.identity: Mapping[str, Any] = {
             "checkpoint": Path(plan.checkpoint).name,
             "network_sha256": renderer.digest,
@@ -221,7 +223,8 @@ class NeuralEngine:
         }
 
     def open(self, scene: Scene, name: str) -> OpenedScene:
-        renderer, plan = self._renderer, self._plan
+        renderer = self._renderer
+        plan = self._plan
         began = time.perf_counter()
         prepared = renderer.prepare(scene, lights_per_pass=plan.lights_per_pass)
         seconds = time.perf_counter() - began

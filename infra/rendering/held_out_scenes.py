@@ -47,7 +47,8 @@ def composing_child(
         folder: empty; it keeps the record of the objects.
         threads: of Mitsuba and the denoiser, if fewer than there are cores.
     """
-    variant, workers = choose_variant(), threads or os.cpu_count() or 1
+    variant = choose_variant()
+    workers = threads or os.cpu_count() or 1
     publication = begin(
         DatasetFolder(folder), build, environment(variant), 1, accept_environment=False
     )

@@ -22,7 +22,8 @@ SHOWN_PX = 256
 _CONFIG = "cg-config-v4.0.0_aces-v2.0_ocio-v2.5"
 """One of the configurations that OpenColorIO has built in, by version: pictures stay the same."""
 _OURS = "Linear Rec.709 (sRGB)"
-_DISPLAY, _VIEW = "sRGB - Display", "ACES 2.0 - SDR 100 nits (Rec.709)"
+_DISPLAY = "sRGB - Display"
+_VIEW = "ACES 2.0 - SDR 100 nits (Rec.709)"
 
 
 @dataclass(frozen=True, kw_only=True)

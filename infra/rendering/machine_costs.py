@@ -128,7 +128,8 @@ def _network_parts(scene: Scene, threads: int) -> dict[int, dict[str, float]]:
     from model.neural_renderer import NeuralRenderer
 
     torch.set_num_threads(threads)
-    renderer, found = NeuralRenderer.load("builtin:tokens"), {}
+    renderer = NeuralRenderer.load("builtin:tokens")
+    found = {}
     for px in PROBED_PX:
         spent = []
         for _ in range(4):

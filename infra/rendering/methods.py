@@ -27,7 +27,8 @@ View = Callable[[NDArray[np.float32], float], NDArray[np.float32]]
 Method = Callable[[Scene], View]
 """Loads a scene, and returns its view; all pictures are of one width."""
 
-DIRECT_LIGHT, TRACED_LIGHT = "direct light, no network", "all traced light, no network"
+DIRECT_LIGHT = "direct light, no network"
+TRACED_LIGHT = "all traced light, no network"
 BUILTIN_NETWORKS = ("builtin:", "builtin:tokens")
 """Networks of every comparison: the better one, and the one that traces nothing."""
 

@@ -207,7 +207,8 @@ def _choice(
     """Return the way that seconds or an error choose, where one of them was asked for."""
     if asked.seconds is None and asked.error_db is None:
         return None
-    table, known = shipped_table(), known_costs(choose_variant())
+    table = shipped_table()
+    known = known_costs(choose_variant())
     cores = os.cpu_count() or 1
     ways = priced_ways(
         table,

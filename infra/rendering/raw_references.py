@@ -53,7 +53,8 @@ def raw_reference(scene: Scene, camera: Camera, spp: int, *name: int) -> RawRefe
     """
     depths = {"max_depth": RenderSettings.max_depth, "rr_depth": RenderSettings.rr_depth}
     tracer = load_tracer(scene, **depths)
-    size, halves = PASS_SPP[0], []
+    size = PASS_SPP[0]
+    halves = []
     for half in range(2):
         total = np.zeros((camera.resolution, camera.resolution, 3))
         passes = spp // (2 * size)

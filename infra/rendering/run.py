@@ -98,7 +98,8 @@ def carry_out(plan: RenderPlan, reader: SceneReader, watcher: RenderWatcher) -> 
         TrilightError: a network or a scene that cannot be loaded or rendered, or a file that
             cannot be written.
     """
-    finished, notes = list[FinishedShot](), dict[str, None]()
+    finished = list[FinishedShot]()
+    notes = dict[str, None]()
     choice = plan.choice
     if choice is not None:
         watcher.chosen(choice)
@@ -192,12 +193,14 @@ def _finish(
     """Write what people look at; return the shot, and the frame if there are both engines."""
     files = {name: file for name, (file, _) in made.items()}
     radiances = {name: radiance_rgb for name, (_, radiance_rgb) in made.items()}
-    now, agreement = None, None
+    now = None
+    agreement = None
     if len(made) == 1:
         (radiance_rgb,) = radiances.values()
         pixels = shown(radiance_rgb, look)
     else:
-        traced, neural = radiances["mitsuba"], radiances["neural"]
+        traced = radiances["mitsuba"]
+        neural = radiances["neural"]
         pixels = comparison_sheet(traced, neural, look)
         agreement = psnr_log_db(neural, traced)
         now = Frame(

@@ -19,7 +19,9 @@ SUFFIXES = (".mp4", ".webp")
 _CRF = "16"
 """Quality of H.264: below about 18 losses are not seen; 0 would be none."""
 _WEBP_QUALITY = 90
-_BT709, _SRGB, _STUDIO_RANGE = 1, 13, 1
+_BT709 = 1
+_SRGB = 13
+_STUDIO_RANGE = 1
 """Of the video's colours, by their numbers in ITU-T H.273 and in FFmpeg."""
 
 
@@ -53,13 +55,15 @@ def _opened(frames: Sequence[Path]) -> Iterator[Image.Image]:
 
 
 def _mp4(frames: Sequence[Path], fps: int) -> bytes:
-    av, stream = _av(), io.BytesIO()
+    av = _av()
+    stream = io.BytesIO()
     with av.open(stream, "w", format="mp4") as container:
         track: Any = None
         for picture in _opened(frames):
             if track is None:
                 track = container.add_stream("libx264", Fraction(fps), options={"crf": _CRF})
-                track.width, track.height, track.pix_fmt = *picture.size, "yuv420p"
+                track.width, track.height = picture.size
+                track.pix_fmt = "yuv420p"
                 track.codec_context.thread_count = 1  # more once gave other bytes
                 track.codec_context.colorspace = _BT709  # players guess by size where none is told
                 track.codec_context.color_primaries = _BT709

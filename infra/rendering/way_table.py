@@ -27,7 +27,8 @@ from storage.settings.ranges import Within
 SHIPPED = Path(__file__).with_name("previews.json")
 """Measured and written by infra.setup.preview_table."""
 
-NETWORK_SCENE, NETWORK_VIEW = "network scene", "network view"
+NETWORK_SCENE = "network scene"
+NETWORK_VIEW = "network view"
 """Parts of a picture of the network builtin:tokens, beside pipeline.renders.preview_parts."""
 
 MEASURE = "trilight doctor --measure"
@@ -123,7 +124,8 @@ def machine_costs_path() -> Path:
 
 def known_costs(variant: Variant) -> KnownCosts:
     """Return the costs of this machine where they were measured, else those that are shipped."""
-    shipped, path = shipped_table().costs, machine_costs_path()
+    shipped = shipped_table().costs
+    path = machine_costs_path()
     try:
         record: Any = json.loads(path.read_bytes())
         costs = from_record(PictureCosts, record)

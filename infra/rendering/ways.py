@@ -196,10 +196,13 @@ def chosen_way(
 ) -> Choice:
     """Return the choice of seconds or of an error, one of which is given; as `reaching`."""
     if seconds is not None:
-        asked, (priced, fits) = f"--seconds {seconds:g}", within_seconds(ways, seconds)
+        asked = f"--seconds {seconds:g}"
+        priced, fits = within_seconds(ways, seconds)
     else:
         assert error_db is not None
-        asked, priced, fits = f"--error {error_db:g}", reaching(ways, error_db, width), True
+        asked = f"--error {error_db:g}"
+        priced = reaching(ways, error_db, width)
+        fits = True
     return Choice(asked=asked, priced=priced, fits=fits, scenes=table.scenes, costs=known.source)
 
 

@@ -259,7 +259,8 @@ def _say(text: str) -> None:
 
 
 def _number(variable: str, default: int) -> int:
-    text, most = os.environ.get(variable, str(default)), _MOST[variable]
+    text = os.environ.get(variable, str(default))
+    most = _MOST[variable]
     if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= most:
         raise TrilightError(
             f"make serve: {variable} is {text!r}; expected a whole number from 1 to {most}."
@@ -274,7 +275,8 @@ def main(arguments: list[str]) -> None:
             _say(f"ended: {stop()} processes")
             return
         host = os.environ.get("TRILIGHT_HOST", "127.0.0.1")
-        port, workers = _number("TRILIGHT_PORT", _DEFAULT_PORT), _number("TRILIGHT_WORKERS", 1)
+        port = _number("TRILIGHT_PORT", _DEFAULT_PORT)
+        workers = _number("TRILIGHT_WORKERS", 1)
         url = start(host=host, port=port, workers=workers)
         _say(f"Prefect: {url.removesuffix('/api')}; logs: {state_folder()}")
         # not the password itself: what is on a screen gets into recordings and logs of others

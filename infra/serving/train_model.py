@@ -66,7 +66,8 @@ def train_model(**parameters: Any) -> None:
 
     Prefect waits for half a minute then; `resume` goes on from there.
     """
-    order, log = train_order(parameters), get_run_logger()
+    order = train_order(parameters)
+    log = get_run_logger()
     cards = len(visible_gpus())
     limit = (
         concurrency(GPU_LIMIT, occupy=min(order.processes, cards), strict=False)

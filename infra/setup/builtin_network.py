@@ -59,7 +59,8 @@ def main(
     name: Annotated[str, Parameter(help="by which it will be opened")] = "builtin:hits",
 ) -> None:
     """Copy the weights and write the card."""
-    folder, dataset = RunFolder(run), open_dataset(data)
+    folder = RunFolder(run)
+    dataset = open_dataset(data)
     weights = folder.weights.read_bytes()
     about = json.loads(folder.settings.read_text())
     judged = json.loads((evaluation / "evaluation.json").read_text())
@@ -117,7 +118,8 @@ def _card(
     weights: bytes,
     command: str,
 ) -> list[str]:
-    settings, model = about["settings"], about["settings"]["model"]
+    settings = about["settings"]
+    model = about["settings"]["model"]
     most = dataset.manifest.settings["scenes"]["max_triangles"]
     by_hits = model.get("view_stage") == "hits"
     encoder = model["encoder_layers"] if model.get("scene_tokens", True) else 0
@@ -145,7 +147,8 @@ def _card(
 
 
 def _scores(judged: Mapping[str, Any]) -> list[str]:
-    everybody, about = judged["contestants"], judged["about"]
+    everybody = judged["contestants"]
+    about = judged["about"]
     contestants = {NETWORK: everybody[NETWORK]} | everybody  # the file has them by their names
     traced = judged["path tracer"] or {}
     lines = [

@@ -49,7 +49,10 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
     origin = here.removeprefix("source/") if here.startswith("source/") else f"docs/{here}"
 
     def led(found: re.Match[str]) -> str:
-        bang, words, target, anchor = found[1], found[2], found[3], found[4] or ""
+        bang = found[1]
+        words = found[2]
+        target = found[3]
+        anchor = found[4] or ""
         path = _resolved(origin, target)
         if not origin.startswith("docs/") or not path.startswith("docs/"):
             if files.get_file_from_path(_site_uri(path)) is None:

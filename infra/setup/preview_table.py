@@ -72,7 +72,8 @@ _SERIAL = (SCENE,)
 
 def main() -> None:
     """Measure, and write the file."""
-    errors, costs = dict[int, Errors](), dict[int, Costs]()
+    errors = dict[int, Errors]()
+    costs = dict[int, Costs]()
     with _held_out_child() as (renderer, child):
         for index in range(SCENES):
             sys.stdout.write(f"scene {index + 1} of {SCENES}\n")
@@ -119,7 +120,8 @@ def sampled_errors(
     scene: Scene, px: int, reference: RawReference
 ) -> Sequence[tuple[Method, float]]:
     """Return the error of each sampled picture of the first view; runs in a render child."""
-    everywhere, errors = np.ones((px, px), np.bool_), []
+    everywhere = np.ones((px, px), np.bool_)
+    errors = []
     for method in ladder(px):
         picture = sampled_method(px, *method)(scene)(scene.c2w[0], float(scene.fov_deg[0]))
         errors.append((method, true_error_db(picture, reference, log10_radiance, everywhere)[0]))
@@ -153,7 +155,8 @@ def _costs_of(
     renderer: "NeuralRenderer", child: IsolatedChild, scene: Scene, px: int
 ) -> dict[str, float]:
     found: dict[str, float] = child.call(timed_parts, scene, px, time.process_time)
-    pose, fov_deg = scene.c2w[0], float(scene.fov_deg[0])
+    pose = scene.c2w[0]
+    fov_deg = float(scene.fov_deg[0])
     renderer.view(renderer.prepare(scene), pose, fov_deg, px)  # warms up
     began = time.process_time()
     prepared = renderer.prepare(scene)

@@ -42,8 +42,10 @@ class DatasetRoom:
             source: as the user named it.
             tracer, checkpoint: for the pages of its scenes.
         """
-        self._dataset, self._source = dataset, source
-        self._tracer, self._checkpoint = tracer, checkpoint
+        self._dataset = dataset
+        self._source = source
+        self._tracer = tracer
+        self._checkpoint = checkpoint
         self._thumbnails = OrderedDict[tuple[str, int, int], bytes]()
         self._open = OpenRooms(_KEY, self._opened)
         self.index = DatasetIndex(dataset)
@@ -69,7 +71,8 @@ class DatasetRoom:
         self._tracer.close()
 
     def _facts(self, _: Question) -> Answer:
-        manifest, rows = self._dataset.manifest, self.index.rows
+        manifest = self._dataset.manifest
+        rows = self.index.rows
         return json_answer(
             {
                 "name": safe_url(self._source),
@@ -85,7 +88,8 @@ class DatasetRoom:
         )
 
     def _rows(self, question: Question) -> Answer:
-        query, every = question.query, self.index.rows
+        query = question.query
+        every = self.index.rows
         chosen = filter_of(query)
         shown = chosen.rows(every)
         first = int(query["from"]) if query.get("from", "").isdecimal() else 0
@@ -107,7 +111,8 @@ class DatasetRoom:
 
     def _thumbnail(self, question: Question) -> Answer:
         key, _, view = question.path.removeprefix("api/thumbnail/").partition("/")
-        row, width = self.index.row(key), question.query.get("px", "160")
+        row = self.index.row(key)
+        width = question.query.get("px", "160")
         if not view.isdecimal() or int(view) >= row.views:
             raise NotThere("the scene has no such view.")
         if not width.isdecimal() or not 16 <= int(width) <= _WIDEST:

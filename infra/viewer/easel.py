@@ -59,7 +59,8 @@ class Easel:
     """Makes the pictures of one scene."""
 
     def __init__(self, scene: Scene, painters: Mapping[str, Painter]) -> None:
-        self._scene, self._painters = scene, painters
+        self._scene = scene
+        self._painters = painters
         self._news = threading.Condition()
         self._jobs = OrderedDict[str, Job]()
         self._next: Job | None = None
@@ -141,7 +142,8 @@ class Easel:
         while True:
             with self._news:
                 self._news.wait_for(lambda: self._next is not None or self._closed)
-                job, self._next = self._next, None
+                job = self._next
+                self._next = None
                 if job is None or self._closed:
                     return
                 self._tell(job, state="working")
@@ -153,7 +155,8 @@ class Easel:
                 if self._next is not None or self._closed or job.state != "working":
                     raise _Superseded
                 if isinstance(step, Painted):
-                    job.painted, job.sampling = step, None
+                    job.painted = step
+                    job.sampling = None
                     job.prices.append(
                         {"spp": step.spp, "core_s": step.core_s, "floor_db": step.floor_db}
                     )
@@ -161,16 +164,19 @@ class Easel:
                     job.sampling = step
                 self._tell(job)
 
-        state, error = "done", ""
+        state = "done"
+        error = ""
         try:
             scene = self.scene(job.wanted.scene_key, job.wanted.edits)
             self._painters[job.wanted.engine].paint(scene, job.wanted, show)
         except _Superseded:
             state = "cancelled"
         except TrilightError as mistake:
-            state, error = "failed", str(mistake)
+            state = "failed"
+            error = str(mistake)
         except Exception as defect:  # of any library: the page says so, and the next picture comes
-            state, error = "failed", f"{type(defect).__name__}: {defect}"
+            state = "failed"
+            error = f"{type(defect).__name__}: {defect}"
         with self._news:
             job.error = error
             self._tell(job, state=state)
@@ -191,7 +197,8 @@ def agreement_db(job: Job, truth: Job | None) -> float | None:
     """Return psnr_log_db of a picture against another one; None where one is missing."""
     if truth is None or truth is job or job.painted is None or truth.painted is None:
         return None
-    mine, other = job.painted.radiance_rgb, truth.painted.radiance_rgb
+    mine = job.painted.radiance_rgb
+    other = truth.painted.radiance_rgb
     if mine is None or other is None or mine.shape != other.shape:
         return None
     return float(psnr_log_db(mine, other))
@@ -211,7 +218,8 @@ def _is_same(job: Job, wanted: Wanted) -> bool:
 
 
 def _can_judge(other: Job, job: Job, engine: str) -> bool:
-    mine, its = job.painted, other.painted
+    mine = job.painted
+    its = other.painted
     return (
         other.wanted.engine == engine
         and other is not job

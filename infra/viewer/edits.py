@@ -36,10 +36,12 @@ def edited(scene: Scene, edits: Mapping[str, Any]) -> Scene:
     Raises:
         TrilightError: a change that means nothing, or one that breaks a law of scenes.
     """
-    lamps, materials = _group(edits, "lamps"), _group(edits, "materials")
+    lamps = _group(edits, "lamps")
+    materials = _group(edits, "materials")
     if not lamps and not materials:
         return scene
-    positions, rows = scene.vertex_positions.copy(), scene.materials.copy()
+    positions = scene.vertex_positions.copy()
+    rows = scene.materials.copy()
     worn = None if scene.material_textures is None else scene.material_textures.copy()
     for row, change in lamps.items():
         _move_lamp(scene, row, change, positions, rows)

@@ -27,7 +27,8 @@ from pipeline.renders.settings import one_picture
 from storage.conventions import preview_gain
 from storage.records.lights import num_lights
 
-THUMBNAIL_PX, THUMBNAIL_SPP = 128, 4
+THUMBNAIL_PX = 128
+THUMBNAIL_SPP = 4
 """Width and samples a pixel of the small pictures."""
 
 _MOST_THUMBNAILS = 1000
@@ -39,8 +40,11 @@ class FolderRoom:
 
     def __init__(self, found: SceneList, tracer: ProgressiveTracer, checkpoint: str | None) -> None:
         """Read nothing yet; tracer and checkpoint are for the pages of its scenes."""
-        self._found, self._tracer, self._checkpoint = found, tracer, checkpoint
-        self._reader, self._reading = SceneReader(), threading.Lock()
+        self._found = found
+        self._tracer = tracer
+        self._checkpoint = checkpoint
+        self._reader = SceneReader()
+        self._reading = threading.Lock()
         self._last: tuple[int, LoadedScene] | None = None
         self._thumbnails = OrderedDict[int, bytes]()
         self._open = OpenRooms(_NUMBER, self._opened)
@@ -135,7 +139,8 @@ class FolderRoom:
         number = int(key)
         if number >= len(self._found.names):
             raise NotThere("the folder has no such file.")
-        name, loaded = self._found.names[number], self._loaded(number)
+        name = self._found.names[number]
+        loaded = self._loaded(number)
         place = str(self._found.root / name)
         return scene_room(name, loaded, self._tracer, self._checkpoint, place)
 

@@ -71,7 +71,8 @@ def refusal(
         return Refusal(status=HTTPStatus.BAD_REQUEST, sentence="A header is there twice.")
     if headers.get("host") != here:
         return _forbidden(f"Only http://{here} is answered, and no other name of this machine.")
-    origin, site = headers.get("origin"), headers.get("sec-fetch-site", "none")
+    origin = headers.get("origin")
+    site = headers.get("sec-fetch-site", "none")
     # a link with the whole address may stand anywhere: who follows it leaves the other page
     followed = method == "GET" and headers.get("sec-fetch-dest") == "document"
     near = site in ("none", "same-origin") or followed

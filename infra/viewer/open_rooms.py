@@ -21,7 +21,8 @@ class OpenRooms:
 
     def __init__(self, key: re.Pattern[str], opened: Callable[[str], SceneRoom]) -> None:
         """Take what a key looks like, and what opens one; it may raise TrilightError."""
-        self._key, self._opened = key, opened
+        self._key = key
+        self._opened = opened
         self._opening = threading.Lock()
         self._open = OrderedDict[str, SceneRoom]()
 

@@ -82,7 +82,9 @@ class TracedPainter:
 
     def __init__(self, tracer: ProgressiveTracer, scene_number: int, *, direct: bool) -> None:
         """Take what traces, and a number that no other scene of this process has."""
-        self._tracer, self._number, self._direct = tracer, scene_number, direct
+        self._tracer = tracer
+        self._number = scene_number
+        self._direct = direct
         self.title = "Direct light" if direct else "Path traced"
         self.means = (
             "Lamp, surface, camera: traced without any further bounce."
@@ -107,7 +109,9 @@ class SamplesPainter:
 
     def __init__(self, tracer: ProgressiveTracer, scene_number: int, spp: int) -> None:
         """Take what `TracedPainter` takes, and the samples."""
-        self._tracer, self._number, self.spp = tracer, scene_number, spp
+        self._tracer = tracer
+        self._number = scene_number
+        self.spp = spp
         self.title = f"{spp} sample{'s' if spp > 1 else ''}, filtered"
         self.means = (
             f"{spp} path{'s' if spp > 1 else ''} a pixel, then Open Image Denoise "
@@ -119,7 +123,8 @@ class SamplesPainter:
             show(_traced(step) if isinstance(step, GrowingPicture) else step)
 
         camera = (wanted.camera.c2w, wanted.camera.fov_deg)
-        key, settings = (self._number, wanted.scene_key), _traced_settings(wanted)
+        key = (self._number, wanted.scene_key)
+        settings = _traced_settings(wanted)
         self._tracer.paint(scene, key, camera, settings, shown, preview_spp=self.spp)
 
 
@@ -147,7 +152,8 @@ class NetworkPainter:
     """A network; loaded with its first picture, and ready for more cameras of the last scene."""
 
     def __init__(self, checkpoint: str, title: str, means: str) -> None:
-        self.title, self.means = title, means
+        self.title = title
+        self.means = means
         self.checkpoint = checkpoint
         self._renderer: NeuralRenderer | None = None
         self._prepared: tuple[str, PreparedScene, float] | None = None
@@ -185,12 +191,14 @@ class PassPainter:
     """What the pixels see: a function of scene and camera, without any light."""
 
     def __init__(self, shown: ShownPass) -> None:
-        self.title, self.means = shown.title.capitalize(), "What the pixels see, without light."
+        self.title = shown.title.capitalize()
+        self.means = "What the pixels see, without light."
         self._shown = shown
 
     def paint(self, scene: Scene, wanted: Wanted, show: Show) -> None:
         (name,) = pass_names([self._shown.word])
-        pose, angle = wanted.camera.c2w[None], np.array([wanted.camera.fov_deg], np.float32)
+        pose = wanted.camera.c2w[None]
+        angle = np.array([wanted.camera.fov_deg], np.float32)
         began_s = time.process_time()
         seen = view_passes(
             scene.with_cameras(pose, angle), [name], view=0, resolution=wanted.resolution
@@ -210,7 +218,8 @@ class TargetPainter:
 
     def __init__(self, radiance_rgb: NDArray[np.float32], floors_db: Sequence[float]) -> None:
         """Take the pictures [V, R, R, 3] and their stated errors, which may be none."""
-        self._pictures, self._floors_db = radiance_rgb, floors_db
+        self._pictures = radiance_rgb
+        self._floors_db = floors_db
 
     @property
     def width_px(self) -> int:

@@ -38,7 +38,8 @@ EXPORTS = {
 }
 """Forms of one file that a page offers, as far as they can be written."""
 
-CAMERA, EDITED = "camera.json", "scene.safetensors"
+CAMERA = "camera.json"
+EDITED = "scene.safetensors"
 """What the page saves, as the commands name it that it shows."""
 
 _OCTETS = "application/octet-stream"
@@ -112,7 +113,8 @@ class SceneRoom:
 
     def _is_offered(self, suffix: str) -> bool:
         """Return whether a form of one file can be written; text has its pictures beside it."""
-        form, scene = FORMATS.get(suffix), self.scene
+        form = FORMATS.get(suffix)
+        scene = self.scene
         pictures = suffix == ".usda" and (scene.textures or scene.environment is not None)
         return form is not None and form.write is not None and not pictures
 
@@ -143,7 +145,8 @@ class SceneRoom:
 
     def _repeated(self, job: Job) -> Mapping[str, Any]:
         """Return the command that makes a picture, and its camera in a form that `render` reads."""
-        wanted, camera = job.wanted, job.wanted.camera
+        wanted = job.wanted
+        camera = job.wanted.camera
         place = ["--view", str(wanted.view), "--out", "view.exr"]
         if wanted.view is None:  # of a file of cameras come many pictures, into a folder
             place = ["--cameras", CAMERA, "--out", "view"]
@@ -171,13 +174,15 @@ class SceneRoom:
         if agreement_db(job, truth) is None:
             raise TrilightError("There is nothing to judge this picture by yet.")
         assert job.painted is not None and truth is not None and truth.painted is not None
-        mine, other = job.painted.radiance_rgb, truth.painted.radiance_rgb
+        mine = job.painted.radiance_rgb
+        other = truth.painted.radiance_rgb
         assert mine is not None and other is not None
         return error_picture(mine, other)
 
     def _export(self, question: Question) -> Answer:
         body = question.body if isinstance(question.body, dict) else {}
-        suffix, edits = str(body.get("form")), edits_of(body)
+        suffix = str(body.get("form"))
+        edits = edits_of(body)
         if suffix not in EXPORTS or not self._is_offered(suffix):
             raise TrilightError(f"form {suffix:.20}: expected one of {' '.join(EXPORTS)}.")
         key = sha256_hex(canonical_json(edits))[:24]
@@ -190,7 +195,8 @@ class SceneRoom:
 
 
 def _told(job: Job, truth: Job | None) -> Mapping[str, Any]:
-    painted, sampling = job.painted, job.sampling
+    painted = job.painted
+    sampling = job.sampling
     told: dict[str, Any] = {
         "id": job.id,
         "engine": job.wanted.engine,

@@ -89,7 +89,9 @@ class PageServer(ThreadingHTTPServer):
         Raises:
             TrilightError: the port is taken.
         """
-        self.gets, self.posts, self.word = gets, posts, new_word()
+        self.gets = gets
+        self.posts = posts
+        self.word = new_word()
         self.places = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self._awaited: dict[socket.socket, float] = {}
         self._changing = threading.Lock()
@@ -151,7 +153,8 @@ class _Handler(BaseHTTPRequestHandler):
     server: PageServer
     protocol_version = "HTTP/1.1"
     timeout = _STALLED_S
-    server_version, sys_version = "trilight", ""
+    server_version = "trilight"
+    sys_version = ""
 
     def do_GET(self) -> None:
         self._answer("GET")
@@ -163,7 +166,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Say nothing: the path holds the password."""
 
     def _answer(self, method: str) -> None:
-        port, word = self.server.server_port, self.server.word
+        port = self.server.server_port
+        word = self.server.word
         refused = refusal(method, self.path, self.headers.items(), port=port, word=word)
         if refused is not None:
             self.close_connection = True
@@ -176,9 +180,11 @@ class _Handler(BaseHTTPRequestHandler):
             try:
                 answer = self._routed(method, data)
             except NotThere as error:
-                status, sentence = HTTPStatus.NOT_FOUND, str(error)
+                status = HTTPStatus.NOT_FOUND
+                sentence = str(error)
             except TrilightError as error:
-                status, sentence = HTTPStatus.UNPROCESSABLE_ENTITY, str(error)
+                status = HTTPStatus.UNPROCESSABLE_ENTITY
+                sentence = str(error)
             except Exception as error:
                 status = HTTPStatus.INTERNAL_SERVER_ERROR
                 sentence = f"The viewer cannot answer this ({type(error).__name__})."

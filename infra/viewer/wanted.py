@@ -62,7 +62,8 @@ def wanted_of(body: Any, engines: Mapping[str, Any], views: int) -> Wanted:
     engine = str(body.get("engine"))
     if engine not in engines:
         raise TrilightError(f"engine {engine:.40}: {expected_one_of(engine, list(engines))}.")
-    width, view = body.get("resolution"), body.get("view")
+    width = body.get("resolution")
+    view = body.get("view")
     if not (isinstance(width, int) and 16 <= width <= MOST_PX and width % 8 == 0):
         raise TrilightError(
             f"resolution is {width!r:.20}; expected a multiple of 8 from 16 to {MOST_PX}."

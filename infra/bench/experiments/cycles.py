@@ -25,7 +25,10 @@ from storage.conventions import log10_radiance
 from storage.metrics import psnr_linear_db
 from storage.records.scene import Scene
 
-PLAIN, TEXTURED, SKY, GIVEN = "plain", "textured", "sky", "given"
+PLAIN = "plain"
+TEXTURED = "textured"
+SKY = "sky"
+GIVEN = "given"
 RESOLUTION = 64
 OUR_SHARE = 4
 """Samples of ours, in two halves, for each sample of one picture of Cycles: they cost less."""
@@ -102,7 +105,8 @@ def agreement_figures(ours: RawReference, theirs: CyclesSamples) -> dict[str, fl
     one, other = (picture.astype(np.float64) for picture in theirs.pictures_rgb)
     level = float(np.quantile((one + other).mean(axis=-1) / 2, 0.9))
     exposure = EXPOSED / level if level > 0 else 1.0
-    one, other = one * exposure, other * exposure
+    one = one * exposure
+    other = other * exposure
     ours = RawReference(a_rgb=ours.a_rgb * exposure, b_rgb=ours.b_rgb * exposure)
     their_halves = RawReference(a_rgb=one, b_rgb=other)
     pixels_db = _linear_db(0.5 * (ours.a_rgb + ours.b_rgb), one)

@@ -38,7 +38,9 @@ STATED_PX = (64, 256)
 REFERENCE_PX = 256
 """Width of the references in pixels, the largest that is judged."""
 
-OURS, STATED, PLAIN = "Trilight, stated errors", "Trilight, other widths", "plain Mitsuba"
+OURS = "Trilight, stated errors"
+STATED = "Trilight, other widths"
+PLAIN = "plain Mitsuba"
 
 
 def adaptive(target_db: float, resolution: int, max_spp: int) -> RenderSettings:
@@ -87,7 +89,8 @@ def _trials(scale: BenchScale, options: BenchOptions) -> list[str]:
 def _measure(
     context: BenchContext, points: Sequence[Point], trial: str
 ) -> list[tuple[str, Figures]]:
-    scale, scene = context.scale, context.scene(trial)
+    scale = context.scale
+    scene = context.scene(trial)
     camera = first_camera(scene, REFERENCE_PX)
     whole = kept_reference(context.child, scene, camera, scale.reference_spp)
     reference = shrunk(whole, scale.resolution)

@@ -16,10 +16,12 @@ from infra.bench_options import BenchOptions
 from storage.dataset.settings import StorageSettings
 from storage.dataset.training_data import TrainingData, open_training_data
 
-UNPACK, TRAIN = "unpacking, one thread", "batches as training reads them"
+UNPACK = "unpacking, one thread"
+TRAIN = "batches as training reads them"
 THREADS = (0, 1, 2, 4)
 """Decoding threads; with 0 the thread that asks decodes."""
-BATCH, RESOLUTION = 4, 64
+BATCH = 4
+RESOLUTION = 64
 """Scenes of a batch, and width of its pictures in pixels, which are reduced from the stored one."""
 _VIEWS = 4
 """Most views of a scene that are drawn."""
@@ -81,7 +83,8 @@ def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
         resolution=RESOLUTION,
         views_per_scene=min(_VIEWS, data.num_views or _VIEWS),
     )
-    began, core_began = time.perf_counter(), time.process_time()
+    began = time.perf_counter()
+    core_began = time.process_time()
     stream = stream_batches(
         data.split("train"), settings, 0, share=RankShare(), workers=threads, unusable=Unusable(0)
     )

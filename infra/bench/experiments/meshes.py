@@ -18,7 +18,8 @@ PICTURED = 3
 """Objects that are path traced at every budget: some seconds each."""
 LARGE = 1100
 """Least clean triangles of an object, so that every budget takes something away."""
-METHOD_GROUP, BUDGET_GROUP = f"methods, {BUDGET} triangles", "faithful, by budget"
+METHOD_GROUP = f"methods, {BUDGET} triangles"
+BUDGET_GROUP = "faithful, by budget"
 
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
@@ -48,11 +49,13 @@ def _measure(
     context: BenchContext, points: Sequence[Point], trial: str
 ) -> Iterator[tuple[str, Figures]]:
     """Measure one object every way, and the pictures of the few that are path traced."""
-    number, scale = int(trial.split()[-1]), context.scale
+    number = int(trial.split()[-1])
+    scale = context.scale
     large = [path for path, faces in context.mesh_files if faces >= LARGE]
     if number > len(large):
         raise Rejected("no_object", f"only {len(large)} objects have {LARGE} triangles")
-    path, pictures = large[number - 1], list[float]()
+    path = large[number - 1]
+    pictures = list[float]()
     if number <= PICTURED:
         method = remeshing.METHODS["faithful"]
         meshes = context.mesh_child.call(coarser, path, CURVE, method)

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from infra.bench.workloads.trainings import TrainingScenes
     from train.settings import TrainSettings
 
-SIDE_A, SIDE_B = "a", "b"
+SIDE_A = "a"
+SIDE_B = "b"
 PRESET = "smoke"
 
 

@@ -72,7 +72,8 @@ def scene_of(workload: Workload) -> SceneTensors:
 def drawn_batch(settings: TrainSettings, scenes: int) -> TrainingBatch:
     """Return a batch on the processor: real scenes, with targets that are noise."""
     generator = torch.Generator().manual_seed(0)
-    views, px = settings.views_per_scene, settings.resolution
+    views = settings.views_per_scene
+    px = settings.resolution
     return TrainingBatch(
         scenes=batch_scenes(
             [_prepared(scene_of(each), settings.model, px) for each in workloads(settings, scenes)]
@@ -98,7 +99,9 @@ def drawn_lpips(settings: TrainSettings, widths: tuple[int, ...] = VGG16_WIDTHS)
     """Return LPIPS with random weights of the published sizes, where a preset asks for LPIPS."""
     if settings.loss.perceptual != "lpips":
         return None
-    vgg16, linear, channels = {}, {}, 3
+    vgg16 = {}
+    linear = {}
+    channels = 3
     generator = torch.Generator().manual_seed(0)
     for block, (numbers, width) in enumerate(zip(BLOCKS, widths, strict=True)):
         for number in numbers:

@@ -21,7 +21,9 @@ from train.loss.objective import Objective
 from train.runs import named_run
 from train.settings import TrainSettings
 
-SHRUNK_PX, SHRUNK_TRIANGLES, SHRUNK_SCENES = 32, 64, 2
+SHRUNK_PX = 32
+SHRUNK_TRIANGLES = 64
+SHRUNK_SCENES = 2
 THIN = (4, 8, 16, 16, 16)
 """Channels of LPIPS where presets are shrunk."""
 _WARM_STEPS = 3

@@ -75,11 +75,14 @@ def read_figures(data: str, threads: int, px: int, least_s: float) -> dict[str, 
     with closing(stream) as batches:
         for _ in itertools.islice(batches, 1 + 16 // BATCH):  # what is decoded ahead counts twice
             pass
-        began, core_began, count = time.perf_counter(), time.process_time(), 0
+        began = time.perf_counter()
+        core_began = time.process_time()
+        count = 0
         while time.perf_counter() - began < least_s:
             next(batches)
             count += BATCH
-        seconds, core_s = time.perf_counter() - began, time.process_time() - core_began
+        seconds = time.perf_counter() - began
+        core_s = time.process_time() - core_began
     views = count * run.views_per_scene
     return {
         "ms": 1e3 * seconds / count,

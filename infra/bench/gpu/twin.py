@@ -25,7 +25,9 @@ from storage.metrics import psnr_log_db
 NETWORKS = ("builtin:tokens", "builtin:hits")
 STORED = Path(__file__).with_name("twin.npz")
 """float16 log10(1 + radiance) [64, 64, 3] by network, and the digest of its weights."""
-TRIANGLES, LIGHTS, PX = 400, 4, 64
+TRIANGLES = 400
+LIGHTS = 4
+PX = 64
 MORE_VIEWS = 5
 
 
@@ -47,7 +49,8 @@ def stored_twin(network: str) -> NDArray[np.float64]:
         TrilightError: it is of other weights.
     """
     with np.load(STORED, allow_pickle=False) as stored:
-        digest, picture = str(stored[f"{network} sha256"]), stored[network]
+        digest = str(stored[f"{network} sha256"])
+        picture = stored[network]
     if digest != (now := _digest(network)):
         raise TrilightError(
             f"bench gpu: the stored picture of {network} is by weights of sha256 {digest[:8]}, "
@@ -68,7 +71,8 @@ def _rendered(
     renderer = NeuralRenderer.load(network, device=str(device), precision=precision)
     scene = cost_scene(TRIANGLES, LIGHTS)
     prepared = renderer.prepare(scene)
-    pose, fov = scene.c2w[0], float(scene.fov_deg[0])
+    pose = scene.c2w[0]
+    fov = float(scene.fov_deg[0])
     picture = renderer.view(prepared, pose, fov, PX)
     times = []
     for _ in range(MORE_VIEWS):

@@ -25,7 +25,8 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-_CLIP_START, _CLIP_END = 1e-4, 1e4
+_CLIP_START = 1e-4
+_CLIP_END = 1e4
 
 
 def main(folder: Path) -> None:
@@ -133,7 +134,8 @@ def add_camera(c2w: NDArray[np.float64], fov_deg: float) -> None:
     camera = bpy.data.cameras.new("camera")
     camera.sensor_fit = "HORIZONTAL"
     camera.angle = np.radians(fov_deg)
-    camera.clip_start, camera.clip_end = _CLIP_START, _CLIP_END
+    camera.clip_start = _CLIP_START
+    camera.clip_end = _CLIP_END
     added = bpy.data.objects.new("camera", camera)
     added.matrix_world = Matrix(c2w.tolist())  # a plain list would be taken column by column
     bpy.context.scene.collection.objects.link(added)
@@ -143,17 +145,22 @@ def add_camera(c2w: NDArray[np.float64], fov_deg: float) -> None:
 def set_up_cycles(request: dict[str, Any], target: Path) -> None:
     """Set what the reference pictures were made with; the rest is as Blender ships it."""
     scene = bpy.context.scene
-    render, cycles = scene.render, scene.cycles
+    render = scene.render
+    cycles = scene.cycles
     render.engine = "CYCLES"
     render.resolution_x = render.resolution_y = request["resolution"]
     render.resolution_percentage = 100
     render.film_transparent = False
     render.use_persistent_data = True
     render.use_compositing = render.use_sequencer = False
-    render.threads_mode, render.threads = "FIXED", request["threads"]
-    render.filepath, render.use_file_extension = str(target), False
+    render.threads_mode = "FIXED"
+    render.threads = request["threads"]
+    render.filepath = str(target)
+    render.use_file_extension = False
     image = render.image_settings
-    image.file_format, image.color_mode, image.color_depth = "OPEN_EXR", "RGB", "32"
+    image.file_format = "OPEN_EXR"
+    image.color_mode = "RGB"
+    image.color_depth = "32"
     image.exr_codec = "NONE"
     settings = {
         "device": "CPU",
@@ -181,7 +188,8 @@ def render(samples: int) -> dict[str, float]:
     """Render, and return the seconds on the clock and of all cores for the whole call."""
     bpy.context.scene.cycles.samples = samples
     bpy.context.scene.update_tag()  # or the data that stayed keep the number of samples too
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall = time.perf_counter()
+    cpu = time.process_time()
     bpy.ops.render.render(write_still=True)
     return {"wall_s": time.perf_counter() - wall, "core_s": time.process_time() - cpu}
 
@@ -199,7 +207,9 @@ def pixels(path: Path) -> NDArray[np.float32]:
 
 def exr_text_attributes(path: Path) -> dict[str, str]:
     """Return the strings in the header of an EXR file: Cycles states its own times there."""
-    data, at, found = path.read_bytes(), 8, {}
+    data = path.read_bytes()
+    at = 8
+    found = {}
     while data[at]:  # a name without letters ends the header
         name_end = data.index(0, at)
         type_end = data.index(0, name_end + 1)

@@ -19,7 +19,8 @@ from storage.metrics import psnr_log_db
 from storage.records.scene import Scene, SceneObject
 
 _SMOOTH_ANGLE_DEG = 30.0
-_EYE, _FOV_DEG = (1.6, -1.6, 1.0), 35.0
+_EYE = (1.6, -1.6, 1.0)
+_FOV_DEG = 35.0
 _LAMP = ((0.8, -1.2, 2.0), (1.3, -0.9, 2.0), (0.9, -0.7, 2.2))
 _RADIANCE = 200.0
 """Pictures are then as bright on average as the median one of `smoke`, 0.23: dB depend on it."""
@@ -76,7 +77,8 @@ def _scene(mesh: TriangleMesh, *, floor_z: float) -> Scene:
     )  # fmt: skip
     lamp = Emitter(triangle=np.array(_LAMP), radiance_rgb=(_RADIANCE,) * 3, reflectance=0.0)
     entry = SceneObject(name="object", kind="object")
-    positions, faces = mesh.positions.astype(np.float32), mesh.faces.astype(np.uint32)
+    positions = mesh.positions.astype(np.float32)
+    faces = mesh.faces.astype(np.uint32)
     pieces = [
         shell_piece(floor, rng, _SMOOTH_ANGLE_DEG),
         object_piece(entry, positions, faces, glossy, rng, _SMOOTH_ANGLE_DEG),

@@ -65,7 +65,9 @@ def render_levels(
     warm_up_denoiser(resolution)
     plain = _Plain(scene)
     features, core_s = _features(scene, camera)
-    total, before, levels = np.zeros((resolution, resolution, 3)), 0, []
+    total = np.zeros((resolution, resolution, 3))
+    before = 0
+    levels = []
     for spp in levels_spp:
         started = time.process_time()
         total += (spp - before) * plain.radiance(camera, seed_for(seed, "plain", spp), spp - before)

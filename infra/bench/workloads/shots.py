@@ -56,7 +56,8 @@ def shots(scene: Scene, variants: Mapping[str, RenderSettings]) -> dict[str, Sho
 
 def _shot(scene: Scene, settings: RenderSettings) -> Shot:
     small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
-    pose, fov_deg = scene.c2w[0], float(scene.fov_deg[0])
+    pose = scene.c2w[0]
+    fov_deg = float(scene.fov_deg[0])
     SceneRenderer(scene, small).render_view(pose, fov_deg, seed=0)  # compiles
     if settings.denoiser != "off":
         warm_up_denoiser(settings.resolution, settings.denoiser)

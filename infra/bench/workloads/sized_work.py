@@ -19,7 +19,8 @@ from infra.bench.workloads.manifests import write_copies
 from storage.errors import TrilightError
 from storage.installation import IMPORT_ROOT, child_environment
 
-_PX, _LIGHTS = 64, 4
+_PX = 64
+_LIGHTS = 4
 _SAMPLING_S = 0.05
 _CODE = "import sys; from importlib import import_module as i; i(sys.argv[1]).main(sys.argv[2:])"
 
@@ -60,7 +61,8 @@ def measure_work(name: str, size: int, folder: Path) -> dict[str, float]:
         words, cwd=IMPORT_ROOT, env=child_environment(), stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT, text=True, start_new_session=True,
     ) as process:  # fmt: skip
-        peak, done = [0], threading.Event()
+        peak = [0]
+        done = threading.Event()
         watch = threading.Thread(target=_watch_memory, args=(process.pid, peak, done))
         watch.start()
         output, _ = process.communicate()
@@ -77,7 +79,9 @@ def measure_work(name: str, size: int, folder: Path) -> dict[str, float]:
 
 def main(words: list[str]) -> None:
     """Do the work in this process and print its seconds as the last line."""
-    work, size, folder = WORK[words[0]], int(words[1]), Path(words[2])
+    work = WORK[words[0]]
+    size = int(words[1])
+    folder = Path(words[2])
     for number, count in enumerate((work.least, size)):
         place = folder / f"{number}"
         place.mkdir()

@@ -68,7 +68,8 @@ def training_figures(
     began = time.perf_counter()
     model = _trained_network(scenes.train, settings, device)
     seconds = time.perf_counter() - began
-    views, found = iter(scenes.judge.judge(model).views), []
+    views = iter(scenes.judge.judge(model).views)
+    found = []
     for judged in scenes.judge.scenes:
         mine = [next(views) for _ in judged.target_VRR3]
         l1 = float(np.mean([view.log_l1 for view in mine]))
@@ -88,7 +89,8 @@ def _trained_network(
     stepper = Stepper(state, settings, Objective(settings.loss, None), crew)
 
     def flops(triangles: int) -> int:
-        views, resolution = settings.views_per_scene, settings.resolution
+        views = settings.views_per_scene
+        resolution = settings.resolution
         workload = Workload(triangles=triangles, views=views, resolution=resolution)
         return training_flops(settings.model, workload)
 
