@@ -47,18 +47,18 @@ class BenchContext:
         """Notes that belong to the result."""
         self.cores = os.cpu_count() or 1
         self._stack = contextlib.ExitStack()
-        self._kept: dict[Any, Any] = {}
+        self._cache: dict[Any, Any] = {}
 
     def close(self) -> None:
         """End the children, delete their folders."""
         self._stack.close()
 
-    def kept(self, key: Any, make: Callable[[], Result]) -> Result:
+    def get_or_make(self, key: Any, make: Callable[[], Result]) -> Result:
         """Return what was made under a key, made now if it was not."""
-        if key not in self._kept:
-            self._kept[key] = make()
-        found: Result = self._kept[key]
-        return found
+        if key not in self._cache:
+            self._cache[key] = make()
+        result: Result = self._cache[key]
+        return result
 
     def note(self, text: str) -> None:
         """Keep a sentence with the result; once."""
@@ -100,22 +100,22 @@ class BenchContext:
         from pipeline.objects.sources import find_objects
         from storage.cache import cache_folder
 
-        found = find_objects(
+        objects = find_objects(
             self.options.objects,
             work_dir=cache_folder("objects"),
             allowed_licences=self.options.allowed_licences,
         )
         sizes = {}
-        for record in found.records:
+        for record in objects.records:
             with contextlib.suppress(Rejected, ChildFailed):
                 sizes[Path(record.path)] = self.mesh_child.call(count_faces, Path(record.path))
         return tuple(sorted(sizes.items(), key=lambda item: (-item[1], str(item[0]))))
 
     def scene(self, trial: str) -> Scene:
         """Return the scene of the trial `sampled N`, or the one of the user's of that name."""
-        given = given_scenes(self.options.scenes)
-        if trial in given:
-            return given[trial](self.child)
+        user_scenes = given_scenes(self.options.scenes)
+        if trial in user_scenes:
+            return user_scenes[trial](self.child)
         scene: Scene = self.child.call(sampled_scene, int(trial.split()[-1]))
         return scene
 

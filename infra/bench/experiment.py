@@ -183,10 +183,10 @@ def public_options(options: BenchOptions) -> dict[str, Any]:
     from infra.rendering.methods import network_labels
     from storage.digests import sha256_hex
 
-    found = dataclasses.asdict(options)
-    found["scenes"] = options.scenes.name if options.scenes else None
-    found["checkpoint"] = list(network_labels(options.checkpoint))
+    values = dataclasses.asdict(options)
+    values["scenes"] = options.scenes.name if options.scenes else None
+    values["checkpoint"] = list(network_labels(options.checkpoint))
     if options.data:
         name = options.data.rstrip("/").rpartition("/")[2]
-        found["data"] = f"{name} ({sha256_hex(options.data.encode())[:8]})"
-    return found
+        values["data"] = f"{name} ({sha256_hex(options.data.encode())[:8]})"
+    return values

@@ -97,18 +97,18 @@ _OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {
 
 
 def _values(experiment: Experiment, run: Run, point: Point) -> dict[str, float]:
-    whole = run.whole_trials()
-    found = {}
+    whole_trials = run.whole_trials()
+    values = {}
     for column in columns_of(experiment):
         if column.over == "pair":
             figures, trials = _differences(column, run, point)
         else:
-            trials = [t for t in whole if column.figure in run.trials[t][point.name]]
+            trials = [t for t in whole_trials if column.figure in run.trials[t][point.name]]
             figures = [run.trials[t][point.name][column.figure] for t in trials]
         if figures:
             value = _over(column, figures, [experiment.cluster(trial) for trial in trials])
-            found[column.name] = column.then(value) if column.then else value
-    return found
+            values[column.name] = column.then(value) if column.then else value
+    return values
 
 
 def _over(column: Column, figures: Sequence[float], clusters: Sequence[str]) -> float:
@@ -131,14 +131,14 @@ def _differences(column: Column, run: Run, point: Point) -> tuple[list[float], l
 
 
 def _intervals(experiment: Experiment, run: Run, point: Point) -> dict[str, tuple[float, float]]:
-    found = {}
+    intervals = {}
     for column in columns_of(experiment):
         if column.over == "pair":
             differences, trials = _differences(column, run, point)
             if differences:
                 clusters = [experiment.cluster(trial) for trial in trials]
-                found[column.name] = mean_interval(differences, clusters)
-    return found
+                intervals[column.name] = mean_interval(differences, clusters)
+    return intervals
 
 
 def _cost_range(experiment: Experiment, run: Run, point: str) -> tuple[float, float] | None:
@@ -160,7 +160,7 @@ def _front(
     error = experiment.error.name
     sign = -1 if experiment.better == "higher" else 1
     costs = (experiment.cost.name, *experiment.also_cost)
-    found = dict[str, bool]()
+    front = dict[str, bool]()
     for group in dict.fromkeys(point.group for point in known):
         names = [
             point.name
@@ -170,5 +170,5 @@ def _front(
         figures = [
             (sign * values[name][error], [values[name][cost] for cost in costs]) for name in names
         ]
-        found |= dict(zip(names, on_front(figures), strict=True))
-    return found
+        front |= dict(zip(names, on_front(figures), strict=True))
+    return front

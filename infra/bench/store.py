@@ -57,20 +57,20 @@ class Store:
         Raises:
             TrilightError: the file holds something else.
         """
-        found: list[Run] = []
+        runs: list[Run] = []
         for number, line in enumerate(self._whole_lines(), 1):
             try:
                 record = json.loads(line)
                 if "plan" in record:
-                    found.append(Run(plan=record["plan"], date=record["date"]))
+                    runs.append(Run(plan=record["plan"], date=record["date"]))
                 else:
-                    _take(found[-1], record)
+                    _take(runs[-1], record)
             except (ValueError, LookupError, TypeError) as error:
                 raise TrilightError(
                     f"{self.path}: line {number} is no row of `trilight bench`; expected a file "
                     "that it wrote. Name another one by --out."
                 ) from error
-        return found
+        return runs
 
     def newest(self) -> Run | None:
         """Return the last run that has ended."""

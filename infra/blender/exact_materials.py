@@ -137,9 +137,9 @@ def follow(material: Any, name: str, base: Any, gloss: Any) -> None:
         material.node_tree.links.new(base.links[0].from_socket, gloss)
         return
     is_color = base.type == "RGBA"
-    shown = list(base.default_value)[:3] if is_color else base.default_value
-    if not np.allclose(shown, material[_PREFIX + name], rtol=1e-6):  # edited before this script
-        material[_PREFIX + name] = shown
+    value = list(base.default_value)[:3] if is_color else base.default_value
+    if not np.allclose(value, material[_PREFIX + name], rtol=1e-6):  # edited before this script
+        material[_PREFIX + name] = value
     for socket in (base, gloss):
         curves = socket.driver_add("default_value")
         for channel, curve in enumerate(curves[:3] if is_color else [curves]):
@@ -156,19 +156,19 @@ def show_linear_values(tree: Any, node: Any) -> None:
     held = interpolate_linear_values(node.image)
     if held is None:
         return
-    shown = tree.nodes.new("ShaderNodeTexImage")
-    shown.name = f"{_LINEAR} {node.name}"
-    shown.image = held
-    shown.extension = node.extension
+    linear_node = tree.nodes.new("ShaderNodeTexImage")
+    linear_node.name = f"{_LINEAR} {node.name}"
+    linear_node.image = held
+    linear_node.extension = node.extension
     for known in node.inputs["Vector"].links:
-        tree.links.new(known.from_socket, shown.inputs["Vector"])
+        tree.links.new(known.from_socket, linear_node.inputs["Vector"])
     chosen = tree.nodes.new("ShaderNodeMix")  # Blender exports the first texture that it finds
     chosen.data_type = "RGBA"
     factor, first, second = (chosen.inputs[n] for n in (0, 6, 7))
     factor.default_value = 1.0
     targets = [known.to_socket for known in node.outputs["Color"].links]
     tree.links.new(node.outputs["Color"], first)
-    tree.links.new(shown.outputs["Color"], second)
+    tree.links.new(linear_node.outputs["Color"], second)
     for target in targets:
         tree.links.new(chosen.outputs[2], target)
 

@@ -5,9 +5,9 @@ import time
 from infra.cli.changes import Shared
 from infra.cli.console import first_words, note
 from infra.cli.dataset_changes import with_shared
-from infra.cli.generate_progress import watched
+from infra.cli.generate_progress import show_progress
 from infra.cli.generate_report import report
-from infra.cli.options import Shown, command
+from infra.cli.options import OutputOptions, command
 from pipeline.executors.registry import find_executor
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.renders.variant import choose_variant
@@ -16,7 +16,7 @@ from storage.settings.described import checked
 
 
 @checked()
-class ExecutorChoice:
+class ExecutorOptions:
     """The executor of the tasks."""
 
     runner: str = "threads"
@@ -29,22 +29,24 @@ class ExecutorChoice:
 
 
 @command("build")
-def generate(order: DatasetOrder, shared: Shared, runner: ExecutorChoice, shown: Shown) -> None:
-    make(with_shared(order, shared), runner, shown)
+def generate(
+    order: DatasetOrder, shared: Shared, runner: ExecutorOptions, output: OutputOptions
+) -> None:
+    make(with_shared(order, shared), runner, output)
 
 
-def make(order: DatasetOrder, runner: ExecutorChoice, shown: Shown) -> None:
+def make(order: DatasetOrder, runner: ExecutorOptions, output: OutputOptions) -> None:
     """Make a dataset and say what came of it; raises TrilightError."""
     folder = dataset_folder(order.place)
     started = time.monotonic()
-    first_words(f"Making {folder.shown} with the build {order.build}", silent=shown.json)
+    first_words(f"Making {folder.shown} with the build {order.build}", silent=output.json)
     executor = find_executor(runner.runner, runner.address, order.workers)
     from infra.planning import describe_run  # slow: every stage
 
-    if not shown.json and (text := describe_run(order, folder)):
+    if not output.json and (text := describe_run(order, folder)):
         first_words(text)
-    if (text := choose_variant().note) and not shown.json:
+    if (text := choose_variant().note) and not output.json:
         note(f"{text}; see trilight doctor")
-    with watched(folder, silent=shown.json):
+    with show_progress(folder, silent=output.json):
         outcome = executor.make(order, runner.address)
-    report(folder, outcome, time.monotonic() - started, as_json=shown.json)
+    report(folder, outcome, time.monotonic() - started, as_json=output.json)

@@ -27,7 +27,7 @@ from train.loss.lpips import Lpips
 NOISE = "noise of the references"
 """Name of the row that says what the targets leave open: nobody can be asked for more."""
 
-Told = Callable[[int, int, str], None]
+OnProgress = Callable[[int, int, str], None]
 """Called with (finished, all) pairs of scene and width, and what is being done."""
 
 
@@ -80,15 +80,15 @@ class BoardContest:
 
 def first_keys(shards: ShardSet, limit: int) -> list[str]:
     """Return the keys of the first scenes of a split; no picture is read."""
-    found: list[str] = []
+    keys: list[str] = []
     for number in range(len(shards.names)):
-        if len(found) < limit:
+        if len(keys) < limit:
             with closing(shards.open(number)) as shard:
-                found += shard.keys
-    return found[:limit]
+                keys += shard.keys
+    return keys[:limit]
 
 
-def judge_all(contest: BoardContest, told: Told) -> None:
+def judge_all(contest: BoardContest, on_progress: OnProgress) -> None:
     """Add every row that is missing.
 
     Raises:
@@ -96,20 +96,20 @@ def judge_all(contest: BoardContest, told: Told) -> None:
     """
     total = len(contest.keys) * len(contest.widths)
     done = 0
-    told(done, total, "")
+    on_progress(done, total, "")
     samples = first_samples(contest.shards, len(contest.keys), Unusable(0))
     for number, sample in enumerate(samples):
         for width in contest.widths:
-            turn = _Turn(contest, sample, width, timed=number < contest.timed_scenes)
-            for contestant in turn.missing():
-                told(done, total, f"{width} px, {contestant.name}")
-                turn.judge(contestant)
-            turn.judge_noise()
+            scene_run = _SceneAtWidth(contest, sample, width, timed=number < contest.timed_scenes)
+            for contestant in scene_run.missing():
+                on_progress(done, total, f"{width} px, {contestant.name}")
+                scene_run.judge(contestant)
+            scene_run.judge_noise()
             done += 1
-            told(done, total, "")
+            on_progress(done, total, "")
 
 
-class _Turn:
+class _SceneAtWidth:
     """One scene at one width."""
 
     def __init__(self, contest: BoardContest, sample: Sample, width: int, *, timed: bool) -> None:
@@ -140,19 +140,19 @@ class _Turn:
         """Add a contestant's rows, or remember why the scene is left out."""
         timed = self._timed and contestant.is_timed
         try:
-            shown = contestant.shown(self._sample, self._width, timed=timed)
+            pictures = contestant.shown(self._sample, self._width, timed=timed)
         except (Rejected, ChildFailed) as error:
             self._contest.left_out[self._width, self._sample.key] = f"{contestant.name}: {error}"
             return
         scene = self._judged_scene()
-        for view, picture in enumerate(shown.radiance_VRR3):
+        for view, picture in enumerate(pictures.radiance_VRR3):
             scores = picture_scores(
                 picture, scene.target_VRR3[view], scene.hits_VRR[view], self._contest.lpips
             )
             row = BoardRow(
                 scores=scores,
-                first_s=shown.first_s if view == 0 else None,
-                further_s=shown.further_s if view == 0 else None,
+                first_s=pictures.first_s if view == 0 else None,
+                further_s=pictures.further_s if view == 0 else None,
                 machine=self._contest.machine if timed and view == 0 else None,
             )
             self._contest.rows.add(self._key(contestant, view), row)
@@ -196,16 +196,16 @@ class JudgedWidth:
 
 def judged_width(contest: BoardContest, width: int) -> JudgedWidth:
     """Return the rows of a width, put together by view."""
-    found = JudgedWidth(width=width, views=tuple(_views(contest, width)), first_s={}, further_s={})
-    shown = {view.key for view in found.views}
-    timed = [key for key in contest.keys[: contest.timed_scenes] if key in shown]
+    judged = JudgedWidth(width=width, views=tuple(_views(contest, width)), first_s={}, further_s={})
+    scene_keys = {view.key for view in judged.views}
+    timed = [key for key in contest.keys[: contest.timed_scenes] if key in scene_keys]
     for one in contest.present(width):
         for key in timed:
             price = contest.rows.price(contest.key_of(one, width, key, 0), contest.machine)
             if price is not None:
-                found.first_s.setdefault(one.name, []).append(price[0])
-                found.further_s.setdefault(one.name, []).append(price[1])
-    return found
+                judged.first_s.setdefault(one.name, []).append(price[0])
+                judged.further_s.setdefault(one.name, []).append(price[1])
+    return judged
 
 
 def _views(contest: BoardContest, width: int) -> Iterator[JudgedView]:
@@ -228,5 +228,5 @@ def _facts(facts: Any) -> dict[str, Any]:
     """Return facts as they were before JSON made a list of a pair."""
     excursion = facts["excursion"]
     known = {one.name for one in dataclasses.fields(JudgedView)}
-    whole = {**facts, "excursion": None if excursion is None else tuple(excursion)}
-    return {name: value for name, value in whole.items() if name in known}
+    values = {**facts, "excursion": None if excursion is None else tuple(excursion)}
+    return {name: value for name, value in values.items() if name in known}

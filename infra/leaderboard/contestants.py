@@ -91,8 +91,8 @@ def shown_by(method: Method, scene: Scene, *, timed: bool) -> ShownViews:
         return lambda: view(scene.c2w[0], float(scene.fov_deg[0]))
 
     first = timed_views(load, repeats=_REPEATS)
-    whole = first.radiance_rgb[None] if scene.num_views == 1 else _all_views(method, scene)
-    return ShownViews(radiance_VRR3=whole, first_s=first.first_s, further_s=first.further_s)
+    pictures = first.radiance_rgb[None] if scene.num_views == 1 else _all_views(method, scene)
+    return ShownViews(radiance_VRR3=pictures, first_s=first.first_s, further_s=first.further_s)
 
 
 def _all_views(method: Method, scene: Scene) -> NDArray[np.float32]:

@@ -109,11 +109,11 @@ def _paper(widths: Sequence[WidthStandings]) -> list[str]:
             [f"here: {text(each.name)}", *(_mean(metric, each) for metric in PUBLISHED)]
             for each in one.standings
         ]
-    here = f" Below it our means at {_PAPER_PX} pixels." if ours else ""
+    ours_text = f" Below it our means at {_PAPER_PX} pixels." if ours else ""
     return [
         "## Beside the paper",
         "",
-        f"{PUBLISHED_WHERE} Means, as there.{here}",
+        f"{PUBLISHED_WHERE} Means, as there.{ours_text}",
         "",
         table(["", *PUBLISHED], rows, numbers=len(PUBLISHED)),
     ]
@@ -160,9 +160,9 @@ def pairs_csv(widths: Sequence[WidthStandings]) -> bytes:
     """Return pairs.csv: what every contestant has more than every other one."""
     head = ["width", "name", "than", "mean_db", "low_db", "high_db", "share_better"]
     rows = [
-        [one.width, inert(first), inert(second), *_lead_cells(found)]
+        [one.width, inert(first), inert(second), *_lead_cells(lead)]
         for one in widths
-        for (first, second), found in one.pairs.items()
+        for (first, second), lead in one.pairs.items()
     ]
     return _csv(head, rows)
 

@@ -41,19 +41,19 @@ class FolderContestant:
         self._folder = folder
         self._require_all(views)
         self._sha256: dict[tuple[str, int], str] = {}
-        found: dict[int, Path] = {}
+        by_width: dict[int, Path] = {}
         for key, view in views:
             path = self._path(key, view)
             data = _bytes_of(path)
-            found.setdefault(_picture(data, path, widths).shape[0], path)
+            by_width.setdefault(_picture(data, path, widths).shape[0], path)
             self._sha256[key, view] = sha256_hex(data)
-        if len(found) > 1:
-            shown = ", ".join(f"{path.name} has {width}" for width, path in found.items())
+        if len(by_width) > 1:
+            listed = ", ".join(f"{path.name} has {width}" for width, path in by_width.items())
             raise TrilightError(
-                f"--pictures {folder}: its pictures have several widths ({shown}); expected one. "
+                f"--pictures {folder}: its pictures have several widths ({listed}); expected one. "
                 "Put those of each width into a folder of their own."
             )
-        (self._width,) = found
+        (self._width,) = by_width
         self.notes: Sequence[str] = (
             f"{self.name} were made elsewhere: what they cost is not known, and they are judged at "
             f"{self._width} pixels alone",
@@ -129,12 +129,12 @@ def folder_contestants(
     folders: Sequence[Path], views: Views, widths: Sequence[int]
 ) -> Mapping[str, FolderContestant]:
     """Return the folders as contestants by name; raises TrilightError where two have one name."""
-    found: dict[str, FolderContestant] = {}
+    by_name: dict[str, FolderContestant] = {}
     for folder in folders:
         one = FolderContestant(folder, views, widths)
-        if one.name in found:
+        if one.name in by_name:
             raise TrilightError(
                 f"--pictures {folder}: another folder has the same name; expected different ones."
             )
-        found[one.name] = one
-    return found
+        by_name[one.name] = one
+    return by_name

@@ -70,7 +70,7 @@ class BoardRows:
             self._append({"set": set_digest})
             return
         try:
-            found = str(json.loads(lines[0])["set"])
+            stored_digest = str(json.loads(lines[0])["set"])
             for line in lines[1:]:
                 self._keep(*_row(json.loads(line)))
         except (ValueError, KeyError, TypeError) as error:
@@ -78,10 +78,10 @@ class BoardRows:
                 f"{path}: not the rows of a leaderboard ({error}). Choose another --out, or delete "
                 "the file."
             ) from error
-        if found != set_digest:
+        if stored_digest != set_digest:
             raise TrilightError(
-                f"{path}: its rows are of the set {found[:12]}, and SOURCE is {set_digest[:12]}; "
-                "expected the same set. Choose another --out."
+                f"{path}: its rows are of the set {stored_digest[:12]}, and SOURCE is "
+                f"{set_digest[:12]}; expected the same set. Choose another --out."
             )
 
     def get(self, key: RowKey) -> BoardRow | None:

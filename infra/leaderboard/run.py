@@ -11,7 +11,7 @@ from infra.leaderboard.chart import plot_leaderboard
 from infra.leaderboard.contest import (
     BoardContest,
     JudgedWidth,
-    Told,
+    OnProgress,
     first_keys,
     judge_all,
     judged_width,
@@ -77,7 +77,7 @@ class Leaderboard:
     """Its folder."""
 
 
-def make_leaderboard(order: LeaderboardOrder, told: Told) -> Leaderboard:
+def make_leaderboard(order: LeaderboardOrder, on_progress: OnProgress) -> Leaderboard:
     """Judge what is missing, and write leaderboard.md, .csv and .png and pairs.csv.
 
     Raises:
@@ -113,19 +113,19 @@ def make_leaderboard(order: LeaderboardOrder, told: Told) -> Leaderboard:
             rows=BoardRows(order.out / "rows.jsonl", opened.digest),
             notes=() if nearest else (ALONE,),
         )
-        judge_all(contest, told)
-    return _written(order, opened, contest, rival)
+        judge_all(contest, on_progress)
+    return _write_leaderboard(order, opened, contest, rival)
 
 
-def widths_of(asked: Sequence[int], stored: int) -> list[int]:
+def widths_of(requested: Sequence[int], stored: int) -> list[int]:
     """Return the widths to judge at, rising; raises TrilightError where the set lacks one."""
-    if wrong := [width for width in asked if stored % width]:
+    if wrong := [width for width in requested if stored % width]:
         raise TrilightError(
             f"--width is {wrong[0]}; expected a divisor of {stored}, the width of the set. "
             "Generate it at another --resolution for wider pictures."
         )
     usual = [width for width in USUAL_WIDTHS if stored % width == 0]
-    return sorted(set(asked or usual or [stored]))
+    return sorted(set(requested or usual or [stored]))
 
 
 def _names(places: Sequence[str]) -> list[str]:
@@ -212,7 +212,7 @@ def _about_network(name: str, renderer: "NeuralRenderer") -> str:
     return f"{name} is {renderer.digest[:8]}, trained at {width}{most}"
 
 
-def _written(
+def _write_leaderboard(
     order: LeaderboardOrder, opened: TrainingData, contest: BoardContest, rival: str
 ) -> Leaderboard:
     kinds = {one.name: one.kind for one in contest.contestants}

@@ -67,7 +67,7 @@ def standings_of(judged: JudgedWidth, kinds: Mapping[str, str], rival: str) -> W
     names = [name for name in judged.views[0].scores if name != NOISE]
     pairs = {two: pair(judged.views, *two) for two in itertools.permutations(names, 2)}
     front = _front(judged, names)
-    found = [
+    standings = [
         Standing(
             name=name,
             kind=kinds.get(name, ""),
@@ -80,7 +80,7 @@ def standings_of(judged: JudgedWidth, kinds: Mapping[str, str], rival: str) -> W
         )
         for name in [NOISE, *names]
     ]
-    order = sorted(found, key=lambda one: (one.name != NOISE, -one.median_db))
+    order = sorted(standings, key=lambda one: (one.name != NOISE, -one.median_db))
     return WidthStandings(
         width=judged.width,
         num_scenes=len({view.key for view in judged.views}),

@@ -26,7 +26,7 @@ NETWORK = "network"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Beside:
+class SceneComparison:
     """The first view of one scene, by everybody."""
 
     key: str
@@ -61,9 +61,9 @@ def chosen_scenes(dataset: Dataset, count: int) -> list[Chosen]:
     return chosen
 
 
-def pictures_beside(
+def compare_scenes(
     dataset: Dataset, chosen: Sequence[Chosen], *, checkpoint: str, done: Callable[[], None]
-) -> Iterator[Beside]:
+) -> Iterator[SceneComparison]:
     """Yield the first view of each scene.
 
     Args:
@@ -83,7 +83,7 @@ def pictures_beside(
                 by_width[width] = _engines(width, checkpoint)
                 for engine in by_width[width].values():
                     stack.callback(engine.close)
-            yield _beside(sample, entry.split, by_width[width])
+            yield _compare_scene(sample, entry.split, by_width[width])
             done()
 
 
@@ -105,15 +105,15 @@ def _engines(resolution: int, checkpoint: str) -> Mapping[str, Engine]:
         lights_per_pass=MAX_LIGHTS,
         threads=None,
     )
-    started = {NETWORK: network.start(_unwatched)}
-    return started | {name: plan.start(_unwatched) for name, plan in tracers.items()}
+    started = {NETWORK: network.start(_ignore_samples)}
+    return started | {name: plan.start(_ignore_samples) for name, plan in tracers.items()}
 
 
-def _unwatched(_sampling: object) -> None:
+def _ignore_samples(_sampling: object) -> None:
     """Say nothing of the samples."""
 
 
-def _beside(sample: Sample, split: str, engines: Mapping[str, Engine]) -> Beside:
+def _compare_scene(sample: Sample, split: str, engines: Mapping[str, Engine]) -> SceneComparison:
     camera = own_camera(sample.scene, 0)
     target = sample.radiance_rgb[0]
     pictures = {
@@ -121,11 +121,11 @@ def _beside(sample: Sample, split: str, engines: Mapping[str, Engine]) -> Beside
         for name, engine in engines.items()
     }
     template = sample.scene.provenance.get("template", "")
-    return Beside(
+    return SceneComparison(
         key=sample.key,
         caption=f"{split}, {template}, {sample.scene.num_triangles} triangles",
         target_rgb=target,
         floor_db=float(sample.views[0].noise_floor_db),
         pictures_rgb=pictures,
-        psnr_db={name: float(psnr_log_db(shown, target)) for name, shown in pictures.items()},
+        psnr_db={name: float(psnr_log_db(picture, target)) for name, picture in pictures.items()},
     )

@@ -152,13 +152,13 @@ def _broken_off(upload: Upload, what: str, error: Exception) -> TrilightError:
 
 
 def _require_sound(folder: Path) -> None:
-    found = verify_dataset(str(folder), fast=True)
-    if not found.is_finished:
+    verification = verify_dataset(str(folder), fast=True)
+    if not verification.is_finished:
         raise TrilightError(
             f"{folder}: is not finished; expected a whole dataset. Run its trilight generate again."
         )
-    if found.problems:
+    if verification.problems:
         raise TrilightError(
-            f"{folder}: is damaged ({found.problems[0].rstrip('.')}); expected a whole dataset. "
-            f"See trilight verify {folder}."
+            f"{folder}: is damaged ({verification.problems[0].rstrip('.')}); expected a whole "
+            f"dataset. See trilight verify {folder}."
         )

@@ -75,10 +75,10 @@ def start(*, host: str, port: int, workers: int) -> str:
     if shutil.which("prefect") is None:
         raise TrilightError("make serve: there is no command `prefect`; run make setup.")
     _require_free(host, port)
-    shares = [_share(number, workers) for number in range(workers)]
+    shares = [_worker_environment(number, workers) for number in range(workers)]
     quiet_prefect()
     url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}/api"
-    environment = {**os.environ, **grant(url), **_surroundings(host)}
+    environment = {**os.environ, **grant(url), **_shared_environment(host)}
     try:
         _say(f"starting Prefect's server at {url.removesuffix('/api')}; all takes about a minute")
         server = [*SERVER, "--host", host, "--port", str(port)]
@@ -96,7 +96,7 @@ def start(*, host: str, port: int, workers: int) -> str:
     return url
 
 
-def _surroundings(host: str) -> dict[str, str]:
+def _shared_environment(host: str) -> dict[str, str]:
     """Return what all parts are told of where they are, and the mark by which they are known."""
     mark = uuid.uuid4().hex
     write_atomically(_mark_file(), mark.encode())
@@ -117,8 +117,8 @@ def stop() -> int:
     """
     ours = running()
     for number in (signal.SIGTERM, signal.SIGKILL):
-        told = running() if number == signal.SIGKILL else running(without=TOLD_BY_ITS_STARTER)
-        for pid in told:
+        pids = running() if number == signal.SIGKILL else running(without=TOLD_BY_ITS_STARTER)
+        for pid in pids:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, number)
         deadline = time.monotonic() + _END_S
@@ -148,15 +148,15 @@ def running(*, without: str | None = None) -> list[int]:
         mark = f"{_MARK}={_mark_file().read_text()}".encode()
     except FileNotFoundError:
         return []
-    found = []
+    pids = []
     for place in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # ended meanwhile, or of another user
             alive = (place / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
             variables = (place / "environ").read_bytes().split(b"\0")
             other = without and any(text.startswith(f"{without}=".encode()) for text in variables)
             if alive and mark in variables and not other:
-                found.append(int(place.name))
-    return found
+                pids.append(int(place.name))
+    return pids
 
 
 def _prepare(environment: Mapping[str, str]) -> None:
@@ -236,7 +236,7 @@ def _require_free(host: str, port: int) -> None:
         )
 
 
-def _share(number: int, workers: int) -> dict[str, str]:
+def _worker_environment(number: int, workers: int) -> dict[str, str]:
     """Return what a worker's environment says of its part of the machine; alone, it has all."""
     if workers == 1:
         return {}

@@ -45,8 +45,11 @@ def train_order(parameters: Mapping[str, Any]) -> TrainOrder:
         TrilightError: a value that no schema can refuse, such as one that does not fit another
             setting of the run; the message names it.
     """
-    given = {"data": tuple(parameters["data"]), "changes": changed_values(parameters["changes"])}
-    order = TrainOrder(**{**parameters, **given})
+    converted = {
+        "data": tuple(parameters["data"]),
+        "changes": changed_values(parameters["changes"]),
+    }
+    order = TrainOrder(**{**parameters, **converted})
     order.settings()
     return order
 
@@ -55,8 +58,8 @@ def _run_name() -> str:
     """Return what the flow run that begins is called: what is trained, and where."""
     from prefect.runtime import flow_run
 
-    given = {"run": TrainOrder.run, **flow_run.parameters}
-    return "-".join(filter(None, [given["run"], given.get("out")]))
+    parameters = {"run": TrainOrder.run, **flow_run.parameters}
+    return "-".join(filter(None, [parameters["run"], parameters.get("out")]))
 
 
 @flow(name="train-model", flow_run_name=_run_name, persist_result=False)

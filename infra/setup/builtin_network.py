@@ -65,14 +65,14 @@ def main(
     about = json.loads(folder.settings.read_text())
     judged = json.loads((evaluation / "evaluation.json").read_text())
     _check(dataset, weights, about, judged["about"])
-    others = [json.loads((each / "evaluation.json").read_text()) for each in also]
-    for each in others:
+    other_evaluations = [json.loads((each / "evaluation.json").read_text()) for each in also]
+    for each in other_evaluations:
         _require_same(each["about"], weights)
     place = BUILTIN_NETWORKS[name]
     summary = json.loads(folder.summary.read_text())
     lines = [f"# The network `{name}`", "", _HEADS[name], ""]
     lines += _card(dataset, about, judged, summary, weights, command)
-    for each in others:
+    for each in other_evaluations:
         lines += ["", *_scores(each)]
     lines += [
         "",
@@ -147,9 +147,9 @@ def _card(
 
 
 def _scores(judged: Mapping[str, Any]) -> list[str]:
-    everybody = judged["contestants"]
+    all_scores = judged["contestants"]
     about = judged["about"]
-    contestants = {NETWORK: everybody[NETWORK]} | everybody  # the file has them by their names
+    ordered = {NETWORK: all_scores[NETWORK]} | all_scores  # the file has them by their names
     traced = judged["path tracer"] or {}
     lines = [
         f"Scores on {about['scenes']} scenes of split {about['split']} of build {about['build']}, "
@@ -160,8 +160,8 @@ def _scores(judged: Mapping[str, Any]) -> list[str]:
         f"| | {' | '.join(judged['metrics'])} |",
         f"|{'---|' * (len(judged['metrics']) + 1)}",
         *(
-            f"| {who} | {' | '.join(_shown(scores[each]) for each in judged['metrics'])} |"
-            for who, scores in contestants.items()
+            f"| {who} | {' | '.join(_figure_text(scores[each]) for each in judged['metrics'])} |"
+            for who, scores in ordered.items()
         ),
     ]
     if traced:
@@ -190,7 +190,7 @@ def _lights(count: int) -> str:
     return f"{count} light{'' if count == 1 else 's'}"
 
 
-def _shown(figures: Mapping[str, Any]) -> str:
+def _figure_text(figures: Mapping[str, Any]) -> str:
     if figures["median"] is None:
         return "n/a"
     return f"{figures['median']:.4g} ({figures['worse_5_percent']:.4g})"

@@ -47,16 +47,16 @@ class Command:
 
 def every_command() -> list[Command]:
     """Return every command that does something, those within groups included."""
-    return [found for name in COMMANDS for found in _commands(app[name], name)]
+    return [command for name in COMMANDS for command in _commands(app[name], name)]
 
 
-def _commands(found: App, name: str) -> Iterator[Command]:
-    if found.default_command is not None:
-        options = tuple(map(_option, found.assemble_argument_collection()))
-        yield Command(name=name, help=found.help, options=options)
-    for inner in found:
+def _commands(group: App, name: str) -> Iterator[Command]:
+    if group.default_command is not None:
+        options = tuple(map(_option, group.assemble_argument_collection()))
+        yield Command(name=name, help=group.help, options=options)
+    for inner in group:
         if not inner.startswith("-"):
-            yield from _commands(found[inner], f"{name} {inner}")
+            yield from _commands(group[inner], f"{name} {inner}")
 
 
 def _option(argument: Any) -> Option:
@@ -73,11 +73,11 @@ def _option(argument: Any) -> Option:
 def command_line_page() -> str:
     """Return every command with its options, as --help shows them."""
     parts = [_HEAD]
-    for found in every_command():
-        parts.append(f"## `trilight {found.name}`\n\n{found.help}\n")
+    for command in every_command():
+        parts.append(f"## `trilight {command.name}`\n\n{command.help}\n")
         rows = [
             (f"`{', '.join(option.names)}`", option.takes, option.help.replace("|", "\\|"))
-            for option in found.options
+            for option in command.options
         ]
         parts.append(table(("option", "takes", "meaning"), rows) + "\n")
     return "\n".join(parts)

@@ -45,30 +45,32 @@ def on_files(files: Files, config: Any) -> Files:
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
     """Lead links out of docs/ to the pages under `source/`; what has no page loses its link."""
-    here = page.file.src_uri
-    origin = here.removeprefix("source/") if here.startswith("source/") else f"docs/{here}"
+    page_uri = page.file.src_uri
+    origin = (
+        page_uri.removeprefix("source/") if page_uri.startswith("source/") else f"docs/{page_uri}"
+    )
 
-    def led(found: re.Match[str]) -> str:
-        bang = found[1]
-        words = found[2]
-        target = found[3]
-        anchor = found[4] or ""
-        path = _resolved(origin, target)
+    def replace_link(match: re.Match[str]) -> str:
+        bang = match[1]
+        words = match[2]
+        target = match[3]
+        anchor = match[4] or ""
+        path = _resolve_link(origin, target)
         if not origin.startswith("docs/") or not path.startswith("docs/"):
             if files.get_file_from_path(_site_uri(path)) is None:
                 return words
-            target = posixpath.relpath(_site_uri(path), posixpath.dirname(here) or ".")
+            target = posixpath.relpath(_site_uri(path), posixpath.dirname(page_uri) or ".")
         return f"{bang}[{words}]({target}{anchor})"
 
-    return LINK.sub(led, markdown)
+    return LINK.sub(replace_link, markdown)
 
 
 def _targets(page: str, text: str) -> Iterator[str]:
-    for found in LINK.finditer(text):
-        yield _resolved(page, found[3])
+    for match in LINK.finditer(text):
+        yield _resolve_link(page, match[3])
 
 
-def _resolved(page: str, target: str) -> str:
+def _resolve_link(page: str, target: str) -> str:
     """Return a link's target as a path below the checkout."""
     return posixpath.normpath(posixpath.join(posixpath.dirname(page), target))
 

@@ -169,8 +169,8 @@ def quantities_page() -> str:
          each.label)
         for name, each in QUANTITIES.items()
     ]  # fmt: skip
-    others = [(f"`{name}`", _KINDS[kind], means) for name, (kind, means) in TEXTS.items()]
-    return f"{_QUANTITIES}\n{table(('name', 'what it is', 'of what'), [*numbers, *others])}\n"
+    texts = [(f"`{name}`", _KINDS[kind], means) for name, (kind, means) in TEXTS.items()]
+    return f"{_QUANTITIES}\n{table(('name', 'what it is', 'of what'), [*numbers, *texts])}\n"
 
 
 def maps_page() -> str:

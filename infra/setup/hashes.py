@@ -30,8 +30,8 @@ def main(paths: list[Path]) -> None:
     with TemporaryDirectory() as cache:
         repository = PyPIRepository([], cache_dir=cache)
         with repository.allow_all_wheels(), ThreadPoolExecutor(_AT_ONCE) as threads:
-            found = threads.map(lambda pin: _digests(repository, *pin), pins)
-            by_pin = dict(zip(pins, found, strict=True))
+            digests = threads.map(lambda pin: _digests(repository, *pin), pins)
+            by_pin = dict(zip(pins, digests, strict=True))
     for path, rows in locks.items():
         hashed = [
             LockedPackage(name=row.name, version=row.version, sha256=by_pin[row.name, row.version])
@@ -41,15 +41,15 @@ def main(paths: list[Path]) -> None:
 
 
 def _digests(repository: Any, name: str, version: str) -> tuple[str, ...]:
-    found = {
+    digests = {
         digest
         for candidate in repository.find_all_candidates(name)
         if str(candidate.version).partition("+")[0] == version  # both as packaging writes them
         for digest in _digest(candidate.link)
     }
-    if not found:
+    if not digests:
         raise ValueError(f"{name}=={version}: no index gives the sha256 of a file of it.")
-    return tuple(sorted(found))
+    return tuple(sorted(digests))
 
 
 def _digest(link: Any) -> Iterator[str]:

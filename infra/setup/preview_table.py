@@ -154,7 +154,7 @@ def _errors_of(
 def _costs_of(
     renderer: "NeuralRenderer", child: IsolatedChild, scene: Scene, px: int
 ) -> dict[str, float]:
-    found: dict[str, float] = child.call(timed_parts, scene, px, time.process_time)
+    core_s: dict[str, float] = child.call(timed_parts, scene, px, time.process_time)
     pose = scene.c2w[0]
     fov_deg = float(scene.fov_deg[0])
     renderer.view(renderer.prepare(scene), pose, fov_deg, px)  # warms up
@@ -162,19 +162,19 @@ def _costs_of(
     prepared = renderer.prepare(scene)
     encoded = time.process_time()
     renderer.view(prepared, pose, fov_deg, px)
-    found[NETWORK_SCENE] = encoded - began
-    found[NETWORK_VIEW] = time.process_time() - encoded
-    return found
+    core_s[NETWORK_SCENE] = encoded - began
+    core_s[NETWORK_VIEW] = time.process_time() - encoded
+    return core_s
 
 
-def _way_error(px: int, method: Method, found: list[float]) -> WayError:
+def _way_error(px: int, method: Method, errors_db: list[float]) -> WayError:
     return WayError(
         rung="network" if method == NETWORK else "traced",
         spp=method[0],
         denoiser=method[1],
         width=px,
-        median_db=round(float(np.median(found)), 2),
-        least_db=round(min(found), 2),
+        median_db=round(float(np.median(errors_db)), 2),
+        least_db=round(min(errors_db), 2),
     )
 
 

@@ -64,11 +64,16 @@ def plain_name(name: str) -> str:
 
 def _component(source: str, name: str, version: str, license_name: str | None) -> dict[str, Any]:
     url = f"pkg:{source}/{name}@{version}"
-    found: dict[str, Any] = {"type": "library", "bom-ref": url, "name": name, "version": version}
-    found["purl"] = url
+    component: dict[str, Any] = {
+        "type": "library",
+        "bom-ref": url,
+        "name": name,
+        "version": version,
+    }
+    component["purl"] = url
     if license_name:
-        found["licenses"] = [{"license": {"name": license_name}}]
-    return found
+        component["licenses"] = [{"license": {"name": license_name}}]
+    return component
 
 
 if __name__ == "__main__":

@@ -65,15 +65,15 @@ def settings_page() -> str:
 
 def reachable(*roots: type) -> list[type]:
     """Return dataclasses and those that their fields hold, each once, outer ones first."""
-    found: dict[type, None] = {}
+    kinds: dict[type, None] = {}
     for root in roots:
-        found[root] = None
+        kinds[root] = None
         hints = typing.get_type_hints(root)
         for field in dataclasses.fields(root):
             for kind in _kinds(hints[field.name]):
                 if dataclasses.is_dataclass(kind):
-                    found |= dict.fromkeys(reachable(kind))
-    return list(found)
+                    kinds |= dict.fromkeys(reachable(kind))
+    return list(kinds)
 
 
 def _kinds(hint: Any) -> Iterator[type]:
@@ -100,18 +100,18 @@ def _rows(kind: type) -> Iterator[tuple[str, ...]]:
             f"`{field.name}`",
             _first_sentence(field.sentence).replace("|", "\\|"),
             (field.expected + presets).replace("|", "\\|"),
-            _shown(field.default),
+            _default_text(field.default),
             *(["free" if field.is_execution else ""] if is_marked else []),
         )
 
 
-def _shown(default: Any) -> str:
+def _default_text(default: Any) -> str:
     if default is dataclasses.MISSING or dataclasses.is_dataclass(default):
         return ""
     if default is None or default in ((), {}):
         return "none"
     if isinstance(default, tuple):
-        return ", ".join(map(_shown, default))
+        return ", ".join(map(_default_text, default))
     if isinstance(default, bool):
         return str(default).lower()
     return shown_number(default) if isinstance(default, int | float) else f"`{default}`"
@@ -119,5 +119,5 @@ def _shown(default: Any) -> str:
 
 def _first_sentence(doc: str) -> str:
     """Return a text up to its first full stop before a space, in one line."""
-    found = re.match(r".*?(?<! al)\.(?=\s|$)", " ".join(doc.split()))
-    return found[0] if found else doc
+    match = re.match(r".*?(?<! al)\.(?=\s|$)", " ".join(doc.split()))
+    return match[0] if match else doc

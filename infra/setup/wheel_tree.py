@@ -18,11 +18,11 @@ FACE = "trilight"
 PACKAGES = ("storage", "scene_templates", "pipeline", "model", "train", "infra")
 """Packages that move below FACE."""
 
-_BESIDE = ("pyproject.toml", "README.md", "LICENSE", "requirements")
+_BUILD_FILES = ("pyproject.toml", "README.md", "LICENSE", "requirements")
 """What a build reads beside the packages."""
 CHECKOUT_ONLY = "infra/bench"
 """Experiments, which a wheel does not have."""
-_LEFT_OUT = shutil.ignore_patterns("__pycache__", "*.pyc", ".*")
+_IGNORED = shutil.ignore_patterns("__pycache__", "*.pyc", ".*")
 
 
 def write_wheel_tree(checkout: Path, tree: Path) -> None:
@@ -31,13 +31,13 @@ def write_wheel_tree(checkout: Path, tree: Path) -> None:
     Raises:
         SyntaxError: an import that cannot be rewritten in place; it names file and line.
     """
-    for name in _BESIDE:
+    for name in _BUILD_FILES:
         source = checkout / name
         copy = shutil.copytree if source.is_dir() else shutil.copy2
         copy(source, tree / name)
-    shutil.copytree(checkout / FACE, tree / FACE, ignore=_LEFT_OUT)
+    shutil.copytree(checkout / FACE, tree / FACE, ignore=_IGNORED)
     for package in PACKAGES:
-        shutil.copytree(checkout / package, tree / FACE / package, ignore=_LEFT_OUT)
+        shutil.copytree(checkout / package, tree / FACE / package, ignore=_IGNORED)
     shutil.rmtree(tree / FACE / CHECKOUT_ONLY)
     shutil.copy2(checkout / "prefect.yaml", tree / FACE)
     for path in (tree / FACE).rglob("*.py"):
@@ -57,13 +57,13 @@ def with_prefix(source: str, name: str = "<source>") -> str:
             the name `storage` and has no form with a prefix: write `from storage import errors`.
     """
     lines = source.splitlines(keepends=True)
-    for line, column in sorted(_places(ast.parse(source, name), name), reverse=True):
+    for line, column in sorted(_import_positions(ast.parse(source, name), name), reverse=True):
         row = lines[line - 1].encode()  # ast counts columns in bytes
         lines[line - 1] = (row[:column] + f"{FACE}.".encode() + row[column:]).decode()
     return "".join(lines)
 
 
-def _places(module: ast.Module, name: str) -> Iterator[tuple[int, int]]:
+def _import_positions(module: ast.Module, name: str) -> Iterator[tuple[int, int]]:
     """Yield line and column of the name of every package of ours that is imported."""
     for node in ast.walk(module):
         if isinstance(node, ast.ImportFrom) and node.level == 0 and _is_ours(node.module):

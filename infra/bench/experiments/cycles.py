@@ -134,11 +134,11 @@ def _stated_figures(
     one, other = (picture.astype(np.float64) for picture in theirs.pictures_rgb)
     references = {"ours": ours, "theirs": RawReference(a_rgb=one, b_rgb=other)}
     everywhere = np.ones_like(view.hits)
-    found = {"stated_db": view.noise_floor_db}
+    figures = {"stated_db": view.noise_floor_db}
     for name, reference in references.items():
         error_db, _ = true_error_db(view.radiance_rgb, reference, log10_radiance, everywhere)
-        found[f"to_{name}_db"] = error_db
-    return found
+        figures[f"to_{name}_db"] = error_db
+    return figures
 
 
 EXPERIMENT = Experiment(

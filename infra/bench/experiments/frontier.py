@@ -92,26 +92,26 @@ def _measure(
     scale = context.scale
     scene = context.scene(trial)
     camera = first_camera(scene, REFERENCE_PX)
-    whole = kept_reference(context.child, scene, camera, scale.reference_spp)
-    reference = shrunk(whole, scale.resolution)
+    full_reference = kept_reference(context.child, scene, camera, scale.reference_spp)
+    reference = shrunk(full_reference, scale.resolution)
     ours = {p.name: p.settings for p in points if isinstance(p.settings, RenderSettings)}
     plain = [point for point in points if point.name not in ours]
     taken = context.child.call(shots, scene, ours)
     spps = tuple(point.settings for point in plain)
     levels = context.child.call(render_levels, scene, scale.resolution, spps, SEED)
     errors = [plain_figures(level, reference) for level in levels]
-    found: dict[str, Figures] = {
+    by_point: dict[str, Figures] = {
         point.name: each for point, each in zip(plain, errors, strict=True)
     }
     steps = [(each["spp"], each["core_s"], each["db"]) for each in errors]
     for name, shot in taken.items():
-        judged = figures(shot.view, shrunk(whole, ours[name].resolution))
-        own = {"core_s": shot.core_s, "db": judged["log_true_db"], **judged}
+        judged = figures(shot.view, shrunk(full_reference, ours[name].resolution))
+        costs_and_errors = {"core_s": shot.core_s, "db": judged["log_true_db"], **judged}
         if ours[name].resolution == scale.resolution:
-            core_s, is_reached = cost_at_error(steps, own["db"])
-            own |= {"times": core_s / shot.core_s, "bound": float(not is_reached)}
-        found[name] = own
-    return [(point.name, found[point.name]) for point in points]
+            core_s, is_reached = cost_at_error(steps, costs_and_errors["db"])
+            costs_and_errors |= {"times": core_s / shot.core_s, "bound": float(not is_reached)}
+        by_point[name] = costs_and_errors
+    return [(point.name, by_point[point.name]) for point in points]
 
 
 def plain_figures(level: PlainPicture, reference: RawReference) -> dict[str, float]:

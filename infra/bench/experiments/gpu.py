@@ -122,26 +122,26 @@ def _step(run: str, context: BenchContext) -> Figures:
 
 
 def _rendering(context: BenchContext) -> Figures:
-    return _rendered(context)[0]
+    return _render_data(context)[0]
 
 
 def _reading(threads: int, context: BenchContext) -> Figures:
     from infra.bench.gpu.supply import read_figures
 
-    data = context.options.data or _rendered(context)[1]
+    data = context.options.data or _render_data(context)[1]
     seconds = _READ_S[context.scale.name]
     return read_figures(data, threads, context.scale.picture_px, seconds)
 
 
-def _rendered(context: BenchContext) -> tuple[Figures, str]:
+def _render_data(context: BenchContext) -> tuple[Figures, str]:
     """Return the figures of rendering here, and a dataset of what was rendered."""
     from infra.bench.gpu.supply import rendered_figures
 
-    def made() -> tuple[Figures, str]:
+    def render() -> tuple[Figures, str]:
         figures, data = rendered_figures(context.scale.picture_px, context.folder())
         return figures, str(data)
 
-    return context.kept("rendered", made)
+    return context.get_or_make("rendered", render)
 
 
 EXPERIMENT = Experiment(

@@ -49,13 +49,13 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
 def _measure(
     context: BenchContext, points: Sequence[Point], trial: str
 ) -> Iterator[tuple[str, Figures]]:
-    data, count = context.kept("data", lambda: _training_data(context))
+    data, count = context.get_or_make("data", lambda: _training_data(context))
     for point in points:
         if point.group == UNPACK:
-            found = unpacking_figures(context.samples, point.settings, context.folder())
+            figures = unpacking_figures(context.samples, point.settings, context.folder())
         else:
-            found = read_figures(data, count, point.settings)
-        yield point.name, found
+            figures = read_figures(data, count, point.settings)
+        yield point.name, figures
 
 
 def _training_data(context: BenchContext) -> tuple[TrainingData, int]:

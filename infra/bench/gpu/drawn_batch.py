@@ -47,25 +47,25 @@ def scene_of(workload: Workload) -> SceneTensors:
     scene = cost_scene(math.ceil(1.3 * workload.triangles) + 32, _LIGHTS)
     poses = [
         look_at_c2w(
-            eye=(1.4 + math.cos(6 * turn), math.sin(6 * turn) - 2.2, 1.3),
+            eye=(1.4 + math.cos(6 * angle), math.sin(6 * angle) - 2.2, 1.3),
             target=(0, 0, 0.35),
             up=(0, 0, 1),
         )
-        for turn in np.linspace(0, 1, workload.views, endpoint=False)
+        for angle in np.linspace(0, 1, workload.views, endpoint=False)
     ]
-    whole = scene_tensors(
+    tensors = scene_tensors(
         scene.with_cameras(
             np.stack(poses).astype(np.float32), np.full(workload.views, 40.0, np.float32)
         )
     )
     # rows spread over the scene, the room first and the lights last
-    rows = torch.linspace(0, whole.num_triangles - 1, workload.triangles).round().long()
+    rows = torch.linspace(0, tensors.num_triangles - 1, workload.triangles).round().long()
     return SceneTensors(
-        triangles_T33=whole.triangles_T33[rows],
-        normals_T33=whole.normals_T33[rows],
-        material_TM=whole.material_TM[rows],
-        c2w_V44=whole.c2w_V44,
-        fov_deg_V=whole.fov_deg_V,
+        triangles_T33=tensors.triangles_T33[rows],
+        normals_T33=tensors.normals_T33[rows],
+        material_TM=tensors.material_TM[rows],
+        c2w_V44=tensors.c2w_V44,
+        fov_deg_V=tensors.fov_deg_V,
     )
 
 
@@ -76,14 +76,14 @@ def drawn_batch(settings: TrainSettings, scenes: int) -> TrainingBatch:
     px = settings.resolution
     return TrainingBatch(
         scenes=batch_scenes(
-            [_prepared(scene_of(each), settings.model, px) for each in workloads(settings, scenes)]
+            [_prepare(scene_of(each), settings.model, px) for each in workloads(settings, scenes)]
         ),
         target_BVRR3=0.3 * torch.rand(scenes, views, px, px, 3, generator=generator),
         noise_BV=torch.full((scenes, views), 1e-3),
     )
 
 
-def _prepared(tensors: SceneTensors, model: "ModelConfig", px: int) -> SceneTensors:
+def _prepare(tensors: SceneTensors, model: "ModelConfig", px: int) -> SceneTensors:
     """Return a scene with the inputs of its network, as the stream does."""
     if not model.hit_rays:
         return tensors

@@ -17,10 +17,10 @@ def device_facts(device: torch.device) -> str:
     """Return a sentence on a device: memory, libraries, driver; no serial number."""
     if device.type != "cuda":
         return f"no GPU: torch {torch.__version__} with {torch.get_num_threads()} threads"
-    found = torch.cuda.get_device_properties(device)
+    properties = torch.cuda.get_device_properties(device)
     return (
-        f"{found.name}, {found.total_memory / 2**30:.0f} GiB, torch {torch.__version__}, CUDA "
-        f"{torch.version.cuda}, driver {_driver(device.index or 0)}"
+        f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, torch {torch.__version__}, "
+        f"CUDA {torch.version.cuda}, driver {_driver(device.index or 0)}"
     )
 
 

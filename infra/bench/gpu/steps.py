@@ -11,7 +11,7 @@ import torch
 
 from infra.bench.gpu.drawn_batch import drawn_batch, drawn_lpips, workloads
 from infra.bench.gpu.probe import wait_for
-from infra.bench.gpu.step_profile import marked_parts, profiled
+from infra.bench.gpu.step_profile import marked_parts, profile_call
 from model.config import ModelConfig, hits_smoke, smoke, tiny
 from model.costs import training_flops
 from train.loop.crew import Crew
@@ -63,10 +63,10 @@ def step_figures(
     scenes = min(settings.scenes_per_pass, settings.scenes_per_step)
     while scenes:
         try:
-            figures, parts = _measured(settings, scenes, steps, device)
+            figures, parts = _measure_steps(settings, scenes, steps, device)
             if device.type == "cuda" and settings.compile == "auto":
                 _free_memory(device)
-                plain, _ = _measured(
+                plain, _ = _measure_steps(
                     dataclasses.replace(settings, compile="no"), scenes, steps, device
                 )
                 figures["plain_ms"] = plain["ms"]
@@ -84,7 +84,7 @@ def _free_memory(device: torch.device) -> None:
         torch.cuda.empty_cache()
 
 
-def _measured(
+def _measure_steps(
     settings: TrainSettings, scenes: int, steps: int, device: torch.device
 ) -> tuple[dict[str, float], Mapping[str, float]]:
     state = new_state(settings, device)
@@ -113,7 +113,7 @@ def _measured(
     if device.type == "cuda":
         figures["peak_gib"] = torch.cuda.max_memory_allocated(device) / 2**30
     with marked_parts(state.model, objective, state.updater):
-        kernels, parts = profiled(step, device)
+        kernels, parts = profile_call(step, device)
     return {**figures, "kernels": float(kernels)}, parts
 
 

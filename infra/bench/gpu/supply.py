@@ -44,12 +44,12 @@ def rendered_figures(px: int, place: Path) -> tuple[dict[str, float], Path]:
     marks: list[float] = []
     making = place / "making"
     making.mkdir()
-    found = measure_scenes(order, SCENES, making, lambda: marks.append(time.monotonic()))
+    measured = measure_scenes(order, SCENES, making, lambda: marks.append(time.monotonic()))
     staged = DatasetFolder(making).staged_shard(shard_name(0, settings.splits))
     members = [dict(read_staged_scene(staged, row).members) for row in range(SCENES)]
     write_copies(place / "copies", members)
-    view_s = (marks[-1] - marks[0]) / (len(marks) - 1) / found.num_views
-    core_s = sum(found.core_s[1:]) / (SCENES - 1) / found.num_views
+    view_s = (marks[-1] - marks[0]) / (len(marks) - 1) / measured.num_views
+    core_s = sum(measured.core_s[1:]) / (SCENES - 1) / measured.num_views
     return {"ms": 1e3 * view_s, "views_per_s": 1 / view_s, "core_s": core_s}, place / "copies"
 
 

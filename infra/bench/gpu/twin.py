@@ -38,7 +38,7 @@ def twin_figures(network: str, precision: str, device: torch.device) -> dict[str
         TrilightError: what is stored is of other weights than those of this Trilight.
     """
     twin = stored_twin(network)
-    picture, seconds = _rendered(network, device, precision)
+    picture, seconds = _render(network, device, precision)
     return {"ms": 1e3 * seconds, "db": psnr_log_db(picture, twin)}
 
 
@@ -64,7 +64,7 @@ def _digest(network: str) -> str:
     return sha256_hex(BUILTIN_NETWORKS[network].read_bytes())
 
 
-def _rendered(
+def _render(
     network: str, device: torch.device, precision: str
 ) -> tuple[NDArray[np.float64], float]:
     """Return the first view of the scene, and the seconds of one more where all is warm."""
@@ -84,12 +84,12 @@ def _rendered(
 
 def store(path: Path = STORED) -> None:
     """Render the scene by each network on the processor, and write the pictures."""
-    found: dict[str, Any] = {}
+    stored_values: dict[str, Any] = {}
     for network in NETWORKS:
-        picture, _ = _rendered(network, torch.device("cpu"), "float32")
-        found[network] = log10_radiance(picture).astype(np.float16)
-        found[f"{network} sha256"] = _digest(network)
-    np.savez_compressed(path, **found)
+        picture, _ = _render(network, torch.device("cpu"), "float32")
+        stored_values[network] = log10_radiance(picture).astype(np.float16)
+        stored_values[f"{network} sha256"] = _digest(network)
+    np.savez_compressed(path, **stored_values)
 
 
 if __name__ == "__main__":

@@ -40,8 +40,8 @@ def blender_python() -> Path:
         TrilightError: there is no Python of that version, the package index does not give the
             wheel, or what it gave cannot be loaded here.
     """
-    if found := installed_python():
-        return found
+    if installed := installed_python():
+        return installed
     folder = _folder()
     _run("make its environment", [_base_python(), "-m", "venv", "--clear", str(folder)])
     python = _python_of(folder)
@@ -64,10 +64,10 @@ def _base_python() -> str:
     """Return a Python of the wheel's version: this one, or one on the path."""
     if f"{sys.version_info.major}.{sys.version_info.minor}" == PYTHON:
         return sys.executable
-    found = shutil.which(f"python{PYTHON}")
-    if found is None:
+    python = shutil.which(f"python{PYTHON}")
+    if python is None:
         raise _unavailable(f"python{PYTHON} is not on the path; install that version of Python")
-    return found
+    return python
 
 
 def _run(step: str, command: list[str]) -> None:

@@ -209,16 +209,16 @@ def exr_text_attributes(path: Path) -> dict[str, str]:
     """Return the strings in the header of an EXR file: Cycles states its own times there."""
     data = path.read_bytes()
     at = 8
-    found = {}
+    attributes = {}
     while data[at]:  # a name without letters ends the header
         name_end = data.index(0, at)
         type_end = data.index(0, name_end + 1)
         (size,) = struct.unpack_from("<i", data, type_end + 1)
         value = data[type_end + 5 : type_end + 5 + size]
         if data[name_end + 1 : type_end] == b"string":
-            found[data[at:name_end].decode()] = value.decode()
+            attributes[data[at:name_end].decode()] = value.decode()
         at = type_end + 5 + size
-    return found
+    return attributes
 
 
 def _seconds(clock: str) -> float:

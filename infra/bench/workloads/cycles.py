@@ -75,8 +75,8 @@ def cycles_picture(scene: Scene, view: int, options: CyclesOptions) -> CyclesPic
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         np.savez(folder / "scene.npz", **{field: getattr(scene, field) for field in ARRAY_FIELDS})
-        asked = {**dataclasses.asdict(options), **camera}
-        (folder / "request.json").write_text(json.dumps(asked))
+        request = {**dataclasses.asdict(options), **camera}
+        (folder / "request.json").write_text(json.dumps(request))
         _run_blender(_SCRIPT, folder, python)
         timing = json.loads((folder / "timing.json").read_text())
         return CyclesPicture(
@@ -109,14 +109,14 @@ def cycles_of_usd(usd: Path, options: CyclesOptions, seeds: Sequence[int]) -> Cy
         TrilightError: as `cycles_picture`.
     """
     python = blender_python()
-    asked = {**dataclasses.asdict(options), "usd": str(usd.resolve()), "seeds": list(seeds)}
+    request = {**dataclasses.asdict(options), "usd": str(usd.resolve()), "seeds": list(seeds)}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "request.json").write_text(json.dumps(asked))
+        (folder / "request.json").write_text(json.dumps(request))
         _run_blender(_USD_SCRIPT, folder, python)
-        found = [folder / f"picture{number}.npy" for number in range(len(seeds))]
+        picture_files = [folder / f"picture{number}.npy" for number in range(len(seeds))]
         return CyclesSamples(
-            pictures_rgb=tuple(np.load(path, allow_pickle=False) for path in found),
+            pictures_rgb=tuple(np.load(path, allow_pickle=False) for path in picture_files),
             core_s=json.loads((folder / "timing.json").read_text())["core_s"],
         )
 

@@ -19,7 +19,7 @@ def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
         "linear": view.noise_floor_linear_db,
         "object": view.object_noise_floor_db,
     }
-    found = {
+    values = {
         "spp": float(view.spp),
         "at_cap": float(view.at_cap),
         "brightness": 100 * float(view.radiance_rgb.mean() / mean.mean() - 1),
@@ -28,7 +28,7 @@ def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
         pixels = view.hits if name == "object" else np.ones_like(view.hits)
         true_db, open_db = true_error_db(view.radiance_rgb, reference, curve, pixels)
         excess_db = stated_db[name] - true_db
-        found |= {
+        values |= {
             f"{name}_stated_db": stated_db[name],
             f"{name}_true_db": true_db,
             f"{name}_open_db": open_db,
@@ -36,7 +36,7 @@ def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
             f"{name}_over_1": float(excess_db > 1),
             f"{name}_over_3": float(excess_db > 3),
         }
-    return found
+    return values
 
 
 def difference_db(ours: RawReference, theirs: RawReference, curve: Curve) -> float:

@@ -34,5 +34,5 @@ def kept_reference(child: IsolatedChild, scene: Scene, camera: Camera, spp: int)
         halves = {"a": made.a_rgb.astype(np.float32), "b": made.b_rgb.astype(np.float32)}
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, save(halves))
-    kept = load(path.read_bytes())
-    return RawReference(a_rgb=kept["a"].astype(np.float64), b_rgb=kept["b"].astype(np.float64))
+    stored = load(path.read_bytes())
+    return RawReference(a_rgb=stored["a"].astype(np.float64), b_rgb=stored["b"].astype(np.float64))

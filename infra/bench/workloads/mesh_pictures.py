@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.bench.workloads.remeshing import cleaned, raw_mesh
+from infra.bench.workloads.remeshing import clean_mesh, raw_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.renders.settings import RenderSettings
 from storage.conventions import look_at_c2w
@@ -31,7 +31,7 @@ def coarser(path: Path, budgets: Sequence[int], method: str) -> list[TriangleMes
     from pipeline.assets.cleaning.clean import clean
     from pipeline.assets.decimation.by_name import decimate
 
-    source = cleaned(raw_mesh(path))
+    source = clean_mesh(raw_mesh(path))
     meshes = [source, *(clean(decimate(source, budget, method)) for budget in budgets)]
     return [
         TriangleMesh(  # of the declared types: a mesh leaves its child with no other

@@ -43,8 +43,10 @@ def given_scenes(folder: Path | None) -> Mapping[str, MakeScene]:
         raise TrilightError(
             f"--scenes {folder}: it holds no scene; expected RenderFormer scenes (*.json) or glTF."
         )
-    found: dict[str, MakeScene] = {path.name: partial(_call, _gltf_scene, path) for path in trees}
-    return found | {Path(name).stem: partial(_call, _described_scene, root, name) for name in names}
+    scenes: dict[str, MakeScene] = {path.name: partial(_call, _gltf_scene, path) for path in trees}
+    return scenes | {
+        Path(name).stem: partial(_call, _described_scene, root, name) for name in names
+    }
 
 
 def sampled_scene(scene_index: int) -> Scene:
@@ -96,7 +98,7 @@ def _described_scene(root: Path, name: str) -> Scene:
 def _holds_a_scene(path: Path) -> bool:
     """Return whether a file has objects and a camera, as templates have not."""
     try:
-        found = json.loads(path.read_bytes())
+        record = json.loads(path.read_bytes())
     except ValueError:
         return False
-    return isinstance(found, dict) and bool(found.get("objects")) and bool(found.get("cameras"))
+    return isinstance(record, dict) and bool(record.get("objects")) and bool(record.get("cameras"))

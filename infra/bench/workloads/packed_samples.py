@@ -28,10 +28,10 @@ def unpacking_figures(samples: Sequence[Sample], layout: str, work: Path) -> Map
     """
     if layout in TEXTURES:
         files = [_h5_bytes(sample, work, TEXTURES[layout]) for sample in samples]
-        return _timed(files, _unpacked_h5, len)
+        return _time_unpacking(files, _unpacked_h5, len)
     profile: Profile = "lossless" if layout == "lossless" else "compact"
     members = [encode_sample(sample, profile) for sample in samples]
-    return _timed(members, _unpacked_sample, lambda packed: sum(map(len, packed.values())))
+    return _time_unpacking(members, _unpacked_sample, lambda packed: sum(map(len, packed.values())))
 
 
 def _unpacked_sample(members: Mapping[str, bytes]) -> int:
@@ -52,7 +52,7 @@ def _unpacked_h5(data: bytes) -> int:
         return sum(file[name][()].nbytes for name in file)
 
 
-def _timed(
+def _time_unpacking(
     packed: Sequence[Packed], unpack: Callable[[Packed], int], size: Callable[[Packed], int]
 ) -> Mapping[str, float]:
     began = time.process_time()

@@ -30,7 +30,7 @@ def raw_mesh(path: Path) -> "TriangleMesh":
     return normalise(load_mesh(read_source(path, ReadLimits())))
 
 
-def cleaned(raw: "TriangleMesh") -> "TriangleMesh":
+def clean_mesh(raw: "TriangleMesh") -> "TriangleMesh":
     """Return a raw mesh as the mesh stage decimates it; raises Rejected."""
     from pipeline.assets.cleaning.clean import clean
     from pipeline.assets.cleaning.orient import orient_outward
@@ -55,12 +55,12 @@ def remesh(path: Path, side: str, budget: int) -> dict[str, float]:
     from pipeline.assets.quality.measure import MeasuredSource
 
     raw = raw_mesh(path)
-    source = cleaned(raw)
+    source = clean_mesh(raw)
     started = time.process_time()
     if side == REFERENCE:
         result = _reference(raw.positions, raw.faces, budget)
     else:
-        result = decimate(cleaned(raw), budget, METHODS[side])
+        result = decimate(clean_mesh(raw), budget, METHODS[side])
     cpu_s = time.process_time() - started
     mesh = clean(result)
     quality = MeasuredSource(source).quality(mesh)

@@ -69,7 +69,7 @@ def training_figures(
     model = _trained_network(scenes.train, settings, device)
     seconds = time.perf_counter() - began
     views = iter(scenes.judge.judge(model).views)
-    found = []
+    scores_by_view = []
     for judged in scenes.judge.scenes:
         mine = [next(views) for _ in judged.target_VRR3]
         l1 = float(np.mean([view.log_l1 for view in mine]))
@@ -77,8 +77,8 @@ def training_figures(
         if np.isfinite(l1) and l1 > 0:
             db = float(np.mean([view.psnr_log_db for view in mine]))
             figures |= {"log_l1": l1, "percent": 100 * float(np.log(l1)), "db": db}
-        found.append(figures)
-    return found
+        scores_by_view.append(figures)
+    return scores_by_view
 
 
 def _trained_network(

@@ -175,9 +175,9 @@ def _bin(folder: Path) -> Path:
 
 
 def test_an_option_that_two_classes_have_is_refused() -> None:
-    from infra.cli.options import Shown, command
+    from infra.cli.options import OutputOptions, command
 
-    def twice(one: Shown, other: Shown) -> None:
+    def twice(one: OutputOptions, other: OutputOptions) -> None:
         pass
 
     with pytest.raises(AssertionError, match="json"):
