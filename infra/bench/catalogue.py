@@ -1,4 +1,4 @@
-"""All experiments, found by listing the folder `experiments`; each file holds one."""
+"""Catalogue of experiments: each file of the folder `experiments` holds one."""
 
 import importlib
 import pkgutil

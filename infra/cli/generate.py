@@ -1,4 +1,4 @@
-"""`trilight generate`: objects, or scenes in files, to shards."""
+"""`trilight generate`: makes a dataset from objects or from scene files."""
 
 import time
 
@@ -17,15 +17,14 @@ from storage.settings.described import checked
 
 @checked()
 class ExecutorOptions:
-    """The executor of the tasks."""
+    """Executor."""
 
     runner: str = "threads"
-    """Executor of the tasks: threads, in this process; slurm, if this command is one task of a job
-    array, which makes its share; prefect, as a flow run at PREFECT_API_URL; dask, on the workers of
-    a cluster; or an executor of your own (--extend)."""
+    """Executor of the tasks: threads, slurm, prefect, dask, or your own (--extend). slurm: this
+    command is one task of a job array. prefect: a flow run at PREFECT_API_URL. dask: the workers of
+    a cluster."""
     address: str | None = None
-    """With --runner dask: address of the scheduler, such as tcp://host:8786; by default there is
-    none."""
+    """Address of the dask scheduler, such as tcp://host:8786; by default none."""
 
 
 @command("build")
@@ -36,7 +35,7 @@ def generate(
 
 
 def make(order: DatasetOrder, runner: ExecutorOptions, output: OutputOptions) -> None:
-    """Make a dataset and say what came of it; raises TrilightError."""
+    """Make a dataset and print the result; raises TrilightError."""
     folder = dataset_folder(order.place)
     started = time.monotonic()
     first_words(f"Making {folder.shown} with the build {order.build}", silent=output.json)

@@ -1,4 +1,4 @@
-"""The chart of a leaderboard: a panel for each width, core-seconds against the median picture."""
+"""Chart of a leaderboard: a panel for each width, CPU seconds against the median error."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ _COSTS = ("a scene's first view", "a further view")
 
 
 def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
-    """Draw the panels into a PNG file; who has no price is a line across, NOISE a dashed one."""
+    """Draw the panels into a PNG file; entries without a price are lines, NOISE a dashed one."""
     import matplotlib
 
     matplotlib.use("Agg")  # before pyplot: no display is needed

@@ -1,4 +1,4 @@
-"""A folder of anybody's OpenEXR pictures as a contestant: one a view, all looked at first."""
+"""Folder of OpenEXR pictures from elsewhere as a contestant; all are checked at the start."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,27 +15,27 @@ from storage.records.safe_read import read_plain
 from storage.records.sample import Sample
 
 _LEAST = -1e-2
-"""Radiance below this is no rounding of a network's black."""
+"""Least radiance that still counts as a network's rounding of 0."""
 
 Views = Sequence[tuple[str, int]]
-"""Scene and camera of every view that is judged."""
+"""Scene key and camera of every evaluated view."""
 
 
 class FolderContestant:
-    """Pictures that were made elsewhere, at the one width that they have.
+    """Pictures from elsewhere, all of one width.
 
-    Values a little below 0, as networks of logarithms give them, count as 0; alpha is left out.
+    Values slightly below 0, which networks of logarithms return, count as 0; alpha is ignored.
     """
 
     kind = ELSEWHERE
     is_timed = False
 
     def __init__(self, folder: Path, views: Views, widths: Sequence[int]) -> None:
-        """Look at the picture of every view.
+        """Check the picture of every view.
 
         Raises:
-            TrilightError: one is missing, no picture, of another width than the first one or than
-                is judged, or has values that are not finite or below 0.
+            TrilightError: a picture is missing, unreadable, of another width than the first one or
+                than the evaluated ones, or has values that are not finite or below 0.
         """
         self.name = f"pictures of {folder.name or folder.resolve().name}"
         self._folder = folder
@@ -128,7 +128,7 @@ def _refuse(radiance_rgb: NDArray[np.float32], legal: NDArray[np.bool_], name: s
 def folder_contestants(
     folders: Sequence[Path], views: Views, widths: Sequence[int]
 ) -> Mapping[str, FolderContestant]:
-    """Return the folders as contestants by name; raises TrilightError where two have one name."""
+    """Return the folders as contestants by name; raises TrilightError for equal names."""
     by_name: dict[str, FolderContestant] = {}
     for folder in folders:
         one = FolderContestant(folder, views, widths)

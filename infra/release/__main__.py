@@ -1,9 +1,9 @@
-"""`make release`: beside a finished dataset, the network and a page, checked and summed.
+"""`make release`: adds the network, a page and checksums to a finished dataset.
 
     python -m infra.release FOLDER
 
-FOLDER holds `dataset`, as `trilight generate` made it. `network` and `gallery` are written beside
-it; each of the three is a repository of a hub.
+FOLDER holds `dataset`, an output of `trilight generate`. `network` and `gallery` are written next
+to it; each of the three is a repository of a hub.
 """
 
 import shutil
@@ -37,7 +37,7 @@ def main(
     folder: Annotated[Path, Parameter(help="folder that holds dataset")],
     pictures: Annotated[int, Parameter(help="scenes on the page")] = 24,
 ) -> None:
-    """Write network, gallery and sums beside a finished dataset."""
+    """Write network, gallery and checksums next to a finished dataset."""
     first_words(f"Releasing {folder}")
     place = folder / "dataset"
     dataset = open_dataset(str(place))

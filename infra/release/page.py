@@ -1,4 +1,4 @@
-"""The page of a release: traced, network, error and few samples, side by side, from disk."""
+"""Page of a release: traced, network, error and few samples side by side; works from disk."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,14 +28,14 @@ figcaption { font-size: .85rem; color: var(--soft); margin-top: .2rem }
 def write_page(
     folder: Path, comparisons: Sequence[SceneComparison], *, about: Sequence[tuple[str, str]]
 ) -> Path:
-    """Write `index.html`, its pictures and the card of a static space, and return the page.
+    """Write `index.html`, its pictures and the README of a static space; return the page's path.
 
-    Pictures of an earlier page, which would be uploaded too, are deleted.
+    Pictures of an earlier page, which would be uploaded, too, are deleted.
 
     Args:
-        folder: where they go.
-        shown: the scenes, each by the same ones.
-        about: what the pictures are of, as names and values.
+        folder: folder of the page.
+        comparisons: scenes, each rendered by the same methods.
+        about: facts of the pictures, as names and values.
 
     Raises:
         TrilightError: the folder cannot be written.

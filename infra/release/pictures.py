@@ -1,4 +1,4 @@
-"""Pictures of a release: traced to a floor, by the network, and by few samples."""
+"""Pictures of a release: the dataset's, the network's, and those of few samples."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,36 +20,34 @@ from storage.metrics import psnr_log_db
 from storage.records.sample import Sample
 
 RIVALS = (1, 4, 16)
-"""Samples a pixel of the previews beside the network, filtered by Open Image Denoise."""
+"""Samples per pixel of the previews in the comparison, filtered by Open Image Denoise."""
 
 NETWORK = "network"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneComparison:
-    """The first view of one scene, by everybody."""
+    """First view of one scene, rendered by all methods."""
 
     key: str
-    """Of the scene."""
+    """Key of the scene's sample in the dataset."""
     caption: str
-    """What it shows."""
+    """Split, layout and number of triangles as text."""
     target_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance, as the dataset has it."""
+    """[R, R, 3] linear radiance of the dataset's picture."""
     floor_db: float
-    """Of the target."""
+    """Stated error of the target as psnr_log_db."""
     pictures_rgb: Mapping[str, NDArray[np.float32]]
-    """[R, R, 3] linear radiance, by who made it."""
+    """[R, R, 3] linear radiance by method."""
     psnr_db: Mapping[str, float]
-    """psnr_log_db to the target, by who made it."""
+    """psnr_log_db to the target by method."""
 
 
 def chosen_scenes(dataset: Dataset, count: int) -> list[Chosen]:
-    """Return up to `count` scenes that no network of this dataset learned from, if there are any.
-
-    They are those of the test split; of all splits where it is empty.
+    """Return up to `count` scenes of the test split, or of all splits if it is empty.
 
     Raises:
-        TrilightError: none is asked for, or the dataset holds none.
+        TrilightError: `count` is below 1, or the dataset is empty.
     """
     judged = any(shard.num_samples for shard in dataset.shards_of("test"))
     splits = ("test",) if judged else SPLITS
@@ -64,16 +62,16 @@ def chosen_scenes(dataset: Dataset, count: int) -> list[Chosen]:
 def compare_scenes(
     dataset: Dataset, chosen: Sequence[Chosen], *, checkpoint: str, done: Callable[[], None]
 ) -> Iterator[SceneComparison]:
-    """Yield the first view of each scene.
+    """Yield the comparison of each scene's first view.
 
     Args:
-        dataset: the dataset.
-        chosen: its scenes.
-        checkpoint: the network, as `trilight render --checkpoint` takes it.
+        dataset: dataset of the scenes.
+        chosen: scenes to compare.
+        checkpoint: network, as in `trilight render --checkpoint`.
         done: called after each scene.
 
     Raises:
-        TrilightError: a sample is unreadable, or the network or the path tracer cannot show it.
+        TrilightError: a sample is unreadable, or the network or the path tracer cannot render it.
     """
     by_width: dict[int, Mapping[str, Engine]] = {}
     with contextlib.ExitStack() as stack:
@@ -110,7 +108,7 @@ def _engines(resolution: int, checkpoint: str) -> Mapping[str, Engine]:
 
 
 def _ignore_samples(_sampling: object) -> None:
-    """Say nothing of the samples."""
+    """Ignore the progress of the samples."""
 
 
 def _compare_scene(sample: Sample, split: str, engines: Mapping[str, Engine]) -> SceneComparison:

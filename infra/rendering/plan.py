@@ -174,13 +174,13 @@ def _engines(
     return engines
 
 
-def _engine_of(way: Way, options: Asked, resolution: int) -> EnginePlan:
+def _engine_of(preset: Way, options: Asked, resolution: int) -> EnginePlan:
     """Return the engine of the chosen quality preset."""
-    if way.rung == "network":
+    if preset.rung == "network":
         from model.open import BUILTIN_TOKENS
 
         return _neural(options, BUILTIN_TOKENS, resolution)
-    settings = PreviewSettings(resolution=resolution, spp=way.spp, denoiser=way.denoiser)
+    settings = PreviewSettings(resolution=resolution, spp=preset.spp, denoiser=preset.denoiser)
     return _mitsuba(options, settings)
 
 

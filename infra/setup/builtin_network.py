@@ -1,11 +1,11 @@
-"""Ships a trained network: a folder of `model/builtin/`, its weights and its card.
+"""Writes a built-in network: its folder in `model/builtin/`, with weights and model card.
 
     trilight evaluate RUN --data SET --split test --out EVALUATION
     python -m infra.setup.builtin_network RUN --data SET --evaluation EVALUATION --command "..."
 
-With `--also OTHER`, evaluations of it on other sets, such as benchmark-v1, stand on the card too.
+With `--also OTHER`, the card has evaluations on other sets, too, such as benchmark-v1.
 
-Only data of objects that ask for nothing (CC0) may be behind it, and only a small file is shipped.
+The training data must have only objects under CC0, and the weights must be small.
 """
 
 import json
@@ -28,7 +28,7 @@ from train.evaluation.same_time import sentences
 from train.folder import RunFolder
 
 MOST_BYTES = 10_000_000
-"""Of the weights: everybody who clones the project gets them."""
+"""Maximum size of the weights, since every clone of the project holds them."""
 
 _HEADS = {
     "builtin:hits": (
@@ -42,10 +42,10 @@ _HEADS = {
         "does not replace the path tracer."
     ),
 }
-"""What each network that comes along is for, by its name."""
+"""Introduction of each built-in network's card, by its name."""
 
 WORST = 5
-"""Views that the card names as its worst."""
+"""Number of worst views on the card."""
 
 ALLOWED_LICENCES = {"CC0-1.0"}
 
@@ -58,7 +58,7 @@ def main(
     also: Annotated[tuple[Path, ...], Parameter(help="folders of other evaluations of it")] = (),
     name: Annotated[str, Parameter(help="by which it will be opened")] = "builtin:hits",
 ) -> None:
-    """Copy the weights and write the card."""
+    """Copy the weights and write the model card."""
     folder = RunFolder(run)
     dataset = open_dataset(data)
     weights = folder.weights.read_bytes()
@@ -176,7 +176,7 @@ def _scores(judged: Mapping[str, Any]) -> list[str]:
 
 
 def _worst(views: Sequence[Mapping[str, Any]]) -> str:
-    """Return a sentence on the views that it misses most."""
+    """Return a sentence on the views with the greatest error."""
     by_error = sorted(views, key=lambda view: view["scores"][NETWORK]["psnr_log_db"])
     each = [
         f"{view['key']} ({view['scores'][NETWORK]['psnr_log_db']:.1f} dB, {view['template']}, "

@@ -1,9 +1,9 @@
-"""Adds to a lock the sha256 of every file that an index offers for its exact versions.
+"""Adds to a lock file the sha256 of every file that a package index offers for its versions.
 
-`pip-compile --generate-hashes` asks one index by name and, where that does not answer, loads every
-file of every release to compute what each index states anyway. This asks the indices that pip is
-set up with, and computes nothing but the digests of files of this machine. Versions for other
-systems are in it too, so that one lock serves all.
+`pip-compile --generate-hashes` queries one index by name; if that fails, it downloads every file of
+every release to compute digests that each index states anyway. This script queries the indices of
+pip's configuration, and computes only the digests of local files. Files for other systems are
+included, so that one lock serves all.
 
     python -m infra.setup.hashes requirements/all.txt ...
 """
@@ -22,7 +22,7 @@ _AT_ONCE = 8
 
 
 def main(paths: list[Path]) -> None:
-    """Write the locks again, each package followed by its digests; ValueError if it has none."""
+    """Write the locks again with the digests of each package; raises ValueError if one has none."""
     from piptools.repositories import PyPIRepository
 
     locks = {path: read_lock(path) for path in paths}

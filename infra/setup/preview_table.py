@@ -1,9 +1,9 @@
-"""Makes infra/rendering/previews.json, by which `trilight render --seconds` and `--error` choose.
+"""Measures infra/rendering/previews.json, the table of `trilight render --seconds` and `--error`.
 
     python -m infra.setup.preview_table
 
-One view each of held-out scenes is rendered by the network builtin:tokens and with more and more
-samples, on one thread, and the parts of a preview are timed: some hours.
+One view of each held-out scene is rendered by the network builtin:tokens and with increasing
+numbers of samples, on one thread, and the parts of a preview are timed. It takes some hours.
 """
 
 import contextlib
@@ -50,13 +50,13 @@ if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
 
 SCENES = 12
-"""Scenes that are judged and timed."""
+"""Number of scenes that are evaluated and timed."""
 
 WIDTHS = {64: (1024, 2048), 128: (256, 512), 256: (64, 128), 512: (16, 128)}
-"""By width in pixels: most samples of a preview, and samples of the references' halves together."""
+"""Maximum samples of a preview, and samples of both halves of a reference, by width in pixels."""
 
 Method = tuple[int, Filtered]
-"""Samples a pixel and filter; NETWORK is the network builtin:tokens."""
+"""Samples per pixel and filter; NETWORK stands for the network builtin:tokens."""
 
 NETWORK: Method = (0, "off")
 
@@ -64,10 +64,10 @@ Errors = Mapping[int, Mapping[Method, float]]
 """Error in dB of one scene's pictures, by width and method."""
 
 Costs = Mapping[int, Mapping[str, float]]
-"""Core-seconds of one scene's parts, by width and part."""
+"""CPU seconds of one scene's parts, by width and part."""
 
 _SERIAL = (SCENE,)
-"""Parts that one thread does, however many there are."""
+"""Parts that run on one thread, however many there are."""
 
 
 def main() -> None:
@@ -103,7 +103,7 @@ def part_names() -> tuple[str, ...]:
 
 
 def table_of(errors: Mapping[int, Errors], costs: Mapping[int, Costs], machine: str) -> WayTable:
-    """Return the table of some scenes, by their numbers: medians, and the mean of the PROBES."""
+    """Return the table of scenes by their numbers: medians, and the mean of the PROBES."""
     return WayTable(
         scenes=len(errors),
         errors=tuple(

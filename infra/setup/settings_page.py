@@ -1,4 +1,4 @@
-"""The page of settings: every setting with its meaning, range and default."""
+"""Reference page of settings: every setting with its meaning, range and default."""
 
 import dataclasses
 import inspect
@@ -32,7 +32,7 @@ ROOTS: dict[str, tuple[type, ...]] = {
     "Evaluate": (EvaluationOrder,),
     "Leaderboard": (LeaderboardOrder,),
 }
-"""The settings of each command; `reachable` finds the settings within them."""
+"""Settings classes by command; `reachable` finds the classes within them."""
 
 _HEAD = """# Settings
 
@@ -64,7 +64,7 @@ def settings_page() -> str:
 
 
 def reachable(*roots: type) -> list[type]:
-    """Return dataclasses and those that their fields hold, each once, outer ones first."""
+    """Return dataclasses and those in their fields, each once, outer ones first."""
     kinds: dict[type, None] = {}
     for root in roots:
         kinds[root] = None
@@ -77,7 +77,7 @@ def reachable(*roots: type) -> list[type]:
 
 
 def _kinds(hint: Any) -> Iterator[type]:
-    """Yield the classes that a type is made of."""
+    """Yield the classes within a type."""
     if isinstance(hint, type) and not get_args(hint):
         yield hint
     for part in get_args(hint):
@@ -85,7 +85,7 @@ def _kinds(hint: Any) -> Iterator[type]:
 
 
 def _rows(kind: type) -> Iterator[tuple[str, ...]]:
-    if kind is Scene:  # arrays, which no person writes as settings
+    if kind is Scene:  # its fields are arrays, and no settings
         for declared in declared_ranges(Scene):
             part = "" if declared.part is None else f", {declared.part.name}"
             sentence = _first_sentence(field_sentences(Scene)[declared.name])
@@ -118,6 +118,6 @@ def _default_text(default: Any) -> str:
 
 
 def _first_sentence(doc: str) -> str:
-    """Return a text up to its first full stop before a space, in one line."""
+    """Return a text up to its first full stop before a space, as one line."""
     match = re.match(r".*?(?<! al)\.(?=\s|$)", " ".join(doc.split()))
     return match[0] if match else doc

@@ -23,18 +23,18 @@ _TIMEOUT_S = 4 * 3600
 
 @dataclass(frozen=True, kw_only=True)
 class CyclesOptions:
-    """How Cycles shall render a view."""
+    """Options of a render by Cycles."""
 
     resolution: int
     """Width and height in pixels."""
     spp: int
     """Samples per pixel; adaptive sampling is off."""
     denoise: bool
-    """Whether Open Image Denoise cleans the picture, with Cycles' own albedo and normals."""
+    """True to denoise by Open Image Denoise, with Cycles' albedo and normals."""
     bounces: int = 8
     """Most bounces, of each kind and in sum: 8 is Mitsuba's max_depth 10, 0 is direct light."""
     seed: int = 0
-    """Seed of the samples."""
+    """Seed of the samples, for Cycles' random numbers."""
     threads: int = 1
     """Threads of Cycles; the denoiser takes all that the process may use."""
 
@@ -50,8 +50,8 @@ class CyclesPicture:
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance."""
     render_s: float
-    """What Cycles itself states, to 10 ms: sampling and denoising, on the clock. Starting Blender,
-    reading the scene and building its tree of triangles came before."""
+    """Wall-clock seconds of sampling and denoising that Cycles states, to 10 ms, without starting
+    Blender, reading the scene and building its BVH."""
     core_s: float
     """Core-seconds of that call, with what little Blender does around it; other work on the
     machine moves them less than the clock."""

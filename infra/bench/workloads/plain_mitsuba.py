@@ -35,7 +35,7 @@ class PlainPicture:
     """One view with a fixed number of samples."""
 
     spp: int
-    """Samples per pixel."""
+    """Number of samples per pixel."""
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance."""
     core_s: float
