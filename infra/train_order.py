@@ -56,8 +56,8 @@ class TrainOrder:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Changes to settings by dotted name, such as model=large (JSON values); by default none."""
     workers: Annotated[int | None, Within(0, 1024, unit="threads")] = None
-    """Decoding threads of each process, with 0 the main thread; by default the cores that the
-    network leaves free, at most 8. Batches are the same with any number."""
+    """Threads of each process that decode samples, with 0 the main thread; by default the cores
+    that the network leaves free, at most 8. Batches are the same with any number."""
     processes: Annotated[int, Within(1, 1024, unit="processes")] = 1
     """Processes on this machine, started by torchrun; use one for each GPU."""
 

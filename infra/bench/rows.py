@@ -15,7 +15,7 @@ from storage.intervals import mean_interval
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One point beside the others."""
+    """Row of the table: one point with its values."""
 
     point: Point
     """The point's declaration, without its settings."""
@@ -26,8 +26,7 @@ class Row:
     cost_range: tuple[float, float] | None
     """Smallest and largest cost over the trials; None where there was one trial."""
     on_front: bool | None
-    """Whether no other point of its group dominates it; None without an error, and for what is no
-    choice."""
+    """True on the Pareto front of its group; None without an error, and for a yardstick."""
 
 
 def rows_of(experiment: Experiment, run: Run) -> list[Row]:

@@ -90,7 +90,7 @@ MISTAKES = {
     "evaluat": "command 'evaluat' is unknown; did you mean evaluate? Expected one of doctor,",
     "shards merg": "shards: command 'merg' is unknown; did you mean merge?",
     "generate smoke --objekts x": "option '--objekts' is unknown; did you mean --objects?",
-    "verify": "verify: DATASET is missing; expected: The dataset, a folder",
+    "verify": "verify: DATASET is missing; expected: Dataset, a folder",
     "generate smoke --seed": "generate: --seed has no value; expected: Seed of objects",
     "generate smoke --seed 1 --seed 2": "generate: --seed is given twice; expected it once.",
     "verify here there": "verify: 'there' is one argument too many",
