@@ -57,16 +57,16 @@ class FlatEngine:
         pass
 
 
-class Nobody:
-    """Hears how far a render is, and says nothing."""
+class SilentProgress:
+    """Progress of a render that prints nothing."""
 
-    def chosen(self, choice: Choice) -> None:
+    def on_choice(self, choice: Choice) -> None:
         pass
 
-    def pictures(self, done: int, total: int) -> None:
+    def on_picture(self, done: int, total: int) -> None:
         pass
 
-    def sampled(self, now: object) -> None:
+    def on_samples(self, now: object) -> None:
         pass
 
 
@@ -99,7 +99,7 @@ def run(
         shots=list(shots(pairs, where, [engine.name for engine in engines])),
         fps=24,
     )
-    outcome = run_plan(plan, HereReader(), Nobody())
+    outcome = run_plan(plan, HereReader(), SilentProgress())
     return outcome.shots, outcome.notes
 
 
