@@ -1,4 +1,4 @@
-"""The points of a run as rows of a table: columns, intervals, and whether on the front."""
+"""Table of a run: a row for each point, with its columns, intervals and Pareto front."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,19 +18,19 @@ class Row:
     """Row of the table: one point with its values."""
 
     point: Point
-    """The point's declaration, without its settings."""
+    """Declaration of the point, without its settings."""
     values: Mapping[str, float]
     """Value of each measured column, by name."""
     intervals: Mapping[str, tuple[float, float]]
-    """The 95 % interval of each column over `pair`, by name."""
+    """95 % interval of each column over `pair`, by name."""
     cost_range: tuple[float, float] | None
-    """Smallest and largest cost over the trials; None where there was one trial."""
+    """Smallest and largest cost over the trials; None for a single trial."""
     on_front: bool | None
     """True on the Pareto front of its group; None without an error, and for a yardstick."""
 
 
 def rows_of(experiment: Experiment, run: Run) -> list[Row]:
-    """Return the points of a run in their declared order, without those it did not measure.
+    """Return the measured points of a run in their declared order.
 
     Raises:
         TrilightError: the run is of another experiment, or nothing was measured.
@@ -74,7 +74,7 @@ def table_of(experiment: Experiment, run: Run) -> Iterator[list[str]]:
 
 
 def _cell(column: Column, row: Row) -> str:
-    """Return one cell: decibels with one digit behind the point, n/a for what is not known."""
+    """Return one cell: decibels with one decimal, n/a for an unknown value."""
     value = row.values.get(column.name)
     if value is None:
         return "" if column.over == "pair" else "n/a"
@@ -117,7 +117,7 @@ def _over(column: Column, figures: Sequence[float], clusters: Sequence[str]) -> 
 
 
 def _differences(column: Column, run: Run, point: Point) -> tuple[list[float], list[str]]:
-    """Return a point's figures less its rival's, with the trials that have both."""
+    """Return a point's figures minus its rival's, and the trials that have both."""
     if point.rival is None:
         return [], []
     name = column.figure
@@ -153,7 +153,7 @@ def _cost_range(experiment: Experiment, run: Run, point: str) -> tuple[float, fl
 def _front(
     experiment: Experiment, known: Sequence[Point], values: Mapping[str, Mapping[str, float]]
 ) -> dict[str, bool]:
-    """Return which points of each group are on its front, by name."""
+    """Return by name whether a point is on the Pareto front of its group."""
     if experiment.error is None:
         return {}
     error = experiment.error.name

@@ -1,7 +1,7 @@
-"""Our renderer compared with plain Mitsuba at equal true error, and its stated errors judged.
+"""Experiment `frontier`: Trilight and plain Mitsuba at equal true error, and the stated errors.
 
-Errors are true ones, to raw samples of our own tracer in two halves, which no denoiser has seen:
-their noise cancels. The renderers are measured in turn on every scene.
+Errors are true ones, to raw samples of Trilight's path tracer in two independent halves without
+denoising, whose noise cancels. The renderers are measured alternately on every scene.
 """
 
 import dataclasses
@@ -34,9 +34,9 @@ from storage.conventions import log10_radiance
 
 TARGETS_DB = (38.0, 42.0, 46.0, 50.0)
 STATED_PX = (64, 256)
-"""Further widths at which stated errors are judged."""
+"""Further widths at which stated errors are checked."""
 REFERENCE_PX = 256
-"""Width of the references in pixels, the largest that is judged."""
+"""Width of the references in pixels, the largest one of the experiment."""
 
 OURS = "Trilight, stated errors"
 STATED = "Trilight, other widths"
@@ -129,15 +129,15 @@ def plain_figures(level: PlainPicture, reference: RawReference) -> dict[str, flo
 
 
 def cost_at_error(levels: Sequence[tuple[float, float, float]], db: float) -> tuple[float, bool]:
-    """Return the core-seconds at which a path tracer first has an error, and whether it has it.
+    """Return the CPU seconds at which a path tracer reaches an error, and whether it does.
 
-    Between two levels dB are taken linear in log2 of the samples, and core-seconds linear in the
-    samples. Outside of what was measured the nearest level counts: its cost is a lower bound where
-    no level is good enough, and an upper one where all are better.
+    Between two levels dB are linear in log2 of the samples, and CPU seconds linear in the samples.
+    Outside the measured range the nearest level counts: its cost is a lower bound if no level is
+    good enough, and an upper bound if all are better.
 
     Args:
-        levels: samples per pixel, core-seconds and psnr_log_db, rising in samples; one at least.
-        db: psnr_log_db that is asked for, to the same reference.
+        levels: samples per pixel, CPU seconds and psnr_log_db, rising in samples; at least one.
+        db: psnr_log_db to reach, to the same reference.
     """
     row = next((row for row, (_, _, level_db) in enumerate(levels) if level_db >= db), None)
     if row is None:

@@ -1,4 +1,4 @@
-"""The GPU here: what it reaches, whether its pictures are right, steps of every training preset."""
+"""Experiment `gpu`: throughput, correct pictures, and steps of every training preset on a GPU."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -64,7 +64,7 @@ def _runs(scale: BenchScale, options: BenchOptions) -> Sequence[str]:
 def _measure(
     context: BenchContext, points: Sequence[Point], trial: str
 ) -> Iterator[tuple[str, Figures]]:
-    """Measure point by point; one that cannot be measured has no figures, and a note says why."""
+    """Measure point by point; a failed point has no figures, and a note with the reason."""
     import torch
 
     from infra.bench.gpu.probe import device_facts
@@ -134,7 +134,7 @@ def _reading(threads: int, context: BenchContext) -> Figures:
 
 
 def _render_data(context: BenchContext) -> tuple[Figures, str]:
-    """Return the figures of rendering here, and a dataset of what was rendered."""
+    """Return the figures of rendering here, and a dataset of the rendered scenes."""
     from infra.bench.gpu.supply import rendered_figures
 
     def render() -> tuple[Figures, str]:

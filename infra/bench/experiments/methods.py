@@ -1,4 +1,4 @@
-"""All methods to a picture, from pure networks to the path tracer: cost against true error."""
+"""Experiment `methods`: cost against true error, from pure networks to the path tracer."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -78,7 +78,7 @@ def _measure(
 
 
 def _set_up(context: BenchContext) -> tuple[Mapping[int, Mapping[str, Method]], IsolatedChild]:
-    """Return the methods that need no render child, and a child for the others."""
+    """Return the methods of this process, and a render child for the others."""
     import torch
 
     from model.neural_renderer import NeuralRenderer
@@ -107,7 +107,7 @@ def _set_up(context: BenchContext) -> tuple[Mapping[int, Mapping[str, Method]], 
 
 
 def timed_method(method: Method, scene: Scene) -> TimedViews:
-    """Return a scene's first view with its times."""
+    """Return the first view of a scene with its times."""
     camera = scene.c2w[0], float(scene.fov_deg[0])
     return timed_views(lambda: partial(method(scene), *camera))
 
@@ -119,7 +119,7 @@ def timed_samples(scene: Scene, px: int) -> list[TimedViews]:
 
 
 def judged_figures(picture: TimedViews, scene: Scene, reference: RawReference) -> Figures:
-    """Return the figures of a picture; references' noise is in none of the decibels."""
+    """Return the figures of a picture; its decibels exclude the noise of the reference."""
     from train.evaluation.metrics import picture_scores
 
     radiance_rgb = picture.radiance_rgb

@@ -1,4 +1,4 @@
-"""Two trainings that differ in any settings, with equal seeds, judged on the same scenes."""
+"""Experiment `paired-training`: two trainings with different settings and equal seeds."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -28,7 +28,7 @@ def settings_of(side: str, seed: int, scale: BenchScale, options: BenchOptions) 
     """Return the settings of one side's training.
 
     Raises:
-        TrilightError: several presets are named, or a change is none of their settings.
+        TrilightError: several presets are named, or a change names no setting.
     """
     from train.runs import changed_run
 
@@ -59,7 +59,7 @@ def _trials(scale: BenchScale, options: BenchOptions) -> list[str]:
 
 
 def scene_of(trial: str) -> str:
-    """Return the scene of a trial: its errors with all seeds are one cluster."""
+    """Return the scene of a trial, since its errors with all seeds form one cluster."""
     return trial.partition(", ")[2]
 
 

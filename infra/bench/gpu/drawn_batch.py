@@ -1,4 +1,4 @@
-"""A batch of a training preset's size without a dataset: its content changes no time."""
+"""Synthetic batch of a training preset's size, since the content does not change the time."""
 
 import math
 from typing import TYPE_CHECKING
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 _LIGHTS = 4
 UNSTATED_TRIANGLES = 1024
-"""Triangles of the longest scene where a preset sets no limit."""
+"""Triangles of the longest scene if a preset sets no limit."""
 
 SPREAD = 0.06
-"""The shortest scene of a pass is shorter than the longest by this fraction, as in the buckets of
-`pretrain`: half of it is padding, and attention has a mask."""
+"""Fraction by which the shortest scene of a pass is shorter than the longest, as in the buckets of
+`pretrain`. Half of it is padding on average, so that attention has a mask."""
 
 VGG16_WIDTHS = (64, 128, 256, 512, 512)
-"""Channels of the published network's blocks."""
+"""Channels of VGG16's blocks, as in the published LPIPS."""
 
 
 def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:
@@ -43,7 +43,7 @@ def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:
 
 
 def scene_of(workload: Workload) -> SceneTensors:
-    """Return two objects in a room, of exactly so many triangles, and cameras around them."""
+    """Return two objects in a room with an exact number of triangles, and cameras around them."""
     scene = cost_scene(math.ceil(1.3 * workload.triangles) + 32, _LIGHTS)
     poses = [
         look_at_c2w(
@@ -70,7 +70,7 @@ def scene_of(workload: Workload) -> SceneTensors:
 
 
 def drawn_batch(settings: TrainSettings, scenes: int) -> TrainingBatch:
-    """Return a batch on the processor: real scenes, with targets that are noise."""
+    """Return a batch on the processor: scenes of real geometry, with noise as targets."""
     generator = torch.Generator().manual_seed(0)
     views = settings.views_per_scene
     px = settings.resolution
@@ -96,7 +96,7 @@ def _prepare(tensors: SceneTensors, model: "ModelConfig", px: int) -> SceneTenso
 
 
 def drawn_lpips(settings: TrainSettings, widths: tuple[int, ...] = VGG16_WIDTHS) -> Lpips | None:
-    """Return LPIPS with random weights of the published sizes, where a preset asks for LPIPS."""
+    """Return LPIPS with random weights of the published sizes; None if a preset has no LPIPS."""
     if settings.loss.perceptual != "lpips":
         return None
     vgg16 = {}

@@ -12,13 +12,13 @@ from train.loss.lpips import Lpips
 from train.loss.objective import Objective
 
 MARK = "trilight: "
-"""Before the names of parts in a trace."""
+"""Prefix of the names of parts in a trace."""
 REST = "backward and rest"
 
 
 @contextmanager
 def marked_parts(model: nn.Module, objective: Objective, updater: Any) -> Iterator[None]:
-    """Have the parts of a step stand in a trace; the optimiser is what `updater.step` does."""
+    """Mark the parts of a step in a trace; the optimizer is the call of `updater.step`."""
     with ExitStack() as stack:
         for name, module in _parts(model, objective):
             stack.enter_context(_mark_calls(name, module))
@@ -47,7 +47,7 @@ def _parts(model: Any, objective: Objective) -> Iterator[tuple[str, nn.Module]]:
 
 @contextmanager
 def _mark_calls(name: str, module: Any) -> Iterator[None]:
-    """Mark every call of a module, from outside: hooks would be a part of what is compiled."""
+    """Mark every call of a module from outside, because hooks would be compiled with it."""
     before = module._compiled_call_impl  # what a call of a compiled module calls
     call = before or module._call_impl
 
@@ -65,7 +65,7 @@ def _mark_calls(name: str, module: Any) -> Iterator[None]:
 def profile_call(work: Callable[[], object], device: torch.device) -> tuple[int, dict[str, float]]:
     """Return the number of kernels of a call, and its milliseconds by part.
 
-    On a processor operators stand for kernels.
+    On a processor operators are counted instead of kernels.
     """
     from torch.profiler import ProfilerActivity, profile
 
@@ -86,7 +86,7 @@ def profile_call(work: Callable[[], object], device: torch.device) -> tuple[int,
 
 
 def parts_ms(total_us: float, parts: Mapping[str, float]) -> dict[str, float]:
-    """Return milliseconds by part, the dearest first, with the REST; LPIPS is within the loss."""
+    """Return milliseconds by part, largest first, with the REST; LPIPS is part of the loss."""
     microseconds = dict(parts)
     if "LPIPS" in microseconds:
         microseconds["loss"] -= microseconds["LPIPS"]

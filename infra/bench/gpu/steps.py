@@ -1,4 +1,4 @@
-"""Steps of a training preset on a device, with fewer scenes where memory lacks."""
+"""Steps of a training preset on a device, with fewer scenes if memory is too small."""
 
 import dataclasses
 import gc
@@ -25,12 +25,12 @@ SHRUNK_PX = 32
 SHRUNK_TRIANGLES = 64
 SHRUNK_SCENES = 2
 THIN = (4, 8, 16, 16, 16)
-"""Channels of LPIPS where presets are shrunk."""
+"""Channels of LPIPS for shrunk presets."""
 _WARM_STEPS = 3
 
 
 def step_settings(run: str, device: torch.device) -> TrainSettings:
-    """Return a preset that begins with random weights; without a GPU a small one of its form."""
+    """Return a preset with random initial weights; without a GPU a small one of its form."""
     settings = dataclasses.replace(named_run(run), from_weights=False)
     if device.type == "cuda":
         return settings
@@ -56,8 +56,8 @@ def step_figures(
 ) -> tuple[dict[str, float], Mapping[str, float]]:
     """Return figures of a step of one pass, and its milliseconds by part of the network.
 
-    A pass has as many scenes as the preset's, or as memory holds. A preset that fails has no
-    `ms`: the others are measured all the same.
+    A pass has as many scenes as in the preset, or as fit into memory. A preset that fails has no
+    `ms`, so that the others are still measured.
     """
     settings = step_settings(run, device)
     scenes = min(settings.scenes_per_pass, settings.scenes_per_step)
@@ -118,7 +118,7 @@ def _measure_steps(
 
 
 def _step_s(step: Any, steps: int, device: torch.device) -> float:
-    """Return the median seconds of a step after some that are not counted."""
+    """Return the median seconds of a step, after warm-up steps."""
     times = []
     for _ in range(_WARM_STEPS + steps):
         began = time.perf_counter()

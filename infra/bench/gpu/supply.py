@@ -1,4 +1,4 @@
-"""What feeds a GPU: views that are rendered on this machine, and samples that are read."""
+"""Supply of a GPU: rates of rendering views on this machine, and of reading samples."""
 
 import itertools
 import time
@@ -20,19 +20,19 @@ from train.runs import named_run
 
 BUILD = "smoke"
 SCENES = 3
-"""Scenes that are rendered, fewer than a shard of the preset; the first compiles kernels."""
+"""Number of rendered scenes, fewer than a shard of the preset; the first compiles kernels."""
 NOISE_FLOOR_DB = 38.0
 BATCH = 8
 READ_AS = "pretrain"
-"""Training preset whose augmentation is drawn for what is read."""
+"""Training preset whose augmentation is applied to samples."""
 
 
 def rendered_figures(px: int, place: Path) -> tuple[dict[str, float], Path]:
     """Render scenes one after the other on all cores.
 
     Returns:
-        Milliseconds of a view on the clock and core-seconds of one; and a dataset of the scenes,
-        each under many keys.
+        Wall-clock milliseconds and CPU seconds of a view; and a dataset of the scenes, each under
+        many keys.
     """
     settings = named_build(BUILD)
     order = DatasetOrder(
@@ -54,7 +54,7 @@ def rendered_figures(px: int, place: Path) -> tuple[dict[str, float], Path]:
 
 
 def read_figures(data: str, threads: int, px: int, least_s: float) -> dict[str, float]:
-    """Return milliseconds of a sample that is decoded and augmented as READ_AS has it.
+    """Return milliseconds of decoding and augmenting a sample as in READ_AS.
 
     Raises:
         TrilightError: the data cannot be read at this width.

@@ -1,8 +1,8 @@
-"""Pictures by the built-in networks on a GPU, against those that a processor made and we stored.
+"""Pictures by the built-in networks on a GPU, compared with stored ones of a processor.
 
-A GPU that computes something else shows here, before any time is believed. What is stored is of
-certain weights, named by their digest: after another training of a built-in network
-`python -m infra.bench.gpu.twin` makes it again.
+The comparison finds a GPU with wrong results before any time is trusted. The stored pictures belong
+to certain weights, named by their digest: after another training of a built-in network, `python -m
+infra.bench.gpu.twin` renders them again.
 """
 
 import time
@@ -35,7 +35,7 @@ def twin_figures(network: str, precision: str, device: torch.device) -> dict[str
     """Return psnr_log_db of a network's picture to the stored one, and milliseconds of a view.
 
     Raises:
-        TrilightError: what is stored is of other weights than those of this Trilight.
+        TrilightError: the stored picture belongs to other weights than the built-in network's.
     """
     twin = stored_twin(network)
     picture, seconds = _render(network, device, precision)
@@ -46,7 +46,7 @@ def stored_twin(network: str) -> NDArray[np.float64]:
     """Return the stored picture [64, 64, 3] of a network, linear radiance.
 
     Raises:
-        TrilightError: it is of other weights.
+        TrilightError: the picture belongs to other weights.
     """
     with np.load(STORED, allow_pickle=False) as stored:
         digest = str(stored[f"{network} sha256"])
@@ -67,7 +67,7 @@ def _digest(network: str) -> str:
 def _render(
     network: str, device: torch.device, precision: str
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the first view of the scene, and the seconds of one more where all is warm."""
+    """Return the first view of the scene, and the seconds of one more after the warm-up."""
     renderer = NeuralRenderer.load(network, device=str(device), precision=precision)
     scene = cost_scene(TRIANGLES, LIGHTS)
     prepared = renderer.prepare(scene)

@@ -1,6 +1,6 @@
-"""The process that imports Blender: reads a scene, renders one view with Cycles, writes it raw.
+"""Process that imports Blender: reads a scene, renders one view with Cycles, writes it raw.
 
-Run by path with the Python of blender_environment.py, which has nothing of Trilight:
+Run by path with the Python of blender_environment.py, which has no module of Trilight:
 
     python -I blender_process.py FOLDER
 
@@ -30,7 +30,7 @@ _CLIP_END = 1e4
 
 
 def main(folder: Path) -> None:
-    """Render what the folder asks for."""
+    """Render the request in the folder."""
     started = time.perf_counter()
     request = json.loads((folder / "request.json").read_text())
     with np.load(folder / "scene.npz", allow_pickle=False) as arrays:
@@ -50,7 +50,7 @@ def main(folder: Path) -> None:
 
 
 def add_meshes(scene: dict[str, NDArray]) -> None:
-    """Add what reflects as one object, and what emits as another, hidden from the camera."""
+    """Add the reflecting triangles as an object, and the emitting ones as a hidden object."""
     emits = np.any(scene["materials"][:, 7:10] > 0, axis=1)
     materials = [
         _emission(row[7:10]) if emitting else _surface(row)
@@ -111,7 +111,7 @@ def _surface(row: NDArray[np.float32]) -> Any:
 
 
 def _emission(radiance_rgb: NDArray[np.float32]) -> Any:
-    """Return a material that emits to both sides and reflects nothing."""
+    """Return a material that emits on both sides and reflects nothing."""
     material, nodes, output = _material("emitter")
     emission = nodes.new("ShaderNodeEmission")
     emission.inputs["Color"].default_value = (*map(float, radiance_rgb), 1.0)
@@ -130,7 +130,7 @@ def _material(name: str) -> tuple[Any, Any, Any]:
 
 
 def add_camera(c2w: NDArray[np.float64], fov_deg: float) -> None:
-    """Add the camera: Blender's axes are those of `c2w`."""
+    """Add the camera; Blender's axes are those of `c2w`."""
     camera = bpy.data.cameras.new("camera")
     camera.sensor_fit = "HORIZONTAL"
     camera.angle = np.radians(fov_deg)
@@ -143,7 +143,7 @@ def add_camera(c2w: NDArray[np.float64], fov_deg: float) -> None:
 
 
 def set_up_cycles(request: dict[str, Any], target: Path) -> None:
-    """Set what the reference pictures were made with; the rest is as Blender ships it."""
+    """Set the options of the reference pictures; all others keep Blender's defaults."""
     scene = bpy.context.scene
     render = scene.render
     cycles = scene.cycles
@@ -185,7 +185,7 @@ def set_up_cycles(request: dict[str, Any], target: Path) -> None:
 
 
 def render(samples: int) -> dict[str, float]:
-    """Render, and return the seconds on the clock and of all cores for the whole call."""
+    """Render, and return the wall-clock and CPU seconds of the whole call."""
     bpy.context.scene.cycles.samples = samples
     bpy.context.scene.update_tag()  # or the data that stayed keep the number of samples too
     wall = time.perf_counter()
@@ -195,7 +195,7 @@ def render(samples: int) -> dict[str, float]:
 
 
 def pixels(path: Path) -> NDArray[np.float32]:
-    """Return the colours of an EXR file, float32 [R, R, 3], the top row first."""
+    """Return the colors of an EXR file, float32 [R, R, 3], the top row first."""
     image = bpy.data.images.load(str(path))
     image.colorspace_settings.name = "Non-Color"
     width, height = image.size
@@ -206,7 +206,7 @@ def pixels(path: Path) -> NDArray[np.float32]:
 
 
 def exr_text_attributes(path: Path) -> dict[str, str]:
-    """Return the strings in the header of an EXR file: Cycles states its own times there."""
+    """Return the strings in the header of an EXR file, in which Cycles states its times."""
     data = path.read_bytes()
     at = 8
     attributes = {}
@@ -222,7 +222,7 @@ def exr_text_attributes(path: Path) -> dict[str, str]:
 
 
 def _seconds(clock: str) -> float:
-    """Return the seconds of Blender's "minutes:seconds", with hours before where there are any."""
+    """Return the seconds of Blender's "minutes:seconds" or "hours:minutes:seconds"."""
     seconds = 0.0
     for part in clock.split(":"):
         seconds = 60 * seconds + float(part)

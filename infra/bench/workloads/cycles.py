@@ -1,4 +1,4 @@
-"""A view of a `Scene` as Blender's Cycles renders it, from its arrays or our USD; with its cost."""
+"""Renders a view of a `Scene` with Blender's Cycles, from its arrays or its USD, with the cost."""
 
 import dataclasses
 import json
@@ -32,20 +32,21 @@ class CyclesOptions:
     denoise: bool
     """True to denoise by Open Image Denoise, with Cycles' albedo and normals."""
     bounces: int = 8
-    """Most bounces, of each kind and in sum: 8 is Mitsuba's max_depth 10, 0 is direct light."""
+    """Maximum number of bounces, in sum and of each kind; 8 is Mitsuba's max_depth of 10, and 0
+    direct light."""
     seed: int = 0
     """Seed of the samples, for Cycles' random numbers."""
     threads: int = 1
-    """Threads of Cycles; the denoiser takes all that the process may use."""
+    """Threads of Cycles; the denoiser uses all cores of the process."""
 
     def with_seed(self, seed: int) -> "CyclesOptions":
-        """Return the same with another seed."""
+        """Return these options with another seed."""
         return dataclasses.replace(self, seed=seed)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CyclesPicture:
-    """One finished picture and its cost."""
+    """Finished picture and its cost."""
 
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance."""
@@ -53,22 +54,22 @@ class CyclesPicture:
     """Wall-clock seconds of sampling and denoising that Cycles states, to 10 ms, without starting
     Blender, reading the scene and building its BVH."""
     core_s: float
-    """Core-seconds of that call, with what little Blender does around it; other work on the
-    machine moves them less than the clock."""
+    """CPU seconds of that call; other work on the machine changes them less than wall-clock
+    seconds."""
     prepare_s: float
-    """Wall time before that: filling Blender's scene, and a picture of one sample."""
+    """Wall-clock seconds of the preparation: Blender's scene, and a picture of one sample."""
 
 
 def cycles_picture(scene: Scene, view: int, options: CyclesOptions) -> CyclesPicture:
-    """Render one view in a process of its own.
+    """Render one view in a separate process.
 
     Args:
-        scene: that passes `Scene.check`.
-        view: row of its cameras.
-        options: how.
+        scene: scene that passes `Scene.check`.
+        view: row of the camera in the scene.
+        options: options of the render.
 
     Raises:
-        TrilightError: Blender cannot be had (blender_environment), or it failed.
+        TrilightError: Blender cannot be installed (blender_environment), or it failed.
     """
     python = blender_python()
     camera = {"c2w": scene.c2w[view].tolist(), "fov_deg": float(scene.fov_deg[view])}
@@ -89,21 +90,21 @@ def cycles_picture(scene: Scene, view: int, options: CyclesOptions) -> CyclesPic
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CyclesSamples:
-    """Pictures of one view that share no samples, and their cost."""
+    """Independent pictures of one view, and their cost."""
 
     pictures_rgb: tuple[NDArray[np.float32], ...]
-    """[R, R, 3] linear radiance, a picture a seed."""
+    """[R, R, 3] linear radiance, a picture for each seed."""
     core_s: float
-    """Core-seconds of all renders; reading the file came before."""
+    """CPU seconds of all renders, without reading the file."""
 
 
 def cycles_of_usd(usd: Path, options: CyclesOptions, seeds: Sequence[int]) -> CyclesSamples:
-    """Render the first view of a USD file of ours as Blender shows it after our script.
+    """Render the first view of a Trilight USD file in Blender, after exact_materials.py.
 
     Args:
-        usd: the file, with what it names beside it.
-        options: how; its seed counts for nothing.
-        seeds: of the samples of each picture.
+        usd: USD file, with its textures in place.
+        options: options of the render; the seed is ignored.
+        seeds: seed of each picture's samples.
 
     Raises:
         TrilightError: as `cycles_picture`.
@@ -122,7 +123,7 @@ def cycles_of_usd(usd: Path, options: CyclesOptions, seeds: Sequence[int]) -> Cy
 
 
 def _run_blender(script: Path, folder: Path, python: Path) -> None:
-    """Run the script; what Blender writes of its own accord stays in the folder."""
+    """Run the script; files that Blender writes by itself stay in the folder."""
     surroundings = {**os.environ, "HOME": str(folder), "BLENDER_USER_RESOURCES": str(folder)}
     try:
         result = subprocess.run(

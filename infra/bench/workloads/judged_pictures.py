@@ -1,4 +1,4 @@
-"""Pictures with their stated errors, held against raw references (infra.rendering)."""
+"""Stated errors of pictures, compared with true errors to raw references (infra.rendering)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ _CURVES = {"log": log10_radiance, "linear": clamped_radiance, "object": log10_ra
 
 
 def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
-    """Return stated and true errors of a picture, in dB, with what the reference leaves open."""
+    """Return stated and true errors of a picture in dB, with the reference's uncertainty."""
     mean = 0.5 * (reference.a_rgb + reference.b_rgb)
     stated_db = {
         "log": view.noise_floor_db,
@@ -40,9 +40,9 @@ def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
 
 
 def difference_db(ours: RawReference, theirs: RawReference, curve: Curve) -> float:
-    """Return by how much two renderers differ where the noise of both is left out, in dB.
+    """Return the difference of two renderers in dB, without the noise of both.
 
-    The squared difference is the mean of (A - C) (B - D), of halves A and B of one and C and D of
+    The squared difference is the mean of (A - C) (B - D), with halves A and B of one and C and D of
     the other. It may be below 0 by chance, which counts as no difference.
     """
     means = (0.5 * (one.a_rgb + one.b_rgb) for one in (ours, theirs))
@@ -52,7 +52,7 @@ def difference_db(ours: RawReference, theirs: RawReference, curve: Curve) -> flo
 
 
 def shrunk(reference: RawReference, resolution: int) -> RawReference:
-    """Return a reference of a smaller width, which divides the first."""
+    """Return a reference of a smaller width, which divides the reference's."""
     return RawReference(
         a_rgb=_block_means(reference.a_rgb, resolution),
         b_rgb=_block_means(reference.b_rgb, resolution),

@@ -1,4 +1,4 @@
-"""Whole samples in our profiles and in the published HDF5 layout: bytes, and time to unpack."""
+"""Bytes and unpacking time of samples in Trilight's profiles and in RenderFormer's HDF5 layout."""
 
 import io
 import time
@@ -24,7 +24,7 @@ def unpacking_figures(samples: Sequence[Sample], layout: str, work: Path) -> Map
     """Unpack samples of one of LAYOUTS in memory, in one thread.
 
     Returns:
-        Means of the bytes a sample before and after, and of the processor's milliseconds.
+        Mean bytes of a sample before and after, and mean CPU milliseconds.
     """
     if layout in TEXTURES:
         files = [_h5_bytes(sample, work, TEXTURES[layout]) for sample in samples]
@@ -47,7 +47,7 @@ def _h5_bytes(sample: Sample, work: Path, texture_type: TextureType) -> bytes:
 
 
 def _unpacked_h5(data: bytes) -> int:
-    """Read every array as it is, as a loader that trusts its files does."""
+    """Read every array without checks, as a loader that trusts its files does."""
     with h5py.File(io.BytesIO(data)) as file:
         return sum(file[name][()].nbytes for name in file)
 

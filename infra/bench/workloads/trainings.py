@@ -1,4 +1,4 @@
-"""Short trainings of any settings, judged scene by scene on what no network has seen."""
+"""Short trainings of any settings, evaluated scene by scene on held-out scenes."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ from train.settings import TrainSettings
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainingScenes:
-    """The scenes of all trainings of an experiment: those they see, and those they do not."""
+    """Training scenes and held-out scenes of all trainings of an experiment."""
 
     train: ShardSet
     judge: Judge
@@ -38,7 +38,7 @@ class TrainingScenes:
 
 
 def scenes_of(data: str, held_out: int, resolution: int) -> TrainingScenes:
-    """Return the scenes of a dataset, judged on the first ones of its validation split.
+    """Return the scenes of a dataset, with the first ones of its validation split held out.
 
     Raises:
         TrilightError: the validation split is empty.
