@@ -77,9 +77,7 @@ def repair(
         albedo_over_one=cast(AlbedoOverOne, value_of(command, "--albedo-over-one") or "scale"),
         changes=changes,
     )  # checks everything before a shard is moved
-    for name in bad_shards:
-        if (root / name).exists():
-            (root / name).replace(root / f"{name}{ASIDE}")
+    _set_aside(root, bad_shards)
     outcome = make_dataset(order, ThreadRunner())
     if outcome.digest != manifest.dataset_digest:
         raise TrilightError(
@@ -88,6 +86,12 @@ def repair(
         )
     for name in bad_shards:
         (root / f"{name}{ASIDE}").unlink(missing_ok=True)
+
+
+def _set_aside(root: Path, names: Sequence[str]) -> None:
+    for name in names:
+        if (root / name).exists():
+            (root / name).replace(root / f"{name}{ASIDE}")
 
 
 def _require_generated(manifest: Manifest, scenes_from: str | None) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from infra.cli.changes import Shared
 from infra.cli.console import (
@@ -24,6 +24,9 @@ from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import Within
+
+if TYPE_CHECKING:
+    from infra.planning import Prediction
 
 
 @checked()
@@ -63,31 +66,29 @@ def plan(
     if output.json:
         print_json(dataclasses.asdict(prediction))
         return
-    local_cores = cores_owned()
-    print_rows(
-        f"{build}, {prediction.num_scenes} scenes, predicted from {samples} (90 % intervals)",
-        [
-            ("core-hours", prediction.core_hours.to_text("{:,.2f}".format)),
-            (f"on {cores} cores", prediction.hours.to_text(_hours)),
-            (
-                f"on the {local_cores} cores here",
-                prediction.core_hours.to_text(lambda hours: _hours(hours / local_cores)),
-            ),
-            ("USD", prediction.usd.to_text("{:,.2f}".format)),
-            ("GB", prediction.gigabytes.to_text("{:,.2f}".format)),
-            ("shards", f"{prediction.num_shards} of up to {prediction.scenes_per_shard} scenes"),
-            ("a shard", prediction.shard_hours.to_text("{:,.2f} core-hours".format)),
-            (
-                "Prefect's task runs",
-                f"{prediction.num_tasks}, {prediction.task_minutes:.1f} minutes each",
-            ),
-            ("Prefect's database", f"{prediction.database_mb:.1f} MB"),
-            ("manifest.json", f"{prediction.manifest_mb:.1f} MB"),
-        ],
-    )
+    title = f"{build}, {prediction.num_scenes} scenes, predicted from {samples} (90 % intervals)"
+    print_rows(title, _rows(prediction, cores))
     for text in prediction.notes:
         note(text)
     next_step((*generate_words(order), "--out", _free(order.place)))
+
+
+def _rows(prediction: "Prediction", cores: int) -> list[tuple[str, str]]:
+    local_cores = cores_owned()
+    here_text = prediction.core_hours.to_text(lambda hours: _hours(hours / local_cores))
+    tasks = f"{prediction.num_tasks}, {prediction.task_minutes:.1f} minutes each"
+    return [
+        ("core-hours", prediction.core_hours.to_text("{:,.2f}".format)),
+        (f"on {cores} cores", prediction.hours.to_text(_hours)),
+        (f"on the {local_cores} cores here", here_text),
+        ("USD", prediction.usd.to_text("{:,.2f}".format)),
+        ("GB", prediction.gigabytes.to_text("{:,.2f}".format)),
+        ("shards", f"{prediction.num_shards} of up to {prediction.scenes_per_shard} scenes"),
+        ("a shard", prediction.shard_hours.to_text("{:,.2f} core-hours".format)),
+        ("Prefect's task runs", tasks),
+        ("Prefect's database", f"{prediction.database_mb:.1f} MB"),
+        ("manifest.json", f"{prediction.manifest_mb:.1f} MB"),
+    ]
 
 
 def _hours(hours: float) -> str:
