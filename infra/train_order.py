@@ -41,8 +41,8 @@ class TrainOrder:
     """Recorded changes with --resume or --branch, such as num_steps=20000; by default none. They
     apply from the checkpoint on."""
     begin_with: str | None = None
-    """Folder of a run, or checkpoint, with the initial weights of a finetune run; by default, and
-    in all other runs, they are random."""
+    """Run folder or checkpoint with the initial weights of a finetune run; by default random
+    weights."""
     lpips: str | None = None
     """Folder of vgg16-397923af.pth and vgg.pth (LPIPS), or hub; by default the value of
     TRILIGHT_LPIPS."""

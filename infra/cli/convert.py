@@ -15,7 +15,7 @@ class ConvertOptions:
     """Source and target."""
 
     source: str
-    """Scene .usda .usdc .usdz .usd .glb .gltf .json .h5 .safetensors, shard .tar, or
+    """Scene .usda .usdc .usdz .usd .glb .gltf .json .h5 .safetensors, SHARD.tar, or
     SHARD.tar::KEY."""
     target: Path
     """File .usda .usdc .usdz .glb .json .h5 or .safetensors."""
@@ -24,7 +24,7 @@ class ConvertOptions:
     usd_folder: Path | None = None
     """Folder below which a USD stage may read files; by default its own folder."""
     albedo_over_one: AlbedoOverOne = "scale"
-    """Scale RenderFormer materials whose albedos add up to more than 1, or refuse them."""
+    """Scale or refuse RenderFormer materials whose albedos sum to above 1."""
 
 
 @command("source", "target")

@@ -41,7 +41,7 @@ class InspectOptions:
     """Source and pictures."""
 
     source: str
-    """Dataset (folder or URL), folder of a training run, or one scene file."""
+    """Dataset (folder or URL), training run's folder, or one scene file."""
     scenes: Annotated[int, Within(1, 10_000, unit="scenes")] = 16
     """Number of scenes on the contact sheet."""
     by_template: Annotated[int | None, Within(1, 1000, unit="scenes")] = None

@@ -29,7 +29,7 @@ class PassOptions:
     resolution: Annotated[int | None, Within(1, MAX_RESOLUTION, unit="pixels")] = None
     """Width of the pictures; by default the dataset's width, or 256 for a scene file."""
     rays_a_side: Annotated[int, Within(1, MOST_A_SIDE, unit="rays")] = 1
-    """Rays along each side of a pixel, for averaged passes; stored ones have one."""
+    """Rays along each pixel side, for averaged passes; stored ones have one."""
 
 
 @command("source")

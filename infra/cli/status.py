@@ -29,11 +29,11 @@ class StatusOptions:
     dataset: str
     """Dataset, a folder or a URL."""
     missing: bool = False
-    """Print only the numbers of missing shards, such as 0-3,7, for a scheduler."""
+    """Print only the missing shards' numbers, such as 0-3,7, for schedulers."""
     shards_per_task: Annotated[int, Within(1, 10**6, unit="shards")] = 1
     """Number of shards of a task; --missing then prints numbers of tasks."""
     lines: bool = False
-    """Print the missing shards as ranges A:B, one a line, for generate --shards."""
+    """Print missing shards as ranges A:B, one a line, for generate --shards."""
 
     def __post_init__(self) -> None:
         if self.shards_per_task != 1 and not self.missing:

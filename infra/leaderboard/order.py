@@ -16,7 +16,7 @@ class LeaderboardOrder:
     """Dataset, networks and pictures."""
 
     source: str
-    """Dataset (folder or URL) with pictures, such as one of the preset benchmark-v1."""
+    """Dataset (folder or URL) with pictures, such as one of preset benchmark-v1."""
     checkpoint: tuple[str, ...] = ()
     """Networks in addition to the built-in ones; by default none. A network is a run, weights, or a
     name on the Hugging Face hub such as microsoft/renderformer-v1-base. All other rows are compared
@@ -40,4 +40,4 @@ class LeaderboardOrder:
     """Folder of the LPIPS weights, or hub; by default the value of TRILIGHT_LPIPS. Without weights
     LPIPS is n/a."""
     out: Path = Path("leaderboard")
-    """Folder for table, chart and rows; the same folder resumes an interrupted run."""
+    """Folder for table, chart and rows; with existing rows a run resumes."""

@@ -21,12 +21,12 @@ class Asked:
     """Scene, renderer and pictures."""
 
     source: str
-    """Scene file, or SHARD.tar::KEY; for many, also a shard, a folder, or 'NAME{000..119}.json'."""
+    """Scene file, or SHARD.tar::KEY; for many, a shard, a folder, or 'NAME{000..119}.json'."""
     out: Path
     """X.exr for one picture; a folder, X.mp4 or X.webp for many. A PNG for viewing is written
     beside each EXR, enlarged below 256 pixels; existing pictures of a folder or video are kept."""
     engine: EngineChoice = "mitsuba"
-    """Renderer: mitsuba (a path tracer), neural (a network), or both side by side."""
+    """Renderer: mitsuba (path tracer), neural (network), or both side by side."""
     checkpoint: str | None = None
     """neural: model.safetensors of a run; by default the built-in network."""
     resolution: Resolution | None = None
@@ -35,7 +35,7 @@ class Asked:
     """mitsuba: stop at this noise floor (psnr_log_db; higher is cleaner); by default 40, unless
     another floor is given. Of several floors, all are reached."""
     noise_floor_linear_db: NoiseFloor | None = None
-    """mitsuba: stop at this noise floor as psnr_linear_db (radiance clamped to [0, 1]); by default
+    """mitsuba: stop at this noise floor as psnr_linear_db (radiance within [0, 1]); by default
     none. In most pictures it is 5 to 10 dB below psnr_log_db."""
     noise_floor_objects_db: NoiseFloor | None = None
     """mitsuba: stop at this noise floor as object_psnr_log_db (without background); by default
@@ -62,13 +62,13 @@ class Asked:
     """Number of pictures from a circle of cameras around the scene; by default one picture, from
     the scene's camera."""
     arc_deg: Annotated[float, Within(0, 360, low_open=True, unit="degrees")] = 360.0
-    """Angle of the orbit; an arc below 360 is centered on the scene's camera."""
+    """Angle of the orbit; below 360 the scene's camera is its middle."""
     cameras: str | None = None
     """File (.json or a scene) whose cameras are rendered; by default only the scene's camera."""
     fps: Annotated[int, Within(1, 240, unit="pictures a second")] = 24
     """Frames per second of a video."""
     tone_map: ToneMap = "plain"
-    """Tone mapping of PNG and video: plain (sRGB, clipped), or filmic (ACES 2.0)."""
+    """Tone mapping of PNG and video: plain (sRGB) or filmic (ACES 2.0)."""
     exposure_ev: Annotated[float, Within(-32, 32, unit="stops")] = 0.0
     """Exposure of PNG and video in stops; EXR keeps the radiance."""
     precision: Literal["float32", "bfloat16", "tf32", "float16"] = "float32"
@@ -76,7 +76,7 @@ class Asked:
     lights_per_pass: Annotated[int, Within(1, 65_535, unit="triangles")] = 8
     """neural: maximum number of emitting triangles in one pass; passes are added."""
     albedo_over_one: AlbedoOverOne = "scale"
-    """Scale RenderFormer materials whose albedos add up to more than 1, or refuse them."""
+    """Scale or refuse RenderFormer materials whose albedos sum to above 1."""
     seed: Seed = 0
     """mitsuba: seed of the samples."""
     threads: Annotated[int | None, Within(1, 1024, unit="threads")] = None

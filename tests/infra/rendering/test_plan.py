@@ -186,7 +186,7 @@ def test_only_the_plan_reads_what_was_asked() -> None:
     readers = {
         path.name
         for path in (ROOT / "infra/rendering").glob("*.py")
-        if re.search(r"\basked\.\w", path.read_text().replace("rendering.asked", ""))
+        if re.search(r"\boptions\.\w", path.read_text().replace("rendering.options", ""))
     }
     assert readers == {"plan.py", "run.py"}, "run.py opens the reader of scenes"
-    assert "asked" not in (ROOT / "infra/cli/rendered.py").read_text()
+    assert "options." not in (ROOT / "infra/cli/rendered.py").read_text()
