@@ -55,13 +55,13 @@ def parse_changes(texts: Iterable[str]) -> dict[str, Any]:
 
 
 def all_changes(
-    settings: Any, shared: Shared, liked: Mapping[str, Any], stated: Mapping[str, Any]
+    settings: Any, base: Shared, liked: Mapping[str, Any], stated: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return all changes to a preset's settings by dotted name, and check the changed settings.
 
     Args:
         settings: settings of the preset.
-        shared: names a settings file, which overrides `liked`.
+        base: names a settings file, which overrides `liked`.
         liked: record of the settings to use instead of the preset's; may be empty.
         stated: values of other options and of `--set` by dotted name; they override both.
 
@@ -69,7 +69,7 @@ def all_changes(
         TrilightError: a file cannot be read, or a value is refused; for a value of the file, the
             message names its line.
     """
-    filed = {} if shared.settings is None else _read(shared.settings)
+    filed = {} if base.settings is None else _read(base.settings)
     values = {name: value for name, (value, _) in filed.items()}
     merged: dict[str, Any] = {}
     for layer in (differences(settings_record(settings), liked), values, stated):
@@ -82,7 +82,7 @@ def all_changes(
         lines = [line for name, (_, line) in filed.items() if f"'{name}'" in str(error)]
         if not lines:
             raise
-        raise TrilightError(f"{shared.settings}, line {lines[0]}: {error}") from error
+        raise TrilightError(f"{base.settings}, line {lines[0]}: {error}") from error
     return merged
 
 
@@ -92,11 +92,11 @@ def _read(file: str) -> "StatedSettings":
     return read_settings_file(file)
 
 
-def dataset_record(shared: Shared) -> dict[str, Any]:
+def dataset_record(base: Shared) -> dict[str, Any]:
     """Return the settings of the dataset of `--like`, without the name of its preset."""
     from storage.dataset.dataset import open_dataset
 
-    settings = {} if shared.like is None else open_dataset(shared.like).manifest.settings
+    settings = {} if base.like is None else open_dataset(base.like).manifest.settings
     record = {name: value for name, value in settings.items() if name not in _OF_SOURCES}
     if "listed_shards" in record.get("splits", {}):  # those of yet another dataset
         splits = record["splits"].items()
@@ -104,22 +104,22 @@ def dataset_record(shared: Shared) -> dict[str, Any]:
     return record
 
 
-def run_record(shared: Shared) -> dict[str, Any]:
+def run_record(base: Shared) -> dict[str, Any]:
     """Return the settings of the run of `--like`, without the name of its preset.
 
     Raises:
         TrilightError: the folder is not that of a run, or the run uses a removed feature.
     """
-    if shared.like is None:
+    if base.like is None:
         return {}
     from train.stored_settings import known_settings  # slow: imports pydantic
 
-    path = Path(shared.like) / "settings.json"
+    path = Path(base.like) / "settings.json"
     try:
         settings = dict(read_json(read_plain(path), dict[str, Any], str(path))["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrilightError(
-            f"--like {shared.like}: {path} cannot be read; expected the folder of a run."
+            f"--like {base.like}: {path} cannot be read; expected the folder of a run."
         ) from error
-    known = known_settings(settings, f"--like {shared.like}")
+    known = known_settings(settings, f"--like {base.like}")
     return {name: value for name, value in known.items() if name != "run"}

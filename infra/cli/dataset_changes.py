@@ -12,7 +12,7 @@ Order = TypeVar("Order", bound=DatasetOrder)
 _LICENCES = "allowed_licences"
 
 
-def with_shared(order: Order, shared: Shared) -> Order:
+def with_shared(order: Order, base: Shared) -> Order:
     """Return options whose `changes` hold all differences from the preset.
 
     Raises:
@@ -20,8 +20,8 @@ def with_shared(order: Order, shared: Shared) -> Order:
             options state.
     """
     stated = {**_options(order), **order.changes}
-    changes = all_changes(named_build(order.build), shared, dataset_record(shared), stated)
-    if not shared.is_given:
+    changes = all_changes(named_build(order.build), base, dataset_record(base), stated)
+    if not base.is_given:
         return order
     if _LICENCES in changes:  # the option adds licences to those of any source of settings
         changes[_LICENCES] = sorted({*changes[_LICENCES], *order.allow_licences})

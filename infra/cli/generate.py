@@ -29,9 +29,9 @@ class ExecutorOptions:
 
 @command("build")
 def generate(
-    order: DatasetOrder, shared: Shared, runner: ExecutorOptions, output: OutputOptions
+    order: DatasetOrder, base: Shared, runner: ExecutorOptions, output: OutputOptions
 ) -> None:
-    make(with_shared(order, shared), runner, output)
+    make(with_shared(order, base), runner, output)
 
 
 def make(order: DatasetOrder, runner: ExecutorOptions, output: OutputOptions) -> None:

@@ -42,7 +42,7 @@ class PlanOptions:
 @command("build")
 def plan(
     order: DatasetOrder,
-    shared: Shared,
+    base: Shared,
     options: PlanOptions,
     core: CorePrice,
     output: OutputOptions,
@@ -52,7 +52,7 @@ def plan(
             "plan: --scenes-from, --revisits or --shards was given; expected none of them, since a "
             "whole dataset of new scenes is predicted."
         )
-    order = with_shared(order, shared)
+    order = with_shared(order, base)
     build = order.build
     samples = options.samples
     cores = options.cores

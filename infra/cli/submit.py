@@ -47,13 +47,13 @@ def submit(
     submission: SubmitOptions,
     runs: FlowRunOptions,
     order: DatasetOrder,
-    shared: Shared,
+    base: Shared,
     array: ArrayOptions,
     machines: KubernetesOptions,
     output: OutputOptions,
 ) -> None:
     if submission.flow in ARRAYS:
-        order = with_shared(order, shared)
+        order = with_shared(order, base)
         submit_to_array(order, submission.flow, array, machines, as_json=output.json)
         return
     if (array, machines) != (ArrayOptions(), KubernetesOptions()):
@@ -65,7 +65,7 @@ def submit(
     load_prefect()
     from pipeline.flows.submission import parameters
 
-    values = parameters(with_shared(order, shared))
+    values = parameters(with_shared(order, base))
     ended = run_flow(submission.flow, values, runs, where=order.place, as_json=output.json)
     if ended and not output.json and Path(order.place).is_dir():
         next_step(["verify", order.place], ["inspect", order.place])
@@ -77,13 +77,13 @@ def submit(
 )
 @command("build")
 def submit_by_array(
-    order: DatasetByArray, shared: Shared, runs: FlowRunOptions, output: OutputOptions
+    order: DatasetByArray, base: Shared, runs: FlowRunOptions, output: OutputOptions
 ) -> None:
     first_words(f"Submitting {BY_ARRAY} with the build {order.build}", silent=output.json)
     load_prefect()
     from pipeline.flows.submission import parameters
 
-    values = parameters(with_shared(order, shared))
+    values = parameters(with_shared(order, base))
     ended = run_flow(BY_ARRAY, values, runs, where=order.place, as_json=output.json)
     if ended and not output.json and Path(order.place).is_dir():
         next_step(["verify", order.place], ["inspect", order.place])

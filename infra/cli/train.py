@@ -101,9 +101,9 @@ def _end(text: str, status: int) -> NoReturn:
 
 
 @command("run")
-def train(order: TrainOrder, watched: WatchSettings, shared: Shared, output: OutputOptions) -> None:
-    if shared.is_given:
-        changes = all_changes(named_run(order.run), shared, run_record(shared), order.changes)
+def train(order: TrainOrder, watched: WatchSettings, base: Shared, output: OutputOptions) -> None:
+    if base.is_given:
+        changes = all_changes(named_run(order.run), base, run_record(base), order.changes)
         order = dataclasses.replace(order, changes=changes)
     settings = order.settings()  # without torch, so that mistakes are named at once
     if order.processes > 1:

@@ -106,7 +106,7 @@ def make_leaderboard(order: LeaderboardOrder, on_progress: OnProgress) -> Leader
             contestants=[
                 *folder_contestants(order.pictures, views, widths).values(),
                 *([nearest] if nearest else []),
-                *_never_lacking(stack),
+                *_builtin_entries(stack),
                 *_networks(order),
             ],
             lpips=load_lpips(order.lpips),
@@ -133,7 +133,7 @@ def _names(places: Sequence[str]) -> list[str]:
     return [network_name(label) for label in network_labels(places)]
 
 
-def _never_lacking(stack: contextlib.ExitStack) -> Iterator[Contestant]:
+def _builtin_entries(stack: contextlib.ExitStack) -> Iterator[Contestant]:
     """Yield the traced contestants, which every leaderboard has."""
     yield MethodContestant(DIRECT_LIGHT, direct_light_method, notes=())
     traced = functools.cache(traced_network)
