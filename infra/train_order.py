@@ -1,4 +1,4 @@
-"""`TrainOrder`: everything a user asks of a training run, by command line or Prefect's form."""
+"""Options of a training run, for the command line and Prefect's form."""
 
 import os
 import sys
@@ -15,57 +15,51 @@ from train.settings import TrainSettings
 from train.start import Start
 
 RESTARTS = "TORCHELASTIC_RESTART_COUNT"
-"""Variable in which torchrun counts how often it has started its processes again."""
+"""Environment variable in which torchrun counts the restarts of its processes."""
 
 
 @checked()
 class TrainOrder:
-    """Which run to train, on what, and how."""
+    """Training run, data and start."""
 
     run: str = "smoke"
-    """Name of a run (a named set of settings), such as smoke or pretrain."""
+    """Training preset (a named set of settings), such as smoke or pretrain."""
     data: tuple[str, ...] = ("data/smoke",)
-    """Dataset (a folder or a URL); several, which are mixed as the setting data_weights says; or
-    shards by name or pattern, such as s3://b/{train,validation}-{000000..000007}.tar."""
+    """Dataset (a folder or a URL), or shards by name or pattern. Several are mixed by the setting
+    data_weights; a pattern is such as s3://b/{train,validation}-{000000..000007}.tar."""
     out: str | None = None
     """Folder for the run, on the machine that trains; by default runs/RUN."""
     resume: bool = False
-    """Continue from the newest checkpoint. Settings are stated as at the start; those of how it is
-    executed may differ."""
+    """Continue from the newest checkpoint, with the settings of the start. Settings of execution
+    may differ."""
     restartable: bool = False
-    """Resume if the folder has a checkpoint, else begin, so that a scheduler may start the same
-    command again and again. A restart by torchrun does so anyway."""
+    """Resume if the folder has a checkpoint, else begin. A scheduler may then start the same
+    command repeatedly; a restart by torchrun always resumes."""
     branch: str | None = None
-    """Checkpoint, or folder of a run, to continue from in a new folder (--out), which then goes its
-    own way; by default there is none."""
+    """Checkpoint, or folder of a run, to continue in a new folder; by default none."""
     decisions: Mapping[str, Any] = field(default_factory=dict)
-    """Changes to what the run means, with --resume or --branch, such as num_steps=20000 or
-    learning_rate=1e-4; they hold from the checkpoint on and are recorded; by default there are
-    none."""
+    """Recorded changes with --resume or --branch, such as num_steps=20000; by default none. They
+    apply from the checkpoint on."""
     begin_with: str | None = None
-    """Folder of a run, or checkpoint, with the initial weights of a finetune run; by default, and
-    in all other runs, they are random."""
+    """Run folder or checkpoint with the initial weights of a finetune run; by default random
+    weights."""
     lpips: str | None = None
-    """Folder of the LPIPS weights (vgg16-397923af.pth and vgg.pth), or hub to download them; by
-    default the value of TRILIGHT_LPIPS."""
+    """Folder of vgg16-397923af.pth and vgg.pth (LPIPS), or hub; by default the value of
+    TRILIGHT_LPIPS."""
     device: Literal["cpu", "cuda"] | None = None
     """Device to compute on; by default cuda if there is one, else cpu."""
     steps: Annotated[int | None, Within(1, 10**9, unit="steps")] = None
     """Number of steps; by default the run's. Fewer steps also shorten the warm-up and the
     intervals."""
     most_unusable: Annotated[int | None, Within(0, 10**9, unit="samples")] = None
-    """Maximum number of unusable samples to replace by others; by default the first one stops the
-    run."""
+    """Maximum number of unusable samples to replace; by default the first one stops the run."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Changes to the run's settings, by dotted name, such as loss.perceptual=none or model=large
-    (values are JSON); by default there are none."""
+    """Changes to settings by dotted name, such as model=large (JSON values); by default none."""
     workers: Annotated[int | None, Within(0, 1024, unit="threads")] = None
-    """Threads of each process that decode samples, with 0 the main one; by default as many as its
-    share of the cores leaves beside the network, at most 8. Batches are the same with any number.
-    """
+    """Threads of each process that decode samples, with 0 the main thread; by default the cores
+    that the network leaves free, at most 8. Batches are the same with any number."""
     processes: Annotated[int, Within(1, 1024, unit="processes")] = 1
-    """Number of processes on this machine, which torchrun starts; use one for each graphics card.
-    """
+    """Processes on this machine, started by torchrun; use one for each GPU."""
 
     def __post_init__(self) -> None:
         if not self.data:
@@ -73,15 +67,15 @@ class TrainOrder:
 
     @property
     def place(self) -> str:
-        """The folder of the run."""
+        """Folder of the run."""
         return f"runs/{function_name(self.run)}" if self.out is None else self.out
 
     def settings(self) -> TrainSettings:
         """Return the settings of the run.
 
         Raises:
-            TrilightError: no such run or setting, a value that is refused, or a start that is not
-                the run's.
+            TrilightError: an unknown preset or setting, a refused value, or start options that do
+                not fit the run.
         """
         settings = changed_run(
             self.run, self.changes, steps=self.steps, most_unusable=self.most_unusable
@@ -90,7 +84,7 @@ class TrainOrder:
         return settings
 
     def start(self) -> Start:
-        """Return how the run begins."""
+        """Return the start options of the run."""
         return Start(
             resume=self.resume,
             restartable=self.restartable or int(os.environ.get(RESTARTS, "0")) > 0,

@@ -1,4 +1,4 @@
-"""`--extend FILE.py`, anywhere on the line: files of the user's own, loaded before any command."""
+"""Option `--extend FILE.py`, anywhere on the line: loads the user's files before the command."""
 
 import contextlib
 from collections.abc import Mapping, Sequence
@@ -21,22 +21,22 @@ OPTION = "--extend"
 
 
 def extended(words: Sequence[str]) -> list[str]:
-    """Load what `--extend` and TRILIGHT_EXTEND name, and return the words without the option.
+    """Load the files of `--extend` and TRILIGHT_EXTEND; return the words without the option.
 
-    It is taken out here, since a command's own options are only known once its tables are filled.
+    The option is read before the commands, because the files may add names that they accept.
 
     Raises:
-        TrilightError: as `load_extension`, or the option is the last word.
+        TrilightError: a file cannot be loaded, or the option is the last word.
     """
     load_named_extensions()
-    left: list[str] = []
+    kept_words: list[str] = []
     waiting = iter(words)
     for word in waiting:
         if word == "--":
-            return [*left, word, *waiting]
+            return [*kept_words, word, *waiting]
         option, equals, file = word.partition("=")
         if option != OPTION:
-            left.append(word)
+            kept_words.append(word)
             continue
         if not equals:
             file = next(waiting, "")
@@ -46,36 +46,36 @@ def extended(words: Sequence[str]) -> list[str]:
             )
         load_extension(file)
     for path, sha256 in loaded_files():
-        with contextlib.suppress(TrilightError, OSError):  # it only helps to print a command
-            write_atomically(_place_of(sha256), path.encode())
-    return left
+        with contextlib.suppress(TrilightError, OSError):  # only needed to print a next command
+            write_atomically(_last_path_file(sha256), path.encode())
+    return kept_words
 
 
-def _place_of(sha256: str) -> Path:
-    """Return the file of the user's cache that says where an extension was loaded last."""
+def _last_path_file(sha256: str) -> Path:
+    """Return the cache file with the path from which an extension was loaded last."""
     return cache_folder("extensions") / sha256
 
 
 def extend_words(recorded: Mapping[str, str] = MappingProxyType({})) -> list[str]:
-    """Return the words that load what a command needs that goes on from this one.
+    """Return the `--extend` words that the next command needs.
 
     Args:
-        recorded: sha256 of each extension that a dataset was made with, by its name: of those that
-            this user has never loaded, no file is named.
+        recorded: sha256 of each extension of a dataset by name; an extension that this user has
+            never loaded is left out.
     """
     paths = dict.fromkeys(path for path, _ in loaded_files())
     for sha256 in filter(str.isalnum, recorded.values()):
         with contextlib.suppress(TrilightError, OSError, ValueError):
-            path = _place_of(sha256).read_text()
+            path = _last_path_file(sha256).read_text()
             if sha256_hex(Path(path).read_bytes()) == sha256:
                 paths[path] = None
     return [word for path in paths for word in (OPTION, path)]
 
 
-def registered(option: str, value: Any) -> Any:
-    """Return the name of a build or run that was typed; FILE.py:FUNCTION is loaded and named.
+def resolve_reference(option: str, value: Any) -> Any:
+    """Return the name of a typed preset; FILE.py:FUNCTION is loaded and registered first.
 
-    Only the command line comes here: what a form or a dataset says never names a file.
+    Only words of the command line are resolved: forms and datasets never name a file.
     """
     if not isinstance(value, str) or not is_reference(value):
         return value

@@ -1,4 +1,4 @@
-"""Leaving at once, without waiting for threads, children or libraries."""
+"""Ends the process at once, without waiting for threads, children or libraries."""
 
 import contextlib
 import io
@@ -18,9 +18,9 @@ _temporary: set[Path] = set()
 
 
 def open_missing_streams() -> None:
-    """Open /dev/null for each standard stream that was closed, whose number a file would get.
+    """Open /dev/null for each closed standard stream, whose number a later file would get.
 
-    What the encoding of an open one does not have is written as an escape.
+    Characters that the encoding of an open stream lacks are written as escapes.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
@@ -32,20 +32,21 @@ def open_missing_streams() -> None:
 
 
 class InertFormatter(logging.Formatter):
-    """Formats warnings without what a terminal would obey."""
+    """Formatter of warnings that escapes control characters."""
 
     def format(self, record: logging.LogRecord) -> str:
         return escape_lines(super().format(record))
 
 
 def leave(message: str, status: int) -> NoReturn:
-    """End at once: every child ends with its parent, and every file is whole or absent."""
-    out, errors = sys.__stdout__ or sys.stdout, sys.__stderr__ or sys.stderr
+    """End the process at once; children end with it, and every file is whole or absent."""
+    out = sys.__stdout__ or sys.stdout
+    errors = sys.__stderr__ or sys.stderr
     # A signal may arrive in the middle of a write, and Python refuses (RuntimeError) to write or
     # flush the same stream then: hence the descriptors, which no progress bar redraws either.
     with contextlib.suppress(RuntimeError, OSError):
         sys.stdout.flush()
-    if out.isatty():  # a progress bar hides the cursor, which stands behind it
+    if out.isatty():  # a progress bar hides the cursor and leaves it at the end of the bar
         os.write(out.fileno(), f"{_SHOW_CURSOR}\n".encode())
     with contextlib.suppress(OSError):
         os.write(errors.fileno(), f"{escape_lines(message)}\n".encode())
@@ -56,7 +57,7 @@ def leave(message: str, status: int) -> NoReturn:
 
 @contextlib.contextmanager
 def temporary_folder(prefix: str) -> Iterator[Path]:
-    """Lend an empty folder that is gone after the block, and after Ctrl-C too."""
+    """Yield an empty folder that is deleted after the block, also after Ctrl-C."""
     folder = Path(tempfile.mkdtemp(prefix=prefix))
     _temporary.add(folder)
     try:

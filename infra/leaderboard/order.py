@@ -1,4 +1,4 @@
-"""`LeaderboardOrder`: everything a user asks of a leaderboard. Importing it loads no torch."""
+"""Options of `trilight leaderboard`; this module imports no torch."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,33 +13,31 @@ TimedScenes = Annotated[int, Within(1, 10**6, unit="scenes")]
 
 @checked()
 class LeaderboardOrder:
-    """Which set to judge on, and who is judged beside those who never lack."""
+    """Dataset, networks and pictures."""
 
     source: str
-    """A dataset (folder or URL) with pictures, such as one of the build benchmark-v1."""
+    """Dataset (folder or URL) with pictures, such as one of preset benchmark-v1."""
     checkpoint: tuple[str, ...] = ()
-    """Networks to judge as well as those that come with Trilight: a run, weights, or a name on the
-    Hugging Face hub such as microsoft/renderformer-v1-base. All other rows are compared with the
-    first; by default with the network that comes with Trilight."""
+    """Networks in addition to the built-in ones; by default none. A network is a run, weights, or a
+    name on the Hugging Face hub such as microsoft/renderformer-v1-base. All other rows are compared
+    with the first one."""
     pictures: tuple[Path, ...] = ()
-    """Folders of OpenEXR pictures made elsewhere, one for each view, called as export calls them:
-    000000003_view_0.exr; by default there are none."""
+    """Folders of OpenEXR pictures from elsewhere, named as export names them; by default none. Each
+    has one picture a view, such as 000000003_view_0.exr."""
     width: tuple[Width, ...] = ()
-    """Widths of pictures in pixels, which divide the dataset's; by default those of 64, 256 and 512
-    that do, else the dataset's own."""
+    """Widths of pictures in pixels, divisors of the dataset's; by default those of 64, 256 and 512
+    that divide it, else the dataset's own."""
     scenes: SceneCount = 10**6
-    """Maximum number of scenes to judge on, taken from the start of the split."""
+    """Maximum number of scenes, from the start of the split."""
     timed_scenes: TimedScenes = 20
-    """Maximum number of scenes, of these, on which core-seconds are measured; it takes several
-    times as long as showing them once."""
+    """Maximum number of scenes on which CPU seconds are measured."""
     split: Literal["train", "validation", "test"] = "test"
-    """Split to judge on."""
+    """Split of the dataset for the evaluation."""
     train_data: tuple[str, ...] = ()
-    """Datasets whose training pictures are looked up for the nearest one; by default the set itself
-    if it has any, else the other scenes of the split."""
+    """Datasets whose training pictures are looked up; by default the set itself, else the other
+    scenes of the split."""
     lpips: str | None = None
-    """Folder of the LPIPS weights, or hub to download them; by default the value of TRILIGHT_LPIPS,
-    and without either LPIPS is n/a."""
+    """Folder of the LPIPS weights, or hub; by default the value of TRILIGHT_LPIPS. Without weights
+    LPIPS is n/a."""
     out: Path = Path("leaderboard")
-    """Folder for table, chart and rows; asked again with the same folder, it goes on where it
-    stopped."""
+    """Folder for table, chart and rows; with existing rows a run resumes."""

@@ -1,4 +1,4 @@
-"""What `--out` means: one picture, or a folder of numbered ones with or without a video."""
+"""Files of `--out`: one picture, or a folder of numbered pictures with or without a video."""
 
 import tempfile
 from dataclasses import dataclass
@@ -10,19 +10,19 @@ from storage.errors import TrilightError
 
 
 @dataclass(frozen=True, kw_only=True)
-class PicturePlaces:
-    """Where pictures go."""
+class OutputPaths:
+    """Paths of the pictures and of the video."""
 
     stem: Path | None
-    """Of the only picture, without its suffix; None for many."""
+    """Path of the only picture without its suffix; None for many pictures."""
     folder: Path
-    """Where the pictures are."""
+    """Folder of the pictures."""
     video: Path | None
-    """The file that shows them in a row."""
+    """Path of the video; None without one."""
 
     @property
     def is_sequence(self) -> bool:
-        """Whether there may be many pictures."""
+        """True where there may be many pictures."""
         return self.stem is None
 
     def stem_of(self, index: int) -> Path:
@@ -30,27 +30,25 @@ class PicturePlaces:
         return self.stem or self.folder / f"{index:06d}"
 
 
-def place(out: Path) -> PicturePlaces:
-    """Return what is written for `--out`.
+def output_paths(out: Path) -> OutputPaths:
+    """Return the paths that `--out` stands for, and make their folder.
 
     Raises:
-        TrilightError: no such form, a video that cannot be made here, or a place that cannot be
+        TrilightError: an unknown suffix, a video without its encoder, or a folder that cannot be
             written.
     """
     suffix = out.suffix.lower()
     if out.is_dir() or not suffix:
-        return PicturePlaces(stem=None, folder=_writable(out, out), video=None)
+        return OutputPaths(stem=None, folder=_writable(out, out), video=None)
     if suffix == ".exr":
-        return PicturePlaces(
-            stem=out.with_suffix(""), folder=_writable(out.parent, out), video=None
-        )
+        return OutputPaths(stem=out.with_suffix(""), folder=_writable(out.parent, out), video=None)
     if suffix not in SUFFIXES:
         raise TrilightError(
             f"--out is {out}; expected picture.exr, or for many pictures a folder, or X.mp4 or "
             "X.webp, beside which they are kept in a folder X."
         )
     require_encoder(out)
-    return PicturePlaces(stem=None, folder=_writable(out.with_suffix(""), out), video=out)
+    return OutputPaths(stem=None, folder=_writable(out.with_suffix(""), out), video=out)
 
 
 def _writable(folder: Path, out: Path) -> Path:

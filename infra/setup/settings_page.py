@@ -1,4 +1,4 @@
-"""The page of settings: every setting with its meaning, range and default."""
+"""Reference page of settings: every setting with its meaning, range and default."""
 
 import dataclasses
 import inspect
@@ -32,7 +32,7 @@ ROOTS: dict[str, tuple[type, ...]] = {
     "Evaluate": (EvaluationOrder,),
     "Leaderboard": (LeaderboardOrder,),
 }
-"""The settings of each command; `reachable` finds the settings within them."""
+"""Settings classes by command; `reachable` finds the classes within them."""
 
 _HEAD = """# Settings
 
@@ -64,20 +64,20 @@ def settings_page() -> str:
 
 
 def reachable(*roots: type) -> list[type]:
-    """Return dataclasses and those that their fields hold, each once, outer ones first."""
-    found: dict[type, None] = {}
+    """Return dataclasses and those in their fields, each once, outer ones first."""
+    kinds: dict[type, None] = {}
     for root in roots:
-        found[root] = None
+        kinds[root] = None
         hints = typing.get_type_hints(root)
         for field in dataclasses.fields(root):
             for kind in _kinds(hints[field.name]):
                 if dataclasses.is_dataclass(kind):
-                    found |= dict.fromkeys(reachable(kind))
-    return list(found)
+                    kinds |= dict.fromkeys(reachable(kind))
+    return list(kinds)
 
 
 def _kinds(hint: Any) -> Iterator[type]:
-    """Yield the classes that a type is made of."""
+    """Yield the classes within a type."""
     if isinstance(hint, type) and not get_args(hint):
         yield hint
     for part in get_args(hint):
@@ -85,7 +85,7 @@ def _kinds(hint: Any) -> Iterator[type]:
 
 
 def _rows(kind: type) -> Iterator[tuple[str, ...]]:
-    if kind is Scene:  # arrays, which no person writes as settings
+    if kind is Scene:  # its fields are arrays, and no settings
         for declared in declared_ranges(Scene):
             part = "" if declared.part is None else f", {declared.part.name}"
             sentence = _first_sentence(field_sentences(Scene)[declared.name])
@@ -100,24 +100,24 @@ def _rows(kind: type) -> Iterator[tuple[str, ...]]:
             f"`{field.name}`",
             _first_sentence(field.sentence).replace("|", "\\|"),
             (field.expected + presets).replace("|", "\\|"),
-            _shown(field.default),
+            _default_text(field.default),
             *(["free" if field.is_execution else ""] if is_marked else []),
         )
 
 
-def _shown(default: Any) -> str:
+def _default_text(default: Any) -> str:
     if default is dataclasses.MISSING or dataclasses.is_dataclass(default):
         return ""
     if default is None or default in ((), {}):
         return "none"
     if isinstance(default, tuple):
-        return ", ".join(map(_shown, default))
+        return ", ".join(map(_default_text, default))
     if isinstance(default, bool):
         return str(default).lower()
     return shown_number(default) if isinstance(default, int | float) else f"`{default}`"
 
 
 def _first_sentence(doc: str) -> str:
-    """Return a text up to its first full stop before a space, in one line."""
-    found = re.match(r".*?(?<! al)\.(?=\s|$)", " ".join(doc.split()))
-    return found[0] if found else doc
+    """Return a text up to its first full stop before a space, as one line."""
+    match = re.match(r".*?(?<! al)\.(?=\s|$)", " ".join(doc.split()))
+    return match[0] if match else doc

@@ -1,4 +1,4 @@
-"""What the page of a dataset may ask: rows, small pictures, and any scene as a page of its own."""
+"""Request handlers of a dataset's page: rows, thumbnails, and any scene as a page below it."""
 
 import dataclasses
 import re
@@ -7,10 +7,10 @@ from pathlib import Path
 
 from infra.viewer.dataset_filter import SceneFilter, filter_of
 from infra.viewer.dataset_index import DatasetIndex, SceneRow
-from infra.viewer.open_rooms import OpenRooms
+from infra.viewer.open_rooms import OpenScenes
 from infra.viewer.painters import TargetPainter, painters_of
-from infra.viewer.scene_room import SceneRoom
-from infra.viewer.server import Answer, NotThere, Question, Route, json_answer
+from infra.viewer.scene_room import SceneHandlers
+from infra.viewer.server import NotFound, Request, Response, Route, json_response
 from pipeline.documents.png import encode_png
 from pipeline.documents.scene_page import preview
 from pipeline.making.progressive_tracer import ProgressiveTracer
@@ -22,55 +22,58 @@ from storage.records.exr import decode_exr
 from storage.remote.safe_url import safe_url
 
 MOST_ROWS = 200
-"""Scenes of one answer."""
+"""Maximum number of scenes in one response."""
 
 _MOST_THUMBNAILS = 1000
 _WIDEST = 1024
 _KEY = re.compile(r"[0-9A-Za-z_\-]+")
 
 
-class DatasetRoom:
-    """A dataset, and the scenes of it that are open."""
+class DatasetHandlers:
+    """Handlers of a dataset, and of its scenes that are open."""
 
     def __init__(
         self, dataset: Dataset, source: str, tracer: ProgressiveTracer, checkpoint: str | None
     ) -> None:
-        """Begin to read the index.
+        """Start to read the index.
 
         Args:
-            dataset: that was opened.
-            source: as the user named it.
-            tracer, checkpoint: for the pages of its scenes.
+            dataset: opened dataset.
+            source: folder or URL of the dataset, as the user named it.
+            tracer, checkpoint: path tracer and network for the pages of its scenes.
         """
-        self._dataset, self._source = dataset, source
-        self._tracer, self._checkpoint = tracer, checkpoint
+        self._dataset = dataset
+        self._source = source
+        self._tracer = tracer
+        self._checkpoint = checkpoint
         self._thumbnails = OrderedDict[tuple[str, int, int], bytes]()
-        self._open = OpenRooms(_KEY, self._opened)
+        self._scenes = OpenScenes(_KEY, self._open_scene)
         self.index = DatasetIndex(dataset)
         self.index.begin()
 
     def gets(self) -> dict[str, Route]:
-        """Return what is asked by GET."""
+        """Return the routes of GET requests."""
         return {
             "api/dataset": self._facts,
             "api/rows": self._rows,
             "api/thumbnail/": self._thumbnail,
-            "scene/": self._open.get,
+            "scene/": self._scenes.get,
         }
 
     def posts(self) -> dict[str, Route]:
-        """Return what is asked by POST."""
-        return {"scene/": self._open.post}
+        """Return the routes of POST requests."""
+        return {"scene/": self._scenes.post}
 
     def close(self) -> None:
-        """End what is being read or made."""
+        """Stop reading and rendering."""
         self.index.close()
-        self._open.close()
+        self._scenes.close()
         self._tracer.close()
 
-    def _facts(self, _: Question) -> Answer:
-        manifest, rows = self._dataset.manifest, self.index.rows
-        return json_answer(
+    def _facts(self, _: Request) -> Response:
+        manifest = self._dataset.manifest
+        rows = self.index.rows
+        return json_response(
             {
                 "name": safe_url(self._source),
                 "build": manifest.build,
@@ -84,16 +87,17 @@ class DatasetRoom:
             }
         )
 
-    def _rows(self, question: Question) -> Answer:
-        query, every = question.query, self.index.rows
+    def _rows(self, request: Request) -> Response:
+        query = request.query
+        every = self.index.rows
         chosen = filter_of(query)
-        shown = chosen.rows(every)
+        matching = chosen.rows(every)
         first = int(query["from"]) if query.get("from", "").isdecimal() else 0
-        page = shown[first : first + MOST_ROWS]
-        return json_answer(
+        page = matching[first : first + MOST_ROWS]
+        return json_response(
             {
                 "of": len(every),
-                "total": len(shown),
+                "total": len(matching),
                 "rows": [dataclasses.asdict(row) for row in page],
                 "command": self._command(chosen),
             }
@@ -105,20 +109,21 @@ class DatasetRoom:
         root = Path(self._source)
         return chosen.command(root, root.with_name(f"{root.resolve().name}-selected"))
 
-    def _thumbnail(self, question: Question) -> Answer:
-        key, _, view = question.path.removeprefix("api/thumbnail/").partition("/")
-        row, width = self.index.row(key), question.query.get("px", "160")
+    def _thumbnail(self, request: Request) -> Response:
+        key, _, view = request.path.removeprefix("api/thumbnail/").partition("/")
+        row = self.index.row(key)
+        width = request.query.get("px", "160")
         if not view.isdecimal() or int(view) >= row.views:
-            raise NotThere("the scene has no such view.")
+            raise NotFound("the scene has no such view.")
         if not width.isdecimal() or not 16 <= int(width) <= _WIDEST:
             raise TrilightError(f"px is {width:.10}; expected 16 to {_WIDEST}.")
-        wanted = (key, int(view), int(width))
-        png = self._thumbnails.get(wanted)
+        key_view_px = (key, int(view), int(width))
+        png = self._thumbnails.get(key_view_px)
         if png is None:
-            png = self._thumbnails[wanted] = self._small_picture(row, int(view), int(width))
+            png = self._thumbnails[key_view_px] = self._small_picture(row, int(view), int(width))
             while len(self._thumbnails) > _MOST_THUMBNAILS:
                 self._thumbnails.popitem(last=False)
-        return Answer(body=png, kind="image/png")
+        return Response(body=png, kind="image/png")
 
     def _small_picture(self, row: SceneRow, view: int, width: int) -> bytes:
         shard = self._dataset.manifest.shards[row.shard]
@@ -131,14 +136,14 @@ class DatasetRoom:
             radiance_rgb = decode_exr(read_member(stream, members[f"{view}.exr"]))
         return encode_png(preview(radiance_rgb * preview_gain(radiance_rgb), width))
 
-    def _opened(self, key: str) -> SceneRoom:
+    def _open_scene(self, key: str) -> SceneHandlers:
         row = self.index.row(key)
         shard = self._dataset.manifest.shards[row.shard]
         (sample,) = self._dataset.read_samples(shard, [key])
         floors = [view.noise_floor_db for view in sample.views]
         target = TargetPainter(sample.radiance_rgb, floors)
         is_here = isinstance(self._dataset.files, LocalFiles)
-        return SceneRoom(
+        return SceneHandlers(
             source=f"{Path(self._source) / shard.name}::{key}" if is_here else "",
             name=f"scene {key}, {row.split}",
             scene=sample.scene,

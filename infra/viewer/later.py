@@ -1,34 +1,34 @@
-"""A page that is there before what it shows: its questions wait until the source is open."""
+"""Page that is served before its source is open; its requests wait until then."""
 
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Protocol
 
 from infra.run_record import is_run, tensorboard_command
-from infra.viewer.server import Answer, Question, Route, routed
+from infra.viewer.server import Request, Response, Route, dispatch
 from infra.viewer.static_files import static_routes
 from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
 
 _KEY = "::"
-"""Between the file of many scenes and the key of one."""
+"""Separator between the file of many scenes and the key of one."""
 
 
-class PageRoom(Protocol):
-    """What a page asks about."""
+class PageHandlers(Protocol):
+    """Request handlers of a page."""
 
     def gets(self) -> dict[str, Route]:
-        """Return what is asked by GET."""
+        """Return the routes of GET requests."""
 
     def posts(self) -> dict[str, Route]:
-        """Return what is asked by POST."""
+        """Return the routes of POST requests."""
 
     def close(self) -> None:
-        """End what is being read or made."""
+        """Stop reading and rendering."""
 
 
 def page_of(source: str) -> str:
-    """Return the name of the page that shows a source; TrilightError where nothing is there."""
+    """Return the name of the page of a source; raises TrilightError without such a source."""
     if "://" in source:
         return "dataset.html"
     path = Path(source)
@@ -51,19 +51,19 @@ def page_of(source: str) -> str:
     return "scene.html"
 
 
-class LaterRoom:
-    """The routes of a room that is being opened."""
+class DeferredHandlers:
+    """Routes that wait for the handlers of a source that is being opened."""
 
     def __init__(self, page: str) -> None:
-        """Take the page that asks; `opened` gives the room once it is set."""
-        self.opened = Future[PageRoom]()
+        """Serve a page; its other requests wait for the result of `opened`."""
+        self.opened = Future[PageHandlers]()
         self.gets: dict[str, Route] = {
             **static_routes(page), "api/": self._get, "scene/": self._get,
         }  # fmt: skip
         self.posts: dict[str, Route] = {"api/": self._post, "scene/": self._post}
 
-    def _get(self, question: Question) -> Answer:
-        return routed(self.opened.result().gets(), question)
+    def _get(self, request: Request) -> Response:
+        return dispatch(self.opened.result().gets(), request)
 
-    def _post(self, question: Question) -> Answer:
-        return routed(self.opened.result().posts(), question)
+    def _post(self, request: Request) -> Response:
+        return dispatch(self.opened.result().posts(), request)

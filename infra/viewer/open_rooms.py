@@ -1,4 +1,4 @@
-"""Pages of single scenes below the page of many: the last few stay open."""
+"""Pages of single scenes below the page of many; the most recent ones stay open."""
 
 import dataclasses
 import re
@@ -6,48 +6,49 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 
-from infra.viewer.scene_room import SceneRoom
-from infra.viewer.server import Answer, NotThere, Question, routed
+from infra.viewer.scene_room import SceneHandlers
+from infra.viewer.server import NotFound, Request, Response, dispatch
 from infra.viewer.static_files import static_routes
 
 MOST_OPEN = 3
-"""Scenes whose pages are open."""
+"""Maximum number of scenes whose pages stay open."""
 
 _BELOW = re.compile(r"scene/([^/]+)/(.*)", re.DOTALL)
 
 
-class OpenRooms:
-    """Scenes by their keys, each at `scene/KEY/`."""
+class OpenScenes:
+    """Handlers of the most recent scenes by key, each at `scene/KEY/`."""
 
-    def __init__(self, key: re.Pattern[str], opened: Callable[[str], SceneRoom]) -> None:
-        """Take what a key looks like, and what opens one; it may raise TrilightError."""
-        self._key, self._opened = key, opened
+    def __init__(self, key: re.Pattern[str], open_scene: Callable[[str], SceneHandlers]) -> None:
+        """Store the pattern of keys, and the function that opens a scene by its key."""
+        self._key = key
+        self._open_scene = open_scene
         self._opening = threading.Lock()
-        self._open = OrderedDict[str, SceneRoom]()
+        self._open = OrderedDict[str, SceneHandlers]()
 
-    def get(self, question: Question) -> Answer:
-        """Answer a GET."""
-        room, below = self._room(question)
-        return routed({**static_routes("scene.html"), **room.gets()}, below)
+    def get(self, request: Request) -> Response:
+        """Respond to a GET request."""
+        room, below = self._scene_handlers(request)
+        return dispatch({**static_routes("scene.html"), **room.gets()}, below)
 
-    def post(self, question: Question) -> Answer:
-        """Answer a POST."""
-        room, below = self._room(question)
-        return routed(room.posts(), below)
+    def post(self, request: Request) -> Response:
+        """Respond to a POST request."""
+        room, below = self._scene_handlers(request)
+        return dispatch(room.posts(), below)
 
     def close(self) -> None:
-        """End what is being made, and wait for it."""
+        """Stop rendering, and wait for its end."""
         for room in self._open.values():
             room.close()
 
-    def _room(self, question: Question) -> tuple[SceneRoom, Question]:
-        found = _BELOW.fullmatch(question.path)
-        if found is None or not self._key.fullmatch(found[1]):
-            raise NotThere("there is no such scene.")
-        key = found[1]
+    def _scene_handlers(self, request: Request) -> tuple[SceneHandlers, Request]:
+        match = _BELOW.fullmatch(request.path)
+        if match is None or not self._key.fullmatch(match[1]):
+            raise NotFound("there is no such scene.")
+        key = match[1]
         with self._opening:
-            room = self._open.pop(key, None) or self._opened(key)
+            room = self._open.pop(key, None) or self._open_scene(key)
             self._open[key] = room
             while len(self._open) > MOST_OPEN:
-                self._open.popitem(last=False)[1].easel.close()
-        return room, dataclasses.replace(question, path=found[2])
+                self._open.popitem(last=False)[1].queue.close()
+        return room, dataclasses.replace(request, path=match[2])

@@ -1,4 +1,4 @@
-"""`Wanted`: the picture that a page asks for, checked."""
+"""Options of a picture that a page requests, parsed and checked."""
 
 import math
 from collections.abc import Mapping
@@ -13,74 +13,75 @@ from storage.errors import TrilightError, expected_one_of
 from storage.records.scene import MAX_POSITION_M
 
 MOST_PX = 1024
-"""Widest picture that a page may ask for."""
+"""Maximum width in pixels of a requested picture."""
 
 _POSE_LENGTH = 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Wanted:
-    """One picture."""
+class PictureOptions:
+    """Options of one picture."""
 
     engine: str
-    """Name of the way to it."""
+    """Name of the renderer."""
     camera: ShotCamera
     view: int | None
-    """Row of the scene's own camera that `camera` is, if it is one."""
+    """Row of `camera` in the scene; None for another camera."""
     resolution: int
-    """Width in pixels."""
+    """Width of the picture in pixels, a multiple of 8."""
     edits: Mapping[str, Any]
-    """As infra.viewer.edits reads them."""
+    """Edits of the scene in the form of infra.viewer.edits."""
     error_db: float
-    """Error at which a path tracer ends."""
+    """Stated error as psnr_log_db at which a path tracer stops."""
 
     @property
     def scene_key(self) -> str:
-        """Equal for equal changes of the scene."""
+        """Digest of the edits."""
         return _digest(self.edits)
 
     @property
-    def place_key(self) -> str:
-        """Equal where pictures of different engines can be compared: scene, camera and width."""
+    def camera_key(self) -> str:
+        """Digest of edits, camera and width, by which pictures of engines are compared."""
         pose = [round(float(value), 6) for value in self.camera.c2w.reshape(-1)]
         return _digest([self.edits, pose, round(self.camera.fov_deg, 4), self.resolution])
 
 
-def wanted_of(body: Any, engines: Mapping[str, Any], views: int) -> Wanted:
-    """Return what the body of a request asks for.
+def parse_picture_options(body: Any, engines: Mapping[str, Any], views: int) -> PictureOptions:
+    """Return the options in the body of a request.
 
     Args:
-        body: JSON of the request.
-        engines: known ones, by name.
-        views: cameras of the scene.
+        body: JSON value of the request.
+        engines: renderers of the page by name.
+        views: number of cameras of the scene.
 
     Raises:
-        TrilightError: it asks for nothing that there is.
+        TrilightError: an option is missing or invalid.
     """
     if not isinstance(body, Mapping):
         raise TrilightError("the request is no JSON object.")
     engine = str(body.get("engine"))
     if engine not in engines:
         raise TrilightError(f"engine {engine:.40}: {expected_one_of(engine, list(engines))}.")
-    width, view = body.get("resolution"), body.get("view")
+    width = body.get("resolution")
+    view = body.get("view")
     if not (isinstance(width, int) and 16 <= width <= MOST_PX and width % 8 == 0):
         raise TrilightError(
             f"resolution is {width!r:.20}; expected a multiple of 8 from 16 to {MOST_PX}."
         )
     if view is not None and not (isinstance(view, int) and 0 <= view < views):
         raise TrilightError(f"view is {view!r:.20}; expected 0 to {views - 1}, or none.")
-    return Wanted(
+    return PictureOptions(
         engine=engine,
         camera=_camera(body),
         view=view,
         resolution=int(width),
-        edits=edits_of(body),
+        edits=parse_edits(body),
         error_db=_number(body.get("error_db", 45), "error_db", 10, 60),
     )
 
 
-def edits_of(body: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the changes of the scene that a request states; raises TrilightError for no object."""
+def parse_edits(body: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the edits in the body of a request; raises TrilightError if they are no object."""
     edits = body.get("edits")
     if edits is not None and not isinstance(edits, Mapping):
         raise TrilightError(f"edits: {edits!r:.20} is no JSON object; expected one, or null.")
@@ -97,7 +98,7 @@ def _camera(body: Mapping[str, Any]) -> ShotCamera:
     rotation = c2w[:3, :3]
     if abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
         raise TrilightError("c2w: expected the pose of a camera, a rotation without mirroring.")
-    # a browser rounds; scenes want an orthonormal rotation
+    # a browser rounds, and scenes need an orthonormal rotation: the nearest one, by the SVD
     u, _, vt = np.linalg.svd(rotation)
     c2w[:3, :3] = u @ vt
     c2w[3] = (0, 0, 0, 1)

@@ -1,7 +1,7 @@
-"""Raw references kept in the user's cache: they cost a hundred times what they judge.
+"""Cache of raw references, which cost a hundred times the pictures that they judge.
 
-Kept are float32 numbers, and what was just rendered is rounded to them too, so that a figure does
-not depend on whether its reference was there already.
+The cache holds float32 numbers, and a new reference is rounded to them, too, so that a figure does
+not depend on whether its reference was cached.
 """
 
 import numpy as np
@@ -18,13 +18,13 @@ from storage.records.scene_file import scene_digest
 
 
 def kept_reference(child: IsolatedChild, scene: Scene, camera: Camera, spp: int) -> RawReference:
-    """Return two halves of raw samples of a view, rendered by a child unless they are kept.
+    """Return two halves of raw samples of a view, from the cache or rendered by a child.
 
     Args:
-        child: a render child.
-        scene: that passes `Scene.check`.
-        camera: the view.
-        spp: samples per pixel, both halves together, a multiple of 128.
+        child: render child.
+        scene: scene that passes `Scene.check`.
+        camera: camera of the view.
+        spp: samples per pixel of both halves together, a multiple of 128.
     """
     view = [camera.c2w.tolist(), camera.fov_deg, camera.resolution, spp]
     name = sha256_hex(canonical_json([scene_digest(scene), *view]))
@@ -34,5 +34,5 @@ def kept_reference(child: IsolatedChild, scene: Scene, camera: Camera, spp: int)
         halves = {"a": made.a_rgb.astype(np.float32), "b": made.b_rgb.astype(np.float32)}
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, save(halves))
-    kept = load(path.read_bytes())
-    return RawReference(a_rgb=kept["a"].astype(np.float64), b_rgb=kept["b"].astype(np.float64))
+    stored = load(path.read_bytes())
+    return RawReference(a_rgb=stored["a"].astype(np.float64), b_rgb=stored["b"].astype(np.float64))

@@ -1,4 +1,4 @@
-"""Short trainings of any settings, judged scene by scene on what no network has seen."""
+"""Short trainings of any settings, evaluated scene by scene on held-out scenes."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ from train.settings import TrainSettings
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainingScenes:
-    """The scenes of all trainings of an experiment: those they see, and those they do not."""
+    """Training scenes and held-out scenes of all trainings of an experiment."""
 
     train: ShardSet
     judge: Judge
@@ -38,7 +38,7 @@ class TrainingScenes:
 
 
 def scenes_of(data: str, held_out: int, resolution: int) -> TrainingScenes:
-    """Return the scenes of a dataset, judged on the first ones of its validation split.
+    """Return the scenes of a dataset, with the first ones of its validation split held out.
 
     Raises:
         TrilightError: the validation split is empty.
@@ -68,7 +68,8 @@ def training_figures(
     began = time.perf_counter()
     model = _trained_network(scenes.train, settings, device)
     seconds = time.perf_counter() - began
-    views, found = iter(scenes.judge.judge(model).views), []
+    views = iter(scenes.judge.judge(model).views)
+    scores_by_view = []
     for judged in scenes.judge.scenes:
         mine = [next(views) for _ in judged.target_VRR3]
         l1 = float(np.mean([view.log_l1 for view in mine]))
@@ -76,8 +77,8 @@ def training_figures(
         if np.isfinite(l1) and l1 > 0:
             db = float(np.mean([view.psnr_log_db for view in mine]))
             figures |= {"log_l1": l1, "percent": 100 * float(np.log(l1)), "db": db}
-        found.append(figures)
-    return found
+        scores_by_view.append(figures)
+    return scores_by_view
 
 
 def _trained_network(
@@ -88,7 +89,8 @@ def _trained_network(
     stepper = Stepper(state, settings, Objective(settings.loss, None), crew)
 
     def flops(triangles: int) -> int:
-        views, resolution = settings.views_per_scene, settings.resolution
+        views = settings.views_per_scene
+        resolution = settings.resolution
         workload = Workload(triangles=triangles, views=views, resolution=resolution)
         return training_flops(settings.model, workload)
 

@@ -19,7 +19,7 @@ from infra.cli.changes import Shared, all_changes
 from infra.cli.console import progress_bars
 from infra.cli.dataset_changes import with_shared
 from infra.cli.settings_file import read_settings_file
-from infra.cli.train import _BarProgress, _judged, _QuietProgress
+from infra.cli.train import _BarProgress, _QuietProgress, _validation_rows
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.making.dataset_order import DatasetOrder
 from storage.dataset.manifest import read_manifest
@@ -390,4 +390,4 @@ def test_a_median_picture_without_error_divides_nothing() -> None:
         result: Any = SimpleNamespace(
             scores=scores, median_scores=median, lead=lead, beats_median=False
         )
-        assert says in _judged(result)[0][1]
+        assert says in _validation_rows(result)[0][1]

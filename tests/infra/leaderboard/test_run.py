@@ -70,7 +70,7 @@ def order(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Leader
 def short(order: LeaderboardOrder, monkeypatch: pytest.MonkeyPatch) -> LeaderboardOrder:
     """Return an order of one network beside the nearest picture, without a chart."""
     monkeypatch.setattr(run_module, "BUILTIN_NETWORKS", ("builtin:tokens",))
-    monkeypatch.setattr(run_module, "_never_lacking", lambda stack: [])
+    monkeypatch.setattr(run_module, "_builtin_entries", lambda stack: [])
     monkeypatch.setattr(run_module, "plot_leaderboard", lambda *words: None)
     return order
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from infra.rendering import plan
-from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, paired
+from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, pair_cameras
 from infra.rendering.engines import MitsubaPlan, NeuralPlan
 from infra.rendering.plan import plan_render
 from infra.rendering.request import Asked
@@ -75,13 +75,13 @@ def test_a_camera_that_looks_away_turns_about_itself() -> None:
 
 def test_scenes_and_cameras_go_together() -> None:
     first, second = sources(2)
-    assert paired(sources(2), [7]) == [(first, 7), (second, 7)]
+    assert pair_cameras(sources(2), [7]) == [(first, 7), (second, 7)]
     one, three = sources(1), cameras(3)
-    assert paired(one, three) == [(first, camera) for camera in three]
-    assert paired(sources(3), three) == list(zip(sources(3), three, strict=True))
-    assert [camera for _, camera in paired(sources(3), three[:1])] == [three[0]] * 3
+    assert pair_cameras(one, three) == [(first, camera) for camera in three]
+    assert pair_cameras(sources(3), three) == list(zip(sources(3), three, strict=True))
+    assert [camera for _, camera in pair_cameras(sources(3), three[:1])] == [three[0]] * 3
     with pytest.raises(TrilightError, match="2 scenes and 3 cameras; expected one of either"):
-        paired(sources(2), three)
+        pair_cameras(sources(2), three)
 
 
 def test_a_path_is_a_list_of_cameras_or_any_scene(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_both_engines_share_the_width_and_have_files_of_their_own(
     assert isinstance(mitsuba, MitsubaPlan) and isinstance(neural, NeuralPlan)
     assert mitsuba.settings.resolution == neural.resolution == plan.resolution == 16
     assert neural.checkpoint == network
-    assert plan.place.video == tmp_path / "turn.webp"
+    assert plan.output.video == tmp_path / "turn.webp"
     assert len(plan.shots) == 3
     assert all(isinstance(shot.camera, ShotCamera) for shot in plan.shots)
     last, folder = plan.shots[2], tmp_path / "turn"
@@ -186,7 +186,7 @@ def test_only_the_plan_reads_what_was_asked() -> None:
     readers = {
         path.name
         for path in (ROOT / "infra/rendering").glob("*.py")
-        if re.search(r"\basked\.\w", path.read_text().replace("rendering.asked", ""))
+        if re.search(r"\boptions\.\w", path.read_text().replace("rendering.options", ""))
     }
     assert readers == {"plan.py", "run.py"}, "run.py opens the reader of scenes"
-    assert "asked" not in (ROOT / "infra/cli/rendered.py").read_text()
+    assert "options." not in (ROOT / "infra/cli/rendered.py").read_text()

@@ -141,14 +141,14 @@ def test_wrong_variables_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_workers_share_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRILIGHT_CORES", "9")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1,2")
-    assert local._share(0, 1) == {}
-    two = [local._share(number, 2) for number in range(2)]
+    assert local._worker_environment(0, 1) == {}
+    two = [local._worker_environment(number, 2) for number in range(2)]
     assert [share["CUDA_VISIBLE_DEVICES"] for share in two] == ["0,2", "1"]
     assert [share["TRILIGHT_CORES"] for share in two] == ["4", "4"]
-    four = [local._share(number, 4)["CUDA_VISIBLE_DEVICES"] for number in range(4)]
+    four = [local._worker_environment(number, 4)["CUDA_VISIBLE_DEVICES"] for number in range(4)]
     assert four == ["0", "1", "2", "0"]
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert local._share(11, 12) == {"TRILIGHT_CORES": "1"}
+    assert local._worker_environment(11, 12) == {"TRILIGHT_CORES": "1"}
 
 
 def test_cards_are_those_of_this_machine_or_of_all_workers(

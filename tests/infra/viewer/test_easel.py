@@ -12,19 +12,19 @@ import pytest
 from PIL import Image
 
 from infra.viewer import scene_bytes as module
-from infra.viewer.easel import Easel, Job, agreement_db
-from infra.viewer.edits import edited
+from infra.viewer.easel import RenderJob, RenderQueue, agreement_db
+from infra.viewer.edits import apply_edits
 from infra.viewer.painters import (
     NetworkPainter,
-    Painted,
     Painter,
+    RenderedImage,
     SamplesPainter,
     Show,
     TargetPainter,
 )
 from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
-from infra.viewer.scene_room import SceneRoom
-from infra.viewer.wanted import Wanted, wanted_of
+from infra.viewer.scene_room import SceneHandlers
+from infra.viewer.wanted import PictureOptions, parse_picture_options
 from pipeline.renders.results import Sampling
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -49,14 +49,14 @@ class GreyPainter:
         if not waits:
             self.ended.set()
 
-    def paint(self, scene: Scene, wanted: Wanted, show: Show) -> None:
+    def paint(self, scene: Scene, wanted: PictureOptions, show: Show) -> None:
         self.painted += 1
         if self.grey < 0:
             raise ZeroDivisionError("of a library")
         picture = np.full((wanted.resolution, wanted.resolution, 3), self.grey, np.float32)
         while not self.ended.wait(0.01):
             show(Sampling(spp=1, expected_spp=9, missing_db=None))
-        show(Painted(radiance_rgb=picture, core_s=0.25, floor_db=self.floor_db, spp=64))
+        show(RenderedImage(radiance_rgb=picture, core_s=0.25, floor_db=self.floor_db, spp=64))
 
 
 def request(engine: str = "traced", **changes: Any) -> dict[str, Any]:
@@ -64,60 +64,62 @@ def request(engine: str = "traced", **changes: Any) -> dict[str, Any]:
     return {"engine": engine, "c2w": pose, "fov": 45.0, "view": 0, "resolution": 16, **changes}
 
 
-def wanted(engine: str = "traced", **changes: Any) -> Wanted:
-    return wanted_of(request(engine, **changes), {engine: None}, 2)
+def wanted(engine: str = "traced", **changes: Any) -> PictureOptions:
+    return parse_picture_options(request(engine, **changes), {engine: None}, 2)
 
 
-def room_of(painters: dict[str, Painter], target_px: int | None = None) -> SceneRoom:
+def room_of(painters: dict[str, Painter], target_px: int | None = None) -> SceneHandlers:
     scene, notes = tiny_scene(), ("a note",)
-    return SceneRoom(name="tiny", scene=scene, notes=notes, painters=painters, target_px=target_px)
+    return SceneHandlers(
+        name="tiny", scene=scene, notes=notes, painters=painters, target_px=target_px
+    )
 
 
-def until_begun(easel: Easel, job: Job) -> Job:
+def until_begun(easel: RenderQueue, job: RenderJob) -> RenderJob:
     while job.state != "working":
-        easel.news(job.id, job.version)
+        easel.wait_for_update(job.id, job.version)
     return job
 
 
-def over(easel: Easel, job: Job) -> Job:
+def over(easel: RenderQueue, job: RenderJob) -> RenderJob:
     while job.state in ("waiting", "working"):
-        easel.news(job.id, job.version)
+        easel.wait_for_update(job.id, job.version)
     return job
 
 
 def test_a_finished_picture_is_kept_and_an_equal_question_costs_nothing() -> None:
     painter = GreyPainter(0.5)
-    easel = Easel(tiny_scene(), {"traced": painter})
-    first = over(easel, easel.ask(wanted()))
-    assert first.state == "done" and first.painted is not None
-    assert easel.ask(wanted()) is first
-    assert over(easel, easel.ask(wanted(fov=50.0))) is not first
+    easel = RenderQueue(tiny_scene(), {"traced": painter})
+    first = over(easel, easel.submit(wanted()))
+    assert first.state == "done" and first.image is not None
+    assert easel.submit(wanted()) is first
+    assert over(easel, easel.submit(wanted(fov=50.0))) is not first
     assert painter.painted == 2
     easel.close()
 
 
 def test_who_asks_for_another_gives_up_the_one_at_hand() -> None:
     slow, quick = GreyPainter(0.1, waits=True), GreyPainter(0.5)
-    easel = Easel(tiny_scene(), {"traced": slow, "hits": quick})
-    given_up = until_begun(easel, easel.ask(wanted()))
-    never_begun = easel.ask(wanted(fov=50.0))
-    last = over(easel, easel.ask(wanted("hits")))
+    easel = RenderQueue(tiny_scene(), {"traced": slow, "hits": quick})
+    given_up = until_begun(easel, easel.submit(wanted()))
+    never_begun = easel.submit(wanted(fov=50.0))
+    last = over(easel, easel.submit(wanted("hits")))
     assert (given_up.state, never_begun.state, last.state) == ("cancelled", "cancelled", "done")
     assert slow.painted == 1
-    again = easel.ask(wanted())
+    again = easel.submit(wanted())
     assert again is not given_up
-    easel.rest()
+    easel.cancel_all()
     assert over(easel, again).state == "cancelled"
     easel.close()
 
 
 def test_a_failure_is_a_sentence_and_the_next_picture_comes() -> None:
-    easel = Easel(tiny_scene(), {"bad": GreyPainter(-1), "good": GreyPainter(0.5)})
-    assert over(easel, easel.ask(wanted("bad"))).error == "ZeroDivisionError: of a library"
+    easel = RenderQueue(tiny_scene(), {"bad": GreyPainter(-1), "good": GreyPainter(0.5)})
+    assert over(easel, easel.submit(wanted("bad"))).error == "ZeroDivisionError: of a library"
     broken = {"materials": {"0": {"diffuse": [0.9, 0.9, 0.9]}}}
-    failed = over(easel, easel.ask(wanted("good", edits=broken)))
+    failed = over(easel, easel.submit(wanted("good", edits=broken)))
     assert failed.state == "failed" and "diffuse + specular" in failed.error
-    assert over(easel, easel.ask(wanted("good"))).state == "done"
+    assert over(easel, easel.submit(wanted("good"))).state == "done"
     with pytest.raises(TrilightError, match="not kept"):
         easel.job("999")
     easel.close()
@@ -125,9 +127,9 @@ def test_a_failure_is_a_sentence_and_the_next_picture_comes() -> None:
 
 def test_the_end_waits_for_the_picture_at_hand() -> None:
     room = room_of({"traced": GreyPainter(0.1, waits=True)})
-    until_begun(room.easel, room.easel.ask(wanted()))
+    until_begun(room.queue, room.queue.submit(wanted()))
     room.close()
-    assert room.easel._thread is not None and not room.easel._thread.is_alive()
+    assert room.queue._thread is not None and not room.queue._thread.is_alive()
 
 
 def test_pictures_of_one_place_are_judged_by_the_target_and_else_by_the_traced_one() -> None:
@@ -136,19 +138,19 @@ def test_pictures_of_one_place_are_judged_by_the_target_and_else_by_the_traced_o
         "hits": GreyPainter(0.3),
         "target": TargetPainter(TARGETS, [33.0, 34.0]),
     }
-    easel = Easel(tiny_scene(), painters)
-    hits = over(easel, easel.ask(wanted("hits")))
-    assert easel.truth(hits) is None and agreement_db(hits, None) is None
-    traced = over(easel, easel.ask(wanted("traced")))
-    assert easel.truth(hits) is traced
+    easel = RenderQueue(tiny_scene(), painters)
+    hits = over(easel, easel.submit(wanted("hits")))
+    assert easel.reference(hits) is None and agreement_db(hits, None) is None
+    traced = over(easel, easel.submit(wanted("traced")))
+    assert easel.reference(hits) is traced
     expected = -20 * np.log10(np.log10(1.4) - np.log10(1.3))
     assert agreement_db(hits, traced) == pytest.approx(expected, abs=1e-3)
-    target = over(easel, easel.ask(wanted("target")))
-    assert easel.truth(hits) is target and easel.truth(traced) is target
-    assert target.painted is not None and target.painted.floor_db == 33.0
-    elsewhere = over(easel, easel.ask(wanted("hits", fov=50.0)))
-    assert easel.truth(elsewhere) is None
-    free = over(easel, easel.ask(wanted("target", view=None, fov=50.0)))
+    target = over(easel, easel.submit(wanted("target")))
+    assert easel.reference(hits) is target and easel.reference(traced) is target
+    assert target.image is not None and target.image.floor_db == 33.0
+    elsewhere = over(easel, easel.submit(wanted("hits", fov=50.0)))
+    assert easel.reference(elsewhere) is None
+    free = over(easel, easel.submit(wanted("target", view=None, fov=50.0)))
     assert free.state == "failed" and "own cameras" in free.error
     easel.close()
 
@@ -166,8 +168,8 @@ def test_a_wish_that_means_nothing_is_refused() -> None:
     for changes in MEANINGLESS:
         with case(changes):
             with pytest.raises(TrilightError):
-                wanted_of({**request(), **changes}, {"traced": None}, 2)
-            assert wanted_of(request(), {"traced": None}, 2).resolution == 16
+                parse_picture_options({**request(), **changes}, {"traced": None}, 2)
+            assert parse_picture_options(request(), {"traced": None}, 2).resolution == 16
 
 
 def test_the_page_of_a_scene_is_told_all_of_it() -> None:
@@ -207,8 +209,8 @@ def test_a_scene_is_saved_with_its_changes_and_nothing_is_written_here() -> None
 
 def test_a_lamp_moves_and_shines_brighter_and_all_else_stays() -> None:
     scene = tiny_scene()
-    assert edited(scene, {}) is edited(scene, {"lamps": {}, "materials": {}}) is scene
-    found = edited(scene, {"lamps": {str(LIGHT): {"move": [0.5, 0, -1], "gain": 2}}})
+    assert apply_edits(scene, {}) is apply_edits(scene, {"lamps": {}, "materials": {}}) is scene
+    found = apply_edits(scene, {"lamps": {str(LIGHT): {"move": [0.5, 0, -1], "gain": 2}}})
     lamp = scene.faces[2]
     assert found.vertex_positions[lamp] == pytest.approx(
         scene.vertex_positions[lamp] + np.array([0.5, 0, -1])
@@ -220,10 +222,10 @@ def test_a_lamp_moves_and_shines_brighter_and_all_else_stays() -> None:
 
 def test_a_material_takes_the_place_of_its_texture() -> None:
     scene = textured_scene()
-    found = edited(scene, {"materials": {"0": {"diffuse": [0.1, 0.2, 0.3]}}})
+    found = apply_edits(scene, {"materials": {"0": {"diffuse": [0.1, 0.2, 0.3]}}})
     assert found.materials[FLOOR, DIFFUSE] == pytest.approx([0.1, 0.2, 0.3])
     assert len(found.textures) == len(scene.textures) - 1
-    bare = edited(scene, {"materials": {"0": {"diffuse": [0.1, 0.2, 0.3], "roughness": 0.7}}})
+    bare = apply_edits(scene, {"materials": {"0": {"diffuse": [0.1, 0.2, 0.3], "roughness": 0.7}}})
     assert bare.uv is None and not bare.textures
     assert bare.materials[FLOOR, ROUGHNESS] == pytest.approx(0.7)
     assert len(scene.textures) == 2, "the scene that was read stays as it is"
@@ -246,7 +248,7 @@ def test_what_means_nothing_is_refused() -> None:
     for edits, says in WRONG_EDITS:
         with case(edits):
             with pytest.raises(TrilightError, match=says):
-                edited(tiny_scene(), edits)
+                apply_edits(tiny_scene(), edits)
 
 
 def parts(scene: Scene) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]:
@@ -337,8 +339,8 @@ def test_the_page_shows_the_command_of_each_way() -> None:
     room = dataclasses.replace(room_of(ways), source="a set/x.tar::000000001")
 
     def command(engine: str, **changes: Any) -> str:
-        job = Job(id="1", wanted=wanted(engine, **changes))
-        told = room._repeated(job)
+        job = RenderJob(id="1", options=wanted(engine, **changes))
+        told = room._reproduction(job)
         assert json.loads(told["camera"])["cameras"][0]["fov"] == 45
         return str(told["command"]).removeprefix("trilight render ")
 

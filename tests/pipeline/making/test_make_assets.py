@@ -242,7 +242,9 @@ def test_a_mistake_is_one_line(tmp_path: Path, option: tuple[str, str]) -> None:
 
 def test_epsilons_are_shares_or_percent() -> None:
     def settings(epsilon: str) -> AssetSettings:
-        return assets._settings(assets.Meshes(source="builtin:", out=Path("a"), epsilon=epsilon))
+        return assets._settings(
+            assets.AssetOptions(source="builtin:", out=Path("a"), epsilon=epsilon)
+        )
 
     for text in ("half", "9", "-1%", "nan", "inf", "0", "%", "1%%", "5 %."):
         with case(text), pytest.raises(TrilightError, match="epsilon is"):
