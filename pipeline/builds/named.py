@@ -39,15 +39,15 @@ def typed_build(typed: str) -> str:
     return BUILDS.typed(typed, _as_build)
 
 
-def _as_build(found: Any) -> NamedBuild:
-    if isinstance(found, BuildSettings):
-        splits = found.splits
+def _as_build(returned: Any) -> NamedBuild:
+    if isinstance(returned, BuildSettings):
+        splits = returned.splits
         num_scenes = splits.shards_per_cycle * splits.scenes_per_shard
-        return NamedBuild(settings=lambda: found, num_scenes=num_scenes)
-    if isinstance(found, NamedBuild):
-        return found
+        return NamedBuild(settings=lambda: returned, num_scenes=num_scenes)
+    if isinstance(returned, NamedBuild):
+        return returned
     raise TrilightError(
-        f"it returned a {type(found).__name__}; expected BuildSettings or a NamedBuild."
+        f"it returned a {type(returned).__name__}; expected BuildSettings or a NamedBuild."
     )
 
 
@@ -83,10 +83,10 @@ def named_build(
             f"build='my-{build.build}')."
         )
     named = {"seed": seed, "renders.resolution": resolution}
-    wanted: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
+    overrides: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
     floors = asked_floors(noise_floor_db, noise_floor_linear_db, noise_floor_objects_db)
-    wanted |= {f"renders.{name}": db for name, db in floors.items()}
-    build = changed(build, wanted)
+    overrides |= {f"renders.{name}": db for name, db in floors.items()}
+    build = changed(build, overrides)
     licences = tuple(sorted({*build.allowed_licences, *allow_licences}))
     return changed(dataclasses.replace(build, allowed_licences=licences), changes or {})
 

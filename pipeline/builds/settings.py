@@ -61,11 +61,15 @@ class BuildSettings:
     @property
     def mesh_settings(self) -> AssetSettings:
         """Settings of the mesh stage: objects keep their materials where scenes ask for those."""
-        own = self.assets.own_materials
-        asked = self.scenes.materials.source == "object"
-        emission = own.emission or (asked and self.scenes.materials.own_emission > 0)
-        own = dataclasses.replace(own, keep=own.keep or asked, emission=emission)
-        return dataclasses.replace(self.assets, own_materials=own)
+        source_materials = self.assets.own_materials
+        keeps_materials = self.scenes.materials.source == "object"
+        emission = source_materials.emission or (
+            keeps_materials and self.scenes.materials.own_emission > 0
+        )
+        source_materials = dataclasses.replace(
+            source_materials, keep=source_materials.keep or keeps_materials, emission=emission
+        )
+        return dataclasses.replace(self.assets, own_materials=source_materials)
 
     def as_json(self) -> dict[str, Any]:
         """Return the settings as JSON values."""
@@ -95,7 +99,8 @@ def differences(
 ) -> Iterator[tuple[str, Any, Any]]:
     """Yield (dotted name, value before, value now) for each setting that differs."""
     for name in sorted({*before, *now}):
-        old, new = before.get(name), now.get(name)
+        old = before.get(name)
+        new = now.get(name)
         if isinstance(old, Mapping) and isinstance(new, Mapping):
             yield from differences(old, new, f"{prefix}{name}.")
         elif old != new:

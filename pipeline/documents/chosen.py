@@ -42,10 +42,10 @@ def choose_scenes(
     ends = [np.cumsum([shard.num_samples for shard in each], dtype=int) for each in shards]
     counts = [int(each[-1]) if len(each) else 0 for each in ends]
     chosen = []
-    for each, end, count, places in zip(
-        shards, ends, counts, _places(counts, max_scenes), strict=True
+    for each, end, count, num_chosen in zip(
+        shards, ends, counts, _scenes_per_split(counts, max_scenes), strict=True
     ):
-        rows = np.linspace(0, count - 1, places).round().astype(int)
+        rows = np.linspace(0, count - 1, num_chosen).round().astype(int)
         holding = np.searchsorted(end, rows, side="right")
         for number in dict.fromkeys(holding.tolist()):
             shard = each[number]
@@ -67,18 +67,18 @@ def read_chosen(dataset: Dataset, chosen: Sequence[Chosen]) -> Iterator[tuple[Ch
             yield entry, sample
 
 
-def _places(counts: Sequence[int], max_scenes: int) -> list[int]:
+def _scenes_per_split(counts: Sequence[int], max_scenes: int) -> list[int]:
     """Return how many scenes of each split to show, together at most `max_scenes`."""
     total = sum(counts)
     if total <= max_scenes:
         return list(counts)
     one_each = max_scenes >= sum(count > 0 for count in counts)
-    wanted = max(max_scenes // _LEAST_SHARE, int(one_each))
-    least = [min(count, wanted) for count in counts]
-    left = max_scenes - sum(least)
+    minimum = max(max_scenes // _LEAST_SHARE, int(one_each))
+    least = [min(count, minimum) for count in counts]
+    remaining = max_scenes - sum(least)
     spare = [count - low for count, low in zip(counts, least, strict=True)]
-    share = [left * entry // sum(spare) for entry in spare]
-    while sum(share) < left:
-        unmet = [entry - given for entry, given in zip(spare, share, strict=True)]
+    share = [remaining * entry // sum(spare) for entry in spare]
+    while sum(share) < remaining:
+        unmet = [entry - granted for entry, granted in zip(spare, share, strict=True)]
         share[int(np.argmax(unmet))] += 1
     return [low + more for low, more in zip(least, share, strict=True)]

@@ -31,15 +31,17 @@ def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Stati
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
     """
-    out, manifest = out or dataset.folder, dataset.manifest
-    statistics, found = dataset_statistics(dataset), dataset_distributions(dataset)
-    rights = rights_of(found.locked)
-    write_atomically(out.attribution, attribution_of(found.locked, manifest.settings))
+    out = out or dataset.folder
+    manifest = dataset.manifest
+    statistics = dataset_statistics(dataset)
+    distributions = dataset_distributions(dataset)
+    rights = rights_of(distributions.locked)
+    write_atomically(out.attribution, attribution_of(distributions.locked, manifest.settings))
     write_atomically(out.licences, encode_licences(rights))
     write_contact_sheet(dataset, statistics, out=out)
-    write_report(dataset, found, out=out)
+    write_report(dataset, distributions, out=out)
     write_atomically(out.croissant, encode_croissant(manifest, rights))
-    card = encode_card(out, manifest, found, rights)
+    card = encode_card(out, manifest, distributions, rights)
     if out.manifest.exists():
         _write_digests(out, card)
     write_atomically(out.card, card)  # last: with it, the dataset is finished

@@ -45,7 +45,7 @@ class Distributions:
     """Suffixes under which samples have their arrays (storage.records.profiles)."""
     objects: Sequence[LockedObject]
     """The objects that scenes may draw from."""
-    own_maps: Sequence[LockedObject]
+    user_maps: Sequence[LockedObject]
     """The textures and maps of a user's own that they may draw from."""
     failures: Sequence[Failure]
     """What was rejected."""
@@ -58,14 +58,14 @@ class Distributions:
         chunks = [by_name[name] for by_name in self.values.values()]
         return np.concatenate(chunks) if chunks else np.zeros(0, np.float32)
 
-    def reached(self, split: str) -> NDArray[np.bool_] | None:
+    def reaches_targets(self, split: str) -> NDArray[np.bool_] | None:
         """Return whether each view of a split reaches all targets; None where there is none."""
-        met = [
+        checks = [
             self.values[split][measured] >= target
             for name, measured in MEASURED.items()
             if (target := self.targets[name]) is not None
         ]
-        return np.logical_and.reduce(met) if met else None
+        return np.logical_and.reduce(checks) if checks else None
 
     @property
     def splits(self) -> list[str]:
@@ -87,7 +87,7 @@ class Distributions:
     @property
     def locked(self) -> list[LockedObject]:
         """All rows of the lock, whose rights documents list."""
-        return [*self.objects, *self.own_maps]
+        return [*self.objects, *self.user_maps]
 
     @property
     def licences(self) -> Mapping[str, tuple[int, int, int]]:
@@ -95,8 +95,8 @@ class Distributions:
         rows: dict[str, tuple[int, int, int]] = {}
         for entry in self.locked:
             count, used, places = rows.get(entry.licence, (0, 0, 0))
-            here = self.placements.get(entry.uid, 0) + self.map_uses.get(entry.uid, 0)
-            rows[entry.licence] = (count + 1, used + (here > 0), places + here)
+            uses = self.placements.get(entry.uid, 0) + self.map_uses.get(entry.uid, 0)
+            rows[entry.licence] = (count + 1, used + (uses > 0), places + uses)
         return dict(sorted(rows.items()))
 
     @property
@@ -208,11 +208,11 @@ def dataset_distributions(
                     "`trilight verify`."
                 ) from error
         if rows:
-            tally.values.setdefault(shard.split, []).append(_concatenated(rows))
+            tally.values.setdefault(shard.split, []).append(_concatenate(rows))
         shard_done(shard.name)
     locked = dataset.objects_lock()
     return Distributions(
-        values={split: _concatenated(chunks) for split, chunks in tally.values.items()},
+        values={split: _concatenate(chunks) for split, chunks in tally.values.items()},
         num_scenes=dataset.manifest.num_samples,
         scenes=tally.scenes,
         placements=tally.placements,
@@ -222,13 +222,13 @@ def dataset_distributions(
         views_at_cap=tally.views_at_cap,
         packings=tally.packings,
         objects=[entry for entry in locked if entry.kind == OBJECT],
-        own_maps=[entry for entry in locked if entry.kind != OBJECT],
+        user_maps=[entry for entry in locked if entry.kind != OBJECT],
         failures=dataset.failures(),
         targets=_targets(dataset.manifest),
     )
 
 
-def _concatenated(rows: Sequence[Mapping[str, Values]]) -> Mapping[str, Values]:
+def _concatenate(rows: Sequence[Mapping[str, Values]]) -> Mapping[str, Values]:
     return {name: np.concatenate([row[name] for row in rows]) for name in QUANTITIES}
 
 
@@ -236,9 +236,9 @@ def _targets(manifest: Manifest) -> dict[str, float | None]:
     """Return what the settings ask for; a dataset that was not generated here may not say."""
     places = {"max_triangles": "scenes"}
     places |= dict.fromkeys((*MEASURED, "min_spp", "max_spp"), "renders")
-    found: dict[str, float | None] = {}
+    targets: dict[str, float | None] = {}
     for name, group in places.items():
         settings = manifest.settings.get(group)
         value = settings.get(name) if isinstance(settings, Mapping) else None
-        found[name] = value if isinstance(value, int | float) else None
-    return found
+        targets[name] = value if isinstance(value, int | float) else None
+    return targets

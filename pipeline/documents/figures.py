@@ -20,13 +20,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.documents.html import Markup, data_uri, image
 
-BLUE, RED, INK, FAINT = "#3b6ea5", "#c8443f", "#333333", "#dddddd"
+BLUE = "#3b6ea5"
+RED = "#c8443f"
+INK = "#333333"
+FAINT = "#dddddd"
 SERIES = ("#3b6ea5", "#e0a03b", "#5f9e6e", "#a56cb4", "#8c8c8c", "#c8443f", "#4bb0b8", "#6b5b4b")
 """Colours of the parts of stacked bars."""
 
 _PANEL_INCHES = (2.9, 1.95)
 _DPI = 180
-_MOST_BINS, _LONGEST_LABEL = 30, 26
+_MOST_BINS = 30
+_LONGEST_LABEL = 26
 _MOST_WHOLE_NUMBERS = 24
 
 _STYLE: dict[str, Any] = {
@@ -77,7 +81,7 @@ def panels(count: int, *, columns: int = 2, polar: Sequence[int] = ()) -> tuple[
     return figure, axes
 
 
-def encoded(figure: Figure, alt: str) -> Markup:
+def encode_figure(figure: Figure, alt: str) -> Markup:
     """Return the figure as a picture for a page."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=_DPI, metadata={"Software": None})
@@ -117,7 +121,8 @@ def histogram(
             linewidth=0,
         )
         if _whole_numbers(finite):
-            low, high = int(finite.min()), int(finite.max())
+            low = int(finite.min())
+            high = int(finite.max())
             axes.set_xticks(range(low, high + 1, 1 + (high - low) // 9))
     axes.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(4, integer=True))
     for name, value in (marks or {}).items():
@@ -153,12 +158,12 @@ def stacked_bars(
     width, height = _PANEL_INCHES
     figure = Figure(figsize=(2 * width, max(height, 0.8 + 0.21 * len(bars))), layout="constrained")
     axes = figure.add_subplot()
-    left = np.zeros(len(bars))
+    offset = np.zeros(len(bars))
     rows = np.arange(len(bars))
     for number, (name, lengths) in enumerate(parts.items()):
         colour = SERIES[number % len(SERIES)]
-        axes.barh(rows, lengths, left=left, height=0.68, color=colour, label=short_label(name))
-        left += np.asarray(lengths)
+        axes.barh(rows, lengths, left=offset, height=0.68, color=colour, label=short_label(name))
+        offset += np.asarray(lengths)
     axes.set_yticks(rows, [short_label(name) for name in bars])
     axes.set_ylim(len(bars) - 0.4, -0.6)
     axes.set_xlabel(xlabel)

@@ -56,13 +56,13 @@ def write_gallery(
         cards.append((_card(sample, entry.split), f"{out.report_pages.name}/{names[row]}"))
         facts.append(card_facts(sample, entry.split))
     _remove_others(out, names)
-    shown = f"{len(chosen)} of {dataset.manifest.num_samples} scenes, by their first view."
+    caption = f"{len(chosen)} of {dataset.manifest.num_samples} scenes, by their first view."
     linked = [
         element("a", card, href=link, class_="card", **attributes)
         for (card, link), attributes in zip(cards, card_attributes(facts), strict=True)
     ]
     gallery = element("div", *linked, class_="cards")
-    return joined([element("p", shown), gallery_controls(facts), gallery])
+    return joined([element("p", caption), gallery_controls(facts), gallery])
 
 
 def _card(sample: Sample, split: str) -> Markup:

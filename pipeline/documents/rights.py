@@ -75,7 +75,8 @@ def hub_licence(rights: Rights, *, link: str) -> dict[str, str]:
 def rights_markdown(rights: Rights) -> str:
     """Return the licences with their counts and duties, and the union of these."""
     rows = [
-        (_linked(name), _duties(name), count) for name, count in rights.objects_by_licence.items()
+        (_licence_link(name), _duties(name), count)
+        for name, count in rights.objects_by_licence.items()
     ]
     parts = [table(("licence", "asks for", "objects"), rows, numbers=1)]
     if rights.duties:
@@ -105,7 +106,7 @@ def encode_licences(rights: Rights) -> bytes:
     return f"{head}\n\n{rights_markdown(rights)}\n".encode(errors="replace")
 
 
-def _linked(licence: str) -> str:
+def _licence_link(licence: str) -> str:
     url = licence_url(licence)
     return f"[{code(licence)}]({url})" if url else code(licence)
 

@@ -24,7 +24,8 @@ _MOST_SHOWN = 48
 
 def maps_section(scene: Scene) -> list[Markup]:
     """Return pictures of the textures and of the sky with their rights, where there are any."""
-    figures, rows = [], list[list[Cell]]()
+    figures = []
+    rows = list[list[Cell]]()
     for row, texture in enumerate(scene.textures):
         role = " and ".join(_columns(scene, row))
         rows.append([texture.source.name, f"texture: {role}", *_rest(texture.texels, texture)])

@@ -19,7 +19,7 @@ from pipeline.documents.html import (
     png_uri,
     table,
 )
-from pipeline.documents.pass_colours import id_colours
+from pipeline.documents.pass_colours import id_colors
 from pipeline.documents.scene_maps import MAPS_STYLE, maps_section
 from pipeline.documents.scene_passes import PASSES_STYLE, passes_section
 from storage.conventions import preview_gain, preview_srgb8, srgb8
@@ -102,16 +102,17 @@ def preview(radiance_rgb: NDArray[np.float32], width: int) -> NDArray[np.uint8]:
 
 
 def _navigation(links: Neighbours) -> Markup:
-    shown = [element("a", "All scenes", href=links.report)]
+    anchors = [element("a", "All scenes", href=links.report)]
     if links.before is not None:
-        shown.append(element("a", "← before", href=links.before))
+        anchors.append(element("a", "← before", href=links.before))
     if links.after is not None:
-        shown.append(element("a", "next →", href=links.after))
-    return element("nav", *shown)
+        anchors.append(element("a", "next →", href=links.after))
+    return element("nav", *anchors)
 
 
 def _figures(sample: Sample) -> list[Markup]:
-    figures, gain = [], preview_gain(sample.radiance_rgb)
+    figures = []
+    gain = preview_gain(sample.radiance_rgb)
     for view, (picture, record) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
         uri = png_uri(preview(picture * gain, _PICTURE_PX))
         mark = ", at the cap" if record.at_cap else ""
@@ -156,14 +157,16 @@ def _parts(sample: Sample) -> list[Markup]:
     """Return the pictures of the parts that are stored, with their floors."""
     if sample.parts_rgb is None:
         return []
-    figures, rows, gain = [], list[list[Cell]](), preview_gain(sample.radiance_rgb)
+    figures = []
+    rows = list[list[Cell]]()
+    gain = preview_gain(sample.radiance_rgb)
     for view, record in enumerate(sample.views):
         for part, floor in (record.parts or {}).items():
             picture = sample.parts_rgb[part][view]
             together = picture.sum(axis=0) if picture.ndim == 4 else picture
             name = f"view {view}, {part}"
-            shown = enlargeable(png_uri(preview(together * gain, _PICTURE_PX)), name)
-            figures.append(element("figure", shown, element("figcaption", name)))
+            picture_box = enlargeable(png_uri(preview(together * gain, _PICTURE_PX)), name)
+            figures.append(element("figure", picture_box, element("figcaption", name)))
             floors = (
                 floor.noise_floor_db,
                 floor.noise_floor_linear_db,
@@ -180,7 +183,7 @@ def _objects(scene: Scene) -> Markup:
     shading = {s.row: "smooth" if s.smooth else "flat" for s in surfaces(scene)}
     rows: list[list[Cell]] = [
         [
-            joined([_square(id_colours(row), class_="id"), entry.name], " "),
+            joined([_square(id_colors(row), class_="id"), entry.name], " "),
             entry.kind,
             entry.uid,
             entry.licence,

@@ -53,14 +53,14 @@ def stale_sums(folder: Path) -> list[str]:
     if not (folder / SUMS).is_file():
         return []
     known = _read(folder)
-    there = {path.relative_to(folder).as_posix(): path for path in published_files(folder)}
-    del there[SUMS]
+    files = {path.relative_to(folder).as_posix(): path for path in published_files(folder)}
+    del files[SUMS]
     return sorted(
         name
-        for name in known.keys() | there.keys()
+        for name in known.keys() | files.keys()
         if name not in known
-        or name not in there
-        or (not name.endswith(_SHARD) and sha256_of_file(there[name]) != known[name])
+        or name not in files
+        or (not name.endswith(_SHARD) and sha256_of_file(files[name]) != known[name])
     )
 
 
@@ -74,7 +74,7 @@ def _write(folder: Path, known: dict[str, str]) -> None:
 
 
 def _read(folder: Path) -> dict[str, str]:
-    found = {}
+    sums = {}
     for line in (folder / SUMS).read_text(errors="replace").splitlines():
         sha256, separator, name = line.partition("  ")
         if not separator or len(sha256) != 64:
@@ -82,5 +82,5 @@ def _read(folder: Path) -> dict[str, str]:
                 f"{folder / SUMS}: {line:.40} is no sum; expected lines of `sha256sum`. Delete the "
                 "file, and write it again with make release."
             )
-        found[name] = sha256
-    return found
+        sums[name] = sha256
+    return sums

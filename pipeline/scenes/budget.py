@@ -28,12 +28,12 @@ def levels_within(
     """
     ladders = [sorted(asset.levels, key=_size) for asset in assets]
     rungs = [0] * len(assets)
-    left = num_triangles - sum(_size(ladder[0]) for ladder in ladders)
-    if left < 0:
+    remaining = num_triangles - sum(_size(ladder[0]) for ladder in ladders)
+    if remaining < 0:
         raise Rejected(
             "over_budget",
-            f"{len(assets)} objects need {num_triangles - left} triangles at least, and the scene "
-            f"has {num_triangles} for them",
+            f"{len(assets)} objects need {num_triangles - remaining} triangles at least, and the "
+            f"scene has {num_triangles} for them",
         )
     while True:
         finer = [
@@ -41,12 +41,12 @@ def levels_within(
             for row, (ladder, rung) in enumerate(zip(ladders, rungs, strict=True))
             if rung + 1 < len(ladder)
             and ladder[rung].record.quality.error_p99 > enough_error
-            and _size(ladder[rung + 1]) - _size(ladder[rung]) <= left
+            and _size(ladder[rung + 1]) - _size(ladder[rung]) <= remaining
         ]
         if not finer:
             return tuple(ladder[rung] for ladder, rung in zip(ladders, rungs, strict=True))
         row = -max(finer)[1]  # the first of equals
-        left -= _size(ladders[row][rungs[row] + 1]) - _size(ladders[row][rungs[row]])
+        remaining -= _size(ladders[row][rungs[row] + 1]) - _size(ladders[row][rungs[row]])
         rungs[row] += 1
 
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from pipeline.scenes.budget import levels_within
 from pipeline.scenes.drawn_columns import with_drawn_columns
-from pipeline.scenes.fitting import drawn_rows
-from pipeline.scenes.laws import require_laws
-from pipeline.scenes.own_light import with_own_light
+from pipeline.scenes.fitting import draw_rows
+from pipeline.scenes.laws import require_valid
+from pipeline.scenes.own_light import with_source_emission
 from pipeline.scenes.own_materials import own_skins
 from pipeline.scenes.pieces import (
     ScenePiece,
@@ -25,9 +25,9 @@ from pipeline.scenes.pieces import (
     shell_piece,
 )
 from pipeline.scenes.pool import PooledAsset, fits_of
-from pipeline.scenes.posing import posed
+from pipeline.scenes.posing import pose_points
 from pipeline.scenes.shapes import MeshShape
-from pipeline.scenes.subdivision import filled
+from pipeline.scenes.subdivision import fill_triangles
 from pipeline.scenes.textured_pieces import with_drawn_textures
 from pipeline.scenes.views import with_first_cameras
 from scene_templates.layout import Layout
@@ -49,7 +49,7 @@ def compose_scene(
     seed: int,
     scene_index: int,
     attempt: int,
-    own: OwnMaps = NO_OWN_MAPS,
+    user_maps: OwnMaps = NO_OWN_MAPS,
 ) -> Scene:
     """Compose one scene.
 
@@ -89,7 +89,9 @@ def compose_scene(
     name = {"seed": seed, "scene_index": scene_index, "attempt": attempt}
     skins = own_skins(chosen, levels, settings.materials, **name)
     pieces = scene_pieces(layout, chosen, shapes, settings, rng, skins)
-    pieces = with_drawn_textures(pieces, layout, settings.textures, **name, own=own.textures)
+    pieces = with_drawn_textures(
+        pieces, layout, settings.textures, **name, user_textures=user_maps.textures
+    )
     arrays = joined(pieces)
     arrays["materials"] = with_drawn_columns(arrays["materials"], **name)
     scene = Scene(
@@ -100,9 +102,9 @@ def compose_scene(
         provenance=provenance,
     )
     uids = {piece.skin.uid for piece in pieces if piece.skin and piece.skin.uid}
-    scene = _with_sky(scene, settings, name, own, uids)
+    scene = _with_sky(scene, settings, name, user_maps, uids)
     scene = with_first_cameras(without_constant_textures(scene), settings)
-    require_laws(scene, settings)
+    require_valid(scene, settings)
     return scene
 
 
@@ -110,7 +112,7 @@ def _with_sky(
     scene: Scene,
     settings: SceneSettings,
     name: Mapping[str, int],
-    own: OwnMaps,
+    user_maps: OwnMaps,
     uids: set[str],
 ) -> Scene:
     """Return a scene with its sky, if any, and the uids of the user's own that it has."""
@@ -120,7 +122,7 @@ def _with_sky(
         scene.vertex_positions[scene.faces[emits]].astype(np.float64),
         scene.materials[scene.material_index[emits], EMISSION].astype(np.float64),
         **name,
-        own=own.skies,
+        own=user_maps.skies,
         licences=scene.licences,
     )
     provenance = dict(scene.provenance)
@@ -157,7 +159,7 @@ def _objects_rand(
     pool: Sequence[PooledAsset],
 ) -> list[PooledAsset]:
     budget = _object_budget(settings, plan)
-    return [pool[row] for row in drawn_rows(rng, fits_of(pool), plan.num_objects, budget)]
+    return [pool[row] for row in draw_rows(rng, fits_of(pool), plan.num_objects, budget)]
 
 
 def _object_budget(settings: SceneSettings, plan: ScenePlan) -> int:
@@ -189,13 +191,13 @@ def scene_pieces(
     for pooled, shape, placement, skin in zip(chosen, shapes, layout.objects, looks, strict=True):
         entry = _entry(pooled, taken)
         taken.append(entry.name)
-        positions = posed(shape.points, placement.pose)
+        positions = pose_points(shape.points, placement.pose)
         surface = placement.surface
         piece = object_piece(entry, positions, shape.faces, surface, rng, angle_deg)
         objects.append(piece if skin is None else dressed(piece, positions, shape.faces, skin))
-    objects, lights = with_own_light(objects, emitters, settings.materials.own_emission)
+    objects, lights = with_source_emission(objects, emitters, settings.materials.own_emission)
     pieces = [*shell, *objects, *emitters, *lights]
-    return pieces if settings.fill_to is None else filled(pieces, settings.fill_to)
+    return pieces if settings.fill_to is None else fill_triangles(pieces, settings.fill_to)
 
 
 def _entry(pooled: PooledAsset, taken: Sequence[str]) -> SceneObject:

@@ -32,11 +32,11 @@ def with_drawn_columns(
             continue
         rng = rng_for(seed, f"material column {column.name}", scene_index, attempt)
         values = np.asarray(column.draw(rng, int(reflects.sum())), np.float32)
-        wanted = (int(reflects.sum()), column.width)
-        if values.shape != wanted or not np.all(column.within.holds(values)):
+        shape = (int(reflects.sum()), column.width)
+        if values.shape != shape or not np.all(column.within.holds(values)):
             raise TrilightError(
                 f"material column {column.name!r}: its draw returned shape {values.shape}; "
-                f"expected {wanted}, with every number {column.within}."
+                f"expected {shape}, with every number {column.within}."
             )
         drawn[reflects, part] = values
     return drawn

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from storage.errors import Rejected
 from storage.records.object_index import CampSizes
 
-_PART = 1 << 16
+_CHUNK = 1 << 16
 """Rows that are looked at together: half a megabyte."""
 
 
@@ -39,7 +39,8 @@ class FitTable:
             camps: name of each number; "" is for objects that have no camp.
             sizes: of the camps that occur.
         """
-        self._least, self._camp = least, camp
+        self._least = least
+        self._camp = camp
         self._camps = tuple(camps)
         self.sizes = sizes
 
@@ -68,7 +69,7 @@ class FitTable:
         """Return the camp of a row."""
         return self._camps[int(self._camp[row : row + 1][0])]
 
-    def drawn(self, rng: np.random.Generator, rooms: Mapping[str, int]) -> int | None:
+    def draw_row(self, rng: np.random.Generator, rooms: Mapping[str, int]) -> int | None:
         """Draw a row evenly among those that fit; None where none does.
 
         Args:
@@ -82,23 +83,23 @@ class FitTable:
         limits = np.full(len(self._camps), -1, np.int64)
         for camp, room in rooms.items():
             limits[self._camps.index(camp)] = room
-        starts = range(0, len(self._least), _PART)
+        starts = range(0, len(self._least), _CHUNK)
         counts = np.cumsum([np.count_nonzero(self._fits(start, limits)) for start in starts])
         if not counts[-1]:
             return None
         number = int(rng.integers(counts[-1]))
-        part = int(np.searchsorted(counts, number, side="right"))
-        before = int(counts[part - 1]) if part else 0
-        fitting = np.flatnonzero(self._fits(starts[part], limits))
-        return starts[part] + int(fitting[number - before])
+        chunk = int(np.searchsorted(counts, number, side="right"))
+        before = int(counts[chunk - 1]) if chunk else 0
+        fitting = np.flatnonzero(self._fits(starts[chunk], limits))
+        return starts[chunk] + int(fitting[number - before])
 
     def _fits(self, start: int, limits: NDArray[np.int64]) -> NDArray[np.bool_]:
-        part = slice(start, start + _PART)
-        fits: NDArray[np.bool_] = self._least[part] <= limits[self._camp[part]]
+        chunk = slice(start, start + _CHUNK)
+        fits: NDArray[np.bool_] = self._least[chunk] <= limits[self._camp[chunk]]
         return fits
 
 
-def drawn_rows(
+def draw_rows(
     rng: np.random.Generator, table: FitTable, count: int, num_triangles: int
 ) -> list[int]:
     """Draw rows with replacement, evenly among those that fit beside the ones before.
@@ -116,12 +117,14 @@ def drawn_rows(
     Raises:
         Rejected: "over_budget" where not even the simplest fit.
     """
-    allowed, left, drawn = set(table.sizes), num_triangles, list[int]()
+    allowed = set(table.sizes)
+    remaining = num_triangles
+    rows = list[int]()
     for following in range(count - 1, -1, -1):
         rooms = {
-            camp: left - following * _simplest_beside(table, camp, allowed) for camp in allowed
+            camp: remaining - following * _simplest_after(table, camp, allowed) for camp in allowed
         }
-        row = table.drawn(rng, rooms)
+        row = table.draw_row(rng, rooms)
         if row is None:
             least = min(sizes.least for sizes in table.sizes.values())
             raise Rejected(
@@ -129,14 +132,14 @@ def drawn_rows(
                 f"{count} objects of at least {least} triangles each do not fit into the "
                 f"{num_triangles} that the scene has for them",
             )
-        drawn.append(row)
-        left -= table.size(row)
+        rows.append(row)
+        remaining -= table.size(row)
         if camp := table.camp(row):
             allowed &= {"", camp}
-    return drawn
+    return rows
 
 
-def _simplest_beside(table: FitTable, camp: str, allowed: set[str]) -> int:
+def _simplest_after(table: FitTable, camp: str, allowed: set[str]) -> int:
     """Return the triangles of the simplest object that may still come after one of a camp."""
-    beside = allowed & {"", camp} if camp else allowed
-    return min(table.sizes[other].least for other in beside)
+    camps = allowed & {"", camp} if camp else allowed
+    return min(table.sizes[other].least for other in camps)

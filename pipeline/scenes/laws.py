@@ -11,7 +11,7 @@ from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
 
 
-def require_laws(scene: Scene, settings: SceneSettings, *, in_budget: bool = True) -> None:
+def require_valid(scene: Scene, settings: SceneSettings, *, in_budget: bool = True) -> None:
     """Raise Rejected where a scene breaks the laws of the record, of its budget, or of its lights.
 
     Args:
@@ -32,8 +32,8 @@ def require_laws(scene: Scene, settings: SceneSettings, *, in_budget: bool = Tru
         named = ", ".join(sorted(uids)) or "none"
         raise Rejected("law_broken", f"{error} Its objects and maps are {named}.") from error
     if in_budget and scene.num_triangles > settings.max_triangles:
-        found = f"{scene.num_triangles} triangles; at most {settings.max_triangles} were allowed"
-        raise Rejected("over_budget", found)
+        message = f"{scene.num_triangles} triangles; at most {settings.max_triangles} were allowed"
+        raise Rejected("over_budget", message)
     _require_emitters_outside(scene, settings.lights.num_inside)
 
 

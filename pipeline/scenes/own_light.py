@@ -17,7 +17,7 @@ from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, default_rows
 from storage.records.scene import SceneObject
 
 
-def with_own_light(
+def with_source_emission(
     objects: Sequence[ScenePiece], lamps: Sequence[ScenePiece], share: float
 ) -> tuple[list[ScenePiece], list[ScenePiece]]:
     """Return objects without the parts that emit, and those parts as emitters.
@@ -54,9 +54,9 @@ def with_own_light(
 
 def _scale(objects: Sequence[ScenePiece], lamps: Sequence[ScenePiece], share: float) -> float:
     """Return what stated radiance is multiplied by."""
-    own = [(_emission(piece).astype(np.float64), _areas(piece)) for piece in objects]
-    power = sum(float(areas @ emission.mean(axis=1)) for emission, areas in own)
-    brightest = max((float(emission.max(initial=0)) for emission, _ in own), default=0.0)
+    emissions = [(_emission(piece).astype(np.float64), _areas(piece)) for piece in objects]
+    power = sum(float(areas @ emission.mean(axis=1)) for emission, areas in emissions)
+    brightest = max((float(emission.max(initial=0)) for emission, _ in emissions), default=0.0)
     if not (share and lamps and power > 0):
         return 0.0
     lit = [

@@ -50,8 +50,8 @@ class ScenePiece:
 def shell_piece(part: ShellPart, rng: np.random.Generator, smooth_angle_deg: float) -> ScenePiece:
     """Return a floor or wall; where it has many colours, one per triangle drawn from `rng`."""
     positions = part.positions.astype(np.float32)
-    mesh = _shaded(positions, part.faces, part.surface, smooth_angle_deg)
-    return _surfaced(SceneObject(name=part.name, kind="shell"), mesh, part.surface, rng)
+    mesh = _shade_mesh(positions, part.faces, part.surface, smooth_angle_deg)
+    return _apply_surface(SceneObject(name=part.name, kind="shell"), mesh, part.surface, rng)
 
 
 def object_piece(
@@ -70,16 +70,18 @@ def object_piece(
     faces = without_slivers(positions, faces)
     if len(faces) == 0:
         raise Rejected("no_faces", f"{entry.uid}: no triangle of the level has an area")
-    return _surfaced(entry, _shaded(positions, faces, surface, smooth_angle_deg), surface, rng)
+    return _apply_surface(
+        entry, _shade_mesh(positions, faces, surface, smooth_angle_deg), surface, rng
+    )
 
 
 def dressed(
     piece: ScenePiece, positions: NDArray[np.float32], faces: NDArray[np.uint32], skin: Skin
 ) -> ScenePiece:
     """Return the piece of `object_piece` in a skin of all its faces, slivers included."""
-    kept = not_slivers(positions, faces)
-    uv = skin.uv.reshape(-1, 3, 2)[kept].reshape(-1, 2)
-    emission = None if skin.emission is None else skin.emission[kept]
+    has_area = not_slivers(positions, faces)
+    uv = skin.uv.reshape(-1, 3, 2)[has_area].reshape(-1, 2)
+    emission = None if skin.emission is None else skin.emission[has_area]
     return with_skin(piece, dataclasses.replace(skin, uv=uv, emission=emission))
 
 
@@ -109,7 +111,7 @@ def emitter_piece(emitter: Emitter, row: int) -> ScenePiece:
     )
 
 
-def _shaded(
+def _shade_mesh(
     positions: NDArray[np.float32],
     faces: NDArray[np.uint32],
     surface: SurfaceLook,
@@ -120,7 +122,7 @@ def _shaded(
     return flat_shaded(positions, faces)
 
 
-def _surfaced(
+def _apply_surface(
     entry: SceneObject, mesh: ShadedMesh, surface: SurfaceLook, rng: np.random.Generator
 ) -> ScenePiece:
     """Give a mesh its materials: one row, or one per shading group or triangle."""
@@ -164,7 +166,9 @@ def _skins(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
     """Return the fields that textures take in a Scene: none where no piece has any."""
     if all(piece.skin is None for piece in pieces):
         return {}
-    textures, rows, corners = dict[str, Texture](), [], []
+    textures = dict[str, Texture]()
+    rows = []
+    corners = []
     for piece in pieces:
         index = np.full((len(piece.materials), len(TEXTURED)), CONSTANT, np.int32)
         uv = np.zeros((3 * len(piece.mesh.faces), 2), np.float32)

@@ -32,7 +32,7 @@ def in_unit_sphere(
         return points / np.sqrt(np.sum(np.square(points), axis=1).max())
 
 
-def posed(points: NDArray[np.float64], pose: Pose) -> NDArray[np.float32]:
+def pose_points(points: NDArray[np.float64], pose: Pose) -> NDArray[np.float32]:
     """Return points [V, 3] of the unit sphere in world space."""
     return (pose.radius * rotated(points, pose.rotation) + pose.centre).astype(np.float32)
 

@@ -40,7 +40,8 @@ def with_new_materials(
     """
     scene = without_maps(scene, environment=False)
     rng = rng_for(seed, "new materials", index, attempt)
-    rows, material_index = [scene.materials[:0]], scene.material_index.astype(np.int64)
+    rows = [scene.materials[:0]]
+    material_index = scene.material_index.astype(np.int64)
     lit = {row for row, entry in enumerate(scene.objects) if entry.kind == "emitter"}
     facts = {surface.row: surface for surface in surfaces(scene)}
     for row in range(len(scene.objects)):
@@ -101,8 +102,10 @@ def with_new_lights(
     rng = rng_for(seed, "new lights", index, attempt)
     emitters = emitters_rand(rng, settings, TEMPLATES[name].lights, count, _centres(scene, kinds))
     lamps = [emitter_piece(emitter, row) for row, emitter in enumerate(emitters)]
-    dark, new = _without(scene, lit), joined(lamps)
-    vertices, rows = len(dark.vertex_positions), len(dark.materials)
+    dark = _without(scene, lit)
+    new = joined(lamps)
+    vertices = len(dark.vertex_positions)
+    rows = len(dark.materials)
     triangles, materials = (
         np.append(np.arange(count), np.full(len(more), NEW))
         for count, more in ((len(dark.faces), new["faces"]), (rows, new["materials"]))

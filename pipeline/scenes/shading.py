@@ -52,7 +52,7 @@ def smooth_shaded(
     groups = shading_groups(faces, normals, angle_deg)
     corner_key = groups[:, None] * len(positions) + faces
     angles = _corner_angles(positions, faces)
-    corner_normals = _summed(corner_key, normals[:, None] * angles[..., None])
+    corner_normals = _sum_by_key(corner_key, normals[:, None] * angles[..., None])
     length = np.sqrt(np.sum(np.square(corner_normals), axis=-1))
     facing = np.einsum("tci,ti->tc", corner_normals, normals)
     turned_away = facing <= LEAST_FACING * length
@@ -93,8 +93,8 @@ def shading_groups(
     order = np.argsort(edge, kind="stable")
     pairs = (order[count[edge[order]] == 2] // 3).reshape(-1, 2)
     cosine = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1)
-    joined = pairs[cosine >= math.cos(math.radians(angle_deg))]
-    graph = coo_matrix((np.ones(len(joined)), joined.T), shape=(len(faces), len(faces)))
+    smooth_pairs = pairs[cosine >= math.cos(math.radians(angle_deg))]
+    graph = coo_matrix((np.ones(len(smooth_pairs)), smooth_pairs.T), shape=(len(faces), len(faces)))
     _, groups = connected_components(graph, directed=False)
     return groups.astype(np.int64)
 
@@ -110,7 +110,7 @@ def _corner_angles(
     return np.arctan2(across, np.sum(forward * backward, axis=-1))
 
 
-def _summed(keys: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sum_by_key(keys: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return, for every corner, the sum of `values` [T, 3, 3] over all corners of the same key."""
     _, row = np.unique(keys.ravel(), return_inverse=True)
     flat = values.reshape(-1, 3)

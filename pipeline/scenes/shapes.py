@@ -35,8 +35,8 @@ class MeshShape:
 
     def meets(self, pose: Pose, other: "MeshShape", its_pose: Pose) -> bool:
         """Return whether two posed meshes share a point, or the box of one holds the other's."""
-        apart = pose.centre - its_pose.centre
-        if np.sum(np.square(apart)) > (pose.radius + its_pose.radius) ** 2:
+        offset = pose.centre - its_pose.centre
+        if np.sum(np.square(offset)) > (pose.radius + its_pose.radius) ** 2:
             return False
         low, high = self._box(pose)
         its_low, its_high = other._box(its_pose)

@@ -58,37 +58,41 @@ class Sight:
         toward = directions.reshape(-1, 3).astype(np.float32)
         start = np.tile(origin.astype(np.float32), (len(toward), 1))
         hits = self._surfaces.met(start, toward)
-        met = hits.triangle != MISS
-        is_object = met & self._face_is_object[hits.triangle]
-        behind = met & (np.sum(hits.normal * toward, axis=1) > 0)
-        nearest = float(hits.distance_m[met].min(initial=np.inf))
+        is_hit = hits.triangle != MISS
+        is_object = is_hit & self._face_is_object[hits.triangle]
+        behind = is_hit & (np.sum(hits.normal * toward, axis=1) > 0)
+        nearest = float(hits.distance_m[is_hit].min(initial=np.inf))
         return ViewFacts(
             coverage=float(is_object.mean()),
             shell_back=float((behind & ~is_object).mean()),
-            lit=self._lit(start, toward, hits, met, grid),
+            lit=self._lit_fraction(start, toward, hits, is_hit, grid),
             depth=min(nearest, _distance_to_boxes(origin, self._boxes)),
         )
 
-    def _lit(
+    def _lit_fraction(
         self,
         start: NDArray[np.float32],
         toward: NDArray[np.float32],
         hits: MetSurfaces,
-        met: NDArray[np.bool_],
+        is_hit: NDArray[np.bool_],
         grid: int,
     ) -> float:
         row, column = np.divmod(np.arange(grid * grid), grid)
-        asked = np.flatnonzero(met & (row % LIT_STEP == 0) & (column % LIT_STEP == 0))
-        if len(asked) == 0:
+        sampled = np.flatnonzero(is_hit & (row % LIT_STEP == 0) & (column % LIT_STEP == 0))
+        if len(sampled) == 0:
             return 0.0
-        geometric = hits.normal[asked]
+        geometric = hits.normal[sampled]
         normal = geometric / np.sqrt(np.sum(np.square(geometric), axis=1, keepdims=True))
-        normal *= np.where(np.sum(normal * toward[asked], axis=1, keepdims=True) > 0, -1, 1)
-        point = start[asked] + hits.distance_m[asked, None] * toward[asked] + SHADOW_OFFSET * normal
+        normal *= np.where(np.sum(normal * toward[sampled], axis=1, keepdims=True) > 0, -1, 1)
+        point = (
+            start[sampled]
+            + hits.distance_m[sampled, None] * toward[sampled]
+            + SHADOW_OFFSET * normal
+        )
         ray = self._lights[None] - point[:, None]
         if len(self._sky):
-            away = np.broadcast_to(self._sky, (len(point), *self._sky.shape))
-            ray = np.concatenate([ray, away], axis=1)
+            sky_rays = np.broadcast_to(self._sky, (len(point), *self._sky.shape))
+            ray = np.concatenate([ray, sky_rays], axis=1)
         distance = np.sqrt(np.sum(np.square(ray), axis=-1))
         on_side = np.sum(ray * normal[:, None], axis=-1) > 0
         free = self._surfaces.is_free(

@@ -35,7 +35,7 @@ def with_drawn_textures(
     seed: int,
     scene_index: int,
     attempt: int,
-    own: Sequence[OwnMap[OwnTexture]] = (),
+    user_textures: Sequence[OwnMap[OwnTexture]] = (),
 ) -> list[ScenePiece]:
     """Return the pieces with textures where they are drawn; emitters have none.
 
@@ -57,30 +57,33 @@ def with_drawn_textures(
     frames += [placement.pose.rotation for placement in layout.objects]
     origins = [np.zeros(3)] * len(layout.shell)
     origins += [placement.pose.centre for placement in layout.objects]
-    found, textured = list(pieces), 0
+    result = list(pieces)
+    textured = 0
     for row, (frame, origin) in enumerate(zip(frames, origins, strict=True)):
         rng = rng_for(seed, "texture", scene_index, attempt, row)
-        look = draw_look(rng, settings, own, licences) if textured < MOST_TEXTURED else None
+        look = (
+            draw_look(rng, settings, user_textures, licences) if textured < MOST_TEXTURED else None
+        )
         piece = pieces[row]  # whose own materials come first
         if look is not None and piece.skin is None and piece.entry.kind != "emitter":
             licences.append(look.maps.source.licence)
-            found[row] = _textured(piece, look, frame, origin)
+            result[row] = _apply_texture(piece, look, frame, origin)
             textured += 1
-    return found
+    return result
 
 
-def _textured(
+def _apply_texture(
     piece: ScenePiece, look: TexturedLook, frame: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> ScenePiece:
     corners = piece.mesh.positions[piece.mesh.faces].astype(np.float64)
-    uv = look.uv(cube_places(_turned_back(corners - origin, frame)))
+    uv = look.uv(cube_coordinates(_to_object_axes(corners - origin, frame)))
     skin = Skin(
         uv=uv.astype(np.float32).reshape(-1, 2), textures=_textures(look.maps), uid=look.uid
     )
     return with_skin(piece, skin)
 
 
-def cube_places(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def cube_coordinates(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return where a cube's sides show the corners [T, 3, 3] of triangles: right and up, [T, 3, 2].
 
     A triangle as steep to two sides belongs to the first of x, y and z.
@@ -92,7 +95,7 @@ def cube_places(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray((corners[:, :, None] * axes).sum(axis=-1))
 
 
-def _turned_back(points: NDArray[np.float64], frame: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_object_axes(points: NDArray[np.float64], frame: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points [T, 3, 3] in the axes of an object, whose rotation is `frame`."""
     x, y, z = (points[..., row, None] * frame[row] for row in range(3))
     return x + y + z
