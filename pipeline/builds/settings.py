@@ -20,7 +20,7 @@ from storage.settings.ranges import Seed
 
 @checked()
 class BuildSettings:
-    """The settings of one dataset. They stand in its manifest and never change."""
+    """The settings of one dataset. They are stored in its manifest and never change."""
 
     build: str
     """Name of the build that the settings come from."""
@@ -45,9 +45,9 @@ class BuildSettings:
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave `revisit` out where there is none: digests of earlier builds stay.
+        """Omit `revisit` if there is none, so that digests of earlier builds stay.
 
-        The mesh stage is recorded as it is run, with what scenes ask of it.
+        The settings of the mesh stage are recorded with the changes that scenes require.
         """
         record: dict[str, Any] = as_usual(self)
         if self.mesh_settings.own_materials.keep:
@@ -60,7 +60,7 @@ class BuildSettings:
 
     @property
     def mesh_settings(self) -> AssetSettings:
-        """Settings of the mesh stage: objects keep their materials where scenes ask for those."""
+        """Settings of the mesh stage: objects keep their materials if scenes require them."""
         source_materials = self.assets.own_materials
         keeps_materials = self.scenes.materials.source == "object"
         emission = source_materials.emission or (
@@ -86,7 +86,7 @@ class NamedBuild:
     """A build that the command line knows by name."""
 
     settings: Callable[[], BuildSettings]
-    """A function that returns the settings."""
+    """Function that returns the settings of the dataset."""
     num_scenes: int
     """Number of scenes to make unless the user asks for another."""
     scene_digest: str | None = None

@@ -1,6 +1,6 @@
-"""`README.md` of a dataset: its card, with the front matter that Hugging Face reads.
+"""`README.md` of a dataset: the dataset card, with the front matter that Hugging Face reads.
 
-It tells nothing of the clock, the machine or the order of work: equal datasets give equal cards.
+It holds no time, machine or order of work: equal datasets give equal cards.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -35,7 +35,7 @@ _SETTINGS = (
     ("scenes of a shard", "splits.scenes_per_shard"),
     ("profile", "storage.profile"),
 )
-"""What the card shows of the settings; the manifest has all of them."""
+"""Labels and names of the settings that the card shows; the manifest has all of them."""
 
 
 def encode_card(
@@ -44,10 +44,10 @@ def encode_card(
     """Return the card.
 
     Args:
-        folder: of the dataset; only the names of its documents are used.
-        manifest: of the dataset.
-        found: its distributions.
-        rights: of its objects.
+        folder: folder of the dataset; only the names of its documents are used.
+        manifest: manifest of the dataset.
+        distributions: distributions of the dataset.
+        rights: rights to its objects.
     """
     title = f"Trilight dataset {manifest.build}"
     parts = [
@@ -195,7 +195,7 @@ def _contents(manifest: Manifest, distributions: Distributions) -> str:
 
 
 def _user_maps(distributions: Distributions) -> list[tuple[str, str]]:
-    """Return a row for textures and for maps that are not procedural, where there are such."""
+    """Return a row for the user's textures, and one for the user's maps, if there are any."""
     rows = []
     for kind, name in ((TEXTURE, "textures, not procedural"), (SKY, "skies, not procedural")):
         uids = {entry.uid for entry in distributions.user_maps if entry.kind == kind}
@@ -257,13 +257,13 @@ floor. Lengths are metres, +Z is up, colours are linear Rec.709 radiance, camera
 
 
 def _arrays(packings: Collection[str]) -> list[str]:
-    """Return how a sample's arrays are got; a merged dataset may have them in both packings."""
+    """Return expressions for a sample's arrays; a merged dataset may have both packings."""
     *rest, last = sorted(packings) or [PLAIN]
     return [*(f'sample.get("{packing}")' for packing in rest), f'sample["{last}"]']
 
 
 def _setting(settings: Mapping[str, Any], name: str) -> Any:
-    """Return a setting by its dotted name; None where the manifest does not say."""
+    """Return a setting by its dotted name; None if the manifest lacks it."""
     value: Any = settings
     for part in name.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None

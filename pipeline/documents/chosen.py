@@ -1,4 +1,4 @@
-"""Which scenes a person is shown: a few, spread evenly over splits and shards."""
+"""Chooses a few scenes to show, spread evenly over splits and shards."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from storage.dataset.manifest import ShardEntry
 from storage.records.sample import Sample
 
 _LEAST_SHARE = 8
-"""A split with few scenes gets up to one place in this many."""
+"""Divisor of the chosen scenes: a split with few scenes gets up to one in this many."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,10 +30,10 @@ class Chosen:
 def choose_scenes(
     dataset: Dataset, max_scenes: int, splits: Sequence[str] = SPLITS
 ) -> list[Chosen]:
-    """Choose up to `max_scenes` scenes; only shards of which some are chosen are opened.
+    """Choose up to `max_scenes` scenes; only shards with chosen scenes are opened.
 
-    Every split has its share of them, at least an eighth where it holds so many. Within a split
-    they are spread evenly over its shards. The order is that of splits, then shards.
+    Every split gets scenes in proportion, at least an eighth if it has so many. Within a split they
+    are spread evenly over its shards. The order is that of splits, then shards.
 
     Raises:
         TrilightError: a shard is missing or damaged.
@@ -68,7 +68,7 @@ def read_chosen(dataset: Dataset, chosen: Sequence[Chosen]) -> Iterator[tuple[Ch
 
 
 def _scenes_per_split(counts: Sequence[int], max_scenes: int) -> list[int]:
-    """Return how many scenes of each split to show, together at most `max_scenes`."""
+    """Return the number of scenes to show of each split, together at most `max_scenes`."""
     total = sum(counts)
     if total <= max_scenes:
         return list(counts)

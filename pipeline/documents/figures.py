@@ -1,6 +1,6 @@
-"""Figures of one style, drawn without a display and without the reader's own matplotlib settings.
+"""Draws figures in one style, without a display and without the user's matplotlib settings.
 
-Equal data give equal bytes: no clock and no version is written into a figure.
+Equal data give equal bytes: a figure holds no time and no version.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ RED = "#c8443f"
 INK = "#333333"
 FAINT = "#dddddd"
 SERIES = ("#3b6ea5", "#e0a03b", "#5f9e6e", "#a56cb4", "#8c8c8c", "#c8443f", "#4bb0b8", "#6b5b4b")
-"""Colours of the parts of stacked bars."""
+"""Colors of the segments of stacked bars."""
 
 _PANEL_INCHES = (2.9, 1.95)
 _DPI = 180
@@ -48,7 +48,7 @@ _STYLE: dict[str, Any] = {
     "grid.linewidth": 0.6,
     "legend.fontsize": 7,
     "legend.frameon": False,
-    "text.parse_math": False,  # names from outside may hold dollar signs
+    "text.parse_math": False,  # untrusted names may hold dollar signs
     "xtick.color": "#666666",
     "ytick.color": "#666666",
     "xtick.labelcolor": INK,
@@ -60,10 +60,10 @@ _STYLE: dict[str, Any] = {
 
 @contextlib.contextmanager
 def drawing() -> Iterator[None]:
-    """Give everything that is drawn within the block the style of all figures."""
+    """Apply the common style to all figures that are drawn within the block."""
     style = matplotlib.style.context(["default", _STYLE], after_reset=True)
     with style, warnings.catch_warnings():
-        # a name from outside may need a script that the font lacks: it shows boxes
+        # an untrusted name may need a script that the font lacks: it shows boxes
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
 
@@ -97,14 +97,14 @@ def histogram(
     marks: Mapping[str, float | None] | None = None,
     bounds: tuple[float, float] | None = None,
 ) -> None:
-    """Draw how often values occur: one bar for each whole number, else up to thirty bins.
+    """Draw a histogram: one bar for each whole number, else up to thirty bins.
 
     Args:
-        axes: where.
-        values: [N]; those that are not finite are left out.
-        xlabel, ylabel: what the axes say.
-        marks: lines at values that matter, by name; None draws nothing.
-        bounds: the range of the bins; that of the values where None.
+        axes: axes to draw on.
+        values: [N] values; those that are not finite are left out.
+        xlabel, ylabel: labels of the axes.
+        marks: vertical lines at values, by name; None draws nothing.
+        bounds: range of the bins; None for the range of the values.
     """
     finite = finite_values(values)
     axes.set_xlabel(xlabel)
@@ -148,12 +148,12 @@ def rose(axes: Axes, degrees: ArrayLike, title: str) -> None:
 def stacked_bars(
     bars: Sequence[str], parts: Mapping[str, ArrayLike], *, xlabel: str
 ) -> tuple[Figure, Axes]:
-    """Return a figure of horizontal bars, the first on top, each made of the same parts.
+    """Return a figure of horizontal stacked bars, the first on top.
 
     Args:
         bars: the name of each bar.
-        parts: the lengths [bars] of each part, by its name.
-        xlabel: what the lengths are.
+        parts: the lengths [bars] of each segment, by its name.
+        xlabel: label of the lengths.
     """
     width, height = _PANEL_INCHES
     figure = Figure(figsize=(2 * width, max(height, 0.8 + 0.21 * len(bars))), layout="constrained")
@@ -178,7 +178,7 @@ def stacked_bars(
 
 
 def short_label(text: str) -> str:
-    """Return a name from outside as a label: one line, printable, not too long."""
+    """Return an untrusted name as a label: one printable line of limited length."""
     visible = "".join(letter if letter.isprintable() else " " for letter in str(text))
     line = " ".join(visible.split())
     return line if len(line) <= _LONGEST_LABEL else line[: _LONGEST_LABEL - 1] + "…"

@@ -1,6 +1,6 @@
-"""`quality.html`: what the mesh stage did to a folder of objects, for people to look at.
+"""`quality.html`: a page on the results of the mesh stage for a folder of objects.
 
-One file without scripts or links to elsewhere; text from outside is escaped.
+It is one file without scripts or external links; untrusted text is escaped.
 """
 
 from collections import Counter
@@ -30,7 +30,7 @@ class Pair:
     """Pictures of one object before and after."""
 
     row: AssetRow
-    """What is known of it."""
+    """The object's row in the catalogue, with its quality figures."""
     source: NDArray[np.uint8]
     """[W, W] grey: the cleaned source."""
     result: NDArray[np.uint8]
@@ -50,11 +50,11 @@ def encode_quality_page(
 
     Args:
         rows: the accepted objects.
-        failures: the rejected ones.
+        failures: the rejected objects.
         pairs: pictures by the name of their group.
-        unread: what no code has read of accepted objects, by uid.
+        unread: unread parts of accepted objects, by uid.
         budget: most triangles of an object.
-        target: what was asked for, in words.
+        target: target of the mesh stage, in words.
     """
     parts = [
         element("h1", f"Assets: {target}"),
@@ -84,13 +84,13 @@ def _summary(rows: Sequence[AssetRow], failures: Sequence[Failure]) -> Markup:
 
 
 def _source_materials(rows: Sequence[AssetRow]) -> list[str | Markup]:
-    """Return how many objects have their own materials, and why others do not."""
+    """Return the number of objects with their own materials, and the reasons of the others."""
     requested = [row.materials for row in rows if row.materials is not None]
     if not requested:
         return []
     num_kept = sum(row.colours is not None for row in rows)
     reasons = Counter(materials.reason for materials in requested if materials.reason)
-    lost = Counter(word for found in requested for word in found.lost)
+    lost = Counter(word for materials in requested for word in materials.lost)
     why = ", ".join(f"{name} ({count})" for name, count in reasons.most_common())
     unseen = ", ".join(f"{name} ({count})" for name, count in lost.most_common())
     text = f"In their own materials: {num_kept} of {len(rows)}"

@@ -1,7 +1,7 @@
-"""`report.html`: a gallery of a dataset and its distributions, for people to look at.
+"""`report.html`: a gallery of a dataset and its distributions.
 
-The report is one file, whose only script filters its gallery; the pages of the gallery lie beside
-it in `report/`. It tells nothing of the clock or the machine: equal datasets give equal reports.
+The report is one file, whose only script filters its gallery; the pages of the gallery are in
+`report/`. It holds no time and no machine: equal datasets give equal reports.
 """
 
 import json
@@ -48,7 +48,7 @@ _SECTIONS = {
     "rejections": report_sections.rejections_section,
     "licences": report_sections.licences_section,
 }
-"""What makes each section, by the name that links to it; one of which there is nothing is empty."""
+"""Functions that make the sections, by the name that links to them; a section may be empty."""
 
 
 def write_report(
@@ -62,9 +62,9 @@ def write_report(
 
     Args:
         dataset: the dataset.
-        found: its distributions.
+        distributions: distributions of the dataset.
         max_scenes: most scenes in the gallery, up to 1000; they are spread over splits and shards.
-        out: the folder to write into; that of the dataset where None.
+        out: folder to write into; None for the dataset's folder.
 
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
@@ -97,7 +97,7 @@ def write_report(
 
 
 def _in_one_line(dataset: Dataset, distributions: Distributions) -> str:
-    """Return what the dataset is, above its pictures."""
+    """Return the summary line of the dataset, shown above its pictures."""
     manifest = dataset.manifest
     floors = summary(distributions.all("noise_floor_db"))
     median = f", median noise floor {floors['median']:.1f} dB" if floors["count"] else ""
@@ -140,7 +140,7 @@ def _overview(dataset: Dataset, distributions: Distributions) -> Markup:
 
 
 def _passes(names: Sequence[str]) -> Markup:
-    """Return which passes the shards hold; where they hold none, the command that writes some."""
+    """Return the passes in the shards; if there are none, the command that writes some."""
     if names:
         return joined([", ".join(names), "beside each picture"], " ")
     command = element("code", passes_command())

@@ -1,4 +1,4 @@
-"""The section of a report on textures and skies; a dataset without any has none."""
+"""The section of a report on textures and skies; empty for a dataset without any."""
 
 import numpy as np
 
@@ -9,14 +9,14 @@ from pipeline.documents.report_sections import section, summaries
 from storage.records.quantities import QUANTITIES
 
 _MOST_BARS = 24
-"""More families than this stand in the table only."""
+"""Most families in the figure; the table has all."""
 
 _MANY = {"scene": "scenes", "texture": "textures", "sky": "skies"}
 _OF_SKIES = ("sky_radiance", "sky_peak", "sky_half_light_deg")
 
 
 def maps_section(distributions: Distributions) -> Markup:
-    """Return which textures and skies there are, how large, how bright, and how sharp."""
+    """Return the section on families of textures and skies, their sizes and brightness."""
     if not distributions.maps:
         return Markup()
     with drawing():
@@ -37,7 +37,7 @@ def maps_section(distributions: Distributions) -> Markup:
 
 
 def maps_in_words(distributions: Distributions) -> dict[str, str]:
-    """Return a line on textures and one on skies, for a card; what is not there has none."""
+    """Return a line on textures and one on skies for the card, if there are any."""
     scenes = sum(distributions.scenes.values())
     textures = distributions.all("textures_per_scene")
     skies = distributions.all("skies_per_scene")

@@ -1,4 +1,4 @@
-"""The sections of a report: what a dataset holds, as figures and as numbers beside them."""
+"""The sections of a report: figures of a dataset's distributions, with tables of numbers."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ from storage.records.quantities import QUANTITIES, STATISTICS, summary
 _MOST_USED = 20
 _DEFAULT_STATISTICS = tuple(name for name in STATISTICS if name not in ("p5", "p95"))
 _MOST_BARS = 16
-"""More templates or reasons than this stand in the table only."""
+"""Most templates or reasons in a figure; the table has all."""
 _ATTEMPTS = (
     ("first attempt", 0, 0),
     ("second", 1, 1),
@@ -23,7 +23,7 @@ _ATTEMPTS = (
 
 
 def scenes_section(distributions: Distributions) -> Markup:
-    """Return how many scenes there are of each template and split."""
+    """Return the section on the number of scenes by template and split."""
     splits = distributions.splits
     templates = distributions.templates
     counts = {
@@ -45,7 +45,7 @@ def scenes_section(distributions: Distributions) -> Markup:
 
 
 def objects_section(distributions: Distributions) -> Markup:
-    """Return how many objects scenes hold, and how evenly the objects are used."""
+    """Return the section on objects per scene, and on how evenly objects are used."""
     uses = np.array(distributions.uses_per_object())
     with drawing():
         figure, axes = panels(2)
@@ -64,7 +64,7 @@ def objects_section(distributions: Distributions) -> Markup:
 
 
 def triangles_section(distributions: Distributions) -> Markup:
-    """Return the triangles of scenes and objects."""
+    """Return the section on triangles of scenes and objects."""
     budget = distributions.targets["max_triangles"]
     with drawing():
         figure, axes = panels(2)
@@ -79,7 +79,7 @@ def triangles_section(distributions: Distributions) -> Markup:
 
 
 def materials_section(distributions: Distributions) -> Markup:
-    """Return albedos, roughness and shading of the surfaces that are not lights."""
+    """Return the section on albedos, roughness and shading of all surfaces except lights."""
     picture = _histograms(
         distributions,
         ("diffuse", "specular", "albedo_sum", "roughness"),
@@ -105,14 +105,14 @@ def materials_section(distributions: Distributions) -> Markup:
 
 
 def lights_section(distributions: Distributions) -> Markup:
-    """Return number, radiance, distance and size of the lights."""
+    """Return the section on number, radiance, distance and size of the lights."""
     names = ("lights_per_scene", "total_emission", "light_distance", "light_size")
     picture = _histograms(distributions, names, ylabel=("scenes", "scenes", "lights", "lights"))
     return section("lights", "Lights", picture, summaries(distributions, *names))
 
 
 def cameras_section(distributions: Distributions) -> Markup:
-    """Return where cameras stand and how wide they look."""
+    """Return the section on positions and fields of view of the cameras."""
     names = ("camera_distance", "elevation_deg", "fov_deg")
     with drawing():
         figure, axes = panels(4, polar=(3,))
@@ -128,7 +128,7 @@ def cameras_section(distributions: Distributions) -> Markup:
 
 
 def pictures_section(distributions: Distributions) -> Markup:
-    """Return the measured errors of the pictures and what they cost."""
+    """Return the section on measured errors and samples of the pictures."""
     marks = {measured: distributions.targets[name] for name, measured in MEASURED.items()}
     marks |= {"spp": distributions.targets["max_spp"], "coverage": None}
     with drawing():
@@ -144,7 +144,7 @@ def pictures_section(distributions: Distributions) -> Markup:
 
 
 def rejections_section(distributions: Distributions) -> Markup:
-    """Return what was rejected, by stage and reason, and at which attempt."""
+    """Return the section on rejections by stage, reason and attempt."""
     rejections = distributions.rejections
     if not rejections:
         return joined([_heading("rejections", "Rejections"), element("p", "Nothing was rejected.")])
@@ -167,10 +167,10 @@ def rejections_section(distributions: Distributions) -> Markup:
 
 
 def licences_section(distributions: Distributions) -> Markup:
-    """Return the licences of the objects."""
+    """Return the section on licences of the objects."""
     rows = [(name, *counts) for name, counts in distributions.licences.items()]
     head = ("licence", "objects", "of them in scenes", "places in scenes")
-    note = element("p", "Whom to name for each object stands in attribution.csv.", class_="faint")
+    note = element("p", "attribution.csv names the author of each object.", class_="faint")
     numbers = table(head, rows, numbers=3, class_="narrow")
     return joined([_heading("licences", "Licences"), numbers, note])
 
@@ -268,7 +268,7 @@ def _heading(anchor: str, title: str) -> Markup:
 
 
 def section(anchor: str, title: str, picture: Markup, *details: Markup) -> Markup:
-    """Return a heading that links lead to, with a picture and what stands beside it."""
+    """Return a section: a heading with an anchor, a figure, and details beside it."""
     figure_box = element("div", picture, class_="figure")
     numbers_box = element("div", *details, class_="numbers")
     return joined([_heading(anchor, title), element("div", figure_box, numbers_box, class_="pair")])

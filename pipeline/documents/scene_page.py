@@ -1,4 +1,4 @@
-"""The HTML page of one scene: its pictures, and tables of what they show."""
+"""The HTML page of one scene: its pictures, and tables of its contents."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -44,14 +44,14 @@ nav { display: flex; gap: 1.5rem } td:first-child { min-width: 9rem }
 
 @dataclass(frozen=True, kw_only=True)
 class Neighbours:
-    """Where a page leads to, as relative links."""
+    """Relative links of a scene's page."""
 
     report: str
-    """The report."""
+    """Link to the report with all scenes."""
     before: str | None
-    """The scene before, if there is one."""
+    """Link to the previous scene, if there is one."""
     after: str | None
-    """The scene after."""
+    """Link to the next scene, if there is one."""
 
 
 def encode_scene_page(
@@ -60,9 +60,9 @@ def encode_scene_page(
     """Return the page of one scene.
 
     Args:
-        sample: the scene with its pictures, lawful.
-        split: its split.
-        rejected: the rejected attempts at it and its views.
+        sample: a valid scene with its pictures.
+        split: split of the scene.
+        rejected: rejected attempts at the scene and its views.
         links: relative links to the other pages.
     """
     scene = sample.scene
@@ -93,7 +93,7 @@ def encode_scene_page(
 
 
 def preview(radiance_rgb: NDArray[np.float32], width: int) -> NDArray[np.uint8]:
-    """Return a picture tone-mapped for people, reduced to at most `width` pixels [W, W, 3]."""
+    """Return a picture tone-mapped for display, reduced to at most `width` pixels [W, W, 3]."""
     pixels = preview_srgb8(radiance_rgb)
     if pixels.shape[1] <= width:
         return pixels
@@ -154,7 +154,7 @@ def _views(sample: Sample) -> Markup:
 
 
 def _parts(sample: Sample) -> list[Markup]:
-    """Return the pictures of the parts that are stored, with their floors."""
+    """Return the pictures of the stored light components, with their noise floors."""
     if sample.parts_rgb is None:
         return []
     figures = []

@@ -1,7 +1,7 @@
-"""What the pixels of a scene's views see, as small pictures for its page.
+"""Small pictures of passes (depth, normals, ids and others) for the page of a scene.
 
 They are computed from the scene when the page is written, so that a dataset stores nothing for
-them. At 96 pixels a side, all views of a scene cost about half of what its page costs without them.
+them. At 96 pixels a side, all views of a scene cost about half as much as the rest of its page.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,22 +30,22 @@ PASSES_STYLE = """
 @media (max-width: 32rem) { .passes { grid-template-columns: 1fr 1fr } }
 section code { display: block; overflow-x: auto; white-space: nowrap; margin-bottom: 1rem }
 """
-"""What `passes_section` needs of the page's style."""
+"""Style sheet of `passes_section`."""
 
 _PREVIEW_PX = 96
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShownPass:
-    """How one pass is shown."""
+    """Display of one pass."""
 
     word: str
-    """The pass, as `trilight passes` takes it."""
+    """Name of the pass, as `trilight passes` takes it."""
     title: str
     pixels: Callable[[NDArray], NDArray[np.uint8]]
-    """Returns the picture."""
+    """Converts the values of the pass to a picture."""
     caption: Callable[[NDArray], str]
-    """Returns what the picture's colours mean; it is asked only where something is met."""
+    """Returns the meaning of the picture's colors; called only if a pixel meets a surface."""
 
 
 def _range_caption(form: str) -> Callable[[NDArray], str]:
@@ -87,7 +87,7 @@ SHOWN_PASSES = (
 
 
 def passes_section(sample: Sample) -> Markup:
-    """Return small pictures of what each view of a sample sees, and the command for the numbers."""
+    """Return small pictures of the passes of each view, and the command that writes the numbers."""
     words = [pass_view.word for pass_view in SHOWN_PASSES]
     intro = element(
         "p",
@@ -101,10 +101,10 @@ def passes_section(sample: Sample) -> Markup:
 
 
 def passes_command(words: Sequence[str] = (), *, scene: str | None = None) -> str:
-    """Return the command that writes passes beside the dataset in whose folder it runs.
+    """Return the command that writes passes beside a dataset; it is run in the dataset's folder.
 
     Args:
-        words: passes, as `trilight passes` takes them; none for those it writes by default.
+        words: passes, as `trilight passes` takes them; empty for its default.
         scene: key of the only scene; None for all.
     """
     one = "" if scene is None else f" --scene {scene}"

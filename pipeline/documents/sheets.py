@@ -1,4 +1,4 @@
-"""Sheets: one picture that shows many of a dataset's, for people; tones as preview_srgb8."""
+"""Sheets: one picture with many pictures of a dataset, tone-mapped by `preview_srgb8`."""
 
 from collections.abc import Mapping
 
@@ -40,7 +40,7 @@ def write_contact_sheet(
 
     Args:
         dataset: the dataset.
-        statistics: its statistics.
+        statistics: statistics of the dataset.
         max_scenes: most scenes that are shown.
         out: the folder to write into; the folder of the dataset by default.
 
@@ -70,13 +70,13 @@ def write_contact_sheet(
 
 
 def write_first_pictures(folder: DatasetFolder, sample: Sample, *, build: str, split: str) -> None:
-    """Write `contact_sheet.png` of one scene, for whoever looks before the dataset is finished.
+    """Write `contact_sheet.png` of one scene, as a preview before the dataset is finished.
 
     Args:
-        folder: the dataset in the making.
+        folder: folder of the unfinished dataset.
         sample: its first finished scene.
         build: name of the build.
-        split: of the scene.
+        split: split of the scene.
 
     Raises:
         TrilightError: the folder cannot be written.
@@ -140,7 +140,7 @@ def _tile(radiance_rgb: NDArray[np.float32]) -> Image.Image:
 
 
 def _first_scenes(dataset: Dataset, per_template: int) -> Mapping[str, dict[str, ShardEntry]]:
-    """Return the shard of each scene to show by key, by template."""
+    """Return the scenes to show by template: their shards by key."""
     rows: dict[str, dict[str, ShardEntry]] = {}
     for shard in described_shards(dataset):
         for record in dataset.read_scenes(shard):

@@ -159,8 +159,18 @@ def make_assets(
     )
     _write(folder, settings, report, levels)
     pairs = _pairs(prepared, rows, levels, settings)
+    _write_page(folder, settings, report, pairs)
+    return report
+
+
+def _write_page(
+    folder: AssetFolder,
+    settings: AssetSettings,
+    report: AssetReport,
+    pairs: dict[str, list[Pair]],
+) -> None:
     page = encode_quality_page(
-        rows,
+        report.rows,
         report.failures,
         pairs,
         report.unread,
@@ -168,7 +178,6 @@ def make_assets(
         target=_target(settings),
     )
     write_atomically(folder.page, page)
-    return report
 
 
 def _require_ours(folder: AssetFolder) -> None:

@@ -222,7 +222,7 @@ def prepare_in_batches(
     """Prepare objects together with all other workers; return when all are done.
 
     Args:
-        records: records of the objects, sorted by uid.
+        records: objects, sorted by uid.
         work: input that the batches share.
         workers: number of objects that are prepared here at the same time.
         done: called with a number of objects that are done, here or elsewhere; from any thread.
@@ -245,21 +245,15 @@ def prepare_in_batches(
     def make(number: int) -> bool:
         return not should_stop() and batches[number].make(meshes, done)
 
-    # each worker begins at another batch, since to find one claimed costs a look
-    first = uuid.uuid4().int % len(batches) if batches else 0
-    order = [*range(first, len(batches)), *range(first)]
-
+    order = _random_order(len(batches))
     at_once = 1 + -(-workers // _NUM_OBJECTS)  # no child waits for the last object of a batch
     # children end first: after Ctrl-C no thread waits for the objects that it has in hand
     with ThreadPoolExecutor(at_once) as threads, MeshWork(work.settings, workers) as meshes:
         pause_s = _PAUSES_S[0]
         notice = WaitNotice()
         while True:
-            for number, batch in enumerate(batches):
-                if number not in results and (result := batch.result()) is not None:
-                    results[number] = result
-                    if number not in ours:
-                        done(len(batch.records))
+            for number in _collect_results(batches, results) - ours:
+                done(len(batches[number].records))
             missing = [number for number in order if number not in results]
             if not missing or should_stop():
                 break
@@ -275,6 +269,22 @@ def prepare_in_batches(
                 pause_s = min(2 * pause_s, _PAUSES_S[1])
     ordered = [result for _, result in sorted(results.items())]
     return [one for some, _ in ordered for one in some], [f for _, some in ordered for f in some]
+
+
+def _random_order(count: int) -> list[int]:
+    """Return batch numbers from a random first one: to find a claimed batch costs a look."""
+    first = uuid.uuid4().int % count if count else 0
+    return [*range(first, count), *range(first)]
+
+
+def _collect_results(batches: Sequence[ObjectBatch], results: dict[int, PrepareResult]) -> set[int]:
+    """Add the results that are new to `results`; return the numbers of their batches."""
+    new = set()
+    for number, batch in enumerate(batches):
+        if number not in results and (result := batch.result()) is not None:
+            results[number] = result
+            new.add(number)
+    return new
 
 
 def _may_change(failures: Iterable[Failure]) -> bool:

@@ -111,17 +111,28 @@ def render_sample(
     views = [render_view(view) for view in range(scene.num_views)]
     seen = with_cameras(scene, [view.camera for view in views])
     seen.check()
+    members = kept_pictures.members if kept_pictures else {}
+    return _stack_views(key, seen, views, settings, members)
+
+
+def _stack_views(
+    key: str,
+    scene: Scene,
+    views: Sequence[_AcceptedView],
+    settings: BuildSettings,
+    members: Mapping[str, bytes],
+) -> Sample:
     lights = [view.lights_rgb for view in views if view.lights_rgb is not None]
     parts = [view.parts_rgb for view in views if view.parts_rgb is not None]
     return Sample(
         key=key,
-        scene=seen.with_provenance({**seen.provenance, "settings_sha256": settings.digest}),
+        scene=scene.with_provenance({**scene.provenance, "settings_sha256": settings.digest}),
         radiance_rgb=np.stack([view.radiance_rgb for view in views]),
         views=tuple(view.record for view in views),
         lights_rgb=np.stack(lights) if lights else None,
         parts_rgb=_stack_parts(parts) if parts else None,
-        passes_exr=_passes_exr(seen, settings),
-        kept_members=kept_pictures.members if kept_pictures else {},
+        passes_exr=_passes_exr(scene, settings),
+        kept_members=members,
     )
 
 

@@ -1,7 +1,7 @@
-"""Which objects of a split still fit into a scene, and the draw among them.
+"""Draws objects of a split among those that still fit into a scene.
 
-All of a split may be millions. What a draw has to know of each is its triangles and the camp of its
-licence, two columns that are looked at in parts; where all fit, which is the rule, at none.
+A split may have millions of objects. A draw needs the triangles of each and the camp of its
+licence: two columns that are read in chunks, and not at all if every object fits, as usual.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from storage.errors import Rejected
 from storage.records.object_index import CampSizes
 
 _CHUNK = 1 << 16
-"""Rows that are looked at together: half a megabyte."""
+"""Rows of a column that are read together: half a megabyte."""
 
 
 class Column(Protocol):
@@ -31,13 +31,13 @@ class FitTable:
     def __init__(
         self, least: Column, camp: Column, camps: Sequence[str], sizes: Mapping[str, CampSizes]
     ) -> None:
-        """Remember the columns.
+        """Make a table of columns.
 
         Args:
             least: triangles of the coarsest level of each row.
             camp: number of each row's camp.
-            camps: name of each number; "" is for objects that have no camp.
-            sizes: of the camps that occur.
+            camps: name of each camp by number; "" is for objects without a camp.
+            sizes: number and sizes of the objects of each camp that occurs.
         """
         self._least = least
         self._camp = camp
@@ -46,7 +46,7 @@ class FitTable:
 
     @classmethod
     def of(cls, least: Sequence[int], camps: Sequence[str] = ()) -> "FitTable":
-        """Return the table of some entries; without `camps` none has one."""
+        """Return the table of some objects; without `camps` none has a camp."""
         names = sorted({*camps}) or [""]
         sizes = np.array(least, np.int64)
         numbers = np.array([names.index(camp) for camp in camps] or [0] * len(least), np.int64)
@@ -70,10 +70,10 @@ class FitTable:
         return self._camps[int(self._camp[row : row + 1][0])]
 
     def draw_row(self, rng: np.random.Generator, rooms: Mapping[str, int]) -> int | None:
-        """Draw a row evenly among those that fit; None where none does.
+        """Draw a row uniformly among those that fit; None if none does.
 
         Args:
-            rng: where the number comes from.
+            rng: source of the random number.
             rooms: most triangles by camp; rows of other camps do not fit.
         """
         if rooms.keys() == self.sizes.keys() and all(
@@ -102,20 +102,20 @@ class FitTable:
 def draw_rows(
     rng: np.random.Generator, table: FitTable, count: int, num_triangles: int
 ) -> list[int]:
-    """Draw rows with replacement, evenly among those that fit beside the ones before.
+    """Draw rows with replacement, uniformly among those that fit beside the earlier ones.
 
     If all fit, this is a uniform draw. Otherwise simple objects are drawn more often beside
-    demanding ones, as they would be if whole scenes were drawn until one fits.
-    Objects of two different camps never fit beside each other.
+    demanding ones, as they would be if whole scenes were drawn until one fits. Objects of two
+    different camps never fit beside each other.
 
     Args:
-        rng: where the numbers come from.
-        table: what to draw from, at least one row.
-        count: how many.
-        num_triangles: for all together.
+        rng: source of the random numbers.
+        table: table to draw from, with at least one row.
+        count: number of rows to draw.
+        num_triangles: most triangles of all rows together.
 
     Raises:
-        Rejected: "over_budget" where not even the simplest fit.
+        Rejected: "over_budget" if not even the simplest objects fit.
     """
     allowed = set(table.sizes)
     remaining = num_triangles
@@ -140,6 +140,6 @@ def draw_rows(
 
 
 def _simplest_after(table: FitTable, camp: str, allowed: set[str]) -> int:
-    """Return the triangles of the simplest object that may still come after one of a camp."""
+    """Return the triangles of the simplest object that is allowed after one of a camp."""
     camps = allowed & {"", camp} if camp else allowed
     return min(table.sizes[other].least for other in camps)

@@ -24,11 +24,11 @@ class ShadedMesh:
     """A mesh with one normal per vertex."""
 
     positions: NDArray[np.float32]
-    """[V, 3]."""
+    """[V, 3] vertices in the space of the input."""
     normals: NDArray[np.float32]
-    """[V, 3] unit."""
+    """[V, 3] unit vectors, one for each vertex."""
     faces: NDArray[np.uint32]
-    """[T, 3]."""
+    """[T, 3] rows of the three vertices."""
     groups: NDArray[np.int64]
     """[T] shading group, numbered from 0; all 0 where the mesh is flat."""
 
@@ -83,7 +83,7 @@ def shading_groups(
 ) -> NDArray[np.int64]:
     """Return the group [T] of each face: connected through shared edges of at most `angle_deg`.
 
-    An edge of more than two faces, or of two that disagree on what is outside, is always sharp.
+    An edge of more than two faces, or of two faces with opposite orientation, is always sharp.
     """
     directed = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
     ends = np.sort(directed.astype(np.int64), axis=1)

@@ -1,8 +1,8 @@
-"""More triangles of the same surface: the longest edges are halved until there are enough.
+"""Subdivides meshes: halves the longest edges until a scene has a given number of triangles.
 
-With it a test set measures what the number of triangles alone does. Triangles are flat, so new
-vertices stay on the surface to the rounding of float32; each part keeps the material of the whole,
-and new vertices get the mean of their neighbours' normals.
+A test set uses it to measure the effect of the number of triangles alone. Triangles are flat, so
+new vertices stay on the surface up to the rounding of float32; each new triangle keeps its
+material, and new vertices get the mean of their neighbors' normals.
 """
 
 import dataclasses
@@ -58,7 +58,7 @@ def subdivide(piece: ScenePiece, num_faces: int) -> ScenePiece:
 def _interpolate_uv(
     before: ShadedMesh, after: ShadedMesh, origin: NDArray[np.int64], uv: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Return coordinates [T, 3, 2] of parts of flat triangles whose corners had `uv` [F, 3, 2]."""
+    """Return uv [T, 3, 2] of subdivided triangles, interpolated from `uv` [F, 3, 2]."""
     triangles = before.positions[before.faces].astype(np.float64)[origin]
     parts = after.positions[after.faces].astype(np.float64)
     sides = triangles[:, 1:] - triangles[:, :1]  # [T, 2, 3]
@@ -70,7 +70,7 @@ def _interpolate_uv(
 
 
 class _Work:
-    """A mesh in the making. Edges are identified by position: flat faces share no vertices."""
+    """A mesh while it is subdivided. Positions identify edges: flat faces share no vertices."""
 
     def __init__(self, mesh: ShadedMesh) -> None:
         self._points = list(mesh.positions.astype(np.float64))

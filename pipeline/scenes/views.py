@@ -1,8 +1,8 @@
-"""Chooses cameras: of sixteen proposals per view, those that see enough, one after the other.
+"""Chooses cameras: tries up to sixteen proposals per view until one sees enough.
 
 Proposals are numbered, and each is a pure function of (seed, scene, attempt, view, number). A view
-whose picture turns out black can therefore go on to the next one, long after composition and in
-another process.
+whose picture turns out black can therefore continue with the next one, long after composition and
+in another process.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from storage.records.scene import Scene
 from storage.seeds import rng_for
 
 CAMERA_ATTEMPTS = 16
-"""Proposals per view."""
+"""Number of proposals per view."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,16 +32,16 @@ class ViewCamera:
     fov_deg: np.float32
     """Full field of view in degrees."""
     attempt: int
-    """Number of the proposal."""
+    """Number of the camera's proposal, from 0."""
 
 
 def with_first_cameras(
     scene: Scene, settings: SceneSettings, first_cameras: Sequence[ViewCamera] = ()
 ) -> Scene:
-    """Return the scene with `settings.num_views` cameras, of which the first may be given.
+    """Return the scene with `settings.num_views` cameras: `first_cameras`, then drawn ones.
 
     Raises:
-        Rejected: "no_camera", or "no_layout" where its template draws none.
+        Rejected: "no_camera", or "no_layout" if its template draws none.
     """
     visibility = Sight(scene)
     views = range(len(first_cameras), settings.num_views)
@@ -52,12 +52,12 @@ def with_first_cameras(
 def cameras_of_view(
     scene: Scene, visibility: Sight, settings: SceneSettings, view: int
 ) -> Iterator[ViewCamera]:
-    """Yield the camera that a view has, and then each following proposal that sees enough.
+    """Yield the camera of a view, and then each following proposal that sees enough.
 
     Args:
-        scene: as compose_scene returned it.
-        sight: of this scene.
-        settings: those that the scene was composed with.
+        scene: scene as `compose_scene` returned it.
+        visibility: visibility of this scene.
+        settings: settings that the scene was composed with.
         view: row of `scene.c2w`.
 
     Raises:
@@ -70,14 +70,14 @@ def cameras_of_view(
 
 
 def cameras_of(scene: Scene) -> list[ViewCamera]:
-    """Return the cameras that a scene has."""
+    """Return the cameras of a scene."""
     attempts = scene.provenance.get("camera_attempts", [0] * scene.num_views)
     rows = zip(scene.c2w, scene.fov_deg, attempts, strict=True)
     return [ViewCamera(c2w=c2w, fov_deg=fov, attempt=attempt) for c2w, fov, attempt in rows]
 
 
 def with_cameras(scene: Scene, cameras: Sequence[ViewCamera]) -> Scene:
-    """Return the scene seen by these cameras, whose attempts it remembers."""
+    """Return the scene with these cameras; its provenance records their attempts."""
     posed = scene.with_cameras(
         np.stack([camera.c2w for camera in cameras]),
         np.array([camera.fov_deg for camera in cameras]),
@@ -88,7 +88,7 @@ def with_cameras(scene: Scene, cameras: Sequence[ViewCamera]) -> Scene:
 
 
 def view_problem(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str | None:
-    """Return what is wrong with a view, or None."""
+    """Return why a view is rejected, or None."""
     if facts.depth < settings.min_depth:
         return "too near"
     if has_objects and facts.coverage < settings.min_coverage:
@@ -103,7 +103,7 @@ def view_problem(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> 
 def _accepted_proposals(
     scene: Scene, sight: Sight, settings: SceneSettings, view: int, first: int
 ) -> Iterator[ViewCamera]:
-    """Yield proposals from `first` on that see enough; raises Rejected when they are used up."""
+    """Yield proposals from `first` on that see enough; raises Rejected after the last one."""
     has_objects = any(entry.kind == "object" for entry in scene.objects)
     problems: list[str] = []
     for attempt in range(first, CAMERA_ATTEMPTS):

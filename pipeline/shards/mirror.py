@@ -1,17 +1,15 @@
 """`Mirror`: synchronizes a machine's local folder with a dataset in a bucket.
 
-The bucket has the same files as a folder. The manifest is created once, the objects are frozen
-once, and each shard is uploaded once: the server refuses a second writer, which then reads the
-existing file. Below `.staging` is a note for each shard with its manifest entry and the rejections
-of its scenes. A shard is finished when it and its note are in the bucket, or the manifest lists it.
-The list in the manifest follows from the notes, so any machine that finds all shards may write it.
+The bucket has the same files as a folder. Manifest, lock and shards are each created once: the
+server refuses a second writer, which then reads the existing file. Below `.staging` is a note for
+each shard with its manifest entry and rejections. A shard is finished when it and its note are in
+the bucket, or the manifest lists it. The notes decide that list, so any machine may write it.
 
-The local folder has the manifest without that list; its marks of uploaded shards cover the parts of
+The local folder has the manifest without the list; its marks of uploaded shards cover the parts of
 the dataset that its workers have requested.
 
-Machines claim batches of objects through the bucket (storage.remote.claims). Claims on scenes do
-not reach other machines: two machines with the same shards make scenes twice, and the first writer
-of a shard wins. That wastes work and never gives a wrong result.
+Machines claim batches of objects through the bucket (storage.remote.claims), but not scenes: two
+machines with the same shards make scenes twice, and the first writer wins, without a wrong result.
 """
 
 import contextlib
@@ -90,10 +88,9 @@ class Mirror:
         return Dataset(self._files, manifest)
 
     def adopt(self) -> None:
-        """Synchronize the folder's published files with the bucket.
+        """Synchronize the folder with the bucket; call while no other process uses it.
 
-        Staged scenes stay if they belong to the same dataset; if the folder belongs to another one,
-        or the bucket is empty, they are deleted. Call while no other process uses the folder.
+        Staged scenes stay only if the bucket holds the same dataset.
 
         Raises:
             TrilightError: the bucket cannot be read.
@@ -126,7 +123,6 @@ class Mirror:
             write_manifest(self._folder.manifest, theirs)
 
     def _fetch_lock(self, sha256: str) -> None:
-        """Download the lock and its index, unless the folder has them."""
         lock = self._folder.objects_lock
         index = self._folder.staged_index
         if not sha256 or (lock.exists() and sha256_of_file(lock) == sha256):
@@ -180,8 +176,7 @@ class Mirror:
     def claim(self, path: Path) -> Iterator[bool]:
         """Download a file of the bucket; hold the claim on it if it does not exist.
 
-        The holder uploads the file before the claim ends. Only one process of a machine may claim
-        the same file at a time.
+        The holder uploads the file. Only one process of a machine may claim a file at a time.
         """
         self._fetch(path)
         if path.exists():
@@ -268,8 +263,7 @@ class Mirror:
         """Upload a shard of the folder; the cache keeps its bytes.
 
         Returns:
-            The note on the shard that is in the bucket then, ours or that of the first writer;
-            None if another worker uploads or has uploaded it, or it grows.
+            The note in the bucket; None if another worker uploads or uploaded it, or it grows.
         """
         folder = self._folder
         path = self._folder.shard(name)
@@ -291,9 +285,9 @@ class Mirror:
     def _upload(self, made: ShardNote) -> ShardNote | None:
         """Upload a shard with its log and note; return the note that is in the bucket then.
 
-        A worker that was not first adopts the first writer's note. If that is missing, the first
-        writer was killed, and this worker's rejections are stored instead. A shard with more scenes
-        replaces a smaller one; None if another machine is replacing it.
+        A worker that was not first adopts the first writer's note; if that writer was killed before
+        it wrote one, this worker's rejections are stored. A shard with more scenes replaces a
+        smaller one; None if another machine is replacing it.
         """
         name = made.shard.name
         folder = self._folder
@@ -330,7 +324,6 @@ class Mirror:
             self._bucket.write("manifest.json", path)
 
     def _read_note(self, name: str) -> ShardNote | None:
-        """Return the bucket's note on a shard, or None."""
         data = self._files.read(note := self._name(note_of(self._folder, name)))
         if data is None:
             return None
@@ -343,7 +336,6 @@ class Mirror:
         return ShardNote(shard=shard, failures=(), scenes=planned_scenes_of(theirs, shard))
 
     def _index_remote(self, name: str) -> ShardEntry:
-        """Return the entry of a shard of the bucket by reading it."""
         url = self._files.url.child(name)
         with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
             return index_stream(stream, Path(name).name)
@@ -388,7 +380,6 @@ class Mirror:
         return read_beside(self._files, decode_manifest)
 
     def _merge_failures(self) -> None:
-        """Merge the bucket's rejections into the folder's."""
         theirs = decode_failures(self._files.read("failures.jsonl") or b"")
         known = read_failures(self._folder.failures)
         write_failures(self._folder.failures, [*known, *theirs])
@@ -400,7 +391,6 @@ class Mirror:
             return None
 
     def _mark_sent(self, name: str) -> None:
-        """Record that a shard is in the bucket; a lost record is made again by a scan."""
         path = self._folder.staged_sent / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
