@@ -1,4 +1,4 @@
-"""`BuildSettings`: everything that decides what a dataset holds, except how many scenes."""
+"""`BuildSettings`: all settings that decide the contents of a dataset, except its size."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
@@ -31,17 +31,17 @@ class BuildSettings:
     allowed_licences: tuple[str, ...]
     """Licences of objects that may be used."""
     assets: AssetSettings
-    """How objects become meshes."""
+    """Settings of the mesh stage, which converts objects to meshes."""
     scenes: SceneSettings
-    """How meshes become scenes."""
+    """Settings of composition, which places meshes, lights and cameras in scenes."""
     renders: RenderSettings
-    """How scenes become pictures."""
+    """Settings of rendering, which makes a picture of each view."""
     splits: SplitSettings
-    """How objects and scenes are divided into splits and shards."""
+    """Settings that divide objects and scenes into splits and shards."""
     storage: StorageSettings = dataclasses.field(default_factory=StorageSettings)
-    """How arrays and pictures are packed."""
+    """Settings of the files in which arrays and pictures are packed."""
     revisit: RevisitSettings | None = None
-    """What is new, if the scenes are those of a finished dataset; by default they are composed."""
+    """Changes to the scenes of a finished dataset; by default scenes are composed."""
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:

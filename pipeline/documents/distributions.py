@@ -146,7 +146,7 @@ MEASURED = {
     "noise_floor_linear_db": "noise_floor_linear_db",
     "noise_floor_objects_db": "object_noise_floor_db",
 }
-"""What is measured of a view, by the name of its target in the settings of renders."""
+"""Measured quantity of a view, by the name of its target in the settings of renders."""
 
 
 @dataclass(kw_only=True, eq=False)

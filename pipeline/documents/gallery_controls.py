@@ -13,14 +13,14 @@ from storage.records.lights import num_lights
 from storage.records.sample import Sample
 
 _MOST_CHOICES = 12
-"""Of one filter; a dataset with more layouts has the first ones by name."""
+"""Most choices of one filter; a dataset with more layouts shows the first ones by name."""
 
 _CAPS = {False: "within the target", True: "at the cap"}
 
 _SELECT = "trilight shards select . --out ../selected"
 
 _OPTIONS = {"split": "--split", "layout": "--template", "views": "--where"}
-"""What selects the scenes of a choice, by the name of its filter."""
+"""Option that selects the scenes of a choice, by the name of its filter."""
 
 _WHERE = {_CAPS[False]: "not any(at_cap)", _CAPS[True]: "any(at_cap)"}
 
@@ -56,7 +56,7 @@ addEventListener("pageshow", show);  // a browser that comes back restores the b
 
 @dataclass(frozen=True, kw_only=True)
 class CardFacts:
-    """What the gallery can be filtered and sorted by."""
+    """Filter and sort values of one scene in the gallery."""
 
     choices: Mapping[str, str]
     """Value of the scene for each filter, by its name; empty if unknown."""

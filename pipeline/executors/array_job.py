@@ -31,7 +31,7 @@ class DatasetByArray(DatasetOrder):
     """A dataset made by the tasks of a scheduler's array."""
 
     scheduler: Literal["slurm", "kubernetes", "none"] = "slurm"
-    """Scheduler that is asked for what is missing; none only watches what others have submitted."""
+    """Scheduler that gets the missing tasks; none only shows the progress of submitted ones."""
     shards_per_task: Annotated[int | None, Within(1, 10**6, unit="shards")] = None
     """Number of shards of an array task; by default as few as 1000 tasks allow."""
     at_once: Annotated[int | None, Within(1, 10**6, unit="tasks")] = None

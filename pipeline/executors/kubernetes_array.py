@@ -34,7 +34,7 @@ _KEPT_S = 86400
 
 @checked()
 class KubernetesOptions:
-    """With kubernetes: the machines."""
+    """With kubernetes: options of the machines."""
 
     REMOVED: ClassVar = ("on_demand",)
     """Options of earlier versions, which are refused with a message."""
@@ -219,7 +219,7 @@ def _image(options: KubernetesOptions) -> str:
 
 
 def _require_bucket_alone(order: DatasetOrder) -> None:
-    """Raise TrilightError where a task would need a file of this machine."""
+    """Raise TrilightError if a task would need a file of this machine."""
     if order.place.partition("://")[0] not in WRITABLE:
         raise TrilightError(
             f"submit kubernetes: --out is {order.place}; expected a bucket such as "

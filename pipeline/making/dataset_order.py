@@ -23,7 +23,7 @@ _PER_MACHINE = ("build", "out", "shards", "workers")
 
 @checked()
 class DatasetOrder:
-    """Which dataset to make, or which part of it, and how."""
+    """The dataset to make, the range of its shards, and how."""
 
     build: str = "smoke"
     """Name of a build (a named set of settings), such as smoke or pretrain-256."""

@@ -110,6 +110,6 @@ class SplitPool(IndexedPool):
             raise TrilightError(
                 f"objects.index: says otherwise of {locked.uid!r} than objects.lock.jsonl and its "
                 "file; expected the index of this lock. Delete .staging/objects.index, and it is "
-                "made anew."
+                "made again."
             )
         return pooled

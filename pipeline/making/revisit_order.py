@@ -27,7 +27,7 @@ _LIGHTS = "expected keep, new, or a number of new lights, such as 3"
 
 @checked()
 class Revisit:
-    """The finished dataset, and what is to be new in its scenes."""
+    """The finished dataset, and the changes to its scenes."""
 
     dataset: str
     """Folder of a finished dataset."""
