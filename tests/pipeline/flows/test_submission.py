@@ -153,7 +153,7 @@ def test_what_is_no_prefect_is_said_in_one_sentence_by_every_runner(
     with serve() as site:
         site.put("api/admin/version", "<html>")
         cases = {
-            "http://127.0.0.1:9/api": "^Prefect at .*: Connection refused. Run make serve, or mend",
+            "http://127.0.0.1:9/api": "^Prefect at .*: Connection refused. Run make serve, or fix",
             "garbage": "^Prefect at garbage: .* missing an 'http://'",
             f"{site.url}/api": "is no API of Prefect; expected one, such as",
             f"{site.url}/x": "it answers 404",

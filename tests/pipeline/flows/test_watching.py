@@ -140,10 +140,10 @@ def test_the_page_ends_with_how_far_everything_is(
     monkeypatch.setattr(watching.time, "monotonic", lambda: 0.0)
     watched = RunArtifacts(DatasetOrder(out=str(tmp_path)))
     done = DatasetProgress(shards=1, scenes=4, shards_requested=2, scenes_requested=8)
-    publication = SimpleNamespace(done=done, manifest=SimpleNamespace(num_views=2))
+    publication = SimpleNamespace(progress=done, manifest=SimpleNamespace(num_views=2))
     run: Any = SimpleNamespace(publication=publication)
     watched.record_task(run, _task(4, 1.0))
-    publication.done = DatasetProgress(
+    publication.progress = DatasetProgress(
         shards=2, scenes=8, shards_requested=2, scenes_requested=8, given_up=1
     )
     watched.record_task(run, _task(4, 1.0))  # too soon for another table

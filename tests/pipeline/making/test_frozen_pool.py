@@ -327,7 +327,7 @@ def test_without_own_ones_a_scene_is_what_it_was(
     own = user_maps(accepted.rows, "train")
     first, second = (
         compose_scene(plain, small_pool(), seed=0, scene_index=3, attempt=0, **given)
-        for given in ({}, {"own": own})
+        for given in ({}, {"user_maps": own})
     )
     assert [t.sha256 for t in first.textures] == [t.sha256 for t in second.textures]
     assert "maps" not in second.provenance
