@@ -1,4 +1,4 @@
-"""Which scenes a person is shown: a few, spread evenly over splits and shards."""
+"""Chooses a few scenes to show, spread evenly over splits and shards."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from storage.dataset.manifest import ShardEntry
 from storage.records.sample import Sample
 
 _LEAST_SHARE = 8
-"""A split with few scenes gets up to one place in this many."""
+"""Divisor of the chosen scenes: a split with few scenes gets up to one in this many."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,10 +30,10 @@ class Chosen:
 def choose_scenes(
     dataset: Dataset, max_scenes: int, splits: Sequence[str] = SPLITS
 ) -> list[Chosen]:
-    """Choose up to `max_scenes` scenes; only shards of which some are chosen are opened.
+    """Choose up to `max_scenes` scenes; only shards with chosen scenes are opened.
 
-    Every split has its share of them, at least an eighth where it holds so many. Within a split
-    they are spread evenly over its shards. The order is that of splits, then shards.
+    Every split gets scenes in proportion, at least an eighth if it has so many. Within a split they
+    are spread evenly over its shards. The order is that of splits, then shards.
 
     Raises:
         TrilightError: a shard is missing or damaged.
@@ -42,10 +42,10 @@ def choose_scenes(
     ends = [np.cumsum([shard.num_samples for shard in each], dtype=int) for each in shards]
     counts = [int(each[-1]) if len(each) else 0 for each in ends]
     chosen = []
-    for each, end, count, places in zip(
-        shards, ends, counts, _places(counts, max_scenes), strict=True
+    for each, end, count, num_chosen in zip(
+        shards, ends, counts, _scenes_per_split(counts, max_scenes), strict=True
     ):
-        rows = np.linspace(0, count - 1, places).round().astype(int)
+        rows = np.linspace(0, count - 1, num_chosen).round().astype(int)
         holding = np.searchsorted(end, rows, side="right")
         for number in dict.fromkeys(holding.tolist()):
             shard = each[number]
@@ -67,18 +67,18 @@ def read_chosen(dataset: Dataset, chosen: Sequence[Chosen]) -> Iterator[tuple[Ch
             yield entry, sample
 
 
-def _places(counts: Sequence[int], max_scenes: int) -> list[int]:
-    """Return how many scenes of each split to show, together at most `max_scenes`."""
+def _scenes_per_split(counts: Sequence[int], max_scenes: int) -> list[int]:
+    """Return the number of scenes to show of each split, together at most `max_scenes`."""
     total = sum(counts)
     if total <= max_scenes:
         return list(counts)
     one_each = max_scenes >= sum(count > 0 for count in counts)
-    wanted = max(max_scenes // _LEAST_SHARE, int(one_each))
-    least = [min(count, wanted) for count in counts]
-    left = max_scenes - sum(least)
+    minimum = max(max_scenes // _LEAST_SHARE, int(one_each))
+    least = [min(count, minimum) for count in counts]
+    remaining = max_scenes - sum(least)
     spare = [count - low for count, low in zip(counts, least, strict=True)]
-    share = [left * entry // sum(spare) for entry in spare]
-    while sum(share) < left:
-        unmet = [entry - given for entry, given in zip(spare, share, strict=True)]
+    share = [remaining * entry // sum(spare) for entry in spare]
+    while sum(share) < remaining:
+        unmet = [entry - granted for entry, granted in zip(spare, share, strict=True)]
         share[int(np.argmax(unmet))] += 1
     return [low + more for low, more in zip(least, share, strict=True)]

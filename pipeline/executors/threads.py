@@ -1,4 +1,4 @@
-"""Tasks on threads of this process, each with its own render child: no server, no scheduler."""
+"""`--runner threads`: runs tasks on threads of this process, each with its own render child."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -17,7 +17,7 @@ def make(order: DatasetOrder, address: str | None) -> Outcome:
 
 
 class ThreadRunner:
-    """As many threads as the order has workers; native code runs in their render children."""
+    """Runs each task on one of `job.num_at_once` threads; native code runs in render children."""
 
     num_at_once = None
     window = None

@@ -1,4 +1,4 @@
-"""`--runner prefect`: a dataset as a flow run of this process, shown on Prefect's page.
+"""`--runner prefect`: makes a dataset as a flow run of this process, shown on Prefect's page.
 
 The server is the one of PREFECT_API_URL; where that is not set, a private one for this run.
 """
@@ -14,10 +14,12 @@ if TYPE_CHECKING:
 
 
 def make(order: DatasetOrder, address: str | None) -> "Outcome":
-    """Make a dataset; raises as `make_dataset`, or the private server does not start."""
+    """Make a dataset; raises as `make_dataset`, or if the private server does not start."""
     quiet_prefect()
     with prefect_server():
-        from pipeline.flows.prefect_runner import PrefectRunner  # Prefect reads its settings now
+        from pipeline.flows.prefect_runner import (
+            PrefectRunner,  # late: Prefect reads its settings on import
+        )
 
         return as_flow(order, PrefectRunner())
 
@@ -26,9 +28,9 @@ def as_flow(order: DatasetOrder, runner: "PrefectRunner", **options: Any) -> "Ou
     """Make a dataset as a flow run, with its artifacts; `options` are Prefect's of a flow."""
     from prefect import flow
 
-    from pipeline.flows.watching import make_watched
+    from pipeline.flows.watching import make_with_artifacts
 
     def generate() -> "Outcome":
-        return make_watched(order, runner)
+        return make_with_artifacts(order, runner)
 
     return flow(name="generate-scenes", persist_result=False, **options)(generate)()

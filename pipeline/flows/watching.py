@@ -1,7 +1,7 @@
-"""What people watch on Prefect's page: progress, a table, a summary, a picture of the scenes.
+"""Shows a run on Prefect's page: progress, a table, a summary, a picture of the scenes.
 
-It shows what the files say (`trilight status` says the same); nothing is decided by it, and a run
-goes on where it cannot be shown.
+All numbers come from the dataset's files (`trilight status` shows the same). The artifacts decide
+nothing, and a run continues if they cannot be written.
 """
 
 import base64
@@ -35,66 +35,67 @@ from storage.records.objects import count_by_reason, read_failures
 from storage.remote.safe_url import safe_text
 
 _EVERY_S = 15.0
-"""Between two tables; each is a row of Prefect's database."""
+"""Seconds between two tables; each is a row of Prefect's database."""
 _SHEET_PX = 1024
-"""Longest side of the contact sheet there: about 100 kB."""
+"""Longest side of the contact sheet on the page: about 100 kB."""
 
 
-def make_watched(order: DatasetOrder, runner: Runner) -> Outcome:
-    """Make a dataset within a flow run, with its artifacts; the summary also says what failed."""
+def make_with_artifacts(order: DatasetOrder, runner: Runner) -> Outcome:
+    """Make a dataset within a flow run and show its artifacts; the summary includes failures."""
     # one line per scene; PREFECT_LOGGING_EXTRA_LOGGERS=trilight brings it to the server
     logging.getLogger("trilight").setLevel(logging.INFO)
-    watched = Watched(order)
+    watched = RunArtifacts(order)
     try:
-        outcome = make_dataset(order, runner, watched.task_done)
+        outcome = make_dataset(order, runner, watched.record_task)
     except Exception as error:
-        watched.failed(error)
+        watched.show_failure(error)
         raise
-    watched.finished(outcome)
+    watched.show_result(outcome)
     return outcome
 
 
-class Forgiving:
-    """Shows what it is called with; what cannot be shown is told once, and never ends the run."""
+class BestEffort:
+    """Calls functions that show something; logs the first error, and never raises."""
 
     def __init__(self, log: "logging.Logger | logging.LoggerAdapter[logging.Logger]") -> None:
-        self._log, self._warned = log, False
+        self._log = log
+        self._warned = False
 
     def __call__(self, show: Callable[[], object]) -> None:
         """Show something on the page of a run."""
         try:
             show()
-        except Exception as error:  # a server away for a moment must not cost hours of work
+        except Exception as error:  # a server that is down for a moment must not cost hours of work
             if not self._warned:
                 self._warned = True
                 why = safe_text(str(error).partition("\n")[0])
                 self._log.warning("what this page shows is not complete (%s)", why)
 
 
-class Watched:
+class RunArtifacts:
     """The artifacts of one flow run."""
 
     def __init__(self, order: DatasetOrder) -> None:
-        """Begin to show a run.
+        """Create the first artifact of a run.
 
         Raises:
-            TrilightError: TRILIGHT_USD_PER_CORE_HOUR is no price.
+            TrilightError: TRILIGHT_USD_PER_CORE_HOUR is not a valid price.
         """
         self._order = order
         self._price = usd_per_core_hour()
         self._folder = dataset_folder(order.place)
         self._began: float | None = None  # the first scene; objects are prepared before
-        self._told = -_EVERY_S
+        self._shown_s = -_EVERY_S
         self._scenes = 0
         self._core_s = 0.0
         self._run: Run | None = None
         self._progress: UUID | None = None
         self._log = get_run_logger()
-        self._shown = Forgiving(self._log)
-        self._shown(self._begin)
+        self._show = BestEffort(self._log)
+        self._show(self._begin)
 
-    def task_done(self, run: Run, outcome: TaskOutcome) -> None:
-        """Take a finished task into account, and tell it where the last table is old."""
+    def record_task(self, run: Run, outcome: TaskOutcome) -> None:
+        """Record a finished task, and show a new table if the last one is old."""
         now = time.monotonic()
         if self._began is None and outcome.scenes:
             self._began = now - outcome.seconds
@@ -103,26 +104,27 @@ class Watched:
         self._core_s += outcome.core_s
         for shard in outcome.shards:
             self._log.info("shard %s: %d scenes", shard.name, shard.num_samples)
-        if now - self._told >= _EVERY_S:
-            self._told = now
-            self._shown(lambda: self._tell(run))
+        if now - self._shown_s >= _EVERY_S:
+            self._shown_s = now
+            self._show(lambda: self._tell(run))
 
-    def finished(self, outcome: Outcome) -> None:
-        """Tell the outcome, and how far everything is then."""
+    def show_result(self, outcome: Outcome) -> None:
+        """Show the final progress and the result."""
         if (run := self._run) is not None:
-            self._shown(lambda: self._tell(run))
-        self._shown(lambda: self._sum_up(outcome))
-        done, planned = outcome.num_shards, outcome.num_shards_planned
+            self._show(lambda: self._tell(run))
+        self._show(lambda: self._sum_up(outcome))
+        done = outcome.num_shards
+        planned = outcome.num_shards_planned
         self._log.info("%d of %d shards are there; digest %s", done, planned, outcome.digest)
 
-    def failed(self, error: Exception) -> None:
-        """Tell why the run ended early; what it made is safe."""
+    def show_failure(self, error: Exception) -> None:
+        """Show why the run ended early; finished scenes stay on disk."""
         what = safe_text(f"{type(error).__name__}: {error}".partition("\n")[0])
         made = ("scenes of this run", str(self._scenes))
-        self._shown(lambda: self._table("summary", [("failed", what), made]))
+        self._show(lambda: self._table("summary", [("failed", what), made]))
 
     def scenes_per_s(self) -> float:
-        """Return the rate of this run since its first scene was begun; 0 before one is made."""
+        """Return scenes per second since this run's first scene began; 0 before one is made."""
         return self._scenes / (time.monotonic() - self._began) if self._began is not None else 0.0
 
     def _begin(self) -> None:
@@ -132,31 +134,33 @@ class Watched:
         )
 
     def _tell(self, run: Run) -> None:
-        publication = run.publication
-        of = publication.done
-        done, planned = of.scenes, of.scenes_asked
+        writer = run.publication
+        of = writer.progress
+        done = of.scenes
+        planned = of.scenes_requested
         per_s = self.scenes_per_s()
-        left = "unknown" if per_s == 0 else f"{(planned - done) / per_s / 60:.0f} minutes"
+        remaining = "unknown" if per_s == 0 else f"{(planned - done) / per_s / 60:.0f} minutes"
         self._percent(100.0 * done / planned)
         self._table(
             "progress",
             [
-                ("shards", f"{of.shards} of {of.shards_asked}"),
+                ("shards", f"{of.shards} of {of.shards_requested}"),
                 ("scenes in shards", f"{done - of.given_up} of {planned}"),
-                ("views an hour", f"{3600 * per_s * publication.manifest.num_views:.0f}"),
-                ("left, if nobody else helps", left),
+                ("views an hour", f"{3600 * per_s * writer.manifest.num_views:.0f}"),
+                ("left for this run alone", remaining),
             ],
         )
 
     def _sum_up(self, outcome: Outcome) -> None:
-        done, planned = outcome.num_shards, outcome.num_shards_planned
+        done = outcome.num_shards
+        planned = outcome.num_shards_planned
         self._percent(100.0 * done / planned)
         rows = [("shards", f"{done} of {planned}"), ("dataset digest", outcome.digest)]
         rows += outcome.statistics.lines() if outcome.statistics else []
         if outcome.statistics is None:
             self._table("summary", rows)
             return
-        # a page of Prefect's server cannot show files of the worker: it says where they are
+        # Prefect's page cannot show files of the worker, only their path
         self._table("summary", [*rows, ("report", f"{self._order.place}/report.html")])
         if url := report_url(self._order.place):
             create_link_artifact(url, key="report", link_text="report")
@@ -184,10 +188,10 @@ class Watched:
 
 
 def usd_per_core_hour() -> float:
-    """Return what an hour of a core costs.
+    """Return the price of a core-hour in USD.
 
     Raises:
-        TrilightError: TRILIGHT_USD_PER_CORE_HOUR is no price.
+        TrilightError: TRILIGHT_USD_PER_CORE_HOUR is not a valid price.
     """
     text = os.environ.get("TRILIGHT_USD_PER_CORE_HOUR", str(USD_PER_CORE_HOUR))
     try:
@@ -202,13 +206,13 @@ def usd_per_core_hour() -> float:
 
 
 def report_url(out: str) -> str | None:
-    """Return where the report can be opened: below TRILIGHT_PUBLIC_URL, which shows datasets."""
+    """Return the report's URL below TRILIGHT_PUBLIC_URL, which serves datasets; None without it."""
     base = os.environ.get("TRILIGHT_PUBLIC_URL", "").rstrip("/")
     return f"{base}/{Path(out).name}/report.html" if base else None
 
 
 def small_picture(path: Path) -> str:
-    """Return a picture as a URL that holds it, at most _SHEET_PX wide and high."""
+    """Return a picture as a data URI, at most _SHEET_PX wide and high."""
     stream = io.BytesIO()
     with Image.open(path) as picture:
         small = picture.convert("RGB")

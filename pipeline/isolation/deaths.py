@@ -1,8 +1,8 @@
-"""What can end a call in a child, how often the call is tried again, and which ends are verdicts.
+"""The ways a call in a child can fail, the number of retries, and which failures are verdicts.
 
-A kill changes nothing that is made. So an end that the environment may have brought about is never
-remembered of an item and never leads to another method, another level or another picture: the same
-call is made again in a fresh child, and where that does not help, the item fails for this run only.
+A kill must not change any output. So a failure that the environment may have caused is never stored
+for an item and never leads to another method, level or picture: the same call is repeated in a
+fresh child, and if that does not help, the item fails for this run only.
 """
 
 import logging
@@ -18,52 +18,52 @@ Result = TypeVar("Result")
 _LOG = logging.getLogger("trilight.children")
 
 _PAUSE_S = 0.5
-"""After the first failure of the environment, twice as long after the second: what passes by
-itself, such as a lack of memory, has time to pass."""
+"""Seconds after the first failure of the environment, twice as long after the second: a transient
+lack of memory has time to end."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class End:
-    """One way in which a call can end without an answer."""
+    """Retry policy of one way in which a call can fail."""
 
     tries: int
-    """Calls that must end so, each in a fresh child, before no other one is made."""
+    """Number of such failures, each in a fresh child, after which the call is given up."""
     is_verdict: bool
-    """Whether the call itself is to blame then: it would end so in every run, and an outcome that
-    follows from it may be kept. Otherwise the environment is to blame, and nothing may be kept."""
+    """True if the call itself is to blame: it would fail so in every run, and a result that follows
+    from it may be stored. Otherwise the environment is to blame, and nothing may be stored."""
 
 
 ENDS: Mapping[str, End] = {
-    # The kernel counts what the call uses, whatever else the machine does, and it would use that
-    # again.
+    # The kernel counts the CPU time of the call, independent of other load: a retry would use the
+    # same.
     "timeout_cpu": End(tries=1, is_verdict=True),
-    # Native code that fails on an item fails on it again. Once may be the fault of a child that
-    # has leaked, or of an unchecked failed allocation.
+    # Native code that fails on an item fails on it again. One failure may come from a leak in the
+    # child, or from an unchecked failed allocation.
     "crashed_signal": End(tries=2, is_verdict=True),
     # The signal came from outside: the system for want of memory, an operator, a scheduler.
     "killed": End(tries=3, is_verdict=False),
     "stopped": End(tries=3, is_verdict=False),
-    # How much address space an item needs depends on threads and libraries, thus on the machine,
-    # and an allocation also fails for want of memory in all.
+    # The address space that an item needs depends on threads and libraries, thus on the machine,
+    # and an allocation also fails if the machine is out of memory.
     "out_of_memory": End(tries=3, is_verdict=False),
-    # The machine was busy, or a file did not come. Two, since each costs the whole time.
+    # The machine was busy, or a file system was slow. Two, since each try costs the whole time.
     "timeout_wall": End(tries=2, is_verdict=False),
-    # An unforeseen exit or Python error: our mistake, or a missing file
-    # or thread. Neither breaks a law of the item.
+    # An unforeseen exit or Python error: a bug, or a missing file or thread. Neither says that the
+    # item is invalid.
     "crashed": End(tries=3, is_verdict=False),
     "exception": End(tries=3, is_verdict=False),
-    # The child says what it was not asked for: it has lost its mind, or a file has taken it over.
+    # Protocol violation: a corrupt or compromised child.
     "nonsense": End(tries=2, is_verdict=False),
 }
-"""Ends by reason; the keys carry no signal number."""
+"""Retry policy by reason; the keys have no signal number."""
 
 
 class ChildFailed(Exception):
-    """The child died, hung, or raised something unexpected: the environment's fault, or a bug.
+    """The child died, hung, or raised an unexpected error: the environment's fault, or a bug.
 
     Attributes:
-        reason: a name of `ENDS`; `crashed_signal` is followed by the signal's number.
-        message: one sentence with what is known.
+        reason: a key of `ENDS`; the number of the signal follows `crashed_signal`.
+        message: one sentence with the cause, as far as it is known.
     """
 
     def __init__(self, reason: str, message: str) -> None:
@@ -73,7 +73,7 @@ class ChildFailed(Exception):
 
     @property
     def sentence(self) -> str:
-        """What records hold of it: of an error that nobody foresaw its type, not its words."""
+        """Text for stored records: for an unforeseen error its type, not its message."""
         if self.reason != "exception":
             return self.message
         kind = re.search(r"\b(\w{0,60}(?:Error|Exception))(?::| \||$)", self.message)
@@ -81,18 +81,18 @@ class ChildFailed(Exception):
 
     @property
     def is_verdict(self) -> bool:
-        """Whether the call itself is to blame, once `with_retries` has given up."""
+        """True if the call itself is to blame, once `with_retries` has given up."""
         return ENDS[_kind(self.reason)].is_verdict
 
 
 def is_passing(reason: str) -> bool:
-    """Return whether an item that failed for this reason may succeed in the next run."""
+    """Return True if an item that failed for this reason may succeed in the next run."""
     end = ENDS.get(_kind(reason))
     return end is not None and not end.is_verdict
 
 
 def with_retries(call: Callable[[], Result]) -> Result:
-    """Return what `call` returns; where a child fails, call again as often as `ENDS` says.
+    """Return the result of `call`; if the child fails, retry as often as `ENDS` allows.
 
     Raises:
         ChildFailed: the last failure.

@@ -1,7 +1,7 @@
-"""What a function declares to return, as a reader of bytes: they choose no class and no function.
+"""Builds a reader of results from a function's return type; the bytes choose no class.
 
-Known are dataclasses, numpy arrays, tuples, lists, mappings by text or int, `None`, bool, int,
-float, str, bytes, `Path`, `Literal`, unions of these, and `Any` for values of JSON.
+Supported are dataclasses, numpy arrays, tuples, lists, mappings by text or int, `None`, bool, int,
+float, str, bytes, `Path`, `Literal`, unions of these, and `Any` for JSON values.
 """
 
 import dataclasses
@@ -22,15 +22,15 @@ from pipeline.isolation.answers import CLASS
 from storage.array_hints import array_scalar
 
 DTYPES = [np.dtype(code).name for code in "?bhiqBHIQefd"]
-"""The arrays that there are."""
+"""Names of the supported array dtypes."""
 
 
 @functools.cache
 def result_reader(function: Callable[..., Any]) -> SchemaValidator:
-    """Return what reads the result of a function, strictly; None where it declares nothing.
+    """Return the strict validator of a function's result; without a return type it must be None.
 
     Raises:
-        TypeError: what it returns could not be checked.
+        TypeError: a value of the declared type could not be checked.
     """
     declares = hasattr(function, "__annotations__")  # builtins have none
     hint: Any = typing.get_type_hints(function).get("return") if declares else None
@@ -39,7 +39,7 @@ def result_reader(function: Callable[..., Any]) -> SchemaValidator:
 
 
 def first_wrong(error: Exception) -> str:
-    """Return where a value is not as declared, and why, or the name of another error."""
+    """Return the position and reason of the first wrong value, or the name of another error."""
     if not isinstance(error, ValidationError):
         return type(error).__name__
     first = error.errors(include_url=False, include_context=False, include_input=False)[0]
@@ -47,8 +47,9 @@ def first_wrong(error: Exception) -> str:
 
 
 def schema_of(hint: Any) -> core.CoreSchema:
-    """Return the schema of an annotation; TypeError where it says nothing that can be checked."""
-    origin, args = get_origin(hint), get_args(hint)
+    """Return the schema of an annotation; raises TypeError if it cannot be checked."""
+    origin = get_origin(hint)
+    args = get_args(hint)
     if hint in _PLAIN:
         return _PLAIN[hint]
     if origin is Literal:
@@ -75,7 +76,7 @@ def _row(each: core.CoreSchema) -> core.CoreSchema:
 
 
 def _record(kind: type) -> core.CoreSchema:
-    """Return the schema of a dataclass, which is made by calling it: its own checks are made."""
+    """Return the schema of a dataclass; values are made by its constructor, with its checks."""
     hints = typing.get_type_hints(kind)
     names = [field.name for field in dataclasses.fields(kind) if field.init]
     fields = {name: core.typed_dict_field(schema_of(hints[name])) for name in names}
@@ -87,8 +88,8 @@ def _record(kind: type) -> core.CoreSchema:
 
 
 def _array(scalar: Any) -> core.CoreSchema:
-    """Return the schema of arrays of one dtype, or of the dtypes of an abstract one."""
-    wanted = scalar if isinstance(scalar, type) and issubclass(scalar, np.generic) else np.generic
+    """Return the schema of arrays of one dtype, or of all dtypes of an abstract one."""
+    kind = scalar if isinstance(scalar, type) and issubclass(scalar, np.generic) else np.generic
 
     def read(data: tuple[int, str, tuple[int, ...], Any], info: Any) -> NDArray[Any]:
         number, name, shape, order = data
@@ -97,7 +98,7 @@ def _array(scalar: Any) -> core.CoreSchema:
             np.minimum(part, 1, out=part)
         return part.view(name).reshape(shape, order=order)
 
-    names = [name for name in DTYPES if np.issubdtype(name, wanted)]
+    names = [name for name in DTYPES if np.issubdtype(name, kind)]
     return core.with_info_after_validator_function(
         read,
         core.tuple_schema(
@@ -107,7 +108,7 @@ def _array(scalar: Any) -> core.CoreSchema:
 
 
 def _read_bytes(number: int, info: Any) -> bytes:
-    """Return a part as bytes, which all that name it share: it costs its memory once."""
+    """Return a part as bytes; all values that refer to it share one copy."""
     parts = info.context
     if not isinstance(parts[number], bytes):
         parts[number] = parts[number].tobytes()

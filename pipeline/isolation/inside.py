@@ -1,4 +1,4 @@
-"""What happens inside a child: it keeps its limits, answers calls, and dies with its owner."""
+"""The child's side: applies limits, answers calls, and dies with its owner."""
 
 import ctypes
 import math
@@ -21,48 +21,50 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent() -> None:
-    """Ask the kernel to kill this process when its parent ends, whatever ends it (Linux only)."""
+    """Ask the kernel to kill this process when its parent ends, for any reason (Linux only)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _leave_owner(connection: Connection, words: Connection) -> None:
-    """Have of all that was open in the owner and its servers nothing but the way to it.
+def _leave_owner(connection: Connection, output: Connection) -> None:
+    """Close all inherited files except the connection to the owner.
 
-    So a child has no terminal. And the fork server, which no child holds open then, ends with the
-    owner, whatever ends that, and its children with it.
+    So a child has no terminal. And no child keeps the fork server alive: it ends with the owner,
+    for any reason, and its children end with it.
     """
     nothing = os.open(os.devnull, os.O_RDWR)
-    kept = {1, 2, nothing, connection.fileno()}
+    needed_files = {1, 2, nothing, connection.fileno()}
     for standard in (1, 2):
-        os.dup2(words.fileno(), standard)
-    for file in set(map(int, os.listdir("/dev/fd"))) - kept:
-        os.dup2(nothing, file, inheritable=file == 0)  # closed, another file would get its number
+        os.dup2(output.fileno(), standard)
+    for file in set(map(int, os.listdir("/dev/fd"))) - needed_files:
+        os.dup2(
+            nothing, file, inheritable=file == 0
+        )  # if closed, another file could get its number
     die_with_parent()
 
 
-def serve(connection: Connection, words: Connection, memory_bytes: int, cpu_s: int | None) -> None:
+def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: int | None) -> None:
     """Answer calls until the owner closes the connection; ignores Ctrl-C: the owner decides.
 
     Args:
-        connection: to the owner.
-        words: takes what is printed here.
+        connection: connection to the owner.
+        output: receives standard output and standard error.
         memory_bytes: most address space.
-        cpu_s: most processor seconds of one call, or None for no limit.
+        cpu_s: most CPU seconds of one call, or None for no limit.
     """
-    _leave_owner(connection, words)
+    _leave_owner(connection, output)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     most = resource.getrlimit(resource.RLIMIT_AS)[1]
-    if most != resource.RLIM_INFINITY:  # of this shell, which no process can raise
+    if most != resource.RLIM_INFINITY:  # a limit of the shell, which no process can raise
         memory_bytes = min(memory_bytes, most)
     resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
     file = connection.fileno()
     while True:
         try:
-            # our owner's own words, which are trusted; of ours it trusts none
-            (asked,) = receive(file, wait_forever, sys.maxsize)
-            function, args = ForkingPickler.loads(asked.data)
+            # pickle: the child trusts its owner; the owner never unpickles a child's bytes
+            (message,) = receive(file, wait_forever, sys.maxsize)
+            function, args = ForkingPickler.loads(message.data)
         except EOFError:
             os._exit(0)  # the parent has died: skip the destructors of native libraries
         _allow_cpu(cpu_s)
@@ -70,7 +72,7 @@ def serve(connection: Connection, words: Connection, memory_bytes: int, cpu_s: i
 
 
 def _allow_cpu(seconds: int | None) -> None:
-    """Let this process use so much more processor time; the kernel ends it then, in any code."""
+    """Allow more CPU seconds from now on; after them the kernel ends this process in any code."""
     if seconds is None:
         return
     used = resource.getrusage(resource.RUSAGE_SELF)
@@ -91,7 +93,7 @@ def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> list[bytes |
         return encode_error("out_of_memory", "an allocation went over the limit of the child")
     except Exception as error:
         its_author = mistake_in_extension(error)
-        if its_author is not None:  # tried again, it stays
+        if its_author is not None:  # a retry would fail too
             return encode_error("TrilightError", str(its_author))
         return encode_error("exception", _last_error())
 

@@ -1,1 +1,1 @@
-"""The engine that makes datasets, without Prefect: files are the truth."""
+"""The engine that generates datasets, without Prefect: the files on disk are the only state."""

@@ -1,7 +1,7 @@
-"""From folders of textures and of maps to frozen rows, and the files that scenes use.
+"""Prepares the user's textures and environment maps, and freezes them with the objects.
 
-Each is decoded in a child with limits, once; what came of it is in the user's cache. A texture or
-map belongs to the split that the digest of its content says, by the rule of objects.
+Each file is decoded once, in a child with limits; the result is in the user's cache. The digest of
+its content decides the split of a texture or map, by the rule of objects.
 """
 
 import logging
@@ -28,17 +28,17 @@ from storage.remote.safe_url import printable
 log = logging.getLogger("trilight.maps")
 
 _LIMITS = ChildLimits(memory_bytes=8 << 30, wall_s=600, cpu_s=300, calls_per_child=200)
-"""The largest map, 8192 x 4096 in float32, takes 403 MB, and its means six times as much."""
+"""The largest map, 8192 x 4096 in float32, takes 403 MB, and its mip levels six times as much."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AcceptedMaps:
-    """What users bring beside objects."""
+    """The user's textures and environment maps that scenes may use."""
 
     rows: tuple[tuple[LockedObject, Path], ...] = ()
-    """Every texture and map with its prepared file."""
+    """Every usable texture and map with its prepared file."""
     failures: tuple[Failure, ...] = ()
-    """Those that cannot be used."""
+    """Reasons why other files cannot be used, or not fully."""
 
 
 NO_MAPS = AcceptedMaps()
@@ -46,23 +46,23 @@ NO_MAPS = AcceptedMaps()
 
 @dataclass(frozen=True, kw_only=True)
 class MapFolders:
-    """Where a user's own textures and maps are."""
+    """Folders of the user's textures and environment maps."""
 
     folders: tuple[tuple[str, str], ...] = ()
-    """Kind and folder."""
+    """Pairs of a kind (TEXTURE or SKY) and a folder."""
     licence: str | None = None
-    """Of folders without a catalogue, as the user states it."""
+    """Licence that the user states for folders without a catalogue."""
 
 
 NO_FOLDERS = MapFolders()
 
 
 def map_folders(order: DatasetOrder, settings: BuildSettings) -> MapFolders:
-    """Return the folders of an order.
+    """Return the folders of textures and maps that the options name.
 
     Raises:
-        TrilightError: a folder is given that no scene would use, or one is missing that scenes
-            are to use.
+        TrilightError: a folder is given that no scene would use, or scenes need a folder that is
+            not given.
     """
     scenes = settings.scenes
     shares = {
@@ -88,57 +88,60 @@ def map_folders(order: DatasetOrder, settings: BuildSettings) -> MapFolders:
     )
 
 
-def accept_maps(asked: MapFolders, settings: BuildSettings, *, workers: int) -> AcceptedMaps:
+def accept_maps(user_folders: MapFolders, settings: BuildSettings, *, workers: int) -> AcceptedMaps:
     """Prepare the textures and maps of folders.
 
     Args:
-        asked: the folders.
+        user_folders: the folders.
         settings: the build: sizes, licences and splits.
-        workers: files at a time.
+        workers: number of files that are decoded at the same time.
 
     Raises:
-        TrilightError: a folder is missing or empty, none of it can be used, or the cache cannot be
-            written.
+        TrilightError: a folder is missing or empty, none of its files can be used, or the cache
+            cannot be written.
     """
     rows: list[tuple[LockedObject, Path]] = []
     failures: list[Failure] = []
-    for kind, folder in asked.folders:
-        found = find_maps(
-            kind, folder, licence=asked.licence, allowed_licences=settings.allowed_licences
+    for kind, folder in user_folders.folders:
+        listing = find_maps(
+            kind, folder, licence=user_folders.licence, allowed_licences=settings.allowed_licences
         )
-        outcomes = _prepared(kind, found.maps, settings, workers)
+        outcomes = _prepare_maps(kind, listing.maps, settings, workers)
         usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
-        failures += [_unread(locked, path) for locked, path in usable if _notes(path).exists()]
+        failures += [
+            _unread_failure(locked, path) for locked, path in usable if _notes(path).exists()
+        ]
         lost = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
-        failures += [*found.failures, *lost]
+        failures += [*listing.failures, *lost]
         if not usable:
-            first = (*lost, *found.failures)[0]
+            first = (*lost, *listing.failures)[0]
             raise TrilightError(
-                f"{PLURALS[kind]}: none of {len(lost) + len(found.failures)} files can be used; "
-                f"the first is {first.item}: {first.reason} ({first.message}). Mend or replace it."
+                f"{PLURALS[kind]}: none of {len(lost) + len(listing.failures)} files can be used; "
+                f"the first is {first.item}: {first.reason} ({first.message}). Fix or replace it."
             )
-        _tell_of(kind, [locked for locked, _ in usable], lost)
+        _warn_of_maps(kind, [locked for locked, _ in usable], lost)
         rows += usable
     return AcceptedMaps(rows=tuple(rows), failures=tuple(failures))
 
 
-def _prepared(
+def _prepare_maps(
     kind: str, maps: Sequence[FoundMap], settings: BuildSettings, workers: int
 ) -> list[tuple[LockedObject, Path] | Failure]:
     scenes = settings.scenes
     size = scenes.textures.surfaces.size if kind == TEXTURE else scenes.skies.maps.height
-    all_files = reach(files=(path for found in maps for path in found.files.values()))
+    all_files = reach(files=(path for user_map in maps for path in user_map.files.values()))
     pool = ChildPool(
-        lambda _: IsolatedChild(limits=_LIMITS, setup=_nothing, confined_to=all_files), workers
+        lambda _: IsolatedChild(limits=_LIMITS, setup=_no_setup, confined_to=all_files), workers
     )
 
-    def prepare(found: FoundMap) -> tuple[LockedObject, Path] | Failure:
+    def prepare(user_map: FoundMap) -> tuple[LockedObject, Path] | Failure:
         try:
             with pool.borrow() as child:
-                path = _outcome(MapFiles(kind=kind, files=found.files, size=size), child)
-            return _locked(kind, found, path, settings), path
+                path = _prepare_file(MapFiles(kind=kind, files=user_map.files, size=size), child)
+            return _lock_entry(kind, user_map, path, settings), path
         except Rejected as rejection:
-            uid, reason = found.record.uid, rejection.reason
+            uid = user_map.record.uid
+            reason = rejection.reason
             return Failure(stage="objects", item=uid, reason=reason, message=rejection.message)
 
     try:
@@ -149,29 +152,29 @@ def _prepared(
 
 
 def _notes(prepared: Path) -> Path:
-    """Return the file beside a prepared one that says what is not read; absent where all is."""
+    """Return the path of the note on unread parts of a prepared file; absent if there are none."""
     return prepared.with_suffix(".txt")
 
 
-def _unread(locked: LockedObject, path: Path) -> Failure:
+def _unread_failure(locked: LockedObject, path: Path) -> Failure:
     message = _notes(path).read_text("utf-8")
     return Failure(stage="objects", item=locked.uid, reason="not_read", message=message)
 
 
-def _nothing() -> None:
-    """Set up a child that needs nothing."""
+def _no_setup() -> None:
+    """Do nothing: the child needs no setup."""
 
 
-def _outcome(asked: MapFiles, child: IsolatedChild) -> Path:
-    """Return the prepared file, made in a child unless it is there; raises Rejected."""
-    name = outcome_name(asked)
+def _prepare_file(map_files: MapFiles, child: IsolatedChild) -> Path:
+    """Prepare a file in a child unless the cache has it; return its path. Raises Rejected."""
+    name = outcome_name(map_files)
     path = cache_folder("maps") / name[:2] / f"{name}.safetensors"
     if not path.exists():
         try:
-            data, unread = call_with_retries(child, prepare_map, asked)
+            data, unread = call_with_retries(child, prepare_map, map_files)
         except ChildFailed as failure:
             raise Rejected(failure.reason, failure.sentence) from failure
-        if outcome_name(asked) != name:
+        if outcome_name(map_files) != name:
             raise Rejected("unreadable_file", "it changed while it was being prepared")
         if unread:
             message = printable(f"it is used without {'; '.join(unread)}")
@@ -180,8 +183,9 @@ def _outcome(asked: MapFiles, child: IsolatedChild) -> Path:
     return path
 
 
-def _locked(kind: str, found: FoundMap, path: Path, settings: BuildSettings) -> LockedObject:
-    data, record = path.read_bytes(), found.record
+def _lock_entry(kind: str, user_map: FoundMap, path: Path, settings: BuildSettings) -> LockedObject:
+    data = path.read_bytes()
+    record = user_map.record
     return LockedObject(
         uid=record.uid,
         asset_sha256=sha256_hex(data),
@@ -195,7 +199,7 @@ def _locked(kind: str, found: FoundMap, path: Path, settings: BuildSettings) -> 
     )
 
 
-def _tell_of(kind: str, locked: Sequence[LockedObject], lost: Sequence[Failure]) -> None:
+def _warn_of_maps(kind: str, locked: Sequence[LockedObject], lost: Sequence[Failure]) -> None:
     if lost:
         first = lost[0]
         log.warning(

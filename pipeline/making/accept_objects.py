@@ -1,4 +1,4 @@
-"""From a source to frozen objects; where they are frozen already, from the lock and its index."""
+"""Freezes the objects of a source; if they are frozen already, loads the lock and its index."""
 
 import shutil
 import threading
@@ -11,7 +11,7 @@ from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.freeze_objects import (
     AcceptedObjects,
     freeze_objects,
-    frozen_objects,
+    read_frozen_objects,
     require_same,
 )
 from pipeline.making.object_batches import (
@@ -31,75 +31,83 @@ from storage.records.objects import OBJECT, LockedObject, ObjectRecord
 from storage.remote.safe_url import safe_url
 
 
-def share_mesh_work(order: AskedObjects) -> ListedObjects | None:
-    """Prepare objects that are not frozen yet, with all other workers; outside any mutex.
+def prepare_unfrozen_objects(options: AskedObjects) -> ListedObjects | None:
+    """Prepare objects cooperatively, without holding the objects lock, unless they are frozen.
 
     Returns:
-        What the source has, for `accept_objects`, where it has been listed.
+        The listed source, for `accept_objects`; None if the objects are frozen already.
 
     Raises:
         TrilightError: as `list_objects` and `prepare_in_batches`.
     """
-    publication = order.publication
-    folder = publication.folder
-    with folder.turn("objects"):  # one worker writes built-in objects, and the others find them
-        publication.refresh()
-        publication.take_lock()
-        if frozen_objects(publication) is not None:
+    writer = options.publication
+    folder = writer.folder
+    with folder.turn("objects"):  # one worker writes built-in objects, the others load them
+        writer.refresh()
+        writer.fetch_lock()
+        if read_frozen_objects(writer) is not None:
             return None
-        listed = order.listed()
+        listed = options.list_source()
         announce_objects(folder, len(listed.allowed))
-    _prepare(listed, listed.allowed, order, enough=lambda: publication.has(folder.staged_index))
+    _prepare(listed, listed.allowed, options, should_stop=lambda: writer.has(folder.staged_index))
     return listed
 
 
-def accept_objects(order: AskedObjects, listed: ListedObjects | None = None) -> AcceptedObjects:
-    """Turn a source into frozen meshes: of all its objects, or of those that were frozen before.
+def accept_objects(options: AskedObjects, listed: ListedObjects | None = None) -> AcceptedObjects:
+    """Prepare the meshes of a source and freeze them; later, load those that were frozen.
 
-    Textures and maps of a user's own are frozen with them. Call in the turn `objects`.
+    The user's textures and maps are frozen with them. Call while holding the mutex `objects`.
 
     Args:
-        order: what is asked for.
-        listed: what the source has, where that is known.
+        options: source, licences and settings of the objects.
+        listed: the listed source, if it is known.
 
     Raises:
         TrilightError, EnvironmentFailure: as `list_objects` and `freeze_objects`.
     """
-    settings, folder = order.settings, order.publication.folder
-    if trusted := trusted_objects(order):
+    settings = options.settings
+    folder = options.publication.folder
+    if trusted := load_trusted_objects(options):
         return trusted
-    frozen = frozen_objects(order.publication)
-    shared, listed = listed is not None, listed or order.listed()
-    maps = _same_maps(accept_maps(order.own, settings, workers=order.workers), order, frozen)
-    wanted = listed.allowed
+    frozen = read_frozen_objects(options.publication)
+    shared = listed is not None
+    listed = listed or options.list_source()
+    maps = _select_frozen_maps(
+        accept_maps(options.user_folders, settings, workers=options.workers), options, frozen
+    )
+    selected = listed.allowed
     if frozen is not None:
-        wanted = _batches_of(frozen, wanted)
-        announce_objects(folder, len(wanted))
-    prepared, rejected = _prepare(listed, wanted, order, again=not shared)
+        selected = _select_frozen_batches(frozen, selected)
+        announce_objects(folder, len(selected))
+    prepared, rejected = _prepare(listed, selected, options, retry_transient=not shared)
     lost = [failure for failure in rejected if failure.stage == "objects"]
-    listed.require_some(len(wanted) - len(lost), [*listed.refused, *lost])
+    listed.require_some(len(selected) - len(lost), [*listed.refused, *lost])
     if frozen is not None:
         prepared = [one for one in prepared if one.record.uid in frozen]
         rejected = [failure for failure in rejected if failure.item in frozen]
-    accepted = freeze_objects(order, prepared, [*listed.refused, *rejected], listed.num_found, maps)
+    accepted = freeze_objects(
+        options, prepared, [*listed.refused, *rejected], listed.num_found, maps
+    )
     shutil.rmtree(folder.staged_batches, ignore_errors=True)
     return accepted
 
 
-def _same_maps(
-    maps: AcceptedMaps, order: AskedObjects, frozen: dict[str, LockedObject] | None
+def _select_frozen_maps(
+    maps: AcceptedMaps, options: AskedObjects, frozen: dict[str, LockedObject] | None
 ) -> AcceptedMaps:
-    """Return those of the maps that the dataset was begun with, or all where that is now."""
+    """Return the maps that the dataset was begun with; all if it begins now."""
     if frozen is None:
         return maps
-    kept = tuple(row for row in maps.rows if row[0].uid in frozen)
+    rows = tuple(row for row in maps.rows if row[0].uid in frozen)
     of_maps = {uid: entry for uid, entry in frozen.items() if entry.kind != OBJECT}
-    require_same(safe_url(order.source), of_maps, [entry for entry, _ in kept])
-    return replace(maps, rows=kept)
+    require_same(safe_url(options.source), of_maps, [entry for entry, _ in rows])
+    return replace(maps, rows=rows)
 
 
-def _batches_of(frozen: Container[str], records: list[ObjectRecord]) -> list[ObjectRecord]:
-    """Return those that share a batch with a frozen object: the batch may be prepared already."""
+def _select_frozen_batches(
+    frozen: Container[str], records: list[ObjectRecord]
+) -> list[ObjectRecord]:
+    """Return the records that share a batch with a frozen object: it may be prepared already."""
     batches = cut_objects(sorted(records, key=attrgetter("uid")))
     return [one for batch in batches if any(r.uid in frozen for r in batch) for one in batch]
 
@@ -107,33 +115,36 @@ def _batches_of(frozen: Container[str], records: list[ObjectRecord]) -> list[Obj
 def _prepare(
     listed: ListedObjects,
     records: Sequence[ObjectRecord],
-    order: AskedObjects,
-    enough: Callable[[], bool] = lambda: False,
-    again: bool = True,
+    options: AskedObjects,
+    should_stop: Callable[[], bool] = lambda: False,
+    retry_transient: bool = True,
 ) -> PrepareResult:
-    folder = order.publication.folder
+    folder = options.publication.folder
     downloads = _Downloads(listed, folder, len(records))
     work = ObjectWork(
-        settings=order.settings.mesh_settings,
-        publication=order.publication,
+        settings=options.settings.mesh_settings,
+        writer=options.publication,
         fetch=None if listed.listing.is_here else downloads.fetch,
     )
     return prepare_in_batches(
         sorted(records, key=attrgetter("uid")),
         work,
-        workers=order.workers,
+        workers=options.workers,
         done=lambda count: count_object(folder, count),
-        enough=enough,
-        again=again,
+        should_stop=should_stop,
+        retry_transient=retry_transient,
     )
 
 
 class _Downloads:
-    """The downloads of this worker's batches, announced together."""
+    """Downloads objects and announces the progress over all batches of this worker."""
 
     def __init__(self, listed: ListedObjects, folder: DatasetFolder, total: int) -> None:
-        self._listed, self._folder, self._total = listed, folder, total
-        self._mutex, self._done = threading.Lock(), 0
+        self._listed = listed
+        self._folder = folder
+        self._total = total
+        self._mutex = threading.Lock()
+        self._done = 0
 
     def fetch(self, records: list[ObjectRecord]) -> Fetched:
         return self._listed.fetch(records, self._announce)
@@ -144,34 +155,34 @@ class _Downloads:
             announce_downloads(self._folder, self._done, self._total)
 
 
-def trusted_objects(order: AskedObjects) -> AcceptedObjects | None:
-    """Return the frozen objects by their index, without a look at any of them.
+def load_trusted_objects(options: AskedObjects) -> AcceptedObjects | None:
+    """Return the frozen objects by their index, without opening any of them.
 
-    The lock has their digests, by which each is checked where a scene draws it. None where nothing
-    is frozen yet, there is no index of this lock, or another source is asked for than before: then
-    every object has to be looked at.
+    The lock has their digests, which are checked when a scene draws an object. None if nothing is
+    frozen yet, the lock has no index, or the source differs from the frozen one: then every object
+    has to be checked.
 
     Raises:
         TrilightError: as `accept_maps`.
     """
-    publication = order.publication
-    folder = publication.folder
-    publication.take_lock()
+    writer = options.publication
+    folder = writer.folder
+    writer.fetch_lock()
     try:
         facts = ObjectIndex(folder.staged_index).facts
         lock = LockRows(folder.objects_lock)
     except TrilightError:
         return None
     known = facts.lock_sha256, facts.lock_bytes, facts.asked
-    if known != (publication.manifest.objects_lock_sha256, lock.num_bytes, order.digest):
+    if known != (writer.manifest.objects_lock_sha256, lock.num_bytes, options.digest):
         return None
-    found = accept_maps(order.own, order.settings, workers=order.workers)
-    maps = tuple(row for row in found.rows if lock.find(row[0].uid) == row[0])
+    accepted_maps = accept_maps(options.user_folders, options.settings, workers=options.workers)
+    maps = tuple(row for row in accepted_maps.rows if lock.find(row[0].uid) == row[0])
     if len(maps) != facts.num_maps:  # the long way says which one has changed
         return None
     return AcceptedObjects(
         num_objects=facts.num_objects,
         num_found=facts.num_found,
-        pool=order.pool,
+        pool=options.pool,
         maps=maps,
     )

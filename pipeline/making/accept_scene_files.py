@@ -1,4 +1,4 @@
-"""From a folder of scene files to the frozen list of files that its dataset is made of."""
+"""Checks a folder of scene files and freezes the list of files that the dataset is made of."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -11,9 +11,9 @@ from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_note
 from pipeline.exchange.scene_files import SceneFiles, build_scene
 from pipeline.exchange.scene_folder import SceneFolder, require_usable
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
-from pipeline.making.freeze_objects import AcceptedObjects, frozen_objects
+from pipeline.making.freeze_objects import AcceptedObjects, read_frozen_objects
 from pipeline.making.prepare_isolated import asset_child
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from pipeline.objects.licences import StatedLicence, stated_licence
 from storage.dataset.progress import announce_objects, count_object
 from storage.dataset.splits import JUDGED_SPLIT
@@ -24,7 +24,7 @@ from storage.records.objects import LockedObject
 def settings_for_files(
     settings: BuildSettings, folder: SceneFolder | None, views: int | None
 ) -> BuildSettings:
-    """Return the build's settings for the scenes of a folder: how many they are, and their views.
+    """Return the build's settings with the number of scenes and views of a folder.
 
     Without a folder, the settings stay as they are.
 
@@ -46,22 +46,22 @@ def accept_scene_files(
     folder: SceneFolder,
     licence: str | None,
     settings: BuildSettings,
-    publication: Publication,
+    writer: DatasetWriter,
 ) -> AcceptedObjects:
-    """Build every scene once, without a picture, and freeze their files at the first time.
+    """Build every scene once, without rendering; the first run freezes their files.
 
-    A file of which no scene can be made is noted, and none of what it names is frozen for it.
+    A file that cannot become a scene is noted, and the files that it names are not frozen for it.
 
     Raises:
         TrilightError: no scene at all can be built, the licence is not allowed, or the files are
             not those that the dataset was begun with.
     """
-    stated = _allowed(stated_licence(licence), settings)
-    files = _built_once(folder, stated, settings, publication)
-    locked = [_locked(uid, digest, stated) for uid, digest in sorted(files.sha256.items())]
-    frozen = frozen_objects(publication)
+    stated = _require_allowed(stated_licence(licence), settings)
+    files = _build_all(folder, stated, settings, writer)
+    locked = [_lock_entry(uid, digest, stated) for uid, digest in sorted(files.sha256.items())]
+    frozen = read_frozen_objects(writer)
     if frozen is None:
-        publication.lock_objects(locked)
+        writer.lock_objects(locked)
     else:
         _require_same_files(frozen, locked)
     return AcceptedObjects(
@@ -71,11 +71,11 @@ def accept_scene_files(
     )
 
 
-def _built_once(
-    folder: SceneFolder, stated: StatedLicence, settings: BuildSettings, publication: Publication
+def _build_all(
+    folder: SceneFolder, stated: StatedLicence, settings: BuildSettings, writer: DatasetWriter
 ) -> SceneFiles:
-    """Return the digests of all files that scenes can be made of, and what is wrong with others."""
-    announce_objects(publication.folder, len(folder.names))
+    """Build every scene; return digests of the usable files, and errors of the others."""
+    announce_objects(writer.folder, len(folder.names))
     sha256: dict[str, str] = {}
     notes: list[str] = []
     unusable = dict(folder.unusable)
@@ -84,14 +84,14 @@ def _built_once(
         for name in folder.names:
             if name not in unusable:
                 try:
-                    built = _built(child, folder, name, settings)
+                    built = _build_in_child(child, folder, name, settings)
                     sha256 |= built.sha256
                     notes += built.notes
                 except EnvironmentFailure:
                     raise
                 except TrilightError as mistake:
                     unusable[name] = str(mistake)
-            count_object(publication.folder)
+            count_object(writer.folder)
     finally:
         child.close()
     require_usable(folder.names, unusable)
@@ -108,18 +108,18 @@ def _built_once(
 
 @dataclass(frozen=True, kw_only=True)
 class BuiltScene:
-    """What is kept of a scene that was built once, to see whether it can be."""
+    """Digests and notes of a scene that was built once as a check."""
 
     sha256: Mapping[str, str]
-    """Digest of every file that it is made of by path below the folder."""
+    """Digest of every file of the scene, by path below the folder."""
     notes: tuple[str, ...]
-    """What a person should know of it."""
+    """Notes for the user, such as unread fields and scaled albedos."""
 
 
 def build_once(
     root: Path, name: str, settings: AssetSettings, num_views: int, over_one: AlbedoOverOne
 ) -> BuiltScene:
-    """Build a scene; only children come here. Raises TrilightError as `build_scene`."""
+    """Build a scene; runs only in child processes. Raises TrilightError as `build_scene`."""
     unread: list[str] = []
     scene, sha256 = build_scene(
         root,
@@ -136,10 +136,10 @@ def build_once(
     return BuiltScene(sha256=sha256, notes=notes)
 
 
-def _built(
+def _build_in_child(
     child: IsolatedChild, folder: SceneFolder, name: str, settings: BuildSettings
 ) -> BuiltScene:
-    """Build a scene in a child; raises TrilightError, of the environment where that is at fault."""
+    """Build a scene in a child; raises TrilightError, or EnvironmentFailure for the machine."""
     num_views = settings.scenes.num_views
     try:
         return call_with_retries(
@@ -154,7 +154,7 @@ def _built(
     except ChildFailed as failure:
         if failure.is_verdict:
             raise TrilightError(
-                f"{name}: its meshes cannot be read ({failure}); mend or remove the file."
+                f"{name}: its meshes cannot be read ({failure}); fix or remove the file."
             ) from failure
         raise EnvironmentFailure(
             f"{name}: its meshes could not be read this time ({failure}). Run the same command "
@@ -162,7 +162,7 @@ def _built(
         ) from failure
 
 
-def _allowed(stated: StatedLicence, settings: BuildSettings) -> StatedLicence:
+def _require_allowed(stated: StatedLicence, settings: BuildSettings) -> StatedLicence:
     if stated.licence.casefold() not in {name.casefold() for name in settings.allowed_licences}:
         raise TrilightError(
             f"--licence is {stated.licence}, which is not on the allow-list; if you may use the "
@@ -171,7 +171,7 @@ def _allowed(stated: StatedLicence, settings: BuildSettings) -> StatedLicence:
     return stated
 
 
-def _locked(uid: str, sha256: str, stated: StatedLicence) -> LockedObject:
+def _lock_entry(uid: str, sha256: str, stated: StatedLicence) -> LockedObject:
     return LockedObject(
         uid=uid,
         asset_sha256=sha256,

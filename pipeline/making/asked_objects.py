@@ -1,40 +1,40 @@
-"""What is asked for where the objects of a dataset are frozen."""
+"""`ObjectOptions`: source, licences and settings of the objects to freeze."""
 
 from dataclasses import dataclass
 
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.accept_maps import NO_FOLDERS, MapFolders
 from pipeline.making.frozen_pool import FrozenPool
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from pipeline.objects.sources import ListedObjects, list_objects
 from storage.digests import canonical_json, sha256_hex
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AskedObjects:
-    """The objects of a dataset, as they are asked for."""
+    """Source and settings of a dataset's objects."""
 
     source: str
-    """Where they come from, as `find_objects` takes it; may hold a secret."""
+    """Source of the objects, as `find_objects` takes it; may hold a secret."""
     licence: str | None
-    """Of files without a statement, as the user states it."""
+    """Licence that the user states for files without one."""
     settings: BuildSettings
-    """The build, which says how objects are prepared and dealt to splits."""
-    publication: Publication
-    """The dataset."""
+    """Settings of the build: how objects are prepared and assigned to splits."""
+    publication: DatasetWriter
+    """Writer of the dataset that the objects are frozen for."""
     workers: int
-    """Objects at a time."""
-    own: MapFolders = NO_FOLDERS
+    """Number of objects that are prepared at the same time."""
+    user_folders: MapFolders = NO_FOLDERS
     """Folders of textures and maps, which are frozen with the objects."""
 
     @property
     def digest(self) -> str:
-        """Of what the source is asked for: another source is looked at again."""
+        """Digest of source and licence: with another one, every object is checked again."""
         return sha256_hex(canonical_json([self.source, self.licence]))
 
     @property
     def pool(self) -> FrozenPool:
-        """Where scenes, once the objects are frozen, have them from."""
+        """The pool from which scenes draw objects once these are frozen."""
         folder = self.publication.folder
         return FrozenPool(
             lock=folder.objects_lock,
@@ -43,7 +43,7 @@ class AskedObjects:
             licence=self.licence,
         )
 
-    def listed(self) -> ListedObjects:
+    def list_source(self) -> ListedObjects:
         """List the source; raises as `list_objects`."""
         return list_objects(
             self.source,

@@ -1,4 +1,4 @@
-"""One attempt at one scene, inside a render child: compose it, render its views."""
+"""One attempt at one scene, inside a render child: composes it and renders its views."""
 
 import os
 from collections.abc import Sequence
@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pipeline.assets.store import AssetStore
 from pipeline.builds.settings import BuildSettings
-from pipeline.making.frozen_pool import AssetAway, FrozenPool
-from pipeline.making.own_maps import own_maps
+from pipeline.making.frozen_pool import AssetMissing, FrozenPool
+from pipeline.making.own_maps import user_maps
 from pipeline.making.prepare_isolated import asset_store
 from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.revisited_scenes import RevisitedScenes
@@ -30,59 +30,60 @@ MAX_ATTEMPTS = 16
 
 @dataclass(frozen=True, kw_only=True)
 class SceneRecipe:
-    """What a render child needs to know once."""
+    """Configuration of a render child, sent once when it starts."""
 
     settings: BuildSettings
-    """The build."""
+    """Settings of the dataset."""
     variant: Variant
-    """What Mitsuba runs on."""
+    """Mitsuba variant and denoiser device."""
     threads: int
-    """Threads of this child."""
+    """Number of CPU threads of this child."""
     gpu: str | None = None
-    """Graphics card of this child, as CUDA_VISIBLE_DEVICES names it; None where none is used."""
+    """GPU of this child, as CUDA_VISIBLE_DEVICES names it; None without one."""
     pool: FrozenPool | None = None
-    """The frozen objects, where scenes are composed of them."""
+    """The frozen objects, if scenes are composed of them."""
     assets: AssetStore = field(default_factory=asset_store)
-    """Where their prepared files are, as the maker sees it."""
+    """Store of the objects' prepared files, as the worker sees it."""
     maps: tuple[tuple[LockedObject, Path], ...] = ()
-    """A user's own textures and skies with their prepared files."""
+    """The user's textures and skies with their prepared files."""
     revisited: RevisitedScenes | None = None
-    """Where scenes are those of a finished dataset."""
+    """Reader of a finished dataset, if scenes are those of one."""
     folder: DatasetFolder | None = None
-    """Where it is told how far a scene is; None where nobody looks."""
+    """Folder that gets the progress of a scene; None reports none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneAttempt:
-    """What became of one attempt."""
+    """The result of one attempt."""
 
     sample: Sample | None
-    """The finished sample, or nothing where the attempt was rejected."""
+    """The finished sample; None if the attempt was rejected."""
     failures: list[Failure]
-    """The rejection of the attempt, and of cameras on the way to a sample."""
-    away: tuple[str, str] | None = None
-    """uid and file of an object that must be prepared again before this attempt can be made."""
+    """Rejections of the attempt, and of cameras on the way to a sample."""
+    missing_asset: tuple[str, str] | None = None
+    """uid and file name of an object that must be prepared again before this attempt."""
 
 
 class _ChildState:
-    """The objects and maps of a render child by split, each opened where a scene takes it."""
+    """Objects and maps of a render child by split, each opened when a scene takes it."""
 
-    source: SceneRecipe
+    recipe: SceneRecipe
     pool: dict[str, Sequence[PooledAsset]]
-    own: dict[str, OwnMaps]
+    maps: dict[str, OwnMaps]
 
 
 _state = _ChildState()
 
 
-def set_up_child(source: SceneRecipe) -> None:
-    """Prepare a render child: its graphics card, Mitsuba's variant, its threads, and the assets."""
-    if source.gpu is not None:
-        os.environ["CUDA_VISIBLE_DEVICES"] = source.gpu
-    activate(source.variant)
-    set_threads(source.threads)
-    _state.source = source
-    _state.pool, _state.own = {}, {}
+def set_up_child(recipe: SceneRecipe) -> None:
+    """Set up a render child: its GPU, Mitsuba's variant, its threads, and the assets."""
+    if recipe.gpu is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = recipe.gpu
+    activate(recipe.variant)
+    set_threads(recipe.threads)
+    _state.recipe = recipe
+    _state.pool = {}
+    _state.maps = {}
 
 
 def attempt_scene(
@@ -91,20 +92,20 @@ def attempt_scene(
     """Make one attempt at a scene; equal arguments give equal results in every child.
 
     Args:
-        split: of the scene.
-        scene_index: which.
-        attempt: from 0.
-        from_file: the scene, where it comes from a file: a confined child has read that.
+        split: split of the scene.
+        scene_index: index of the scene, from 0.
+        attempt: number of the attempt, from 0.
+        from_file: the scene if it comes from a file, which a confined child has read.
     """
     key = sample_key(scene_index)
-    settings = _state.source.settings
+    settings = _state.recipe.settings
     failures: list[Failure] = []
-    told = ViewProgress(_state.source.folder, scene_index)
+    progress = ViewProgress(_state.recipe.folder, scene_index)
     stage = "scenes"
     try:
-        begun = _scene(split, scene_index, attempt, from_file)
+        render_input = _scene(split, scene_index, attempt, from_file)
         stage = "renders"
-        sample = render_sample(key, begun, settings, failures, told)
+        sample = render_sample(key, render_input, settings, failures, progress)
     except Rejected as rejection:
         failures.append(
             Failure(
@@ -116,17 +117,20 @@ def attempt_scene(
             )
         )
         return SceneAttempt(sample=None, failures=failures)
-    except AssetAway as missing:
-        return SceneAttempt(sample=None, failures=[], away=(missing.uid, missing.asset_name))
+    except AssetMissing as missing:
+        return SceneAttempt(
+            sample=None, failures=[], missing_asset=(missing.uid, missing.asset_name)
+        )
     finally:
-        told.end()
+        progress.end()
     return SceneAttempt(sample=sample, failures=failures)
 
 
 def _scene(split: str, scene_index: int, attempt: int, from_file: Scene | None) -> BegunScene:
-    source, settings = _state.source, _state.source.settings
-    if source.revisited is not None:
-        return source.revisited.scene(scene_index, attempt, settings)
+    recipe = _state.recipe
+    settings = _state.recipe.settings
+    if recipe.revisited is not None:
+        return recipe.revisited.scene(scene_index, attempt, settings)
     if from_file is not None:
         return BegunScene(scene=from_file, kept_cameras=settings.scenes.num_views)
     scene = compose_scene(
@@ -135,22 +139,22 @@ def _scene(split: str, scene_index: int, attempt: int, from_file: Scene | None) 
         seed=settings.seed,
         scene_index=scene_index,
         attempt=attempt,
-        own=maps_of(split),
+        user_maps=maps_of(split),
     )
     return BegunScene(scene=scene)
 
 
 def assets_of(split: str) -> Sequence[PooledAsset]:
-    """Return the objects of a split, sorted by uid; each is opened when it is taken."""
+    """Return the objects of a split, sorted by uid; each is opened on first access."""
     if split not in _state.pool:
-        frozen = _state.source.pool
+        frozen = _state.recipe.pool
         assert frozen is not None, "only composed scenes draw objects"
-        _state.pool[split] = frozen.opened(split, _state.source.assets)
+        _state.pool[split] = frozen.open_split(split, _state.recipe.assets)
     return _state.pool[split]
 
 
 def maps_of(split: str) -> OwnMaps:
-    """Return a user's own textures and maps of a split; each is read when a scene takes it."""
-    if split not in _state.own:
-        _state.own[split] = own_maps(_state.source.maps, split)
-    return _state.own[split]
+    """Return the user's textures and maps of a split; each is read when a scene takes it."""
+    if split not in _state.maps:
+        _state.maps[split] = user_maps(_state.recipe.maps, split)
+    return _state.maps[split]

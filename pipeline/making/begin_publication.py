@@ -1,10 +1,10 @@
-"""A dataset is begun in a folder, or gone on with where it is the same one."""
+"""Begins a dataset in a folder, or resumes the one there if its settings are the same."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from pipeline.builds.settings import BuildSettings, differences
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, read_head, write_manifest
@@ -21,8 +21,8 @@ def begin(
     num_scenes: int,
     *,
     accept_environment: bool,
-) -> Publication:
-    """Begin a dataset, or go on with the one that is there.
+) -> DatasetWriter:
+    """Begin a dataset in a folder, or resume the one that is there.
 
     The number of scenes never falls.
 
@@ -32,29 +32,29 @@ def begin(
     """
     if num_scenes < 1:
         raise TrilightError(f"scenes is {num_scenes}; expected at least 1.")
-    wanted = planned_scenes(num_scenes, settings.splits)
+    num_planned = planned_scenes(num_scenes, settings.splits)
     with folder.turn("manifest"):
         if folder.manifest.exists():
             manifest = read_head(folder.manifest)
             _require_same_dataset(folder, manifest, settings, environment, accept_environment)
-            wanted = max(wanted, manifest.num_scenes)
+            num_planned = max(num_planned, manifest.num_scenes)
         else:
             require_free(folder, _names_in(folder))
             manifest = Manifest(
                 build=settings.build,
                 settings=settings.as_json(),
                 environment=environment,
-                num_scenes=wanted,
+                num_scenes=num_planned,
                 num_views=settings.scenes.num_views,
                 objects_lock_sha256="",
                 shards=(),
                 extensions=recorded("data"),
             )
             write_manifest(folder.manifest, manifest)
-        publication = Publication(folder, manifest, settings.splits)
-        if wanted != manifest.num_scenes:
-            publication.extend(wanted)
-    return publication
+        writer = DatasetWriter(folder, manifest, settings.splits)
+        if num_planned != manifest.num_scenes:
+            writer.extend(num_planned)
+    return writer
 
 
 def _require_same_dataset(
@@ -66,8 +66,8 @@ def _require_same_dataset(
 ) -> None:
     _require_generated(folder, manifest)
     require_same_extensions(folder.shown, manifest.extensions, recorded("data"))
-    begun = from_record(BuildSettings, manifest.settings).as_json()  # fields may come later
-    _require_same(folder, "setting", begun, settings.as_json(), "choose another --out")
+    stored = from_record(BuildSettings, manifest.settings).as_json()  # fields may come later
+    _require_same(folder, "setting", stored, settings.as_json(), "choose another --out")
     if not accept_environment:
         _require_same(
             folder,
@@ -80,23 +80,23 @@ def _require_same_dataset(
 
 
 def require_free(folder: DatasetFolder, names: Iterable[str]) -> None:
-    """Refuse to begin a dataset where something else is.
+    """Raise if a folder or bucket holds files that a new dataset would replace.
 
     Args:
-        folder: of the dataset.
-        names: of the shards and documents that are where it is to be.
+        folder: the dataset's folder.
+        names: names of the shards and documents that exist there.
 
     Raises:
         TrilightError: there are shards, or a document that the dataset's own would replace.
     """
-    there = set(names)
-    if any(name.endswith(".tar") for name in there):
+    existing = set(names)
+    if any(name.endswith(".tar") for name in existing):
         raise TrilightError(
             f"{folder.shown}: there are shards but no manifest.json; expected an empty folder or a "
             "dataset. Choose another --out."
         )
     for path in (folder.card, folder.licences):
-        if path.name in there:
+        if path.name in existing:
             raise TrilightError(
                 f"{folder.shown}: {path.name} is there, and the dataset's own would replace it; "
                 "expected an empty folder or a dataset. Choose another --out."
@@ -112,7 +112,7 @@ def _require_generated(folder: DatasetFolder, manifest: Manifest) -> None:
     if derivation := derivation_of(manifest.settings):
         raise TrilightError(
             f"{folder.shown}: this dataset was made by `trilight shards {derivation.operation}` "
-            "and cannot grow; extend its sources and make it anew, or choose another --out."
+            "and cannot grow; extend its sources and make it again, or choose another --out."
         )
 
 

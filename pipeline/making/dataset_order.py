@@ -17,14 +17,13 @@ from storage.settings.described import checked, option_words
 from storage.settings.ranges import Seed, Share, Within
 
 _RANGE = re.compile(r"(\d+):(\d+)")
-_ELSEWHERE = ("build", "out", "shards", "workers")
-"""Fields that differ from machine to machine: the folder, the part to make, the number of
-processes."""
+_PER_MACHINE = ("build", "out", "shards", "workers")
+"""Fields that differ from machine to machine: folder, range of shards, number of processes."""
 
 
 @checked()
 class DatasetOrder:
-    """Which dataset to make, or which part of it, and how."""
+    """The dataset to make, the range of its shards, and how."""
 
     build: str = "smoke"
     """Name of a build (a named set of settings), such as smoke or pretrain-256."""
@@ -116,11 +115,11 @@ class DatasetOrder:
 
     @property
     def place(self) -> str:
-        """Where the dataset is made."""
+        """Path or URL of the dataset."""
         return f"data/{function_name(self.build)}" if self.out is None else self.out
 
     def shard_range(self) -> range | None:
-        """Return the shards that are asked for, or None for all.
+        """Return the range of requested shards, or None for all.
 
         Raises:
             TrilightError: `shards` is no range, or an empty one.
@@ -137,7 +136,7 @@ class DatasetOrder:
 
 
 def _refuse_maps(order: DatasetOrder) -> None:
-    """Refuse folders of maps for scenes that are not composed, and a licence of none."""
+    """Raise if map folders are given for scenes that are not composed, or a licence without any."""
     for name, value in (("--textures", order.textures), ("--skies", order.skies)):
         if value is not None and (order.scenes_from or order.revisits):
             raise TrilightError(
@@ -151,14 +150,14 @@ def _refuse_maps(order: DatasetOrder) -> None:
 
 
 def generate_words(order: DatasetOrder) -> list[str]:
-    """Return the words of `generate` for what an order asks beside its defaults, without `--out`.
+    """Return the arguments of `generate` that repeat these options, without `--out`.
 
-    Which part of the dataset this machine makes, and with how many processes, is left out; so are
-    passwords.
+    Options of this machine alone (the range of shards, the number of processes) are left out; so
+    are passwords.
     """
-    words = option_words(order, leave_out=_ELSEWHERE)
-    return ["generate", order.build, *map(_shown, words)]
+    words = option_words(order, leave_out=_PER_MACHINE)
+    return ["generate", order.build, *map(_hide_secret, words)]
 
 
-def _shown(word: str) -> str:
+def _hide_secret(word: str) -> str:
     return safe_url(word) if "://" in word else word

@@ -1,7 +1,7 @@
-"""A dataset made of finished datasets: its shards, then its documents, then all of it at once.
+"""Makes a dataset of finished datasets: its shards, then its documents.
 
-It is written into a hidden folder beside its place, which is renamed when it is whole. A killed run
-leaves that folder, and the next one clears it.
+It is written into a hidden folder beside its path, which is renamed when it is complete. A killed
+run leaves that folder, and the next one clears it.
 """
 
 import os
@@ -20,32 +20,32 @@ from storage.errors import TrilightError
 
 
 def derive_dataset(
-    places: Sequence[str],
+    paths: Sequence[str],
     derive: Derive,
     out: Path,
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[str, Statistics]:
-    """Make a dataset of finished ones.
+    """Make a dataset of finished ones by merging, selecting or resharding.
 
     Args:
-        places: folders of the sources.
-        derive: what to make of them.
-        out: its folder, which must not exist or be empty.
-        progress: called with the shards that are read or written so far, and with their number.
+        paths: folders of the sources.
+        derive: operation and arguments.
+        out: folder of the new dataset, which must not exist or be empty.
+        progress: called with the number of shards read or written so far, and the total.
 
     Returns:
-        The dataset digest, and what the dataset holds.
+        The dataset digest, and the statistics of the dataset.
 
     Raises:
-        TrilightError: as `pipeline.shards.derive.derive_shards`, or `out` holds something.
+        TrilightError: as `pipeline.shards.derive.derive_shards`, or `out` is not empty.
     """
     out = Path(os.path.realpath(out))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise TrilightError(
             f"{out}: is there already; expected a new folder. Choose another --out."
         )
-    sources = [open_finished(place) for place in places]
+    sources = [open_finished(path) for path in paths]
     work = DatasetFolder(out.with_name(f".{out.name}.part"))
     with work.locked():
         _clear(work)
@@ -63,7 +63,7 @@ def derive_dataset(
 
 
 def _clear(work: DatasetFolder) -> None:
-    """Delete what a killed run left; call only while holding the folder's lock."""
+    """Delete the files of a killed run; call only while holding the folder's lock."""
     for path in work.root.iterdir():
         if path == work.staging:
             continue

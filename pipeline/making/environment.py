@@ -1,4 +1,4 @@
-"""What the bytes of a dataset depend on beside its settings: processor, variant, libraries."""
+"""The environment that decides a dataset's bytes beside its settings: processor, libraries."""
 
 import platform
 import zlib
@@ -24,23 +24,23 @@ _VECTOR_EXTENSIONS = ("avx512f", "avx2", "sse4_2", "asimd")
 
 
 def environment(variant: Variant) -> dict[str, Any]:
-    """Return what a dataset must agree on to keep its digest, as JSON values."""
-    # Only where it is not the processor: what was made before this could be said stays the same.
-    on_card = {} if variant.denoiser == "CPU" else {"denoiser_device": variant.denoiser}
+    """Return the processor, variant and library versions that decide a digest, as JSON values."""
+    # Stated only for a GPU, so that manifests from before this field stay equal.
+    gpu_denoiser = {} if variant.denoiser == "CPU" else {"denoiser_device": variant.denoiser}
     return {
-        **on_card,
+        **gpu_denoiser,
         "mitsuba_variant": variant.name,
         "llvm": Path(variant.libllvm).name,
         "processor": f"{platform.machine()} {vector_extension()}".strip(),
         "libraries": {
             **{name: _version(name) for name in _LIBRARIES},
-            "zlib": zlib.ZLIB_RUNTIME_VERSION,  # Python's own, which packs the arrays of scenes
+            "zlib": zlib.ZLIB_RUNTIME_VERSION,  # Python's own: compresses the arrays of scenes
         },
     }
 
 
 def vector_extension() -> str:
-    """Return the widest vector extension of this processor that compilers use, or nothing."""
+    """Return the widest vector extension of this processor that compilers use, or an empty text."""
     try:
         flags = Path("/proc/cpuinfo").read_text().split()
     except OSError:

@@ -1,4 +1,4 @@
-"""The objects of a dataset, frozen: what its scenes draw from, the same for all its makers."""
+"""Freezes the objects of a dataset: the pool that its scenes draw from, equal for all workers."""
 
 import logging
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from pipeline.making.accept_maps import NO_MAPS, AcceptedMaps
 from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.frozen_pool import FrozenPool
 from pipeline.making.object_batches import PreparedObject
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.making.unread import format_unread, write_unread
 from storage.conventions import SPLITS
@@ -34,78 +34,83 @@ log = logging.getLogger("trilight.objects")
 
 @dataclass(frozen=True, kw_only=True)
 class AcceptedObjects:
-    """What scenes may use."""
+    """The frozen inputs of a dataset's scenes."""
 
     num_objects: int
     """Objects that scenes may draw from."""
     num_found: int
     """Objects in the source, refused ones included."""
     pool: FrozenPool | None = None
-    """Where scenes are composed: the frozen objects."""
+    """The frozen objects, if scenes are composed."""
     maps: tuple[tuple[LockedObject, Path], ...] = ()
-    """A user's own textures and skies with their prepared files."""
+    """The user's textures and skies with their prepared files."""
     files: SceneFiles | None = None
-    """Where scenes come from files: those, and the objects are the files themselves."""
+    """The scene files, if scenes come from files; the objects are then the files themselves."""
     revisited: RevisitedScenes | None = None
-    """Where scenes are those of a finished dataset: that, whose objects these are."""
+    """Reader of a finished dataset, if scenes are those of one; the objects are its objects."""
 
 
 def freeze_objects(
-    order: AskedObjects,
+    options: AskedObjects,
     prepared: list[PreparedObject],
     rejected: list[Failure],
     num_found: int,
     maps: AcceptedMaps = NO_MAPS,
 ) -> AcceptedObjects:
-    """Freeze the objects at the first time, and later require that they are the same.
+    """Freeze the objects in the first run; in later runs require that they are the same.
 
     Args:
-        order: what is asked for.
-        prepared: objects that the mesh stage accepted, or later those of them that are frozen.
-        rejected: refusals of the source, and of the mesh stage.
+        options: source, licences and settings of the objects.
+        prepared: objects that the mesh stage accepted; in later runs the frozen ones among them.
+        rejected: rejections by the source and by the mesh stage.
         num_found: number of objects in the source.
-        maps: textures and maps of the user's own, which are frozen with the objects.
+        maps: the user's textures and maps, which are frozen with the objects.
 
     Raises:
         TrilightError: no object is accepted, a split has none, or the objects are not those that
             the dataset was begun with.
-        EnvironmentFailure: one of those could not be prepared this time.
+        EnvironmentFailure: a frozen object could not be prepared this time.
     """
-    publication, settings = order.publication, order.settings
-    shown, frozen = safe_url(order.source), frozen_objects(publication)
-    passing = [failure for failure in rejected if is_passing(failure.reason)]
+    writer = options.publication
+    settings = options.settings
+    display_name = safe_url(options.source)
+    frozen = read_frozen_objects(writer)
+    transient = [failure for failure in rejected if is_passing(failure.reason)]
     if frozen is not None:
-        for failure in passing:
-            require_tried(shown, failure)
-    publication.add_failures([*rejected, *maps.failures])
-    objects = [_locked(asset, settings) for asset in prepared]
+        for failure in transient:
+            require_tried(display_name, failure)
+    writer.add_failures([*rejected, *maps.failures])
+    objects = [_lock_entry(asset, settings) for asset in prepared]
     locked = [*objects, *(entry for entry, _ in maps.rows)]
     if frozen is None:
-        _require_enough(objects, settings, publication, shown)
-        _warn_of(shown, passing)
-        _tell_of_materials(shown, prepared, publication.folder.logs)
-        _tell_of_unread(shown, prepared, publication.folder.logs)
-        publication.lock_objects(locked)
+        _require_enough(objects, settings, writer, display_name)
+        _warn_of_transient(display_name, transient)
+        _warn_of_drawn_materials(display_name, prepared, writer.folder.logs)
+        _warn_of_unread(display_name, prepared, writer.folder.logs)
+        writer.lock_objects(locked)
     else:
-        require_same(shown, frozen, locked)
-    _index(order, locked, prepared, num_found)
+        require_same(display_name, frozen, locked)
+    _write_index(options, locked, prepared, num_found)
     return AcceptedObjects(
         num_objects=len(objects),
         num_found=num_found,
-        pool=order.pool,
+        pool=options.pool,
         maps=maps.rows,
     )
 
 
-def _index(
-    order: AskedObjects,
+def _write_index(
+    options: AskedObjects,
     locked: list[LockedObject],
     prepared: list[PreparedObject],
     num_found: int,
 ) -> None:
-    """Write the index of the lock, by which later makers trust it."""
-    assets, publication = {asset.record.uid: asset for asset in prepared}, order.publication
-    folder, objects, offset = publication.folder, list[IndexedObject](), 0
+    """Write the index of the lock, by which later workers load it without opening objects."""
+    assets = {asset.record.uid: asset for asset in prepared}
+    writer = options.publication
+    folder = writer.folder
+    objects = list[IndexedObject]()
+    offset = 0
     with open_plain(folder.objects_lock) as lines:
         for line, entry in zip(lines, sorted(locked, key=attrgetter("uid")), strict=True):
             if entry.kind == OBJECT:
@@ -122,23 +127,23 @@ def _index(
     write_object_index(
         folder.staged_index,
         objects,
-        lock_sha256=publication.manifest.objects_lock_sha256,
+        lock_sha256=writer.manifest.objects_lock_sha256,
         lock_bytes=offset,
-        asked=order.digest,
+        asked=options.digest,
         num_found=num_found,
         num_maps=len(locked) - len(objects),
     )
-    publication.send(folder.staged_index)
+    writer.upload(folder.staged_index)
 
 
-def frozen_objects(publication: Publication) -> dict[str, LockedObject] | None:
-    """Return what the dataset was begun with by uid, or None where nothing is frozen yet."""
-    if not publication.manifest.objects_lock_sha256:
+def read_frozen_objects(writer: DatasetWriter) -> dict[str, LockedObject] | None:
+    """Return the frozen objects by uid, or None if nothing is frozen yet."""
+    if not writer.manifest.objects_lock_sha256:
         return None
-    return {entry.uid: entry for entry in read_objects_lock(publication.folder.objects_lock)}
+    return {entry.uid: entry for entry in read_objects_lock(writer.folder.objects_lock)}
 
 
-def _locked(asset: PreparedObject, settings: BuildSettings) -> LockedObject:
+def _lock_entry(asset: PreparedObject, settings: BuildSettings) -> LockedObject:
     record = asset.record
     return LockedObject(
         uid=record.uid,
@@ -153,22 +158,22 @@ def _locked(asset: PreparedObject, settings: BuildSettings) -> LockedObject:
 
 
 def _require_enough(
-    locked: list[LockedObject], settings: BuildSettings, publication: Publication, source: str
+    locked: list[LockedObject], settings: BuildSettings, writer: DatasetWriter, source: str
 ) -> None:
     if not locked:
         raise TrilightError(
             f"objects {source!r}: none was accepted; expected at least one usable object with an "
-            f"allowed licence. The reasons are in {publication.folder.failures}."
+            f"allowed licence. The reasons are in {writer.folder.failures}."
         )
-    shards = range(publication.num_shards)
-    needed = {split_of_shard(index, settings.splits) for index in shards}
+    shards = range(writer.num_shards)
+    splits_in_use = {split_of_shard(index, settings.splits) for index in shards}
     require_objects(
-        {split: sum(entry.split == split for entry in locked) for split in SPLITS}, needed
+        {split: sum(entry.split == split for entry in locked) for split in SPLITS}, splits_in_use
     )
 
 
 def require_tried(source: str, failure: Failure) -> None:
-    """Refuse to judge an object of the dataset where the environment has kept it from us."""
+    """Raise EnvironmentFailure if a frozen object failed for a transient reason."""
     if is_passing(failure.reason):
         raise EnvironmentFailure(
             f"objects {source!r}: {failure.item!r}, which the dataset was begun with, could not be "
@@ -177,29 +182,29 @@ def require_tried(source: str, failure: Failure) -> None:
         )
 
 
-def changed(source: str, uid: str, state: str) -> TrilightError:
-    """Return the error of a frozen object that its source has not got any more as it was."""
+def object_changed_error(source: str, uid: str, state: str) -> TrilightError:
+    """Return the error of a frozen object that its source has lost or changed."""
     return TrilightError(
         f"objects {source!r}: {uid!r} {state}; expected the objects that the dataset was begun "
         "with (objects.lock.jsonl). Restore it, or choose another --out."
     )
 
 
-def _warn_of(source: str, passing: list[Failure]) -> None:
-    if passing:
-        counts = ", ".join(f"{count} x {why}" for _, why, count in count_by_reason(passing))
+def _warn_of_transient(source: str, transient: list[Failure]) -> None:
+    if transient:
+        counts = ", ".join(f"{count} x {why}" for _, why, count in count_by_reason(transient))
         log.warning(
             "objects %r: %d could not be prepared this time (%s), each after several tries, and "
             "the dataset is begun without them; failures.jsonl names them. A dataset begun later "
             "tries them again.",
             source,
-            len(passing),
+            len(transient),
             counts,
         )
 
 
-def _tell_of_materials(source: str, prepared: list[PreparedObject], logs: Path) -> None:
-    """Say which objects get drawn materials although their own were asked for, and write it."""
+def _warn_of_drawn_materials(source: str, prepared: list[PreparedObject], logs: Path) -> None:
+    """Log and record the objects that get drawn materials although their own were requested."""
     drawn = {each.record.uid: (each.without_own,) for each in prepared if each.without_own}
     path = write_unread(logs, drawn, "drawn_materials")
     if drawn:
@@ -213,8 +218,8 @@ def _tell_of_materials(source: str, prepared: list[PreparedObject], logs: Path) 
         )
 
 
-def _tell_of_unread(source: str, prepared: list[PreparedObject], logs: Path) -> None:
-    """Say what no code has read of the objects' files, and write it down."""
+def _warn_of_unread(source: str, prepared: list[PreparedObject], logs: Path) -> None:
+    """Log and record the parts of the objects' files that no reader supports."""
     unread = {asset.record.uid: asset.unread for asset in prepared if asset.unread}
     path = write_unread(logs, unread)
     if unread:
@@ -228,9 +233,9 @@ def _tell_of_unread(source: str, prepared: list[PreparedObject], logs: Path) -> 
 
 
 def require_same(source: str, frozen: dict[str, LockedObject], now: list[LockedObject]) -> None:
-    """Raise TrilightError where a frozen row is not among those of now."""
+    """Raise TrilightError if a frozen row is missing or differs now."""
     by_uid = {entry.uid: entry for entry in now}
     for uid, entry in frozen.items():
         if by_uid.get(uid) != entry:
             state = "has changed" if uid in by_uid else "is missing or no longer usable"
-            raise changed(source, uid, state)
+            raise object_changed_error(source, uid, state)

@@ -1,9 +1,9 @@
-"""The frozen objects of a dataset as its makers have them: an index, and files where one is drawn.
+"""`FrozenPool`: the frozen objects of a dataset, read by index and opened when a scene draws them.
 
-A maker trusts what the lock has frozen and the asset store has proved: it starts without a look at
-any object. A render child opens the one to three objects of its scene, checks their digests against
-the lock, and keeps a few. An object whose file is not there any more, or was never on this machine,
-is prepared again by the maker (`pipeline.making.restore_object`).
+A worker trusts the lock and the asset store: it starts without opening any object. A render child
+opens the one to three objects of its scene, checks their digests against the lock, and keeps a few
+open. If an object's file is missing on this machine, the worker prepares it again
+(`pipeline.making.restore_object`).
 """
 
 from collections import OrderedDict
@@ -21,33 +21,33 @@ from storage.records.lock_rows import LockRows
 from storage.records.object_index import ObjectIndex
 
 _MOST_OPEN = 8
-"""Objects that a split of a child keeps; most scenes have three at most."""
+"""Objects that a child keeps open for each split; most scenes have three at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrozenPool:
-    """Where the frozen objects of a dataset are; it may travel to another machine."""
+    """Paths of a dataset's frozen objects; can be sent to another machine."""
 
     lock: Path
-    """objects.lock.jsonl of the dataset's folder."""
+    """Path of objects.lock.jsonl in the dataset's folder."""
     index: Path
-    """Its index (storage.records.object_index)."""
+    """Path of the lock's index (storage.records.object_index)."""
     source: str
-    """Where the objects come from, for those that have to be prepared again."""
+    """Source of the objects, for those that have to be prepared again."""
     licence: str | None
-    """Of files without a statement, as the user states it."""
+    """Licence that the user states for files without one."""
 
-    def opened(self, split: str, store: AssetStore) -> "OpenedPool":
+    def open_split(self, split: str, store: AssetStore) -> "SplitPool":
         """Return the objects of a split, sorted by uid; raises TrilightError without any."""
-        return OpenedPool(self, split, store)
+        return SplitPool(self, split, store)
 
 
-class AssetAway(Exception):
-    """The prepared file of an object is not in the store, or is not the one of the lock.
+class AssetMissing(Exception):
+    """The store lacks the prepared file of an object, or has another than the lock's.
 
     Attributes:
-        uid: of the object.
-        asset_name: of the file that is missing.
+        uid: uid of the object.
+        asset_name: name of the missing file.
     """
 
     def __init__(self, uid: str, asset_name: str) -> None:
@@ -56,8 +56,8 @@ class AssetAway(Exception):
         self.asset_name = asset_name
 
 
-class OpenedPool(IndexedPool):
-    """The objects of one split, each opened when it is taken."""
+class SplitPool(IndexedPool):
+    """The objects of one split, each opened on access."""
 
     def __init__(self, frozen: FrozenPool, split: str, store: AssetStore) -> None:
         index = ObjectIndex(frozen.index)
@@ -68,18 +68,21 @@ class OpenedPool(IndexedPool):
             index.column("least", rows), index.column("camp", rows), index.facts.camps, rows.camps
         )
         self._offsets = index.column("offset", rows)
-        self._index, self._first, self._split = index, rows.start, split
-        self._lock, self._store = LockRows(frozen.lock), store
+        self._index = index
+        self._first = rows.start
+        self._split = split
+        self._lock = LockRows(frozen.lock)
+        self._store = store
         self._open: OrderedDict[int, PooledAsset] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._offsets)
 
     def __getitem__(self, row: int) -> PooledAsset:  # type: ignore[override]
-        """Return an object, from its file unless it was among the last.
+        """Return an object; read its file unless it is still open.
 
         Raises:
-            AssetAway: it has to be prepared again.
+            AssetMissing: it has to be prepared again.
             TrilightError: the index is not that of the lock.
         """
         if not 0 <= row < len(self):
@@ -97,16 +100,16 @@ class OpenedPool(IndexedPool):
         try:
             data = self._store.asset_path(name).read_bytes()
         except FileNotFoundError as error:
-            raise AssetAway(locked.uid, name) from error
+            raise AssetMissing(locked.uid, name) from error
         if sha256_hex(data) != locked.asset_sha256:
-            raise AssetAway(locked.uid, name)
+            raise AssetMissing(locked.uid, name)
         asset = decode_asset(data)
         pooled = PooledAsset(locked=locked, asset=asset)
-        found = locked.split, least_triangles(asset), pooled.camp
-        if found != (self._split, self.fits.size(row), self.fits.camp(row)):
+        stored = locked.split, least_triangles(asset), pooled.camp
+        if stored != (self._split, self.fits.size(row), self.fits.camp(row)):
             raise TrilightError(
                 f"objects.index: says otherwise of {locked.uid!r} than objects.lock.jsonl and its "
                 "file; expected the index of this lock. Delete .staging/objects.index, and it is "
-                "made anew."
+                "made again."
             )
         return pooled

@@ -1,4 +1,4 @@
-"""What one scene holds, and a sheet of it from all sides; in a child process with limits."""
+"""Reports the contents of one scene and renders a turntable of it, in children with limits."""
 
 import dataclasses
 import math
@@ -24,36 +24,40 @@ from storage.records.material import EMISSION, PUBLISHED_COLUMNS, unread_columns
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
 
-VIEWS, ROWS = 8, 2
-"""Pictures of a turntable, and the rows in which they stand."""
+VIEWS = 8
+ROWS = 2
+"""Rows of pictures in a turntable."""
 
-_RESOLUTION, _SPP = 192, 64
-_FOV_DEG, _ELEVATION_DEG = 40.0, 25.0
+_RESOLUTION = 192
+_SPP = 64
+_FOV_DEG = 40.0
+_ELEVATION_DEG = 25.0
 _ROOM_AROUND = 1.03
-"""Of the least distance from which everything is within the picture."""
+"""Factor on the least camera distance from which the whole scene is within the picture."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class InspectedScene:
-    """What there is to say of a scene."""
+    """Facts about one scene, and notes of its reader."""
 
     facts: Mapping[str, Any]
-    """JSON values by name."""
+    """Facts for the user as JSON values, by name, such as triangles and extent_m."""
     notes: tuple[str, ...]
-    """What of the file could not be carried over."""
+    """Parts of the file that the reader could not convert."""
 
 
 def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene:
-    """Return what a scene holds, and write its turntable where one is asked for.
+    """Return facts about a scene, and write its turntable if a path is given.
 
     Raises:
         TrilightError: the source is unusable, or the sheet cannot be rendered or written.
     """
     if turntable is not None and turntable.suffix.lower() != ".png":
         raise TrilightError(f"--turntable is {turntable}; expected the name of a file X.png.")
-    child, renderer = file_child(reach_of(source)), unconfined_child()
+    child = file_child(reach_of(source))
+    renderer = unconfined_child()
     try:
-        found = call_with_retries(child, _facts, source)
+        inspected = call_with_retries(child, _facts, source)
         if turntable is not None:
             from pipeline.documents.png import encode_png
 
@@ -67,13 +71,14 @@ def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene
     finally:
         child.close()
         renderer.close()
-    return found
+    return inspected
 
 
 def _facts(source: SceneSource) -> InspectedScene:
     loaded = load_source(source)
     scene = loaded.scene
-    low, high = scene.vertex_positions.min(axis=0), scene.vertex_positions.max(axis=0)
+    low = scene.vertex_positions.min(axis=0)
+    high = scene.vertex_positions.max(axis=0)
     kinds = Counter(entry.kind for entry in scene.objects)
     licences = Counter(scene.licences)
     added = unread_columns(scene.materials, PUBLISHED_COLUMNS)
@@ -97,27 +102,27 @@ def _facts(source: SceneSource) -> InspectedScene:
 
 
 def _maps(scene: Scene) -> dict[str, Any]:
-    """Return what there is to say of textures and environment, where there are any."""
-    found: dict[str, Any] = {}
+    """Return facts about textures and environment, if there are any."""
+    facts: dict[str, Any] = {}
     if scene.textures:
         sizes = (
             f"{each.source.name or each.sha256[:8]} {each.texels.shape[1]} x {each.texels.shape[0]}"
             for each in scene.textures[:8]
         )
-        found["textures"] = f"{len(scene.textures)}: {', '.join(sizes)}"
+        facts["textures"] = f"{len(scene.textures)}: {', '.join(sizes)}"
     if (sky := scene.environment) is not None:
         height, width, _ = sky.radiance_rgb.shape
-        found["environment"] = (
+        facts["environment"] = (
             f"{sky.source.name or sky.sha256[:8]} {width} x {height}, greatest radiance "
             f"{float(sky.radiance_rgb.max()):.4g}, {'seen' if sky.is_seen else 'hidden'}"
         )
-    return found
+    return facts
 
 
 def _turntable(scene: Scene, variant: Variant) -> NDArray[np.uint8]:
     """Return a sheet [H, W, 3] of the scene from all sides, lit by its own lights.
 
-    Walls that stand before what they hold are left out of a picture, and with them their light.
+    Walls between the camera and the objects are left out of a picture, and with them their light.
     """
     from pipeline.renders.renderer import SceneRenderer
 
@@ -141,9 +146,10 @@ def _turntable(scene: Scene, variant: Variant) -> NDArray[np.uint8]:
 
 
 def seen_into(scene: Scene, pose: NDArray[np.float32]) -> Scene:
-    """Return a scene without the triangles of its shell that hide what stands in it.
+    """Return a scene without the triangles of its shell that hide its objects.
 
-    Their planes part the camera of the pose [4, 4] from the middle of what stands there.
+    The planes of these triangles lie between the camera of the pose [4, 4] and the middle of the
+    objects.
     """
     shells = np.array([entry.kind == "shell" for entry in scene.objects])[scene.object_index]
     inside = scene.vertex_positions[scene.faces[~shells & ~scene.triangle_emits]].reshape(-1, 3)
@@ -168,22 +174,22 @@ def seen_into(scene: Scene, pose: NDArray[np.float32]) -> Scene:
 
 
 def turntable_poses(scene: Scene) -> list[NDArray[np.float32]]:
-    """Return poses [4, 4] around what reflects, so that each sees all of it."""
+    """Return camera poses [4, 4] around all reflecting surfaces; each sees all of them."""
     points = scene.vertex_positions[np.unique(scene.faces[~scene.triangle_emits])]
     if not len(points):
         points = scene.vertex_positions
     middle = (points.min(axis=0) + points.max(axis=0)).astype(np.float64) / 2
     tangent = math.tan(math.radians(_FOV_DEG) / 2)
     poses = []
-    for turn in 2 * np.pi * np.arange(VIEWS) / VIEWS:
+    for azimuth in 2 * np.pi * np.arange(VIEWS) / VIEWS:
         up = math.sin(math.radians(_ELEVATION_DEG))
         flat = math.cos(math.radians(_ELEVATION_DEG))
-        away = np.array([flat * math.sin(turn), -flat * math.cos(turn), up])
-        turned = look_at_c2w(eye=middle + away, target=middle, up=[0, 0, 1])
-        # in the camera's axes about the middle: what lies nearer has to lie nearer the axis
-        local = np.einsum("pi,ij->pj", points - middle, turned[:3, :3])
-        needed = np.abs(local[:, :2]).max(axis=1) / tangent + local[:, 2]
-        distance = max(_ROOM_AROUND * float(needed.max()), 1e-3)
-        pose = look_at_c2w(eye=middle + distance * away, target=middle, up=[0, 0, 1])
+        direction = np.array([flat * math.sin(azimuth), -flat * math.cos(azimuth), up])
+        facing = look_at_c2w(eye=middle + direction, target=middle, up=[0, 0, 1])
+        # in the camera's axes about the middle: a nearer point has to lie nearer to the axis
+        local = np.einsum("pi,ij->pj", points - middle, facing[:3, :3])
+        distances = np.abs(local[:, :2]).max(axis=1) / tangent + local[:, 2]
+        distance = max(_ROOM_AROUND * float(distances.max()), 1e-3)
+        pose = look_at_c2w(eye=middle + distance * direction, target=middle, up=[0, 0, 1])
         poses.append(pose.astype(np.float32))
     return poses

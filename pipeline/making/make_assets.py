@@ -1,4 +1,4 @@
-"""Just the mesh stage: a source of objects to a folder of clean meshes with a quality report."""
+"""Runs the mesh stage alone: from a source of objects to clean meshes and a quality report."""
 
 import contextlib
 import dataclasses
@@ -22,7 +22,7 @@ from pipeline.documents.quality_page import Pair, encode_quality_page
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.isolation import ChildFailed, call_with_retries, reach
 from pipeline.making.prepare_isolated import asset_child, prepare_isolated
-from pipeline.making.unread import Unread, write_unread
+from pipeline.making.unread import UnreadNotes, write_unread
 from pipeline.objects.glb import encode_glb
 from pipeline.objects.ply import encode_ply
 from pipeline.objects.sources import find_objects
@@ -41,10 +41,10 @@ _WIDTH_PX = 256
 
 @dataclass(frozen=True)
 class AssetFolder:
-    """The paths of what `trilight assets` writes."""
+    """The paths that `trilight assets` writes."""
 
     root: Path
-    """The folder that users name."""
+    """The folder that `--out` names."""
 
     @property
     def summary(self) -> Path:
@@ -77,20 +77,20 @@ class AssetFolder:
 
 @dataclass(frozen=True, kw_only=True)
 class AssetReport:
-    """What became of the objects of a source."""
+    """The result of the mesh stage for all objects of a source."""
 
     rows: tuple[AssetRow, ...]
-    """The accepted ones, in the order of their uids."""
+    """The accepted objects, in the order of their uids."""
     failures: tuple[Failure, ...]
-    """The rejected ones."""
+    """The rejected objects with their reasons."""
     geometry_sha256: tuple[str, ...]
-    """Digest of the geometry of each written mesh, by which `generate` deals it to a split."""
-    unread: Unread
-    """What no code has read of the accepted ones."""
+    """Digest of the geometry of each written mesh, by which `generate` assigns it to a split."""
+    unread: UnreadNotes
+    """Unread parts of the accepted objects' files."""
 
     @property
     def num_repaired(self) -> int:
-        """How many of the accepted ones had triangles dropped or turned."""
+        """Number of accepted objects with dropped or flipped triangles."""
         return sum(row.source.repaired for row in self.rows)
 
     def as_json(self) -> dict[str, Any]:
@@ -117,27 +117,27 @@ def make_assets(
     planned: Callable[[int], None],
     done: Callable[[], None],
 ) -> AssetReport:
-    """Prepare the objects of a source and write the folder; again is quick, by the asset store.
+    """Prepare the objects of a source and write the folder; a repeated call uses the asset store.
 
     Args:
-        source: as `find_objects` takes it.
-        folder: empty, or made by this function before: then it is replaced.
-        settings: with one budget, since the folder has one mesh per object.
-        allowed_licences: objects under others are refused.
-        licence: of files that come without any statement.
-        workers: objects at a time.
-        downloaded: called with how many downloads are done and how many there are.
-        planned: called with the number of objects, once they are known.
+        source: source of objects, as `find_objects` takes it.
+        folder: an empty folder, or one of an earlier call, which is replaced.
+        settings: settings of the mesh stage with one budget: the folder has one mesh per object.
+        allowed_licences: objects under other licences are rejected.
+        licence: licence of files that state none.
+        workers: number of objects that are prepared at the same time.
+        downloaded: called with the number of finished downloads and their total.
+        planned: called with the number of objects, once it is known.
         done: called after each object, from any thread.
 
     Raises:
-        TrilightError: the source is unusable, or the folder holds something else or cannot be
+        TrilightError: the source is unusable, or the folder holds other files or cannot be
             written.
     """
     if workers < 1:
         raise TrilightError(f"workers is {workers}; expected at least 1.")
     _require_ours(folder)
-    found = find_objects(
+    listed = find_objects(
         source,
         work_dir=cache_folder("objects"),
         allowed_licences=allowed_licences,
@@ -145,20 +145,32 @@ def make_assets(
         downloaded=downloaded,
     )
     write_atomically(folder.summary, b"{}")  # from here on the folder is ours
-    planned(len(found.records))
-    prepared, rejected = prepare_isolated(list(found.records), settings, workers=workers, done=done)
+    planned(len(listed.records))
+    prepared, rejected = prepare_isolated(
+        list(listed.records), settings, workers=workers, done=done
+    )
     levels = [_only_level(asset) for asset in prepared]
     rows = [_row(asset, level) for asset, level in zip(prepared, levels, strict=True)]
     report = AssetReport(
         rows=tuple(rows),
-        failures=tuple(sorted([*found.failures, *rejected], key=lambda row: row.item)),
+        failures=tuple(sorted([*listed.failures, *rejected], key=lambda row: row.item)),
         geometry_sha256=tuple(map(_geometry_sha256, levels)),
         unread={asset.record.uid: asset.unread for asset in prepared if asset.unread},
     )
     _write(folder, settings, report, levels)
     pairs = _pairs(prepared, rows, levels, settings)
+    _write_page(folder, settings, report, pairs)
+    return report
+
+
+def _write_page(
+    folder: AssetFolder,
+    settings: AssetSettings,
+    report: AssetReport,
+    pairs: dict[str, list[Pair]],
+) -> None:
     page = encode_quality_page(
-        rows,
+        report.rows,
         report.failures,
         pairs,
         report.unread,
@@ -166,7 +178,6 @@ def make_assets(
         target=_target(settings),
     )
     write_atomically(folder.page, page)
-    return report
 
 
 def _require_ours(folder: AssetFolder) -> None:
@@ -190,13 +201,15 @@ def _only_level(asset: PreparedAsset) -> Level:
 
 
 def _geometry_sha256(level: Level) -> str:
-    """Return the digest that the mesh stage finds in the file of a level."""
-    positions, faces = level.positions.astype(np.float64), level.faces.astype(np.int64)
+    """Return the digest that the mesh stage would compute for the written file of a level."""
+    positions = level.positions.astype(np.float64)
+    faces = level.faces.astype(np.int64)
     return geometry_sha256(clean(normalise(TriangleMesh(positions=positions, faces=faces))))
 
 
 def _row(prepared: PreparedAsset, level: Level) -> AssetRow:
-    record, asset = prepared.record, decode_asset(prepared.path.read_bytes())
+    record = prepared.record
+    asset = decode_asset(prepared.path.read_bytes())
     return AssetRow(
         uid=record.uid,
         path=f"meshes/{_file_name(record.uid, '.ply' if level.skin is None else '.glb')}",
@@ -215,13 +228,13 @@ def _row(prepared: PreparedAsset, level: Level) -> AssetRow:
 
 
 def _file_name(uid: str, suffix: str) -> str:
-    """Return a name that is safe everywhere: a uid is text from outside."""
+    """Return a file name that is safe on every system: a uid is untrusted text."""
     readable = re.sub(r"[^A-Za-z0-9]+", "-", uid).strip("-")[-60:]
     return f"{readable}-{hashlib.sha256(uid.encode()).hexdigest()[:8]}{suffix}"
 
 
-def _encoded(level: Level) -> bytes:
-    """Return the file of a mesh: PLY, or GLB where it has its own materials."""
+def _encode_mesh(level: Level) -> bytes:
+    """Return a mesh as a PLY file, or as GLB if it has its own materials."""
     if level.skin is None:
         return encode_ply(level.positions, level.faces)
     return encode_glb(level.positions, level.faces, level.skin.uv, level.skin.textures)
@@ -231,10 +244,10 @@ def _write(
     folder: AssetFolder, settings: AssetSettings, report: AssetReport, levels: list[Level]
 ) -> None:
     for row, level in zip(report.rows, levels, strict=True):
-        write_atomically(folder.root / row.path, _encoded(level))
-    wanted = {folder.root / row.path for row in report.rows}
+        write_atomically(folder.root / row.path, _encode_mesh(level))
+    written = {folder.root / row.path for row in report.rows}
     for path in (*folder.meshes.glob("*.ply"), *folder.meshes.glob("*.glb")):
-        if path not in wanted:
+        if path not in written:
             path.unlink()
     lines = [canonical_json(row.as_json()) + b"\n" for row in report.rows]
     write_atomically(folder.catalogue, b"".join(lines))
@@ -276,7 +289,7 @@ def _pairs(
             for i in indices:
                 path = prepared[i].record.path
                 child.may(reach(files=[Path(path)]))
-                with contextlib.suppress(ChildFailed):  # a picture less is no reason to stop
+                with contextlib.suppress(ChildFailed):  # a missing picture must not stop the run
                     source, result = call_with_retries(
                         child, preview_both, path, settings, levels[i], _WIDTH_PX
                     )

@@ -1,10 +1,10 @@
-"""Batches of objects: the mesh stage as work like scenes, shared by all workers, never done twice.
+"""Batches of objects: divides the mesh stage among all workers, without preparing any twice.
 
-A batch is some dozens of objects that follow each other in the order of their uids, which alone say
-where it ends: an object more changes one batch. Workers claim batches as they claim scenes, in a
-bucket through the bucket; a kill loses the batches in hand. The result of a batch is a small file
-whose name follows from all that it depends on. It lies beside the dataset for its other workers,
-and in the user's cache for later ones. A worker that finds it there prepares none of its objects.
+A batch is some dozens of objects that follow each other in the order of their uids, which alone
+decide where it ends: one more object changes one batch. Workers claim batches as they claim scenes,
+through the bucket if there is one; a kill loses the batches in hand. The result of a batch is a
+small file whose name is a digest of all its inputs. It lies beside the dataset for the other
+workers, and in the user's cache for later datasets. A worker that finds it prepares no object.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset
 from pipeline.isolation import is_passing
 from pipeline.making.prepare_isolated import MeshWork
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from pipeline.objects.listing import SUFFIXES, Fetched
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
@@ -35,14 +35,14 @@ from storage.records.objects import Failure, ObjectRecord
 _CACHE = "object-batches"
 """Folder of the user's cache with results for later datasets."""
 _NUM_OBJECTS = 32
-"""Objects of a batch, in the mean: a minute of one core where nothing is known yet."""
-_WHOLE = (".off", ".stl", ".usdz")
-"""Suffixes of files that name no other ones; what lies beside the others counts too, of a PLY where
-its pictures are read."""
+"""Mean number of objects of a batch: about one core-minute if nothing is cached."""
+_SELF_CONTAINED = (".off", ".stl", ".usdz")
+"""Suffixes of files that refer to no others; for other files the neighbors count too, for a PLY
+only if its pictures are read."""
 _LAYERS = (".usd", ".usda", ".usdc")
-"""Of those that may name other objects."""
+"""Suffixes of files that may refer to other object files."""
 _PAUSES_S = (0.2, 10.0)
-"""Between two looks at the batches of others; the first one doubles up to the last."""
+"""Shortest and longest seconds between two looks at other workers' batches; the pause doubles."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,19 +50,19 @@ class PreparedObject:
     """An object that the mesh stage has accepted, here or on another machine."""
 
     record: ObjectRecord
-    """Identity and rights."""
+    """Identity and rights of the object."""
     asset_name: str
-    """By which the asset store knows its prepared file."""
+    """Name of the prepared file in the asset store."""
     asset_sha256: str
-    """Digest of that file."""
+    """Digest of the prepared file."""
     geometry_sha256: str
-    """Digest of its cleaned geometry."""
+    """Digest of the object's cleaned geometry."""
     least_triangles: int
-    """Of its coarsest level."""
+    """Number of triangles of the coarsest level."""
     without_own: str = ""
-    """Reason code of why it goes without materials of its own, where they were asked for."""
+    """Reason code for missing materials of its own, if they were requested."""
     unread: tuple[str, ...] = ()
-    """What of its file no code has read, in short sentences."""
+    """Unread parts of the object's file, in short sentences."""
 
 
 PrepareResult = tuple[list[PreparedObject], list[Failure]]
@@ -70,7 +70,7 @@ Fetch = Callable[[list[ObjectRecord]], Fetched]
 
 
 def prepared_object(asset: PreparedAsset) -> PreparedObject:
-    """Return what is to be remembered of an asset whose file is here."""
+    """Return the record of an asset whose prepared file is on this machine."""
     return PreparedObject(
         record=asset.record,
         asset_name=asset.path.stem,
@@ -84,19 +84,19 @@ def prepared_object(asset: PreparedAsset) -> PreparedObject:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectWork:
-    """What all batches of a dataset share."""
+    """The input that all batches of a dataset share."""
 
     settings: AssetSettings
     """Settings of the mesh stage."""
-    publication: Publication
-    """The dataset."""
+    writer: DatasetWriter
+    """Writer of the dataset that the objects are prepared for."""
     fetch: Fetch | None = None
-    """Brings objects to this machine; None where their files are here."""
+    """Downloads objects to this machine; None if their files are local."""
     _folders: dict[tuple[Path, bool], str] = field(default_factory=dict)
-    """Digests of folders that were looked at."""
+    """Digests of the folders that were hashed."""
 
     def name(self, records: Sequence[ObjectRecord], *, are_here: bool) -> str:
-        """Return the name of the result of a batch, whose files may be here to be looked at."""
+        """Return the file name of a batch's result; `are_here` says that its files are local."""
         named = self.settings.own_materials.keep
         of_objects = [_facts(record, are_here, self._folders, named) for record in records]
         facts = [of_objects, asdict(self.settings), RECIPE, READERS]
@@ -105,24 +105,24 @@ class ObjectWork:
 
 
 class ObjectBatch:
-    """Some objects, and the file with the result of their preparation."""
+    """A batch of objects and the file with its result."""
 
     def __init__(self, records: list[ObjectRecord], work: ObjectWork) -> None:
         self.records = records
         self._work = work
         name = work.name(records, are_here=work.fetch is None)
-        self._file = work.publication.folder.staged_batches / name
-        """Beside the dataset, for its other workers."""
+        self._file = work.writer.folder.staged_batches / name
+        """Result in the dataset's folder, for its other workers."""
         self.claim_file = self._file.with_suffix(".claim")  # as Publication.claim has it
-        self._kept = cache_folder(_CACHE) / name if work.fetch is None else None
-        """In the user's cache; of objects to fetch, it is known once they are here."""
+        self._cached = cache_folder(_CACHE) / name if work.fetch is None else None
+        """Result in the user's cache; None for remote objects until they have been downloaded."""
         self._by_uid = {record.uid: record for record in records}
 
     def result(self) -> PrepareResult | None:
-        """Return what came of the objects, in their order; None where that is not known yet."""
+        """Return the result of the batch, in the order of its objects; None if unknown yet."""
         try:
-            if found := self._read(self._file):
-                return found
+            if result := self._read(self._file):
+                return result
         except PermissionError as error:
             raise TrilightError(
                 f"{self._file}: {error.strerror}; expected a file that every worker of the "
@@ -130,38 +130,38 @@ class ObjectBatch:
                 "run as one user."
             ) from error
         with contextlib.suppress(PermissionError):  # another user's cache
-            return self._read(self._kept) if self._kept else None
+            return self._read(self._cached) if self._cached else None
         return None
 
     def make(self, meshes: MeshWork, done: Callable[[int], None]) -> bool:
-        """Prepare the objects unless another worker does or has done; return whether we have.
+        """Prepare the objects unless another worker does or has done so; return True if done here.
 
         Args:
             meshes: children for the mesh stage.
-            done: called with numbers of objects that were prepared or rejected.
+            done: called with the number of objects that were just prepared or rejected.
         """
-        publication = self._work.publication
-        with publication.claim(self._file) as ours:
+        writer = self._work.writer
+        with writer.claim(self._file) as ours:
             if not ours or self.result() is not None:
                 return False
-            here, lost = self._fetch()
+            records, lost = self._fetch()
             done(len(lost))
             if result := self.result():
-                done(len(here))
+                done(len(records))
             else:
-                assets, failures = meshes.prepare(here, lambda: done(1))
+                assets, failures = meshes.prepare(records, lambda: done(1))
                 result = [*map(prepared_object, assets)], [*failures, *lost]
             is_final = not _may_change(result[1])
             data = _encode(result)
-            if is_final and self._kept:
-                write_atomically(self._kept, data)
+            if is_final and self._cached:
+                write_atomically(self._cached, data)
             write_atomically(self._file, data)
             if is_final:
-                publication.send(self._file)
+                writer.upload(self._file)
         return True
 
-    def forget_passing(self) -> None:
-        """Forget what the environment has kept from an earlier run: it is tried again."""
+    def forget_transient(self) -> None:
+        """Delete a result with transient failures, so that these objects are tried again."""
         result = self.result()
         if result is not None and _may_change(result[1]):
             self._file.unlink(missing_ok=True)
@@ -169,11 +169,11 @@ class ObjectBatch:
     def _fetch(self) -> Fetched:
         if self._work.fetch is None:
             return self.records, []
-        here, lost = self._work.fetch(self.records)
-        here = sorted(here, key=lambda record: record.uid)
+        records, lost = self._work.fetch(self.records)
+        records = sorted(records, key=lambda record: record.uid)
         if not lost:
-            self._kept = cache_folder(_CACHE) / self._work.name(here, are_here=True)
-        return here, lost
+            self._cached = cache_folder(_CACHE) / self._work.name(records, are_here=True)
+        return records, lost
 
     def _read(self, path: Path) -> PrepareResult | None:
         try:
@@ -185,7 +185,8 @@ class ObjectBatch:
             return None
 
     def _decode(self, rows: Iterable[dict[str, Any]]) -> PrepareResult:
-        prepared, failures = list[PreparedObject](), list[Failure]()
+        prepared = list[PreparedObject]()
+        failures = list[Failure]()
         for row in rows:
             if "reason" in row:
                 failures.append(Failure(**row))
@@ -199,7 +200,7 @@ class ObjectBatch:
 
 
 def cut_objects(records: Sequence[ObjectRecord]) -> list[list[ObjectRecord]]:
-    """Cut records, sorted by uid, into batches, at places that the uids alone decide."""
+    """Cut records, sorted by uid, into batches; the uids alone decide where."""
     batches: list[list[ObjectRecord]] = []
     for record in records:
         is_first = int(sha256_hex(record.uid.encode())[:8], 16) % _NUM_OBJECTS == 0
@@ -215,18 +216,18 @@ def prepare_in_batches(
     *,
     workers: int,
     done: Callable[[int], None],
-    enough: Callable[[], bool] = lambda: False,
-    again: bool = True,
+    should_stop: Callable[[], bool] = lambda: False,
+    retry_transient: bool = True,
 ) -> PrepareResult:
-    """Prepare objects together with all who do so at the same time; returns when all are done.
+    """Prepare objects together with all other workers; return when all are done.
 
     Args:
-        records: sorted by uid.
-        work: what the batches share.
-        workers: objects at a time here.
-        done: called with the number of objects that were prepared, or found so; from any thread.
-        enough: whether to return with what is known, since nobody needs the rest any more.
-        again: try again what the environment has kept from an earlier call.
+        records: objects, sorted by uid.
+        work: input that the batches share.
+        workers: number of objects that are prepared here at the same time.
+        done: called with a number of objects that are done, here or elsewhere; from any thread.
+        should_stop: returns True if the remaining objects are no longer needed.
+        retry_transient: try objects again that failed for a transient reason before.
 
     Returns:
         The accepted objects and the rejected ones, both in the order of `records`.
@@ -235,37 +236,33 @@ def prepare_in_batches(
         TrilightError: as `prepare_assets`, or the dataset cannot be written.
     """
     batches = [ObjectBatch(batch, work) for batch in cut_objects(records)]
-    if again:
+    if retry_transient:
         for batch in batches:
-            batch.forget_passing()
+            batch.forget_transient()
     results: dict[int, PrepareResult] = {}
     ours: set[int] = set()
 
     def make(number: int) -> bool:
-        return not enough() and batches[number].make(meshes, done)
+        return not should_stop() and batches[number].make(meshes, done)
 
-    # each worker begins at another batch, since to find one claimed costs a look
-    first = uuid.uuid4().int % len(batches) if batches else 0
-    order = [*range(first, len(batches)), *range(first)]
-
+    order = _random_order(len(batches))
     at_once = 1 + -(-workers // _NUM_OBJECTS)  # no child waits for the last object of a batch
     # children end first: after Ctrl-C no thread waits for the objects that it has in hand
     with ThreadPoolExecutor(at_once) as threads, MeshWork(work.settings, workers) as meshes:
-        pause_s, notice = _PAUSES_S[0], WaitNotice()
+        pause_s = _PAUSES_S[0]
+        notice = WaitNotice()
         while True:
-            for number, batch in enumerate(batches):
-                if number not in results and (result := batch.result()) is not None:
-                    results[number] = result
-                    if number not in ours:
-                        done(len(batch.records))
+            for number in _collect_results(batches, results) - ours:
+                done(len(batches[number].records))
             missing = [number for number in order if number not in results]
-            if not missing or enough():
+            if not missing or should_stop():
                 break
             tried = zip(missing, threads.map(make, missing), strict=True)
             made = [number for number, is_ours in tried if is_ours]
             ours.update(made)
             if made:
-                pause_s, notice = _PAUSES_S[0], WaitNotice()
+                pause_s = _PAUSES_S[0]
+                notice = WaitNotice()
             else:  # others are at them
                 notice.update(batches[missing[0]].claim_file)
                 time.sleep(pause_s)
@@ -274,13 +271,29 @@ def prepare_in_batches(
     return [one for some, _ in ordered for one in some], [f for _, some in ordered for f in some]
 
 
+def _random_order(count: int) -> list[int]:
+    """Return batch numbers from a random first one: to find a claimed batch costs a look."""
+    first = uuid.uuid4().int % count if count else 0
+    return [*range(first, count), *range(first)]
+
+
+def _collect_results(batches: Sequence[ObjectBatch], results: dict[int, PrepareResult]) -> set[int]:
+    """Add the results that are new to `results`; return the numbers of their batches."""
+    new = set()
+    for number, batch in enumerate(batches):
+        if number not in results and (result := batch.result()) is not None:
+            results[number] = result
+            new.add(number)
+    return new
+
+
 def _may_change(failures: Iterable[Failure]) -> bool:
-    """Return whether a later run may have another result: of downloads, and of passing deaths."""
+    """Return True if a later run may succeed: after failed downloads and transient failures."""
     return any(failure.stage == "objects" or is_passing(failure.reason) for failure in failures)
 
 
 def _encode(result: PrepareResult) -> bytes:
-    """Return the file of a result; rights of objects are in its name."""
+    """Return a result as a file; the digest in its name covers the rights of objects."""
     prepared, failures = result
     rows = [*map(_row, prepared), *map(asdict, failures)]
     return b"".join(canonical_json(row) + b"\n" for row in rows)
@@ -295,32 +308,33 @@ def _row(one: PreparedObject) -> dict[str, Any]:
 def _facts(
     record: ObjectRecord, is_here: bool, folders: dict[tuple[Path, bool], str], with_pictures: bool
 ) -> list[Any]:
-    """Return what a result depends on; of a file that is here, that it is as it was.
+    """Return the inputs of a result as JSON values: the record, and the state of a local file.
 
-    `folders` remembers what was found in folders.
+    `folders` caches digests of folders.
     """
     facts = asdict(record)
-    path, root = Path(facts.pop("path")), facts.pop("root")
+    path = Path(facts.pop("path"))
+    root = facts.pop("root")
     if not is_here:
         return [facts]
-    fetched = path.is_relative_to(cache_folder(""))  # when it came says nothing
+    fetched = path.is_relative_to(cache_folder(""))  # its time is that of the download
     suffix = path.suffix.lower()
-    alone = fetched or suffix in _WHOLE or (suffix == ".ply" and not with_pictures)
+    alone = fetched or suffix in _SELF_CONTAINED or (suffix == ".ply" and not with_pictures)
     folder = Path(root) if root and with_pictures else path.parent
-    beside = "" if alone else _beside(folder, suffix in _LAYERS, folders)
-    return [facts, path.suffix, *_state(path, fetched), beside]
+    neighbors = "" if alone else _digest_neighbors(folder, suffix in _LAYERS, folders)
+    return [facts, path.suffix, *_state(path, fetched), neighbors]
 
 
 def _state(path: Path, fetched: bool) -> list[int]:
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return []
-    return [found.st_size, 0 if fetched else found.st_mtime_ns]
+    return [status.st_size, 0 if fetched else status.st_mtime_ns]
 
 
-def _beside(folder: Path, layers: bool, folders: dict[tuple[Path, bool], str]) -> str:
-    """Return a digest of the files of a folder that an object in it may name."""
+def _digest_neighbors(folder: Path, layers: bool, folders: dict[tuple[Path, bool], str]) -> str:
+    """Return a digest of the files of a folder that an object in it may refer to."""
     if (folder, layers) not in folders:
         files = sorted(path for path in folder.rglob("*") if path.is_file())
         named = [path for path in files if layers or path.suffix.lower() not in SUFFIXES]

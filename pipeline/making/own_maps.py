@@ -1,4 +1,4 @@
-"""The frozen textures and maps of a split, as scenes draw from them."""
+"""The user's frozen textures and maps of a split, as scenes draw from them."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -13,26 +13,26 @@ from storage.records.objects import SKY, TEXTURE, LockedObject
 from storage.records.texture import MapSource
 
 
-def own_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
-    """Return what scenes of a split may take, sorted by uid; nothing is read yet.
+def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
+    """Return the maps that scenes of a split may use, sorted by uid; no file is read yet.
 
     Args:
-        rows: of a lock with the prepared files; objects among them are left out.
+        rows: rows of a lock with the prepared files; objects among them are left out.
         split: train, validation or test.
     """
-    here = sorted(
+    of_split = sorted(
         ((locked, path) for locked, path in rows if locked.split == split),
         key=lambda pair: pair[0].uid,
     )
     return OwnMaps(
         textures=[
             OwnMap(uid=locked.uid, source=_source(locked), load=partial(_texture, path))
-            for locked, path in here
+            for locked, path in of_split
             if locked.kind == TEXTURE
         ],
         skies=[
             OwnMap(uid=locked.uid, source=_source(locked), load=partial(_radiance, path))
-            for locked, path in here
+            for locked, path in of_split
             if locked.kind == SKY
         ],
     )

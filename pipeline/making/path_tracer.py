@@ -1,7 +1,6 @@
-"""Pictures of scenes by path tracing, in a child process with limits.
+"""`PathTracer`: renders scenes by path tracing, in a child process with limits.
 
-This process asks the child for one pass of samples after another, so that it can say how far a
-picture is.
+This process requests one pass of samples after another, so that it can report progress.
 """
 
 from collections.abc import Callable, Generator, Mapping
@@ -22,8 +21,8 @@ from storage.records.scene import Scene
 from storage.settings.described import settings_record
 
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=1 << 30)
-"""One call takes the scene, each of the others is one pass of samples; the child keeps its state,
-so it is replaced only where it died."""
+"""The first call sends the scene, each other one renders one pass of samples; the child keeps its
+state, so it is replaced only if it dies."""
 
 
 class PathTracer:
@@ -38,37 +37,39 @@ class PathTracer:
         threads: int,
         sampled: Callable[[Sampling], None],
     ) -> None:
-        """Remember how to render.
+        """Configure the tracer; the child starts later.
 
         Args:
-            settings: how well, or with how many samples.
-            seed: of the samples of every picture, from 0.
-            variant: what Mitsuba runs on.
-            threads: how many of them.
+            settings: target quality, or the number of samples of a preview.
+            seed: seed of the samples of every picture, from 0.
+            variant: Mitsuba variant and denoiser device.
+            threads: number of CPU threads of renderer and denoiser.
             sampled: called after each pass of samples.
         """
-        self._settings, self._seed, self._sampled = settings, seed, sampled
+        self._settings = settings
+        self._seed = seed
+        self._on_samples = sampled
         self.identity: Mapping[str, Any] = {
             "seed": str(seed),  # the integers of an EXR header end at 2^31
             "settings": settings_record(settings),
             "environment": environment(variant),
         }
-        """All that decides a picture beside scene and camera, as JSON values."""
+        """Everything beside scene and camera that decides a picture, as JSON values."""
         self._is_open = False
         self._child = IsolatedChild(
             limits=_LIMITS, setup=set_up_renderer, setup_args=(variant, threads)
         )
 
     def wake(self, name: str) -> None:
-        """Start the child and load the renderer, if that is to do; TrilightError as of `open`."""
-        self._call(name, lambda: self._child.call(_nothing))
+        """Start the child and load the renderer, if needed; raises TrilightError as `open`."""
+        self._call(name, lambda: self._child.call(_no_op))
 
     def open(self, scene: Scene, name: str) -> None:
-        """Take the scene that is rendered from now on.
+        """Load the scene that the following calls render.
 
         Args:
-            scene: passes `Scene.check`.
-            name: for messages.
+            scene: a scene that passes `Scene.check`.
+            name: name of the scene, for messages.
 
         Raises:
             TrilightError: it cannot be rendered.
@@ -77,22 +78,22 @@ class PathTracer:
         self._call(name, self._open)
 
     def render(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> RenderedView:
-        """Return the picture of one camera, where the settings say how good it is to be.
+        """Render the picture of one camera to the quality that the settings state.
 
         Args:
             c2w: [4, 4] camera to world.
             fov_deg: full field of view in degrees.
-            name: of the picture, for messages.
+            name: name of the picture, for messages.
 
         Raises:
-            TrilightError: there is none.
+            TrilightError: the picture cannot be rendered.
         """
         view = self._call(name, lambda: self._picture(c2w, fov_deg))
         assert isinstance(view, RenderedView)
         return view
 
     def preview(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> Preview:
-        """Return the preview of one camera, where the settings are a preview's; as `render`."""
+        """Render the preview of one camera, if the settings are a preview's; as `render`."""
         view = self._call(name, lambda: self._picture(c2w, fov_deg))
         assert isinstance(view, Preview)
         return view
@@ -112,7 +113,7 @@ class PathTracer:
         try:
             self._child.call(_begin_view, c2w, fov_deg, self._seed)
             while isinstance(step := self._child.call(_advance), Sampling):
-                self._sampled(step)
+                self._on_samples(step)
         except ChildFailed:
             self._is_open = False
             raise
@@ -135,7 +136,7 @@ class PathTracer:
 
 
 class _ChildState:
-    """What the child holds between two calls."""
+    """State of the child between two calls."""
 
     renderer: SceneRenderer | PreviewRenderer
     steps: Generator[Sampling, None, RenderedView | Preview]
@@ -149,8 +150,8 @@ def set_up_renderer(variant: Variant, threads: int) -> None:
     set_threads(threads)
 
 
-def _nothing() -> None:
-    """A child that can do this is ready."""
+def _no_op() -> None:
+    """Do nothing: a call forces the child to start."""
 
 
 def _open_scene(scene: Scene, settings: RenderSettings | PreviewSettings) -> None:

@@ -1,4 +1,4 @@
-"""The whole line on one page: from a source of objects to a dataset that one can train on.
+"""The whole pipeline on one page: from a source of objects to a dataset for training.
 
     step       what comes out                                        who does it
     ---------  ----------------------------------------------------  ------------------------------
@@ -7,19 +7,19 @@
     scenes     meshes with a room, materials, lights and cameras     pipeline.scenes.compose
     renders    a picture of each camera, down to the noise floor     pipeline.renders.renderer
     shards     tars of finished scenes, the same bytes everywhere    pipeline.shards.pack
-    documents  card, report, contact sheet: what people look at      pipeline.documents
+    documents  card, report and contact sheet for readers            pipeline.documents
 
-The objects are frozen after the mesh stage (where scenes come from files, the files are; where
-they are those of a finished dataset, its objects are). From then on scene k is a function of the
-settings, the frozen objects and k, and so it does not matter who makes it. A `Runner` makes many
+The objects are frozen after the mesh stage (scene files instead, if scenes come from files; the
+objects of a finished dataset, if its scenes are revisited). From then on scene k is a function of
+the settings, the frozen objects and k alone, whichever worker makes it. A `Runner` makes many
 scenes at the same time (`make_shards`): on threads, in a Slurm array, with Prefect, on a Dask
 cluster (pipeline.executors.registry lists them). Native code runs in child processes, so that a
 crash costs one attempt.
 
-Files are the truth, and every step may be killed at any moment. A mesh is kept in the asset store,
-a scene in the staging folder, a shard in the dataset; the next run looks at what is there and makes
-the rest. Several runs on one folder share the work (storage.claims), and those on one bucket share
-batches of objects (storage.remote.claims) and what is finished (pipeline.shards.mirror).
+The files on disk are the only state, and every step may be killed at any moment. A mesh is kept in
+the asset store, a scene in the staging folder, a shard in the dataset; the next run looks for these
+and makes the rest. Several runs on one folder share the work (storage.claims), and those on one
+bucket share batches of objects (storage.remote.claims) and shards (pipeline.shards.mirror).
 """
 
 import contextlib
@@ -36,7 +36,11 @@ from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.making.accept_maps import MapFolders, map_folders
-from pipeline.making.accept_objects import accept_objects, share_mesh_work, trusted_objects
+from pipeline.making.accept_objects import (
+    accept_objects,
+    load_trusted_objects,
+    prepare_unfrozen_objects,
+)
 from pipeline.making.accept_revisited import accept_revisited
 from pipeline.making.accept_scene_files import accept_scene_files
 from pipeline.making.asked_objects import AskedObjects
@@ -45,7 +49,7 @@ from pipeline.making.bucket_publication import joined
 from pipeline.making.dataset_order import DatasetOrder, generate_words
 from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.machine import cores_owned
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from pipeline.making.render_children import (
     close_children,
     cores_of_child,
@@ -59,11 +63,11 @@ from pipeline.making.run import (
     ShardJob,
     TaskOutcome,
     Watcher,
-    begun_publication,
-    settings_of,
+    begin_or_resume_dataset,
+    resolve_settings,
 )
 from pipeline.making.runner import Runner
-from pipeline.making.tasks import Piece, rounds
+from pipeline.making.tasks import Piece, iter_rounds_until_done
 from pipeline.making.unfinished_shard import UnfinishedShard
 from storage.dataset.asked import write_asked
 from storage.dataset.layout import dataset_folder
@@ -78,17 +82,17 @@ from storage.records.scene import Scene
 def make_dataset(
     order: DatasetOrder, runner: Runner, watch: Watcher = lambda run, outcome: None
 ) -> Outcome:
-    """Make a dataset, or what is missing of it, or of a range of its shards.
+    """Make a dataset: all its missing shards, or those of a range.
 
     Args:
-        order: which dataset, and which part of it.
-        runner: who runs the tasks.
+        order: the dataset, and the range of shards to make.
+        runner: runs the tasks.
         watch: called after each task.
 
     Raises:
-        TrilightError: what the user can mend; what is finished is safe.
+        TrilightError: an error that the user can fix; finished scenes stay on disk.
     """
-    with _begun(order) as run:  # objects, meshes
+    with _begin_run(order) as run:  # objects, meshes
         make_shards(run, runner, watch)  # scenes, renders, shards
         finished = run.publication.finish()
         run.require_within_budget()
@@ -99,70 +103,72 @@ def make_dataset(
 
 
 def prepare_dataset(order: DatasetOrder) -> Run:
-    """Begin a dataset and freeze its objects, without a picture; raises as `make_dataset`."""
-    with _begun(order) as run:
+    """Begin a dataset and freeze its objects, without rendering; raises as `make_dataset`."""
+    with _begin_run(order) as run:
         return run
 
 
 @contextlib.contextmanager
-def _begun(order: DatasetOrder) -> Iterator[Run]:
-    """Join the makers of a dataset, and have its objects frozen by whoever comes first."""
+def _begin_run(order: DatasetOrder) -> Iterator[Run]:
+    """Join a dataset's workers and yield the run; the first worker freezes the objects."""
     folder = dataset_folder(order.place)
     folder = replace(folder, root=Path(os.path.realpath(folder.root)))
-    settings, listed = settings_of(order, folder)  # refuses an order before anything is written
+    settings, listed = resolve_settings(
+        order, folder
+    )  # refuses an order before anything is written
     with joined(folder):
-        own = map_folders(order, settings)
-        publication = begun_publication(order, settings, folder)
+        user_folders = map_folders(order, settings)
+        writer = begin_or_resume_dataset(order, settings, folder)
         if listed or order.revisits:
             with folder.turn("objects"):
-                publication.refresh()
+                writer.refresh()
                 accepted = (
-                    accept_scene_files(listed, order.licence, settings, publication)
+                    accept_scene_files(listed, order.licence, settings, writer)
                     if listed
-                    else accept_revisited(order.revisits or "", settings, publication)
+                    else accept_revisited(order.revisits or "", settings, writer)
                 )
         else:
-            accepted = _accept_together(order, settings, publication, own)
+            accepted = _accept_together(order, settings, writer, user_folders)
         write_asked(folder, generate_words(order))
         yield Run(
             order=order,
             settings=settings,
-            listed=listed,
-            publication=publication,
+            scene_folder=listed,
+            publication=writer,
             accepted=accepted,
         )
 
 
 def _accept_together(
-    order: DatasetOrder, settings: BuildSettings, publication: Publication, own: MapFolders
+    order: DatasetOrder, settings: BuildSettings, writer: DatasetWriter, user_folders: MapFolders
 ) -> AcceptedObjects:
-    """Return the frozen objects: at once where they are known, else prepared with other workers."""
-    asked = AskedObjects(
+    """Return the frozen objects; prepare them with the other workers if they are not frozen."""
+    options = AskedObjects(
         source=object_source(settings, order.objects),
         licence=order.licence,
         settings=settings,
-        publication=publication,
+        publication=writer,
         workers=cores_owned(),
-        own=own,
+        user_folders=user_folders,
     )
-    if trusted := trusted_objects(asked):
+    if trusted := load_trusted_objects(options):
         return trusted
-    listed = share_mesh_work(asked)
-    with publication.folder.turn("objects"):  # one maker freezes, and the others find it done
-        publication.refresh()
-        return accept_objects(asked, listed)
+    listed = prepare_unfrozen_objects(options)
+    with writer.folder.turn("objects"):  # one worker freezes, and the others load the result
+        writer.refresh()
+        return accept_objects(options, listed)
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:
-    """Turn frozen meshes into shards: the runner runs many tasks at once, each by `make_task`."""
-    publication = run.publication
+    """Turn frozen meshes into shards: the runner calls `make_task` for many tasks in parallel."""
+    writer = run.publication
     job = run.job(runner.num_at_once or run.num_workers())
     try:
-        for this_round in rounds(run, at_once=runner.window or job.num_at_once):
-            for outcome in runner.run(this_round.tasks, job):  # here work goes parallel
+        for this_round in iter_rounds_until_done(run, at_once=runner.window or job.num_at_once):
+            for outcome in runner.run(this_round.tasks, job):  # parallel from here
                 this_round.record(outcome)
                 for shard in outcome.shards:
-                    publication.add_shard(shard)
+                    writer.add_shard(shard)
                 watch(run, outcome)
                 run.require_within_budget()
     finally:
@@ -170,10 +176,10 @@ def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:
 
 
 def make_task(job: ShardJob, pieces: tuple[Piece, ...]) -> TaskOutcome:
-    """Make the scenes of some pieces, and the shards that are whole then.
+    """Make the scenes of some pieces, and pack the shards that are complete then.
 
-    This is what a runner calls for each task, on a thread, in another process or on another
-    machine. What is there already is not made again.
+    A runner calls this for each task, on a thread, in another process or on another machine.
+    Finished scenes are not made again.
 
     Raises:
         TrilightError: the output cannot be written, or this machine would make other bytes.
@@ -196,16 +202,18 @@ def make_piece(
     child: IsolatedChild,
     read: Callable[[int], Scene] | None = None,
 ) -> tuple[int, ShardEntry | None]:
-    """Make what is missing of a piece, and pack its shard if that is whole then.
+    """Make the missing scenes of a piece, and pack its shard if that is complete then.
 
-    Scenes that somebody else is making are left to them; whoever stages the last one packs. A scene
-    that cannot be made is not an error: the shard goes without it, and failures.jsonl says why.
+    Scenes claimed by other workers are skipped; the worker that stages the last scene packs. A
+    scene that cannot be made is no error: the shard omits it, and failures.jsonl has the reason.
 
     Returns:
-        How many scenes were made or given up here, and the shard where this call packed it.
+        Number of scenes made or given up here, and the shard if this call packed it.
     """
-    splits, profile = job.settings.splits, job.settings.storage.profile
-    shard, scenes = UnfinishedShard(job.folder, splits, piece.shard_index), 0
+    splits = job.settings.splits
+    profile = job.settings.storage.profile
+    shard = UnfinishedShard(job.folder, splits, piece.shard_index)
+    scenes = 0
     attempts = 1 if read else MAX_ATTEMPTS  # a file is always the same
     for scene_index in range(piece.first, piece.last):
         with shard.claim(scene_index) as ours:
@@ -233,28 +241,31 @@ def make_scene(
     restore: Callable[[str, str], None],
     read: Callable[[int], Scene] | None = None,
 ) -> tuple[Sample | None, list[Failure]]:
-    """Turn meshes into a scene with pictures: the first attempt that is not rejected, if any is.
+    """Compose and render a scene: return the sample of the first accepted attempt, and failures.
 
     In the child, `attempt_scene` composes the scene and renders its views; a scene of a file is
-    read in another one, by `read`. If a child is killed, crashes or takes too long, the same
-    attempt is tried again in a new one. An object whose prepared file is away is brought back by
-    `restore`, for the same attempt.
+    read in another child, by `read`. If a child is killed, crashes or takes too long, the same
+    attempt is repeated in a new one. If the prepared file of an object is missing, `restore` makes
+    it again for the same attempt.
     """
     failures: list[Failure] = []
     for attempt in range(attempts):
         key = sample_key(scene_index)
         try:
-            found = (read(scene_index),) if read else ()
-            tried = call_with_retries(child, attempt_scene, split, scene_index, attempt, *found)
-            while tried.away:
-                restore(*tried.away)
+            from_file = (read(scene_index),) if read else ()
+            tried = call_with_retries(child, attempt_scene, split, scene_index, attempt, *from_file)
+            while tried.missing_asset:
+                restore(*tried.missing_asset)
                 tried = call_with_retries(child, attempt_scene, split, scene_index, attempt)
         except (ChildFailed, Rejected) as error:
             if isinstance(error, Rejected):
-                stage, reason, why = "scenes", error.reason, error.message
+                stage = "scenes"
+                reason = error.reason
+                why = error.message
             else:
                 why = f"{error.reason}: {error.sentence}"
-                stage, reason = "renders", "environmental_skip"
+                stage = "renders"
+                reason = "environmental_skip"
             failures.append(
                 Failure(stage=stage, item=key, reason=reason, message=why, attempt=attempt)
             )
@@ -265,9 +276,9 @@ def make_scene(
     return None, failures
 
 
-def make_documents(publication: Publication) -> Statistics:
-    """Turn all shards into documents; one maker at a time."""
-    with publication.folder.turn("documents"):
-        statistics = write_documents(publication.dataset(), publication.folder)
-        publication.send_documents()
+def make_documents(writer: DatasetWriter) -> Statistics:
+    """Write the documents of all shards; one worker at a time."""
+    with writer.folder.turn("documents"):
+        statistics = write_documents(writer.dataset(), writer.folder)
+        writer.upload_documents()
         return statistics

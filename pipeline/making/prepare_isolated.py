@@ -1,4 +1,4 @@
-"""The mesh stage in children with limits, with the shared asset store."""
+"""Runs the mesh stage in children with limits, with the shared asset store."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -16,50 +16,51 @@ from storage.records.objects import Failure, ObjectRecord
 
 _LIMITS = ChildLimits(memory_bytes=5 << 30, wall_s=300, cpu_s=60, calls_per_child=50)
 """Measured on 148 objects and 78 hostile files: a usable mesh takes seconds and far below 1 GiB.
-The wall time only ends what waits without working; a busy machine does not decide who passes."""
+The wall time only ends idle waits; a busy machine does not decide which objects are accepted."""
 
 
 def asset_store() -> AssetStore:
-    """Return the store of this user: below TRILIGHT_CACHE, or ~/.cache/trilight."""
+    """Return the asset store of this user: below TRILIGHT_CACHE, or ~/.cache/trilight."""
     return AssetStore(cache_folder("assets"))
 
 
 def asset_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
-    """Return a child for mesh work, which may read these files, and what it is let by `may`."""
+    """Return a child for mesh work, confined to these files and those of `allow_files`."""
     preload_mesh_libraries()
     return IsolatedChild(limits=_LIMITS, setup=require_filters, confined_to=confined_to)
 
 
 def preload_mesh_libraries() -> None:
-    """Have every new child begin with the mesh libraries; call before the first one starts."""
+    """Preload the mesh libraries in every new child; call before the first one starts."""
     names = ("pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters")
     preload([module_name(name) for name in names])
 
 
 class MeshWork:
-    """Children for mesh work that several batches of objects share; a context that ends them."""
+    """Children for mesh work that several batches share; a context manager that ends them."""
 
     def __init__(self, settings: AssetSettings, workers: int) -> None:
-        """Remember what to do; a child is started where an object needs one.
+        """Configure the children; each starts when an object needs it.
 
         Args:
-            settings: of the mesh stage.
-            workers: objects at a time.
+            settings: settings of the mesh stage.
+            workers: number of objects that are prepared at the same time.
         """
-        self._settings, self._workers = settings, workers
+        self._settings = settings
+        self._workers = workers
         self._pool = ChildPool(lambda _: asset_child(), workers)
 
     def prepare(
         self, records: list[ObjectRecord], done: Callable[[], None]
     ) -> tuple[list[PreparedAsset], list[Failure]]:
         """Prepare objects; arguments and errors as `prepare_assets`; from any thread."""
-        places = {place for one in records for place in (one.path, one.root) if place}
-        all_files = reach(files=map(Path, sorted(places)))
+        paths = {path for one in records for path in (one.path, one.root) if path}
+        all_files = reach(files=map(Path, sorted(paths)))
 
         @contextlib.contextmanager
         def borrow() -> Iterator[IsolatedChild]:
             with self._pool.borrow() as child:
-                child.may(all_files)  # at once: a child is replaced for a file that it may not read
+                child.may(all_files)  # all files at once: each new file replaces the child
                 yield child
 
         return prepare_assets(
@@ -91,7 +92,7 @@ def prepare_isolated(
 
 
 def require_filters() -> None:
-    """Stop the run where pymeshlab is broken: that is no fault of the objects.
+    """Stop the run if pymeshlab is broken, which is no fault of the objects.
 
     Raises:
         TrilightError: pymeshlab is installed and lacks a filter that we use.

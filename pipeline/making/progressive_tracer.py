@@ -1,7 +1,7 @@
-"""Pictures that become better while somebody looks at them, in a child process with limits.
+"""`ProgressiveTracer`: renders pictures that improve while they are shown, in a child with limits.
 
-Unlike pipeline.making.path_tracer it hands on each look, gives up where it is told to, and changes
-scene, camera, width and depth between two pictures.
+Unlike pipeline.making.path_tracer it passes on each intermediate picture, can be canceled, and
+changes scene, camera, width and depth between two pictures.
 """
 
 import threading
@@ -22,14 +22,14 @@ from storage.records.scene import Scene
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=600, calls_per_child=1 << 30)
 
 MOST_SCENES = 2
-"""Scenes and settings that the child keeps loaded."""
+"""Number of pairs of a scene and settings that the child keeps loaded."""
 
 
 class ProgressiveTracer:
-    """Renders one picture at a time, whoever asks; the child starts with the first."""
+    """Renders one picture at a time, for all threads; the child starts with the first picture."""
 
     def __init__(self, *, variant: Variant, threads: int) -> None:
-        """Remember how to start; `variant` is what Mitsuba runs on."""
+        """Configure the child: Mitsuba's variant, and the number of CPU threads."""
         self._child = IsolatedChild(
             limits=_LIMITS, setup=set_up_renderer, setup_args=(variant, threads)
         )
@@ -41,27 +41,27 @@ class ProgressiveTracer:
         key: Hashable,
         camera: tuple[NDArray[np.float32], float],
         settings: RenderSettings,
-        shown: Callable[[Sampling], None],
+        on_look: Callable[[Sampling], None],
         *,
         preview_spp: int | None = None,
     ) -> None:
-        """Make one picture; `shown` receives its looks, and between them how far it is.
+        """Render one picture; the callback receives intermediate pictures and progress.
 
         Args:
-            scene: passes `Scene.check`.
-            key: equal for equal scenes.
+            scene: a scene that passes `Scene.check`.
+            key: key of the scene, equal for equal scenes.
             camera: pose [4, 4] and full field of view in degrees.
-            settings: how good the picture is to become.
-            shown: may raise, which ends the picture.
-            preview_spp: samples of a preview, which is made in place of the picture that grows.
+            settings: target quality of the picture.
+            on_look: receives each step; may raise, which ends the picture.
+            preview_spp: samples of a preview that is rendered instead of the progressive picture.
 
         Raises:
-            TrilightError: it cannot be rendered.
+            TrilightError: the scene cannot be rendered.
         """
         try:
             with self._one_at_a_time:
                 begin = ((key, settings), camera, preview_spp)
-                with_retries(lambda: self._paint(scene, begin, shown))
+                with_retries(lambda: self._render(scene, begin, on_look))
         except Rejected as rejection:
             raise TrilightError(
                 f"the scene cannot be rendered ({rejection}); expected surfaces, lights with an "
@@ -76,20 +76,20 @@ class ProgressiveTracer:
         """End the child."""
         self._child.close()
 
-    def _paint(self, scene: Scene, begin: "_Begin", shown: Callable[[Sampling], None]) -> None:
+    def _render(self, scene: Scene, begin: "_Begin", on_look: Callable[[Sampling], None]) -> None:
         if not self._child.call(_begin, None, *begin):
             self._child.call(_begin, scene, *begin)
         while (step := self._child.call(_advance)) is not None:
-            shown(step)
+            on_look(step)
 
 
 _Camera = tuple[NDArray[np.float32], float]
 _Begin = tuple[tuple[Hashable, RenderSettings], _Camera, int | None]
-"""Scene with its settings, camera, and samples of a preview."""
+"""Scene key with its settings, camera, and samples of a preview."""
 
 
-class _ChildOfLooks:
-    """What the child holds between two calls."""
+class _ChildState:
+    """State of the child between two calls."""
 
     steps: Generator[Sampling, None, GrowingPicture]
 
@@ -98,7 +98,7 @@ class _ChildOfLooks:
         self.ended = True
 
 
-_state = _ChildOfLooks()
+_state = _ChildState()
 
 
 def _begin(
@@ -107,7 +107,7 @@ def _begin(
     camera: _Camera,
     preview_spp: int | None,
 ) -> bool:
-    """Begin a picture; return whether the scene, if it is not given, is still loaded."""
+    """Begin a picture; return False if no scene is given and it is no longer loaded."""
     renderer = _state.loaded.pop(key, None)
     if renderer is None:
         if scene is None:
@@ -125,7 +125,7 @@ def _begin(
 
 
 def _advance() -> Sampling | GrowingPicture | None:
-    """Return the next step; None after the last."""
+    """Return the next step; None after the last one."""
     if _state.ended:
         return None
     try:

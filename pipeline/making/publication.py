@@ -1,4 +1,4 @@
-"""The manifest of a dataset that is made: begun, compared, and listed when all shards are there."""
+"""`DatasetWriter`: publishes shards and writes the manifest of a dataset in a folder."""
 
 import contextlib
 import dataclasses
@@ -47,95 +47,95 @@ from storage.records.objects import (
     write_failures,
 )
 
-_LOOKS = 7
-"""For a shard that a worker says it has packed; network file systems may show it a minute later."""
+_MAX_LOOKS = 7
+"""Looks for a shard that a worker has packed; network file systems may show it a minute later."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Done:
-    """What is finished of the shards that were asked for."""
+class DatasetProgress:
+    """Progress of the requested shards."""
 
     shards: int = 0
-    """Shards that are there."""
+    """Finished shards among the requested ones."""
     scenes: int = 0
-    """Scenes for which they stand, given-up ones included."""
-    shards_asked: int = 0
-    """Shards that were asked for."""
-    scenes_asked: int = 0
-    """Their scenes."""
+    """Scenes of the finished shards, given-up ones included."""
+    shards_requested: int = 0
+    """Shards that this run requested."""
+    scenes_requested: int = 0
+    """Scenes of the requested shards."""
     given_up: int = 0
     """Scenes of this run that could not be made; of all runs once the dataset is finished."""
 
 
-class Publication:
-    """What is public of a dataset, shared by all who make it.
+class DatasetWriter:
+    """Writes the published files of a dataset, together with its other workers.
 
-    Until all shards are there the manifest is a head of a few kilobytes, and each shard has a note:
-    a maker writes what it has made, and reads no more than it asks for. Every change of the
-    manifest is made in turn, to what is on the disk then, and reaches the disk before the call
-    returns.
+    Until all shards are finished the manifest is a head of a few kilobytes, and each shard has a
+    note: a worker writes notes on its own shards, and reads only those of the requested ones. Every
+    change of the manifest holds its mutex, applies to the file on disk at that moment, and reaches
+    the disk before the call returns.
     """
 
     def __init__(self, folder: DatasetFolder, manifest: Manifest, splits: SplitSettings) -> None:
         self.folder = folder
         self.manifest = manifest
-        """What the dataset is; its shards are listed once it is finished."""
-        self.done = Done()
-        """What is finished of what was asked for, as far as this maker has looked."""
+        """Manifest of the dataset; it lists shards only once the dataset is finished."""
+        self.progress = DatasetProgress()
+        """Progress of the requested shards, at this worker's last look."""
         self.failures: list[Failure] = []
-        """What was rejected on the way to the shards of this run, until the manifest lists them."""
+        """Rejections of this run's scenes, until the manifest lists their shards."""
         self.left_to_others = False
-        """Whether another machine has just listed the shards, and writes the documents."""
+        """True if another machine has just listed the shards, and writes the documents."""
         self._splits = splits
 
     @property
     def splits(self) -> SplitSettings:
-        """How scenes are divided, as far as they are planned: the last shard may hold fewer."""
+        """Split settings, cut to the planned scenes: the last shard may hold fewer."""
         return cut_splits(self.manifest.num_scenes, self._splits)
 
     def dataset(self) -> Dataset:
-        """Return what is public, for whoever reads it."""
+        """Return a reader of the published dataset."""
         return open_dataset(str(self.folder.root))
 
-    def send_documents(self) -> None:
-        """Bring the documents of the folder to where the dataset is: here they are."""
+    def upload_documents(self) -> None:
+        """Upload the documents; no-op for a local folder."""
 
     @property
     def num_shards(self) -> int:
-        """How many shards the dataset will have."""
+        """Number of shards of the finished dataset."""
         return shards_for(self.manifest.num_scenes, self._splits)
 
     def lock_objects(self, objects: list[LockedObject]) -> None:
-        """Freeze the objects of the dataset."""
+        """Freeze the objects of the dataset: write their lock file and its digest."""
         lock = encode_objects_lock(objects)
-        with self._turn():
+        with self._lock_manifest():
             write_atomically(self.folder.objects_lock, lock)
             self._write(objects_lock_sha256=sha256_hex(lock))
 
-    def take_lock(self) -> None:
-        """Have the lock and its index here, where another machine has frozen the objects."""
+    def fetch_lock(self) -> None:
+        """Download the lock and its index if another machine has frozen the objects."""
 
     def claim(self, path: Path) -> contextlib.AbstractContextManager[bool]:
-        """Hold the claim on a file that one worker makes; yield whether it is ours.
+        """Hold the claim on a file that one worker makes; yield True if this worker holds it.
 
-        Where it is, another worker may have made the file in the meantime.
+        Another worker may have made the file in the meantime.
         """
         return claimed(path.with_suffix(".claim"))
 
-    def send(self, path: Path) -> None:
-        """Bring a file of the folder to where the dataset is: here it is."""
+    def upload(self, path: Path) -> None:
+        """Upload a file of the folder; no-op for a local folder."""
 
     def has(self, path: Path) -> bool:
-        """Return whether a file of the folder is where the dataset is."""
+        """Return True if a file of the folder is published."""
         return path.exists()
 
     def add_shard(self, shard: ShardEntry) -> None:
-        """Note a finished shard.
+        """Record a finished shard.
 
         Raises:
-            TrilightError: it is not here, so that its maker works in another folder.
+            TrilightError: it is not here, so that its worker uses another folder.
         """
-        self._require_here(shard.name)
+        self._require_visible(shard.name)
         failures = read_failures(rejections_of_shard(self.folder, shard.name))
         self._note(ShardNote(shard=shard, failures=tuple(failures)))
 
@@ -146,41 +146,41 @@ class Publication:
     def _count(self, note: ShardNote) -> None:
         num_scenes = self._num_scenes([number_of_shard(note.shard)])
         self.failures += note.failures
-        self.done = dataclasses.replace(
-            self.done,
-            shards=self.done.shards + 1,
-            scenes=self.done.scenes + num_scenes,
-            given_up=self.done.given_up + num_scenes - note.shard.num_samples,
+        self.progress = dataclasses.replace(
+            self.progress,
+            shards=self.progress.shards + 1,
+            scenes=self.progress.scenes + num_scenes,
+            given_up=self.progress.given_up + num_scenes - note.shard.num_samples,
         )
 
-    def missing_shards(self, wanted: range | None = None) -> list[int]:
-        """Return which of the wanted shards are still to make or to grow; of all by default.
+    def missing_shards(self, requested: range | None = None) -> list[int]:
+        """Return the unfinished or growing shards among the requested ones; by default of all.
 
-        What that costs depends on what is wanted alone.
+        The cost depends on the number of requested shards alone.
         """
-        self.refresh()  # somebody may have planned more
+        self.refresh()  # another run may have planned more
         every = range(self.num_shards)
-        asked = every if wanted is None else every[wanted.start : wanted.stop]
-        missing = self._missing(asked)
-        self.done = dataclasses.replace(
-            self.done,
-            shards=len(asked) - len(missing),
-            scenes=self._num_scenes(asked) - self._num_scenes(missing),
-            shards_asked=len(asked),
-            scenes_asked=self._num_scenes(asked),
+        selected = every if requested is None else every[requested.start : requested.stop]
+        missing = self._missing(selected)
+        self.progress = dataclasses.replace(
+            self.progress,
+            shards=len(selected) - len(missing),
+            scenes=self._num_scenes(selected) - self._num_scenes(missing),
+            shards_requested=len(selected),
+            scenes_requested=self._num_scenes(selected),
         )
         return missing
 
     def _missing(self, shards: range) -> list[int]:
-        there = self._shards_there(shards)
-        return [index for index in shards if shard_name(index, self._splits) not in there]
+        finished = self._finished_shards(shards)
+        return [index for index in shards if shard_name(index, self._splits) not in finished]
 
     def _num_scenes(self, shards: Iterable[int]) -> int:
         splits = self.splits
         return sum(len(scenes_of_shard(index, splits)) for index in shards)
 
-    def _shards_there(self, shards: range) -> set[str]:
-        """Return names of whole shards where the dataset is, at least those that are asked."""
+    def _finished_shards(self, shards: range) -> set[str]:
+        """Return the names of finished shards: at least all finished ones of a range."""
         return {
             name
             for part in parts_of(shards)
@@ -188,32 +188,32 @@ class Publication:
             if name not in self.manifest.growing
         }
 
-    def num_shards_there(self) -> int:
-        """Return how many shards are there, as far as is known here."""
+    def num_finished_shards(self) -> int:
+        """Return the number of finished shards, as far as this machine knows."""
         names = shard_names_in(self.folder.root)
         return sum(name not in self.manifest.growing for name in names)
 
-    def _are_all_there(self) -> bool:
-        """Return whether every shard is there; looks part by part, up to the first that is not."""
+    def _is_complete(self) -> bool:
+        """Return True if every shard is finished; stops at the first part that is not."""
         parts = list(in_parts(range(self.num_shards)))
-        if any(len(self._shards_there(part)) < len(part) for part in parts):  # names cost more
+        if any(len(self._finished_shards(part)) < len(part) for part in parts):  # names cost more
             return False
         return not any(map(self._missing, parts))
 
     def finish(self) -> Manifest | None:
-        """List all shards in the manifest, and their rejections, if all are there; return it.
+        """List all shards in the manifest if all are finished, and return it; else None.
 
         Raises:
             TrilightError: a shard is damaged, or the folder cannot be written.
         """
         self.refresh()
-        if not self._are_all_there():
+        if not self._is_complete():
             return None
-        with self._turn():  # somebody may have planned more
-            if not self._are_all_there():
+        with self._lock_manifest():  # another run may have planned more
+            if not self._is_complete():
                 return None
             listed = read_manifest(self.folder.manifest)
-            if (notes := self._unlisted(listed)) or listed.growing:
+            if (notes := self._unlisted_notes(listed)) or listed.growing:
                 shards = {entry.name: entry for entry in listed.shards}
                 shards |= {note.shard.name: note.shard for note in notes}
                 every = tuple(sorted(shards.values(), key=number_of_shard))
@@ -223,26 +223,29 @@ class Publication:
             for staged in (self.folder.staged_entries, self.folder.staged_failures):
                 shutil.rmtree(staged, ignore_errors=True)
             self.folder.staged_given_up.unlink(missing_ok=True)
-        num_scenes, self.failures = self._num_scenes(range(self.num_shards)), []
+        num_scenes = self._num_scenes(range(self.num_shards))
+        self.failures = []
         given_up = num_scenes - listed.num_samples
         self.manifest = listed
-        self.done = dataclasses.replace(self.done, given_up=given_up)
+        self.progress = dataclasses.replace(self.progress, given_up=given_up)
         return listed
 
-    def _unlisted(self, listed: Manifest) -> list[ShardNote]:
-        """Return what is known of every shard that is not in a manifest, or has been made anew."""
+    def _unlisted_notes(self, listed: Manifest) -> list[ShardNote]:
+        """Return the notes of all shards that a manifest does not list, or lists in an old form."""
         known = {entry.name for entry in listed.shards} - set(noted_names(self.folder))
         every = (shard_name(index, self._splits) for index in range(self.num_shards))
         return [noted_shard(self.folder, name) for name in every if name not in known]
 
     def extend(self, num_scenes: int) -> None:
-        """Plan more scenes; call in the turn of the manifest.
+        """Plan more scenes; call while holding the mutex of the manifest.
 
-        A last shard that is there with fewer scenes than fit grows from now on: in the turn, each
-        shard of a folder holds what is planned for it, or else the manifest says that it grows.
+        A last shard that is not full grows from now on. While the mutex is held, each shard of a
+        folder holds its planned scenes, or else the manifest lists it as growing.
         """
-        growing, last = set(self.manifest.growing), self.num_shards - 1
-        name, scenes = shard_name(last, self._splits), scenes_of_shard(last, self.splits)
+        growing = set(self.manifest.growing)
+        last = self.num_shards - 1
+        name = shard_name(last, self._splits)
+        scenes = scenes_of_shard(last, self.splits)
         if scenes != scenes_of_shard(last, self._splits):
             (self.folder.staged_sent / name).unlink(missing_ok=True)  # of a bucket: looked at again
             if self.folder.shard(name).exists() and name not in growing:
@@ -251,19 +254,19 @@ class Publication:
         self._write(num_scenes=num_scenes, growing=tuple(sorted(growing)), documents={})
 
     def add_failures(self, failures: Iterable[Failure]) -> None:
-        """Add rows to `failures.jsonl`; a row that is there already stays single."""
-        with self._turn():
+        """Add rows to `failures.jsonl`, without duplicates."""
+        with self._lock_manifest():
             self._add_failures(failures)
 
-    def _has(self, name: str) -> bool:
-        """Return whether a shard that somebody has packed can be seen."""
+    def _sees_shard(self, name: str) -> bool:
+        """Return True if a packed shard is visible here."""
         return self.folder.has_shard(name)
 
-    def _require_here(self, name: str) -> None:
-        for look in range(_LOOKS):
-            if self._has(name):
+    def _require_visible(self, name: str) -> None:
+        for look in range(_MAX_LOOKS):
+            if self._sees_shard(name):
                 return
-            time.sleep(2**look if look < _LOOKS - 1 else 0)
+            time.sleep(2**look if look < _MAX_LOOKS - 1 else 0)
         raise TrilightError(
             f"{self.folder.shown}: a worker has packed {name}, and it is not here: the worker's "
             "folder is not this one. Expected workers that see the same --out at the same place "
@@ -271,21 +274,21 @@ class Publication:
         )
 
     def refresh(self) -> None:
-        """Read what other makers have written of the dataset as such.
+        """Read the head of the manifest again, as other workers may have changed it.
 
         Raises:
             TrilightError: another dataset has been begun in the folder since.
         """
-        found = read_head(self.folder.manifest)
-        if found.settings != self.manifest.settings:
+        head = read_head(self.folder.manifest)
+        if head.settings != self.manifest.settings:
             raise TrilightError(
                 f"{self.folder.shown}: another dataset has been begun here in the meantime; choose "
                 "another --out."
             )
-        self.manifest = found
+        self.manifest = head
 
     @contextlib.contextmanager
-    def _turn(self) -> Iterator[None]:
+    def _lock_manifest(self) -> Iterator[None]:
         with self.folder.turn("manifest"):
             self.refresh()
             yield
@@ -295,6 +298,6 @@ class Publication:
         write_failures(self.folder.failures, [*known, *failures])
 
     def _write(self, **changes: Any) -> None:
-        whole = read_manifest(self.folder.manifest)  # a finished set that grows has shards
-        write_manifest(self.folder.manifest, dataclasses.replace(whole, **changes))
+        manifest = read_manifest(self.folder.manifest)  # a finished set that grows has shards
+        write_manifest(self.folder.manifest, dataclasses.replace(manifest, **changes))
         self.manifest = dataclasses.replace(self.manifest, **changes)

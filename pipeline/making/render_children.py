@@ -1,7 +1,7 @@
-"""The children of this process that make scenes: made at the first task of a job, then warm.
+"""Pools of children that make scenes: started by the first task of a job, then kept warm.
 
-Those that render see scenes of our own making. Where scenes come from files, another child reads
-these, confined to their folder (pipeline.isolation.confinement).
+Render children get composed scenes, which are trusted. If scenes come from files, another child
+reads these, confined to their folder (pipeline.isolation.confinement).
 """
 
 import contextlib
@@ -25,9 +25,11 @@ from storage.extensions import recorded, require_same_extensions
 from storage.records.scene import Scene
 
 _RENDER_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=200)
-"""A scene at 4096 samples and 512 pixels takes minutes; a render child holds below 1 GiB."""
-_CARD_LIMITS = ChildLimits(memory_bytes=1 << 46, wall_s=3600, calls_per_child=200)
-"""CUDA reserves addresses for all memory of card and machine."""
+"""A scene at 4096 samples and 512 pixels takes minutes, and a render child holds below 1 GiB: the
+limits on memory and wall time end only a child that leaks or hangs. After 200 calls a fresh child
+starts, so that leaks stay bounded."""
+_GPU_LIMITS = ChildLimits(memory_bytes=1 << 46, wall_s=3600, calls_per_child=200)
+"""CUDA reserves addresses for all memory of GPU and machine."""
 
 _pools: dict[tuple[str, ...], ChildPool] = {}
 _pools_lock = threading.Lock()
@@ -42,42 +44,44 @@ def close_children() -> None:
 
 
 def close_idle_children() -> None:
-    """End the render children of this process that no task uses; others may be at work here."""
+    """End the render children of this process that no task uses; other jobs may run here."""
     with _pools_lock:
         _close_idle()
 
 
-def _close_idle(but: tuple[str, ...] = ()) -> None:
+def _close_idle(keep: tuple[str, ...] = ()) -> None:
     idle = [key for key, pool in _pools.items() if pool.num_users == 0]
     for key in idle:
-        if not but or key[: len(but)] != but:
+        if not keep or key[: len(keep)] != keep:
             _pools.pop(key).close()
 
 
 @contextlib.contextmanager
 def render_child(job: ShardJob) -> Iterator[IsolatedChild]:
-    """Lend a child for a job, made at its first task; idle ones of other jobs end then."""
-    with _lent((), job, _render_pool) as child:
+    """Lend a render child; the first task of a job creates its pool and ends idle ones."""
+    with _borrow_child((), job, _render_pool) as child:
         yield child
 
 
 @contextlib.contextmanager
 def scene_reader(job: ShardJob) -> Iterator[Callable[[int], Scene] | None]:
-    """Lend what reads a scene from its file by its index; None where scenes are composed.
+    """Lend a function that reads a scene file by its index; None if scenes are composed.
 
-    It raises as `SceneFiles.scene`, and ChildFailed.
+    The function raises as `SceneFiles.scene`, and ChildFailed.
     """
-    files, settings = job.accepted.files, job.settings
+    files = job.accepted.files
+    settings = job.settings
     if files is None:
         yield None
         return
-    with _lent(("files",), job, _reading_pool) as child:
+    with _borrow_child(("files",), job, _reading_pool) as child:
 
         def read(index: int) -> Scene:
-            num_views, seed = settings.scenes.num_views, settings.seed
-            asked = (files, index, settings.assets, num_views, seed)
-            scene = call_with_retries(child, scene_of_file, *asked)
-            scene.check()  # here: whoever has taken the child over may say what it likes
+            num_views = settings.scenes.num_views
+            seed = settings.seed
+            arguments = (files, index, settings.assets, num_views, seed)
+            scene = call_with_retries(child, scene_of_file, *arguments)
+            scene.check()  # here: a compromised child may send anything
             return scene
 
         yield read
@@ -86,19 +90,19 @@ def scene_reader(job: ShardJob) -> Iterator[Callable[[int], Scene] | None]:
 def scene_of_file(
     files: SceneFiles, scene_index: int, assets: AssetSettings, num_views: int, seed: int
 ) -> Scene:
-    """Read a scene; only children come here. Raises as `SceneFiles.scene`."""
+    """Read a scene; runs only in child processes. Raises as `SceneFiles.scene`."""
     return files.scene(scene_index, assets, num_views=num_views, seed=seed)
 
 
 @contextlib.contextmanager
-def _lent(
+def _borrow_child(
     kind: tuple[str, ...], job: ShardJob, make: Callable[[ShardJob], ChildPool]
 ) -> Iterator[IsolatedChild]:
     of_job = (str(job.folder.root), job.settings.digest, job.lock_sha256)
     key = (*of_job, *kind)
     with _pools_lock:
         if key not in _pools:
-            _close_idle(but=of_job)
+            _close_idle(keep=of_job)
             _pools[key] = make(job)
         pool = _pools[key]
         pool.num_users += 1
@@ -122,36 +126,36 @@ def _render_pool(job: ShardJob) -> ChildPool:
     variant = choose_variant()
     if job.environment:
         require_environment(job.environment, environment(variant))
-    on_card = variant.name == "cuda_ad_rgb"
-    cards = visible_gpus() if on_card else ()
+    on_gpu = variant.name == "cuda_ad_rgb"
+    gpus = visible_gpus() if on_gpu else ()
 
     def new_child(number: int) -> IsolatedChild:
-        source = SceneRecipe(
+        recipe = SceneRecipe(
             settings=job.settings,
             variant=variant,
             threads=cores_of_child(job),
-            gpu=cards[number % len(cards)] if cards else None,
+            gpu=gpus[number % len(gpus)] if gpus else None,
             pool=job.accepted.pool,
             maps=job.accepted.maps,
             revisited=job.accepted.revisited,
             folder=job.folder,
         )
-        limits = _CARD_LIMITS if on_card else _RENDER_LIMITS
-        return IsolatedChild(limits=limits, setup=set_up_child, setup_args=(source,))
+        limits = _GPU_LIMITS if on_gpu else _RENDER_LIMITS
+        return IsolatedChild(limits=limits, setup=set_up_child, setup_args=(recipe,))
 
     return ChildPool(new_child, job.num_at_once)
 
 
 def cores_of_child(job: ShardJob) -> int:
-    """Return how many threads a render child of this process has."""
+    """Return the number of threads of a render child of this process."""
     return max(1, cores_owned() // job.num_at_once)
 
 
-def require_environment(expected: Mapping[str, Any], here: Mapping[str, Any]) -> None:
-    """Raise TrilightError where a machine would make other bytes than the dataset's."""
-    for name, wanted, found in differences(expected, here):
+def require_environment(expected: Mapping[str, Any], actual: Mapping[str, Any]) -> None:
+    """Raise TrilightError if this machine would make other bytes than the dataset's."""
+    for name, old, new in differences(expected, actual):
         raise TrilightError(
-            f"this worker differs from the machine that began the run: {name} is {found!r}; "
-            f"expected {wanted!r}. Use machines of one kind and one image, or accept pictures that "
+            f"this worker differs from the machine that began the run: {name} is {new!r}; "
+            f"expected {old!r}. Use machines of one kind and one image, or accept pictures that "
             "agree only within their noise floors with --accept-environment."
         )

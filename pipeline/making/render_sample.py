@@ -1,7 +1,7 @@
-"""The sample of a scene: every view by the first of its cameras whose picture is accepted.
+"""Renders the sample of a scene: each view by its first camera whose picture is accepted.
 
-Choosing a camera wraps rendering. A `SceneRenderer` makes the picture of one camera or refuses it,
-and knows of no other camera; `cameras_of_view` knows of no picture.
+The choice of a camera wraps rendering. A `SceneRenderer` renders or rejects one camera and knows no
+other; `cameras_of_view` proposes cameras and knows no picture.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,31 +27,30 @@ from storage.seeds import seed_for
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KeptPictures:
-    """Pictures that a scene has already, of its first `num_views` cameras."""
+    """Finished pictures of a scene's first `num_views` cameras."""
 
     num_views: int
-    """How many."""
+    """Number of cameras whose pictures are kept."""
     sample: Sample
-    """The sample that they are of."""
+    """The sample that holds the pictures."""
     members: Mapping[str, bytes]
-    """Packed as they are, by suffix."""
+    """Packed files of the kept pictures, by suffix."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BegunScene:
-    """A scene to make pictures of."""
+    """A scene to render, with the cameras and pictures that stay."""
 
     scene: Scene
-    """With a camera for each view."""
+    """The scene, with a camera for each view."""
     kept_cameras: int = 0
-    """Number of its first cameras that end the scene where their pictures are refused; any other is
-    replaced."""
-    kept: KeptPictures | None = None
-    """What need not be rendered again."""
+    """Number of first cameras that are never replaced: their rejection rejects the scene."""
+    kept_pictures: KeptPictures | None = None
+    """Pictures that need not be rendered again."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _TakenView:
+class _AcceptedView:
     """An accepted picture."""
 
     camera: ViewCamera
@@ -63,67 +62,83 @@ class _TakenView:
 
 def render_sample(
     key: str,
-    begun: BegunScene,
+    render_input: BegunScene,
     settings: BuildSettings,
     failures: list[Failure],
-    told: ViewProgress,
+    progress: ViewProgress,
 ) -> Sample:
     """Render every view of a scene.
 
     Args:
-        key: of the sample.
-        begun: the scene, and which of its cameras and pictures stay.
-        settings: of the build.
-        failures: takes a row for each camera that was refused and replaced.
-        told: hears how far the views are.
+        key: key of the sample.
+        render_input: the scene, and the cameras and pictures that stay.
+        settings: settings of the dataset.
+        failures: receives a row for each camera that was rejected and replaced.
+        progress: reports the progress of the views.
 
     Raises:
         Rejected: the scene cannot be rendered, or a view has no camera left.
     """
-    scene, kept = begun.scene, begun.kept
-    num_kept = kept.num_views if kept else 0
-    sight = Sight(scene)
+    scene = render_input.scene
+    kept_pictures = render_input.kept_pictures
+    num_kept = kept_pictures.num_views if kept_pictures else 0
+    visibility = Sight(scene)
     renderer = SceneRenderer(scene, settings.renders) if num_kept < scene.num_views else None
 
-    def take(view: int) -> _TakenView:
-        if kept and view < num_kept:
-            return _kept_view(kept.sample, view)
+    def render_view(view: int) -> _AcceptedView:
+        if kept_pictures and view < num_kept:
+            return _kept_view(kept_pictures.sample, view)
         assert renderer is not None
-        for camera in cameras_of_view(scene, sight, settings.scenes, view):
+        for camera in cameras_of_view(scene, visibility, settings.scenes, view):
             seed = seed_for(settings.seed, "samples", int(key), view, camera.attempt)
             try:
                 steps = renderer.view_steps(camera.c2w, float(camera.fov_deg), seed)
-                return _taken_view(camera, told.view(view, steps), seed, sight, settings)
+                return _accepted_view(
+                    camera, progress.render_view(view, steps), seed, visibility, settings
+                )
             except Rejected as rejection:
-                reason, message = rejection.reason, rejection.message
-            if view < begun.kept_cameras:
+                reason = rejection.reason
+                message = rejection.message
+            if view < render_input.kept_cameras:
                 raise Rejected(reason, f"view {view}: {message}")
-            item, attempt = f"{key}.{view}", camera.attempt
+            item = f"{key}.{view}"
+            attempt = camera.attempt
             failures.append(
                 Failure(stage="renders", item=item, reason=reason, message=message, attempt=attempt)
             )
         raise AssertionError("cameras_of_view ends by raising Rejected")
 
-    views = [take(view) for view in range(scene.num_views)]
+    views = [render_view(view) for view in range(scene.num_views)]
     seen = with_cameras(scene, [view.camera for view in views])
     seen.check()
+    members = kept_pictures.members if kept_pictures else {}
+    return _stack_views(key, seen, views, settings, members)
+
+
+def _stack_views(
+    key: str,
+    scene: Scene,
+    views: Sequence[_AcceptedView],
+    settings: BuildSettings,
+    members: Mapping[str, bytes],
+) -> Sample:
     lights = [view.lights_rgb for view in views if view.lights_rgb is not None]
     parts = [view.parts_rgb for view in views if view.parts_rgb is not None]
     return Sample(
         key=key,
-        scene=seen.with_provenance({**seen.provenance, "settings_sha256": settings.digest}),
+        scene=scene.with_provenance({**scene.provenance, "settings_sha256": settings.digest}),
         radiance_rgb=np.stack([view.radiance_rgb for view in views]),
         views=tuple(view.record for view in views),
         lights_rgb=np.stack(lights) if lights else None,
-        parts_rgb=_stacked(parts) if parts else None,
-        passes_exr=_passes_exr(seen, settings),
-        kept_members=kept.members if kept else {},
+        parts_rgb=_stack_parts(parts) if parts else None,
+        passes_exr=_passes_exr(scene, settings),
+        kept_members=members,
     )
 
 
-def _kept_view(sample: Sample, view: int) -> _TakenView:
+def _kept_view(sample: Sample, view: int) -> _AcceptedView:
     parts = {name: pictures[view] for name, pictures in (sample.parts_rgb or {}).items()}
-    return _TakenView(
+    return _AcceptedView(
         camera=cameras_of(sample.scene)[view],
         record=sample.views[view],
         radiance_rgb=sample.radiance_rgb[view],
@@ -133,7 +148,8 @@ def _kept_view(sample: Sample, view: int) -> _TakenView:
 
 
 def _passes_exr(scene: Scene, settings: BuildSettings) -> tuple[bytes, ...] | None:
-    names, resolution = settings.storage.passes, settings.renders.resolution
+    names = settings.storage.passes
+    resolution = settings.renders.resolution
     if not names:
         return None
     return tuple(
@@ -142,9 +158,9 @@ def _passes_exr(scene: Scene, settings: BuildSettings) -> tuple[bytes, ...] | No
     )
 
 
-def _taken_view(
+def _accepted_view(
     camera: ViewCamera, rendered: RenderedView, seed: int, sight: Sight, settings: BuildSettings
-) -> _TakenView:
+) -> _AcceptedView:
     grid = settings.scenes.views.coverage_grid
     facts = sight.facts(camera.c2w, float(camera.fov_deg), grid)
     record = ViewRecord(
@@ -158,7 +174,7 @@ def _taken_view(
         camera_attempt=camera.attempt,
         parts=_part_floors(rendered),
     )
-    return _TakenView(
+    return _AcceptedView(
         camera=camera,
         record=record,
         radiance_rgb=rendered.radiance_rgb,
@@ -180,5 +196,5 @@ def _part_floors(rendered: RenderedView) -> dict[str, PartFloor] | None:
     }
 
 
-def _stacked(views: Sequence[Parts]) -> dict[str, NDArray[np.float32]]:
+def _stack_parts(views: Sequence[Parts]) -> dict[str, NDArray[np.float32]]:
     return {name: np.stack([parts[name] for parts in views]) for name in views[0]}

@@ -1,4 +1,4 @@
-"""What `trilight revisit` was asked for, as settings of the new dataset."""
+"""`trilight revisit`: converts its options to options of the new dataset."""
 
 import os
 import re
@@ -27,7 +27,7 @@ _LIGHTS = "expected keep, new, or a number of new lights, such as 3"
 
 @checked()
 class Revisit:
-    """The finished dataset, and what is to be new in its scenes."""
+    """The finished dataset, and the changes to its scenes."""
 
     dataset: str
     """Folder of a finished dataset."""
@@ -74,33 +74,33 @@ class Revisit:
     (values are JSON); by default there are none."""
 
 
-def revisit_order(asked: Revisit) -> DatasetOrder:
-    """Return the order of the new dataset, without the settings of the one before.
+def revisit_order(options: Revisit) -> DatasetOrder:
+    """Return the options of the new dataset, without the settings of the finished one.
 
     Raises:
-        TrilightError: the dataset is unfinished, or what is asked cannot be understood.
+        TrilightError: the dataset is unfinished, or an option is malformed.
     """
-    manifest = open_finished(asked.dataset).manifest
+    manifest = open_finished(options.dataset).manifest
     revisit = RevisitSettings(
         source_digest=manifest.dataset_digest,
-        **_cameras(asked.cameras, manifest.num_views),
-        **_lights(asked.lights),
-        materials=asked.materials,
+        **_cameras(options.cameras, manifest.num_views),
+        **_lights(options.lights),
+        materials=options.materials,
     )
     return DatasetOrder(
-        build=asked.build or manifest.build,
-        revisits=os.path.realpath(asked.dataset),
-        out=asked.out,
-        seed=asked.seed,
-        resolution=asked.resolution,
-        noise_floor_db=asked.noise_floor_db,
-        noise_floor_linear_db=asked.noise_floor_linear_db,
-        noise_floor_objects_db=asked.noise_floor_objects_db,
-        workers=asked.workers,
-        failure_budget=asked.failure_budget,
-        accept_environment=asked.accept_environment,
-        shards=asked.shards,
-        changes={**asked.changes, "revisit": settings_record(revisit)},
+        build=options.build or manifest.build,
+        revisits=os.path.realpath(options.dataset),
+        out=options.out,
+        seed=options.seed,
+        resolution=options.resolution,
+        noise_floor_db=options.noise_floor_db,
+        noise_floor_linear_db=options.noise_floor_linear_db,
+        noise_floor_objects_db=options.noise_floor_objects_db,
+        workers=options.workers,
+        failure_budget=options.failure_budget,
+        accept_environment=options.accept_environment,
+        shards=options.shards,
+        changes={**options.changes, "revisit": settings_record(revisit)},
     )
 
 
@@ -117,17 +117,18 @@ def _cameras(words: str, num_views: int) -> dict[str, Any]:
     if drawn and drawn["layout"] == "new":
         return {"kept_cameras": 0, "new_cameras": int(drawn["count"])}
     if drawn and drawn["layout"] in TEMPLATES:
-        layout, count = drawn["layout"], int(drawn["count"])
+        layout = drawn["layout"]
+        count = int(drawn["count"])
         return {"kept_cameras": 0, "new_cameras": count, "camera_layout": layout}
     if Path(words).is_file():
         c2w, fov_deg = load_cameras(scene_source(words))
         if len(c2w) > MOST_CAMERAS:
             raise TrilightError(f"--cameras {words}: {len(c2w)}; expected up to {MOST_CAMERAS}.")
-        given = tuple(
+        cameras = tuple(
             GivenCamera(c2w=tuple(pose.ravel().tolist()), fov_deg=float(angle))
             for pose, angle in zip(c2w, fov_deg, strict=True)
         )
-        return {"kept_cameras": 0, "given_cameras": given}
+        return {"kept_cameras": 0, "given_cameras": cameras}
     layouts = ", ".join(TEMPLATES)
     raise TrilightError(f"--cameras is {words!r}; {_CAMERAS} (layouts: {layouts}).")
 

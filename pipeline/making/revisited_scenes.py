@@ -1,4 +1,4 @@
-"""Scenes of a finished dataset, with what is new in them: what render children make samples of."""
+"""`RevisitedScenes`: reads scenes of a finished dataset and adds new cameras, lights, materials."""
 
 import contextlib
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.builds.revisit import RevisitSettings
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.render_sample import BegunScene, KeptPictures
-from pipeline.scenes.laws import require_laws
+from pipeline.scenes.laws import require_valid
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
 from pipeline.scenes.views import ViewCamera, cameras_of, with_first_cameras
 from pipeline.shards.finished import FinishedDataset, SampleReader, open_finished, require_whole
@@ -27,54 +27,56 @@ class RevisitedScenes:
     """Reads the scenes of a finished dataset; a render child has one."""
 
     root: Path
-    """Its folder."""
+    """Folder of the finished dataset."""
     digest: str
-    """Its dataset digest."""
+    """Dataset digest of the finished dataset."""
     _checked: set[str] = field(default_factory=set, compare=False, repr=False)
 
     def scene(self, index: int, attempt: int, settings: BuildSettings) -> BegunScene:
-        """Return the scene of an index: the position in the source, shard by shard.
+        """Return the scene of an index, which counts the scenes of the source shard by shard.
 
         Args:
-            index: from 0.
-            attempt: how many times this scene was rejected before; decides what is drawn anew.
-            settings: of the new dataset.
+            index: index of the scene, from 0.
+            attempt: number of earlier rejections of this scene; seeds what is drawn again.
+            settings: settings of the new dataset.
 
         Raises:
-            Rejected: what is drawn anew breaks a law, or no camera is found.
+            Rejected: the changed scene is invalid, or no camera is found.
             TrilightError: the source is not the one that the dataset was begun with, or damaged.
         """
-        asked = settings.revisit
-        assert asked is not None
-        shard, key = self._place(index, settings)
+        revisit = settings.revisit
+        assert revisit is not None
+        shard, key = self._locate(index, settings)
         with contextlib.closing(SampleReader(self._source)) as reader:
             members = reader.members(shard, key)
         sample = decode_sample(key, members)
-        origin = self._origin(sample.scene, key, asked, settings.seed, attempt)
-        scene = _redrawn(sample.scene.with_provenance(origin), index, attempt, settings)
-        cameras = [*cameras_of(sample.scene)[: asked.kept_cameras]]
+        origin = self._origin(sample.scene, key, revisit, settings.seed, attempt)
+        scene = _redraw(sample.scene.with_provenance(origin), index, attempt, settings)
+        cameras = [*cameras_of(sample.scene)[: revisit.kept_cameras]]
         scene = with_first_cameras(
             scene,
             settings.scenes.of_scene(origin["scene_index"]),
-            given=[*cameras, *_given(asked)],
+            first_cameras=[*cameras, *_given_cameras(revisit)],
         )
-        if not asked.keeps_light:
-            # its triangles are those of before, but for the lamps that were asked for
-            require_laws(scene, settings.scenes, in_budget=False)
+        if not revisit.keeps_light:
+            # the triangles stay, except those of the requested lamps: no budget to check
+            require_valid(scene, settings.scenes, in_budget=False)
         return BegunScene(
             scene=scene,
-            kept_cameras=asked.kept_cameras + len(asked.given_cameras),
-            kept=_kept(sample, members, asked) if self._pictures_stay(settings) else None,
+            kept_cameras=revisit.kept_cameras + len(revisit.given_cameras),
+            kept_pictures=_kept_pictures(sample, members, revisit)
+            if self._pictures_stay(settings)
+            else None,
         )
 
     @cached_property
     def _source(self) -> FinishedDataset:
-        found = open_finished(str(self.root))
-        require_digest(found, self.digest)
-        return found
+        dataset = open_finished(str(self.root))
+        require_digest(dataset, self.digest)
+        return dataset
 
-    def _place(self, index: int, settings: BuildSettings) -> tuple[ShardEntry, str]:
-        """Return where a scene lies; its shard is hashed before its first scene is read."""
+    def _locate(self, index: int, settings: BuildSettings) -> tuple[ShardEntry, str]:
+        """Return the shard and key of a scene; a shard is hashed before its first scene is read."""
         starts = settings.splits.first_scenes
         row = int(np.searchsorted(starts, index, side="right")) - 1
         shard = shards_with_scenes(self._source)[row]
@@ -85,19 +87,20 @@ class RevisitedScenes:
             return shard, reader.keys(shard)[index - starts[row]]
 
     def _origin(
-        self, scene: Scene, key: str, asked: RevisitSettings, seed: int, attempt: int
+        self, scene: Scene, key: str, revisit: RevisitSettings, seed: int, attempt: int
     ) -> dict[str, Any]:
         before = dict(scene.provenance)
         step = {"dataset_digest": self.digest, "key": key, "seed": seed, "attempt": attempt}
         origin = {**before, "revisited": [*before.get("revisited", []), step]}
-        if asked.new_cameras and not (asked.kept_cameras and asked.camera_layout is None):
-            layout = asked.camera_layout or before["template"]
+        if revisit.new_cameras and not (revisit.kept_cameras and revisit.camera_layout is None):
+            layout = revisit.camera_layout or before["template"]
             origin["new_cameras"] = {"layout": layout, "seed": seed}
         return origin
 
     def _pictures_stay(self, settings: BuildSettings) -> bool:
-        """Return whether a picture of the same scene and camera would be made and packed alike."""
-        was, now = self._source.manifest.settings, settings.as_json()
+        """Return True if an equal scene and camera would give equal picture files."""
+        was = self._source.manifest.settings
+        now = settings.as_json()
         return (
             settings.revisit is not None
             and settings.revisit.keeps_light
@@ -107,48 +110,49 @@ class RevisitedScenes:
 
 
 def shards_with_scenes(source: FinishedDataset) -> list[ShardEntry]:
-    """Return the shards of a dataset, without those of which every scene was given up."""
+    """Return the shards of a dataset that hold at least one scene."""
     return [shard for shard in source.manifest.shards if shard.num_samples]
 
 
-def require_digest(found: FinishedDataset, digest: str) -> None:
-    """Raise TrilightError where a dataset is not the one that has this digest."""
-    if found.manifest.dataset_digest != digest:
+def require_digest(dataset: FinishedDataset, digest: str) -> None:
+    """Raise TrilightError if a dataset has another digest."""
+    if dataset.manifest.dataset_digest != digest:
         raise TrilightError(
-            f"{found.folder.root}: its dataset digest is {found.manifest.dataset_digest}; expected "
-            f"{digest}, whose scenes the new dataset was begun with. Name that one, or choose "
-            "another --out."
+            f"{dataset.folder.root}: its dataset digest is {dataset.manifest.dataset_digest}; "
+            f"expected {digest}, whose scenes the new dataset was begun with. Name that one, or "
+            "choose another --out."
         )
 
 
-def _redrawn(scene: Scene, index: int, attempt: int, settings: BuildSettings) -> Scene:
-    asked, seed = settings.revisit, settings.seed
-    assert asked is not None
+def _redraw(scene: Scene, index: int, attempt: int, settings: BuildSettings) -> Scene:
+    revisit = settings.revisit
+    seed = settings.seed
+    assert revisit is not None
     ranges = settings.scenes.of_scene(scene.provenance["scene_index"])
-    if asked.materials == "new":
+    if revisit.materials == "new":
         scene = with_new_materials(scene, ranges.materials, seed=seed, index=index, attempt=attempt)
-    if asked.lights == "new":
+    if revisit.lights == "new":
         scene = with_new_lights(
-            scene, ranges.lights, asked.num_lights, seed=seed, index=index, attempt=attempt
+            scene, ranges.lights, revisit.num_lights, seed=seed, index=index, attempt=attempt
         )
     return scene
 
 
-def _given(asked: RevisitSettings) -> list[ViewCamera]:
+def _given_cameras(revisit: RevisitSettings) -> list[ViewCamera]:
     return [
         ViewCamera(
             c2w=np.array(camera.c2w, np.float32).reshape(4, 4),
             fov_deg=np.float32(camera.fov_deg),
             attempt=0,
         )
-        for camera in asked.given_cameras
+        for camera in revisit.given_cameras
     ]
 
 
-def _kept(
-    sample: Sample, members: Mapping[str, bytes], asked: RevisitSettings
+def _kept_pictures(
+    sample: Sample, members: Mapping[str, bytes], revisit: RevisitSettings
 ) -> KeptPictures | None:
-    count = min(asked.kept_cameras, len(sample.views))
+    count = min(revisit.kept_cameras, len(sample.views))
     names = {f"{view}.{kind}exr" for view in range(count) for kind in ("", "lights.", "parts.")}
     of_views = {suffix: data for suffix, data in members.items() if suffix in names}
     return KeptPictures(num_views=count, sample=sample, members=of_views) if count else None

@@ -1,4 +1,4 @@
-"""The records of a run that the steps of `pipeline.making.pipeline` hand on to each other."""
+"""Records that the steps of `pipeline.making.pipeline` pass to each other."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.environment import environment
 from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.machine import visible_gpus
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from pipeline.objects.sources import look_at_source
 from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import DatasetFolder
@@ -27,31 +27,31 @@ from storage.records.objects import Failure
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Run:
-    """A dataset that is begun, with its objects frozen: what every later step needs."""
+    """A dataset that has begun, with its objects frozen: the input of every later step."""
 
     order: DatasetOrder
-    """What was asked for."""
+    """The command's options."""
     settings: BuildSettings
-    """The build with the order's changes."""
-    listed: SceneFolder | None
+    """The build with the options' changes."""
+    scene_folder: SceneFolder | None
     """The scene files, where scenes come from files."""
-    publication: Publication
-    """What is public of the dataset."""
+    publication: DatasetWriter
+    """Writes the manifest and publishes finished shards."""
     accepted: AcceptedObjects
-    """What scenes are made of."""
+    """The frozen objects, textures, skies or scene files that scenes are made of."""
 
     def missing_shards(self) -> list[int]:
-        """Return the numbers of the shards that were asked for and are not there."""
+        """Return the numbers of the requested shards that are not finished."""
         return self.publication.missing_shards(self.order.shard_range())
 
     def num_workers(self) -> int:
-        """Return how many tasks run at a time in one process, where the executor does not say."""
+        """Return the number of parallel tasks of one process; an executor may set another."""
         if self.order.workers is not None:
             return self.order.workers
         return max(1, len(visible_gpus())) if choose_variant().name == "cuda_ad_rgb" else 1
 
     def job(self, num_at_once: int) -> "ShardJob":
-        """Return what the tasks of this run share, `num_at_once` of them in one process."""
+        """Return the job that all tasks of this run share; one process runs `num_at_once` tasks."""
         manifest = self.publication.manifest
         return ShardJob(
             folder=self.publication.folder,
@@ -64,82 +64,86 @@ class Run:
         )
 
     def outcome(self, finished: Manifest | None, statistics: Statistics | None) -> "Outcome":
-        """Return what the run leaves behind, of a finished dataset with what it holds."""
-        publication, listed = self.publication, self.listed
+        """Return the result of the run; a finished dataset adds its digest and statistics."""
+        writer = self.publication
+        listed = self.scene_folder
         notes: tuple[str, ...] = ()
         if listed and self.accepted.files:
             notes = (*self.accepted.files.notes, *listed.notes(self.settings.scenes.num_views))
         elif statistics and self.order.revisits is None:
             notes = frozen_note(self.order.build, statistics)
-            splits, num_scenes = self.settings.splits, publication.manifest.num_scenes
+            splits = self.settings.splits
+            num_scenes = writer.manifest.num_scenes
             if lacking := lacks_validation(num_scenes, splits):
                 notes += (lacking,)
         return Outcome(
             digest=finished.dataset_digest if finished else "",
             num_objects_found=self.accepted.num_found,
             num_objects_used=self.accepted.num_objects,
-            num_scenes_given_up=publication.done.given_up,
-            failures=tuple(publication.failures),
-            num_shards=len(finished.shards) if finished else publication.num_shards_there(),
-            num_shards_planned=publication.num_shards,
+            num_scenes_given_up=writer.progress.given_up,
+            failures=tuple(writer.failures),
+            num_shards=len(finished.shards) if finished else writer.num_finished_shards(),
+            num_shards_planned=writer.num_shards,
             statistics=statistics,
             notes=notes,
         )
 
     def require_within_budget(self) -> None:
-        """Raise TrilightError where too many scenes failed: in this run, in the end in all.
+        """Raise TrilightError if too many scenes failed: in this run, at the end in all runs.
 
-        Scene files of which nothing can be made do not count.
+        Scene files that cannot become a scene do not count.
         """
-        publication, files = self.publication, self.accepted.files
-        num_scenes, budget = publication.manifest.num_scenes, self.order.failure_budget
-        given_up = publication.done.given_up
+        writer = self.publication
+        files = self.accepted.files
+        num_scenes = writer.manifest.num_scenes
+        budget = self.order.failure_budget
+        given_up = writer.progress.given_up
         if given_up > budget * num_scenes + (len(files.unusable) if files else 0):
-            publication.add_failures(publication.failures)
+            writer.add_failures(writer.failures)
             raise TrilightError(
-                f"{publication.folder.shown}: {given_up} of {num_scenes} scenes could not be made, "
+                f"{writer.folder.shown}: {given_up} of {num_scenes} scenes could not be made, "
                 f"more than the failure budget of {budget:.0%}. The reasons are in "
-                f"{publication.folder.failures.name}; mend them, or raise --failure-budget."
+                f"{writer.folder.failures.name}; fix them, or raise --failure-budget."
             )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ShardJob:
-    """What the tasks of a run share; it may travel to another machine of the same kind."""
+    """The input that all tasks of a run share; it can be sent to another machine."""
 
     folder: DatasetFolder
-    """The dataset, at the same place on every machine."""
+    """The dataset, at the same path on every machine."""
     settings: BuildSettings
-    """The build."""
+    """Settings of the dataset, with all changes applied."""
     environment: Mapping[str, Any]
-    """What the dataset was begun with, which every maker must have too; empty to accept any."""
+    """Environment of the dataset's first run, required of every worker; empty to accept any."""
     accepted: AcceptedObjects
-    """What scenes are made of; prepared files are in the user's cache, or are made there again."""
+    """The frozen objects; a prepared file that is missing in the user's cache is made again."""
     lock_sha256: str
     """Digest of the frozen objects."""
     num_at_once: int
     """Tasks at a time in one process; they share its cores."""
     extensions: Mapping[str, str]
-    """What the dataset was begun with, which every maker must have loaded (storage.extensions)."""
+    """Extensions of the dataset's first run, required of every worker (storage.extensions)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskOutcome:
-    """What a task has made."""
+    """The result of one task."""
 
     shards: tuple[ShardEntry, ...]
-    """The shards that it packed."""
+    """The shards that the task packed."""
     scenes: int
-    """Scenes that it made or gave up; others were there, or are made elsewhere."""
+    """Scenes that the task made or gave up, without those that were finished before."""
     seconds: float
-    """Wall time."""
+    """Wall time of the task."""
     core_s: float
-    """The same times the cores of the render child."""
+    """Wall time multiplied by the cores of the render child."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome:
-    """What a run leaves behind."""
+    """The result of a run."""
 
     digest: str
     """The dataset digest; empty where the dataset is not finished."""
@@ -148,32 +152,32 @@ class Outcome:
     num_objects_used: int
     """Objects that scenes may draw from."""
     num_scenes_given_up: int
-    """Scenes that no attempt could save; of this run alone where the dataset is not finished."""
+    """Scenes whose every attempt failed; only those of this run while the dataset is unfinished."""
     failures: tuple[Failure, ...]
-    """What was rejected in this run and is not in `failures.jsonl` yet."""
+    """Rejections of this run that are not in `failures.jsonl` yet."""
     num_shards: int
-    """Shards that are there, as far as is known here."""
+    """Finished shards, as far as this machine knows."""
     num_shards_planned: int
     """Shards of the finished dataset."""
     statistics: Statistics | None
-    """What the dataset holds; None where it is not finished, or another machine, which has finished
-    it, writes its documents."""
+    """Statistics of the dataset; None if it is unfinished, or another machine writes the
+    documents."""
     notes: tuple[str, ...] = ()
-    """What a person should know: fields of scene files that are unknown, cameras that were not
-    used, and whether a frozen set is the published one."""
+    """Notes for the user: unknown fields of scene files, unused cameras, and whether a frozen set
+    is the published one."""
 
 
 Watcher = Callable[[Run, TaskOutcome], None]
 """Called after each task."""
 
 
-def settings_of(
+def resolve_settings(
     order: DatasetOrder, folder: DatasetFolder
 ) -> tuple[BuildSettings, SceneFolder | None]:
-    """Return the settings of an order, and the scene files if scenes come from files.
+    """Return the dataset's settings, and the scene files if scenes come from files.
 
     Raises:
-        TrilightError: the settings contradict each other, or the source or the files are unusable.
+        TrilightError: the settings contradict each other, or the source or files are unusable.
     """
     settings = named_build(
         order.build,
@@ -195,27 +199,27 @@ def settings_of(
     return settings_for_files(settings, listed, order.views), listed
 
 
-def begun_publication(
+def begin_or_resume_dataset(
     order: DatasetOrder, settings: BuildSettings, folder: DatasetFolder
-) -> Publication:
-    """Begin the dataset of an order, or go on with the one that is there.
+) -> DatasetWriter:
+    """Begin a dataset, or resume the one in its folder.
 
     Raises:
-        TrilightError: the dataset was begun otherwise, has not got the shards of the order, or
+        TrilightError: the dataset was begun with other options, lacks the requested shards, or
             cannot be rendered here.
     """
     variant = choose_variant()
-    publication = begin_dataset(
+    writer = begin_dataset(
         folder,
         settings,
         environment(variant),
         BUILDS[order.build].num_scenes if order.scenes is None else order.scenes,
         accept_environment=order.accept_environment,
     )
-    wanted = order.shard_range()
-    if wanted is not None and wanted.start >= publication.num_shards:
+    requested = order.shard_range()
+    if requested is not None and requested.start >= writer.num_shards:
         raise TrilightError(
-            f"shards is {order.shards!r}; expected one that begins below {publication.num_shards}, "
-            f"the shards of {publication.manifest.num_scenes} scenes."
+            f"shards is {order.shards!r}; expected one that begins below {writer.num_shards}, "
+            f"the shards of {writer.manifest.num_scenes} scenes."
         )
-    return publication
+    return writer

@@ -1,8 +1,8 @@
-"""`Runner`: the one interface between the engine and who runs its tasks.
+"""`Runner`: the interface between the engine and the executors that run its tasks.
 
-The engine knows none of them: threads and Slurm are in pipeline.executors, Prefect and Dask in
-pipeline.flows, and a user may bring another. A runner takes tasks one by one as it has room, and
-gives their outcomes as they come: memory does not grow with the number of tasks, and no finished
+The engine imports no executor: threads and Slurm are in pipeline.executors, Prefect and Dask in
+pipeline.flows, and a user may add another. A runner takes tasks one by one as it has room, and
+yields their results as they end: memory does not grow with the number of tasks, and no finished
 task waits for a slow one.
 """
 
@@ -19,25 +19,25 @@ Result = TypeVar("Result")
 
 
 class Runner(Protocol):
-    """Runs `pipeline.making.pipeline.make_task` for each task, somewhere."""
+    """Runs `pipeline.making.pipeline.make_task` once for each task, on any machine."""
 
     @property
     def num_at_once(self) -> int | None:
-        """Tasks at a time in one process, or None where the order says."""
+        """Parallel tasks of one process; None leaves the number to the options."""
 
     @property
     def window(self) -> int | None:
-        """Tasks that are handed out at a time, or None where that is `num_at_once`."""
+        """Number of submitted, unfinished tasks; None means `num_at_once`."""
 
     def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
-        """Yield what became of each task, in the order in which they end.
+        """Yield the result of each task, in the order in which the tasks end.
 
         Raises:
-            TrilightError: a task failed for good; what is finished is safe.
+            TrilightError: a task failed permanently; finished scenes stay on disk.
         """
 
     def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
-        """Call what writes the documents; few may at the same time: it reads the whole dataset."""
+        """Call `write_documents`; limit its parallel calls, since each reads the whole dataset."""
 
 
 def in_window(
@@ -48,9 +48,9 @@ def in_window(
     result: Callable[[Waiting], Result],
     window: int,
 ) -> Iterator[Result]:
-    """Yield results as they come, with at most `window` tasks handed out at a time.
+    """Yield results as tasks end, with at most `window` tasks submitted at a time.
 
-    The next task is handed out before a result is: whoever takes it may take long over it.
+    The next task is submitted before a result is yielded, since the caller may take long over it.
     """
     waiting = iter(tasks)
     running: list[Waiting] = []

@@ -1,12 +1,11 @@
-"""What is missing of a dataset, cut into tasks, round by round until nothing is.
+"""Cuts the missing scenes of a dataset into tasks, in rounds until nothing is missing.
 
-A piece is a range of scenes of one shard; a task is several pieces. Small shards are put together,
+A piece is a range of scenes of one shard; a task is several pieces. Small shards are combined,
 large ones are cut. A task takes one to ten minutes, and a run has at most a thousand of them. How
-long a scene takes is known only as the run goes, so tasks are cut one by one, each when it is
-handed out.
+long a scene takes is known only as the run goes, so each task is cut when it is submitted.
 
-Several makers may share a dataset. A round leaves out what others are making; after it, a run waits
-until they are done, and makes what is left over where one of them died.
+Several workers may share a dataset. A round skips the scenes that others have claimed; after it, a
+run waits until they are done, and makes the scenes that a killed worker left.
 """
 
 import itertools
@@ -22,67 +21,68 @@ from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure
 
 MOST_TASKS = 1000
-"""Task runs of one flow run: Prefect's server takes in about 20 a second, of 19 kB each."""
+"""Most task runs of one flow run: Prefect's server accepts about 20 a second, of 19 kB each."""
 TASK_S = 240.0
-"""Seconds that a task should take."""
+"""Target duration of a task, in seconds."""
 _FIRST_SCENES = 4
-"""Scenes of a task before anything is measured."""
+"""Scenes of a task until the duration of one has been measured."""
 _FIRST_PAUSE_S = 1.0
 _LONGEST_PAUSE_S = 60.0
-"""Between two looks at what others are making; the pause doubles while nothing is left for us."""
+"""Most seconds between two looks at other workers' scenes; the pause doubles while none is free."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Piece:
-    """Scenes of one shard that a task makes in turn."""
+    """A range of scenes of one shard, which a task makes one after another."""
 
     shard_index: int
-    """Which shard."""
+    """Number of the shard, from 0."""
     first: int
-    """Its first scene, by its index in the dataset."""
+    """Index of the first scene in the dataset."""
     last: int
-    """One beyond its last scene."""
+    """Index of the last scene plus 1."""
 
 
 class TaskSizes:
-    """How many scenes the next task gets, from what the finished ones took."""
+    """Chooses the number of scenes of the next task by the durations of finished tasks."""
 
     def __init__(self) -> None:
         self._scenes = 0
         self._seconds = 0.0
 
-    def measured(self, scenes: int, seconds: float) -> None:
-        """Take the duration of a finished task into account."""
+    def add_measurement(self, scenes: int, seconds: float) -> None:
+        """Record the duration of a finished task."""
         self._scenes += scenes
         self._seconds += seconds
 
     def next_size(self, scenes_left: int, tasks_left: int, at_once: int = 1) -> int:
-        """Return a number of scenes, at least 1.
+        """Return the number of scenes of the next task, at least 1.
 
-        Of several at once nobody gets more than half of an equal share of what is left, so that
-        all have work until the end (guided self-scheduling, Polychronopoulos and Kuck 1987).
+        With several tasks at once, none gets more than half of an equal share of the remaining
+        scenes, so that all workers have work until the end (guided self-scheduling,
+        Polychronopoulos and Kuck 1987).
         """
-        wanted: float = _FIRST_SCENES
+        size: float = _FIRST_SCENES
         if self._scenes:
-            wanted = TASK_S * self._scenes / max(self._seconds, 1e-3)
+            size = TASK_S * self._scenes / max(self._seconds, 1e-3)
         if at_once > 1:
-            wanted = min(wanted, scenes_left / (2 * at_once))
-        return max(1, int(wanted), -(-scenes_left // max(1, tasks_left)))
+            size = min(size, scenes_left / (2 * at_once))
+        return max(1, int(size), -(-scenes_left // max(1, tasks_left)))
 
 
-class TasksLeft:
-    """How many tasks a run may still hand out: MOST_TASKS, in however many rounds."""
+class TaskBudget:
+    """Counts the tasks that a run may still submit: MAX_TASKS over all its rounds."""
 
     def __init__(self) -> None:
         self._left = MOST_TASKS
 
-    def cut(
+    def take_tasks(
         self, shards: Sequence[int], splits: SplitSettings, sizes: TaskSizes, *, at_once: int
     ) -> Iterator[tuple[Piece, ...]]:
-        """Yield as `cut_tasks`, but keep a tenth of what is left for rounds that may follow.
+        """Yield the tasks of `cut_tasks`, but save a tenth of the remaining ones for later rounds.
 
         Raises:
-            EnvironmentFailure: none is left.
+            EnvironmentFailure: no task is left.
         """
         if self._left == 0:
             raise EnvironmentFailure(
@@ -104,35 +104,39 @@ def cut_tasks(
     most: int = MOST_TASKS,
     at_once: int = 1,
 ) -> Iterator[tuple[Piece, ...]]:
-    """Yield the tasks that make some shards, each of the size that is right when it is asked for.
+    """Yield the tasks that make some shards; each is sized when it is requested.
 
     Args:
         shards: numbers of the shards.
-        splits: how many scenes they have.
-        sizes: what is known of the time that scenes take.
-        most: tasks to yield at most.
-        at_once: tasks that are handed out at the same time.
+        splits: number of scenes of each shard.
+        sizes: durations of the tasks so far.
+        most: maximum number of tasks.
+        at_once: number of tasks that run at the same time.
     """
     scenes_left = sum(len(scenes_of_shard(index, splits)) for index in shards)
     pieces: list[Piece] = []
-    room, yielded = sizes.next_size(scenes_left, most, at_once), 0
+    room = sizes.next_size(scenes_left, most, at_once)
+    yielded = 0
     for index in shards:
         scenes = scenes_of_shard(index, splits)
         at = scenes.start
         while at < scenes.stop:
             last = min(scenes.stop, at + room)
             pieces.append(Piece(shard_index=index, first=at, last=last))
-            room, scenes_left, at = room - (last - at), scenes_left - (last - at), last
+            room = room - (last - at)
+            scenes_left = scenes_left - (last - at)
+            at = last
             if room == 0:
                 yield tuple(pieces)
-                pieces, yielded = [], yielded + 1
+                pieces = []
+                yielded = yielded + 1
                 room = sizes.next_size(scenes_left, most - yielded, at_once)
     if pieces:
         yield tuple(pieces)
 
 
 class Round:
-    """The tasks of all that is missing now; each is cut when the executor asks for it."""
+    """Tasks for all scenes that are missing now; each is cut when the executor requests it."""
 
     def __init__(self, tasks: Iterator[tuple[Piece, ...]], sizes: TaskSizes) -> None:
         self.tasks = tasks
@@ -140,27 +144,31 @@ class Round:
         self._sizes = sizes
 
     def record(self, outcome: TaskOutcome) -> None:
-        """Take a finished task into account: later tasks get the size that its speed suggests."""
+        """Record a finished task: its speed decides the size of later tasks."""
         self.made_anything |= bool(outcome.scenes or outcome.shards)
         if outcome.scenes:
-            self._sizes.measured(outcome.scenes, outcome.seconds)
+            self._sizes.add_measurement(outcome.scenes, outcome.seconds)
 
 
-def rounds(run: Run, at_once: int) -> Iterator[Round]:
-    """Yield rounds of tasks until no shard that was asked for is missing.
+def iter_rounds_until_done(run: Run, at_once: int) -> Iterator[Round]:
+    """Yield rounds of tasks until no requested shard is missing; sleep between two rounds.
 
     A run of a range of shards ends earlier: when others are making all that is left of the range.
 
     Args:
-        run: the dataset; its publication must learn of each shard that a task has packed.
-        at_once: tasks that are handed out at the same time.
+        run: the dataset; its writer must record each shard that a task has packed.
+        at_once: number of tasks that run at the same time.
 
     Raises:
-        EnvironmentFailure: the run has handed out as many tasks as it may.
+        EnvironmentFailure: the run has submitted its maximum number of tasks.
     """
-    sizes, tasks, pause_s = TaskSizes(), TasksLeft(), _FIRST_PAUSE_S
+    sizes = TaskSizes()
+    tasks = TaskBudget()
+    pause_s = _FIRST_PAUSE_S
     while missing := run.missing_shards():
-        this = Round(tasks.cut(missing, run.publication.splits, sizes, at_once=at_once), sizes)
+        this = Round(
+            tasks.take_tasks(missing, run.publication.splits, sizes, at_once=at_once), sizes
+        )
         yield this
         if this.made_anything:
             pause_s = _FIRST_PAUSE_S
@@ -171,24 +179,25 @@ def rounds(run: Run, at_once: int) -> Iterator[Round]:
 
 
 def _wait_for_others(run: Run, pause_s: float) -> float:
-    """Return the next pause, as soon as nothing is missing or somebody left something undone.
+    """Wait until nothing is missing or a claim is free; return the next pause in seconds.
 
-    No tasks are handed out meanwhile: each would be a row of a scheduler's database.
+    No tasks are submitted meanwhile: each would be a row of a scheduler's database.
     """
-    publication, notice = run.publication, WaitNotice()
+    writer = run.publication
+    notice = WaitNotice()
     while True:
         time.sleep(pause_s)
         pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
         missing = run.missing_shards()
         splits = run.settings.splits
-        shards = [UnfinishedShard(publication.folder, splits, index) for index in missing]
+        shards = [UnfinishedShard(writer.folder, splits, index) for index in missing]
         if not missing or any(shard.is_free() for shard in shards):
             return pause_s
-        notice.update(shards[0].wanted_claims()[0])
+        notice.update(shards[0].missing_claims()[0])
 
 
-def shard_ranges(num_shards: int, parts: int) -> list[str]:
-    """Return nearly equal ranges A:B of shards, as many as there are parts, or shards if fewer."""
-    count = min(parts, num_shards)
-    bounds = [num_shards * part // count for part in range(count + 1)]
+def shard_ranges(num_shards: int, num_ranges: int) -> list[str]:
+    """Return `num_ranges` nearly equal ranges A:B of shards; fewer if there are fewer shards."""
+    count = min(num_ranges, num_shards)
+    bounds = [num_shards * index // count for index in range(count + 1)]
     return [f"{first}:{last}" for first, last in itertools.pairwise(bounds)]

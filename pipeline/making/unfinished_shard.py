@@ -1,7 +1,7 @@
-"""A shard in the making, shared by all who make it: which scenes are missing, claimed or staged.
+"""`UnfinishedShard`: the missing, claimed and staged scenes of a shard that several workers make.
 
 A finished scene waits in the staging folder until all scenes of its shard are there. A claim
-(storage.claims) says that somebody is at work on a scene, or packs the shard; it ends with
+(storage.claims) marks a scene that a worker is making, or a shard that it is packing; it ends with
 the process that holds it, so that nothing has to be cleaned up after a kill.
 """
 
@@ -33,13 +33,15 @@ class UnfinishedShard:
     def __init__(self, folder: DatasetFolder, splits: SplitSettings, shard_index: int) -> None:
         self.name = shard_name(shard_index, splits)
         self.split = split_of_shard(shard_index, splits)
-        self._folder, self._index, self._splits = folder, shard_index, splits
+        self._folder = folder
+        self._index = shard_index
+        self._splits = splits
         self._staged = folder.staged_shard(self.name)
         self._packing = self._staged / "pack.claim"
 
     @contextlib.contextmanager
     def claim(self, scene_index: int) -> Iterator[bool]:
-        """Say whether the scene is ours to make: it is missing, and nobody else is at it.
+        """Claim a scene; yield True if it is missing and no other worker has claimed it.
 
         Raises:
             TrilightError: the folder cannot be written.
@@ -48,7 +50,7 @@ class UnfinishedShard:
             yield False
             return
         with claimed(self._claim(scene_index)) as ours:
-            yield ours and not self._is_done(scene_index)  # somebody may have made it meanwhile
+            yield ours and not self._is_done(scene_index)  # finished meanwhile
 
     def stage(
         self,
@@ -60,23 +62,31 @@ class UnfinishedShard:
         began: float,
         cores: int,
     ) -> None:
-        """Keep a finished scene, or that it was given up, and log what it took; as `stage_scene`.
+        """Stage a finished or given-up scene as `stage_scene`, and log its cost.
 
-        Work on it `began` at that time, by `time.monotonic`, and kept so many `cores` busy.
+        Args:
+            scene_index: index of the scene.
+            sample: the finished scene; None if it was given up.
+            failures: rejections of the scene's attempts.
+            profile: how arrays and pictures are packed.
+            began: start of the work on it, by `time.monotonic`.
+            cores: number of cores that the work kept busy.
         """
         stage_scene(self._staged, scene_index, sample, failures, profile)
-        seconds, outcome = time.monotonic() - began, "made" if sample else "given up"
+        seconds = time.monotonic() - began
+        outcome = "made" if sample else "given up"
         log.info("%s: scene %09d %s in %.1f s", self.name, scene_index, outcome, seconds)
-        folder, count = self._folder, len(failures)
+        folder = self._folder
+        count = len(failures)
         if sample is None:
             count_given_up(folder, scene_index)
         log_scene(folder, self.name, scene_index, seconds=seconds, cores=cores, num_rejected=count)
 
     def pack(self) -> ShardEntry | None:
-        """Pack the shard if all its scenes are staged, unless somebody else does.
+        """Pack the shard if all its scenes are staged, unless another worker does.
 
         Returns:
-            The shard, where this call packed it.
+            The shard if this call packed it, else None.
         """
         scenes, grows = self._plan()
         if self._is_packed() or not all(is_staged(self._staged, index) for index in scenes):
@@ -85,7 +95,7 @@ class UnfinishedShard:
             if not stack.enter_context(claimed(self._packing)):
                 return None
             if grows or scenes != scenes_of_shard(self._index, self._splits):
-                stack.enter_context(self._folder.turn("manifest"))  # the plan stays for so long
+                stack.enter_context(self._folder.turn("manifest"))  # no plan changes meanwhile
             if self._is_packed() or self._plan() != (scenes, grows):
                 return None
             shard = pack_shard(self._folder, self.name, scenes, grows=grows)
@@ -93,18 +103,18 @@ class UnfinishedShard:
         return shard
 
     def is_free(self) -> bool:
-        """Return whether something of the shard is missing that nobody is at: a scene, or packing.
+        """Return True if a missing scene, or the packing, is claimed by no worker.
 
-        This look claims each missing scene for a moment. Whoever wants that scene just then leaves
-        it to us, so a caller that gets True must go and make it.
+        The check claims each missing scene for a moment. A worker that wants the scene just then
+        skips it, so a caller that gets True must make it.
         """
-        claims = self.wanted_claims()
-        if self._is_packed():  # looked at last: packing empties the staging folder
+        claims = self.missing_claims()
+        if self._is_packed():  # checked last: packing empties the staging folder
             return False
         return not all(map(is_claimed, claims))
 
-    def wanted_claims(self) -> list[Path]:
-        """Return the claims on what the shard lacks: its missing scenes, or else its packing."""
+    def missing_claims(self) -> list[Path]:
+        """Return the claim files of the missing scenes; without any, the one of the packing."""
         missing = [index for index in self._plan()[0] if not is_staged(self._staged, index)]
         return [*map(self._claim, missing)] or [self._packing]
 
@@ -119,7 +129,7 @@ class UnfinishedShard:
         return is_sent or (self._folder.shard(self.name).exists() and not self._plan()[1])
 
     def _plan(self) -> tuple[range, bool]:
-        """Return the scenes that are planned now, and whether a shard of fewer is to grow."""
+        """Return the planned scenes, and whether a shard with fewer scenes is to grow."""
         head = read_head(self._folder.manifest)
         scenes = scenes_of_shard(self._index, cut_splits(head.num_scenes, self._splits))
         return scenes, self.name in head.growing

@@ -1,4 +1,4 @@
-"""How far the views of a scene are, told by the child that renders them while it renders them."""
+"""`ViewProgress`: a render child writes the progress of a scene's views to the dataset's folder."""
 
 import time
 from collections.abc import Generator
@@ -8,30 +8,33 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import forget_views, tell_views
 
 _EVERY_S = 0.5
-"""Between two writings."""
+"""Seconds between two writes."""
 
 
 class ViewProgress:
-    """Tells of one scene; a dataset is the same whether anybody listens or not."""
+    """Reports the progress of one scene; never affects the output."""
 
     def __init__(self, folder: DatasetFolder | None, scene_index: int) -> None:
-        self._folder, self._scene_index = folder, scene_index
-        self._told = 0.0
+        self._folder = folder
+        self._scene_index = scene_index
+        self._written_s = 0.0
 
-    def view(self, view: int, steps: Generator[Sampling, None, RenderedView]) -> RenderedView:
-        """Render the view of this number, from 0; raises as the renderer does."""
+    def render_view(
+        self, view: int, steps: Generator[Sampling, None, RenderedView]
+    ) -> RenderedView:
+        """Render view number `view`, from 0, and report progress; raises as the renderer does."""
         while True:
             try:
                 now = next(steps)
             except StopIteration as end:
                 rendered: RenderedView = end.value
                 return rendered
-            if self._folder is not None and time.monotonic() - self._told >= _EVERY_S:
-                self._told = time.monotonic()
-                share = min(1.0, now.spp / now.expected_spp)
-                tell_views(self._folder, self._scene_index, view + share)
+            if self._folder is not None and time.monotonic() - self._written_s >= _EVERY_S:
+                self._written_s = time.monotonic()
+                fraction = min(1.0, now.spp / now.expected_spp)
+                tell_views(self._folder, self._scene_index, view + fraction)
 
     def end(self) -> None:
-        """Tell no more of the scene."""
+        """Delete the progress of the scene."""
         if self._folder is not None:
             forget_views(self._folder, self._scene_index)

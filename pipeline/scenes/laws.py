@@ -1,6 +1,6 @@
-"""Laws of a composed scene; one that breaks them is rejected, and its next attempt tried.
+"""Checks a composed scene; an invalid one is rejected, and its next attempt is tried.
 
-Cameras have been judged before, each by itself (`views`).
+Each camera has been checked before, by itself (`views`).
 """
 
 import numpy as np
@@ -11,17 +11,17 @@ from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
 
 
-def require_laws(scene: Scene, settings: SceneSettings, *, in_budget: bool = True) -> None:
-    """Raise Rejected where a scene breaks the laws of the record, of its budget, or of its lights.
+def require_valid(scene: Scene, settings: SceneSettings, *, in_budget: bool = True) -> None:
+    """Raise Rejected if a scene is invalid, over its budget, or has a light within an object.
 
     Args:
-        scene: any.
+        scene: the scene to check.
         settings: the limits.
-        in_budget: whether the number of triangles is limited too.
+        in_budget: True to limit the number of triangles too.
 
     Raises:
-        Rejected: "law_broken" with what `Scene.check` says, "over_budget", or "emitter_inside"
-            where an emitter reaches into the bounding box of an object.
+        Rejected: "law_broken" with the message of `Scene.check`, "over_budget", or
+            "emitter_inside" if an emitter reaches into the bounding box of an object.
     """
     try:
         scene.check()
@@ -32,8 +32,8 @@ def require_laws(scene: Scene, settings: SceneSettings, *, in_budget: bool = Tru
         named = ", ".join(sorted(uids)) or "none"
         raise Rejected("law_broken", f"{error} Its objects and maps are {named}.") from error
     if in_budget and scene.num_triangles > settings.max_triangles:
-        found = f"{scene.num_triangles} triangles; at most {settings.max_triangles} were allowed"
-        raise Rejected("over_budget", found)
+        message = f"{scene.num_triangles} triangles; at most {settings.max_triangles} were allowed"
+        raise Rejected("over_budget", message)
     _require_emitters_outside(scene, settings.lights.num_inside)
 
 

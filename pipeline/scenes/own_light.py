@@ -1,9 +1,9 @@
-"""Parts of objects that emit become lamps, as bright as a stated share of the drawn ones.
+"""Turns emitting components of objects into lamps, scaled to a fraction of the drawn lamps.
 
-Files state radiance in units of their own. All such parts of a scene are scaled by one number, so
-that together they give the stated share of the power of the drawn lamps; and by less where the
-brightest of them would outshine the brightest lamp. Like every emitter they reflect what lamps do,
-and the camera does not see them.
+Files state radiance in arbitrary units. All such components of a scene are scaled by one number, so
+that together they give the stated fraction of the power of the drawn lamps; by less if the
+brightest of them would outshine the brightest lamp. Like every emitter they have the reflectance of
+lamps, and the camera does not see them.
 """
 
 import dataclasses
@@ -17,17 +17,17 @@ from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, default_rows
 from storage.records.scene import SceneObject
 
 
-def with_own_light(
+def with_source_emission(
     objects: Sequence[ScenePiece], lamps: Sequence[ScenePiece], share: float
 ) -> tuple[list[ScenePiece], list[ScenePiece]]:
-    """Return objects without the parts that emit, and those parts as emitters.
+    """Return objects without their emitting triangles, and these as emitters.
 
-    An object all of which emits becomes an emitter in its place.
+    An object whose triangles all emit becomes an emitter in its place.
 
     Args:
-        objects: some with skins that say what their triangles emit.
-        lamps: the drawn ones.
-        share: of their power that the parts get together; without lamps they stay dark.
+        objects: pieces, some with skins that state the emission of their triangles.
+        lamps: the drawn lamps.
+        share: fraction of the lamps' power for all emitting triangles; 0 without lamps.
     """
     scale = _scale(objects, lamps, share)
     plain = [_without_emission(piece) for piece in objects]
@@ -53,10 +53,10 @@ def with_own_light(
 
 
 def _scale(objects: Sequence[ScenePiece], lamps: Sequence[ScenePiece], share: float) -> float:
-    """Return what stated radiance is multiplied by."""
-    own = [(_emission(piece).astype(np.float64), _areas(piece)) for piece in objects]
-    power = sum(float(areas @ emission.mean(axis=1)) for emission, areas in own)
-    brightest = max((float(emission.max(initial=0)) for emission, _ in own), default=0.0)
+    """Return the factor on the stated radiance."""
+    emissions = [(_emission(piece).astype(np.float64), _areas(piece)) for piece in objects]
+    power = sum(float(areas @ emission.mean(axis=1)) for emission, areas in emissions)
+    brightest = max((float(emission.max(initial=0)) for emission, _ in emissions), default=0.0)
     if not (share and lamps and power > 0):
         return 0.0
     lit = [
@@ -103,7 +103,7 @@ def _part(piece: ScenePiece, chosen: NDArray[np.bool_]) -> ScenePiece:
 
 
 def _emission(piece: ScenePiece) -> NDArray[np.float32]:
-    """Return what the triangles of an object are said to emit, [T, 3]."""
+    """Return the stated radiance of an object's triangles, [T, 3]."""
     stated = None if piece.skin is None else piece.skin.emission
     return np.zeros((len(piece.mesh.faces), 3), np.float32) if stated is None else stated
 

@@ -1,4 +1,4 @@
-"""Objects that keep their own materials: which ones, and their skins for a scene."""
+"""Selects the objects of a scene that keep the materials of their source, and makes their skins."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -23,18 +23,18 @@ def own_skins(
     scene_index: int,
     attempt: int,
 ) -> list[Skin | None]:
-    """Return the skin of each object, or None where its materials are drawn.
+    """Return the skin of each object, or None if its materials are drawn.
 
     Each object has a random stream of its own, so that skins change no other draw of the scene, and
-    another share changes no skin that is there still.
+    another `own_share` changes none of the skins that stay.
 
     Args:
         chosen: the objects of a scene.
-        levels: the level that each is shown by.
-        settings: whether objects keep their own materials, and how many.
-        seed: of the dataset.
-        scene_index: which scene.
-        attempt: how many times this scene was rejected before.
+        levels: the level of detail of each.
+        settings: source of the materials, and the fraction of objects that keep theirs.
+        seed: seed of the dataset.
+        scene_index: index of the scene.
+        attempt: number of earlier rejections of this scene.
 
     Raises:
         Rejected: law_broken, which names the object.
@@ -50,10 +50,10 @@ def own_skins(
 
 
 def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
-    """Return a skin whose textures have the rights of the object that they are of.
+    """Return a skin whose textures carry the rights of their object.
 
     Raises:
-        Rejected: law_broken where they are none: an object may have been prepared long ago.
+        Rejected: law_broken if the textures are invalid: an old version may have prepared them.
     """
     try:
         textures = skin.textures

@@ -1,8 +1,8 @@
-"""What a camera sees of a scene: ray casting on a coarse grid, without materials.
+"""`Visibility`: estimates what a camera sees, by ray casting on a coarse grid.
 
-A grid of 32 x 32 rays costs about a millisecond, and says whether a picture is worth rendering, not
-what is in it: what is smaller than a grid cell may be missed. Everything is computed in the single
-precision of storage.records.surfaces: which cameras a dataset has depends on each bit of it.
+A grid of 32 x 32 rays costs about a millisecond, and decides only if a picture is worth rendering:
+it may miss anything smaller than a grid cell. Everything is computed in the single precision of
+storage.records.surfaces: the cameras of a dataset depend on each bit of it.
 """
 
 from dataclasses import dataclass
@@ -15,30 +15,31 @@ from storage.records.scene import Scene
 from storage.records.surfaces import MISS, MetSurfaces, Surfaces
 
 SHADOW_OFFSET = 1e-4
-"""Where shadow rays start above a surface; hits in single precision are good to about 1e-6."""
+"""Height of a shadow ray's start above its surface; hits in single precision are exact to about
+1e-6."""
 
 LIT_STEP = 2
-"""Light is looked for at every second row and column of the grid: eight emitters ask for eight
-rays per hit."""
+"""Step of the rows and columns of the grid whose light is tested: eight emitters cost eight rays
+per hit."""
 
 
 SKY_RAYS = 8
-"""Directions by which light from all around is looked for: each stands for an eighth of it."""
+"""Number of directions that sample the light of a sky: each stands for an eighth of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewFacts:
-    """What one camera sees."""
+    """Measures of one camera's view."""
 
     coverage: float
-    """Share of the rays that meet an object first."""
+    """Fraction of the rays whose first hit is an object."""
     shell_back: float
-    """Share of the rays that meet a floor or wall first, from behind."""
+    """Fraction of the rays whose first hit is the back of a floor or wall."""
     lit: float
-    """Share of the hit points that the centre of an emitter lights on the side that is seen, or
-    one of SKY_RAYS directions of a sky."""
+    """Fraction of the hit points whose visible side is lit by the center of an emitter, or by one
+    of SKY_RAYS directions of a sky."""
     depth: float
-    """Distance to the nearest thing: what a ray meets, or the bounding box of an object."""
+    """Distance in meters to the nearest ray hit or bounding box of an object."""
 
 
 class Sight:
@@ -53,42 +54,46 @@ class Sight:
         self._boxes = _object_boxes(scene)
 
     def facts(self, c2w: NDArray[np.float32], fov_deg: float, grid: int) -> ViewFacts:
-        """Judge one camera, c2w [4, 4], by the rays of a picture of `grid` x `grid` pixels."""
+        """Measure one camera, c2w [4, 4], by the rays of a picture of `grid` x `grid` pixels."""
         origin, directions = camera_rays(c2w, fov_deg, grid)
         toward = directions.reshape(-1, 3).astype(np.float32)
         start = np.tile(origin.astype(np.float32), (len(toward), 1))
         hits = self._surfaces.met(start, toward)
-        met = hits.triangle != MISS
-        is_object = met & self._face_is_object[hits.triangle]
-        behind = met & (np.sum(hits.normal * toward, axis=1) > 0)
-        nearest = float(hits.distance_m[met].min(initial=np.inf))
+        is_hit = hits.triangle != MISS
+        is_object = is_hit & self._face_is_object[hits.triangle]
+        behind = is_hit & (np.sum(hits.normal * toward, axis=1) > 0)
+        nearest = float(hits.distance_m[is_hit].min(initial=np.inf))
         return ViewFacts(
             coverage=float(is_object.mean()),
             shell_back=float((behind & ~is_object).mean()),
-            lit=self._lit(start, toward, hits, met, grid),
+            lit=self._lit_fraction(start, toward, hits, is_hit, grid),
             depth=min(nearest, _distance_to_boxes(origin, self._boxes)),
         )
 
-    def _lit(
+    def _lit_fraction(
         self,
         start: NDArray[np.float32],
         toward: NDArray[np.float32],
         hits: MetSurfaces,
-        met: NDArray[np.bool_],
+        is_hit: NDArray[np.bool_],
         grid: int,
     ) -> float:
         row, column = np.divmod(np.arange(grid * grid), grid)
-        asked = np.flatnonzero(met & (row % LIT_STEP == 0) & (column % LIT_STEP == 0))
-        if len(asked) == 0:
+        sampled = np.flatnonzero(is_hit & (row % LIT_STEP == 0) & (column % LIT_STEP == 0))
+        if len(sampled) == 0:
             return 0.0
-        geometric = hits.normal[asked]
+        geometric = hits.normal[sampled]
         normal = geometric / np.sqrt(np.sum(np.square(geometric), axis=1, keepdims=True))
-        normal *= np.where(np.sum(normal * toward[asked], axis=1, keepdims=True) > 0, -1, 1)
-        point = start[asked] + hits.distance_m[asked, None] * toward[asked] + SHADOW_OFFSET * normal
+        normal *= np.where(np.sum(normal * toward[sampled], axis=1, keepdims=True) > 0, -1, 1)
+        point = (
+            start[sampled]
+            + hits.distance_m[sampled, None] * toward[sampled]
+            + SHADOW_OFFSET * normal
+        )
         ray = self._lights[None] - point[:, None]
         if len(self._sky):
-            away = np.broadcast_to(self._sky, (len(point), *self._sky.shape))
-            ray = np.concatenate([ray, away], axis=1)
+            sky_rays = np.broadcast_to(self._sky, (len(point), *self._sky.shape))
+            ray = np.concatenate([ray, sky_rays], axis=1)
         distance = np.sqrt(np.sum(np.square(ray), axis=-1))
         on_side = np.sum(ray * normal[:, None], axis=-1) > 0
         free = self._surfaces.is_free(
@@ -100,10 +105,10 @@ class Sight:
 
 
 def _sky_directions(scene: Scene) -> NDArray[np.float32]:
-    """Return directions [K, 3] towards the light of a sky, as far as nothing of a scene reaches.
+    """Return vectors [K, 3] towards the light of a sky, four times as long as the scene's extent.
 
-    Texels are gone through from the top, by the light that comes through each; there is one
-    direction in the middle of each eighth of it. A black sky has none.
+    Texels are accumulated from the top by their light; one direction lies in the middle of each
+    eighth of it. A black sky has none.
     """
     sky = scene.environment
     if sky is None or not sky.radiance_rgb.any():
@@ -121,7 +126,7 @@ def _sky_directions(scene: Scene) -> NDArray[np.float32]:
 
 
 def _object_boxes(scene: Scene) -> NDArray[np.float64]:
-    """Return the bounding boxes [K, 2, 3] of the objects proper."""
+    """Return the bounding boxes [K, 2, 3] of objects, without shell and emitters."""
     boxes = []
     for row, entry in enumerate(scene.objects):
         if entry.kind == "object":
@@ -131,6 +136,6 @@ def _object_boxes(scene: Scene) -> NDArray[np.float64]:
 
 
 def _distance_to_boxes(point: NDArray[np.float64], boxes: NDArray[np.float64]) -> float:
-    """Return the distance to the nearest box; 0 inside of one, infinite where there is none."""
+    """Return the distance to the nearest box; 0 inside of one, infinite without boxes."""
     outside = np.maximum(np.maximum(boxes[:, 0] - point, point - boxes[:, 1]), 0)
     return float(np.sqrt(np.sum(np.square(outside), axis=1)).min(initial=np.inf))

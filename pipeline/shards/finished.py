@@ -1,4 +1,4 @@
-"""Finished datasets as sources of others: checked by digest, then read scene by scene."""
+"""Reads finished datasets as sources of others: checks digests, then reads scene by scene."""
 
 import contextlib
 import json
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from pipeline.shards.scene_values import asked_values
+from pipeline.shards.scene_values import condition_values
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, index_shard, read_manifest
 from storage.dataset.planned import is_whole, num_planned
@@ -23,48 +23,48 @@ from storage.remote.safe_url import safe_url
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FinishedDataset:
-    """A dataset that is whole."""
+    """A dataset whose shards are all finished."""
 
-    folder: DatasetFolder  # its folder
-    manifest: Manifest  # what it says of itself
+    folder: DatasetFolder
+    manifest: Manifest
     objects: Mapping[str, list[LockedObject]]
-    """Its locked objects by uid; a merged dataset may know several under one."""
+    """Locked objects by uid; a merged dataset may have several under one uid."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFacts:
-    """What decides whether a scene is taken, and where it goes."""
+    """Facts that decide whether a scene is selected, and into which shard it goes."""
 
-    shard: ShardEntry  # the shard that it is in
-    key: str  # its key there
+    shard: ShardEntry  # the shard that holds it
+    key: str  # its key in that shard
     template: str  # layout of the scene
     noise_floor_db: float  # noise floor of its worst view, as psnr_log_db
-    uids: tuple[str, ...]  # objects that stand in it, and a user's own textures and map
+    uids: tuple[str, ...]  # its objects, and the user's textures and map in it
     arrays_sha256: str  # digest of its unpacked arrays: equal for equal scenes
-    values: Mapping[str, Any]  # what was asked of it, by name (pipeline.shards.expression)
+    values: Mapping[str, Any]  # requested values by name (pipeline.shards.expression)
 
 
-def open_finished(place: str) -> FinishedDataset:
-    """Open a dataset of this machine.
+def open_finished(path: str) -> FinishedDataset:
+    """Open a finished dataset on this machine.
 
     Raises:
-        TrilightError: a URL, no readable manifest, shards still to make, or a lock that is not the
-            manifest's.
+        TrilightError: the path is a URL, the manifest is unreadable, shards are missing, or the
+            lock is not the manifest's.
     """
-    if "://" in place:
-        raise TrilightError(f"{safe_url(place)}: expected the folder of a dataset on this machine.")
-    folder = DatasetFolder(Path(place))
+    if "://" in path:
+        raise TrilightError(f"{safe_url(path)}: expected the folder of a dataset on this machine.")
+    folder = DatasetFolder(Path(path))
     manifest = read_manifest(folder.manifest)
     if not is_whole(manifest, len(manifest.shards)):
         done = {entry.name for entry in manifest.shards}.difference(manifest.growing)
         raise TrilightError(
-            f"{place}: {len(done)} of {num_planned(manifest)} shards are there; expected a "
+            f"{path}: {len(done)} of {num_planned(manifest)} shards are there; expected a "
             "finished dataset. Run the same `trilight generate` again to finish it."
         )
     lock = folder.objects_lock
     if not lock.exists() or sha256_of_file(lock) != manifest.objects_lock_sha256:
         raise TrilightError(
-            f"{place}: {lock.name} is missing or not the one of the manifest (sha256 differs); run "
+            f"{path}: {lock.name} is missing or not the one of the manifest (sha256 differs); run "
             "`trilight verify`."
         )
     objects: dict[str, list[LockedObject]] = {}
@@ -74,12 +74,12 @@ def open_finished(place: str) -> FinishedDataset:
 
 
 def read_facts(
-    dataset: FinishedDataset, *, asked: Collection[str], shard_done: Callable[[], None]
+    dataset: FinishedDataset, *, names: Collection[str], shard_done: Callable[[], None]
 ) -> Iterator[SceneFacts]:
-    """Yield the facts of every scene, with the values that are asked for by name.
+    """Yield the facts of every scene, with the values of some names.
 
-    The digest of a shard is checked before. Memory is that of one scene. Pictures are hashed with
-    the shard and not decoded.
+    The digest of each shard is checked first. Memory holds one scene at a time. Pictures are hashed
+    with the shard and not decoded.
 
     Raises:
         TrilightError: a shard is missing or its bytes are not those of the manifest, or the record
@@ -89,22 +89,22 @@ def read_facts(
         require_whole(dataset, shard)
         with contextlib.closing(SampleReader(dataset)) as reader:
             for key in reader.keys(shard):
-                yield _facts(shard, key, reader.members(shard, key, ("json", PLAIN, PACKED)), asked)
+                yield _facts(shard, key, reader.members(shard, key, ("json", PLAIN, PACKED)), names)
         shard_done()
 
 
 def require_whole(dataset: FinishedDataset, shard: ShardEntry) -> None:
-    """Raise TrilightError where a shard is missing or its bytes are not those of the manifest."""
+    """Raise TrilightError if a shard is missing or its digest is not the manifest's."""
     path = dataset.folder.shard(shard.name)
     if not path.exists() or index_shard(path) != shard:
         raise TrilightError(
             f"{path}: missing, or its bytes are not those of the manifest (sha256 differs); "
-            "run `trilight verify`, then make the shard anew."
+            "run `trilight verify`, then make the shard again."
         )
 
 
 class SampleReader:
-    """Reads members of samples by key; the shard that it read last stays open. To be closed."""
+    """Reads members of samples by key; keeps the last shard open until `close`."""
 
     def __init__(self, dataset: FinishedDataset) -> None:
         self._folder = dataset.folder
@@ -113,16 +113,16 @@ class SampleReader:
         self._stream: BinaryIO | None = None
 
     def keys(self, shard: ShardEntry) -> list[str]:
-        """Return the keys of a shard's samples in the order of the file; the shard was checked."""
+        """Return the keys of a checked shard's samples, in the order of the file."""
         self._open(shard)
         return list(self._contents.samples)
 
     def members(
         self, shard: ShardEntry, key: str, suffixes: tuple[str, ...] | None = None
     ) -> dict[str, bytes]:
-        """Return members of a sample by suffix, all of them by default; the shard was checked.
+        """Return members of a sample of a checked shard by suffix; by default all of them.
 
-        With its record come the maps that this names.
+        With the record come the maps that it names.
         """
         stream = self._open(shard)
         return self._contents.read(stream, key, lambda name: suffixes is None or name in suffixes)
@@ -131,7 +131,8 @@ class SampleReader:
         if shard is not self._shard or self._stream is None:
             self.close()
             self._stream = open_plain(self._folder.shard(shard.name))
-            self._shard, self._contents = shard, contents_of(self._stream, shard.name)
+            self._shard = shard
+            self._contents = contents_of(self._stream, shard.name)
         return self._stream
 
     def close(self) -> None:
@@ -140,9 +141,9 @@ class SampleReader:
 
 
 def _facts(
-    shard: ShardEntry, key: str, members: Mapping[str, bytes], asked: Collection[str]
+    shard: ShardEntry, key: str, members: Mapping[str, bytes], names: Collection[str]
 ) -> SceneFacts:
-    values = asked_values(decode_scene(key, members), shard.split, asked) if asked else {}
+    values = condition_values(decode_scene(key, members), shard.split, names) if names else {}
     try:
         record = json.loads(members["json"])
         return SceneFacts(

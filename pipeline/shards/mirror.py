@@ -1,17 +1,15 @@
-"""A dataset in a bucket that several machines make: each has a local folder of its own.
+"""`Mirror`: synchronizes a machine's local folder with a dataset in a bucket.
 
-The bucket holds what a folder would hold. The manifest is begun once, the objects are frozen once,
-and each shard is put there once: the server refuses a second writer, who takes what is there.
-Below `.staging` stands for each shard a note with its manifest entry and the rejections of its
-scenes. A shard is finished when it and its note are there, or the manifest lists it. The list in
-the manifest follows from the notes, so whoever finds all shards there may write it.
+The bucket has the same files as a folder. Manifest, lock and shards are each created once: the
+server refuses a second writer, which then reads the existing file. Below `.staging` is a note for
+each shard with its manifest entry and rejections. A shard is finished when it and its note are in
+the bucket, or the manifest lists it. The notes decide that list, so any machine may write it.
 
-A folder here has the manifest without that list; what it notes as sent is what its makers have
-looked at: the parts of the dataset that they were asked for.
+The local folder has the manifest without the list; its marks of uploaded shards cover the parts of
+the dataset that its workers have requested.
 
-Machines claim batches of objects through the bucket (storage.remote.claims). Claims on scenes do
-not reach from one machine to another: two machines with the same shards make scenes twice, and the
-first writer of a shard wins. That is wasted work, never wrong.
+Machines claim batches of objects through the bucket (storage.remote.claims), but not scenes: two
+machines with the same shards make scenes twice, and the first writer wins, without a wrong result.
 """
 
 import contextlib
@@ -57,14 +55,15 @@ from storage.remote.url import RemoteUrl, parse_url
 
 _PLANNED = ".staging/planned/"
 """Folder with one file for each requested number of scenes; the largest counts."""
-_LISTING, _LISTED = ".staging/listing/", ".staging/listed/"
-"""Folders with a file for each number of scenes whose shards somebody lists, or has listed."""
+_LISTING = ".staging/listing/"
+_LISTED = ".staging/listed/"
+"""Folder with one file for each number of scenes whose shards have been listed."""
 _HEAD_BYTES = 1 << 18
-"""What is read of a manifest to know its head, which takes about 6 kB."""
+"""Bytes of a manifest that are read to get its head, which takes about 6 kB."""
 
 
 class Mirror:
-    """Exchange between a machine's folder and the bucket."""
+    """Exchanges files between a machine's folder and the bucket."""
 
     def __init__(self, folder: DatasetFolder) -> None:
         url = parse_url(folder.bucket, what="out")
@@ -81,48 +80,51 @@ class Mirror:
         return self._bucket.names()
 
     def is_begun(self) -> bool:
-        """Return whether there is a manifest."""
+        """Return True if the bucket has a manifest."""
         return self._head() is not None
 
     def dataset(self, manifest: Manifest) -> Dataset:
-        """Return the dataset of a manifest, to be read from the bucket."""
+        """Return a reader of the bucket's dataset by a manifest."""
         return Dataset(self._files, manifest)
 
     def adopt(self) -> None:
-        """Bring the folder's published files in line with the bucket.
+        """Synchronize the folder with the bucket; call while no other process uses it.
 
-        Scenes that wait for their shard stay where they are of the same dataset; where the folder
-        is of another one, or the bucket is empty, they go. Call while no other process holds it.
+        Staged scenes stay only if the bucket holds the same dataset.
 
         Raises:
             TrilightError: the bucket cannot be read.
         """
-        folder, theirs, own = self._folder, self._head(), self._own_head()
-        if not (theirs and own and own.identity == theirs.identity):
-            own = None
+        folder = self._folder
+        theirs = self._head()
+        own_head = self._own_head()
+        if not (theirs and own_head and own_head.identity == theirs.identity):
+            own_head = None
             folder.clear()
         shutil.rmtree(folder.staged_sent, ignore_errors=True)  # `look_at` looks again
         if theirs is None:
             return
         self.plan(theirs.num_scenes)
-        if own:  # as the shards here were packed
-            theirs = dataclasses.replace(theirs, num_scenes=own.num_scenes, growing=own.growing)
-        self._take_lock(theirs.objects_lock_sha256)
+        if own_head:  # as the shards here were packed
+            theirs = dataclasses.replace(
+                theirs, num_scenes=own_head.num_scenes, growing=own_head.growing
+            )
+        self._fetch_lock(theirs.objects_lock_sha256)
         if not theirs.objects_lock_sha256:
-            self._take_failures()
+            self._merge_failures()
         write_manifest(folder.manifest, theirs)
 
-    def take_finished(self) -> None:
-        """Bring the finished manifest of the bucket here, and the lock that it names."""
+    def fetch_finished(self) -> None:
+        """Download the finished manifest of the bucket, and the lock that it names."""
         theirs = self._manifest()
         with self._folder.turn("manifest"):
-            self._take_failures()
-            self._take_lock(theirs.objects_lock_sha256)
+            self._merge_failures()
+            self._fetch_lock(theirs.objects_lock_sha256)
             write_manifest(self._folder.manifest, theirs)
 
-    def _take_lock(self, sha256: str) -> None:
-        """Bring the frozen objects here, and their index, unless they are here."""
-        lock, index = self._folder.objects_lock, self._folder.staged_index
+    def _fetch_lock(self, sha256: str) -> None:
+        lock = self._folder.objects_lock
+        index = self._folder.staged_index
         if not sha256 or (lock.exists() and sha256_of_file(lock) == sha256):
             return
         for path in (lock, index):
@@ -130,17 +132,17 @@ class Mirror:
                 write_atomically(path, data)
 
     def begin(self) -> bool:
-        """Create the bucket's manifest from the folder's; return whether ours came first."""
+        """Create the bucket's manifest from the folder's; return False if another came first."""
         return self._bucket.create("manifest.json", self._folder.manifest)
 
     def plan(self, num_scenes: int) -> None:
-        """Tell all workers how many scenes the dataset is to have."""
+        """Publish a requested number of scenes to all workers."""
         self._bucket.write(f"{_PLANNED}{num_scenes:012d}", b"\n")
 
     def freeze(self, lock: bytes) -> None:
-        """Put the frozen objects into the bucket, after what was rejected for them.
+        """Upload the frozen objects, after the rejections that led to them.
 
-        What others have rejected in the meantime stays.
+        Rejections of other workers stay.
 
         Raises:
             TrilightError: another worker has frozen other objects in the meantime.
@@ -149,7 +151,7 @@ class Mirror:
         theirs = self._files.read(name)
         if theirs in (None, lock):
             with self._folder.turn("manifest"):
-                self._take_failures()
+                self._merge_failures()
                 self._bucket.write("failures.jsonl", self._folder.failures)
         if theirs is None and not self._bucket.create(name, lock):
             theirs = self._files.read(name)
@@ -159,151 +161,154 @@ class Mirror:
                 "expected the same --objects everywhere. Give that, or choose another --out."
             )
 
-    def take_lock(self) -> str:
-        """Bring the frozen objects here where somebody has frozen them; return their digest."""
+    def fetch_lock(self) -> str:
+        """Download the frozen objects if another worker has frozen them; return their digest."""
         head = self._head()
         sha256 = head.objects_lock_sha256 if head else ""
-        self._take_lock(sha256)
+        self._fetch_lock(sha256)
         return sha256
 
     def has(self, path: Path) -> bool:
-        """Return whether a file of the folder is in the bucket."""
+        """Return True if a file of the folder is in the bucket."""
         return self._bucket.read_start(self._name(path), 1) is not None
 
     @contextlib.contextmanager
     def claim(self, path: Path) -> Iterator[bool]:
-        """Bring a file here that is in the bucket; hold the claim on one that is not.
+        """Download a file of the bucket; hold the claim on it if it does not exist.
 
-        Its holder sends the file before the claim ends. Only one process of a machine may ask for
-        the same file at a time.
+        The holder uploads the file. Only one process of a machine may claim a file at a time.
         """
-        self._take(path)
+        self._fetch(path)
         if path.exists():
             yield True
             return
         with self._claims.claimed(self._name(path)) as ours:
             if ours:
-                self._take(path)  # its last holder may have sent it
+                self._fetch(path)  # its last holder may have uploaded it
             yield ours
 
-    def _take(self, path: Path) -> None:
+    def _fetch(self, path: Path) -> None:
         if not path.exists() and (data := self._files.read(self._name(path))) is not None:
             write_atomically(path, data)
 
     def plans(self) -> set[int]:
-        """Return how many scenes somebody has planned, each number that was asked for."""
+        """Return all numbers of scenes that any run has planned."""
         names = (name.removeprefix(_PLANNED) for name in self._bucket.names_in(_PLANNED))
         return {int(text) for text in names if text.isdecimal()}
 
-    def look_at(self, part: int, ends: Mapping[str, range]) -> None:
-        """Note which shards of a part of the dataset are finished in the bucket.
+    def scan_part(self, part: int, ends: Mapping[str, range]) -> None:
+        """Mark the shards of a part of the dataset that are finished in the bucket.
 
-        Scenes of one that holds fewer than are planned, which `ends` names, are staged here.
+        `ends` names shards with fewer scenes than planned; their scenes are staged here.
         """
         place = place_of_part(part)
         notes = self._bucket.names_in(f"{self._name(self._folder.staged_entries)}/{place}")
         for name in filter(SHARD_NAME.fullmatch, self._bucket.names_in(place)):
             noted = self._name(note_of(self._folder, name)) in notes
-            if self._folder.is_sent(name) or not (noted or name in self._listed()):
+            if self._folder.is_sent(name) or not (noted or name in self._manifest_names()):
                 continue
             if scenes := ends.get(name):
-                note = self._noted(name) or self._note_of_list(name)
+                note = self._read_note(name) or self._note_of_list(name)
                 if (note.scenes or MOST_SCENES) < len(scenes):
                     self._unpack(note, scenes[: note.scenes])
                     continue
-                note_shard(self._folder, note)  # another machine may have let it grow
+                note_shard(self._folder, note)  # another machine may have grown it
                 if name in read_head(self._folder.manifest).growing:
                     self._folder.shard(name).unlink(missing_ok=True)
-            self._mark(name)
+            self._mark_sent(name)
 
     def _unpack(self, note: ShardNote, scenes: range) -> None:
-        """Stage the scenes of a shard of the bucket here, if its bytes are the noted ones."""
+        """Stage the scenes of a shard of the bucket here, if its digest is the one of the note."""
         with contextlib.suppress(TrilightError):  # else its scenes are made again
             if note.shard.name not in self._unpacked:
                 with self._files.open(note.shard, checked=True) as tar:
                     unpack_shard(self._folder, note, scenes, tar)
         self._unpacked.add(note.shard.name)
 
-    def _listed(self) -> set[str]:
-        """Return the shards that the manifest lists: those of a set that grows, or was copied."""
+    def _manifest_names(self) -> set[str]:
+        """Return the shards that the bucket's manifest lists: of a grown or copied dataset."""
         if self._names_listed is None:
             self._names_listed = {shard.name for shard in self._manifest().shards}
         return self._names_listed
 
-    def take_listed(self, head: Manifest) -> None:
-        """Bring what the bucket lists already into the folder's manifest, whose head that is."""
-        self._take_failures()
+    def fetch_listed(self, head: Manifest) -> None:
+        """Write the folder's manifest from a head and the shards that the bucket's one lists."""
+        self._merge_failures()
         listed = dataclasses.replace(head, shards=self._manifest().shards)
         write_manifest(self._folder.manifest, listed)
 
     def is_first_to_list(self, num_scenes: int) -> bool:
-        """Return whether nobody else has begun to list the shards of so many scenes."""
+        """Return True if no other machine has begun to list the shards of so many scenes."""
         return self._bucket.create(f"{_LISTING}{num_scenes:012d}", b"\n")
 
-    def say_listed(self, num_scenes: int) -> None:
-        """Say that the manifest lists the shards of so many scenes."""
+    def mark_listed(self, num_scenes: int) -> None:
+        """Record that the manifest lists the shards of so many scenes."""
         self._bucket.write(f"{_LISTED}{num_scenes:012d}", b"\n")
 
     def is_listed(self, num_scenes: int) -> bool:
-        """Return whether the manifest lists the shards of so many scenes, as somebody said."""
+        """Return True if a machine has recorded that the shards of so many scenes are listed."""
         return self._bucket.read_start(f"{_LISTED}{num_scenes:012d}", 1) is not None
 
     def notes(self, names: Sequence[str]) -> list[ShardNote]:
-        """Return the notes on finished shards: from here, or else from the bucket."""
+        """Return the notes on finished shards: from the folder, or else from the bucket."""
         folder = self._folder
-        here = {name for name in names if note_of(folder, name).exists()}
-        there = (self._name(note_of(folder, name)) for name in names if name not in here)
-        own = [noted_shard(folder, name) for name in names if name in here]
-        return own + fetched_notes(self._files.read, there, folder.shown)
+        local_names = {name for name in names if note_of(folder, name).exists()}
+        remote_names = (
+            self._name(note_of(folder, name)) for name in names if name not in local_names
+        )
+        local_notes = [noted_shard(folder, name) for name in names if name in local_names]
+        return local_notes + fetched_notes(self._files.read, remote_names, folder.shown)
 
-    def send(self, name: str) -> ShardNote | None:
-        """Bring a shard of the folder into the bucket; the cache keeps its bytes.
+    def upload_shard(self, name: str) -> ShardNote | None:
+        """Upload a shard of the folder; the cache keeps its bytes.
 
         Returns:
-            The note on the shard that is in the bucket then, ours or that of the first writer;
-            None where another maker sends it or has sent it, or it grows.
+            The note in the bucket; None if another worker uploads or uploaded it, or it grows.
         """
-        folder, path = self._folder, self._folder.shard(name)
+        folder = self._folder
+        path = self._folder.shard(name)
         with claimed(folder.staging / "sending" / f"{name}.claim") as ours:
-            own = read_head(folder.manifest)
-            if not ours or not path.exists() or name in own.growing:
+            head = read_head(folder.manifest)
+            if not ours or not path.exists() or name in head.growing:
                 return None
             made = noted_shard(folder, name)
-            made = dataclasses.replace(made, scenes=planned_scenes_of(own, made.shard))
-            note = made if folder.is_sent(name) else self._put(made)
+            made = dataclasses.replace(made, scenes=planned_scenes_of(head, made.shard))
+            note = made if folder.is_sent(name) else self._upload(made)
             if note is None:
                 return None
-            self._mark(name)
+            self._mark_sent(name)
             if note.shard == made.shard:
                 shard_cache().keep(path, self._files.url.child(name), made.shard.sha256)
             path.unlink(missing_ok=True)
         return note
 
-    def _put(self, made: ShardNote) -> ShardNote | None:
-        """Put a shard and what stands beside it into the bucket; return the note that is there.
+    def _upload(self, made: ShardNote) -> ShardNote | None:
+        """Upload a shard with its log and note; return the note that is in the bucket then.
 
-        A worker that was not first takes over the first writer's note. Where that is missing, the
-        first writer was killed, and ours says what was rejected instead. A shard of more scenes
-        takes the place of one that could grow; None where another machine is at that.
+        A worker that was not first adopts the first writer's note; if that writer was killed before
+        it wrote one, this worker's rejections are stored. A shard with more scenes replaces a
+        smaller one; None if another machine is replacing it.
         """
-        name, here = made.shard.name, self._folder
-        log, note = here.root / log_name(name), self._name(note_of(here, name))
-        first = self._bucket.create(name, here.shard(name))
-        theirs = None if first else self._noted(name)
+        name = made.shard.name
+        folder = self._folder
+        log = folder.root / log_name(name)
+        note = self._name(note_of(folder, name))
+        first = self._bucket.create(name, folder.shard(name))
+        theirs = None if first else self._read_note(name)
         if not first and theirs is None:
-            theirs = dataclasses.replace(made, shard=self._indexed(name))
+            theirs = dataclasses.replace(made, shard=self._index_remote(name))
             if theirs.shard.num_samples < made.shard.num_samples:
                 theirs = dataclasses.replace(theirs, scenes=0)
             elif not self._bucket.create(note, encode_note(theirs)):
-                theirs = self._noted(name)
+                theirs = self._read_note(name)
         if theirs and (theirs.scenes is None or theirs.scenes >= (made.scenes or MOST_SCENES)):
-            note_shard(here, theirs)
+            note_shard(folder, theirs)
             return theirs
         with self._claims.claimed(note) if theirs else contextlib.nullcontext(True) as ours:
-            if theirs and not (ours and self._noted(name) in (theirs, None)):
+            if theirs and not (ours and self._read_note(name) in (theirs, None)):
                 return None
             if theirs:
-                self._bucket.write(name, here.shard(name))
+                self._bucket.write(name, folder.shard(name))
                 self._list_again(made.shard)
             if log.exists():
                 self._bucket.write(self._name(log), log)
@@ -311,44 +316,42 @@ class Mirror:
         return made
 
     def _list_again(self, shard: ShardEntry) -> None:
-        """Have the bucket's manifest list a shard as it is now, where that was listed."""
+        """Update the entry of a shard in the bucket's manifest, if it is listed there."""
         theirs = self._manifest()
         if theirs.with_grown(shard) != theirs:
             path = self._folder.staging / "relisted.json"
             write_manifest(path, theirs.with_grown(shard))
             self._bucket.write("manifest.json", path)
 
-    def _noted(self, name: str) -> ShardNote | None:
-        """Return the note on a shard that is in the bucket, if there is one."""
+    def _read_note(self, name: str) -> ShardNote | None:
         data = self._files.read(note := self._name(note_of(self._folder, name)))
         if data is None:
             return None
         return fetched_notes(lambda _: data, [note], self._folder.shown)[0]
 
     def _note_of_list(self, name: str) -> ShardNote:
-        """Return what the manifest says of a shard without a note, as in a set that was copied."""
+        """Return a note made of the manifest's entry of a shard, as in a copied dataset."""
         theirs = self._manifest()
         shard = {entry.name: entry for entry in theirs.shards}[name]
         return ShardNote(shard=shard, failures=(), scenes=planned_scenes_of(theirs, shard))
 
-    def _indexed(self, name: str) -> ShardEntry:
-        """Return the entry of a shard of the bucket by reading it."""
+    def _index_remote(self, name: str) -> ShardEntry:
         url = self._files.url.child(name)
         with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
             return index_stream(stream, Path(name).name)
 
-    def send_file(self, path: Path) -> None:
-        """Put a file of the folder into the bucket, in place of one that is there."""
+    def upload_file(self, path: Path) -> None:
+        """Upload a file of the folder, replacing an existing one."""
         self._bucket.write(self._name(path), path)
 
-    def send_manifest(self) -> None:
-        """Put the folder's manifest and rejections into the bucket, in place of those there."""
+    def upload_manifest(self) -> None:
+        """Upload the folder's manifest and rejections, replacing the existing ones."""
         with self._folder.turn("manifest"):
             self._bucket.write("failures.jsonl", self._folder.failures)
             self._bucket.write("manifest.json", self._folder.manifest)
 
-    def send_documents(self) -> None:
-        """Put the documents for people and hubs into the bucket, the card last."""
+    def upload_documents(self) -> None:
+        """Upload the documents, the card last."""
         folder = self._folder
         documents = [
             *(folder.attribution, folder.licences, folder.contact_sheet, folder.report),
@@ -359,14 +362,14 @@ class Mirror:
             self._bucket.write(self._name(path), path)
 
     def _head(self) -> Manifest | None:
-        """Return the bucket's manifest without its list, with the digest of the objects there."""
+        """Return the bucket's manifest without its shards, with the digest of the bucket's lock."""
         place = f"{self._folder.shown}/manifest.json"
         start = self._bucket.read_start("manifest.json", _HEAD_BYTES)
         if start is None:
             return None
         try:
             head = decode_head(io.BytesIO(start), place)
-        except TrilightError:  # a longer head; or it is none, which reading it all says
+        except TrilightError:  # the head is longer, or malformed: read it all
             head = self._manifest()
         if head.objects_lock_sha256:
             return head
@@ -376,8 +379,7 @@ class Mirror:
     def _manifest(self) -> Manifest:
         return read_beside(self._files, decode_manifest)
 
-    def _take_failures(self) -> None:
-        """Merge the bucket's rejections into the folder's."""
+    def _merge_failures(self) -> None:
         theirs = decode_failures(self._files.read("failures.jsonl") or b"")
         known = read_failures(self._folder.failures)
         write_failures(self._folder.failures, [*known, *theirs])
@@ -388,8 +390,7 @@ class Mirror:
         except TrilightError:
             return None
 
-    def _mark(self, name: str) -> None:
-        """Note that a shard is in the bucket; what is lost of that is looked at again."""
+    def _mark_sent(self, name: str) -> None:
         path = self._folder.staged_sent / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.executors.array_job import MOST_TASKS, ArrayJob, array_job
+from pipeline.executors.array_job import MAX_TASKS, ArrayJob, array_job
 from pipeline.executors.registry import EXECUTORS, find_executor
 from pipeline.executors.slurm import shards_of_task
 from pipeline.executors.slurm_array import sbatch_environment, sbatch_words
@@ -129,7 +129,7 @@ def test_an_array_fits_the_cluster_and_covers_every_shard(cluster: Path) -> None
     order = DatasetOrder(build="pretrain-256", scenes=2_000_000)
     job = array_job(order, per_task=None, at_once=None)
     shards = -(-2_000_000 // 256)
-    assert len(job.tasks) <= MOST_TASKS
+    assert len(job.tasks) <= MAX_TASKS
     assert job.per_task * len(job.tasks) >= shards > job.per_task * (len(job.tasks) - 1)
     with pytest.raises(TrilightError, match="shards-per-task is 1: .* task 7812; .* 8 shards"):
         array_job(order, per_task=1, at_once=None)

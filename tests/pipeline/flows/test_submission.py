@@ -23,7 +23,7 @@ from prefect.states import Completed, Failed, Running, Scheduled, State
 
 from pipeline.flows import guarded_server
 from pipeline.flows.dataset_flows import generate_scenes
-from pipeline.flows.guarded_server import Door
+from pipeline.flows.guarded_server import RequestGuard
 from pipeline.flows.prefect_server import (
     name_prefect_failures,
     prefect_server,
@@ -140,7 +140,7 @@ def test_no_server_a_closed_port_and_a_password() -> None:
         with pytest.raises(TrilightError, match="no Prefect server is set.*make serve"), server():
             pass
     request = httpx.Request("POST", "http://127.0.0.1:9/api")
-    with pytest.raises(TrilightError, match="it wants a password.*PREFECT_API_AUTH_STRING"):
+    with pytest.raises(TrilightError, match="it requires a password.*PREFECT_API_AUTH_STRING"):
         with name_prefect_failures():
             httpx.Response(401, request=request).raise_for_status()
 
@@ -153,7 +153,7 @@ def test_what_is_no_prefect_is_said_in_one_sentence_by_every_runner(
     with serve() as site:
         site.put("api/admin/version", "<html>")
         cases = {
-            "http://127.0.0.1:9/api": "^Prefect at .*: Connection refused. Run make serve, or mend",
+            "http://127.0.0.1:9/api": "^Prefect at .*: Connection refused. Run make serve, or fix",
             "garbage": "^Prefect at garbage: .* missing an 'http://'",
             f"{site.url}/api": "is no API of Prefect; expected one, such as",
             f"{site.url}/x": "it answers 404",
@@ -189,7 +189,7 @@ def _answer(kind: str = "http", **headers: str) -> list[MutableMapping[str, Any]
 
     raw = [(name.encode(), value.encode()) for name, value in headers.items()]
     scope = {"type": kind, "headers": raw, "path": "/api/deployments/filter"}
-    asyncio.run(Door(_application, ["server", "My-Host"])(scope, receive, send))
+    asyncio.run(RequestGuard(_application, ["server", "My-Host"])(scope, receive, send))
     return sent
 
 
@@ -246,7 +246,7 @@ def test_half_requests_are_closed_and_slow_answers_are_not(monkeypatch: pytest.M
         await asyncio.sleep(1.2)
         await _application(scope, receive, send)
 
-    http = guarded_server.impatient_protocol()
+    http = guarded_server.request_timeout_protocol()
     config = uvicorn.Config(answer_slowly, port=0, http=http, lifespan="off", log_level="error")
     served = uvicorn.Server(config)
     thread = threading.Thread(target=served.run, daemon=True)

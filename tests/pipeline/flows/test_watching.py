@@ -14,14 +14,14 @@ import pytest
 from PIL import Image
 
 from pipeline.executors.array_job import ArrayJob, DatasetByArray
-from pipeline.executors.kubernetes_array import KubernetesOptions, options_here
+from pipeline.executors.kubernetes_array import KubernetesOptions, options_from_environment
 from pipeline.executors.registry import find_executor
 from pipeline.flows import array_flow, watching
 from pipeline.flows.array_flow import make_by_array
 from pipeline.flows.prefect_runner import PrefectRunner
-from pipeline.flows.watching import Watched, report_url, small_picture, usd_per_core_hour
+from pipeline.flows.watching import RunArtifacts, report_url, small_picture, usd_per_core_hour
 from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.publication import Done
+from pipeline.making.publication import DatasetProgress
 from pipeline.making.run import TaskOutcome
 from storage.errors import TrilightError
 from tests.for_each import for_each
@@ -88,9 +88,9 @@ def test_a_page_that_cannot_be_shown_does_not_end_the_run(
     tables: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     _cannot_show(watching, monkeypatch)
-    watched = Watched(DatasetOrder(out=str(tmp_path)))
-    watched.task_done(None, _task(1, 1.0))  # type: ignore[arg-type]
-    watched.failed(ValueError("x"))
+    watched = RunArtifacts(DatasetOrder(out=str(tmp_path)))
+    watched.record_task(None, _task(1, 1.0))  # type: ignore[arg-type]
+    watched.show_failure(ValueError("x"))
     assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
@@ -100,10 +100,10 @@ def test_the_rate_begins_with_the_first_scene(
     """An hour of preparing objects, then 4 scenes in 20 s."""
     now = 0.0
     monkeypatch.setattr(watching.time, "monotonic", lambda: now)
-    watched = Watched(DatasetOrder(out=str(tmp_path)))
+    watched = RunArtifacts(DatasetOrder(out=str(tmp_path)))
     assert watched.scenes_per_s() == 0
     now = 3620.0
-    watched.task_done(None, _task(4, 20.0))  # type: ignore[arg-type]
+    watched.record_task(None, _task(4, 20.0))  # type: ignore[arg-type]
     assert watched.scenes_per_s() == 4 / 20
 
 
@@ -122,7 +122,7 @@ def test_a_page_shows_the_scenes_and_where_their_report_is(
     outcome: Any = SimpleNamespace(
         num_shards=1, num_shards_planned=1, digest="d", statistics=statistics
     )
-    Watched(DatasetOrder(out=str(out))).finished(outcome)
+    RunArtifacts(DatasetOrder(out=str(out))).show_result(outcome)
     ((_, rows),) = tables
     assert (rows["report"], rows["views"]) == (f"{out}/report.html", "16")
     (url,) = pictures
@@ -138,15 +138,17 @@ def test_the_page_ends_with_how_far_everything_is(
     tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(watching.time, "monotonic", lambda: 0.0)
-    watched = Watched(DatasetOrder(out=str(tmp_path)))
-    done = Done(shards=1, scenes=4, shards_asked=2, scenes_asked=8)
-    publication = SimpleNamespace(done=done, manifest=SimpleNamespace(num_views=2))
+    watched = RunArtifacts(DatasetOrder(out=str(tmp_path)))
+    done = DatasetProgress(shards=1, scenes=4, shards_requested=2, scenes_requested=8)
+    publication = SimpleNamespace(progress=done, manifest=SimpleNamespace(num_views=2))
     run: Any = SimpleNamespace(publication=publication)
-    watched.task_done(run, _task(4, 1.0))
-    publication.done = Done(shards=2, scenes=8, shards_asked=2, scenes_asked=8, given_up=1)
-    watched.task_done(run, _task(4, 1.0))  # too soon for another table
+    watched.record_task(run, _task(4, 1.0))
+    publication.progress = DatasetProgress(
+        shards=2, scenes=8, shards_requested=2, scenes_requested=8, given_up=1
+    )
+    watched.record_task(run, _task(4, 1.0))  # too soon for another table
     outcome: Any = SimpleNamespace(num_shards=2, num_shards_planned=2, digest="d", statistics=None)
-    watched.finished(outcome)
+    watched.show_result(outcome)
     assert [key for key, _ in tables] == ["progress", "progress", "summary"]
     shown = [(rows["shards"], rows["scenes in shards"]) for _, rows in tables[:2]]
     assert shown == [("1 of 2", "4 of 8"), ("2 of 2", "7 of 8")]
@@ -160,7 +162,7 @@ def test_a_run_that_fails_says_so_in_its_summary(
 
     monkeypatch.setattr(watching, "make_dataset", full)
     with pytest.raises(TrilightError):
-        watching.make_watched(DatasetOrder(out=str(tmp_path)), PrefectRunner())
+        watching.make_with_artifacts(DatasetOrder(out=str(tmp_path)), PrefectRunner())
     ((key, rows),) = tables
     assert key == "summary"
     assert rows["failed"].startswith("TrilightError: the disk is full")
@@ -176,7 +178,7 @@ def test_a_price_that_is_none_is_named_at_the_start(
     assert usd_per_core_hour() == 0.5
     monkeypatch.setenv("TRILIGHT_USD_PER_CORE_HOUR", text)
     with pytest.raises(TrilightError, match=rf"TRILIGHT_USD_PER_CORE_HOUR is '{text}'; expected"):
-        Watched(DatasetOrder())
+        RunArtifacts(DatasetOrder())
 
 
 @pytest.fixture
@@ -257,11 +259,11 @@ def test_a_page_that_cannot_be_shown_does_not_end_an_array(
 def test_machines_are_those_of_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who may start a run chooses neither an image nor an account."""
     assert not _OWN & set(KubernetesOptions.__dataclass_fields__)
-    assert options_here() == KubernetesOptions()
+    assert options_from_environment() == KubernetesOptions()
     stated = tmp_path / "machines.json"
     monkeypatch.setenv("TRILIGHT_MACHINES", str(stated))
     stated.write_text(json.dumps({"where": "a-namespace", "cores": 4}))
-    assert options_here() == KubernetesOptions(where="a-namespace", cores=4)
+    assert options_from_environment() == KubernetesOptions(where="a-namespace", cores=4)
     for text, message in (
         ("{", "cannot be read"),
         ('{"core": 4}', "core"),
@@ -269,4 +271,4 @@ def test_machines_are_those_of_the_worker(tmp_path: Path, monkeypatch: pytest.Mo
     ):
         stated.write_text(text)
         with pytest.raises(TrilightError, match=message):
-            options_here()
+            options_from_environment()

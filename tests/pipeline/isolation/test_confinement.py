@@ -220,7 +220,7 @@ def test_what_cannot_be_had_is_said(
         asset_child()
     monkeypatch.setenv(confinement.VARIABLE, "auto")
     confinement._warn.cache_clear()
-    assert confinement.confinement_wanted() and confinement.confinement_wanted()
+    assert confinement.should_confine() and confinement.should_confine()
     assert [record.getMessage().count("lacks Landlock") for record in caplog.records] == [1]
     caplog.clear()
 

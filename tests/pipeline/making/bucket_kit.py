@@ -12,7 +12,7 @@ import pytest
 from pipeline.builds.named import named_build
 from pipeline.making import bucket_publication
 from pipeline.making.bucket_publication import begin_dataset, joined
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from pipeline.shards.pack import pack_shard
 from storage.dataset.layout import dataset_folder
 from storage.dataset.staging import stage_scene
@@ -87,7 +87,7 @@ class Machines:
         self._monkeypatch.setenv("TRILIGHT_CACHE", str(self._tmp_path / name))
 
     @contextlib.contextmanager
-    def maker(self, name: str, scenes: int = 8, **changes: Any) -> Iterator[Publication]:
+    def maker(self, name: str, scenes: int = 8, **changes: Any) -> Iterator[DatasetWriter]:
         """Take part from a machine, as a run does."""
         self.use(name)
         folder = dataset_folder(OUT)
@@ -96,11 +96,11 @@ class Machines:
             yield begin_dataset(folder, build, ENVIRONMENT, scenes, accept_environment=False)
 
 
-def other_shard(publication: Publication) -> Any:
+def other_shard(writer: DatasetWriter) -> Any:
     """Pack a first shard of other bytes, as another processor may, with rejections of its own."""
     for index in range(4):
         sample = dataclasses.replace(_sample(9 + index), key=sample_key(index))
         failure = Failure(stage="renders", item=sample_key(index), reason="other", message="y")
-        staged = publication.folder.staged_shard("train-000000.tar")
+        staged = writer.folder.staged_shard("train-000000.tar")
         stage_scene(staged, index, sample, [failure], "lossless")
-    return pack_shard(publication.folder, "train-000000.tar", range(4))
+    return pack_shard(writer.folder, "train-000000.tar", range(4))

@@ -18,7 +18,7 @@ from pipeline.making.begin_publication import begin
 from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects
 from pipeline.making.object_batches import prepared_object
 from pipeline.making.prepare_isolated import asset_store
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from storage.dataset.layout import DatasetFolder
 from storage.digests import sha256_hex
 from storage.records.asset import encode_asset
@@ -58,23 +58,21 @@ def prepared(number: int) -> PreparedAsset:
     )
 
 
-def begun(root: Path) -> Publication:
+def begun(root: Path) -> DatasetWriter:
     """Begin a dataset of four scenes."""
     return begin(DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False)
 
 
-def asked(
-    publication: Publication, source: str = SOURCE, licence: str | None = None
-) -> AskedObjects:
+def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> AskedObjects:
     """Return what is asked for of objects."""
     return AskedObjects(
-        source=source, licence=licence, settings=build(), publication=publication, workers=1
+        source=source, licence=licence, settings=build(), publication=writer, workers=1
     )
 
 
-def frozen(publication: Publication, objects: Sequence[PreparedAsset]) -> AcceptedObjects:
+def frozen(writer: DatasetWriter, objects: Sequence[PreparedAsset]) -> AcceptedObjects:
     """Freeze objects, as after the mesh stage."""
-    return freeze_objects(asked(publication), [*map(prepared_object, objects)], [], len(objects))
+    return freeze_objects(asked(writer), [*map(prepared_object, objects)], [], len(objects))
 
 
 class Mesher:

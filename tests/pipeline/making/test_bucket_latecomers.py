@@ -9,11 +9,11 @@ import pytest
 
 from pipeline.making import bucket_publication
 from pipeline.making import publication as publications
-from pipeline.making.accept_objects import trusted_objects
-from pipeline.making.frozen_pool import AssetAway
+from pipeline.making.accept_objects import load_trusted_objects
+from pipeline.making.frozen_pool import AssetMissing
 from pipeline.making.pipeline import prepare_dataset
 from pipeline.making.prepare_isolated import asset_store
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from pipeline.shards import mirror
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
@@ -68,11 +68,11 @@ def test_the_rejections_are_those_of_the_shard_that_is_there(
 def test_a_shard_whose_maker_died_at_once_gets_the_rejections_of_the_next(
     bucket: Any, machines: Machines
 ) -> None:
-    with machines.maker("a") as publication:
-        publication.lock_objects([_locked()])
-        other = other_shard(publication)
-        bucket.pipe_file(f"shards/set/{FIRST}", publication.folder.shard(FIRST).read_bytes())
-        publication.add_shard(other)
+    with machines.maker("a") as writer:
+        writer.lock_objects([_locked()])
+        other = other_shard(writer)
+        bucket.pipe_file(f"shards/set/{FIRST}", writer.folder.shard(FIRST).read_bytes())
+        writer.add_shard(other)
     assert {row.reason for row in open_dataset(OUT).failures()} == {"other"}
 
 
@@ -82,29 +82,29 @@ def test_a_worker_with_another_cache_is_named(
     """It has packed a shard that is neither here nor in the bucket."""
     monkeypatch.setattr(publications.time, "sleep", lambda seconds: None)
     elsewhere = _dataset(tmp_path / "elsewhere").manifest.shards[1]
-    with machines.maker("a") as publication:
-        publication.lock_objects([_locked()])
+    with machines.maker("a") as writer:
+        writer.lock_objects([_locked()])
         with pytest.raises(TrilightError, match="folder is not this one.*TRILIGHT_CACHE"):
-            publication.add_shard(elsewhere)
+            writer.add_shard(elsewhere)
         assert open_dataset(OUT).manifest.shards == ()
 
 
 def test_a_shard_that_another_machine_has_sent_is_listed(bucket: Any, machines: Machines) -> None:
-    with machines.maker("a") as publication:
-        publication.lock_objects([_locked()])
+    with machines.maker("a") as writer:
+        writer.lock_objects([_locked()])
         with machines.maker("b") as worker:
             make_tiny_shard(worker, 0)
             (entry,) = open_dataset(OUT).manifest.shards
         machines.use("a")
-        publication.add_shard(entry)
-        make_tiny_shard(publication, 1)
-        listed = publication.finish()
+        writer.add_shard(entry)
+        make_tiny_shard(writer, 1)
+        listed = writer.finish()
         assert listed is not None and listed.shards[0] == entry
     assert len(_failures(bucket, "failures.jsonl")) == 8
 
 
 @contextlib.contextmanager
-def _ending_together(machines: Machines) -> Iterator[tuple[Publication, Publication]]:
+def _ending_together(machines: Machines) -> Iterator[tuple[DatasetWriter, DatasetWriter]]:
     """Two makers that find all shards there: the first says that it lists; the second is in use."""
     with machines.maker("a") as first, machines.maker("b") as second:
         machines.use("a")
@@ -113,7 +113,7 @@ def _ending_together(machines: Machines) -> Iterator[tuple[Publication, Publicat
         make_tiny_shard(first, 1)
         assert first._mirror.is_first_to_list(8)  # type: ignore[attr-defined]
         machines.use("b")
-        second.take_lock()
+        second.fetch_lock()
         yield first, second
 
 
@@ -136,7 +136,7 @@ def test_of_those_who_end_together_one_reads_the_notes(
             if len(waits) == 3:
                 machines.use("a")
                 with monkeypatch.context() as patch:
-                    patch.setattr(first, "_let_others_list", lambda: None)
+                    patch.setattr(first, "_wait_for_lister", lambda: None)
                     first.finish()
                 machines.use("b")
                 read.clear()
@@ -170,7 +170,7 @@ def test_who_waited_and_then_lists_more_writes_the_documents(
         def meanwhile(pause_s: float) -> None:
             machines.use("a")
             with monkeypatch.context() as patch:
-                patch.setattr(first, "_let_others_list", lambda: None)
+                patch.setattr(first, "_wait_for_lister", lambda: None)
                 first.finish()
             with machines.maker("c", 16) as third:
                 make_tiny_shard(third, 2)
@@ -215,8 +215,8 @@ def test_who_comes_later_trusts_the_index_of_the_first(bucket: Any, machines: Ma
         accepted = frozen(first, [prepared(number) for number in range(30)])
         assert accepted.num_objects == 30
     with machines.maker("b") as later:
-        trusted = trusted_objects(asked(later))
+        trusted = load_trusted_objects(asked(later))
         assert trusted is not None and trusted.pool is not None
         assert trusted.num_objects == 30
-        with pytest.raises(AssetAway):
-            trusted.pool.opened("train", asset_store())[0]
+        with pytest.raises(AssetMissing):
+            trusted.pool.open_split("train", asset_store())[0]

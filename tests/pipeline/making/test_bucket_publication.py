@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.executors.array_job import array_job
 from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from pipeline.shards.mirror import Mirror
 from pipeline.shards.pack import pack_shard
 from storage.dataset.dataset import open_dataset
@@ -30,13 +30,13 @@ from tests.scenes_by_hand import tiny_sample
 FIRST, SECOND = "train-000000.tar", "train-000001.tar"
 
 
-def make(publication: Publication, *shards: int) -> None:
+def make(writer: DatasetWriter, *shards: int) -> None:
     """Freeze the objects where nobody has, make shards that are missing, and list all, if so."""
-    if not publication.manifest.objects_lock_sha256:
-        publication.lock_objects([_locked()])
-    for index in set(shards) & set(publication.missing_shards()):
-        make_tiny_shard(publication, index)
-    publication.finish()
+    if not writer.manifest.objects_lock_sha256:
+        writer.lock_objects([_locked()])
+    for index in set(shards) & set(writer.missing_shards()):
+        make_tiny_shard(writer, index)
+    writer.finish()
 
 
 def names(bucket: Any) -> set[str]:
@@ -49,8 +49,8 @@ def test_an_array_is_of_what_a_bucket_lacks(bucket: Any, machines: Machines) -> 
     splits = {f"splits.{name}": value for name, value in vars(_build().splits).items()}
     order = DatasetOrder(build="smoke", out=OUT, scenes=8, changes=splits)
     assert array_job(order, per_task=None, at_once=None).tasks == [0, 1]
-    with machines.maker("a") as publication:
-        make(publication, 0)
+    with machines.maker("a") as writer:
+        make(writer, 0)
         assert FIRST in names(bucket)
         assert array_job(order, per_task=None, at_once=None).tasks == [1]
         assert read_status(OUT).shards_done == 1
@@ -83,10 +83,10 @@ def test_an_old_list_that_arrives_late_is_mended(
     bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Between two requests of the first maker the second one plans more, and finishes it."""
-    send_manifest = Mirror.send_manifest
+    send_manifest = Mirror.upload_manifest
 
     def late(self: Mirror) -> None:
-        monkeypatch.setattr(Mirror, "send_manifest", send_manifest)
+        monkeypatch.setattr(Mirror, "upload_manifest", send_manifest)
         with machines.maker("b", 8) as second:
             make(second, 1)
         machines.use("a")
@@ -97,7 +97,7 @@ def test_an_old_list_that_arrives_late_is_mended(
     with machines.maker("a", 4) as first:
         first.lock_objects([_locked()])
         make_tiny_shard(first, 0)
-        monkeypatch.setattr(Mirror, "send_manifest", late)
+        monkeypatch.setattr(Mirror, "upload_manifest", late)
         listed = first.finish()
     assert listed is not None and len(listed.shards) == 2
     assert open_dataset(OUT).manifest == listed
@@ -121,42 +121,42 @@ def test_other_objects_and_other_settings_are_refused(bucket: Any, machines: Mac
 
 
 def test_scenes_that_wait_are_kept_for_their_dataset_only(bucket: Any, machines: Machines) -> None:
-    with machines.maker("a") as publication:
-        make(publication)
-        staged = publication.folder.staged_shard(FIRST)
+    with machines.maker("a") as writer:
+        make(writer)
+        staged = writer.folder.staged_shard(FIRST)
         stage_scene(staged, 0, tiny_sample(), [], "lossless")
     with machines.maker("a"):
         assert is_staged(staged, 0)
     bucket.rm("shards/set", recursive=True)
-    with machines.maker("a") as publication:
+    with machines.maker("a") as writer:
         assert not is_staged(staged, 0)
-        assert not publication.manifest.objects_lock_sha256
+        assert not writer.manifest.objects_lock_sha256
 
 
 def test_a_shard_that_was_deleted_is_made_again(bucket: Any, machines: Machines) -> None:
-    with machines.maker("a") as publication:
-        make(publication, 0, 1)
-        digest = publication.manifest.dataset_digest
+    with machines.maker("a") as writer:
+        make(writer, 0, 1)
+        digest = writer.manifest.dataset_digest
     bucket.rm_file(f"shards/set/{FIRST}")
-    with machines.maker("b") as publication:
-        assert publication.missing_shards() == [0]
-        make(publication, 0)
+    with machines.maker("b") as writer:
+        assert writer.missing_shards() == [0]
+        make(writer, 0)
     assert open_dataset(OUT).digest == digest
     assert verify_dataset(OUT).problems == []
 
 
 def test_a_shard_is_listed_only_when_it_is_in_the_bucket(bucket: Any, machines: Machines) -> None:
     """A thread, or another process of this machine, packs it while somebody publishes."""
-    with machines.maker("a") as publication:
-        make(publication, 0)
-        folder, profile = publication.folder, _build().storage.profile
+    with machines.maker("a") as writer:
+        make(writer, 0)
+        folder, profile = writer.folder, _build().storage.profile
         for index in range(4, 8):
             stage_scene(folder.staged_shard(SECOND), index, _sample(index), [], profile)
         pack_shard(folder, SECOND, range(4, 8))
-        publication.finish()
+        writer.finish()
         assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST]
         assert verify_dataset(OUT).problems == []
-        assert publication.missing_shards() == []
+        assert writer.missing_shards() == []
     assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST, SECOND]
 
 
@@ -174,9 +174,9 @@ def test_a_larger_wish_of_one_maker_is_known_to_all(bucket: Any, machines: Machi
 def test_a_sent_shard_need_not_be_fetched(
     bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with machines.maker("a") as publication:
-        make(publication, 0)
-        assert not publication.folder.shard(FIRST).exists()
+    with machines.maker("a") as writer:
+        make(writer, 0)
+        assert not writer.folder.shard(FIRST).exists()
 
         def never(*arguments: Any) -> None:
             raise AssertionError("fetched")
@@ -190,21 +190,21 @@ def test_access_that_is_lost_in_the_middle_loses_nothing(
     bucket: Any, machines: Machines, moto: int, tmp_path: Path
 ) -> None:
     expected = _dataset(tmp_path / "plain").manifest.dataset_digest
-    with machines.maker("a") as publication:
-        make(publication, 0)
+    with machines.maker("a") as writer:
+        make(writer, 0)
         control(moto, "reset-auth", b"0")
         try:
             with pytest.raises(TrilightError) as caught:
-                make_tiny_shard(publication, 1)
+                make_tiny_shard(writer, 1)
         finally:
             control(moto, "reset-auth", b"inf")
-        assert publication.folder.shard(SECOND).exists()
+        assert writer.folder.shard(SECOND).exists()
     text = str(caught.value)
     assert text.startswith(f"out '{OUT}': cannot be written") and "\n" not in text
     assert "access that lets you list, read and write" in text and "s3cret" not in text
-    with machines.maker("a") as publication:
-        assert publication.missing_shards() == []
-        publication.finish()
+    with machines.maker("a") as writer:
+        assert writer.missing_shards() == []
+        writer.finish()
     assert open_dataset(OUT).digest == expected
 
 

@@ -151,11 +151,11 @@ def test_a_dataset_never_causes_an_import(
     """Its build may say FILE.py:FUNCTION, and its extensions may lie beside it."""
     folder = tmp_path / "set"
     monkeypatch.chdir(tmp_path)
-    publication = begin_tiny(folder, 4)
-    make_tiny_shard(publication, 0)
+    writer = begin_tiny(folder, 4)
+    make_tiny_shard(writer, 0)
     for place in (tmp_path, folder):
         written(place, TRAP, "trap.py")
-    manifest = dataclasses.replace(publication.manifest, build="trap.py:f", extensions=extended)
+    manifest = dataclasses.replace(writer.manifest, build="trap.py:f", extensions=extended)
     write_manifest(folder / "manifest.json", manifest)
     verify_dataset(str(folder))
     expected = "begun with the extension trap.py" if extended else "'trap.py:f' is unknown"

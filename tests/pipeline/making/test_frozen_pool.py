@@ -16,17 +16,17 @@ from pipeline.documents.attribution import encode_attribution
 from pipeline.making import accept_maps as accepting
 from pipeline.making import asked_objects, frozen_pool, pipeline, restore_object
 from pipeline.making.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
-from pipeline.making.accept_objects import accept_objects, trusted_objects
+from pipeline.making.accept_objects import accept_objects, load_trusted_objects
 from pipeline.making.attempt_scene import SceneAttempt
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.freeze_objects import AcceptedObjects, require_same
-from pipeline.making.frozen_pool import AssetAway, OpenedPool
-from pipeline.making.own_maps import own_maps
+from pipeline.making.frozen_pool import AssetMissing, SplitPool
+from pipeline.making.own_maps import user_maps
 from pipeline.making.prepare_isolated import asset_store
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from pipeline.objects.maps.prepared import MapFiles, prepare_map
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.fitting import drawn_rows
+from pipeline.scenes.fitting import draw_rows
 from pipeline.scenes.pool import PooledAsset, fits_of
 from scene_templates.own_maps import OwnMap, drawn_own
 from storage.conventions import SPLITS
@@ -55,37 +55,39 @@ NUM_OBJECTS = 30
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Publication, AcceptedObjects]]:
+def made(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[DatasetWriter, AcceptedObjects]]:
     folder = tmp_path_factory.mktemp("frozen")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRILIGHT_CACHE", str(folder / "cache"))
-        publication = begun(folder / "set")
-        yield publication, frozen(publication, [prepared(n) for n in range(NUM_OBJECTS)])
+        writer = begun(folder / "set")
+        yield writer, frozen(writer, [prepared(n) for n in range(NUM_OBJECTS)])
 
 
-def _opened(accepted: AcceptedObjects, split: str = "train") -> OpenedPool:
+def _opened(accepted: AcceptedObjects, split: str = "train") -> SplitPool:
     assert accepted.pool is not None
-    return accepted.pool.opened(split, asset_store())
+    return accepted.pool.open_split(split, asset_store())
 
 
-def _whole(publication: Publication, accepted: AcceptedObjects) -> list[PooledAsset]:
+def _whole(writer: DatasetWriter, accepted: AcceptedObjects) -> list[PooledAsset]:
     """The pool as it would be with every object of the split in memory."""
     by_digest = {p.asset_sha256: p.path for p in map(prepared, range(NUM_OBJECTS))}
     return [
         PooledAsset(locked=row, asset=decode_asset(Path(by_digest[row.asset_sha256]).read_bytes()))
-        for row in read_objects_lock(publication.folder.objects_lock)
+        for row in read_objects_lock(writer.folder.objects_lock)
         if row.split == "train"
     ]
 
 
 def test_scenes_of_opened_objects_are_those_of_objects_in_memory(
-    made: tuple[Publication, AcceptedObjects],
+    made: tuple[DatasetWriter, AcceptedObjects],
 ) -> None:
     whole, opened = _whole(*made), _opened(made[1])
     assert [entry.locked for entry in opened] == [entry.locked for entry in whole]
     for room in (30, 60, 200, 5000):  # some objects do not fit, or all do
         draws = [
-            [drawn_rows(np.random.default_rng(n), fits_of(pool), 2, room) for n in range(20)]
+            [draw_rows(np.random.default_rng(n), fits_of(pool), 2, room) for n in range(20)]
             for pool in (opened, whole)
         ]
         assert draws[0] == draws[1]
@@ -98,7 +100,7 @@ def test_scenes_of_opened_objects_are_those_of_objects_in_memory(
 
 
 def test_only_a_few_objects_are_open(
-    made: tuple[Publication, AcceptedObjects], monkeypatch: pytest.MonkeyPatch
+    made: tuple[DatasetWriter, AcceptedObjects], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(frozen_pool, "_MOST_OPEN", 3)
     read: list[bytes] = []
@@ -119,38 +121,38 @@ def test_only_a_few_objects_are_open(
             pool[row]
 
 
-def read_objects_lock_uids(publication: Publication) -> list[str]:
-    rows = read_objects_lock(publication.folder.objects_lock)
+def read_objects_lock_uids(writer: DatasetWriter) -> list[str]:
+    rows = read_objects_lock(writer.folder.objects_lock)
     return [row.uid for row in rows if row.split == "train"]
 
 
 def test_a_second_start_looks_at_no_object(
-    made: tuple[Publication, AcceptedObjects], monkeypatch: pytest.MonkeyPatch
+    made: tuple[DatasetWriter, AcceptedObjects], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And at all of them where it is asked for another source, or there is no index of the lock."""
-    publication, accepted = made
+    writer, accepted = made
 
     def look(source: str, **more: object) -> None:
         raise LookupError(source)
 
     monkeypatch.setattr(asked_objects, "list_objects", look)
-    assert accept_objects(asked(publication)) == accepted
+    assert accept_objects(asked(writer)) == accepted
     for source, licence in (("another", None), (SOURCE, "MIT")):
         with pytest.raises(LookupError):
-            accept_objects(asked(publication, source, licence))
-    index, lock = publication.folder.staged_index, publication.folder.objects_lock
+            accept_objects(asked(writer, source, licence))
+    index, lock = writer.folder.staged_index, writer.folder.objects_lock
     for path in (index, lock):
         was = path.read_bytes()
         for damaged in (b"", was[:40], was + b" "):
             path.write_bytes(damaged)
             if (path, damaged) != (index, was + b" "):  # which tells nothing about the lock
-                assert trusted_objects(asked(publication)) is None
+                assert load_trusted_objects(asked(writer)) is None
         path.write_bytes(was)
-    assert trusted_objects(asked(publication)) == accepted
+    assert load_trusted_objects(asked(writer)) == accepted
 
 
 def test_a_file_that_is_not_the_locked_one_is_away(
-    made: tuple[Publication, AcceptedObjects],
+    made: tuple[DatasetWriter, AcceptedObjects],
 ) -> None:
     pool = _opened(made[1])
     name = pool._index.asset_name(pool._first)
@@ -159,7 +161,7 @@ def test_a_file_that_is_not_the_locked_one_is_away(
     try:
         for damage in (path.unlink, lambda: path.write_bytes(was[:-1]), lambda: _swap(path, pool)):
             damage()
-            with pytest.raises(AssetAway) as caught:
+            with pytest.raises(AssetMissing) as caught:
                 pool[0]
             assert (caught.value.uid, caught.value.asset_name) == (
                 read_objects_lock_uids(made[0])[0],
@@ -170,14 +172,14 @@ def test_a_file_that_is_not_the_locked_one_is_away(
     assert pool[0].locked.uid == read_objects_lock_uids(made[0])[0]
 
 
-def _swap(path: Path, pool: OpenedPool) -> None:
+def _swap(path: Path, pool: SplitPool) -> None:
     """Put another object of the same store in the place of one."""
     other = asset_store().asset_path(pool._index.asset_name(pool._first + 1))
     path.write_bytes(other.read_bytes())
 
 
 def test_an_index_that_contradicts_the_objects_is_refused(
-    made: tuple[Publication, AcceptedObjects],
+    made: tuple[DatasetWriter, AcceptedObjects],
 ) -> None:
     """A wrong number of triangles would quietly change what is drawn."""
     path = made[0].folder.staged_index
@@ -201,7 +203,7 @@ def test_an_object_that_is_away_is_brought_back_for_the_same_attempt(
 
     def call(child: object, function: object, *args: object) -> SceneAttempt:
         calls.append(args)
-        return SceneAttempt(sample=None, failures=[], away=away[0] if away else None)
+        return SceneAttempt(sample=None, failures=[], missing_asset=away[0] if away else None)
 
     def restore(uid: str, name: str) -> None:
         calls.append((uid, name))
@@ -216,9 +218,9 @@ def test_an_object_that_is_away_is_brought_back_for_the_same_attempt(
 def test_an_object_that_is_there_again_is_found(tmp_path: Path) -> None:
     """A worker that lives long has listed the source before."""
     source = ("builtin:4", None, tmp_path / "objects", ("MIT", "CC0-1.0"))
-    uid = restore_object._listed(*source).allowed[0].uid
+    uid = restore_object._list_source(*source).allowed[0].uid
     shutil.rmtree(tmp_path / "objects")
-    record = restore_object.found_again(*source, uid)
+    record = restore_object.find_object(*source, uid)
     assert record is not None and Path(record.path).exists()
 
 
@@ -285,12 +287,17 @@ def test_no_texture_or_map_of_test_is_in_train(
     uids: dict[str, set[str]] = {}
     shown: dict[str, set[str]] = {}
     for split in SPLITS:
-        own = own_maps(accepted.rows, split)
+        own = user_maps(accepted.rows, split)
         uids[split], shown[split] = set(), set()
         for index in range(5):
             try:
                 scene = compose_scene(
-                    settings.scenes, small_pool(), seed=0, scene_index=index, attempt=0, own=own
+                    settings.scenes,
+                    small_pool(),
+                    seed=0,
+                    scene_index=index,
+                    attempt=0,
+                    user_maps=own,
                 )
             except Rejected:
                 continue
@@ -317,10 +324,10 @@ def test_without_own_ones_a_scene_is_what_it_was(
     """Folders change no draw while their shares are 0, and procedural ones stay where none is."""
     changes = {name: 0.0 for name in SHARES if name.endswith("own_share")}
     plain = named_build("smoke", changes=SHARES | changes).scenes
-    own = own_maps(accepted.rows, "train")
+    own = user_maps(accepted.rows, "train")
     first, second = (
         compose_scene(plain, small_pool(), seed=0, scene_index=3, attempt=0, **given)
-        for given in ({}, {"own": own})
+        for given in ({}, {"user_maps": own})
     )
     assert [t.sha256 for t in first.textures] == [t.sha256 for t in second.textures]
     assert "maps" not in second.provenance

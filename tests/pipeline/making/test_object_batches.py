@@ -56,7 +56,7 @@ def _prepare(
     fetch: Callable[[list[ObjectRecord]], Fetched] | None = None,
 ) -> tuple[PrepareResult, int]:
     counted: list[int] = []
-    work = ObjectWork(settings=AssetSettings(), publication=begun(out), fetch=fetch)
+    work = ObjectWork(settings=AssetSettings(), writer=begun(out), fetch=fetch)
     found = prepare_in_batches(records, work, workers=1, done=counted.append)
     return found, sum(counted)
 

@@ -9,7 +9,7 @@ from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.making import publication as publications
 from pipeline.making.begin_publication import begin
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from pipeline.objects.generated import generate_objects
 from pipeline.shards.pack import pack_shard
 from storage.dataset import layout
@@ -38,7 +38,7 @@ def _build() -> BuildSettings:
     return dataclasses.replace(build, scenes=dataclasses.replace(build.scenes, num_views=2))
 
 
-def _begin(root: Path, build: BuildSettings, scenes: int = 4, **environment: str) -> Publication:
+def _begin(root: Path, build: BuildSettings, scenes: int = 4, **environment: str) -> DatasetWriter:
     return begin(
         DatasetFolder(root), build, {**ENVIRONMENT, **environment}, scenes, accept_environment=False
     )
@@ -52,30 +52,30 @@ def _sample(index: int) -> Sample:
     return dataclasses.replace(tiny_sample(seed=index), key=sample_key(index))
 
 
-def make_tiny_shard(publication: Publication, index: int) -> None:
+def make_tiny_shard(writer: DatasetWriter, index: int) -> None:
     """Make a shard of four tiny scenes, each with one rejection."""
     build = _build()
-    folder, name = publication.folder, shard_name(index, build.splits)
+    folder, name = writer.folder, shard_name(index, build.splits)
     for scene in scenes_of_shard(index, build.splits):
         failure = Failure(stage="scenes", item=sample_key(scene), reason="no_camera", message="x")
         profile = build.storage.profile
         stage_scene(folder.staged_shard(name), scene, _sample(scene), [failure], profile)
-    publication.add_shard(pack_shard(folder, name, scenes_of_shard(index, build.splits)))
+    writer.add_shard(pack_shard(folder, name, scenes_of_shard(index, build.splits)))
 
 
-def begin_tiny(root: Path, scenes: int) -> Publication:
+def begin_tiny(root: Path, scenes: int) -> DatasetWriter:
     """Begin a dataset of tiny scenes, four to a shard, two views each."""
     return _begin(root, _build(), scenes)
 
 
-def _dataset(root: Path, scenes: int = 8) -> Publication:
+def _dataset(root: Path, scenes: int = 8) -> DatasetWriter:
     build = _build()
-    publication = _begin(root, build, scenes)
-    publication.lock_objects([_locked()])
-    for index in publication.missing_shards():
-        make_tiny_shard(publication, index)
-    publication.finish()
-    return publication
+    writer = _begin(root, build, scenes)
+    writer.lock_objects([_locked()])
+    for index in writer.missing_shards():
+        make_tiny_shard(writer, index)
+    writer.finish()
+    return writer
 
 
 def test_the_digest_knows_nothing_of_place_or_order(tmp_path: Path) -> None:
@@ -91,11 +91,11 @@ def test_the_digest_knows_nothing_of_place_or_order(tmp_path: Path) -> None:
 
 
 def test_as_many_scenes_are_planned_as_are_asked_for(tmp_path: Path) -> None:
-    publication = _begin(tmp_path, _build(), 5)
-    assert publication.manifest.num_scenes == 5
-    assert publication.missing_shards() == [0, 1]
-    done = publication.done
-    assert (done.shards, done.shards_asked, done.scenes_asked) == (0, 2, 5)
+    writer = _begin(tmp_path, _build(), 5)
+    assert writer.manifest.num_scenes == 5
+    assert writer.missing_shards() == [0, 1]
+    done = writer.progress
+    assert (done.shards, done.shards_requested, done.scenes_requested) == (0, 2, 5)
 
 
 def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Path) -> None:
@@ -113,11 +113,11 @@ def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Pa
 def test_a_shard_that_missed_the_manifest_is_found(tmp_path: Path) -> None:
     """A kill between the shard's rename and its note's, or the manifest's, leaves it so."""
     whole = _dataset(tmp_path / "a").manifest
-    publication = _begin(tmp_path / "b", _build(), 8)
-    publication.lock_objects([_locked()])
+    writer = _begin(tmp_path / "b", _build(), 8)
+    writer.lock_objects([_locked()])
     for index in range(2):
-        make_tiny_shard(publication, index)
-    note_of(publication.folder, whole.shards[0].name).unlink()
+        make_tiny_shard(writer, index)
+    note_of(writer.folder, whole.shards[0].name).unlink()
     assert open_dataset(str(tmp_path / "b")).manifest.shards == whole.shards[1:]
     later = _begin(tmp_path / "b", _build(), 8)
     assert later.missing_shards() == []
@@ -148,25 +148,25 @@ def test_damage_is_named(tmp_path: Path, fast: bool) -> None:
     assert verify_dataset(tmp_path, fast=fast).problems
 
 
-def _make_again(publication: Publication, samples: list[Sample]) -> None:
+def _make_again(writer: DatasetWriter, samples: list[Sample]) -> None:
     """Replace the first shard by one of these samples."""
     name = shard_name(0, _build().splits)
     for index, sample in enumerate(samples):
         again = dataclasses.replace(sample, key=sample_key(index))
-        stage_scene(publication.folder.staged_shard(name), index, again, [], "lossless")
-    publication.folder.shard(name).unlink()  # the first writer of a shard wins
-    publication.add_shard(pack_shard(publication.folder, name, range(len(samples))))
-    publication.finish()
+        stage_scene(writer.folder.staged_shard(name), index, again, [], "lossless")
+    writer.folder.shard(name).unlink()  # the first writer of a shard wins
+    writer.add_shard(pack_shard(writer.folder, name, range(len(samples))))
+    writer.finish()
 
 
 def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
-    publication = _dataset(tmp_path, 4)
-    publication.lock_objects([dataclasses.replace(_locked(), split="test")])
+    writer = _dataset(tmp_path, 4)
+    writer.lock_objects([dataclasses.replace(_locked(), split="test")])
     assert verify_dataset(tmp_path).problems == []  # the tiny scenes use no object
     scene = tiny_scene()
     used = dataclasses.replace(scene.objects[0], kind="object", uid="a")
     sample = dataclasses.replace(_sample(0), scene=tiny_scene(objects=(used, *scene.objects[1:])))
-    _make_again(publication, [sample] * 4)
+    _make_again(writer, [sample] * 4)
     assert "belongs to split test" in verify_dataset(tmp_path).problems[0]
 
 
@@ -182,10 +182,10 @@ def test_documents_of_others_are_not_replaced(tmp_path: Path, name: str) -> None
 
 
 def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None:
-    publication = _dataset(tmp_path, 4)
+    writer = _dataset(tmp_path, 4)
     licences = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC-BY-SA-3.0")
     rows = [dataclasses.replace(_locked(), uid=uid) for uid in "abc"]
-    publication.lock_objects(rows)
+    writer.lock_objects(rows)
     scene = tiny_scene()
     floor = scene.objects[0]
     samples = []
@@ -196,7 +196,7 @@ def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None
         ][index % 2 :]
         objects = (*scene.objects, *used)
         samples.append(dataclasses.replace(_sample(index), scene=tiny_scene(objects=objects)))
-    _make_again(publication, samples)
+    _make_again(writer, samples)
     problems = [text for text in verify_dataset(tmp_path).problems if "share-alike" in text]
     assert [problem.split(":")[1] for problem in problems] == [
         " sample 000000000", " sample 000000002",
@@ -210,19 +210,19 @@ def test_a_shard_in_the_folder_of_a_worker_alone_is_no_shard(
     """Such a run would go on for ever: what is packed would be missing again and again."""
     pauses: list[float] = []
     elsewhere = _dataset(tmp_path / "worker", 4).manifest.shards[0]
-    publication = _begin(tmp_path / "here", _build(), 4)
+    writer = _begin(tmp_path / "here", _build(), 4)
     monkeypatch.setattr(publications.time, "sleep", pauses.append)
     with pytest.raises(TrilightError, match="a worker has packed .* folder is not this one"):
-        publication.add_shard(elsewhere)
+        writer.add_shard(elsewhere)
     assert sum(pauses) > 60  # a network file system may keep a listing for a minute
-    assert publication.missing_shards() == [0]
+    assert writer.missing_shards() == [0]
 
     def appear(seconds: float) -> None:
         name = elsewhere.name
         (tmp_path / "here" / name).write_bytes((tmp_path / "worker" / name).read_bytes())
 
     monkeypatch.setattr(publications.time, "sleep", appear)
-    publication.add_shard(elsewhere)
+    writer.add_shard(elsewhere)
     assert open_dataset(str(tmp_path / "here")).manifest.shards == (elsewhere,)
 
 
@@ -248,26 +248,26 @@ def test_the_first_shards_stay_where_the_design_has_them() -> None:
 @pytest.mark.usefixtures("two_each")
 def test_a_dataset_in_parts_is_whole(tmp_path: Path) -> None:
     """Shards, rejections and logs move together; reading and verifying find them."""
-    publication = _dataset(tmp_path, scenes=20)
-    shards = publication.manifest.shards
+    writer = _dataset(tmp_path, scenes=20)
+    shards = writer.manifest.shards
     names = [shard.name for shard in shards]
     assert names == [
         "train-000000.tar", "train-000001.tar", "part-0001/validation-000002.tar",
         "part-0001/train-000003.tar", "part-0002/train-000004.tar",
     ]  # fmt: skip
-    assert read_manifest(tmp_path / "manifest.json") == publication.manifest
+    assert read_manifest(tmp_path / "manifest.json") == writer.manifest
     found = verify_dataset(tmp_path)
     assert (found.problems, found.num_samples) == ([], 20)
     dataset = open_dataset(str(tmp_path))
     keys = [s.key for shard in dataset.manifest.shards for s in dataset.read_shard(shard)]
     assert keys == [sample_key(index) for index in range(20)]
     assert _most_entries(tmp_path) == 2
-    assert publication.missing_shards() == []
-    assert read_progress(publication.folder).scenes_done == 20
+    assert writer.missing_shards() == []
+    assert read_progress(writer.folder).scenes_done == 20
     path = tmp_path / names[3]
     moved = path.rename(tmp_path / "away")
     assert verify_dataset(tmp_path).problems == ["part-0001/train-000003.tar: missing"]
-    assert publication.missing_shards() == [3]
+    assert writer.missing_shards() == [3]
     moved.rename(path)
     assert index_shard(path) == shards[3]
     path.with_name("train-000009.tar").write_bytes(b"")

@@ -14,7 +14,7 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.making import render_sample as module
 from pipeline.making import view_progress
 from pipeline.making.begin_publication import begin
-from pipeline.making.publication import Publication
+from pipeline.making.publication import DatasetWriter
 from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.results import RenderedView, Sampling
@@ -136,14 +136,14 @@ def build(**changes: object) -> BuildSettings:
     return named_build("smoke", resolution=16, changes={**small, **changes})
 
 
-def begun(root: Path, settings: BuildSettings) -> Publication:
+def begun(root: Path, settings: BuildSettings) -> DatasetWriter:
     return begin(DatasetFolder(root), settings, ENVIRONMENT, 4, accept_environment=False)
 
 
-def finished(root: Path, settings: BuildSettings) -> Publication:
+def finished(root: Path, settings: BuildSettings) -> DatasetWriter:
     """Make a dataset of one shard with four tiny scenes, as a run does but for rendering."""
-    publication = begun(root, settings)
-    publication.lock_objects([_locked()])
+    writer = begun(root, settings)
+    writer.lock_objects([_locked()])
     name = shard_name(0, settings.splits)
     indices = scenes_of_shard(0, settings.splits)
     for index in indices:
@@ -154,10 +154,10 @@ def finished(root: Path, settings: BuildSettings) -> Publication:
                 for view in range(2)
             )
             made = dataclasses.replace(made, passes_exr=tuple(packed))
-        folder = publication.folder.staged_shard(name)
+        folder = writer.folder.staged_shard(name)
         stage_scene(folder, index, made, [], settings.storage.profile)
-    publication.add_shard(pack_shard(publication.folder, name, indices))
-    return publication
+    writer.add_shard(pack_shard(writer.folder, name, indices))
+    return writer
 
 
 def test_what_stores_some_says_so_in_the_order_of_the_table() -> None:
@@ -223,18 +223,18 @@ def test_a_view_counts_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     folder, told = DatasetFolder(tmp_path), list[float]()
     monkeypatch.setattr(view_progress, "_EVERY_S", 0.0)
     monkeypatch.setattr(view_progress, "tell_views", lambda *words: told.append(words[2]))
-    assert ViewProgress(folder, 5).view(2, _steps()) is DONE
+    assert ViewProgress(folder, 5).render_view(2, _steps()) is DONE
     assert told == [2.25, 2.5, 2.75, 3.0]
 
 
 def test_quick_passes_are_told_once_and_to_nobody(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path)
     progress = ViewProgress(folder, 5)
-    assert progress.view(0, _steps()) is DONE
-    assert progress.view(1, _steps()) is DONE
+    assert progress.render_view(0, _steps()) is DONE
+    assert progress.render_view(1, _steps()) is DONE
     assert _told(folder) == ["0.250"]
     progress.end()
     assert _told(folder) == []
     nobody = ViewProgress(None, 5)
-    assert nobody.view(0, _steps()) is DONE
+    assert nobody.render_view(0, _steps()) is DONE
     nobody.end()

@@ -13,7 +13,7 @@ from infra.cli.changes import parse_changes
 from pipeline.making.dataset_order import DatasetOrder, generate_words
 from pipeline.making.machine import cores_owned, visible_gpus
 from pipeline.making.runner import in_window
-from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece, TaskSizes, TasksLeft, cut_tasks
+from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece, TaskBudget, TaskSizes, cut_tasks
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
@@ -35,7 +35,7 @@ def test_every_scene_is_in_one_task(
     shards: list[int], per_shard: int, seconds: float, most: int
 ) -> None:
     splits, sizes = SplitSettings(scenes_per_shard=per_shard), TaskSizes()
-    sizes.measured(1, seconds)
+    sizes.add_measurement(1, seconds)
     tasks = list(cut_tasks(shards, splits, sizes, most=most))
     expected = [scene for shard in shards for scene in scenes_of_shard(shard, splits)]
     assert _scenes(tasks) == expected
@@ -49,7 +49,7 @@ def test_every_scene_is_in_one_task(
 def test_a_task_takes_the_time_that_it_should() -> None:
     """At 10 s a scene 24 of them: half a shard of 48, or six of 4."""
     sizes = TaskSizes()
-    sizes.measured(3, 30.0)
+    sizes.add_measurement(3, 30.0)
     for per_shard, pieces in ((48, 1), (4, 6)):
         tasks = list(cut_tasks(range(24), SplitSettings(scenes_per_shard=per_shard), sizes))
         assert len(_scenes(tasks[:1])) == TASK_S / 10
@@ -61,7 +61,7 @@ def test_sizes_follow_what_is_measured_on_the_way() -> None:
     tasks = cut_tasks(range(100), SplitSettings(scenes_per_shard=4), sizes)
     assert len(_scenes([next(tasks)])) == 4
     next(tasks)  # was cut when the first was handed out
-    sizes.measured(4, 4.0)
+    sizes.add_measurement(4, 4.0)
     assert len(_scenes([next(tasks)])) == TASK_S
 
 
@@ -69,7 +69,7 @@ def test_sizes_follow_what_is_measured_on_the_way() -> None:
 def test_several_at_once_all_have_work_until_the_end(at_once: int) -> None:
     """Fast scenes, of which one task could take all: nobody gets more than half of a share."""
     sizes = TaskSizes()
-    sizes.measured(4, 1.0)
+    sizes.add_measurement(4, 1.0)
     left = 256
     for task in cut_tasks(range(64), SplitSettings(scenes_per_shard=4), sizes, at_once=at_once):
         size = len(_scenes([task]))
@@ -79,10 +79,12 @@ def test_several_at_once_all_have_work_until_the_end(at_once: int) -> None:
 
 
 def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
-    splits, left, rounds = SplitSettings(scenes_per_shard=1), TasksLeft(), list[int]()
+    splits, left, rounds = SplitSettings(scenes_per_shard=1), TaskBudget(), list[int]()
     with pytest.raises(EnvironmentFailure, match="run the same command again"):
         while True:
-            rounds.append(sum(1 for _ in left.cut(range(5000), splits, TaskSizes(), at_once=1)))
+            rounds.append(
+                sum(1 for _ in left.take_tasks(range(5000), splits, TaskSizes(), at_once=1))
+            )
     assert rounds[:2] == [900, 90]
     assert sum(rounds) == MOST_TASKS
 

@@ -119,10 +119,10 @@ def test_who_waits_for_others_says_for_whom(
 ) -> None:
     monkeypatch.setattr(claims, "_SILENT_S", 0.0)
     folder, missing = DatasetFolder(tmp_path), [[0], [0], []]
-    publication = SimpleNamespace(folder=folder)
+    writer = SimpleNamespace(folder=folder)
     settings = SimpleNamespace(splits=_build().splits)
     run: Any = SimpleNamespace(
-        publication=publication, settings=settings, missing_shards=lambda: missing.pop(0)
+        publication=writer, settings=settings, missing_shards=lambda: missing.pop(0)
     )
     _make(tmp_path, 1, 4, Counter())
     with claimed(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
@@ -226,7 +226,7 @@ def _run(root: Path, scenes: int) -> Run:
     return Run(
         order=DatasetOrder(out=str(root), scenes=scenes),
         settings=_build(),
-        listed=None,
+        scene_folder=None,
         publication=begin_tiny(root, scenes),
         accepted=AcceptedObjects(num_objects=0, num_found=0),
     )
@@ -302,7 +302,7 @@ def test_a_rerun_does_not_escape_the_failure_budget(
     with pytest.raises(TrilightError, match=r"4 of 4 .*The reasons are in failures\.jsonl"):
         run.require_within_budget()  # while it is made
     assert [row.item for row in read_failures(folder.failures)] == [*map(sample_key, range(4))]
-    monkeypatch.setattr(pipeline, "_begun", lambda order: contextlib.nullcontext(run))
+    monkeypatch.setattr(pipeline, "_begin_run", lambda order: contextlib.nullcontext(run))
     with pytest.raises(TrilightError, match="4 of 4 scenes could not be made"):
         make_dataset(run.order, Idle())
 

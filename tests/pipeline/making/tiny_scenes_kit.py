@@ -61,7 +61,7 @@ def without_rendering(
         made(scene)
         return dataclasses.replace(tiny_sample(seed=scene), key=sample_key(scene)), []
 
-    monkeypatch.setattr("pipeline.making.pipeline.share_mesh_work", lambda *given: None)
+    monkeypatch.setattr("pipeline.making.pipeline.prepare_unfrozen_objects", lambda *given: None)
     monkeypatch.setattr("pipeline.making.pipeline.accept_objects", accept)
     monkeypatch.setattr("pipeline.making.pipeline.make_scene", make)
     without_probe(monkeypatch)

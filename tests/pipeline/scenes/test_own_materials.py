@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.scenes.own_light import with_own_light
+from pipeline.scenes.own_light import with_source_emission
 from pipeline.scenes.own_materials import own_skins
 from pipeline.scenes.pieces import ScenePiece, Skin, dressed, emitter_piece, joined, object_piece
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.redrawn import with_new_lights
-from pipeline.scenes.subdivision import subdivided
+from pipeline.scenes.subdivision import subdivide
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Emitter
 from scene_templates.settings import SceneSettings
@@ -140,7 +140,7 @@ def test_subdivision_moves_no_colour() -> None:
     (skin,) = own_skins(entries, [level], OWN.materials, **name, attempt=0)
     assert skin is not None
     whole = dressed(piece, positions, level.faces, skin)
-    more = subdivided(whole, 100)
+    more = subdivide(whole, 100)
     assert more.skin is not None and len(more.mesh.faces) > 90
 
     centres = more.mesh.positions[more.mesh.faces].astype(np.float64).mean(axis=1)
@@ -255,7 +255,7 @@ def test_an_emissive_triangle_is_the_same_lamp_to_the_last_bit() -> None:
     """Positions, normals and materials; pictures are a function of these."""
     lamp = _lamp(QUAD[FACES[0]] + [0, 0, 2], (8.0, 8.0, 8.0))
     piece = _object([[2, 1, 0], [0, 0, 0]])
-    (left,), (own,) = with_own_light([piece], [lamp], share=0.25)
+    (left,), (own,) = with_source_emission([piece], [lamp], share=0.25)
     power = 0.25 * 8.0  # areas are equal, and (2 + 1 + 0) / 3 is 1
     ours = joined([own])
     twin = joined([_lamp(QUAD[FACES[0]], (2 * power, power, 0.0))])
@@ -268,9 +268,9 @@ def test_an_emissive_triangle_is_the_same_lamp_to_the_last_bit() -> None:
 
 def test_no_part_outshines_the_brightest_lamp_and_what_emits_stays_in_its_place() -> None:
     lamp = _lamp(QUAD[FACES[0]] * 10, (3.0, 2.0, 1.0))
-    _, (own,) = with_own_light([_object([[7, 0, 0], [0, 0, 0]])], [lamp], share=1.0)
+    _, (own,) = with_source_emission([_object([[7, 0, 0], [0, 0, 0]])], [lamp], share=1.0)
     assert own.materials[0, EMISSION] == pytest.approx([3, 0, 0])
-    pieces, more = with_own_light([_object([[1, 0, 0], [0, 1, 0]])], [lamp], share=0.1)
+    pieces, more = with_source_emission([_object([[1, 0, 0], [0, 1, 0]])], [lamp], share=0.1)
     assert [piece.entry.kind for piece in pieces] == ["emitter"] and not more
     assert len(pieces[0].materials) == 2 and pieces[0].skin is None
     entry = pieces[0].entry
@@ -280,7 +280,7 @@ def test_no_part_outshines_the_brightest_lamp_and_what_emits_stays_in_its_place(
 @pytest.mark.parametrize(("lamps", "share"), [(True, 0.0), (False, 1.0)])
 def test_without_lamps_or_share_all_stays_dark(lamps: bool, share: float) -> None:
     drawn = [_lamp(QUAD[FACES[0]], (1.0, 1.0, 1.0))] if lamps else []
-    (piece,), more = with_own_light([_object([[1, 1, 1], [0, 0, 0]])], drawn, share)
+    (piece,), more = with_source_emission([_object([[1, 1, 1], [0, 0, 0]])], drawn, share)
     assert not more and len(piece.mesh.faces) == 2
     assert piece.skin is not None and piece.skin.emission is None
 

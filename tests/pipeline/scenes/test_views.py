@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
-from pipeline.scenes.laws import require_laws
+from pipeline.scenes.laws import require_valid
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
 from pipeline.scenes.sight import Sight
 from pipeline.scenes.views import (
     CAMERA_ATTEMPTS,
     ViewCamera,
     cameras_of_view,
-    complaint,
+    view_problem,
     with_cameras,
 )
 from scene_templates.families import DEFAULT_FAMILIES
@@ -121,15 +121,15 @@ def _camera(eye: list[float]) -> NDArray[np.float32]:
 
 def test_light_is_seen_from_its_side_past_emitters_and_not_through_roofs() -> None:
     """The hand-made floor is lit from above: fully so from above, not at all from below."""
-    sight = Sight(tiny_scene())
-    above, below = (sight.facts(_camera([0, 0, z]), 30.0, 16) for z in (1.0, -1.0))
+    visibility = Sight(tiny_scene())
+    above, below = (visibility.facts(_camera([0, 0, z]), 30.0, 16) for z in (1.0, -1.0))
     assert (above.lit, above.shell_back, above.coverage) == (1.0, 0.0, 0.0)
     assert (below.lit, below.shell_back, below.coverage) == (0.0, 1.0, 0.0)
     # A scene without objects need not show any, and one with objects must.
-    assert complaint(above, ViewLaws(), has_objects=False) is None
-    assert complaint(above, ViewLaws(), has_objects=True) == "sees too little of the objects"
-    assert complaint(below, ViewLaws(), has_objects=False) == "sees the back of the shell"
-    assert complaint(below, ViewLaws(max_shell_back=1.0), has_objects=False) is not None
+    assert view_problem(above, ViewLaws(), has_objects=False) is None
+    assert view_problem(above, ViewLaws(), has_objects=True) == "sees too little of the objects"
+    assert view_problem(below, ViewLaws(), has_objects=False) == "sees the back of the shell"
+    assert view_problem(below, ViewLaws(max_shell_back=1.0), has_objects=False) is not None
     scene = tiny_scene()
     roof = scene.vertex_positions[:4] + np.array([0, 0, 1.5], np.float32)
     covered = dataclasses.replace(
@@ -292,7 +292,7 @@ def test_redrawn_scenes_are_equal_for_equal_arguments_and_keep_the_laws(scene: S
     near = dataclasses.replace(SMOKE.lights, distance=(0.01, 0.02), target_jitter=0.0)
     inside = with_new_lights(scene, near, 8, **SEEDED, attempt=0)
     with pytest.raises(Rejected, match="emitter_inside"):
-        require_laws(inside, SMOKE)
+        require_valid(inside, SMOKE)
 
 
 def test_a_scene_of_a_file_draws_no_lights() -> None:
