@@ -15,7 +15,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
-from pipeline.isolation.confinement import VARIABLE, missing_parts, wanted_confinement
+from pipeline.isolation.confinement import VARIABLE, confinement_mode, missing_features
 from pipeline.isolation.landlock import landlock_version
 from pipeline.isolation.seccomp import seccomp_works
 from pipeline.renders.facts import render_facts
@@ -209,8 +209,8 @@ def _mesh_filters() -> Finding:
 
 
 def _confinement() -> Finding:
-    mode = wanted_confinement()
-    missing = missing_parts()
+    mode = confinement_mode()
+    missing = missing_features()
     version = landlock_version()
     has = [f"Landlock {version}"] if version else []
     text = ", ".join([*has, *(["seccomp"] if seccomp_works() else [])]) or "nothing to confine by"

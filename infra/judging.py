@@ -18,9 +18,9 @@ from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from storage.typed_json import read_json
 from train.evaluation.evaluate import (
-    Contest,
-    judged_views,
-    make_rivals,
+    EvalConfig,
+    judge_views,
+    make_baselines,
     sheet_views,
     stored_resolution,
     worst_and_median,
@@ -29,7 +29,7 @@ from train.evaluation.evaluate import (
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.report import markdown, record
 from train.evaluation.same_time import same_time
-from train.evaluation.sheet import drawn_sheet, write_picture
+from train.evaluation.sheet import draw_sheet, write_picture
 from train.loop.checkpoints import network_of_run
 from train.loop.crew import choose_device
 from train.loss.lpips import load_lpips
@@ -47,7 +47,7 @@ class Judgement:
     """All figures as JSON values (train.evaluation.report)."""
     views: tuple[JudgedView, ...]
     """Scores of each view, in the order of the dataset."""
-    contest: Contest
+    contest: EvalConfig
     """Network, data and baselines of the evaluation."""
 
 
@@ -91,17 +91,19 @@ def judge_network(
         resolution = min(network_file.trained.resolution or stored, stored)
     torch_device = choose_device(device)
     distance = load_lpips(lpips)
-    contest = Contest(
+    contest = EvalConfig(
         network=network_file.open().to(torch_device),
         shards=shards,
         resolution=resolution,
-        rivals=make_rivals(rivals.split("train"), resolution) if "train" in rivals.splits else None,
+        baselines=make_baselines(rivals.split("train"), resolution)
+        if "train" in rivals.splits
+        else None,
         lpips=None if distance is None else distance.to(torch_device),
         most_scenes=most_scenes,
     )
     counted = _SceneCounter(done, _num_scenes(contest))
     with _tracing(contest, tracer_views) as (contest, traced):
-        views = judged_views(contest, counted.one_more)
+        views = judge_views(contest, counted.one_more)
     about = _about(checkpoint, opened, contest, split, views)
     return Judgement(
         record=record(views, about, traced(views)), views=tuple(views), contest=contest
@@ -109,7 +111,7 @@ def judge_network(
 
 
 @contextlib.contextmanager
-def _tracing(contest: Contest, most_views: int) -> Iterator[tuple[Contest, EqualTimeReport]]:
+def _tracing(contest: EvalConfig, most_views: int) -> Iterator[tuple[EvalConfig, EqualTimeReport]]:
     """Add the path tracer in the network's time to the evaluation, if it can trace the scenes."""
     rival = TracerRival(contest.resolution, most_views=most_views, num_scenes=_num_scenes(contest))
     with contextlib.closing(rival):
@@ -146,7 +148,7 @@ def write_judgement(judgement: Judgement, out: str | Path) -> Path:
     remaining = iter(pictures)
     for name, rows in chosen.items():
         title = (f"{name}, of {len(views)} views at {contest.resolution} pixels, by psnr_log_db",)
-        sheet = drawn_sheet([next(remaining) for _ in rows], title)
+        sheet = draw_sheet([next(remaining) for _ in rows], title)
         write_picture(folder / f"{name.replace(' ', '_')}.png", sheet)
     return folder
 
@@ -180,7 +182,7 @@ class _SceneCounter:
 def _about(
     checkpoint: str,
     opened: TrainingData,
-    contest: Contest,
+    contest: EvalConfig,
     split: str,
     views: Sequence[JudgedView],
 ) -> dict[str, str | int]:
@@ -188,7 +190,7 @@ def _about(
     return {
         "network": Path(checkpoint).name,
         "network sha256": network_digest(contest.network),
-        "data": opened.shown.rstrip("/").rsplit("/", 1)[-1],
+        "data": opened.display_name.rstrip("/").rsplit("/", 1)[-1],
         "build": opened.build or "unknown",
         "data digest": opened.digest,
         "split": split,
@@ -197,7 +199,7 @@ def _about(
     }
 
 
-def _num_scenes(contest: Contest) -> int:
+def _num_scenes(contest: EvalConfig) -> int:
     """Return the number of scenes to evaluate; opens only shards that are evaluated anyway."""
     count = 0
     for number in range(len(contest.shards.names)):

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.machine import cores_owned
+from pipeline.making.machine import available_cores
 from pipeline.making.pipeline import make_task, prepare_dataset
 from pipeline.making.render_children import close_children
-from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece
+from pipeline.making.tasks import MAX_TASKS, TASK_S, Piece
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.dataset.progress import read_progress
-from storage.dataset.scene_logs import look_at_logs
+from storage.dataset.scene_logs import sample_logs
 from storage.dataset.shard import contents_of
 from storage.dataset.splits import lacks_validation, planned_scenes, shard_name, shards_for
 from storage.dataset.staging import read_staged_scene
@@ -146,8 +146,8 @@ def predict(
     num_scenes = planned_scenes(_num_scenes(order), splits)
     num_shards = shards_for(num_scenes, splits)
     core_hours = _total(measured.core_s[1:] or measured.core_s, num_scenes / 3600)
-    scene_s = core_hours.value * 3600 / num_scenes / cores_owned()
-    num_tasks = min(MOST_TASKS, max(1, math.ceil(num_scenes * scene_s / TASK_S)))
+    scene_s = core_hours.value * 3600 / num_scenes / available_cores()
+    num_tasks = min(MAX_TASKS, max(1, math.ceil(num_scenes * scene_s / TASK_S)))
     prediction = Prediction(
         num_scenes=num_scenes,
         num_shards=num_shards,
@@ -178,10 +178,10 @@ def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
     said = "; how long that takes is known after the first scenes"
     if folder.manifest.exists():
         manifest = read_manifest(folder.manifest)
-        last = look_at_logs(folder).last
+        last = sample_logs(folder).last
         scenes = max(scenes, manifest.num_scenes)
         remaining = max(scenes - read_progress(folder).scenes_done, 0)
-        cores = cores_owned()
+        cores = available_cores()
         if last:
             core_s = [row.seconds * row.cores for row in last]
             minutes = _total(core_s, remaining / cores / 60).to_text("{:,.1f}".format)

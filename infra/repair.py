@@ -16,7 +16,7 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.derived import derivation_of
 from storage.dataset.manifest import Manifest
 from storage.errors import TrilightError
-from storage.extensions import recorded, require_same_extensions
+from storage.extensions import extension_digests, require_same_extensions
 from storage.records.objects import OBJECT, SKY, TEXTURE
 from storage.remote.url import parse_url
 
@@ -50,13 +50,13 @@ def repair(
     root = parse_url(dataset, what="dataset")
     if not isinstance(root, Path):
         raise TrilightError(
-            f"dataset {root.shown!r} is on a server; expected a folder to repair. Repair the "
+            f"dataset {root.display_url!r} is on a server; expected a folder to repair. Repair the "
             "folder that it was copied from."
         )
     opened = open_dataset(str(root))
     manifest = opened.manifest
     _require_generated(manifest, scenes_from)
-    require_same_extensions(str(root), manifest.extensions, recorded("data"))
+    require_same_extensions(str(root), manifest.extensions, extension_digests("data"))
     changes = _changes(manifest)
     licence = _stated_licence(opened)
     command = read_asked(opened) or ()
@@ -126,7 +126,7 @@ def _revisit_source(dataset: Dataset, command: Sequence[str]) -> str | None:
         return None
     if (place := value_of(command, "--revisits")) is None:
         raise TrilightError(
-            f"{dataset.shown}: its scenes are those of the dataset "
+            f"{dataset.display_name}: its scenes are those of the dataset "
             f"{settings['revisit']['source_digest']}, and logs/asked.json does not say where that "
             "is. Delete the bad shards, and run the same `trilight revisit` again."
         )
@@ -146,7 +146,8 @@ def _user_maps(dataset: Dataset, command: Sequence[str]) -> dict[str, str | None
     }
     if None in folders.values():
         raise TrilightError(
-            f"{dataset.shown}: its scenes have textures or maps of a folder, and logs/asked.json "
+            f"{dataset.display_name}: its scenes have textures or maps of a folder, and "
+            "logs/asked.json "
             "does not say where that is. Delete the bad shards, and run the same `trilight "
             "generate` again."
         )

@@ -26,7 +26,7 @@ from pipeline.renders.variant import Variant, activate, choose_variant
 from storage.errors import Rejected, TrilightError
 from storage.records.sample import Sample
 from storage.records.scene import Scene
-from train.evaluation.same_time import Times, TracerTimes
+from train.evaluation.same_time import SameTimeResult, TracerTimes
 
 TIMED_SCENES = 4
 """Number of scenes on which both are timed."""
@@ -92,7 +92,7 @@ class TracerRival:
             views = "all views"
         return f"{views} of {'each scene' if self._every == 1 else f'one scene in {self._every}'}"
 
-    def measure(self, network: RenderFormer, samples: Sequence[Sample]) -> Times:
+    def measure(self, network: RenderFormer, samples: Sequence[Sample]) -> SameTimeResult:
         """Time both on some scenes, and choose the samples that fit.
 
         The network is timed first, then the path tracer, then the network once more.
@@ -115,7 +115,7 @@ class TracerRival:
         theirs, missing = self._prices(scenes, _middle([each.further_s for each in ours]))
         ours += [_network_price(renderer, scene, self._resolution) for scene in scenes]
         further_s = _middle([each.further_s for each in ours])
-        return Times(
+        return SameTimeResult(
             network_first_s=_middle([each.first_s for each in ours]),
             network_further_s=further_s,
             scenes=len(scenes),

@@ -12,14 +12,14 @@ from storage.settings.described import checked, option_words
 from storage.settings.ranges import Within
 from train.runs import changed_run
 from train.settings import TrainSettings
-from train.start import Start
+from train.start import StartOptions
 
 RESTARTS = "TORCHELASTIC_RESTART_COUNT"
 """Environment variable in which torchrun counts the restarts of its processes."""
 
 
 @checked()
-class TrainOrder:
+class TrainOptions:
     """Training run, data and start."""
 
     run: str = "smoke"
@@ -83,9 +83,9 @@ class TrainOrder:
         self.start().check(settings)
         return settings
 
-    def start(self) -> Start:
+    def start(self) -> StartOptions:
         """Return the start options of the run."""
-        return Start(
+        return StartOptions(
             resume=self.resume,
             restartable=self.restartable or int(os.environ.get(RESTARTS, "0")) > 0,
             branch=self.branch,

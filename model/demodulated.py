@@ -21,7 +21,7 @@ from torch.nn.functional import softplus
 from model.hits.camera import Rays
 from model.hits.lit_scene import LitScene
 from model.hits.tracing import like, lit_scene_of
-from model.precision import as_given
+from model.precision import without_autocast
 from model.scene_tensors import Cameras, SceneTensors
 
 _START = -1.5
@@ -38,7 +38,7 @@ def compose_radiance(light_BVRR6: Tensor, albedo_BVRR6: Tensor) -> Tensor:
         light_BVRR6: output of a head; diffuse, then specular.
         albedo_BVRR6: albedo in the same order.
     """
-    with as_given(light_BVRR6.device):
+    with without_autocast(light_BVRR6.device):
         log10_BVRR6 = softplus(light_BVRR6 + _START).clamp(max=_BRIGHTEST)
         reflected = albedo_BVRR6 * torch.expm1(log10_BVRR6 * math.log(10))
         return torch.log1p(reflected[..., :3] + reflected[..., 3:]) / math.log(10)

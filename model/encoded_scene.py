@@ -17,7 +17,7 @@ KeysValues = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TokenPlaces:
+class TokenPositions:
     """Positions of the tokens of scenes: registers first, then triangles."""
 
     positions_BN33: Tensor
@@ -50,7 +50,7 @@ class EncodedScene:
     Keys are stored before their rotation, since that depends on the camera.
     """
 
-    places: TokenPlaces
+    places: TokenPositions
     """Positions of all tokens, registers included."""
     keys_values: tuple[KeysValues, ...]
     """Keys and values for each layer of the view stage; for `hits`, keys are rotated into world

@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate, silu
 
 from model.config import NUM_TAPS, ModelConfig
 from model.layers import LAYER_NORM_EPS, Norm
-from model.precision import as_given
+from model.precision import without_autocast
 from model.rays import unbundle
 
 LAST_CHANNELS = 32
@@ -39,7 +39,7 @@ class LinearHead(nn.Module):
     def forward(self, taps_MQW: Sequence[Tensor]) -> Tensor:
         """Return pictures [M, channels, R, R]."""
         tokens_MQW = taps_MQW[0].to(self.last.weight.dtype)
-        with as_given(tokens_MQW.device):
+        with without_autocast(tokens_MQW.device):
             return unbundle(self.last(self.norm(tokens_MQW)), self.patch_px)
 
     def rounded_parts(self) -> list[nn.Module]:
@@ -155,7 +155,7 @@ class DptHead(nn.Module):
                 width = 2 * grids[0].shape[-1]
             fused = self.fuse[level](fused, grids[level], (height, width))
         halved = self.halve(fused).to(self.last.weight.dtype)
-        with as_given(halved.device):
+        with without_autocast(halved.device):
             return self.last(silu(self.widen(halved)))
 
     def rounded_parts(self) -> list[nn.Module]:

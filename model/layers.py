@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 from model.attention import Keys, attend
 from model.encoded_scene import KeysValues
 from model.positions import Rotation, rotate
-from model.precision import as_given
+from model.precision import without_autocast
 from model.rounding import rounded_call, rounded_weights
 from model.windows import Windows, attend_in_windows
 
@@ -35,7 +35,7 @@ class Norm(nn.RMSNorm):
         """[..., W] -> [..., W]."""
         assert self.weight is not None
         weight = self.weight.to(x.dtype)
-        with as_given(x.device):
+        with without_autocast(x.device):
             return nn.functional.rms_norm(x, self.normalized_shape, weight, self.eps)
 
 

@@ -23,7 +23,7 @@ class LightGroup:
     scene: Scene
     """Scene with these lights only, scaled to the power of all lights: a tenth of the light would
     be darker than any training scene."""
-    share: float
+    fraction: float
     """Factor of the group's picture in the sum, 0 to 1."""
 
 
@@ -44,14 +44,14 @@ def light_groups(scene: Scene, most: int) -> list[LightGroup]:
     """
     emitting_E = np.flatnonzero(scene.triangle_emits)
     if not len(emitting_E):
-        return [LightGroup(scene=scene, share=1.0)]
+        return [LightGroup(scene=scene, fraction=1.0)]
     corners_E33 = scene.vertex_positions[scene.faces[emitting_E]].astype(np.float64)
     lamp_E = _lamps(corners_E33)
     groups = _pack_lamps(lamp_E, _is_inside(scene, corners_E33, lamp_E), most)
     power_E = _emitted_power(scene, emitting_E, corners_E33)
     powers = [float(power_E[np.isin(lamp_E, lamps)].sum()) for lamps in groups]
     if len(groups) == 1 or not any(powers):
-        return [LightGroup(scene=scene, share=1.0)]
+        return [LightGroup(scene=scene, fraction=1.0)]
     lit_groups = [
         (lamps, power / sum(powers)) for lamps, power in zip(groups, powers, strict=True) if power
     ]
@@ -134,4 +134,4 @@ def _group(scene: Scene, removed_faces: NDArray[np.int64], fraction: float) -> L
         object_index=np.delete(scene.object_index, removed_faces),
         materials=materials,
     )
-    return LightGroup(scene=alone, share=fraction)
+    return LightGroup(scene=alone, fraction=fraction)

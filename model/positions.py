@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from model.encoded_scene import TokenPlaces
+from model.encoded_scene import TokenPositions
 from model.packing import Packing, pack_tokens
 
 Rotation = tuple[Tensor, Tensor]
@@ -116,7 +116,7 @@ def token_positions(
     num_registers: int,
     eps: float,
     num_triangles: tuple[int, ...] | None = None,
-) -> TokenPlaces:
+) -> TokenPositions:
     """Return the positions of registers and triangles; `num_triangles` agrees with the mask.
 
     The published code divides the registers' sum of positions by T + 1e-5, in world space and again
@@ -134,7 +134,7 @@ def token_positions(
         count_B = is_triangle_BT.sum(dim=1).to(scale_BN11.dtype)
         is_key_BN = nn.functional.pad(is_triangle_BT, (num_registers, 0), value=True)
     scale_BN11[:, :num_registers] = (count_B / (count_B + eps))[:, None, None, None]
-    return TokenPlaces(
+    return TokenPositions(
         positions_BN33=torch.cat([registers_BR33, triangles_BT33], dim=1),
         scale_BN11=scale_BN11,
         is_key_BN=is_key_BN,
@@ -155,12 +155,12 @@ def packed_camera_rotation(rotation_BVNA: Rotation, packing: Packing) -> Rotatio
     return rotation[0].transpose(1, 2), rotation[1].transpose(1, 2)
 
 
-def world_rotation(rotary: TriangleRotary, places: TokenPlaces) -> Rotation:
+def world_rotation(rotary: TriangleRotary, places: TokenPositions) -> Rotation:
     """Return the rotation [B, N, D / 2] of all tokens in world space."""
     return rotary(places.positions_BN33 * places.scale_BN11)
 
 
-def camera_rotation(rotary: TriangleRotary, places: TokenPlaces, c2w_BV44: Tensor) -> Rotation:
+def camera_rotation(rotary: TriangleRotary, places: TokenPositions, c2w_BV44: Tensor) -> Rotation:
     """Return the rotation [B, V, N, D / 2] of all tokens in the space of each camera."""
     positions_BVN33 = to_camera(places.positions_BN33, c2w_BV44)
     return rotary(positions_BVN33 * places.scale_BN11[:, None])

@@ -80,7 +80,7 @@ def set_precision(model: "RenderFormer", name: str) -> "RenderFormer":
     return model
 
 
-def as_given(device: torch.device) -> AbstractContextManager[None]:
+def without_autocast(device: torch.device) -> AbstractContextManager[None]:
     """Return a context without autocast, in which operations keep the types of their inputs."""
     if device.type == "meta":  # it has no autocast, and operations are only counted there
         return nullcontext()  # torch 2.11 cannot compile a check whether a device has it
@@ -88,14 +88,14 @@ def as_given(device: torch.device) -> AbstractContextManager[None]:
 
 
 @contextmanager
-def quick_products(device: torch.device, *, wanted: bool) -> Iterator[None]:
+def fast_float32_products(device: torch.device, *, enabled: bool) -> Iterator[None]:
     """Let a GPU multiply float32 matrices with 10 bits of mantissa, eight times as fast.
 
     Used while a network trains in reduced precision: in the backward pass, whose other products
     have 7 bits, and in the pixel network of `hits`. On an H200 float32 there took a sixth of the
     step of `hits-256`.
     """
-    if device.type != "cuda" or not wanted:
+    if device.type != "cuda" or not enabled:
         yield
         return
     before = torch.get_float32_matmul_precision()

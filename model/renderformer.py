@@ -23,7 +23,7 @@ from model.image_head import zero_last_layer
 from model.positions import TriangleRotary, token_positions
 from model.precision import tf32
 from model.scene_tensors import Cameras, SceneBatch, in_light_units
-from model.sky.known import require_known
+from model.sky.known import require_known_sky
 from model.triangle_encoder import TriangleEncoder
 from model.view_decoder import ViewDecoder
 from storage.errors import TrilightError
@@ -104,7 +104,7 @@ class RenderFormer(nn.Module):
     ) -> EncodedScene:
         """Encode scenes by the view-independent stage, if there is one."""
         for sky in batch.skies or ():
-            require_known(sky, self.config)
+            require_known_sky(sky, self.config)
         places = token_positions(
             batch.triangles_BT33,
             batch.is_triangle_BT,
@@ -183,7 +183,7 @@ class RenderFormer(nn.Module):
         if self.encoder is not None:
             self.encoder.recompute = enabled
 
-    def initialise(self, generator: torch.Generator) -> None:
+    def initialize(self, generator: torch.Generator) -> None:
         """Initialize all weights: Xavier for matrices, small tokens, a black picture."""
         for module in self.modules():
             if isinstance(module, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):

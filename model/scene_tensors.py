@@ -165,7 +165,7 @@ def tensors_of(scenes: SceneTensors | SceneBatch) -> dict[str, Tensor]:
     return {name: value for name, value in vars(scenes).items() if isinstance(value, Tensor)}
 
 
-def converted(scenes: Scenes, convert: Callable[[Tensor], Tensor]) -> Scenes:
+def map_tensors(scenes: Scenes, convert: Callable[[Tensor], Tensor]) -> Scenes:
     """Return the same scenes with each tensor converted, such as moved to a device."""
     fields: dict[str, Any] = {name: convert(each) for name, each in tensors_of(scenes).items()}
     if scenes.traced is not None:

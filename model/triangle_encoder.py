@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from model.attention import Keys
 from model.config import ModelConfig
-from model.encoded_scene import TokenPlaces
+from model.encoded_scene import TokenPositions
 from model.layers import TOKEN_NORM_EPS, EncoderLayer, Norm, dtype_of, run_layer
 from model.packing import Packing, pack_tokens
 from model.positions import (
@@ -19,7 +19,7 @@ from model.positions import (
     packed_rotation,
     world_rotation,
 )
-from model.precision import as_given
+from model.precision import without_autocast
 from model.scene_tensors import SceneBatch
 from storage.records.material import material_width
 
@@ -53,7 +53,7 @@ class TriangleTokens(nn.Module):
         input of networks with the view stage `hits`. It is compressed to log1p(4 x), since it spans
         orders of magnitude; the curve is linear below a quarter of the mean, and logarithmic above.
         """
-        with as_given(material_BTM.device):
+        with without_autocast(material_BTM.device):
             material_BTW = self.material_norm(self.material(material_BTM))
             normal_BTW = self.normal_norm(self.normal(encode_normals(normals_BT33, self.octaves)))
             tokens_BTW = self.token_W + material_BTW + normal_BTW
@@ -77,14 +77,14 @@ class TriangleEncoder(nn.Module):
             for _ in range(config.encoder_layers)
         )
 
-    def packing(self, places: TokenPlaces) -> Packing | None:
+    def packing(self, places: TokenPositions) -> Packing | None:
         """Return the packing of the tokens before the layers, or None without packing."""
         return places.packing(next(self.layers.parameters()), self.rotary.head_width)
 
     def forward(
         self,
         batch: SceneBatch,
-        places: TokenPlaces,
+        places: TokenPositions,
         light_BTL: Tensor | None = None,
         packing: Packing | None = None,
     ) -> Tensor:

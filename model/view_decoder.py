@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from model.config import ModelConfig
-from model.encoded_scene import EncodedScene, KeysValues, TokenPlaces
+from model.encoded_scene import EncodedScene, KeysValues, TokenPositions
 from model.image_head import build_head, stack_taps
 from model.layers import TOKEN_NORM_EPS, DecoderLayer, Norm, dtype_of, run_layer
 from model.packing import Packing
@@ -21,7 +21,7 @@ from model.positions import (
     camera_rotation,
     packed_camera_rotation,
 )
-from model.precision import as_given
+from model.precision import without_autocast
 from model.rays import bundle_rays, ray_directions
 from model.rounding import rounded_call, rounded_parts_of
 from model.scene_tensors import Cameras
@@ -50,7 +50,7 @@ class ViewDecoder(nn.Module):
         self.head = build_head(config)
 
     def keys_values(
-        self, context_BNW: Tensor, places: TokenPlaces, packing: Packing | None = None
+        self, context_BNW: Tensor, places: TokenPositions, packing: Packing | None = None
     ) -> tuple[KeysValues, ...]:
         """Return each layer's keys and values of a context: once per scene, for any views.
 
@@ -104,7 +104,7 @@ class ViewDecoder(nn.Module):
     def bundle_tokens(self, fov_deg_BV: Tensor, resolution: int) -> Tensor:
         """Return the tokens [B, V, Q, W] of square pictures, float32 under autocast too."""
         rays_BVQC = bundle_rays(ray_directions(fov_deg_BV, resolution), self.patch_px)
-        with as_given(rays_BVQC.device):
+        with without_autocast(rays_BVQC.device):
             return self.token_W + self.rays_norm(self.rays(rays_BVQC))
 
     def _cuts(self, per_side: int, device: torch.device) -> Cuts:

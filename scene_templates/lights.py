@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scene_templates.cameras import Sector
 from scene_templates.checks import OFFSET, SIZE, Counts, Range
 from scene_templates.layout import Emitter
-from scene_templates.rotations import Orientation, rotated, rotation_rand
+from scene_templates.rotations import Orientation, rotate_points, rotation_rand
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 
@@ -111,7 +111,9 @@ def _emitter_rand(
     rng: np.random.Generator, settings: LightSettings, centre: NDArray[np.float64], count: int
 ) -> Emitter:
     # About its own middle, so that its distance is the one drawn.
-    turned = rotated(TRIANGLE - TRIANGLE.mean(axis=0), rotation_rand(rng, settings.orientation))
+    turned = rotate_points(
+        TRIANGLE - TRIANGLE.mean(axis=0), rotation_rand(rng, settings.orientation)
+    )
     triangle = turned * rng.uniform(*settings.scale, size=3) + centre
     radiance = rng.uniform(*settings.total_emission) / count
     red, green, blue = radiance * _tint_rand(rng, settings.coloured_share)

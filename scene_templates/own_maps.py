@@ -19,7 +19,7 @@ Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class OwnMap(Generic[Made]):
+class UserMap(Generic[Made]):
     """A texture or map that is read when it is drawn."""
 
     uid: str
@@ -31,7 +31,7 @@ class OwnMap(Generic[Made]):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class OwnTexture:
+class UserTexture:
     """Reflectance maps of a user's texture."""
 
     diffuse_rgb: NDArray[np.float32]
@@ -63,21 +63,21 @@ class OwnTexture:
 class OwnMaps:
     """User textures and skies that the scenes of a split may use."""
 
-    textures: Sequence[OwnMap[OwnTexture]] = ()
+    textures: Sequence[UserMap[UserTexture]] = ()
     """The user's textures, sorted by uid."""
-    skies: Sequence[OwnMap[NDArray[np.float32]]] = ()
+    skies: Sequence[UserMap[NDArray[np.float32]]] = ()
     """Maps [H, 2H, 3] of linear radiance, sorted by uid."""
 
 
 NO_OWN_MAPS = OwnMaps()
 
 
-def drawn_own(
+def draw_user_map(
     rng: np.random.Generator,
-    user_maps: Sequence[OwnMap[Made]],
+    user_maps: Sequence[UserMap[Made]],
     share: float,
     licences: Sequence[str],
-) -> OwnMap[Made] | None:
+) -> UserMap[Made] | None:
     """Return one of a user's own, each equally likely, or None where a procedural one is taken.
 
     Nothing is drawn of `rng` where the share is 0 or there is none.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scene_templates.checks import Range
 from scene_templates.layout import Plane, Pose
 from scene_templates.rooms import SIDES, Room
-from scene_templates.rotations import Orientation, rotated, rotation_rand
+from scene_templates.rotations import Orientation, rotate_points, rotation_rand
 from storage.errors import Rejected
 from storage.settings.described import checked
 from storage.settings.ranges import Share
@@ -148,7 +148,7 @@ def _pose_rand(
     """Draw a place for an object clear of others, or None where none was found."""
     rotation = rotation_rand(rng, settings.orientation)
     rests = bool(rng.random() < settings.resting_share)
-    points = radius * rotated(shape.points, rotation)
+    points = radius * rotate_points(shape.points, rotation)
     low = np.full(3, -0.5)
     high = np.full(3, 0.5)
     if settings.inside:

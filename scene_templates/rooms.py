@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from scene_templates.checks import OFFSET, SHIFT, SIZE, Range
 from scene_templates.layout import Plane
-from scene_templates.rotations import rotated, rotation_xyz
+from scene_templates.rotations import rotate_points, rotation_xyz
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 
@@ -75,7 +75,7 @@ def patch(side: Side, placement: PatchPlacement) -> NDArray[np.float64]:
     second = (side.axis + 2) % 3
     local[:, first], local[:, second] = (v, u) if side.sign > 0 else (u, v)
     local[:, side.axis] = side.sign
-    turned = rotated(local, rotation_xyz(placement.rotation_deg))
+    turned = rotate_points(local, rotation_xyz(placement.rotation_deg))
     return (turned * placement.scale + placement.translation) / 2
 
 

@@ -17,7 +17,7 @@ Kind = Literal["uniform", "whole number", "share", "colour", "shade", "direction
 
 
 @dataclass(frozen=True, kw_only=True)
-class StatedDraw:
+class RecordedDraw:
     """Stated distribution of one name, and the drawn values."""
 
     kind: Kind
@@ -42,7 +42,7 @@ class RecordedSampler:
     def __init__(self, rng: np.random.Generator) -> None:
         """Draw from `rng`, which no other code may use at the same time."""
         self._rng = rng
-        self.made: dict[str, StatedDraw] = {}
+        self.made: dict[str, RecordedDraw] = {}
 
     def uniform(self, name: str, low: float, high: float) -> float:
         """Return a number uniform in [low, high]."""
@@ -101,14 +101,14 @@ class RecordedSampler:
         return float(low + (high - low) * self._rng.random())
 
     def _record(self, name: str, kind: Kind, stated: Any, value: Any) -> Any:
-        draw = self.made.setdefault(name, StatedDraw(kind=kind, stated=stated))
+        draw = self.made.setdefault(name, RecordedDraw(kind=kind, stated=stated))
         if (draw.kind, draw.stated) != (kind, stated):
             raise ValueError(f"{name!r} is drawn from {stated} and from {draw.stated}")
         draw.values.append(value)
         return value
 
 
-def _row(draw: StatedDraw) -> str:
+def _row(draw: RecordedDraw) -> str:
     if draw.kind == "share":
         return f"true with probability {draw.stated:g}"
     if draw.kind == "choice":

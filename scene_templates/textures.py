@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.checks import Range
-from scene_templates.own_maps import OwnMap, OwnTexture, drawn_own
+from scene_templates.own_maps import UserMap, UserTexture, draw_user_map
 from scene_templates.surfaces.draw import SurfaceMapSettings, draw_surface
 from scene_templates.surfaces.maps import SurfaceMaps
 from storage.settings.described import checked
@@ -65,7 +65,7 @@ class TexturedLook:
 def draw_look(
     rng: np.random.Generator,
     settings: TextureSettings,
-    user_textures: Sequence[OwnMap[OwnTexture]] = (),
+    user_textures: Sequence[UserMap[UserTexture]] = (),
     licences: Sequence[str] = (),
 ) -> TexturedLook | None:
     """Return the texture of a surface, or None where it has none.
@@ -83,7 +83,7 @@ def draw_look(
     tile_m = rng.uniform(*settings.tile_m)
     turns = int(rng.integers(4))
     shift_u, shift_v = rng.random(2)
-    chosen = drawn_own(rng, user_textures, settings.own_share, licences)
+    chosen = draw_user_map(rng, user_textures, settings.own_share, licences)
     if chosen is None:
         maps = draw_surface(rng, settings.surfaces)
     else:

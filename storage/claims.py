@@ -37,7 +37,7 @@ _unlocked = itertools.count()
 
 
 @contextlib.contextmanager
-def claimed(path: Path, *, wait: bool = False) -> Iterator[bool]:
+def hold_claim(path: Path, *, wait: bool = False) -> Iterator[bool]:
     """Hold a claim for the block; yield whether it is ours.
 
     Args:

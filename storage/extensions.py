@@ -169,7 +169,7 @@ def load_reference(reference: str) -> Iterator[Any]:
         yield member() if callable(member) else member
 
 
-def recorded(part: Decided) -> dict[str, str]:
+def extension_digests(part: Decided) -> dict[str, str]:
     """Return the sha256 of each extension that has part in what is made, by its name.
 
     One that registers nothing may do anything, and counts too. One that only adds a metric, a

@@ -82,7 +82,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             extension.decides.update(self._decides)
             extension.undo.append(lambda: self._remove(name))
 
-    def typed(self, reference: str, as_entry: Callable[[Any], Entry]) -> str:
+    def resolve(self, reference: str, as_entry: Callable[[Any], Entry]) -> str:
         """Return the name of an entry that was typed on a command line.
 
         FILE.py:FUNCTION runs a file of their own and registers what the function returns as

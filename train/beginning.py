@@ -17,7 +17,7 @@ from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.extensions import recorded
+from storage.extensions import extension_digests
 from storage.records.safe_read import read_plain
 from storage.typed_json import read_json
 from train.data.mixture import RECORD, plan_mixture
@@ -35,14 +35,14 @@ from train.loop.checkpoints import (
     save_checkpoint,
     saved_steps,
 )
-from train.loop.crew import Crew
-from train.loop.muon import fitting_precision
+from train.loop.crew import DistributedContext
+from train.loop.muon import choose_muon_precision
 from train.loop.recorder import MetricsLog
 from train.loop.state import TrainState, new_state
 from train.progress import TrainProgress
 from train.result import pretty_json
 from train.settings import TrainSettings
-from train.start import Start
+from train.start import StartOptions
 from train.stored_settings import stored_settings
 from train.watching.rows import read_rows
 
@@ -69,8 +69,8 @@ def plan_start(
     settings: TrainSettings,
     folder: RunFolder,
     data_digest: str,
-    start: Start,
-    dist_context: Crew,
+    start: StartOptions,
+    dist_context: DistributedContext,
     progress: TrainProgress,
 ) -> StartPlan:
     """Read what the run starts or resumes with, without writing anything.
@@ -85,7 +85,7 @@ def plan_start(
             "another --out."
         )
     start.check(settings)
-    if not start.goes_on:
+    if not start.continues_run:
         source = start.begin_with
         if source is None:
             return StartPlan(settings=settings)
@@ -95,7 +95,7 @@ def plan_start(
     branch = None if start.resume or start.branch is None else Path(start.branch)
     if branch is None or branch.is_dir():
         checkpoints = (folder if branch is None else RunFolder(branch)).checkpoints
-        checkpoint = newest_checkpoint(checkpoints, dist_context, progress.noted)
+        checkpoint = newest_checkpoint(checkpoints, dist_context, progress.note)
     else:
         checkpoint = read_checkpoint(branch)
         # the first process soon writes into the folder that all have looked at
@@ -113,7 +113,7 @@ def init_or_resume_state(
     plan: StartPlan,
     folder: RunFolder,
     data: TrainingData,
-    dist_context: Crew,
+    dist_context: DistributedContext,
     progress: TrainProgress,
 ) -> TrainState:
     """Create or restore the state before the run's next step, and record it on disk.
@@ -123,12 +123,12 @@ def init_or_resume_state(
     Raises:
         TrilightError: `data_weights` has another length than the list of datasets.
     """
-    precision = fitting_precision(dist_context)
+    precision = choose_muon_precision(dist_context)
     data_digest = data.digest
     header = None if plan.checkpoint is None else plan.checkpoint.header
     mixture = plan_mixture(data, plan.settings, header)
     if mixture is not None:
-        progress.noted(f"the stream mixes {mixture}")
+        progress.note(f"the stream mixes {mixture}")
     if plan.checkpoint is None or plan.resume_plan is None:
         state = new_state(plan.settings, dist_context.device, plan.network, precision)
         state.mixture = mixture
@@ -146,7 +146,7 @@ def init_or_resume_state(
     if plan.branch is not None:
         state.history += (_origin(state.step, "checkpoint", plan.checkpoint.header),)
     for note in plan.resume_plan.notes:
-        progress.noted(note)
+        progress.note(note)
     _record_execution_changes(plan.checkpoint, dist_context, state, progress)
     if dist_context.is_first:
         _write_resumed_run(plan, folder, state, data_digest, dist_context)
@@ -154,7 +154,11 @@ def init_or_resume_state(
 
 
 def _write_resumed_run(
-    plan: StartPlan, folder: RunFolder, state: TrainState, data_digest: str, dist_context: Crew
+    plan: StartPlan,
+    folder: RunFolder,
+    state: TrainState,
+    data_digest: str,
+    dist_context: DistributedContext,
 ) -> None:
     """Write how a run resumes, so that a kill before its next checkpoint loses nothing."""
     if plan.branch is not None:
@@ -207,13 +211,13 @@ def _write_settings(
     settings: TrainSettings,
     state: TrainState,
     data_digest: str,
-    dist_context: Crew,
+    dist_context: DistributedContext,
     more: Mapping[str, Any] | None = None,
 ) -> None:
     """Write settings.json: current settings, their history, and how the run started."""
     origin = {
         "begun_with_sha256": None,
-        **({"extensions": extensions} if (extensions := recorded("weights")) else {}),
+        **({"extensions": extensions} if (extensions := extension_digests("weights")) else {}),
         "versions": {"torch": torch.__version__, "python": platform.python_version()},
         "threads": torch.get_num_threads(),
         "processes": dist_context.world_size,
@@ -238,7 +242,10 @@ def _read_settings(folder: RunFolder) -> dict[str, Any]:
 
 
 def _record_execution_changes(
-    checkpoint: Checkpoint, dist_context: Crew, state: TrainState, progress: TrainProgress
+    checkpoint: Checkpoint,
+    dist_context: DistributedContext,
+    state: TrainState,
+    progress: TrainProgress,
 ) -> None:
     """Report and record changed processes, threads and Muon precision."""
     header = checkpoint.header
@@ -260,6 +267,6 @@ def _record_execution_changes(
     for name, (before, after) in now.items():
         if before is None or after is None or before == after:
             continue
-        progress.noted(f"the run goes on with {descriptions[name]}")
+        progress.note(f"the run goes on with {descriptions[name]}")
         event = Event(step=state.step, kind="execution", name=name, before=before, after=after)
         state.history += (event,)

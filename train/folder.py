@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from storage.claims import claimed, describe_holder
+from storage.claims import describe_holder, hold_claim
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
-    from train.loop.crew import Crew
+    from train.loop.crew import DistributedContext
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class RunFolder:
 
 
 @contextlib.contextmanager
-def claim_run(folder: RunFolder, dist_context: "Crew") -> Iterator[None]:
+def claim_run(folder: RunFolder, dist_context: "DistributedContext") -> Iterator[None]:
     """Lock a run's folder against other trainers for the block; all processes must call it.
 
     The first process holds the lock. Folders that are empty afterwards are removed again.
@@ -85,7 +85,7 @@ def claim_run(folder: RunFolder, dist_context: "Crew") -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         if dist_context.is_first:
             try:
-                if not stack.enter_context(claimed(folder.claim)):
+                if not stack.enter_context(hold_claim(folder.claim)):
                     problem = TrilightError(
                         f"{folder.root}: {describe_holder(folder.claim)}, trains there; expected a "
                         "folder for this trainer alone. Wait until it has ended, or choose another "

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from storage.errors import TrilightError
 from storage.settings.changes import changed, differences
-from storage.settings.described import described, from_record, settings_record
+from storage.settings.described import describe_fields, from_record, settings_record
 from train.loop.schedule import decay_start_step
 from train.settings import TrainSettings
 from train.stored_settings import known_settings
@@ -28,7 +28,7 @@ _FIXED = ("run", "from_weights", "model", "base_widths")
 _LEAST_DIGITS = 8
 """Minimum number of digits that identify a digest; fewer could match other data."""
 
-_EXECUTION = frozenset(field.name for field in described(TrainSettings) if field.is_execution)
+_EXECUTION = frozenset(field.name for field in describe_fields(TrainSettings) if field.is_execution)
 
 
 @dataclass(frozen=True, kw_only=True)

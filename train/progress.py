@@ -9,7 +9,7 @@ class TrainProgress:
     Each does nothing here; a subclass overrides those that it displays.
     """
 
-    def noted(self, text: str) -> None:
+    def note(self, text: str) -> None:
         """Receive a message for the user, such as a warning about the data."""
 
     def begin(
@@ -28,14 +28,14 @@ class TrainProgress:
     def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
         """Receive `step` finished steps; `loss` is the mean over the views of the last one."""
 
-    def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
+    def report_validation(self, *, step: int, scores: Mapping[str, float]) -> None:
         """Receive the scores of a validation after `step` steps (evaluation.scores)."""
 
-    def hung(self, text: str) -> None:
+    def report_hang(self, text: str) -> None:
         """Receive a hang of a run that is to stop on one; called from another thread.
 
         The caller has to end the process, since nothing else ends a call that hangs.
         """
 
-    def interrupted(self, times: int) -> None:
+    def report_interrupt(self, times: int) -> None:
         """Receive the `times`-th signal to stop; called from another thread."""

@@ -82,7 +82,7 @@ def finish_run(
         scores=validation.scores if validation else None,
         median_scores=judge.median_scores if judge else None,
         lead=validation.lead if validation else None,
-        unusable=tuple(state.unusable.messages),
+        unusable=tuple(state.bad_samples.messages),
         history=state.history,
         seconds=seconds,
     )

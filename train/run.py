@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from model.renderformer import count_parameters
-from model.sky.known import lit_sky, require_known
+from model.sky.known import lit_sky, require_known_sky
 from storage.dataset.mixed_data import open_mixture
 from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
@@ -18,13 +18,13 @@ from train.beginning import init_or_resume_state, plan_start
 from train.data.arrival import decodes_on_device, step_scenes
 from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import Unusable, first_samples
+from train.data.unusable import BadSampleCounter, first_samples
 from train.data.workers import choose_workers, detect_machine
 from train.evaluation.judge import Judge
 from train.evaluation.rivals import median_picture
 from train.folder import RunFolder, claim_run
 from train.loop.checkpoints import saved_steps
-from train.loop.crew import Crew
+from train.loop.crew import DistributedContext
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState
 from train.loop.trainer import Trainer, scene_flops
@@ -33,7 +33,7 @@ from train.loss.objective import Objective
 from train.progress import TrainProgress
 from train.result import TrainResult, finish_run
 from train.settings import TrainSettings
-from train.start import Start
+from train.start import StartOptions
 from train.watching.notes import add_note
 from train.watching.settings import WatchSettings
 from train.watching.weights_and_biases import require_wandb
@@ -55,8 +55,8 @@ def train_run(
     *,
     data: Sequence[str],
     out: Path,
-    start: Start | None = None,
-    crew: Crew | None = None,
+    start: StartOptions | None = None,
+    dist_context: DistributedContext | None = None,
     workers: int | None = None,
     watched: WatchSettings | None = None,
     progress: TrainProgress | None = None,
@@ -86,18 +86,20 @@ def train_run(
             went dead, too little memory, or a signal that asked to stop.
     """
     require_wandb((watched or WatchSettings()).wandb)
-    crew = crew or Crew(device=torch.device("cpu"))
+    dist_context = dist_context or DistributedContext(device=torch.device("cpu"))
     folder = RunFolder(out)
-    with claim_run(folder, crew):
+    with claim_run(folder, dist_context):
         return _train(
             settings,
             data=data,
             folder=folder,
-            start=start or Start(),
-            dist_context=crew,
+            start=start or StartOptions(),
+            dist_context=dist_context,
             workers=workers,
             watched=watched or WatchSettings(),
-            progress=progress if progress is not None and crew.is_first else TrainProgress(),
+            progress=progress
+            if progress is not None and dist_context.is_first
+            else TrainProgress(),
         )
 
 
@@ -106,8 +108,8 @@ def _train(
     *,
     data: Sequence[str],
     folder: RunFolder,
-    start: Start,
-    dist_context: Crew,
+    start: StartOptions,
+    dist_context: DistributedContext,
     workers: int | None,
     watched: WatchSettings,
     progress: TrainProgress,
@@ -118,7 +120,7 @@ def _train(
     start = _resolve_restart(start, folder, dist_context)
     early_notes = _NoteBuffer(progress)
     for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
-        early_notes.noted(note)
+        early_notes.note(note)
     workers = _choose_workers(settings, dist_context, early_notes) if workers is None else workers
     plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
     settings = plan.settings
@@ -126,7 +128,7 @@ def _train(
     objective = Objective(settings.loss, lpips).to(dist_context.device)
     _check_data(dataset, settings)
     state = init_or_resume_state(plan, folder, dataset, dist_context, early_notes)
-    judge = _make_judge(dataset, settings, state.unusable) if dist_context.is_first else None
+    judge = _make_judge(dataset, settings, state.bad_samples) if dist_context.is_first else None
     recorder = None
     if dist_context.is_first:
         recorder = _recorder(state, settings, folder, judge, progress, watched)
@@ -152,7 +154,9 @@ def _train(
     return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
 
 
-def _choose_workers(settings: TrainSettings, dist_context: Crew, progress: TrainProgress) -> int:
+def _choose_workers(
+    settings: TrainSettings, dist_context: DistributedContext, progress: TrainProgress
+) -> int:
     """Return the number of decoding threads, and report the reason."""
     choice = choose_workers(
         detect_machine(),
@@ -160,11 +164,13 @@ def _choose_workers(settings: TrainSettings, dist_context: Crew, progress: Train
         on_gpu=dist_context.device.type == "cuda",
         busy_threads=torch.get_num_threads(),
     )
-    progress.noted(choice.reason)
+    progress.note(choice.reason)
     return choice.threads
 
 
-def _resolve_restart(start: Start, folder: RunFolder, dist_context: Crew) -> Start:
+def _resolve_restart(
+    start: StartOptions, folder: RunFolder, dist_context: DistributedContext
+) -> StartOptions:
     """Decide in all processes alike whether a restartable run resumes.
 
     All processes must call it: torchrun counts restarts for each machine separately, and a network
@@ -175,7 +181,11 @@ def _resolve_restart(start: Start, folder: RunFolder, dist_context: Crew) -> Sta
 
 
 def _batches(
-    data: TrainingData, settings: TrainSettings, state: TrainState, dist_context: Crew, workers: int
+    data: TrainingData,
+    settings: TrainSettings,
+    state: TrainState,
+    dist_context: DistributedContext,
+    workers: int,
 ) -> Generator[list[TrainingScene], None, None]:
     """Return the scenes of this process for each step, beginning with the state's step."""
     stream = dataclasses.replace(
@@ -185,9 +195,9 @@ def _batches(
         data.split("train"),
         stream,
         state.step,
-        share=dist_context.share,
+        rank_slice=dist_context.rank_slice,
         workers=workers,
-        unusable=state.unusable,
+        unusable=state.bad_samples,
         mixture=state.mixture,
     )
 
@@ -199,15 +209,15 @@ class _NoteBuffer(TrainProgress):
         self._progress = progress
         self.texts: list[str] = []
 
-    def noted(self, text: str) -> None:
-        self._progress.noted(text)
+    def note(self, text: str) -> None:
+        self._progress.note(text)
         self.texts.append(text)
 
 
 def _record_start(
     folder: RunFolder,
     state: TrainState,
-    dist_context: Crew,
+    dist_context: DistributedContext,
     notes: Sequence[str],
     *,
     resumed: bool,
@@ -239,7 +249,7 @@ def _check_data(data: TrainingData, settings: TrainSettings) -> None:
     per_light = settings.augmentation.light_mix > 1
     num_views = [source.num_views for source in data.sources]
     if None in num_views or per_light:
-        unusable = Unusable(settings.most_unusable)
+        unusable = BadSampleCounter(settings.most_unusable)
         samples = list(first_samples(shards, len(data.sources), unusable))
         num_views = [sample.scene.num_views for sample in samples]
         for sample in samples:
@@ -247,12 +257,14 @@ def _check_data(data: TrainingData, settings: TrainSettings) -> None:
     fewest = min(count for count in num_views if count is not None)
     if settings.views_per_scene > fewest:
         raise TrilightError(
-            f"views_per_scene is {settings.views_per_scene}, but scenes of {data.shown} "
+            f"views_per_scene is {settings.views_per_scene}, but scenes of {data.display_name} "
             f"have {fewest} views; expected at most that many."
         )
 
 
-def _make_judge(data: TrainingData, settings: TrainSettings, unusable: Unusable) -> Judge | None:
+def _make_judge(
+    data: TrainingData, settings: TrainSettings, unusable: BadSampleCounter
+) -> Judge | None:
     if VALIDATION not in data.splits:
         return None
     training = [
@@ -260,9 +272,11 @@ def _make_judge(data: TrainingData, settings: TrainSettings, unusable: Unusable)
         for sample in first_samples(data.split("train"), MEDIAN_SCENES, unusable)
     ]
     # no damage is allowed here: a score over fewer scenes would be another score
-    samples = list(first_samples(data.split(VALIDATION), settings.validation_scenes, Unusable(0)))
+    samples = list(
+        first_samples(data.split(VALIDATION), settings.validation_scenes, BadSampleCounter(0))
+    )
     for sample in samples:  # before any step, not at the first validation
-        require_known(lit_sky(sample.scene.environment), settings.model)
+        require_known_sky(lit_sky(sample.scene.environment), settings.model)
     return Judge(samples, settings.resolution, median_picture(training))
 
 

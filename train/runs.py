@@ -271,7 +271,7 @@ def typed_run(typed: str) -> str:
     Raises:
         TrilightError: as `Registry.typed`, or the function returns something else.
     """
-    return RUNS.typed(typed, _as_run)
+    return RUNS.resolve(typed, _as_run)
 
 
 def _as_run(settings: Any) -> Callable[[], TrainSettings]:
@@ -322,13 +322,13 @@ def changed_run(
     run = named_run(name)
     every = dict(changes)
     if steps is not None:
-        every |= {**in_proportion(run, steps, changes), "num_steps": steps}
+        every |= {**scale_intervals(run, steps, changes), "num_steps": steps}
     if most_unusable is not None:
         every["most_unusable"] = most_unusable
     return changed(run, every)
 
 
-def in_proportion(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -> dict[str, int]:
+def scale_intervals(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -> dict[str, int]:
     """Return the scaled warm-up and intervals of a shorter run; nothing for a longer one.
 
     Each interval is a multiple of another: validations and checkpoints fall on rows of the log, and

@@ -11,7 +11,7 @@ _HOW = "--set from_weights"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Start:
+class StartOptions:
     """Options of how a run starts or resumes."""
 
     resume: bool = False
@@ -31,7 +31,7 @@ class Start:
     """Source of the LPIPS weights (train.loss.lpips.load_lpips)."""
 
     @property
-    def goes_on(self) -> bool:
+    def continues_run(self) -> bool:
         """True if the run starts from a checkpoint, not from weights alone."""
         return self.resume or self.branch is not None
 
@@ -47,7 +47,7 @@ class Start:
                 f"run {settings.run}: branch is {self.branch} and begin_with is {self.begin_with}; "
                 "expected one of them: the whole state of a run, or its weights alone."
             )
-        if self.goes_on:
+        if self.continues_run:
             return
         if self.decisions and not self.restartable:
             name = next(iter(self.decisions))

@@ -137,7 +137,7 @@ def render_views(
         seed=seed,
         variant=choose_variant(),
         threads=threads or os.cpu_count() or 1,
-        sampled=lambda now: None,
+        on_samples=lambda now: None,
     )
     try:
         tracer.open(scene, "scene")

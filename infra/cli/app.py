@@ -11,7 +11,7 @@ from types import FrameType
 from cyclopts import CycloptsError
 
 from infra.cli.commands import app, complaint
-from infra.cli.extending import extended
+from infra.cli.extending import load_extensions
 from infra.cli.leaving import InertFormatter, leave, open_missing_streams
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.extensions import mistake_in_extension
@@ -36,10 +36,10 @@ def main() -> None:
     try:
         _require_usable_names()
         if "TRILIGHT_CONFINE" in os.environ:  # at once, though no file may have to be read
-            from pipeline.isolation.confinement import wanted_confinement
+            from pipeline.isolation.confinement import confinement_mode
 
-            wanted_confinement()
-        app(extended(sys.argv[1:]))
+            confinement_mode()
+        app(load_extensions(sys.argv[1:]))
         sys.stdout.flush()
     except CycloptsError as mistake:
         leave(f"trilight: {complaint(mistake)}", 2)

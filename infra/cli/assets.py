@@ -24,7 +24,7 @@ from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.errors import TrilightError
 from storage.records.objects import count_by_reason
 from storage.remote.safe_url import safe_url
-from storage.settings.described import checked, described
+from storage.settings.described import checked, describe_fields
 from storage.settings.ranges import Within
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ _BUDGET = 1400
 _EPSILON_BUDGET = 4096
 """Triangles that the largest scene of RenderFormer may hold in all."""
 _SHOWN = 12
-_LEVELS = next(field.within for field in described(AssetSettings) if field.name == "budgets")
+_LEVELS = next(field.within for field in describe_fields(AssetSettings) if field.name == "budgets")
 
 
 @checked()
@@ -81,9 +81,9 @@ def assets(options: AssetOptions, output: OutputOptions) -> None:
             allowed_licences=(*DEFAULT_ALLOWED, *options.allow_licences),
             licence=options.licence,
             workers=options.workers or os.cpu_count() or 1,
-            downloaded=lambda done, total: bars.update(fetched, completed=done, total=total),
-            planned=lambda total: bars.update(task, total=total),
-            done=lambda: bars.advance(task),
+            on_download=lambda done, total: bars.update(fetched, completed=done, total=total),
+            on_plan=lambda total: bars.update(task, total=total),
+            on_object=lambda: bars.advance(task),
         )
     if output.json:
         print_json(report.as_json())

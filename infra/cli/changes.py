@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @checked()
-class Shared:
+class BaseSettings:
     """Base settings."""
 
     like: str | None = None
@@ -55,7 +55,7 @@ def parse_changes(texts: Iterable[str]) -> dict[str, Any]:
 
 
 def all_changes(
-    settings: Any, base: Shared, liked: Mapping[str, Any], stated: Mapping[str, Any]
+    settings: Any, base: BaseSettings, liked: Mapping[str, Any], stated: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return all changes to a preset's settings by dotted name, and check the changed settings.
 
@@ -92,7 +92,7 @@ def _read(file: str) -> "StatedSettings":
     return read_settings_file(file)
 
 
-def dataset_record(base: Shared) -> dict[str, Any]:
+def dataset_record(base: BaseSettings) -> dict[str, Any]:
     """Return the settings of the dataset of `--like`, without the name of its preset."""
     from storage.dataset.dataset import open_dataset
 
@@ -104,7 +104,7 @@ def dataset_record(base: Shared) -> dict[str, Any]:
     return record
 
 
-def run_record(base: Shared) -> dict[str, Any]:
+def run_record(base: BaseSettings) -> dict[str, Any]:
     """Return the settings of the run of `--like`, without the name of its preset.
 
     Raises:

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any, TypeVar
 
-from infra.cli.changes import Shared, all_changes, dataset_record
+from infra.cli.changes import BaseSettings, all_changes, dataset_record
 from pipeline.builds.named import named_build
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.renders.settings import asked_floors
@@ -12,7 +12,7 @@ Order = TypeVar("Order", bound=DatasetOrder)
 _LICENCES = "allowed_licences"
 
 
-def with_shared(order: Order, base: Shared) -> Order:
+def with_base_settings(order: Order, base: BaseSettings) -> Order:
     """Return options whose `changes` hold all differences from the preset.
 
     Raises:

@@ -9,11 +9,11 @@ from rich.text import Text
 from infra.cli.console import console, first_words, look_at, print_json, progress_bars
 from infra.cli.options import OutputOptions, command
 from infra.torch_library import require_torch
-from train.evaluation.order import EvaluationOrder
+from train.evaluation.order import EvaluationOptions
 
 
 @command("checkpoint")
-def evaluate(order: EvaluationOrder, output: OutputOptions) -> None:
+def evaluate(order: EvaluationOptions, output: OutputOptions) -> None:
     first_words(f"Judging {order.checkpoint} on the split {order.split}", silent=output.json)
     require_torch("evaluate")
     from infra.judging import judge_network, write_judgement
@@ -34,7 +34,7 @@ def evaluate(order: EvaluationOrder, output: OutputOptions) -> None:
         )
     first_words("Drawing the sheets", silent=output.json)
     record = judgement.record
-    out = write_judgement(judgement, order.place)
+    out = write_judgement(judgement, order.report_folder)
     if output.json:
         print_json({name: record[name] for name in ("about", "contestants", "path tracer")})
     else:

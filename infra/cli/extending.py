@@ -20,7 +20,7 @@ from storage.extensions import (
 OPTION = "--extend"
 
 
-def extended(words: Sequence[str]) -> list[str]:
+def load_extensions(words: Sequence[str]) -> list[str]:
     """Load the files of `--extend` and TRILIGHT_EXTEND; return the words without the option.
 
     The option is read before the commands, because the files may add names that they accept.

@@ -8,7 +8,7 @@ from storage.errors import TrilightError
 from storage.settings.described import checked
 
 if TYPE_CHECKING:
-    from pipeline.flows.submission import SeenRun, Submitted
+    from pipeline.flows.submission import RunStatus, SubmittedRun
 
 
 @checked()
@@ -49,12 +49,12 @@ def run_flow(
             if as_json:
                 print_json({"flow_run": str(run.id), "deployment": run.deployment})
             return False
-        last = _watch_run(prefect.looks(client, run.id), silent=as_json)
+        last = _watch_run(prefect.poll_run(client, run.id), silent=as_json)
     _report(run, last, where, as_json=as_json)
     return True
 
 
-def _print_run(run: "Submitted", workers: int) -> None:
+def _print_run(run: "SubmittedRun", workers: int) -> None:
     console.print(f"Run {run.name} of {run.deployment}: {run.page}", soft_wrap=True)
     console.print(
         f"Ctrl-C here leaves it running; prefect flow-run cancel {run.id} ends it", soft_wrap=True
@@ -64,7 +64,7 @@ def _print_run(run: "Submitted", workers: int) -> None:
         note(f"no worker of the pool {run.pool} is online, and the run waits for one: {start}")
 
 
-def _watch_run(looks: "Iterable[SeenRun]", *, silent: bool) -> "SeenRun":
+def _watch_run(looks: "Iterable[RunStatus]", *, silent: bool) -> "RunStatus":
     """Draw the progress of a run, and return its last state."""
     last = None
     with progress_bars() as bars:
@@ -80,7 +80,7 @@ def _watch_run(looks: "Iterable[SeenRun]", *, silent: bool) -> "SeenRun":
     return last
 
 
-def _report(run: "Submitted", last: "SeenRun", where: str, *, as_json: bool) -> None:
+def _report(run: "SubmittedRun", last: "RunStatus", where: str, *, as_json: bool) -> None:
     rows: Sequence[tuple[str, str]] = last.tables.get("summary", ())
     if as_json:
         print_json(

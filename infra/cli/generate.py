@@ -2,9 +2,9 @@
 
 import time
 
-from infra.cli.changes import Shared
+from infra.cli.changes import BaseSettings
 from infra.cli.console import first_words, note
-from infra.cli.dataset_changes import with_shared
+from infra.cli.dataset_changes import with_base_settings
 from infra.cli.generate_progress import show_progress
 from infra.cli.generate_report import report
 from infra.cli.options import OutputOptions, command
@@ -29,16 +29,16 @@ class ExecutorOptions:
 
 @command("build")
 def generate(
-    order: DatasetOrder, base: Shared, runner: ExecutorOptions, output: OutputOptions
+    order: DatasetOrder, base: BaseSettings, runner: ExecutorOptions, output: OutputOptions
 ) -> None:
-    make(with_shared(order, base), runner, output)
+    make(with_base_settings(order, base), runner, output)
 
 
 def make(order: DatasetOrder, runner: ExecutorOptions, output: OutputOptions) -> None:
     """Make a dataset and print the result; raises TrilightError."""
     folder = dataset_folder(order.place)
     started = time.monotonic()
-    first_words(f"Making {folder.shown} with the build {order.build}", silent=output.json)
+    first_words(f"Making {folder.display_name} with the build {order.build}", silent=output.json)
     executor = find_executor(runner.runner, runner.address, order.workers)
     from infra.planning import describe_run  # slow: every stage
 

@@ -41,7 +41,7 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json
         rows.append(("look at", ", ".join(_shown_path(folder, path) for path in looked_at)))
     rows += [
         ("wall time", f"{seconds:.0f} s"),
-        ("shards, manifest", folder.shown),
+        ("shards, manifest", folder.display_name),
     ]
     if rejected:
         later = "" if statistics else ", once the dataset is finished"
@@ -49,12 +49,12 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json
     _print_notes(outcome.notes)
     if statistics is None and outcome.digest:
         print_rows("Dataset finished by another machine, which writes its documents", rows)
-        next_step(["verify", folder.shown])
+        next_step(["verify", folder.display_name])
         return
     if statistics is None:
         progress = f"{outcome.num_shards} of {outcome.num_shards_planned} shards are there"
         print_rows(f"Range finished; {progress}", rows)
-        next_step(["status", folder.shown])
+        next_step(["status", folder.display_name])
         return
     print_rows("Dataset finished", rows)
     next_step(*_next_steps(folder, statistics))
@@ -62,10 +62,10 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json
 
 def _next_steps(folder: DatasetFolder, statistics: Statistics) -> Iterator[Sequence[str]]:
     """Yield the next commands for a finished dataset; training only where it has such scenes."""
-    yield ("verify", folder.shown)
-    yield ("inspect", folder.shown)
+    yield ("verify", folder.display_name)
+    yield ("inspect", folder.display_name)
     if statistics.scenes_by_split.get("train") and _fits_training(read_head(folder.manifest)):
-        yield ("train", _RUN, "--data", folder.shown)
+        yield ("train", _RUN, "--data", folder.display_name)
 
 
 def _fits_training(manifest: Manifest) -> bool:
@@ -86,7 +86,7 @@ def _print_json(
 ) -> None:
     statistics = outcome.statistics
     row: dict[str, object] = {
-        "out": folder.shown,
+        "out": folder.display_name,
         "dataset_digest": outcome.digest,
         "finished": bool(outcome.digest),
         "shards": outcome.num_shards,
@@ -107,7 +107,7 @@ def _print_json(
 
 def _shown_path(folder: DatasetFolder, path: Path) -> str:
     """Return the path or URL of a file of a dataset, for people."""
-    return f"{folder.shown}/{path.relative_to(folder.root)}"
+    return f"{folder.display_name}/{path.relative_to(folder.root)}"
 
 
 def _print_notes(notes: Sequence[str]) -> None:

@@ -79,7 +79,7 @@ def inspect(options: InspectOptions, output: OutputOptions) -> None:
     if output.json:
         print_json(_as_json(opened, statistics, distributions))
         return
-    _print_summary(opened.shown, opened, statistics, distributions)
+    _print_summary(opened.display_name, opened, statistics, distributions)
     look_at(f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY)
 
 
@@ -96,8 +96,10 @@ def _inspect_run(root: Path, *, json: bool) -> None:
 def _require_shards(opened: Dataset) -> None:
     if not opened.manifest.shards:
         raise TrilightError(
-            f"{opened.shown}: the dataset is empty, since none of its shards is finished; expected "
-            f"at least one. See its progress with `trilight status {shlex.quote(opened.shown)}`."
+            f"{opened.display_name}: the dataset is empty, since none of its shards is finished; "
+            "expected "
+            "at least one. See its progress with `trilight status "
+            f"{shlex.quote(opened.display_name)}`."
         )
 
 

@@ -11,13 +11,13 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.options import OutputOptions, command
-from infra.leaderboard.order import LeaderboardOrder
+from infra.leaderboard.order import LeaderboardOptions
 from infra.torch_library import require_torch
 from storage.remote.safe_url import safe_url
 
 
 @command("source")
-def leaderboard(order: LeaderboardOrder, output: OutputOptions) -> None:
+def leaderboard(order: LeaderboardOptions, output: OutputOptions) -> None:
     first_words(f"Judging on {safe_url(order.source)}, into {order.out}", silent=output.json)
     require_torch("leaderboard")
     from infra.leaderboard.run import make_leaderboard

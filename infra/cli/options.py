@@ -22,7 +22,7 @@ from infra.cli.completion import NAMES
 from infra.cli.extending import resolve_reference
 from infra.cli.words import FileName, choices_of, is_repeated, kind_of, takes_names, value_of
 from storage.errors import TrilightError
-from storage.settings.described import Described, checked, described, option_of
+from storage.settings.described import FieldDescription, checked, describe_fields, option_of
 from storage.settings.ranges import shown_number
 
 ALIASES = {
@@ -70,9 +70,11 @@ def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., No
             field.name: _parameter(field, group, by_place=field.name in arguments)
             for kind in kinds.values()
             for group in [Group.create_ordered(_title(kind))]
-            for field in described(kind)
+            for field in describe_fields(kind)
         }
-        assert len(parameters) == sum(len(described(kind)) for kind in kinds.values()), parameters
+        assert len(parameters) == sum(len(describe_fields(kind)) for kind in kinds.values()), (
+            parameters
+        )
         in_order = [*arguments, *(name for name in parameters if name not in arguments)]
         signature = inspect.Signature([parameters[name] for name in in_order])
 
@@ -91,7 +93,7 @@ def _title(kind: type) -> str:
     return (inspect.getdoc(kind) or "").split("\n")[0].removesuffix(".")
 
 
-def _parameter(field: Described, group: Group, *, by_place: bool) -> inspect.Parameter:
+def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> inspect.Parameter:
     """Return a field as a parameter of the signature that cyclopts reads."""
     # an argument that takes several words may be empty where the field has an empty default
     required = field.default is MISSING or (by_place and field.default != ())
@@ -124,7 +126,9 @@ def _parameter(field: Described, group: Group, *, by_place: bool) -> inspect.Par
     )
 
 
-def _help(field: Described, choices: tuple[str, ...], *, several: bool, required: bool) -> str:
+def _help(
+    field: FieldDescription, choices: tuple[str, ...], *, several: bool, required: bool
+) -> str:
     """Return the sentence of a field, and in brackets its choices, range and default.
 
     A clause "; by default X." of the sentence stands in the brackets as "default: X".
@@ -150,7 +154,7 @@ def _default_text(default: Any) -> str:
     return shown_number(default) if isinstance(default, int | float) else str(default)
 
 
-def _metavar(field: Described, choices: tuple[str, ...]) -> str:
+def _metavar(field: FieldDescription, choices: tuple[str, ...]) -> str:
     if takes_names(field.hint):
         return "NAME=VALUE"
     return "CHOICE" if choices else _METAVARS.get(kind_of(field.hint), "TEXT")
@@ -171,7 +175,7 @@ def _several(_: Any, tokens: tuple[Token, ...]) -> list[str]:
 
 def _settings(kind: type, words_by_name: Mapping[str, Any]) -> Any:
     """Return an instance of settings from words; a complaint about a field names its option."""
-    fields = {field.name: field for field in described(kind)}
+    fields = {field.name: field for field in describe_fields(kind)}
     values = {
         name: resolve_reference(name, value_of(words, fields[name].hint))
         for name, words in words_by_name.items()

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 from typing import TYPE_CHECKING, Annotated
 
-from infra.cli.changes import Shared
+from infra.cli.changes import BaseSettings
 from infra.cli.console import (
     duration,
     first_words,
@@ -14,11 +14,11 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
-from infra.cli.dataset_changes import with_shared
+from infra.cli.dataset_changes import with_base_settings
 from infra.cli.leaving import temporary_folder
 from infra.cli.options import OutputOptions, command
 from pipeline.making.dataset_order import DatasetOrder, generate_words
-from pipeline.making.machine import cores_owned
+from pipeline.making.machine import available_cores
 from pipeline.making.price import CorePrice
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
@@ -42,7 +42,7 @@ class PlanOptions:
 @command("build")
 def plan(
     order: DatasetOrder,
-    base: Shared,
+    base: BaseSettings,
     options: PlanOptions,
     core: CorePrice,
     output: OutputOptions,
@@ -52,7 +52,7 @@ def plan(
             "plan: --scenes-from, --revisits or --shards was given; expected none of them, since a "
             "whole dataset of new scenes is predicted."
         )
-    order = with_shared(order, base)
+    order = with_base_settings(order, base)
     build = order.build
     samples = options.samples
     cores = options.cores
@@ -74,7 +74,7 @@ def plan(
 
 
 def _rows(prediction: "Prediction", cores: int) -> list[tuple[str, str]]:
-    local_cores = cores_owned()
+    local_cores = available_cores()
     here_text = prediction.core_hours.to_text(lambda hours: _hours(hours / local_cores))
     tasks = f"{prediction.num_tasks}, {prediction.task_minutes:.1f} minutes each"
     return [

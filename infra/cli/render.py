@@ -8,7 +8,7 @@ from rich.text import Text
 
 from infra.cli.console import progress_bars
 from infra.cli.options import OutputOptions, command
-from infra.rendering.request import Asked
+from infra.rendering.request import RenderOptions
 
 if TYPE_CHECKING:
     from infra.rendering.ways import Choice
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @command("source")
-def render(options: Asked, output: OutputOptions) -> None:
+def render(options: RenderOptions, output: OutputOptions) -> None:
     from infra.cli.rendered import print_outcome
     from infra.rendering.run import render_from_options
 

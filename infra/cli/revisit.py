@@ -1,15 +1,15 @@
 """`trilight revisit`: makes a new dataset from the scenes of a finished one."""
 
-from infra.cli.changes import Shared
+from infra.cli.changes import BaseSettings
 from infra.cli.console import first_words
-from infra.cli.dataset_changes import with_shared
+from infra.cli.dataset_changes import with_base_settings
 from infra.cli.generate import ExecutorOptions, make
 from infra.cli.options import OutputOptions, command
-from pipeline.making.revisit_order import Revisit, revisit_order
+from pipeline.making.revisit_order import RevisitOptions, revisit_order
 
 
 @command("dataset")
-def revisit(options: Revisit, runner: ExecutorOptions, output: OutputOptions) -> None:
+def revisit(options: RevisitOptions, runner: ExecutorOptions, output: OutputOptions) -> None:
     first_words(f"Reading {options.dataset}", silent=output.json)
-    order = with_shared(revisit_order(options), Shared(like=options.dataset))
+    order = with_base_settings(revisit_order(options), BaseSettings(like=options.dataset))
     make(order, runner, output)

@@ -16,9 +16,9 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.options import OutputOptions, command
-from pipeline.shards.derive import Derive
+from pipeline.shards.derive import DeriveOptions
 from pipeline.shards.finished import open_finished
-from pipeline.shards.listing import listed_scenes
+from pipeline.shards.listing import list_scenes as read_scene_rows
 from pipeline.shards.plans import Selection
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -88,7 +88,7 @@ class ReshardOptions:
 def merge(sources: MergeOptions, new: NewDatasetOptions, output: OutputOptions) -> None:
     if len(sources.datasets) < 2:
         raise TrilightError(f"merge: {len(sources.datasets)} dataset; expected at least 2.")
-    _run(sources.datasets, Derive(operation="merge"), new.out, as_json=output.json)
+    _run(sources.datasets, DeriveOptions(operation="merge"), new.out, as_json=output.json)
 
 
 @app.command(help="Keep the scenes that meet every condition, under their keys.")
@@ -96,7 +96,7 @@ def merge(sources: MergeOptions, new: NewDatasetOptions, output: OutputOptions) 
 def select(options: SelectOptions, new: NewDatasetOptions, output: OutputOptions) -> None:
     if options.selection == Selection():
         raise TrilightError("select: expected --where, --split, --template or --min-noise-floor.")
-    derive = Derive(operation="select", selection=options.selection)
+    derive = DeriveOptions(operation="select", selection=options.selection)
     _run([options.dataset], derive, new.out, as_json=output.json)
 
 
@@ -108,7 +108,7 @@ def list_scenes(chosen: SelectOptions, output: OutputOptions) -> None:
     first_words(f"Reading {chosen.dataset}", silent=output.json)
     with progress_bars() as bars:
         task = bars.add_task("shards", total=None, note="", visible=not output.json)
-        scenes = listed_scenes(
+        scenes = read_scene_rows(
             open_finished(str(chosen.dataset)),
             chosen.selection,
             progress=lambda done, total: bars.update(task, completed=done, total=total),
@@ -135,11 +135,11 @@ def list_scenes(chosen: SelectOptions, output: OutputOptions) -> None:
 @app.command(help="Repack the scenes of every split into shards of another size.")
 @command("dataset")
 def reshard(options: ReshardOptions, new: NewDatasetOptions, output: OutputOptions) -> None:
-    derive = Derive(operation="reshard", scenes_per_shard=options.scenes_per_shard)
+    derive = DeriveOptions(operation="reshard", scenes_per_shard=options.scenes_per_shard)
     _run([options.dataset], derive, new.out, as_json=output.json)
 
 
-def _run(datasets: Sequence[Path], derive: Derive, out: Path, *, as_json: bool) -> None:
+def _run(datasets: Sequence[Path], derive: DeriveOptions, out: Path, *, as_json: bool) -> None:
     first_words(f"Making {out}", silent=as_json)
     from pipeline.making.derive_dataset import derive_dataset  # slow: matplotlib
 

@@ -70,7 +70,7 @@ def status(options: StatusOptions, core: CorePrice, output: OutputOptions) -> No
     if cost is not None:
         rows.append(("cost so far", f"{progress.core_hours:.2f} core-hours, {cost:.2f} USD"))
     title = "finished" if progress.finished else "unfinished"
-    print_rows(f"{progress.shown}: {progress.build}, {title}", rows)
+    print_rows(f"{progress.display_name}: {progress.build}, {title}", rows)
     if progress.next_words:
         next_step(progress.next_words, recorded=progress.extensions)
     else:

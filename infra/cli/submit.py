@@ -4,9 +4,9 @@ from pathlib import Path
 
 from cyclopts import App
 
-from infra.cli.changes import Shared
+from infra.cli.changes import BaseSettings
 from infra.cli.console import first_words, next_step
-from infra.cli.dataset_changes import with_shared
+from infra.cli.dataset_changes import with_base_settings
 from infra.cli.flow_runs import FlowRunOptions, run_flow
 from infra.cli.options import OutputOptions, command
 from infra.cli.submit_array import ARRAYS, ArrayOptions, submit_to_array
@@ -47,13 +47,13 @@ def submit(
     submission: SubmitOptions,
     runs: FlowRunOptions,
     order: DatasetOrder,
-    base: Shared,
+    base: BaseSettings,
     array: ArrayOptions,
     machines: KubernetesOptions,
     output: OutputOptions,
 ) -> None:
     if submission.flow in ARRAYS:
-        order = with_shared(order, base)
+        order = with_base_settings(order, base)
         submit_to_array(order, submission.flow, array, machines, as_json=output.json)
         return
     if (array, machines) != (ArrayOptions(), KubernetesOptions()):
@@ -65,7 +65,7 @@ def submit(
     load_prefect()
     from pipeline.flows.submission import parameters
 
-    values = parameters(with_shared(order, base))
+    values = parameters(with_base_settings(order, base))
     ended = run_flow(submission.flow, values, runs, where=order.place, as_json=output.json)
     if ended and not output.json and Path(order.place).is_dir():
         next_step(["verify", order.place], ["inspect", order.place])
@@ -77,13 +77,13 @@ def submit(
 )
 @command("build")
 def submit_by_array(
-    order: DatasetByArray, base: Shared, runs: FlowRunOptions, output: OutputOptions
+    order: DatasetByArray, base: BaseSettings, runs: FlowRunOptions, output: OutputOptions
 ) -> None:
     first_words(f"Submitting {BY_ARRAY} with the build {order.build}", silent=output.json)
     load_prefect()
     from pipeline.flows.submission import parameters
 
-    values = parameters(with_shared(order, base))
+    values = parameters(with_base_settings(order, base))
     ended = run_flow(BY_ARRAY, values, runs, where=order.place, as_json=output.json)
     if ended and not output.json and Path(order.place).is_dir():
         next_step(["verify", order.place], ["inspect", order.place])

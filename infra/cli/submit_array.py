@@ -8,11 +8,11 @@ from infra.cli.console import console, first_words, next_step, note, print_json,
 from pipeline.executors.array_job import ArrayJob, array_job
 from pipeline.executors.kubernetes_array import (
     KubernetesOptions,
-    create_words,
+    create_command,
     submit_job,
     write_manifest,
 )
-from pipeline.executors.slurm_array import sbatch_environment, sbatch_words, submit_array
+from pipeline.executors.slurm_array import sbatch_command, sbatch_environment, submit_array
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
@@ -81,7 +81,7 @@ def _submit_kubernetes(
 ) -> None:
     manifest = (write_manifest if array.dry_run else submit_job)(job, options)
     name = manifest.parent.name
-    words = create_words(manifest)
+    words = create_command(manifest)
     if as_json:
         print_json(
             {
@@ -127,4 +127,4 @@ def _slurm_line(job: ArrayJob, options: Sequence[str]) -> str:
     """Return the shell command; it makes the folder of the logs, without which all tasks fail."""
     variables = sbatch_environment(job).items()
     settings = [f"{name}={shlex.quote(value)}" for name, value in variables]
-    return " ".join(["mkdir -p logs &&", *settings, shlex.join(sbatch_words(job, options))])
+    return " ".join(["mkdir -p logs &&", *settings, shlex.join(sbatch_command(job, options))])

@@ -12,17 +12,17 @@ from rich.progress import Progress as Bars
 from rich.progress import TaskID
 from rich.text import Text
 
-from infra.cli.changes import Shared, all_changes, run_record
+from infra.cli.changes import BaseSettings, all_changes, run_record
 from infra.cli.console import console, look_at, print_rows, progress_bars
 from infra.cli.options import OutputOptions, command
 from infra.run_record import tensorboard_command
 from infra.torch_library import require_torch
-from infra.train_order import TrainOrder
+from infra.train_order import TrainOptions
 from storage.errors import TrilightError
 from storage.installation import child_environment
 from storage.settings.described import option_words
 from train.progress import TrainProgress
-from train.runs import in_proportion, named_run
+from train.runs import named_run, scale_intervals
 from train.settings import TrainSettings
 from train.watching.settings import WatchSettings
 
@@ -39,7 +39,7 @@ class _BarProgress(TrainProgress):
         self._task: TaskID = bars.add_task("steps", total=None, start=False, note="")
         self._first_step = 0
 
-    def noted(self, text: str) -> None:
+    def note(self, text: str) -> None:
         console.print(Text(f"Note: {text}.", style="yellow"))
 
     def begin(
@@ -65,14 +65,14 @@ class _BarProgress(TrainProgress):
         note = f"loss {loss:.4f}, {views_per_s:.1f} views/s"
         self._bars.update(self._task, completed=step - self._first_step, note=note)
 
-    def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
+    def report_validation(self, *, step: int, scores: Mapping[str, float]) -> None:
         console.print(
             f"step {step}: validation log L1 {scores['log_l1']:.4f}, median "
             f"{scores['psnr_log_db_median']:.2f} dB log, {scores['psnr_linear_db_median']:.2f} dB "
             "linear"
         )
 
-    def interrupted(self, times: int) -> None:
+    def report_interrupt(self, times: int) -> None:
         if times == 1:
             console.print(
                 "Stopping after this step and saving. Press Ctrl-C again to end without saving."
@@ -81,7 +81,7 @@ class _BarProgress(TrainProgress):
         self._bars.stop()
         _end("ended at once", 130)
 
-    def hung(self, text: str) -> None:
+    def report_hang(self, text: str) -> None:
         self._bars.stop()
         _end(text, 1)
 
@@ -89,7 +89,7 @@ class _BarProgress(TrainProgress):
 class _QuietProgress(TrainProgress):
     """Progress that prints nothing."""
 
-    def hung(self, text: str) -> None:
+    def report_hang(self, text: str) -> None:
         _end(text, 1)
 
 
@@ -101,7 +101,9 @@ def _end(text: str, status: int) -> NoReturn:
 
 
 @command("run")
-def train(order: TrainOrder, watched: WatchSettings, base: Shared, output: OutputOptions) -> None:
+def train(
+    order: TrainOptions, watched: WatchSettings, base: BaseSettings, output: OutputOptions
+) -> None:
     if base.is_given:
         changes = all_changes(named_run(order.run), base, run_record(base), order.changes)
         order = dataclasses.replace(order, changes=changes)
@@ -119,7 +121,7 @@ def train(order: TrainOrder, watched: WatchSettings, base: Shared, output: Outpu
         _report(result)
 
 
-def _launch(order: TrainOrder, watched: WatchSettings, output: OutputOptions) -> NoReturn:
+def _launch(order: TrainOptions, watched: WatchSettings, output: OutputOptions) -> NoReturn:
     """Become torchrun, which starts this command once for each process."""
     if "RANK" in os.environ:
         raise TrilightError(
@@ -130,15 +132,15 @@ def _launch(order: TrainOrder, watched: WatchSettings, output: OutputOptions) ->
 
 
 def _run_training(
-    order: TrainOrder, settings: TrainSettings, watched: WatchSettings, *, quiet: bool
+    order: TrainOptions, settings: TrainSettings, watched: WatchSettings, *, quiet: bool
 ) -> "TrainResult | None":
     """Train by `train.run.train_run`; imports torch, which takes seconds."""
     require_torch("train")
-    from train.loop.crew import join_crew
+    from train.loop.crew import join_processes
     from train.loop.interrupts import Stopped
     from train.run import train_run
 
-    with join_crew(order.device) as crew, progress_bars() as bars:
+    with join_processes(order.device) as crew, progress_bars() as bars:
         progress = _QuietProgress() if quiet else _BarProgress(bars)
         try:
             return train_run(
@@ -148,7 +150,7 @@ def _run_training(
                 start=order.start(),
                 workers=order.workers,
                 watched=watched,
-                crew=crew,
+                dist_context=crew,
                 progress=progress,
             )
         except Stopped as stopped:
@@ -160,13 +162,13 @@ def _run_training(
             raise Stopped(stopped.step, command) from stopped
 
 
-def _announce(order: TrainOrder, settings: TrainSettings) -> None:
+def _announce(order: TrainOptions, settings: TrainSettings) -> None:
     """Print the start or the continuation of a run, before torch is imported."""
-    if order.start().goes_on:  # how, the checkpoint says
+    if order.start().continues_run:  # how, the checkpoint says
         console.print(f"Run {settings.run} goes on. Loading torch and the checkpoint ...")
         return
     if (steps := order.steps) is not None:
-        shorter = in_proportion(named_run(order.run), steps, order.changes)
+        shorter = scale_intervals(named_run(order.run), steps, order.changes)
         if shorter:
             text = ", ".join(f"{name}={value}" for name, value in shorter.items())
             console.print(f"In proportion to {steps} steps: {text}")

@@ -48,9 +48,9 @@ def view(options: ViewOptions) -> None:
     console.print("Only this machine reaches it, with this address. Ctrl-C ends it.", style="dim")
     if not options.no_browser and _has_screen():
         webbrowser.open(server.address)
-    from infra.viewer.open_source import opened_room  # slow: formats, renderers
+    from infra.viewer.open_source import open_handlers  # slow: formats, renderers
 
-    room = opened_room(options.source, checkpoint=options.checkpoint, threads=options.threads)
+    room = open_handlers(options.source, checkpoint=options.checkpoint, threads=options.threads)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
     later.opened.set_result(room)

@@ -18,9 +18,9 @@ from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
 from storage.records.sample import Sample
 from storage.seeds import rng_for
-from train.data.unusable import Unusable, first_samples
-from train.evaluation.judge import JudgedScene, judged_scene
-from train.evaluation.judged_view import JudgedView, facts_of
+from train.data.unusable import BadSampleCounter, first_samples
+from train.evaluation.judge import ValidationScene, validation_scene
+from train.evaluation.judged_view import JudgedView, scene_facts
 from train.evaluation.metrics import METRICS, noise_floors, picture_scores
 from train.loss.lpips import Lpips
 
@@ -97,7 +97,7 @@ def judge_all(contest: BoardContest, on_progress: OnProgress) -> None:
     total = len(contest.keys) * len(contest.widths)
     done = 0
     on_progress(done, total, "")
-    samples = first_samples(contest.shards, len(contest.keys), Unusable(0))
+    samples = first_samples(contest.shards, len(contest.keys), BadSampleCounter(0))
     for number, sample in enumerate(samples):
         for width in contest.widths:
             scene_run = _SceneAtWidth(contest, sample, width, timed=number < contest.timed_scenes)
@@ -117,7 +117,7 @@ class _SceneAtWidth:
         self._sample = sample
         self._width = width
         self._timed = timed
-        self._scene: JudgedScene | None = None
+        self._scene: ValidationScene | None = None
 
     def missing(self) -> list[Contestant]:
         """Return the contestants that lack rows or times of the scene."""
@@ -160,7 +160,7 @@ class _SceneAtWidth:
     def judge_noise(self) -> None:
         """Add the scores of the targets' own noise, with facts of the scene."""
         sample = self._sample
-        facts = facts_of(self._sample)
+        facts = scene_facts(self._sample)
         for view in self._views():
             key = self._contest.row_key(self._width, NOISE, "", sample.key, view)
             if self._contest.rows.get(key) is None:
@@ -174,9 +174,9 @@ class _SceneAtWidth:
                 )
                 self._contest.rows.add(key, BoardRow(scores=floors, facts=facts))
 
-    def _judged_scene(self) -> JudgedScene:
+    def _judged_scene(self) -> ValidationScene:
         if self._scene is None:
-            self._scene = judged_scene(self._sample, self._width)
+            self._scene = validation_scene(self._sample, self._width)
         return self._scene
 
 

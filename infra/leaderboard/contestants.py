@@ -31,7 +31,7 @@ from storage.records.scene import Scene
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
-    from train.evaluation.rivals import Rivals
+    from train.evaluation.rivals import Baselines
 
 TRACED_LIGHT = KINDS[1]
 TRACER = KINDS[2]
@@ -210,7 +210,7 @@ class NearestContestant:
     def __init__(
         self,
         name: str,
-        rivals_of: Callable[[int], "Rivals"],
+        rivals_of: Callable[[int], "Baselines"],
         *,
         pool: str,
         not_itself: bool,

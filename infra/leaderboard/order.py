@@ -12,7 +12,7 @@ TimedScenes = Annotated[int, Within(1, 10**6, unit="scenes")]
 
 
 @checked()
-class LeaderboardOrder:
+class LeaderboardOptions:
     """Dataset, networks and pictures."""
 
     source: str

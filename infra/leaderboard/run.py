@@ -23,7 +23,7 @@ from infra.leaderboard.contestants import (
     NetworkContestant,
     SampledContestant,
 )
-from infra.leaderboard.order import LeaderboardOrder
+from infra.leaderboard.order import LeaderboardOptions
 from infra.leaderboard.page import page, pairs_csv, standings_csv
 from infra.leaderboard.picture_folder import folder_contestants
 from infra.leaderboard.rows import BoardRows
@@ -46,7 +46,7 @@ from pipeline.renders.variant import choose_variant
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
-from train.evaluation.evaluate import RIVAL_SCENES, make_rivals, stored_resolution
+from train.evaluation.evaluate import BASELINE_SCENES, make_baselines, stored_resolution
 from train.loop.checkpoints import network_of_run
 from train.loss.lpips import load_lpips
 
@@ -77,7 +77,7 @@ class Leaderboard:
     """Folder of the leaderboard's files."""
 
 
-def make_leaderboard(order: LeaderboardOrder, on_progress: OnProgress) -> Leaderboard:
+def make_leaderboard(order: LeaderboardOptions, on_progress: OnProgress) -> Leaderboard:
     """Evaluate the missing views; write leaderboard.md, leaderboard.csv, pairs.csv and a chart.
 
     Raises:
@@ -88,7 +88,8 @@ def make_leaderboard(order: LeaderboardOrder, on_progress: OnProgress) -> Leader
     shards = opened.split(order.split)
     if opened.num_views is None:
         raise TrilightError(
-            f"SOURCE is {opened.shown}, a list of shards; expected a dataset with its manifest."
+            f"SOURCE is {opened.display_name}, a list of shards; expected a dataset with its "
+            "manifest."
         )
     widths = widths_of(order.width, stored_resolution(shards))
     keys = first_keys(shards, order.scenes)
@@ -153,7 +154,7 @@ ALONE = "no picture is looked up: the set has no scene beside the one that is ju
 
 
 def _nearest(
-    order: LeaderboardOrder, opened: TrainingData, keys: Sequence[str]
+    order: LeaderboardOptions, opened: TrainingData, keys: Sequence[str]
 ) -> NearestContestant | None:
     """Return the lookup among pictures of the training split, or of the other scenes.
 
@@ -164,28 +165,29 @@ def _nearest(
     split = "train" if trained else order.split
     if order.train_data and not trained:
         raise TrilightError(
-            f"--train-data {pool.shown}: it has no training split; expected one. Leave it out to "
+            f"--train-data {pool.display_name}: it has no training split; expected one. Leave it "
+            "out to "
             "look up the other scenes of the set."
         )
     if pool.digest == opened.digest and first_keys(pool.split(split), 2) == keys[:2] == keys[:1]:
         return None
     name = NEAREST_TRAINED if trained else NEAREST_OTHER
     note = (
-        f"{name} is found by the target itself, among the first {RIVAL_SCENES} scenes of the "
+        f"{name} is found by the target itself, among the first {BASELINE_SCENES} scenes of the "
         f"{split} split: no way to look one of them up can do better"
     )
     if not trained:
         note += ". The set has no training split, so that its other scenes are looked up"
     return NearestContestant(
         name,
-        lambda width: make_rivals(pool.split(split), width),
+        lambda width: make_baselines(pool.split(split), width),
         pool=f"{pool.digest} {split}",
         not_itself=pool.digest == opened.digest,
         notes=(note,),
     )
 
 
-def _networks(order: LeaderboardOrder) -> Iterator[Contestant]:
+def _networks(order: LeaderboardOptions) -> Iterator[Contestant]:
     """Yield the built-in networks and those of the options, each once."""
     from model.neural_renderer import NeuralRenderer
 
@@ -213,7 +215,7 @@ def _about_network(name: str, renderer: "NeuralRenderer") -> str:
 
 
 def _write_leaderboard(
-    order: LeaderboardOrder, opened: TrainingData, contest: BoardContest, rival: str
+    order: LeaderboardOptions, opened: TrainingData, contest: BoardContest, rival: str
 ) -> Leaderboard:
     kinds = {one.name: one.kind for one in contest.contestants}
     judged = [judged_width(contest, width) for width in contest.widths]

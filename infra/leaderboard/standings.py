@@ -9,8 +9,8 @@ import numpy as np
 
 from infra.cost_tables import on_front
 from infra.leaderboard.contest import NOISE, JudgedWidth
-from train.evaluation.judged_view import summary
-from train.evaluation.pairs import METRIC, PairedLead, pair
+from train.evaluation.judged_view import summarize_views
+from train.evaluation.pairs import METRIC, PairedLead, paired_lead
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +65,7 @@ def standings_of(judged: JudgedWidth, kinds: Mapping[str, str], rival: str) -> W
         rival: name of the row that all others are compared with.
     """
     names = [name for name in judged.views[0].scores if name != NOISE]
-    pairs = {two: pair(judged.views, *two) for two in itertools.permutations(names, 2)}
+    pairs = {two: paired_lead(judged.views, *two) for two in itertools.permutations(names, 2)}
     front = _front(judged, names)
     standings = [
         Standing(
@@ -74,7 +74,7 @@ def standings_of(judged: JudgedWidth, kinds: Mapping[str, str], rival: str) -> W
             first_s=_median(judged.first_s.get(name)),
             further_s=_median(judged.further_s.get(name)),
             timed_scenes=len(judged.first_s.get(name, ())),
-            scores=summary(judged.views, name),
+            scores=summarize_views(judged.views, name),
             lead=pairs.get((name, rival)),
             on_front=front.get(name),
         )
@@ -94,7 +94,7 @@ def _front(judged: JudgedWidth, names: Sequence[str]) -> dict[str, bool]:
     priced = [name for name in names if judged.first_s.get(name)]
     figures = []
     for name in priced:
-        median_db = float(summary(judged.views, name)[METRIC]["median"])
+        median_db = float(summarize_views(judged.views, name)[METRIC]["median"])
         costs = [float(np.median(each[name])) for each in (judged.first_s, judged.further_s)]
         figures.append((-median_db, costs))
     return dict(zip(priced, on_front(figures), strict=True))

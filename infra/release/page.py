@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from infra.release.pictures import NETWORK, SceneComparison
-from pipeline.documents.html import Markup, element, enlargeable, joined, page, table
+from pipeline.documents.html import Markup, element, enlargeable, join_markup, page, table
 from pipeline.documents.markdown import front_matter
 from pipeline.documents.png import encode_png
 from storage.atomic import write_atomically
@@ -52,7 +52,7 @@ def write_page(
         *rows,
     ]
     path = folder / "index.html"
-    write_atomically(path, page(_TITLE, joined(body), style=_STYLE))
+    write_atomically(path, page(_TITLE, join_markup(body), style=_STYLE))
     card = front_matter({"title": _TITLE, "sdk": "static", "license": "cc0-1.0"})
     write_atomically(folder / "README.md", f"{card}\n# {_TITLE}\n\n{_EXPLAINED}\n".encode())
     return path

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from infra.rendering.cameras import own_camera
 from infra.rendering.engines import Engine, MitsubaPlan, NeuralPlan
 from model.weights import MAX_LIGHTS
-from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
+from pipeline.documents.chosen import ChosenScene, choose_scenes, read_chosen
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.variant import choose_variant
 from storage.conventions import SPLITS
@@ -43,7 +43,7 @@ class SceneComparison:
     """psnr_log_db to the target by method."""
 
 
-def chosen_scenes(dataset: Dataset, count: int) -> list[Chosen]:
+def chosen_scenes(dataset: Dataset, count: int) -> list[ChosenScene]:
     """Return up to `count` scenes of the test split, or of all splits if it is empty.
 
     Raises:
@@ -60,7 +60,7 @@ def chosen_scenes(dataset: Dataset, count: int) -> list[Chosen]:
 
 
 def compare_scenes(
-    dataset: Dataset, chosen: Sequence[Chosen], *, checkpoint: str, done: Callable[[], None]
+    dataset: Dataset, chosen: Sequence[ChosenScene], *, checkpoint: str, done: Callable[[], None]
 ) -> Iterator[SceneComparison]:
     """Yield the comparison of each scene's first view.
 

@@ -105,7 +105,7 @@ class MitsubaPlan:
             seed=self.seed,
             variant=self.variant,
             threads=self.threads,
-            sampled=sampled,
+            on_samples=sampled,
         )
         return MitsubaEngine(tracer, is_preview=isinstance(self.settings, PreviewSettings))
 

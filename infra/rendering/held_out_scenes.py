@@ -13,7 +13,7 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.making.accept_objects import accept_objects
-from pipeline.making.asked_objects import AskedObjects
+from pipeline.making.asked_objects import ObjectOptions
 from pipeline.making.attempt_scene import MAX_ATTEMPTS, SceneRecipe, assets_of, set_up_child
 from pipeline.making.begin_publication import begin
 from pipeline.making.environment import environment
@@ -52,8 +52,8 @@ def composing_child(
     publication = begin(
         DatasetFolder(folder), build, environment(variant), 1, accept_environment=False
     )
-    objects_order = AskedObjects(
-        source=objects, licence=None, settings=build, publication=publication, workers=workers
+    objects_order = ObjectOptions(
+        source=objects, licence=None, settings=build, writer=publication, workers=workers
     )
     accepted = accept_objects(objects_order)
     recipe = SceneRecipe(settings=build, variant=variant, threads=workers, pool=accepted.pool)

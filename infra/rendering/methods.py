@@ -167,7 +167,7 @@ def untrained_network(config: "ModelConfig") -> "NeuralRenderer":
     from model.renderformer import RenderFormer
 
     model = RenderFormer(config)
-    model.initialise(torch.Generator().manual_seed(0))
+    model.initialize(torch.Generator().manual_seed(0))
     with torch.no_grad():
         model.decoder.head.query.weight.zero_()
         model.decoder.head.last.bias[-6:] = -30.0  # softplus of this is 0: nothing is added

@@ -10,7 +10,7 @@ from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, 
 from infra.rendering.engines import EnginePlan, MitsubaPlan, NeuralPlan
 from infra.rendering.look import Look
 from infra.rendering.places import OutputPaths, output_paths
-from infra.rendering.request import Asked, EngineChoice
+from infra.rendering.request import EngineChoice, RenderOptions
 from infra.rendering.sources import scene_sources
 from infra.rendering.way_table import known_costs, shipped_table
 from infra.rendering.ways import Choice, Way, chosen_way, priced_ways
@@ -73,7 +73,7 @@ class RenderPlan:
     """Quality preset that --seconds or --error chose; None without these."""
 
 
-def plan_render(options: Asked, reader: SceneReader) -> RenderPlan:
+def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
     """Return the plan of a render, and make the folder of its files.
 
     Raises:
@@ -124,7 +124,7 @@ def shots(
         yield Shot(source=source, camera=camera, exrs=exrs, png=png, keep=output.is_sequence)
 
 
-def _network_and_width(options: Asked) -> tuple[str | None, int]:
+def _network_and_width(options: RenderOptions) -> tuple[str | None, int]:
     """Return the checkpoint (None without a network) and the width of pictures in pixels."""
     if options.engine == "mitsuba":
         return None, options.resolution or _RESOLUTION
@@ -142,7 +142,7 @@ def _network_and_width(options: Asked) -> tuple[str | None, int]:
     )
 
 
-def _settings(options: Asked, resolution: int) -> RenderSettings | PreviewSettings:
+def _settings(options: RenderOptions, resolution: int) -> RenderSettings | PreviewSettings:
     """Return the render settings; with --seconds or --error a placeholder until `_choice`."""
     if options.seconds is not None or options.error_db is not None:
         return PreviewSettings(resolution=resolution, spp=1)
@@ -164,7 +164,7 @@ def _settings(options: Asked, resolution: int) -> RenderSettings | PreviewSettin
 
 
 def _engines(
-    options: Asked, settings: RenderSettings | PreviewSettings, checkpoint: str | None
+    options: RenderOptions, settings: RenderSettings | PreviewSettings, checkpoint: str | None
 ) -> list[EnginePlan]:
     engines = list[EnginePlan]()
     if options.engine != "neural":
@@ -174,7 +174,7 @@ def _engines(
     return engines
 
 
-def _engine_of(preset: Way, options: Asked, resolution: int) -> EnginePlan:
+def _engine_of(preset: Way, options: RenderOptions, resolution: int) -> EnginePlan:
     """Return the engine of the chosen quality preset."""
     if preset.rung == "network":
         from model.open import BUILTIN_TOKENS
@@ -184,7 +184,7 @@ def _engine_of(preset: Way, options: Asked, resolution: int) -> EnginePlan:
     return _mitsuba(options, settings)
 
 
-def _mitsuba(options: Asked, settings: RenderSettings | PreviewSettings) -> MitsubaPlan:
+def _mitsuba(options: RenderOptions, settings: RenderSettings | PreviewSettings) -> MitsubaPlan:
     return MitsubaPlan(
         settings=settings,
         seed=options.seed,
@@ -193,7 +193,7 @@ def _mitsuba(options: Asked, settings: RenderSettings | PreviewSettings) -> Mits
     )
 
 
-def _neural(options: Asked, checkpoint: str, resolution: int) -> NeuralPlan:
+def _neural(options: RenderOptions, checkpoint: str, resolution: int) -> NeuralPlan:
     return NeuralPlan(
         checkpoint=checkpoint,
         precision=options.precision,
@@ -204,7 +204,7 @@ def _neural(options: Asked, checkpoint: str, resolution: int) -> NeuralPlan:
 
 
 def _choice(
-    options: Asked, pairs: Sequence[tuple[SceneSource, ShotCamera | int]], resolution: int
+    options: RenderOptions, pairs: Sequence[tuple[SceneSource, ShotCamera | int]], resolution: int
 ) -> Choice | None:
     """Return the quality preset for --seconds or --error; None without these."""
     if options.seconds is None and options.error_db is None:
@@ -230,13 +230,15 @@ def _choice(
     )
 
 
-def _one_pair(options: Asked) -> list[tuple[SceneSource, ShotCamera | int]]:
+def _one_pair(options: RenderOptions) -> list[tuple[SceneSource, ShotCamera | int]]:
     if options.orbit is not None or options.cameras is not None:
         raise TrilightError(f"--out is {options.out}; expected a folder, X.mp4 or X.webp for many.")
     return [(scene_source(options.source), options.view)]
 
 
-def _pairs(options: Asked, reader: SceneReader) -> list[tuple[SceneSource, ShotCamera | int]]:
+def _pairs(
+    options: RenderOptions, reader: SceneReader
+) -> list[tuple[SceneSource, ShotCamera | int]]:
     sources = scene_sources(options.source, reader)
     cameras: Sequence[ShotCamera | int] = [options.view]
     if options.cameras is not None:

@@ -17,7 +17,7 @@ EngineChoice = Literal["mitsuba", "neural", "both"]
 
 
 @checked()
-class Asked:
+class RenderOptions:
     """Scene, renderer and pictures."""
 
     source: str

@@ -20,7 +20,7 @@ from infra.rendering.picture_file import (
     write_picture,
 )
 from infra.rendering.plan import RenderPlan, Shot, plan_render
-from infra.rendering.request import Asked
+from infra.rendering.request import RenderOptions
 from infra.rendering.video import write_video
 from infra.rendering.ways import Choice
 from pipeline.documents.png import encode_png
@@ -85,7 +85,7 @@ class RenderProgress(Protocol):
         """Report a finished pass of the path tracer."""
 
 
-def render_from_options(options: Asked, watcher: RenderProgress) -> RenderResult:
+def render_from_options(options: RenderOptions, watcher: RenderProgress) -> RenderResult:
     """Plan a render and run the plan; raises TrilightError as these two do."""
     with SceneReader(options.albedo_over_one) as reader:
         return run_plan(plan_render(options, reader), reader, watcher)

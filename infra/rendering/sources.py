@@ -6,7 +6,7 @@ from pathlib import Path
 from pipeline.exchange.formats import SceneSource, readable
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
-from storage.dataset.shard_places import expanded
+from storage.dataset.shard_places import expand_pattern
 from storage.errors import TrilightError
 
 
@@ -24,7 +24,7 @@ def scene_sources(text: str, reader: SceneReader) -> list[SceneSource]:
     """
     if "://" not in text and Path(text).is_dir():
         return [scene_source(str(path)) for path in _scene_files(Path(text))]
-    names = expanded(text, "scenes") if "{" in text else [text]
+    names = expand_pattern(text, "scenes") if "{" in text else [text]
     files = [scene_source(name, many=True) for name in names]
     return [scene for source in files for scene in reader.scenes_of(source)]
 

@@ -35,11 +35,11 @@ from infra.serving.access import ROOT, grant, next_command, revoke, settings_fil
 from pipeline.flows.guarded_server import NAMES
 from pipeline.flows.prefect_server import (
     SERVER,
-    TOLD_BY_ITS_STARTER,
+    STOPPED_BY_PARENT,
     quiet_prefect,
     wait_until_healthy,
 )
-from pipeline.making.machine import cores_owned, visible_gpus
+from pipeline.making.machine import available_cores, visible_gpus
 from storage.atomic import write_atomically
 from storage.cache import open_private
 from storage.errors import TrilightError
@@ -116,7 +116,7 @@ def stop() -> int:
     """
     ours = running()
     for number in (signal.SIGTERM, signal.SIGKILL):
-        pids = running() if number == signal.SIGKILL else running(without=TOLD_BY_ITS_STARTER)
+        pids = running() if number == signal.SIGKILL else running(without=STOPPED_BY_PARENT)
         for pid in pids:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, number)
@@ -230,7 +230,7 @@ def _worker_environment(number: int, workers: int) -> dict[str, str]:
     """Return the environment variables of a worker's cores and GPUs; empty for a single worker."""
     if workers == 1:
         return {}
-    share = {"TRILIGHT_CORES": str(max(1, cores_owned() // workers))}
+    share = {"TRILIGHT_CORES": str(max(1, available_cores() // workers))}
     if cards := visible_gpus():  # with fewer cards than workers, some share one
         share["CUDA_VISIBLE_DEVICES"] = ",".join(cards[number % len(cards) :: workers])
     return share

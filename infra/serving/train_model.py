@@ -12,7 +12,7 @@ from prefect import flow
 from prefect.concurrency.sync import concurrency
 from prefect.logging import get_run_logger
 
-from infra.train_order import TrainOrder
+from infra.train_order import TrainOptions
 from pipeline.flows.forms import PublicUrl, changed_values, changes_form, parameters_of
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.process import run_to_end
@@ -38,7 +38,7 @@ TRAIN_FORMS: Mapping[str, Any] = {
 """Types of parameters that are narrower in the form than on the command line."""
 
 
-def train_order(parameters: Mapping[str, Any]) -> TrainOrder:
+def train_order(parameters: Mapping[str, Any]) -> TrainOptions:
     """Return the training options of the flow's parameters.
 
     Raises:
@@ -49,7 +49,7 @@ def train_order(parameters: Mapping[str, Any]) -> TrainOrder:
         "data": tuple(parameters["data"]),
         "changes": changed_values(parameters["changes"]),
     }
-    order = TrainOrder(**{**parameters, **converted})
+    order = TrainOptions(**{**parameters, **converted})
     order.settings()
     return order
 
@@ -58,12 +58,12 @@ def _run_name() -> str:
     """Return the name of the flow run: training preset and folder."""
     from prefect.runtime import flow_run
 
-    parameters = {"run": TrainOrder.run, **flow_run.parameters}
+    parameters = {"run": TrainOptions.run, **flow_run.parameters}
     return "-".join(filter(None, [parameters["run"], parameters.get("out")]))
 
 
 @flow(name="train-model", flow_run_name=_run_name, persist_result=False)
-@parameters_of(TrainOrder, **TRAIN_FORMS)
+@parameters_of(TrainOptions, **TRAIN_FORMS)
 def train_model(**parameters: Any) -> None:
     """Train a model on a dataset, in processes of its own; a run that is cancelled is saved.
 

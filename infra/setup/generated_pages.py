@@ -11,7 +11,7 @@ from scene_templates.skies.draw import SkyMapSettings
 from scene_templates.skies.draws import PALEST, SkyDraws
 from scene_templates.skies.families import OUR_SKIES, SKIES
 from scene_templates.skies.texels import SkyTexels
-from scene_templates.stated_draws import StatedDraw
+from scene_templates.stated_draws import RecordedDraw
 from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.surfaces.draws import LEAST_TINT, SurfaceDraws
 from scene_templates.surfaces.families import OUR_SURFACES, SURFACES
@@ -184,9 +184,9 @@ def maps_page() -> str:
     return "\n".join(parts)
 
 
-def surface_draws(name: str) -> Mapping[str, StatedDraw]:
+def surface_draws(name: str) -> Mapping[str, RecordedDraw]:
     """Return all draws of a family of surfaces by name, for natural colors."""
-    made: dict[str, StatedDraw] = {}
+    made: dict[str, RecordedDraw] = {}
     albedo = SurfaceMapSettings().albedo
     for seed in range(_SEEDS):
         draws = SurfaceDraws(rng_for(seed, "page"), natural_share=1.0, albedo=albedo)
@@ -195,9 +195,9 @@ def surface_draws(name: str) -> Mapping[str, StatedDraw]:
     return _but(made, "natural colours", ": tint")
 
 
-def sky_draws(name: str) -> Mapping[str, StatedDraw]:
+def sky_draws(name: str) -> Mapping[str, RecordedDraw]:
     """Return all draws of a family of skies by name, for natural colors."""
-    made: dict[str, StatedDraw] = {}
+    made: dict[str, RecordedDraw] = {}
     settings = SkyMapSettings()
     for seed in range(_SEEDS):
         draws = SkyDraws(
@@ -211,12 +211,12 @@ def sky_draws(name: str) -> Mapping[str, StatedDraw]:
     return _but(made, "coloured lights")
 
 
-def _but(made: Mapping[str, StatedDraw], *said_above: str) -> dict[str, StatedDraw]:
+def _but(made: Mapping[str, RecordedDraw], *said_above: str) -> dict[str, RecordedDraw]:
     return {label: draw for label, draw in made.items() if not label.endswith(said_above)}
 
 
 def _family(
-    name: str, family: Callable[..., object], made: Mapping[str, StatedDraw]
+    name: str, family: Callable[..., object], made: Mapping[str, RecordedDraw]
 ) -> Iterator[str]:
     yield f"### `{name}`\n\n{' '.join((inspect.getdoc(family) or '').split())}\n"
     yield table(("drawn", "distribution"), [(label, str(draw)) for label, draw in made.items()])

@@ -7,30 +7,30 @@ import typing
 from collections.abc import Iterator
 from typing import Any, get_args
 
-from infra.leaderboard.order import LeaderboardOrder
-from infra.rendering.request import Asked
-from infra.serving.train_model import TrainOrder
+from infra.leaderboard.order import LeaderboardOptions
+from infra.rendering.request import RenderOptions
+from infra.serving.train_model import TrainOptions
 from pipeline.builds.settings import BuildSettings
 from pipeline.documents.markdown import table
 from pipeline.flows.orders import DatasetInRuns
 from pipeline.making.price import CorePrice
-from pipeline.making.revisit_order import Revisit
+from pipeline.making.revisit_order import RevisitOptions
 from storage.records.scene import Scene
-from storage.settings.described import described, field_sentences
+from storage.settings.described import describe_fields, field_sentences
 from storage.settings.ranges import declared_ranges, shown_number
-from train.evaluation.order import EvaluationOrder
+from train.evaluation.order import EvaluationOptions
 from train.settings import TrainSettings
 from train.watching.settings import WatchSettings
 
 ROOTS: dict[str, tuple[type, ...]] = {
     "Scene": (Scene,),
     "Generate": (DatasetInRuns, BuildSettings),
-    "Revisit": (Revisit,),
-    "Render": (Asked,),
+    "Revisit": (RevisitOptions,),
+    "Render": (RenderOptions,),
     "Plan": (CorePrice,),
-    "Train": (TrainOrder, TrainSettings, WatchSettings),
-    "Evaluate": (EvaluationOrder,),
-    "Leaderboard": (LeaderboardOrder,),
+    "Train": (TrainOptions, TrainSettings, WatchSettings),
+    "Evaluate": (EvaluationOptions,),
+    "Leaderboard": (LeaderboardOptions,),
 }
 """Settings classes by command; `reachable` finds the classes within them."""
 
@@ -91,7 +91,7 @@ def _rows(kind: type) -> Iterator[tuple[str, ...]]:
             sentence = _first_sentence(field_sentences(Scene)[declared.name])
             yield f"`{declared.name}`{part}", sentence, str(declared.within), ""
         return
-    fields = described(kind) if hasattr(kind, "__pydantic_fields__") else ()
+    fields = describe_fields(kind) if hasattr(kind, "__pydantic_fields__") else ()
     is_marked = any(field.is_execution for field in fields)
     for field in fields:
         named = [name for kind in _kinds(field.hint) for name in getattr(kind, "PRESETS", ())]

@@ -113,12 +113,12 @@ class DatasetIndex:
     def _read_shard(self, number: int, shard: ShardEntry) -> None:
         dataset = self._dataset
         with dataset.files.open(shard, checked=False) as stream:
-            with reading(dataset.shown, shard.name):
+            with reading(dataset.display_name, shard.name):
                 samples = contents_of(stream, shard.name).samples
             for key, members in samples.items():
                 if self._closed:
                     return
-                with reading(dataset.shown, shard.name):
+                with reading(dataset.display_name, shard.name):
                     row = _row(stream, key, members, number, shard.split)
                 self._rows.append(row)
                 self._by_key[key] = row

@@ -129,7 +129,7 @@ class DatasetHandlers:
         shard = self._dataset.manifest.shards[row.shard]
         with (
             self._dataset.files.open(shard, checked=False) as stream,
-            reading(self._dataset.shown, shard.name),
+            reading(self._dataset.display_name, shard.name),
         ):
             samples = scan_samples(stream, shard.name)
             members = next(members for key, members in samples if key == row.key)

@@ -109,7 +109,7 @@ class FolderHandlers:
             return loaded.radiance_rgb[0]
         steps = list[Sampling]()
         scene = loaded.scene
-        self._tracer.paint(
+        self._tracer.render(
             scene,
             ("thumbnail", number),
             (scene.c2w[0], float(scene.fov_deg[0])),

@@ -14,7 +14,7 @@ from pipeline.renders.variant import choose_variant
 from storage.dataset.dataset import open_dataset
 
 
-def opened_room(source: str, *, checkpoint: str | None, threads: int | None) -> PageHandlers:
+def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -> PageHandlers:
     """Open a source, and return the handlers of its page.
 
     Args:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.viewer.wanted import PictureOptions
-from pipeline.documents.scene_passes import SHOWN_PASSES, ShownPass
+from pipeline.documents.scene_passes import PASS_VIEWS, PassView
 from pipeline.making.progressive_tracer import ProgressiveTracer
 from pipeline.renders.preview import usual_filter
 from pipeline.renders.results import GrowingPicture, Sampling
@@ -101,7 +101,7 @@ class TracedPainter:
             show(_image_of_step(step) if isinstance(step, GrowingPicture) else step)
 
         camera = (options.camera.c2w, options.camera.fov_deg)
-        self._tracer.paint(scene, (self._number, options.scene_key), camera, settings, on_step)
+        self._tracer.render(scene, (self._number, options.scene_key), camera, settings, on_step)
 
 
 class SamplesPainter:
@@ -125,7 +125,7 @@ class SamplesPainter:
         camera = (options.camera.c2w, options.camera.fov_deg)
         key = (self._number, options.scene_key)
         settings = _traced_settings(options)
-        self._tracer.paint(scene, key, camera, settings, on_step, preview_spp=self.spp)
+        self._tracer.render(scene, key, camera, settings, on_step, preview_spp=self.spp)
 
 
 def _traced_settings(options: PictureOptions) -> RenderSettings:
@@ -190,7 +190,7 @@ class NetworkPainter:
 class PassPainter:
     """Pass of the visible surfaces, such as depth: a function of scene and camera without light."""
 
-    def __init__(self, shown_pass: ShownPass) -> None:
+    def __init__(self, shown_pass: PassView) -> None:
         self.title = shown_pass.title.capitalize()
         self.means = "What the pixels see, without light."
         self._shown = shown_pass
@@ -284,5 +284,5 @@ def painters_of(
     if target is not None:
         painters["target"] = target
     return painters | {
-        f"pass-{shown_pass.word}": PassPainter(shown_pass) for shown_pass in SHOWN_PASSES
+        f"pass-{shown_pass.word}": PassPainter(shown_pass) for shown_pass in PASS_VIEWS
     }

@@ -20,7 +20,7 @@ _BLURRED_ROWS = 16
 """Number of rows of the blurred map: 11 degrees each."""
 
 
-class DrawnSky:
+class SkySampler:
     """Sampler of an environment map that is not all black."""
 
     def __init__(self, sky: Environment) -> None:
@@ -35,7 +35,7 @@ class DrawnSky:
         self._height = height
         self._width = width
 
-    def drawn(self, u: Floats) -> Floats:
+    def sample_directions(self, u: Floats) -> Floats:
         """Return unit world directions [3, P] for numbers u [2, P] in the unit square."""
         first = u[0].astype(np.float64)
         texel = np.searchsorted(self._cumulative, first, side="right").clip(
@@ -50,7 +50,7 @@ class DrawnSky:
         local = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z])
         return (self.sky.rotation.astype(np.float64) @ local).astype(np.float32)
 
-    def density(self, direction: Floats) -> Floats:
+    def pdf(self, direction: Floats) -> Floats:
         """Return the probability density [P] of unit directions [3, P], per steradian."""
         u, v = np.moveaxis(latlong_uv(self.sky.to_map(direction.T)), -1, 0)
         row = ((1 - v) * self._height).astype(np.intp).clip(0, self._height - 1)
@@ -61,7 +61,7 @@ class DrawnSky:
         """Return the radiance [3, P] from unit directions [3, P]."""
         return environment_values(self.sky, as_rows(direction)).T.astype(np.float32)
 
-    def blurred(self, direction: Floats) -> Floats:
+    def blurred_radiance(self, direction: Floats) -> Floats:
         """Return the radiance [3, P] of a blurred map with few rows and the same total flux."""
         return environment_values(self._coarse, as_rows(direction)).T.astype(np.float32)
 

@@ -14,7 +14,7 @@ def lit_sky(sky: Environment | None) -> Environment | None:
     return sky if sky is not None and sky.radiance_rgb.any() else None
 
 
-def require_known(sky: Environment | None, config: "ModelConfig") -> None:
+def require_known_sky(sky: Environment | None, config: "ModelConfig") -> None:
     """Raise if a scene has a sky that the network does not support.
 
     Raises:

@@ -15,7 +15,7 @@ from pathlib import Path
 from pipeline.assets.recipe import READERS, RECIPE
 from pipeline.assets.settings import AssetSettings
 from storage.atomic import TEMPORARY_SUFFIX, write_atomically
-from storage.claims import claimed
+from storage.claims import hold_claim
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
 from storage.records.asset import Asset, encode_asset
@@ -88,7 +88,7 @@ class AssetStore:
         Raises:
             TrilightError: the store cannot be written.
         """
-        with claimed(self.root / "locks" / key[:_LOCKS], wait=True):
+        with hold_claim(self.root / "locks" / key[:_LOCKS], wait=True):
             yield
 
     def _unread_path(self, key: str) -> Path:

@@ -36,7 +36,7 @@ def typed_build(typed: str) -> str:
     Raises:
         TrilightError: as `Registry.typed`, or the function returns something else.
     """
-    return BUILDS.typed(typed, _as_build)
+    return BUILDS.resolve(typed, _as_build)
 
 
 def _as_build(returned: Any) -> NamedBuild:

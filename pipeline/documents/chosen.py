@@ -15,7 +15,7 @@ _LEAST_SHARE = 8
 
 
 @dataclass(frozen=True, kw_only=True)
-class Chosen:
+class ChosenScene:
     """One scene to show."""
 
     key: str
@@ -29,7 +29,7 @@ class Chosen:
 
 def choose_scenes(
     dataset: Dataset, max_scenes: int, splits: Sequence[str] = SPLITS
-) -> list[Chosen]:
+) -> list[ChosenScene]:
     """Choose up to `max_scenes` scenes; only shards with chosen scenes are opened.
 
     Every split gets scenes in proportion, at least an eighth if it has so many. Within a split they
@@ -52,11 +52,13 @@ def choose_scenes(
             keys = dataset.keys(shard)
             first = int(end[number]) - shard.num_samples
             inside = rows[holding == number] - first
-            chosen += [Chosen(key=keys[row], shard=shard) for row in inside]
+            chosen += [ChosenScene(key=keys[row], shard=shard) for row in inside]
     return chosen
 
 
-def read_chosen(dataset: Dataset, chosen: Sequence[Chosen]) -> Iterator[tuple[Chosen, Sample]]:
+def read_chosen(
+    dataset: Dataset, chosen: Sequence[ChosenScene]
+) -> Iterator[tuple[ChosenScene, Sample]]:
     """Yield the chosen scenes with their pictures, one at a time.
 
     Raises:

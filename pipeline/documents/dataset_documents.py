@@ -51,7 +51,7 @@ def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Stati
 
 def _write_digests(folder: DatasetFolder, card: bytes) -> None:
     """Store the digests of the documents in the manifest; `card` is still to be written."""
-    with folder.turn("manifest"):
+    with folder.mutex("manifest"):
         written = (folder.attribution, folder.licences, folder.croissant)
         documents = {path.name: sha256_of_file(path) for path in written}
         documents[folder.card.name] = sha256_hex(card)

@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 
-from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
+from pipeline.documents.chosen import ChosenScene, choose_scenes, read_chosen
 from pipeline.documents.gallery_controls import (
     CardFacts,
     card_attributes,
     card_facts,
     gallery_controls,
 )
-from pipeline.documents.html import Markup, element, image, joined, png_uri
+from pipeline.documents.html import Markup, element, image, join_markup, png_uri
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, preview
 from storage.atomic import write_atomically
 from storage.conventions import preview_gain
@@ -62,7 +62,7 @@ def write_gallery(
         for (card, link), attributes in zip(cards, card_attributes(facts), strict=True)
     ]
     gallery = element("div", *linked, class_="cards")
-    return joined([element("p", caption), gallery_controls(facts), gallery])
+    return join_markup([element("p", caption), gallery_controls(facts), gallery])
 
 
 def _card(sample: Sample, split: str) -> Markup:
@@ -73,10 +73,12 @@ def _card(sample: Sample, split: str) -> Markup:
     caption = f"{template}, {num_objects} {'object' if num_objects == 1 else 'objects'}"
     name = f"{sample.key} {split}"
     text = element("span", name, Markup("<br>"), element("span", caption, class_="faint"))
-    return joined([picture, text], "")
+    return join_markup([picture, text], "")
 
 
-def _by_scene(failures: Sequence[Failure], chosen: Sequence[Chosen]) -> Mapping[str, list[Failure]]:
+def _by_scene(
+    failures: Sequence[Failure], chosen: Sequence[ChosenScene]
+) -> Mapping[str, list[Failure]]:
     """Return the rejections of each chosen scene and its views."""
     rejected: dict[str, list[Failure]] = {entry.key: [] for entry in chosen}
     for failure in failures:

@@ -66,7 +66,7 @@ def escape(text: object) -> Markup:
     return text if isinstance(text, Markup) else Markup(html.escape(str(text)))
 
 
-def joined(parts: Iterable[str], separator: str = "\n") -> Markup:
+def join_markup(parts: Iterable[str], separator: str = "\n") -> Markup:
     """Join parts, escaping those that are not Markup."""
     return Markup(separator.join(escape(part) for part in parts))
 
@@ -96,7 +96,7 @@ def table(
     first = max(len(head), *(len(row) for row in rows), 0) - numbers
 
     def line(tag: str, cells: Sequence[Cell]) -> Markup:
-        return joined(
+        return join_markup(
             (
                 element(tag, cell, class_="n") if column >= first else element(tag, cell)
                 for column, cell in enumerate(cells)
@@ -107,7 +107,7 @@ def table(
     lines = [element("tr", line("td", row)) for row in rows]
     if head:
         lines.insert(0, element("tr", line("th", head)))
-    return element("table", joined(lines), **attributes)
+    return element("table", join_markup(lines), **attributes)
 
 
 def page(title: str, body: str, *, style: str = "", script: str = "") -> bytes:
@@ -117,7 +117,7 @@ def page(title: str, body: str, *, style: str = "", script: str = "") -> bytes:
         sha256 = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
         allowed = f"script-src 'sha256-{sha256}'"
         policy = f'<meta http-equiv="Content-Security-Policy" content="{allowed}">'
-        body = joined([body, Markup(f"<script>{script}</script>")])
+        body = join_markup([body, Markup(f"<script>{script}</script>")])
     text = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width">'

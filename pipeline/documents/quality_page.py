@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.documents.figures import drawing, encode_figure, histogram, panels
-from pipeline.documents.html import Markup, element, image, joined, page, png_uri, table
+from pipeline.documents.html import Markup, element, image, join_markup, page, png_uri, table
 from storage.records.asset import AssetRow
 from storage.records.objects import Failure
 
@@ -65,7 +65,7 @@ def encode_quality_page(
         *([_unread_table(unread)] if unread else []),
         _accepted_table(rows),
     ]
-    return page("Assets", joined(parts), style=_STYLE)
+    return page("Assets", join_markup(parts), style=_STYLE)
 
 
 def _summary(rows: Sequence[AssetRow], failures: Sequence[Failure]) -> Markup:
@@ -116,7 +116,7 @@ def _histograms(rows: Sequence[AssetRow], budget: int) -> Markup:
 
 
 def _group(name: str, pairs: Sequence[Pair]) -> Markup:
-    return joined([element("h2", name), *(_pair(pair) for pair in pairs)])
+    return join_markup([element("h2", name), *(_pair(pair) for pair in pairs)])
 
 
 def _pair(pair: Pair) -> Markup:
@@ -144,13 +144,15 @@ def _pair(pair: Pair) -> Markup:
 
 def _rejected_table(failures: Sequence[Failure]) -> Markup:
     cells = [(row.item, row.reason, row.message) for row in failures]
-    return joined([element("h2", "Rejected"), table(("object", "reason", "what was found"), cells)])
+    return join_markup(
+        [element("h2", "Rejected"), table(("object", "reason", "what was found"), cells)]
+    )
 
 
 def _unread_table(unread: Mapping[str, Sequence[str]]) -> Markup:
     cells = [(uid, ", ".join(unread[uid])) for uid in sorted(unread)]
     heading = element("h2", "Not read")
-    return joined([heading, table(("object", "what its file holds beside that"), cells)])
+    return join_markup([heading, table(("object", "what its file holds beside that"), cells)])
 
 
 def _materials_of(row: AssetRow) -> str:
@@ -178,4 +180,4 @@ def _accepted_table(rows: Sequence[AssetRow]) -> Markup:
         for row in sorted(rows, key=lambda row: (-row.quality.error_p99, row.uid))
     ]
     heading = element("h2", "Accepted, the largest error first")
-    return joined([heading, table(head, cells, numbers=5)])
+    return join_markup([heading, table(head, cells, numbers=5)])

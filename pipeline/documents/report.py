@@ -12,7 +12,7 @@ from pipeline.documents import report_sections
 from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.gallery import write_gallery
 from pipeline.documents.gallery_controls import CONTROLS_SCRIPT, CONTROLS_STYLE
-from pipeline.documents.html import Markup, element, joined, page, table
+from pipeline.documents.html import Markup, element, join_markup, page, table
 from pipeline.documents.report_maps import maps_section
 from pipeline.documents.scene_passes import passes_command
 from storage.atomic import write_atomically
@@ -91,7 +91,7 @@ def write_report(
     ]
     title = f"Dataset {dataset.manifest.build}"
     style = _STYLE + CONTROLS_STYLE
-    data = page(title, joined(body), style=style, script=CONTROLS_SCRIPT)
+    data = page(title, join_markup(body), style=style, script=CONTROLS_SCRIPT)
     write_atomically(folder.report, data)
     return folder.report
 
@@ -142,13 +142,13 @@ def _overview(dataset: Dataset, distributions: Distributions) -> Markup:
 def _passes(names: Sequence[str]) -> Markup:
     """Return the passes in the shards; if there are none, the command that writes some."""
     if names:
-        return joined([", ".join(names), "beside each picture"], " ")
+        return join_markup([", ".join(names), "beside each picture"], " ")
     command = element("code", passes_command())
-    return joined(["none stored;", command, "in the dataset's folder writes them"], " ")
+    return join_markup(["none stored;", command, "in the dataset's folder writes them"], " ")
 
 
 def _settings(dataset: Dataset) -> Markup:
-    return joined(
+    return join_markup(
         [
             element("h2", "Settings", id="settings"),
             _details("Of the build", _without_sources(dataset.manifest.settings)),

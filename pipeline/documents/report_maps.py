@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.documents.distributions import Distributions
 from pipeline.documents.figures import drawing, encode_figure, histogram, panels, stacked_bars
-from pipeline.documents.html import Cell, Markup, element, joined, table
+from pipeline.documents.html import Cell, Markup, element, join_markup, table
 from pipeline.documents.report_sections import section, summaries
 from storage.records.quantities import QUANTITIES
 
@@ -33,7 +33,7 @@ def maps_section(distributions: Distributions) -> Markup:
     rows: list[list[Cell]] = [[kind, name, count] for (kind, name), count in ordered]
     numbers = table(("map", "family or name", "scenes"), rows, numbers=1)
     first = section("maps", "Textures and skies", families, _shares(distributions), numbers)
-    return joined([first, _sizes(distributions)])
+    return join_markup([first, _sizes(distributions)])
 
 
 def maps_in_words(distributions: Distributions) -> dict[str, str]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.documents.distributions import MEASURED, SURFACE_COUNTS, Distributions
 from pipeline.documents.figures import drawing, encode_figure, histogram, panels, rose, stacked_bars
-from pipeline.documents.html import Cell, Markup, element, joined, table
+from pipeline.documents.html import Cell, Markup, element, join_markup, table
 from storage.records.quantities import QUANTITIES, STATISTICS, summary
 
 _MOST_USED = 20
@@ -58,7 +58,7 @@ def objects_section(distributions: Distributions) -> Markup:
         distributions, "objects_per_scene", extra=[("places of an object", 0, uses)]
     )
     note = element("p", f"{int((uses > 0).sum())} of {len(uses)} objects stand in a scene.")
-    return joined(
+    return join_markup(
         [section("objects", "Objects", picture, numbers, note), _most_used(distributions)]
     )
 
@@ -147,7 +147,9 @@ def rejections_section(distributions: Distributions) -> Markup:
     """Return the section on rejections by stage, reason and attempt."""
     rejections = distributions.rejections
     if not rejections:
-        return joined([_heading("rejections", "Rejections"), element("p", "Nothing was rejected.")])
+        return join_markup(
+            [_heading("rejections", "Rejections"), element("p", "Nothing was rejected.")]
+        )
     names = [f"{stage}: {reason}" for stage, reason in rejections]
     with drawing():
         parts = {
@@ -172,7 +174,7 @@ def licences_section(distributions: Distributions) -> Markup:
     head = ("licence", "objects", "of them in scenes", "places in scenes")
     note = element("p", "attribution.csv names the author of each object.", class_="faint")
     numbers = table(head, rows, numbers=3, class_="narrow")
-    return joined([_heading("licences", "Licences"), numbers, note])
+    return join_markup([_heading("licences", "Licences"), numbers, note])
 
 
 def _most_used(distributions: Distributions) -> Markup:
@@ -191,7 +193,7 @@ def _most_used(distributions: Distributions) -> Markup:
         rows.append([uid, title, split, bar, count])
     head = ("object", "title", "split", "", "places")
     heading = element("h3", f"The {len(ranked)} most used objects")
-    return joined([heading, table(head, rows, numbers=1)])
+    return join_markup([heading, table(head, rows, numbers=1)])
 
 
 def _floors_by_split(distributions: Distributions) -> Markup:
@@ -271,4 +273,6 @@ def section(anchor: str, title: str, picture: Markup, *details: Markup) -> Marku
     """Return a section: a heading with an anchor, a figure, and details beside it."""
     figure_box = element("div", picture, class_="figure")
     numbers_box = element("div", *details, class_="numbers")
-    return joined([_heading(anchor, title), element("div", figure_box, numbers_box, class_="pair")])
+    return join_markup(
+        [_heading(anchor, title), element("div", figure_box, numbers_box, class_="pair")]
+    )

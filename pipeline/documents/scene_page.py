@@ -13,7 +13,7 @@ from pipeline.documents.html import (
     Markup,
     element,
     enlargeable,
-    joined,
+    join_markup,
     outside_link,
     page,
     png_uri,
@@ -89,7 +89,7 @@ def encode_scene_page(
         element("h2", "Provenance"),
         _provenance(scene.provenance),
     ]
-    return page(title, joined(body), style=_STYLE + PASSES_STYLE + MAPS_STYLE)
+    return page(title, join_markup(body), style=_STYLE + PASSES_STYLE + MAPS_STYLE)
 
 
 def preview(radiance_rgb: NDArray[np.float32], width: int) -> NDArray[np.uint8]:
@@ -183,7 +183,7 @@ def _objects(scene: Scene) -> Markup:
     shading = {s.row: "smooth" if s.smooth else "flat" for s in surfaces(scene)}
     rows: list[list[Cell]] = [
         [
-            joined([_square(id_colors(row), class_="id"), entry.name], " "),
+            join_markup([_square(id_colors(row), class_="id"), entry.name], " "),
             entry.kind,
             entry.uid,
             entry.licence,

@@ -36,7 +36,7 @@ _PREVIEW_PX = 96
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShownPass:
+class PassView:
     """Display of one pass."""
 
     word: str
@@ -57,27 +57,27 @@ def _ids_seen(ids: NDArray) -> str:
     return f"{seen} seen, in the colours of the table Objects"
 
 
-SHOWN_PASSES = (
-    ShownPass(
+PASS_VIEWS = (
+    PassView(
         word="depth",
         title="depth",
         pixels=depth_grays,
         caption=_range_caption("{:.2f} to {:.2f} m, near is bright"),
     ),
-    ShownPass(
+    PassView(
         word="normal",
         title="shading normal",
         pixels=normal_colors,
         caption=lambda _: "x, y, z of the world from -1 to 1 as red, green, blue",
     ),
-    ShownPass(word="object", title="object ids", pixels=id_colors, caption=_ids_seen),
-    ShownPass(
+    PassView(word="object", title="object ids", pixels=id_colors, caption=_ids_seen),
+    PassView(
         word="diffuse",
         title="diffuse albedo",
         pixels=albedo_colors,
         caption=_range_caption("{:.2f} to {:.2f} (no unit)"),
     ),
-    ShownPass(
+    PassView(
         word="roughness",
         title="roughness",
         pixels=fraction_grays,
@@ -88,7 +88,7 @@ SHOWN_PASSES = (
 
 def passes_section(sample: Sample) -> Markup:
     """Return small pictures of the passes of each view, and the command that writes the numbers."""
-    words = [pass_view.word for pass_view in SHOWN_PASSES]
+    words = [pass_view.word for pass_view in PASS_VIEWS]
     intro = element(
         "p",
         f"What each view sees through the centres of {_PREVIEW_PX} x {_PREVIEW_PX} pixels, "
@@ -116,7 +116,7 @@ def _view(sample: Sample, view: int, words: Sequence[str]) -> Markup:
     names = [pass_names([word])[0] for word in words]
     passes = view_passes(sample.scene, names, view=view, resolution=_PREVIEW_PX)
     figures = []
-    for pass_view, name in zip(SHOWN_PASSES, names, strict=True):
+    for pass_view, name in zip(PASS_VIEWS, names, strict=True):
         values = passes[name]
         is_hit = np.any(values != MISS if values.dtype == np.int32 else np.isfinite(values))
         means = pass_view.caption(values) if is_hit else "nothing is met"

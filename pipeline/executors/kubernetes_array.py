@@ -92,7 +92,7 @@ def write_manifest(job: ArrayJob, options: KubernetesOptions) -> Path:
     return path
 
 
-def create_words(manifest: Path) -> list[str]:
+def create_command(manifest: Path) -> list[str]:
     """Return the command that submits a job, `kubectl` first."""
     return ["kubectl", "create", "--filename", str(manifest)]
 
@@ -109,7 +109,7 @@ def submit_job(job: ArrayJob, options: KubernetesOptions) -> Path:
             "submit kubernetes: no kubectl here; expected it installed and logged in. The "
             "manifest is written; --dry-run prints the command that submits it."
         )
-    done = subprocess.run(create_words(path), capture_output=True, text=True, check=False)
+    done = subprocess.run(create_command(path), capture_output=True, text=True, check=False)
     if done.returncode:
         why = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
         raise TrilightError(

@@ -18,7 +18,7 @@ _OF_THE_SCRIPT = ("--out", "--scenes", "--objects")
 """Options that the script takes from its environment."""
 
 
-def sbatch_words(job: ArrayJob, options: Sequence[str] = ()) -> list[str]:
+def sbatch_command(job: ArrayJob, options: Sequence[str] = ()) -> list[str]:
     """Return the command that submits an array, `sbatch` first.
 
     Args:
@@ -56,7 +56,7 @@ def submit_array(job: ArrayJob, options: Sequence[str] = ()) -> str:
         )
     Path("logs").mkdir(exist_ok=True)  # the script's tasks write their logs here
     done = subprocess.run(
-        sbatch_words(job, options),
+        sbatch_command(job, options),
         env={**os.environ, **sbatch_environment(job)},
         capture_output=True,
         text=True,

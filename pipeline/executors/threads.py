@@ -5,7 +5,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset, make_task
-from pipeline.making.run import Outcome, ShardJob, TaskOutcome
+from pipeline.making.run import Outcome, ShardJob, TaskResult
 from pipeline.making.runner import in_window
 from pipeline.making.tasks import Piece
 from storage.dataset.statistics import Statistics
@@ -22,7 +22,7 @@ class ThreadRunner:
     num_at_once = None
     window = None
 
-    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
+    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
         pool = ThreadPoolExecutor(job.num_at_once)
         try:
             yield from in_window(
@@ -39,5 +39,5 @@ class ThreadRunner:
         return write_documents()
 
 
-def _first_done(running: list["Future[TaskOutcome]"]) -> "Future[TaskOutcome]":
+def _first_done(running: list["Future[TaskResult]"]) -> "Future[TaskResult]":
     return next(iter(wait(running, return_when=FIRST_COMPLETED).done))

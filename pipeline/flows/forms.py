@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from pipeline.builds.named import BUILDS
 from pipeline.builds.settings import BuildSettings
 from pipeline.objects.sources import SOURCES
-from storage.settings.described import described
+from storage.settings.described import describe_fields
 
 Returned = TypeVar("Returned")
 
@@ -40,9 +40,9 @@ def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
                 default=inspect.Parameter.empty if field.default is MISSING else field.default,
                 annotation=annotations.get(field.name, _form_type(field.hint)),
             )
-            for field in described(settings)
+            for field in describe_fields(settings)
         ]
-        lines = [f"    {field.name}: {field.sentence}" for field in described(settings)]
+        lines = [f"    {field.name}: {field.sentence}" for field in describe_fields(settings)]
         function.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         text = inspect.getdoc(function) or ""
         function.__doc__ = "\n".join([text, "", "Args:", *lines])
@@ -59,7 +59,7 @@ def changes_form(settings: type, example: Any) -> type[BaseModel]:
         example: an instance, which says what the groups within tuples are.
     """
     fields: dict[str, Any] = {}
-    for field in described(settings):
+    for field in describe_fields(settings):
         value = getattr(example, field.name)
         kind = _form_type(field.hint)
         first = value[0] if isinstance(value, tuple) and value else value

@@ -99,7 +99,8 @@ def _require_shared(client: "Client", order: DatasetOrder) -> None:
         seen_by_all.unlink(missing_ok=True)
     if blind := sorted(worker for worker, sees in seen.items() if not sees):
         raise TrilightError(
-            f"{folder.shown}: {len(blind)} of {len(seen)} Dask workers do not see this folder, "
+            f"{folder.display_name}: {len(blind)} of {len(seen)} Dask workers do not see this "
+            "folder, "
             f"such as {blind[0]}; expected all to see the same --out at the same place (for a "
             "bucket, the same TRILIGHT_CACHE). Share it."
         )

@@ -17,7 +17,7 @@ from prefect.tasks import Task, exponential_backoff
 
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from pipeline.making.pipeline import make_task
-from pipeline.making.run import ShardJob, TaskOutcome
+from pipeline.making.run import ShardJob, TaskResult
 from pipeline.making.runner import in_window
 from pipeline.making.tasks import Piece
 from pipeline.renders.variant import choose_variant
@@ -49,7 +49,7 @@ def is_retryable(task_: Task[..., Any], run: TaskRun, state: State[Any]) -> bool
     retry_jitter_factor=0.5,
     retry_condition_fn=is_retryable,
 )
-def make_scenes(first: str, work: "OpaqueWork") -> TaskOutcome:
+def make_scenes(first: str, work: "OpaqueWork") -> TaskResult:
     """Make some pieces; `first` names their first scene on Prefect's page.
 
     If pictures are rendered on a GPU, GPU_LIMIT limits the tasks that run at the same time.
@@ -79,7 +79,7 @@ class PrefectRunner:
         self.window = window
         self.num_at_once = num_at_once
 
-    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
+    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
         """Yield results as tasks end; raises the error of a task's last try."""
         return in_window(
             tasks,
@@ -122,7 +122,7 @@ def _gpu_slot() -> contextlib.AbstractContextManager[None]:
     return concurrency(GPU_LIMIT, occupy=1, strict=False)
 
 
-def _first_done(running: list[PrefectFuture[TaskOutcome]]) -> PrefectFuture[TaskOutcome]:
+def _first_done(running: list[PrefectFuture[TaskResult]]) -> PrefectFuture[TaskResult]:
     return next(iter(as_completed(running)))
 
 

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from storage.cache import cache_folder, open_private, private_folder
-from storage.claims import claimed
+from storage.claims import hold_claim
 from storage.errors import TrilightError
 from storage.installation import IMPORT_ROOT, child_environment
 from storage.remote.safe_url import safe_text
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import httpx
     from prefect.client.orchestration import SyncPrefectClient
 
-TOLD_BY_ITS_STARTER = "TRILIGHT_TOLD_BY_ITS_STARTER"
+STOPPED_BY_PARENT = "TRILIGHT_TOLD_BY_ITS_STARTER"
 """Variable that marks a process which gets SIGTERM from its parent, and from no other process."""
 PASSWORD = "PREFECT_SERVER_API_AUTH_STRING"
 """Variable of the server: USER:PASSWORD, which every request must state."""
@@ -174,7 +174,7 @@ def prefect_server() -> Iterator[str]:
     password = new_password()
     with contextlib.ExitStack() as starting, open_private(home / _LOG_NAME, "ab") as log:
         # two first starts at once would both migrate the database
-        starting.enter_context(claimed(home / "start.lock", wait=True))
+        starting.enter_context(hold_claim(home / "start.lock", wait=True))
         port = _free_port()
         server = subprocess.Popen(
             [*SERVER, "--port", str(port), "--with-parent"],

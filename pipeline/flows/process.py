@@ -4,7 +4,7 @@ import signal
 import subprocess
 from collections.abc import Callable, Sequence
 
-from pipeline.flows.prefect_server import TOLD_BY_ITS_STARTER
+from pipeline.flows.prefect_server import STOPPED_BY_PARENT
 from pipeline.isolation import die_with_parent
 from storage.installation import child_environment
 from storage.remote.safe_url import safe_text
@@ -32,7 +32,7 @@ def run_to_end(command: Sequence[str], say: Callable[[str], None]) -> tuple[int,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        env={**child_environment(), TOLD_BY_ITS_STARTER: "1"},
+        env={**child_environment(), STOPPED_BY_PARENT: "1"},
         start_new_session=True,
         preexec_fn=die_with_parent,
     ) as process:

@@ -25,14 +25,14 @@ from prefect.settings import get_current_settings
 from pipeline.flows.prefect_server import prefect_client
 from storage.errors import TrilightError
 from storage.remote.safe_url import safe_text
-from storage.settings.described import described
+from storage.settings.described import describe_fields
 
 POLL_S = 1.0
 """Seconds between two polls of a run."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Submitted:
+class SubmittedRun:
     """A flow run that the server has accepted."""
 
     id: UUID
@@ -47,7 +47,7 @@ class Submitted:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SeenRun:
+class RunStatus:
     """State and artifacts of a run at one moment."""
 
     state: str
@@ -88,7 +88,7 @@ def parameters(order: Any) -> dict[str, Any]:
     """
     kind: type = type(order)
     values: dict[str, Any] = {}
-    for field in described(kind):
+    for field in describe_fields(kind):
         value = getattr(order, field.name)
         if field.name == "build" or value not in (field.default, {}):
             values[field.name] = _nest_groups(value) if isinstance(value, Mapping) else value
@@ -98,7 +98,7 @@ def parameters(order: Any) -> dict[str, Any]:
 
 def submit(
     client: SyncPrefectClient, flow: str, deployment: str | None, values: Mapping[str, Any]
-) -> Submitted:
+) -> SubmittedRun:
     """Create a flow run; return as soon as the server has accepted it.
 
     Args:
@@ -125,7 +125,7 @@ def submit(
     chosen = by_name[name]
     run = client.create_flow_run_from_deployment(chosen.id, parameters=dict(values))
     base = str(get_current_settings().ui_url or client.api_url).removesuffix("/api/")
-    return Submitted(
+    return SubmittedRun(
         id=run.id,
         name=run.name,
         deployment=f"{flow}/{name}",
@@ -140,9 +140,9 @@ def workers_online(client: SyncPrefectClient, pool: str) -> int:
     return sum(worker.status == WorkerStatus.ONLINE for worker in workers)
 
 
-def looks(
+def poll_run(
     client: SyncPrefectClient, run: UUID, sleep: Callable[[float], None] = time.sleep
-) -> Iterator[SeenRun]:
+) -> Iterator[RunStatus]:
     """Poll a flow run; yield its status until it has ended."""
     while True:
         look = _read_status(client, client.read_flow_run(run))
@@ -152,7 +152,7 @@ def looks(
         sleep(POLL_S)
 
 
-def _read_status(client: SyncPrefectClient, run: FlowRun) -> SeenRun:
+def _read_status(client: SyncPrefectClient, run: FlowRun) -> RunStatus:
     state = run.state
     is_final = state is not None and state.is_final()
     artifacts = client.read_artifacts(
@@ -165,7 +165,7 @@ def _read_status(client: SyncPrefectClient, run: FlowRun) -> SeenRun:
         for artifact in in_order
         if artifact.type == "table" and artifact.key and (rows := _rows(artifact.data))
     }
-    return SeenRun(
+    return RunStatus(
         state=state.name or state.type.value if state else "Pending",
         message=safe_text(state.message or "") if state else "",
         percent=float(str(bars[-1].data)) if bars else 0.0,

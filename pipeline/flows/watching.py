@@ -27,7 +27,7 @@ from prefect.logging import get_run_logger
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset
 from pipeline.making.price import PRICES, USD_PER_CORE_HOUR
-from pipeline.making.run import Outcome, Run, TaskOutcome
+from pipeline.making.run import Outcome, Run, TaskResult
 from pipeline.making.runner import Runner
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
@@ -94,7 +94,7 @@ class RunArtifacts:
         self._show = BestEffort(self._log)
         self._show(self._begin)
 
-    def record_task(self, run: Run, outcome: TaskOutcome) -> None:
+    def record_task(self, run: Run, outcome: TaskResult) -> None:
         """Record a finished task, and show a new table if the last one is old."""
         now = time.monotonic()
         if self._began is None and outcome.scenes:

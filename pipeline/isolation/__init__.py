@@ -15,7 +15,7 @@ from pipeline.isolation.child import (
     preload,
 )
 from pipeline.isolation.confinement import NO_FILES, Reach, reach
-from pipeline.isolation.deaths import ChildFailed, Result, is_passing, with_retries
+from pipeline.isolation.deaths import ChildFailed, Result, is_transient, with_retries
 from pipeline.isolation.inside import die_with_parent
 
 __all__ = [
@@ -28,7 +28,7 @@ __all__ = [
     "Result",
     "call_with_retries",
     "die_with_parent",
-    "is_passing",
+    "is_transient",
     "preload",
     "reach",
     "with_retries",

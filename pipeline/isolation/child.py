@@ -96,7 +96,7 @@ class IsolatedChild:
         self._reach = confined_to
         self._code = frozenset[Path]()
 
-    def may(self, more: Reach) -> None:
+    def allow_files(self, more: Reach) -> None:
         """Extend the files that a confined child may use; not while another thread calls.
 
         A running child without that access is replaced: the kernel cannot loosen a confinement.

@@ -84,7 +84,7 @@ def reach(*, files: Iterable[Path] = (), writes: Iterable[Path] = ()) -> Reach:
     )
 
 
-def wanted_confinement() -> Mode:
+def confinement_mode() -> Mode:
     """Return the value of TRILIGHT_CONFINE, by default `auto`; raises TrilightError for others."""
     text = os.environ.get(VARIABLE, "auto")
     if text in get_args(Mode):
@@ -92,7 +92,7 @@ def wanted_confinement() -> Mode:
     raise TrilightError(f"{VARIABLE} is {text!r}; {expected_one_of(text, get_args(Mode))}.")
 
 
-def missing_parts() -> list[str]:
+def missing_features() -> list[str]:
     """Return the names of features that this machine lacks to confine children."""
     missing = [] if landlock_version() else ["Landlock (Linux 5.13 or later, switched on)"]
     return missing if seccomp_works() else [*missing, "seccomp (Linux on x86_64 or aarch64)"]
@@ -107,8 +107,8 @@ def should_confine() -> bool:
         EnvironmentFailure: the value is `required`, and this machine lacks a feature.
         TrilightError: the value is unknown.
     """
-    mode = wanted_confinement()
-    missing = missing_parts()
+    mode = confinement_mode()
+    missing = missing_features()
     if missing and mode == "required":
         raise EnvironmentFailure(
             f"{VARIABLE} is required, but this machine lacks {' and '.join(missing)}; expected "

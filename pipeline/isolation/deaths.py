@@ -85,7 +85,7 @@ class ChildFailed(Exception):
         return ENDS[_kind(self.reason)].is_verdict
 
 
-def is_passing(reason: str) -> bool:
+def is_transient(reason: str) -> bool:
     """Return True if an item that failed for this reason may succeed in the next run."""
     end = ENDS.get(_kind(reason))
     return end is not None and not end.is_verdict

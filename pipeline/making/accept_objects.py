@@ -7,7 +7,7 @@ from dataclasses import replace
 from operator import attrgetter
 
 from pipeline.making.accept_maps import AcceptedMaps, accept_maps
-from pipeline.making.asked_objects import AskedObjects
+from pipeline.making.asked_objects import ObjectOptions
 from pipeline.making.freeze_objects import (
     AcceptedObjects,
     freeze_objects,
@@ -31,7 +31,7 @@ from storage.records.objects import OBJECT, LockedObject, ObjectRecord
 from storage.remote.safe_url import safe_url
 
 
-def prepare_unfrozen_objects(options: AskedObjects) -> ListedObjects | None:
+def prepare_unfrozen_objects(options: ObjectOptions) -> ListedObjects | None:
     """Prepare objects cooperatively, without holding the objects lock, unless they are frozen.
 
     Returns:
@@ -40,9 +40,9 @@ def prepare_unfrozen_objects(options: AskedObjects) -> ListedObjects | None:
     Raises:
         TrilightError: as `list_objects` and `prepare_in_batches`.
     """
-    writer = options.publication
+    writer = options.writer
     folder = writer.folder
-    with folder.turn("objects"):  # one worker writes built-in objects, the others load them
+    with folder.mutex("objects"):  # one worker writes built-in objects, the others load them
         writer.refresh()
         writer.fetch_lock()
         if read_frozen_objects(writer) is not None:
@@ -53,7 +53,7 @@ def prepare_unfrozen_objects(options: AskedObjects) -> ListedObjects | None:
     return listed
 
 
-def accept_objects(options: AskedObjects, listed: ListedObjects | None = None) -> AcceptedObjects:
+def accept_objects(options: ObjectOptions, listed: ListedObjects | None = None) -> AcceptedObjects:
     """Prepare the meshes of a source and freeze them; later, load those that were frozen.
 
     The user's textures and maps are frozen with them. Call while holding the mutex `objects`.
@@ -66,10 +66,10 @@ def accept_objects(options: AskedObjects, listed: ListedObjects | None = None) -
         TrilightError, EnvironmentFailure: as `list_objects` and `freeze_objects`.
     """
     settings = options.settings
-    folder = options.publication.folder
+    folder = options.writer.folder
     if trusted := load_trusted_objects(options):
         return trusted
-    frozen = read_frozen_objects(options.publication)
+    frozen = read_frozen_objects(options.writer)
     shared = listed is not None
     listed = listed or options.list_source()
     maps = _select_frozen_maps(
@@ -93,7 +93,7 @@ def accept_objects(options: AskedObjects, listed: ListedObjects | None = None) -
 
 
 def _select_frozen_maps(
-    maps: AcceptedMaps, options: AskedObjects, frozen: dict[str, LockedObject] | None
+    maps: AcceptedMaps, options: ObjectOptions, frozen: dict[str, LockedObject] | None
 ) -> AcceptedMaps:
     """Return the maps that the dataset was begun with; all if it begins now."""
     if frozen is None:
@@ -115,15 +115,15 @@ def _select_frozen_batches(
 def _prepare(
     listed: ListedObjects,
     records: Sequence[ObjectRecord],
-    options: AskedObjects,
+    options: ObjectOptions,
     should_stop: Callable[[], bool] = lambda: False,
     retry_transient: bool = True,
 ) -> PrepareResult:
-    folder = options.publication.folder
+    folder = options.writer.folder
     downloads = _Downloads(listed, folder, len(records))
     work = ObjectWork(
         settings=options.settings.mesh_settings,
-        writer=options.publication,
+        writer=options.writer,
         fetch=None if listed.listing.is_here else downloads.fetch,
     )
     return prepare_in_batches(
@@ -155,7 +155,7 @@ class _Downloads:
             announce_downloads(self._folder, self._done, self._total)
 
 
-def load_trusted_objects(options: AskedObjects) -> AcceptedObjects | None:
+def load_trusted_objects(options: ObjectOptions) -> AcceptedObjects | None:
     """Return the frozen objects by their index, without opening any of them.
 
     The lock has their digests, which are checked when a scene draws an object. None if nothing is
@@ -165,7 +165,7 @@ def load_trusted_objects(options: AskedObjects) -> AcceptedObjects | None:
     Raises:
         TrilightError: as `accept_maps`.
     """
-    writer = options.publication
+    writer = options.writer
     folder = writer.folder
     writer.fetch_lock()
     try:

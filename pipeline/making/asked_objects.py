@@ -11,7 +11,7 @@ from storage.digests import canonical_json, sha256_hex
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class AskedObjects:
+class ObjectOptions:
     """Source and settings of a dataset's objects."""
 
     source: str
@@ -20,7 +20,7 @@ class AskedObjects:
     """Licence that the user states for files without one."""
     settings: BuildSettings
     """Settings of the build: how objects are prepared and assigned to splits."""
-    publication: DatasetWriter
+    writer: DatasetWriter
     """Writer of the dataset that the objects are frozen for."""
     workers: int
     """Number of objects that are prepared at the same time."""
@@ -35,7 +35,7 @@ class AskedObjects:
     @property
     def pool(self) -> FrozenPool:
         """The pool from which scenes draw objects once these are frozen."""
-        folder = self.publication.folder
+        folder = self.writer.folder
         return FrozenPool(
             lock=folder.objects_lock,
             index=folder.staged_index,
@@ -47,7 +47,7 @@ class AskedObjects:
         """List the source; raises as `list_objects`."""
         return list_objects(
             self.source,
-            work_dir=self.publication.folder.staged_objects,
+            work_dir=self.writer.folder.staged_objects,
             allowed_licences=self.settings.allowed_licences,
             licence=self.licence,
         )

@@ -10,7 +10,7 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.making.frozen_pool import AssetMissing, FrozenPool
 from pipeline.making.own_maps import user_maps
 from pipeline.making.prepare_isolated import asset_store
-from pipeline.making.render_sample import BegunScene, render_sample
+from pipeline.making.render_sample import RenderInput, render_sample
 from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.renderer import set_threads
@@ -126,13 +126,13 @@ def attempt_scene(
     return SceneAttempt(sample=sample, failures=failures)
 
 
-def _scene(split: str, scene_index: int, attempt: int, from_file: Scene | None) -> BegunScene:
+def _scene(split: str, scene_index: int, attempt: int, from_file: Scene | None) -> RenderInput:
     recipe = _state.recipe
     settings = _state.recipe.settings
     if recipe.revisited is not None:
         return recipe.revisited.scene(scene_index, attempt, settings)
     if from_file is not None:
-        return BegunScene(scene=from_file, kept_cameras=settings.scenes.num_views)
+        return RenderInput(scene=from_file, kept_cameras=settings.scenes.num_views)
     scene = compose_scene(
         settings.scenes,
         assets_of(split),
@@ -141,7 +141,7 @@ def _scene(split: str, scene_index: int, attempt: int, from_file: Scene | None) 
         attempt=attempt,
         user_maps=maps_of(split),
     )
-    return BegunScene(scene=scene)
+    return RenderInput(scene=scene)
 
 
 def assets_of(split: str) -> Sequence[PooledAsset]:

@@ -10,7 +10,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, read_head, write_manifest
 from storage.dataset.splits import planned_scenes
 from storage.errors import TrilightError
-from storage.extensions import recorded, require_same_extensions
+from storage.extensions import extension_digests, require_same_extensions
 from storage.settings.described import from_record
 
 
@@ -33,7 +33,7 @@ def begin(
     if num_scenes < 1:
         raise TrilightError(f"scenes is {num_scenes}; expected at least 1.")
     num_planned = planned_scenes(num_scenes, settings.splits)
-    with folder.turn("manifest"):
+    with folder.mutex("manifest"):
         if folder.manifest.exists():
             manifest = read_head(folder.manifest)
             _require_same_dataset(folder, manifest, settings, environment, accept_environment)
@@ -48,7 +48,7 @@ def begin(
                 num_views=settings.scenes.num_views,
                 objects_lock_sha256="",
                 shards=(),
-                extensions=recorded("data"),
+                extensions=extension_digests("data"),
             )
             write_manifest(folder.manifest, manifest)
         writer = DatasetWriter(folder, manifest, settings.splits)
@@ -65,7 +65,7 @@ def _require_same_dataset(
     accept_environment: bool,
 ) -> None:
     _require_generated(folder, manifest)
-    require_same_extensions(folder.shown, manifest.extensions, recorded("data"))
+    require_same_extensions(folder.display_name, manifest.extensions, extension_digests("data"))
     stored = from_record(BuildSettings, manifest.settings).as_json()  # fields may come later
     _require_same(folder, "setting", stored, settings.as_json(), "choose another --out")
     if not accept_environment:
@@ -92,13 +92,15 @@ def require_free(folder: DatasetFolder, names: Iterable[str]) -> None:
     existing = set(names)
     if any(name.endswith(".tar") for name in existing):
         raise TrilightError(
-            f"{folder.shown}: there are shards but no manifest.json; expected an empty folder or a "
+            f"{folder.display_name}: there are shards but no manifest.json; expected an empty "
+            "folder or a "
             "dataset. Choose another --out."
         )
     for path in (folder.card, folder.licences):
         if path.name in existing:
             raise TrilightError(
-                f"{folder.shown}: {path.name} is there, and the dataset's own would replace it; "
+                f"{folder.display_name}: {path.name} is there, and the dataset's own would replace "
+                "it; "
                 "expected an empty folder or a dataset. Choose another --out."
             )
 
@@ -111,7 +113,8 @@ def _names_in(folder: DatasetFolder) -> Iterator[str]:
 def _require_generated(folder: DatasetFolder, manifest: Manifest) -> None:
     if derivation := derivation_of(manifest.settings):
         raise TrilightError(
-            f"{folder.shown}: this dataset was made by `trilight shards {derivation.operation}` "
+            f"{folder.display_name}: this dataset was made by `trilight shards "
+            f"{derivation.operation}` "
             "and cannot grow; extend its sources and make it again, or choose another --out."
         )
 
@@ -128,6 +131,7 @@ def _require_same(
         name, old, new = differing[0]
         more = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
         raise TrilightError(
-            f"{folder.shown}: this dataset was begun with another {what}: {name} was {old!r}, now "
+            f"{folder.display_name}: this dataset was begun with another {what}: {name} was "
+            f"{old!r}, now "
             f"{new!r}{more}; {next_step}."
         )

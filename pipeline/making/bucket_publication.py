@@ -200,7 +200,7 @@ def begin_dataset(
     return in_bucket
 
 
-def joined(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
+def hold_membership(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
     """Hold the membership of a dataset's workers; a bucket is first mirrored to its local folder.
 
     The manifest of a dataset without any object, scene or shard is deleted: it begins again.
@@ -208,7 +208,7 @@ def joined(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
     Raises:
         TrilightError: the folder cannot be written, or the bucket not be read.
     """
-    return folder.joined(
+    return folder.hold_membership(
         Mirror(folder).adopt if folder.bucket else partial(delete_empty_manifest, folder)
     )
 

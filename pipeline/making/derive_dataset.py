@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pipeline.documents.dataset_documents import write_documents
-from pipeline.shards.derive import Derive, derive_shards
+from pipeline.shards.derive import DeriveOptions, derive_shards
 from pipeline.shards.finished import open_finished
 from storage.atomic import write_error
 from storage.dataset.dataset import open_dataset
@@ -21,7 +21,7 @@ from storage.errors import TrilightError
 
 def derive_dataset(
     paths: Sequence[str],
-    derive: Derive,
+    derive: DeriveOptions,
     out: Path,
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -47,7 +47,7 @@ def derive_dataset(
         )
     sources = [open_finished(path) for path in paths]
     work = DatasetFolder(out.with_name(f".{out.name}.part"))
-    with work.locked():
+    with work.hold_exclusively():
         _clear(work)
         try:
             derive_shards(sources, derive, work, progress=progress)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
-from pipeline.isolation import is_passing
+from pipeline.isolation import is_transient
 from pipeline.making.accept_maps import NO_MAPS, AcceptedMaps
-from pipeline.making.asked_objects import AskedObjects
+from pipeline.making.asked_objects import ObjectOptions
 from pipeline.making.frozen_pool import FrozenPool
 from pipeline.making.object_batches import PreparedObject
 from pipeline.making.publication import DatasetWriter
@@ -51,7 +51,7 @@ class AcceptedObjects:
 
 
 def freeze_objects(
-    options: AskedObjects,
+    options: ObjectOptions,
     prepared: list[PreparedObject],
     rejected: list[Failure],
     num_found: int,
@@ -71,11 +71,11 @@ def freeze_objects(
             the dataset was begun with.
         EnvironmentFailure: a frozen object could not be prepared this time.
     """
-    writer = options.publication
+    writer = options.writer
     settings = options.settings
     display_name = safe_url(options.source)
     frozen = read_frozen_objects(writer)
-    transient = [failure for failure in rejected if is_passing(failure.reason)]
+    transient = [failure for failure in rejected if is_transient(failure.reason)]
     if frozen is not None:
         for failure in transient:
             require_tried(display_name, failure)
@@ -100,14 +100,14 @@ def freeze_objects(
 
 
 def _write_index(
-    options: AskedObjects,
+    options: ObjectOptions,
     locked: list[LockedObject],
     prepared: list[PreparedObject],
     num_found: int,
 ) -> None:
     """Write the index of the lock, by which later workers load it without opening objects."""
     assets = {asset.record.uid: asset for asset in prepared}
-    writer = options.publication
+    writer = options.writer
     folder = writer.folder
     objects = list[IndexedObject]()
     offset = 0
@@ -129,7 +129,7 @@ def _write_index(
         objects,
         lock_sha256=writer.manifest.objects_lock_sha256,
         lock_bytes=offset,
-        asked=options.digest,
+        request_digest=options.digest,
         num_found=num_found,
         num_maps=len(locked) - len(objects),
     )
@@ -174,7 +174,7 @@ def _require_enough(
 
 def require_tried(source: str, failure: Failure) -> None:
     """Raise EnvironmentFailure if a frozen object failed for a transient reason."""
-    if is_passing(failure.reason):
+    if is_transient(failure.reason):
         raise EnvironmentFailure(
             f"objects {source!r}: {failure.item!r}, which the dataset was begun with, could not be "
             f"prepared this time ({failure.reason}: {failure.message}). Nothing has changed; run "

@@ -10,7 +10,7 @@ _CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 _GPUS = Path("/proc/driver/nvidia/gpus")
 
 
-def cores_owned() -> int:
+def available_cores() -> int:
     """Return the number of cores that this process may keep busy.
 
     TRILIGHT_CORES sets it, so that several workers can share one machine; by default it is the

@@ -113,9 +113,9 @@ def make_assets(
     allowed_licences: Sequence[str],
     licence: str | None,
     workers: int,
-    downloaded: Callable[[int, int], None],
-    planned: Callable[[int], None],
-    done: Callable[[], None],
+    on_download: Callable[[int, int], None],
+    on_plan: Callable[[int], None],
+    on_object: Callable[[], None],
 ) -> AssetReport:
     """Prepare the objects of a source and write the folder; a repeated call uses the asset store.
 
@@ -142,12 +142,12 @@ def make_assets(
         work_dir=cache_folder("objects"),
         allowed_licences=allowed_licences,
         licence=licence,
-        downloaded=downloaded,
+        downloaded=on_download,
     )
     write_atomically(folder.summary, b"{}")  # from here on the folder is ours
-    planned(len(listed.records))
+    on_plan(len(listed.records))
     prepared, rejected = prepare_isolated(
-        list(listed.records), settings, workers=workers, done=done
+        list(listed.records), settings, workers=workers, done=on_object
     )
     levels = [_only_level(asset) for asset in prepared]
     rows = [_row(asset, level) for asset, level in zip(prepared, levels, strict=True)]
@@ -288,7 +288,7 @@ def _pairs(
         for name, indices in groups.items():
             for i in indices:
                 path = prepared[i].record.path
-                child.may(reach(files=[Path(path)]))
+                child.allow_files(reach(files=[Path(path)]))
                 with contextlib.suppress(ChildFailed):  # a missing picture must not stop the run
                     source, result = call_with_retries(
                         child, preview_both, path, settings, levels[i], _WIDTH_PX

@@ -20,7 +20,7 @@ from typing import Any
 from pipeline.assets.recipe import READERS, RECIPE
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset
-from pipeline.isolation import is_passing
+from pipeline.isolation import is_transient
 from pipeline.making.prepare_isolated import MeshWork
 from pipeline.making.publication import DatasetWriter
 from pipeline.objects.listing import SUFFIXES, Fetched
@@ -289,7 +289,7 @@ def _collect_results(batches: Sequence[ObjectBatch], results: dict[int, PrepareR
 
 def _may_change(failures: Iterable[Failure]) -> bool:
     """Return True if a later run may succeed: after failed downloads and transient failures."""
-    return any(failure.stage == "objects" or is_passing(failure.reason) for failure in failures)
+    return any(failure.stage == "objects" or is_transient(failure.reason) for failure in failures)
 
 
 def _encode(result: PrepareResult) -> bytes:

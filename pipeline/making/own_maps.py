@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.objects.maps.prepared import decode_prepared
-from scene_templates.own_maps import OwnMap, OwnMaps, OwnTexture
+from scene_templates.own_maps import OwnMaps, UserMap, UserTexture
 from storage.records.objects import SKY, TEXTURE, LockedObject
 from storage.records.texture import MapSource
 
@@ -26,12 +26,12 @@ def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
     )
     return OwnMaps(
         textures=[
-            OwnMap(uid=locked.uid, source=_source(locked), load=partial(_texture, path))
+            UserMap(uid=locked.uid, source=_source(locked), load=partial(_texture, path))
             for locked, path in of_split
             if locked.kind == TEXTURE
         ],
         skies=[
-            OwnMap(uid=locked.uid, source=_source(locked), load=partial(_radiance, path))
+            UserMap(uid=locked.uid, source=_source(locked), load=partial(_radiance, path))
             for locked, path in of_split
             if locked.kind == SKY
         ],
@@ -47,9 +47,9 @@ def _source(locked: LockedObject) -> MapSource:
     )
 
 
-def _texture(path: Path) -> OwnTexture:
+def _texture(path: Path) -> UserTexture:
     arrays = decode_prepared(path.read_bytes(), path.name).arrays
-    return OwnTexture(
+    return UserTexture(
         diffuse_rgb=arrays["diffuse"],
         specular_rgb=arrays["specular"],
         roughness=arrays.get("roughness"),

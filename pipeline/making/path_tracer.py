@@ -35,7 +35,7 @@ class PathTracer:
         seed: int,
         variant: Variant,
         threads: int,
-        sampled: Callable[[Sampling], None],
+        on_samples: Callable[[Sampling], None],
     ) -> None:
         """Configure the tracer; the child starts later.
 
@@ -48,7 +48,7 @@ class PathTracer:
         """
         self._settings = settings
         self._seed = seed
-        self._on_samples = sampled
+        self._on_samples = on_samples
         self.identity: Mapping[str, Any] = {
             "seed": str(seed),  # the integers of an EXR header end at 2^31
             "settings": settings_record(settings),

@@ -43,12 +43,12 @@ from pipeline.making.accept_objects import (
 )
 from pipeline.making.accept_revisited import accept_revisited
 from pipeline.making.accept_scene_files import accept_scene_files
-from pipeline.making.asked_objects import AskedObjects
+from pipeline.making.asked_objects import ObjectOptions
 from pipeline.making.attempt_scene import MAX_ATTEMPTS, attempt_scene
-from pipeline.making.bucket_publication import joined
+from pipeline.making.bucket_publication import hold_membership
 from pipeline.making.dataset_order import DatasetOrder, generate_words
 from pipeline.making.freeze_objects import AcceptedObjects
-from pipeline.making.machine import cores_owned
+from pipeline.making.machine import available_cores
 from pipeline.making.publication import DatasetWriter
 from pipeline.making.render_children import (
     close_children,
@@ -61,7 +61,7 @@ from pipeline.making.run import (
     Outcome,
     Run,
     ShardJob,
-    TaskOutcome,
+    TaskResult,
     Watcher,
     begin_or_resume_dataset,
     resolve_settings,
@@ -116,11 +116,11 @@ def _begin_run(order: DatasetOrder) -> Iterator[Run]:
     settings, listed = resolve_settings(
         order, folder
     )  # refuses an order before anything is written
-    with joined(folder):
+    with hold_membership(folder):
         user_folders = map_folders(order, settings)
         writer = begin_or_resume_dataset(order, settings, folder)
         if listed or order.revisits:
-            with folder.turn("objects"):
+            with folder.mutex("objects"):
                 writer.refresh()
                 accepted = (
                     accept_scene_files(listed, order.licence, settings, writer)
@@ -143,18 +143,18 @@ def _accept_together(
     order: DatasetOrder, settings: BuildSettings, writer: DatasetWriter, user_folders: MapFolders
 ) -> AcceptedObjects:
     """Return the frozen objects; prepare them with the other workers if they are not frozen."""
-    options = AskedObjects(
+    options = ObjectOptions(
         source=object_source(settings, order.objects),
         licence=order.licence,
         settings=settings,
-        publication=writer,
-        workers=cores_owned(),
+        writer=writer,
+        workers=available_cores(),
         user_folders=user_folders,
     )
     if trusted := load_trusted_objects(options):
         return trusted
     listed = prepare_unfrozen_objects(options)
-    with writer.folder.turn("objects"):  # one worker freezes, and the others load the result
+    with writer.folder.mutex("objects"):  # one worker freezes, and the others load the result
         writer.refresh()
         return accept_objects(options, listed)
 
@@ -175,7 +175,7 @@ def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:
         close_children()
 
 
-def make_task(job: ShardJob, pieces: tuple[Piece, ...]) -> TaskOutcome:
+def make_task(job: ShardJob, pieces: tuple[Piece, ...]) -> TaskResult:
     """Make the scenes of some pieces, and pack the shards that are complete then.
 
     A runner calls this for each task, on a thread, in another process or on another machine.
@@ -188,7 +188,7 @@ def make_task(job: ShardJob, pieces: tuple[Piece, ...]) -> TaskOutcome:
     with render_child(job) as child, scene_reader(job) as read:
         made = [make_piece(job, piece, child, read) for piece in pieces]
     seconds = time.monotonic() - started
-    return TaskOutcome(
+    return TaskResult(
         shards=tuple(shard for _, shard in made if shard),
         scenes=sum(scenes for scenes, _ in made),
         seconds=seconds,
@@ -278,7 +278,7 @@ def make_scene(
 
 def make_documents(writer: DatasetWriter) -> Statistics:
     """Write the documents of all shards; one worker at a time."""
-    with writer.folder.turn("documents"):
+    with writer.folder.mutex("documents"):
         statistics = write_documents(writer.dataset(), writer.folder)
         writer.upload_documents()
         return statistics

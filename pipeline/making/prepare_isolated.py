@@ -60,7 +60,7 @@ class MeshWork:
         @contextlib.contextmanager
         def borrow() -> Iterator[IsolatedChild]:
             with self._pool.borrow() as child:
-                child.may(all_files)  # all files at once: each new file replaces the child
+                child.allow_files(all_files)  # all files at once: each new file replaces the child
                 yield child
 
         return prepare_assets(

@@ -35,7 +35,7 @@ class ProgressiveTracer:
         )
         self._one_at_a_time = threading.Lock()
 
-    def paint(
+    def render(
         self,
         scene: Scene,
         key: Hashable,

@@ -11,7 +11,7 @@ from typing import Any
 
 from pipeline.shards.pack import unpack_here
 from storage.atomic import write_atomically
-from storage.claims import claimed
+from storage.claims import hold_claim
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import (
     DatasetFolder,
@@ -120,7 +120,7 @@ class DatasetWriter:
 
         Another worker may have made the file in the meantime.
         """
-        return claimed(path.with_suffix(".claim"))
+        return hold_claim(path.with_suffix(".claim"))
 
     def upload(self, path: Path) -> None:
         """Upload a file of the folder; no-op for a local folder."""
@@ -268,7 +268,8 @@ class DatasetWriter:
                 return
             time.sleep(2**look if look < _MAX_LOOKS - 1 else 0)
         raise TrilightError(
-            f"{self.folder.shown}: a worker has packed {name}, and it is not here: the worker's "
+            f"{self.folder.display_name}: a worker has packed {name}, and it is not here: the "
+            "worker's "
             "folder is not this one. Expected workers that see the same --out at the same place "
             "(for a bucket, the same TRILIGHT_CACHE); share it, and run the same command again."
         )
@@ -282,14 +283,15 @@ class DatasetWriter:
         head = read_head(self.folder.manifest)
         if head.settings != self.manifest.settings:
             raise TrilightError(
-                f"{self.folder.shown}: another dataset has been begun here in the meantime; choose "
+                f"{self.folder.display_name}: another dataset has been begun here in the meantime; "
+                "choose "
                 "another --out."
             )
         self.manifest = head
 
     @contextlib.contextmanager
     def _lock_manifest(self) -> Iterator[None]:
-        with self.folder.turn("manifest"):
+        with self.folder.mutex("manifest"):
             self.refresh()
             yield
 

@@ -16,12 +16,12 @@ from pipeline.isolation import ChildLimits, IsolatedChild, call_with_retries, re
 from pipeline.making.attempt_scene import SceneRecipe, set_up_child
 from pipeline.making.children import ChildPool
 from pipeline.making.environment import environment
-from pipeline.making.machine import cores_owned, visible_gpus
+from pipeline.making.machine import available_cores, visible_gpus
 from pipeline.making.prepare_isolated import asset_child
 from pipeline.making.run import ShardJob
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
-from storage.extensions import recorded, require_same_extensions
+from storage.extensions import extension_digests, require_same_extensions
 from storage.records.scene import Scene
 
 _RENDER_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=200)
@@ -122,7 +122,7 @@ def _reading_pool(job: ShardJob) -> ChildPool:
 
 
 def _render_pool(job: ShardJob) -> ChildPool:
-    require_same_extensions("this worker: the dataset", job.extensions, recorded("data"))
+    require_same_extensions("this worker: the dataset", job.extensions, extension_digests("data"))
     variant = choose_variant()
     if job.environment:
         require_environment(job.environment, environment(variant))
@@ -148,7 +148,7 @@ def _render_pool(job: ShardJob) -> ChildPool:
 
 def cores_of_child(job: ShardJob) -> int:
     """Return the number of threads of a render child of this process."""
-    return max(1, cores_owned() // job.num_at_once)
+    return max(1, available_cores() // job.num_at_once)
 
 
 def require_environment(expected: Mapping[str, Any], actual: Mapping[str, Any]) -> None:

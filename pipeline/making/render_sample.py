@@ -14,7 +14,7 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
-from pipeline.scenes.sight import Sight
+from pipeline.scenes.sight import Visibility
 from pipeline.scenes.views import ViewCamera, cameras_of, cameras_of_view, with_cameras
 from storage.errors import Rejected
 from storage.records.objects import Failure
@@ -38,7 +38,7 @@ class KeptPictures:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class BegunScene:
+class RenderInput:
     """A scene to render, with the cameras and pictures that stay."""
 
     scene: Scene
@@ -62,7 +62,7 @@ class _AcceptedView:
 
 def render_sample(
     key: str,
-    render_input: BegunScene,
+    render_input: RenderInput,
     settings: BuildSettings,
     failures: list[Failure],
     progress: ViewProgress,
@@ -82,7 +82,7 @@ def render_sample(
     scene = render_input.scene
     kept_pictures = render_input.kept_pictures
     num_kept = kept_pictures.num_views if kept_pictures else 0
-    visibility = Sight(scene)
+    visibility = Visibility(scene)
     renderer = SceneRenderer(scene, settings.renders) if num_kept < scene.num_views else None
 
     def render_view(view: int) -> _AcceptedView:
@@ -159,7 +159,11 @@ def _passes_exr(scene: Scene, settings: BuildSettings) -> tuple[bytes, ...] | No
 
 
 def _accepted_view(
-    camera: ViewCamera, rendered: RenderedView, seed: int, sight: Sight, settings: BuildSettings
+    camera: ViewCamera,
+    rendered: RenderedView,
+    seed: int,
+    sight: Visibility,
+    settings: BuildSettings,
 ) -> _AcceptedView:
     grid = settings.scenes.views.coverage_grid
     facts = sight.facts(camera.c2w, float(camera.fov_deg), grid)

@@ -26,7 +26,7 @@ _LIGHTS = "expected keep, new, or a number of new lights, such as 3"
 
 
 @checked()
-class Revisit:
+class RevisitOptions:
     """The finished dataset, and the changes to its scenes."""
 
     dataset: str
@@ -74,7 +74,7 @@ class Revisit:
     (values are JSON); by default there are none."""
 
 
-def revisit_order(options: Revisit) -> DatasetOrder:
+def revisit_order(options: RevisitOptions) -> DatasetOrder:
     """Return the options of the new dataset, without the settings of the finished one.
 
     Raises:

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.builds.revisit import RevisitSettings
 from pipeline.builds.settings import BuildSettings
-from pipeline.making.render_sample import BegunScene, KeptPictures
+from pipeline.making.render_sample import KeptPictures, RenderInput
 from pipeline.scenes.laws import require_valid
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
 from pipeline.scenes.views import ViewCamera, cameras_of, with_first_cameras
@@ -32,7 +32,7 @@ class RevisitedScenes:
     """Dataset digest of the finished dataset."""
     _checked: set[str] = field(default_factory=set, compare=False, repr=False)
 
-    def scene(self, index: int, attempt: int, settings: BuildSettings) -> BegunScene:
+    def scene(self, index: int, attempt: int, settings: BuildSettings) -> RenderInput:
         """Return the scene of an index, which counts the scenes of the source shard by shard.
 
         Args:
@@ -61,7 +61,7 @@ class RevisitedScenes:
         if not revisit.keeps_light:
             # the triangles stay, except those of the requested lamps: no budget to check
             require_valid(scene, settings.scenes, in_budget=False)
-        return BegunScene(
+        return RenderInput(
             scene=scene,
             kept_cameras=revisit.kept_cameras + len(revisit.given_cameras),
             kept_pictures=_kept_pictures(sample, members, revisit)

@@ -101,7 +101,8 @@ class Run:
         if given_up > budget * num_scenes + (len(files.unusable) if files else 0):
             writer.add_failures(writer.failures)
             raise TrilightError(
-                f"{writer.folder.shown}: {given_up} of {num_scenes} scenes could not be made, "
+                f"{writer.folder.display_name}: {given_up} of {num_scenes} scenes could not be "
+                "made, "
                 f"more than the failure budget of {budget:.0%}. The reasons are in "
                 f"{writer.folder.failures.name}; fix them, or raise --failure-budget."
             )
@@ -128,7 +129,7 @@ class ShardJob:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TaskOutcome:
+class TaskResult:
     """The result of one task."""
 
     shards: tuple[ShardEntry, ...]
@@ -167,7 +168,7 @@ class Outcome:
     is the published one."""
 
 
-Watcher = Callable[[Run, TaskOutcome], None]
+Watcher = Callable[[Run, TaskResult], None]
 """Called after each task."""
 
 

@@ -9,7 +9,7 @@ task waits for a slow one.
 from collections.abc import Callable, Iterable, Iterator
 from typing import Protocol, TypeVar
 
-from pipeline.making.run import ShardJob, TaskOutcome
+from pipeline.making.run import ShardJob, TaskResult
 from pipeline.making.tasks import Piece
 from storage.dataset.statistics import Statistics
 
@@ -29,7 +29,7 @@ class Runner(Protocol):
     def window(self) -> int | None:
         """Number of submitted, unfinished tasks; None means `num_at_once`."""
 
-    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
+    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
         """Yield the result of each task, in the order in which the tasks end.
 
         Raises:

@@ -13,14 +13,14 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from pipeline.making.run import Run, TaskOutcome
+from pipeline.making.run import Run, TaskResult
 from pipeline.making.unfinished_shard import UnfinishedShard
 from storage.claims import WaitNotice
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure
 
-MOST_TASKS = 1000
+MAX_TASKS = 1000
 """Most task runs of one flow run: Prefect's server accepts about 20 a second, of 19 kB each."""
 TASK_S = 240.0
 """Target duration of a task, in seconds."""
@@ -74,7 +74,7 @@ class TaskBudget:
     """Counts the tasks that a run may still submit: MAX_TASKS over all its rounds."""
 
     def __init__(self) -> None:
-        self._left = MOST_TASKS
+        self._left = MAX_TASKS
 
     def take_tasks(
         self, shards: Sequence[int], splits: SplitSettings, sizes: TaskSizes, *, at_once: int
@@ -86,7 +86,7 @@ class TaskBudget:
         """
         if self._left == 0:
             raise EnvironmentFailure(
-                f"this run has handed out all of its {MOST_TASKS} tasks, and other runs hold "
+                f"this run has handed out all of its {MAX_TASKS} tasks, and other runs hold "
                 "claims on the missing scenes. What was finished is safe: run the same command "
                 "again."
             )
@@ -101,7 +101,7 @@ def cut_tasks(
     splits: SplitSettings,
     sizes: TaskSizes,
     *,
-    most: int = MOST_TASKS,
+    most: int = MAX_TASKS,
     at_once: int = 1,
 ) -> Iterator[tuple[Piece, ...]]:
     """Yield the tasks that make some shards; each is sized when it is requested.
@@ -143,7 +143,7 @@ class Round:
         self.made_anything = False
         self._sizes = sizes
 
-    def record(self, outcome: TaskOutcome) -> None:
+    def record(self, outcome: TaskResult) -> None:
         """Record a finished task: its speed decides the size of later tasks."""
         self.made_anything |= bool(outcome.scenes or outcome.shards)
         if outcome.scenes:

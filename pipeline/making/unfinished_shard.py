@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline.shards.pack import pack_shard
-from storage.claims import claimed, is_claimed
-from storage.dataset.layout import DatasetFolder, numbered
+from storage.claims import hold_claim, is_claimed
+from storage.dataset.layout import DatasetFolder, numbered_path
 from storage.dataset.manifest import ShardEntry, read_head
 from storage.dataset.progress import count_given_up
 from storage.dataset.scene_logs import log_scene
@@ -49,7 +49,7 @@ class UnfinishedShard:
         if self._is_done(scene_index):
             yield False
             return
-        with claimed(self._claim(scene_index)) as ours:
+        with hold_claim(self._claim(scene_index)) as ours:
             yield ours and not self._is_done(scene_index)  # finished meanwhile
 
     def stage(
@@ -92,10 +92,10 @@ class UnfinishedShard:
         if self._is_packed() or not all(is_staged(self._staged, index) for index in scenes):
             return None
         with contextlib.ExitStack() as stack:
-            if not stack.enter_context(claimed(self._packing)):
+            if not stack.enter_context(hold_claim(self._packing)):
                 return None
             if grows or scenes != scenes_of_shard(self._index, self._splits):
-                stack.enter_context(self._folder.turn("manifest"))  # no plan changes meanwhile
+                stack.enter_context(self._folder.mutex("manifest"))  # no plan changes meanwhile
             if self._is_packed() or self._plan() != (scenes, grows):
                 return None
             shard = pack_shard(self._folder, self.name, scenes, grows=grows)
@@ -119,7 +119,7 @@ class UnfinishedShard:
         return [*map(self._claim, missing)] or [self._packing]
 
     def _claim(self, scene_index: int) -> Path:
-        return self._staged / numbered(scene_index, f"{sample_key(scene_index)}.claim")
+        return self._staged / numbered_path(scene_index, f"{sample_key(scene_index)}.claim")
 
     def _is_done(self, scene_index: int) -> bool:
         return is_staged(self._staged, scene_index) or self._is_packed()

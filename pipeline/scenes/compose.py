@@ -14,13 +14,13 @@ from pipeline.scenes.drawn_columns import with_drawn_columns
 from pipeline.scenes.fitting import draw_rows
 from pipeline.scenes.laws import require_valid
 from pipeline.scenes.own_light import with_source_emission
-from pipeline.scenes.own_materials import own_skins
+from pipeline.scenes.own_materials import source_skins
 from pipeline.scenes.pieces import (
     ScenePiece,
     Skin,
-    dressed,
+    apply_skin,
+    concatenate_pieces,
     emitter_piece,
-    joined,
     object_piece,
     shell_piece,
 )
@@ -87,7 +87,7 @@ def compose_scene(
     ]
     layout = layout_rand(rng, settings, plan, shapes)
     name = {"seed": seed, "scene_index": scene_index, "attempt": attempt}
-    skins = own_skins(chosen, levels, settings.materials, **name)
+    skins = source_skins(chosen, levels, settings.materials, **name)
     pieces = scene_pieces(layout, chosen, shapes, settings, rng, skins)
     pieces = with_drawn_textures(
         pieces, layout, settings.textures, **name, user_textures=user_maps.textures
@@ -104,7 +104,7 @@ def _scene_of(
     pieces: Sequence[ScenePiece], provenance: dict[str, Any], name: Mapping[str, int]
 ) -> Scene:
     """Return the scene of some pieces, still without cameras."""
-    arrays = joined(pieces)
+    arrays = concatenate_pieces(pieces)
     arrays["materials"] = with_drawn_columns(arrays["materials"], **name)
     return Scene(
         **arrays,
@@ -129,7 +129,7 @@ def _with_sky(
         scene.vertex_positions[scene.faces[emits]].astype(np.float64),
         scene.materials[scene.material_index[emits], EMISSION].astype(np.float64),
         **name,
-        own=user_maps.skies,
+        user_skies=user_maps.skies,
         licences=scene.licences,
     )
     provenance = dict(scene.provenance)
@@ -201,7 +201,7 @@ def scene_pieces(
         positions = pose_points(shape.points, placement.pose)
         surface = placement.surface
         piece = object_piece(entry, positions, shape.faces, surface, rng, angle_deg)
-        objects.append(piece if skin is None else dressed(piece, positions, shape.faces, skin))
+        objects.append(piece if skin is None else apply_skin(piece, positions, shape.faces, skin))
     objects, lights = with_source_emission(objects, emitters, settings.materials.own_emission)
     pieces = [*shell, *objects, *emitters, *lights]
     return pieces if settings.fill_to is None else fill_triangles(pieces, settings.fill_to)

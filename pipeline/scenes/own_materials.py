@@ -14,7 +14,7 @@ from storage.records.texture import TEXTURED, MapSource
 from storage.seeds import rng_for
 
 
-def own_skins(
+def source_skins(
     chosen: Sequence[PooledAsset],
     levels: Sequence[Level],
     settings: MaterialSettings,

@@ -75,7 +75,7 @@ def object_piece(
     )
 
 
-def dressed(
+def apply_skin(
     piece: ScenePiece, positions: NDArray[np.float32], faces: NDArray[np.uint32], skin: Skin
 ) -> ScenePiece:
     """Return the piece of `object_piece` with a skin that covers all faces, slivers included."""
@@ -141,7 +141,7 @@ def _apply_surface(
     return ScenePiece(entry=entry, mesh=mesh, materials=materials, material_index=rows)
 
 
-def joined(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
+def concatenate_pieces(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
     """Return the geometry, materials and textures of a Scene, in the order of the pieces."""
     vertex_start = _starts([len(piece.mesh.positions) for piece in pieces])
     material_start = _starts([len(piece.materials) for piece in pieces])

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.layout import Pose
-from scene_templates.rotations import rotated
+from scene_templates.rotations import rotate_points
 
 SMALLEST_DOUBLE_AREA = 1e-12
 """A triangle of a square micrometre: no ray meets it, and its normal is rounding."""
@@ -34,7 +34,7 @@ def in_unit_sphere(
 
 def pose_points(points: NDArray[np.float64], pose: Pose) -> NDArray[np.float32]:
     """Return points [V, 3] of the unit sphere in world space."""
-    return (pose.radius * rotated(points, pose.rotation) + pose.centre).astype(np.float32)
+    return (pose.radius * rotate_points(points, pose.rotation) + pose.centre).astype(np.float32)
 
 
 def not_slivers(positions: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.bool_]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scenes.drawn_columns import with_drawn_columns
-from pipeline.scenes.pieces import emitter_piece, joined
+from pipeline.scenes.pieces import concatenate_pieces, emitter_piece
 from scene_templates.lights import LightSettings, emitters_rand
 from scene_templates.materials import MaterialSettings, surface_rand
 from scene_templates.templates import TEMPLATES
@@ -100,7 +100,7 @@ def with_new_lights(
     emitters = emitters_rand(rng, settings, TEMPLATES[name].lights, count, _centres(scene, kinds))
     lamps = [emitter_piece(emitter, row) for row, emitter in enumerate(emitters)]
     dark = _without(scene, lit)
-    new = joined(lamps)
+    new = concatenate_pieces(lamps)
     vertices = len(dark.vertex_positions)
     rows = len(dark.materials)
     triangles, materials = (

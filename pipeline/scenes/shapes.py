@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.posing import in_unit_sphere
 from scene_templates.layout import Pose
-from scene_templates.rotations import rotated
+from scene_templates.rotations import rotate_points
 from storage.errors import Rejected
 from storage.records.asset import Level
 
@@ -63,5 +63,5 @@ class MeshShape:
         return fcl.CollisionObject(self._tree[1], fcl.Transform(pose.rotation, pose.centre))
 
     def _box(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        points = pose.radius * rotated(self.points, pose.rotation) + pose.centre
+        points = pose.radius * rotate_points(self.points, pose.rotation) + pose.centre
         return points.min(axis=0), points.max(axis=0)

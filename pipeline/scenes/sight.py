@@ -42,7 +42,7 @@ class ViewFacts:
     """Distance in meters to the nearest ray hit or bounding box of an object."""
 
 
-class Sight:
+class Visibility:
     """A scene prepared for judging cameras."""
 
     def __init__(self, scene: Scene) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import ScenePiece, Skin, with_skin
 from scene_templates.layout import Layout
-from scene_templates.own_maps import OwnMap, OwnTexture
+from scene_templates.own_maps import UserMap, UserTexture
 from scene_templates.surfaces.maps import SurfaceMaps
 from scene_templates.textures import MOST_TEXTURED, TexturedLook, TextureSettings, draw_look
 from storage.conventions import linear_from_srgb8, srgb8
@@ -34,7 +34,7 @@ def with_drawn_textures(
     seed: int,
     scene_index: int,
     attempt: int,
-    user_textures: Sequence[OwnMap[OwnTexture]] = (),
+    user_textures: Sequence[UserMap[UserTexture]] = (),
 ) -> list[ScenePiece]:
     """Return the pieces, some with drawn textures; emitters have none.
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scenes.sight import Sight, ViewFacts
+from pipeline.scenes.sight import ViewFacts, Visibility
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
@@ -43,14 +43,14 @@ def with_first_cameras(
     Raises:
         Rejected: "no_camera", or "no_layout" if its template draws none.
     """
-    visibility = Sight(scene)
+    visibility = Visibility(scene)
     views = range(len(first_cameras), settings.num_views)
     drawn = [next(_accepted_proposals(scene, visibility, settings, view, 0)) for view in views]
     return with_cameras(scene, [*first_cameras, *drawn])
 
 
 def cameras_of_view(
-    scene: Scene, visibility: Sight, settings: SceneSettings, view: int
+    scene: Scene, visibility: Visibility, settings: SceneSettings, view: int
 ) -> Iterator[ViewCamera]:
     """Yield the camera of a view, and then each following proposal that sees enough.
 
@@ -101,7 +101,7 @@ def view_problem(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> 
 
 
 def _accepted_proposals(
-    scene: Scene, sight: Sight, settings: SceneSettings, view: int, first: int
+    scene: Scene, sight: Visibility, settings: SceneSettings, view: int, first: int
 ) -> Iterator[ViewCamera]:
     """Yield proposals from `first` on that see enough; raises Rejected after the last one."""
     has_objects = any(entry.kind == "object" for entry in scene.objects)

@@ -52,7 +52,7 @@ _SAME = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Derive:
+class DeriveOptions:
     """Operation on finished datasets, with its arguments."""
 
     operation: Operation  # what it is called
@@ -72,7 +72,7 @@ class Derive:
 
 def derive_shards(
     sources: Sequence[FinishedDataset],
-    derive: Derive,
+    derive: DeriveOptions,
     out: DatasetFolder,
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -116,7 +116,7 @@ def derive_shards(
 
 
 def _group_scenes(
-    sources: Sequence[FinishedDataset], derive: Derive, selected: Sequence[SelectedScene]
+    sources: Sequence[FinishedDataset], derive: DeriveOptions, selected: Sequence[SelectedScene]
 ) -> tuple[list[list[SelectedScene]], int | None]:
     """Return the scenes of each new shard, and the shard size if it is not the sources'."""
     if derive.operation == "merge":
@@ -141,7 +141,7 @@ def _samples(
 
 def _manifest(
     sources: Sequence[FinishedDataset],
-    derive: Derive,
+    derive: DeriveOptions,
     objects: Sequence[LockedObject],
     shards: tuple[ShardEntry, ...],
     scenes_per_shard: int | None,

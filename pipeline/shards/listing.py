@@ -33,7 +33,7 @@ class SceneListing:
     """Total number of scenes of the dataset."""
 
 
-def listed_scenes(
+def list_scenes(
     source: FinishedDataset,
     selection: Selection,
     *,

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from pipeline.shards.pack import unpack_shard
 from storage.atomic import write_atomically
-from storage.claims import claimed
+from storage.claims import hold_claim
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles, read_beside
 from storage.dataset.layout import DatasetFolder, place_of_part
 from storage.dataset.manifest import (
@@ -40,7 +40,7 @@ from storage.dataset.settings import MOST_SCENES
 from storage.dataset.shard_notes import (
     ShardNote,
     encode_note,
-    fetched_notes,
+    fetch_notes,
     note_of,
     note_shard,
     noted_shard,
@@ -117,7 +117,7 @@ class Mirror:
     def fetch_finished(self) -> None:
         """Download the finished manifest of the bucket, and the lock that it names."""
         theirs = self._manifest()
-        with self._folder.turn("manifest"):
+        with self._folder.mutex("manifest"):
             self._merge_failures()
             self._fetch_lock(theirs.objects_lock_sha256)
             write_manifest(self._folder.manifest, theirs)
@@ -150,14 +150,15 @@ class Mirror:
         name = self._folder.objects_lock.name
         theirs = self._files.read(name)
         if theirs in (None, lock):
-            with self._folder.turn("manifest"):
+            with self._folder.mutex("manifest"):
                 self._merge_failures()
                 self._bucket.write("failures.jsonl", self._folder.failures)
         if theirs is None and not self._bucket.create(name, lock):
             theirs = self._files.read(name)
         if theirs not in (None, lock):
             raise TrilightError(
-                f"{self._folder.shown}: another worker has frozen other objects in the meantime; "
+                f"{self._folder.display_name}: another worker has frozen other objects in the "
+                "meantime; "
                 "expected the same --objects everywhere. Give that, or choose another --out."
             )
 
@@ -182,7 +183,7 @@ class Mirror:
         if path.exists():
             yield True
             return
-        with self._claims.claimed(self._name(path)) as ours:
+        with self._claims.hold_claim(self._name(path)) as ours:
             if ours:
                 self._fetch(path)  # its last holder may have uploaded it
             yield ours
@@ -257,7 +258,7 @@ class Mirror:
             self._name(note_of(folder, name)) for name in names if name not in local_names
         )
         local_notes = [noted_shard(folder, name) for name in names if name in local_names]
-        return local_notes + fetched_notes(self._files.read, remote_names, folder.shown)
+        return local_notes + fetch_notes(self._files.read, remote_names, folder.display_name)
 
     def upload_shard(self, name: str) -> ShardNote | None:
         """Upload a shard of the folder; the cache keeps its bytes.
@@ -267,7 +268,7 @@ class Mirror:
         """
         folder = self._folder
         path = self._folder.shard(name)
-        with claimed(folder.staging / "sending" / f"{name}.claim") as ours:
+        with hold_claim(folder.staging / "sending" / f"{name}.claim") as ours:
             head = read_head(folder.manifest)
             if not ours or not path.exists() or name in head.growing:
                 return None
@@ -304,7 +305,7 @@ class Mirror:
         if theirs and (theirs.scenes is None or theirs.scenes >= (made.scenes or MOST_SCENES)):
             note_shard(folder, theirs)
             return theirs
-        with self._claims.claimed(note) if theirs else contextlib.nullcontext(True) as ours:
+        with self._claims.hold_claim(note) if theirs else contextlib.nullcontext(True) as ours:
             if theirs and not (ours and self._read_note(name) in (theirs, None)):
                 return None
             if theirs:
@@ -327,7 +328,7 @@ class Mirror:
         data = self._files.read(note := self._name(note_of(self._folder, name)))
         if data is None:
             return None
-        return fetched_notes(lambda _: data, [note], self._folder.shown)[0]
+        return fetch_notes(lambda _: data, [note], self._folder.display_name)[0]
 
     def _note_of_list(self, name: str) -> ShardNote:
         """Return a note made of the manifest's entry of a shard, as in a copied dataset."""
@@ -346,7 +347,7 @@ class Mirror:
 
     def upload_manifest(self) -> None:
         """Upload the folder's manifest and rejections, replacing the existing ones."""
-        with self._folder.turn("manifest"):
+        with self._folder.mutex("manifest"):
             self._bucket.write("failures.jsonl", self._folder.failures)
             self._bucket.write("manifest.json", self._folder.manifest)
 
@@ -363,7 +364,7 @@ class Mirror:
 
     def _head(self) -> Manifest | None:
         """Return the bucket's manifest without its shards, with the digest of the bucket's lock."""
-        place = f"{self._folder.shown}/manifest.json"
+        place = f"{self._folder.display_name}/manifest.json"
         start = self._bucket.read_start("manifest.json", _HEAD_BYTES)
         if start is None:
             return None

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.exact import cosine, sine
-from scene_templates.own_maps import OwnMap, drawn_own
+from scene_templates.own_maps import UserMap, draw_user_map
 from scene_templates.skies.draw import draw_sky
 from scene_templates.skies.settings import SkySettings
 from storage.records.environment import Environment
@@ -43,7 +43,7 @@ def scene_sky(
     seed: int,
     scene_index: int,
     attempt: int,
-    own: Sequence[OwnMap[NDArray[np.float32]]] = (),
+    user_skies: Sequence[UserMap[NDArray[np.float32]]] = (),
     licences: Sequence[str] = (),
 ) -> SceneSky | None:
     """Return the sky of a scene, or None where it has none.
@@ -61,7 +61,7 @@ def scene_sky(
         return None
     rng = rng_for(seed, "sky", scene_index, attempt)
     place = rng_for(seed, "own sky", scene_index, attempt)
-    chosen = drawn_own(place, own, settings.own_share, licences)
+    chosen = draw_user_map(place, user_skies, settings.own_share, licences)
     if chosen is None:
         drawn = draw_sky(rng, settings.maps)
         family = drawn.family

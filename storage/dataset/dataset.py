@@ -116,7 +116,7 @@ class RemoteDatasetFiles(_Files):
 
     def __init__(self, url: RemoteUrl) -> None:
         self.url = url
-        self.shown = url.shown
+        self.shown = url.display_url
 
     def open_beside(self, name: str) -> BinaryIO | None:
         url = self.url.child(name)
@@ -145,7 +145,7 @@ class RemoteDatasetFiles(_Files):
             return facts_of(url).num_bytes
         except TransferFailed as error:
             if error.__cause__ is not None and is_missing(error.__cause__):
-                raise ShardMissing(f"{url.shown}: the shard is missing.") from error
+                raise ShardMissing(f"{url.display_url}: the shard is missing.") from error
             raise unreadable(url, error) from error
 
     def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
@@ -222,7 +222,7 @@ class Dataset:
         self._noted = noted
 
     @property
-    def shown(self) -> str:
+    def display_name(self) -> str:
         """The place of the dataset for messages, without secrets."""
         return self.files.shown
 
@@ -230,7 +230,9 @@ class Dataset:
     def folder(self) -> DatasetFolder:
         """The dataset's folder; raises TrilightError where it is on a server."""
         if isinstance(self.files, RemoteDatasetFiles):
-            raise TrilightError(f"dataset {self.shown!r} is on a server; expected a local folder.")
+            raise TrilightError(
+                f"dataset {self.display_name!r} is on a server; expected a local folder."
+            )
         return DatasetFolder(self.files.root)
 
     @property
@@ -288,7 +290,7 @@ class Dataset:
         with self.files.open(shard, checked=False) as stream:
             contents = self._contents(stream, shard)
             for key in contents.samples:
-                with reading(self.shown, shard.name):
+                with reading(self.display_name, shard.name):
                     members = contents.read(stream, key, lambda name: not name.endswith("exr"))
                     record = decode_scene(key, members, held)
                     _require_lawful(record)
@@ -300,7 +302,7 @@ class Dataset:
         with self.files.open(shard, checked=False) as stream:
             contents = self._contents(stream, shard)
             for key in keys:
-                with reading(self.shown, shard.name):
+                with reading(self.display_name, shard.name):
                     sample = decode_sample(key, contents.read(stream, key), held)
                     _require_lawful(sample)
                 yield sample
@@ -312,7 +314,7 @@ class Dataset:
         if len(keys) != shard.num_samples:
             raise TrilightError(
                 f"{shard.name}: {len(keys)} samples; expected {shard.num_samples}, as the manifest "
-                f"says. Run `trilight verify {shlex.quote(self.shown)} --repair`."
+                f"says. Run `trilight verify {shlex.quote(self.display_name)} --repair`."
             )
         return keys
 
@@ -323,7 +325,7 @@ class Dataset:
         return {suffix for members in samples.values() for suffix in members}
 
     def _contents(self, stream: BinaryIO, shard: ShardEntry) -> ShardContents:
-        with reading(self.shown, shard.name):
+        with reading(self.display_name, shard.name):
             return contents_of(stream, shard.name)
 
     def lock_bytes(self) -> bytes | None:

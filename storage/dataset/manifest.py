@@ -22,7 +22,7 @@ from typing import Annotated, Any, BinaryIO, Literal
 
 from storage.atomic import atomic_writer
 from storage.conventions import MANIFEST_VERSION, READABLE_MANIFESTS, SPLITS, require_readable
-from storage.dataset.layout import numbered
+from storage.dataset.layout import numbered_path
 from storage.dataset.shard import scan_samples
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError
@@ -180,7 +180,7 @@ def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
     num_bytes = stream.seek(0, 2)
     stream.seek(0)
     return ShardEntry(
-        name=numbered(int(match[2]), PurePosixPath(name).name),
+        name=numbered_path(int(match[2]), PurePosixPath(name).name),
         split=match[1],
         num_samples=num_samples,
         num_bytes=num_bytes,

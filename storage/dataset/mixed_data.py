@@ -62,12 +62,13 @@ def open_mixture(data: Sequence[str]) -> TrainingData:
         before = next((other for other in opened[:row] if other.digest == each.digest), None)
         if before is not None:
             raise TrilightError(
-                f"data: {each.shown} holds the same dataset as {before.shown}; expected each once. "
+                f"data: {each.display_name} holds the same dataset as {before.display_name}; "
+                "expected each once. "
                 "How often its scenes are drawn, data_weights says."
             )
         each.split("train")
     return TrainingData(
-        shown=" and ".join(each.shown for each in opened),
+        display_name=" and ".join(each.display_name for each in opened),
         digest=MIXED + sha256_hex(canonical_json([each.digest for each in opened])),
         splits={split: shards for split in SPLITS if (shards := _mix_split(opened, split))},
         num_views=_of_all([each.num_views for each in opened], min),

@@ -16,7 +16,7 @@ from pathlib import Path
 from storage.atomic import write_atomically, write_error
 from storage.dataset.asked import read_asked
 from storage.dataset.dataset import Dataset, LocalFiles, open_listed
-from storage.dataset.layout import DatasetFolder, numbered, shard_names_in
+from storage.dataset.layout import DatasetFolder, numbered_path, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
 from storage.dataset.planned import expected_scenes, is_whole, listed_scenes, planned_shards
 from storage.dataset.scene_logs import (
@@ -24,7 +24,7 @@ from storage.dataset.scene_logs import (
     SceneLog,
     decode_scene_log,
     log_name,
-    look_at_logs,
+    sample_logs,
 )
 from storage.dataset.shard_notes import note_of, noted_names, noted_shard
 from storage.errors import TrilightError
@@ -99,7 +99,7 @@ def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
     The note only shows progress, so failing to write it is no error.
     """
     with contextlib.suppress(OSError):
-        path = folder.staged_at_work / numbered(scene_index, f"{scene_index:09d}")
+        path = folder.staged_at_work / numbered_path(scene_index, f"{scene_index:09d}")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f"{views:.3f}")
 
@@ -107,7 +107,7 @@ def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
 def forget_views(folder: DatasetFolder, scene_index: int) -> None:
     """Delete the note of `tell_views`: the scene is finished, or starts again."""
     with contextlib.suppress(OSError):
-        (folder.staged_at_work / numbered(scene_index, f"{scene_index:09d}")).unlink()
+        (folder.staged_at_work / numbered_path(scene_index, f"{scene_index:09d}")).unlink()
 
 
 def read_progress(folder: DatasetFolder) -> Progress:
@@ -243,7 +243,7 @@ _LOGS_READ = 64
 class DatasetStatus:
     """Status of a dataset, finished or not."""
 
-    shown: str
+    display_name: str
     """Path or URL without secrets."""
     build: str
     """Name of the dataset preset."""
@@ -285,8 +285,8 @@ class DatasetStatus:
     def next_words(self) -> Sequence[str] | None:
         """The words of the command to run next, if it is known."""
         if self.finished:
-            return ("verify", self.shown)
-        return None if self.asked is None else (*self.asked, "--out", self.shown)
+            return ("verify", self.display_name)
+        return None if self.asked is None else (*self.asked, "--out", self.display_name)
 
 
 def read_status(url: str) -> DatasetStatus:
@@ -304,13 +304,13 @@ def read_status(url: str) -> DatasetStatus:
     given_up = _scenes_given_up(local, manifest) if local else 0
     done -= given_up
     given_up += max(manifest.num_scenes - sum(planned.values()), 0)
-    looked, share = (look_at_logs(local), 1.0) if local else _sampled_logs(dataset)
+    looked, share = (sample_logs(local), 1.0) if local else _sampled_logs(dataset)
     last = looked.last
     core_s = looked.core_s
     scenes_left = manifest.num_scenes - done - given_up
     views_per_hour, remaining_s = _rate(last, share, manifest, scenes_left)
     return DatasetStatus(
-        shown=dataset.shown,
+        display_name=dataset.display_name,
         build=manifest.build,
         shards_done=len(names),
         shards_planned=len(planned),

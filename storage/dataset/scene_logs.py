@@ -106,7 +106,7 @@ class LogSample:
     spaced. None without a log."""
 
 
-def look_at_logs(folder: DatasetFolder) -> LogSample:
+def sample_logs(folder: DatasetFolder) -> LogSample:
     """Return what the logs say, reading few of them however many there are."""
     logs = sorted(_logs(folder.logs))
     if not logs:

@@ -106,7 +106,7 @@ def noted_names(folder: DatasetFolder) -> Iterator[str]:
     return shard_names_in(folder.staged_entries, _SUFFIX)
 
 
-def fetched_notes(
+def fetch_notes(
     read: Callable[[str], bytes | None], names: Iterable[str], dataset_name: str
 ) -> list[ShardNote]:
     """Return notes that are on a server, many at a time.

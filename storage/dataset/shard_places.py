@@ -33,7 +33,11 @@ class ShardPlace:
     @property
     def display_name(self) -> str:
         """The path or URL without secrets, for messages."""
-        return self.place.shown if isinstance(self.place, RemoteUrl) else printable(str(self.place))
+        return (
+            self.place.display_url
+            if isinstance(self.place, RemoteUrl)
+            else printable(str(self.place))
+        )
 
     @property
     def split(self) -> str:
@@ -65,7 +69,7 @@ def listed_shards(patterns: Sequence[str]) -> list[ShardPlace]:
         TrilightError: a URL is refused (storage.remote.url), a pattern is not closed or names more
             than MAX_SHARDS, a range runs backwards, or a shard is named twice.
     """
-    texts = list(itertools.chain.from_iterable(expanded(pattern) for pattern in patterns))
+    texts = list(itertools.chain.from_iterable(expand_pattern(pattern) for pattern in patterns))
     places = [ShardPlace(place=parse_url(text, what=_WHAT)) for text in texts]
     if len(places) > MAX_SHARDS:
         raise TrilightError(f"the list names {len(places)} shards; expected at most {MAX_SHARDS}.")
@@ -77,7 +81,7 @@ def listed_shards(patterns: Sequence[str]) -> list[ShardPlace]:
     return places
 
 
-def expanded(pattern: str, what: str = "shards") -> list[str]:
+def expand_pattern(pattern: str, what: str = "shards") -> list[str]:
     """Return what a brace pattern of `what` stands for; raises as `listed_shards`.
 
     A file or folder of that very name is no pattern.

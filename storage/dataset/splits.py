@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from storage.conventions import SPLITS
-from storage.dataset.layout import numbered
+from storage.dataset.layout import numbered_path
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def shard_name(shard_index: int, settings: "SplitSettings") -> str:
 
 def named_shard(shard_index: int, split: str) -> str:
     """Return the name of a shard of a split, relative to the dataset."""
-    return numbered(shard_index, f"{split}-{shard_index:06d}.tar")
+    return numbered_path(shard_index, f"{split}-{shard_index:06d}.tar")
 
 
 def scenes_of_shard(shard_index: int, settings: "SplitSettings") -> range:

@@ -91,7 +91,10 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
     """
     tally = _Tally()
     for shard in (read := described_shards(dataset)):
-        with dataset.files.open(shard, checked=False) as stream, reading(dataset.shown, shard.name):
+        with (
+            dataset.files.open(shard, checked=False) as stream,
+            reading(dataset.display_name, shard.name),
+        ):
             _require_whole(dataset, shard)
             _count_shard(stream, shard, tally)
     is_complete = len(read) == len(dataset.manifest.shards)

@@ -35,7 +35,7 @@ class DataSource:
 class TrainingData:
     """The shards of every split that holds a sample, of one dataset or several."""
 
-    shown: str
+    display_name: str
     """Paths or URLs as messages show them."""
     digest: str
     """Identity that a checkpoint stores: the dataset digest; for a list, a digest of its names
@@ -58,7 +58,8 @@ class TrainingData:
         if name not in self.splits:
             names = ", ".join(self.splits) or "no split"
             raise TrilightError(
-                f"{self.shown}: the {name} split holds no scene; expected at least one. There is "
+                f"{self.display_name}: the {name} split holds no scene; expected at least one. "
+                "There is "
                 f"{names}: choose it, or generate the dataset with more scenes; in a list, name "
                 f"shards {name}-....tar too."
             )
@@ -103,7 +104,7 @@ def _of_dataset(root: str) -> TrainingData:
     build = dataset.manifest.build
     num_views = dataset.manifest.num_views
     return TrainingData(
-        shown=dataset.shown,
+        display_name=dataset.display_name,
         digest=dataset.digest,
         splits=splits,
         num_views=num_views,
@@ -131,7 +132,7 @@ def _of_list(patterns: Sequence[str]) -> TrainingData:
     digest = f"list:{sha256_hex(canonical_json(names))}"
     display_name = f"the list of {len(places)} shards"
     return TrainingData(
-        shown=display_name,
+        display_name=display_name,
         digest=digest,
         splits=splits,
         num_views=None,

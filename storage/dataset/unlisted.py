@@ -10,7 +10,7 @@ from storage.dataset.manifest import SHARD_NAME, number_of_shard
 from storage.dataset.planned import num_planned
 from storage.dataset.shard_notes import (
     ShardNote,
-    fetched_notes,
+    fetch_notes,
     note_of,
     noted_names,
     noted_shard,
@@ -52,5 +52,5 @@ def _notes(dataset: Dataset) -> list[ShardNote]:
         listed = {shard.name for shard in manifest.shards}
         unlisted = sorted(filter(SHARD_NAME.fullmatch, names - listed))
         notes = (note_of(bucket_root, name).as_posix() for name in unlisted)
-        return fetched_notes(files.read, [name for name in notes if name in names], files.shown)
+        return fetch_notes(files.read, [name for name in notes if name in names], files.shown)
     return []

@@ -164,10 +164,10 @@ def decode_exr(data: bytes) -> NDArray[np.float32]:
         TrilightError: not an EXR file, truncated, larger than MAX_RESOLUTION, or with other
             channels than R, G and B.
     """
-    return unpacked(decode_stored(data))
+    return to_float32(decode_stored(data))
 
 
-def unpacked(stored: Stored) -> NDArray[np.float32]:
+def to_float32(stored: Stored) -> NDArray[np.float32]:
     """Return the numbers of pictures that may be bits of half floats, of any shape."""
     if stored.dtype == np.float32:
         return np.asarray(stored, np.float32)

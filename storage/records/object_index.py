@@ -103,7 +103,7 @@ def write_object_index(
     *,
     lock_sha256: str,
     lock_bytes: int,
-    asked: str,
+    request_digest: str,
     num_found: int,
     num_maps: int = 0,
 ) -> IndexFacts:
@@ -126,7 +126,7 @@ def write_object_index(
     facts = IndexFacts(
         lock_sha256=lock_sha256,
         lock_bytes=lock_bytes,
-        asked=asked,
+        asked=request_digest,
         num_found=num_found,
         num_maps=num_maps,
         camps=tuple(camps),

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import TrilightError
-from storage.records.exr import FIRST_ILLEGAL, Stored, decode_stored, unpacked
+from storage.records.exr import FIRST_ILLEGAL, Stored, decode_stored, to_float32
 from storage.records.held_maps import HeldMaps
 from storage.records.lights import decode_lights_exr, num_lights
 from storage.records.sample import ViewRecord, check_radiance, decode_scene
@@ -45,7 +45,7 @@ class StoredSample:
         """
         pictures: list[Stored] = [self._read(f"{view}.exr", decode_stored) for view in views]
         if any(picture.dtype == np.float32 for picture in pictures):
-            pictures = [unpacked(picture) for picture in pictures]
+            pictures = [to_float32(picture) for picture in pictures]
         shapes = {picture.shape for picture in pictures}
         if len(shapes) > 1 or any(height != width for height, width, _ in shapes):
             sizes = ", ".join(sorted(f"{height} x {width}" for height, width, _ in shapes))
@@ -54,7 +54,7 @@ class StoredSample:
             )
         for view, picture in zip(views, pictures, strict=True):
             if picture.dtype == np.float32 or picture.max() >= FIRST_ILLEGAL:
-                check_radiance(self.key, "", unpacked(picture)[None], first_view=view)
+                check_radiance(self.key, "", to_float32(picture)[None], first_view=view)
         stacked: NDArray = np.stack(pictures)
         if stacked.dtype == np.uint16:  # the only legal one that is not below it is -0
             stacked[stacked >= FIRST_ILLEGAL] = 0

@@ -87,7 +87,7 @@ class Bucket:
         Raises:
             TrilightError: as `names`, or the folder may not be written.
         """
-        self._retry(lambda: self._put(name, content, mode="overwrite"), "written")
+        self._retry(lambda: self._upload(name, content, mode="overwrite"), "written")
 
     def create(self, name: str, content: Path | bytes) -> bool:
         """Write a file unless it exists, and return whether it was written; otherwise as `write`.
@@ -97,7 +97,7 @@ class Bucket:
 
         def create_file() -> bool:
             try:
-                self._put(name, content, mode="create")
+                self._upload(name, content, mode="create")
             except Exception as error:  # drivers raise what they like
                 if not is_taken(error):
                     raise
@@ -110,13 +110,14 @@ class Bucket:
         """Raise TrilightError where the server writes a file again that it was to create once."""
         if self.create(_PROBE, b"\n") and self.create(_PROBE, b"\n"):
             raise TrilightError(
-                f"{self.url.what} {self.url.shown!r}: the server does not know conditional writes "
+                f"{self.url.what} {self.url.display_url!r}: the server does not know conditional "
+                "writes "
                 "(If-None-Match, or ifGenerationMatch), so two workers could replace each other's "
                 "files; expected one that refuses to create a file twice. Use another server, or "
                 "a folder."
             )
 
-    def _put(self, name: str, content: Path | bytes, *, mode: str) -> None:
+    def _upload(self, name: str, content: Path | bytes, *, mode: str) -> None:
         driver = shared_driver(self.url)
         target = self.url.child(name).root
         if isinstance(content, bytes):
@@ -138,7 +139,8 @@ class Bucket:
             lasting = cause is None or is_missing(cause) or not may_pass(cause)
             kind = TrilightError if lasting else EnvironmentFailure
             raise kind(
-                f"{self.url.what} {self.url.shown!r}: cannot be {what} ({error.message}); expected "
+                f"{self.url.what} {self.url.display_url!r}: cannot be {what} ({error.message}); "
+                "expected "
                 "a bucket that exists, and access that lets you list, read and write there. What "
                 "was finished is safe: fix it and run the same command again."
             ) from error

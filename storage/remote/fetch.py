@@ -156,7 +156,7 @@ async def _stream_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: 
             _start_over(stream)
             raise Interrupted from EOFError("the file changed while it was read")
         if answer.status == 404:
-            raise FileNotFoundError(url.shown)
+            raise FileNotFoundError(url.display_url)
         answer.raise_for_status()
         if answer.status != 206:
             _start_over(stream)
@@ -185,6 +185,7 @@ def unreadable(url: RemoteUrl, error: TransferFailed) -> Unreadable:
     """Return the user's view of a file that cannot be read."""
     hint = " Public buckets need FSSPEC_S3_ANON=true." if url.scheme == "s3" else ""
     return Unreadable(
-        f"{url.what} {url.shown!r}: cannot be read ({error.message}); expected a file that can be "
+        f"{url.what} {url.display_url!r}: cannot be read ({error.message}); expected a file that "
+        "can be "
         f"reached. Check the URL and your access to it.{hint}"
     )

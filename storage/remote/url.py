@@ -56,7 +56,7 @@ class RemoteUrl:
         return self.scheme in ("http", "https")
 
     @property
-    def shown(self) -> str:
+    def display_url(self) -> str:
         """The URL without secrets, for messages and for the names of cached files."""
         return printable(self.root if self.is_http else f"{self.scheme}://{self.root}")
 
@@ -122,7 +122,8 @@ def open_driver(url: RemoteUrl) -> Any:
         import fsspec
     except ImportError as error:
         raise TrilightError(
-            f"{url.what} {url.shown!r}: {url.scheme}:// needs the package {package}; expected it "
+            f"{url.what} {url.display_url!r}: {url.scheme}:// needs the package {package}; "
+            "expected it "
             f"to be installed. Run pip install {package}."
         ) from error
     # Drivers log whole requests, with their secrets, on the way to an error that we report anyway.

@@ -82,7 +82,7 @@ def checked(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Described:
+class FieldDescription:
     """Description of one field of a class of settings."""
 
     name: str
@@ -101,13 +101,13 @@ class Described:
 
 
 @functools.cache
-def described(kind: type) -> tuple[Described, ...]:
+def describe_fields(kind: type) -> tuple[FieldDescription, ...]:
     """Return what is said of the fields of a class of settings, in their order."""
     hints = _hints(kind)
     ranges = {field.name: field for field in declared_ranges(kind)}
     sentences = field_sentences(kind)
     return tuple(
-        Described(
+        FieldDescription(
             name=field.name,
             hint=hints[field.name],
             default=_default(field),
@@ -292,7 +292,7 @@ def _complaint(
     if first["type"] in ("unexpected_keyword_argument", "unexpected_property"):
         if steps[-1] in removed_fields(holder):
             return TrilightError(removal_message(f"{where}{place}"))
-        known = [each.name for each in described(holder)]
+        known = [each.name for each in describe_fields(holder)]
         return TrilightError(f"{where}{place} does not exist; {expected_one_of(steps[-1], known)}.")
     expected = field.expected if field else expected_of(holder)
     if first["type"].startswith("missing"):
@@ -300,7 +300,7 @@ def _complaint(
     return TrilightError(f"{where}{place} is {_SHORT.repr(first['input'])}; expected {expected}.")
 
 
-def _place(steps: Sequence[str], kind: type) -> tuple[list[str], type, Described | None]:
+def _place(steps: Sequence[str], kind: type) -> tuple[list[str], type, FieldDescription | None]:
     """Return the steps that a person knows, the class that holds the last, and its field."""
     known_steps = list[str]()
     holder = kind
@@ -313,7 +313,7 @@ def _place(steps: Sequence[str], kind: type) -> tuple[list[str], type, Described
             continue
         if len(groups) == 1 and not step.isdigit():
             (holder,) = groups.values()
-        fields = described(holder) if group_of(holder) else ()
+        fields = describe_fields(holder) if group_of(holder) else ()
         field = {each.name: each for each in fields}.get(step, field)
         known_steps.append(step)
     return known_steps, holder, field
@@ -337,7 +337,7 @@ def option_words(settings: Any, *, leave_out: tuple[str, ...] = ()) -> list[str]
     kind: Any = type(settings)
     return [
         word
-        for field in described(kind)
+        for field in describe_fields(kind)
         if field.name not in leave_out and getattr(settings, field.name) != field.default
         for word in _words(option_of(field.name), getattr(settings, field.name))
     ]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from infra.cli.extending import extended
+from infra.cli.extending import load_extensions
 from model.config import SIZES, ModelConfig
 from pipeline.builds.named import BUILDS, named_build, typed_build
 from pipeline.exchange.convert import write_scene
@@ -169,14 +169,14 @@ def test_a_size_is_a_setting(copied: Callable[[str], Path]) -> None:
 def test_an_executor_is_a_runner(copied: Callable[[str], Path]) -> None:
     path = copied("executor.py")
     with room_for_extensions():
-        words = extended(["generate", "smoke", f"--extend={path}", "--runner", "commands"])
+        words = load_extensions(["generate", "smoke", f"--extend={path}", "--runner", "commands"])
         assert words == ["generate", "smoke", "--runner", "commands"]
         assert "commands" in EXECUTORS
-        again = extended(["--extend", str(path), "doctor", "--", "--extend"])
+        again = load_extensions(["--extend", str(path), "doctor", "--", "--extend"])
         assert again == ["doctor", "--", "--extend"]
         for nothing in (["--extend"], ["--extend="]):
             with pytest.raises(TrilightError, match=r"--extend: names no file; expected"):
-                extended(nothing)
+                load_extensions(nothing)
 
 
 TINY = (

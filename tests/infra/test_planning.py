@@ -10,9 +10,9 @@ from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict
 from pipeline.executors.threads import ThreadRunner
 from pipeline.isolation import confinement
 from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.machine import cores_owned
+from pipeline.making.machine import available_cores
 from pipeline.making.pipeline import make_dataset
-from pipeline.making.tasks import MOST_TASKS
+from pipeline.making.tasks import MAX_TASKS
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.shard import scan_members
@@ -34,7 +34,7 @@ def test_equal_scenes_add_up_exactly() -> None:
     assert found.hours.value == pytest.approx(1.6)
     assert found.usd.value == pytest.approx(12.8)
     assert found.gigabytes.value == pytest.approx(0.384)
-    assert found.num_tasks <= MOST_TASKS
+    assert found.num_tasks <= MAX_TASKS
     assert found.notes == ()
 
 
@@ -59,7 +59,7 @@ def test_two_million_scenes_come_with_warnings() -> None:
     order = DatasetOrder(build="pretrain-256", scenes=2_000_000)
     measured = _measured((400.0, 400.0))
     found = predict(measured, order, cores=4096, usd_per_core_hour=0.04)
-    assert found.num_tasks == MOST_TASKS
+    assert found.num_tasks == MAX_TASKS
     assert found.manifest_mb < 2  # it lists 7,813 shards, however many views they hold
     assert any("flow runs" in note for note in found.notes)
     fewer = predict(measured, dataclasses.replace(order, scenes=500), cores=1, usd_per_core_hour=1)
@@ -90,7 +90,7 @@ def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
     order = tiny_order(out=str(tmp_path / "set"), scenes=24)
     measured = measure_scenes(order, 10, tmp_path / "measured", lambda: None)
     assert not (tmp_path / "set").exists()
-    cores = cores_owned()
+    cores = available_cores()
     assert measured.core_s == tuple(cores * seconds for seconds in (1000, *range(1, 10)))
     sampled = list(scenes)
     scenes.clear()

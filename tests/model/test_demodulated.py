@@ -129,7 +129,7 @@ def test_every_weight_learns() -> None:
 
 def test_it_begins_with_equal_light_everywhere() -> None:
     model = RenderFormer(DEMODULATED)
-    model.initialise(torch.Generator().manual_seed(0))
+    model.initialize(torch.Generator().manual_seed(0))
     shown, half = picture(model, corner()), picture(model, with_albedos(corner(), 0.5, 0.5))
     assert shown.max() > 0.1
     # float32 through a logarithm and back

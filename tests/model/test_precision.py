@@ -11,7 +11,7 @@ from torch import Tensor
 from model import encoded_scene, rounding
 from model.packing import pack_lengths, pack_tokens
 from model.precision import rounded_parts, set_precision, tf32
-from model.scene_tensors import SceneBatch, batch_scenes, converted, scene_tensors, tensors_of
+from model.scene_tensors import SceneBatch, batch_scenes, map_tensors, scene_tensors, tensors_of
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import EMISSION, material_width
@@ -67,7 +67,7 @@ def test_positions_are_never_rounded() -> None:
     far = copy.deepcopy(near)
     far.triangles_T33.add_(100.0)
     far.c2w_V44[:, :3, 3].add_(100.0)
-    pictures = [render(model, converted(scene, torch.Tensor.float)) for scene in (near, far)]
+    pictures = [render(model, map_tensors(scene, torch.Tensor.float)) for scene in (near, far)]
     # the angles move by 100 x 5 / 2^24; what they turn is rounded to 8 bits, so some ulps of that
     assert (pictures[0] - pictures[1]).abs().max() < 0.1 * pictures[0].std()
 

@@ -13,7 +13,7 @@ from pipeline.builds.named import named_build
 from scene_templates.exact import cosine, dot, lerp, ramp, sine, smoothstep
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.layout_rand import scene_plan
-from scene_templates.rotations import rotated, rotation_xyz, uniform_rotation
+from scene_templates.rotations import rotate_points, rotation_xyz, uniform_rotation
 from scene_templates.settings import SceneSettings
 from scene_templates.stated_draws import RecordedSampler
 from storage.seeds import rng_for
@@ -112,7 +112,7 @@ def test_rotations_turn_about_x_then_y_then_z_and_to_the_left() -> None:
     for angles in rng.uniform(-180, 180, size=(50, 3)):
         x, y, z = (rotation_xyz(np.where(np.arange(3) == axis, angles, 0)) for axis in range(3))
         assert np.abs(rotation_xyz(angles) - z @ y @ x).max() < 1e-14
-    turned = rotated(np.array([[1.0, 0, 0]]), rotation_xyz([0, 0, 90]))
+    turned = rotate_points(np.array([[1.0, 0, 0]]), rotation_xyz([0, 0, 90]))
     assert np.abs(turned - [[0, 1, 0]]).max() < 1e-15
 
 

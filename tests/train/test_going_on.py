@@ -19,7 +19,7 @@ from storage.settings.described import settings_record
 from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run
 from train.going_on import ResumePlan, event_records, plan_resume
-from train.runs import RUNS, changed_run, in_proportion, named_run
+from train.runs import RUNS, changed_run, named_run, scale_intervals
 from train.settings import AugmentationSettings, TrainSettings
 from train.stored_settings import known_settings, stored_settings
 
@@ -262,7 +262,7 @@ def test_what_is_stated_is_not_brought_along() -> None:
     found = changed_run("smoke", stated, steps=24)
     assert {name: getattr(found, name) for name in stated} == stated
     assert changed_run("smoke", {"checkpoint_every": 9}, steps=80).log_every in (1, 3)
-    assert not in_proportion(named_run("smoke"), 24, stated).keys() & stated.keys()
+    assert not scale_intervals(named_run("smoke"), 24, stated).keys() & stated.keys()
     with pytest.raises(TrilightError, match="warmup_steps is 50; expected 0 to 23"):
         changed_run("smoke", {"warmup_steps": 50}, steps=24)
     with pytest.raises(TrilightError, match="num_steps'? is 0; expected a whole number from 1"):

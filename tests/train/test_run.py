@@ -26,7 +26,7 @@ from train.loop import trainer
 from train.loop.interrupts import Stopped
 from train.progress import TrainProgress
 from train.result import TrainResult
-from train.start import Start
+from train.start import StartOptions
 from train.watching.rows import read_rows
 
 TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share", "time_s", "memory_mb"}
@@ -45,7 +45,7 @@ class Listener(Heard):
     def advance(self, *, step: int, **_: Any) -> None:
         self.heard.append(f"step {step}")
 
-    def validated(self, *, step: int, **_: Any) -> None:
+    def report_validation(self, *, step: int, **_: Any) -> None:
         self.heard.append(f"validated {step}")
 
 
@@ -145,7 +145,7 @@ def test_the_same_command_begins_begins_again_and_goes_on(
     dataset: Dataset, whole: TrainResult, tmp_path: Path
 ) -> None:
     """As a scheduler starts it: killed before the first checkpoint, and after one."""
-    start = Start(restartable=True)
+    start = StartOptions(restartable=True)
     for step in (3, 7):
         with pytest.raises(Killed):
             trained(tiny_run(), dataset, tmp_path, start=start, progress=Heard(killed_at=step))

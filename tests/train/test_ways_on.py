@@ -28,7 +28,7 @@ from train.loop.step import PendingStats, Stepper
 from train.progress import TrainProgress
 from train.result import TrainResult
 from train.settings import TrainSettings
-from train.start import Start
+from train.start import StartOptions
 
 
 def run(
@@ -39,7 +39,7 @@ def run(
     progress: TrainProgress | None = None,
     **start: Any,
 ) -> TrainResult:
-    return trained(settings, data, out, start=Start(**start), progress=progress)
+    return trained(settings, data, out, start=StartOptions(**start), progress=progress)
 
 
 def wsd(**changes: Any) -> TrainSettings:
@@ -209,7 +209,7 @@ def test_ten_skipped_steps_go_on_by_a_decision(
     """
     settings = wsd(num_steps=16, keep_every=2, checkpoint_every=2)
 
-    original = Stepper.take
+    original = Stepper.launch
 
     def diverging(self: Stepper, *given: Any, **rest: Any) -> PendingStats:
         now = self._settings

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from train.settings import AugmentationSettings, Rotation
 
 
-def augmented(
+def augment_scene(
     scene: TrainingScene, settings: "AugmentationSettings", rng: np.random.Generator
 ) -> TrainingScene:
     """Return the scene under random symmetries; disabled ones draw no random number."""
@@ -40,14 +40,14 @@ def augmented(
         factor_L = torch.from_numpy(settings.light_mix**exponent_L).float()
         scene = mix_lights(scene, factor_L)
     if settings.light_scale > 1:
-        scene = with_light_scaled(scene, float(settings.light_scale ** rng.uniform(-1, 1)))
+        scene = scale_light(scene, float(settings.light_scale ** rng.uniform(-1, 1)))
     if settings.mirror and rng.random() < 0.5:
-        scene = mirrored(scene)
+        scene = mirror_scene(scene)
     if settings.channels:
-        scene = with_channels(scene, rng.permutation(3))
+        scene = permute_channels(scene, rng.permutation(3))
     if settings.vertex_order:
         first_T = rng.integers(3, size=scene.tensors.num_triangles)
-        scene = with_vertices_turned(scene, first_T)
+        scene = rotate_vertex_order(scene, first_T)
     if settings.rotation != "none" or settings.translation:
         shift = rng.normal(0, settings.translation, 3)
         scene = move_scene(scene, random_rotation(settings.rotation, rng), torch.from_numpy(shift))
@@ -98,7 +98,7 @@ def move_scene(scene: TrainingScene, rotation_33: Tensor, shift_3: Tensor) -> Tr
     return dataclasses.replace(scene, tensors=tensors)
 
 
-def mirrored(scene: TrainingScene) -> TrainingScene:
+def mirror_scene(scene: TrainingScene) -> TrainingScene:
     """Return the scene and its cameras mirrored at x = 0.
 
     Four things change together: positions and normals, the order of vertices (which keeps the
@@ -123,7 +123,7 @@ def mirrored(scene: TrainingScene) -> TrainingScene:
     return dataclasses.replace(scene, tensors=tensors, target_VRR3=target_VRR3, lights_VLRR3=None)
 
 
-def with_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
+def permute_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
     """Return the scene with permuted color channels. Drops the pictures of single lights."""
     numbers = np.arange(scene.tensors.material_TM.shape[1])
     for column, part in laid_out(scene.tensors.columns):
@@ -146,7 +146,7 @@ def with_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
     )
 
 
-def with_vertices_turned(scene: TrainingScene, first_T: np.ndarray) -> TrainingScene:
+def rotate_vertex_order(scene: TrainingScene, first_T: np.ndarray) -> TrainingScene:
     """Return the scene with each triangle's vertices (0, 1, 2) read from `turn_T[t]` on.
 
     The first vertex of a triangle is arbitrary, but the network's rotary positions depend on it,
@@ -196,7 +196,7 @@ def _tensor(values: NDArray[np.float32]) -> Tensor:
 LN_10 = math.log(10.0)
 
 
-def with_light_scaled(scene: TrainingScene, factor: float) -> TrainingScene:
+def scale_light(scene: TrainingScene, factor: float) -> TrainingScene:
     """Return the scene with all light scaled. Drops the pictures of single lights."""
     factor_T = torch.full((scene.tensors.num_triangles,), factor)
     tensors = _scale_emission(scene.tensors, factor_T)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from model.scene_tensors import SceneBatch, batch_scenes, converted
+from model.scene_tensors import SceneBatch, batch_scenes, map_tensors
 from train.data.scenes import TrainingScene, with_target
 
 MOST_WASTE = 0.05
@@ -39,7 +39,7 @@ class TrainingBatch:
         """Return the batch with each tensor converted."""
         return dataclasses.replace(
             self,
-            scenes=converted(self.scenes, convert),
+            scenes=map_tensors(self.scenes, convert),
             target_BVRR3=convert(self.target_BVRR3),
             noise_BV=convert(self.noise_BV),
             levels_BL=None if self.levels_BL is None else convert(self.levels_BL),

@@ -53,7 +53,7 @@ class OrderSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RankShare:
+class RankSlice:
     """Slice of every global batch that one process takes."""
 
     rank: int = 0
@@ -126,12 +126,12 @@ def windows_from(
         epoch += 1
 
 
-def places_from(windows: Iterator[ShardWindow], first: int) -> Iterator[Visit]:
+def visits_from(windows: Iterator[ShardWindow], first: int) -> Iterator[Visit]:
     """Yield endless visits, from position `first` on."""
     return (visit for window in windows for visit in window.visits if visit.position >= first)
 
 
-def batched(visits: Iterator[Visit], batch_size: int) -> Iterator[tuple[Visit, ...]]:
+def batch_visits(visits: Iterator[Visit], batch_size: int) -> Iterator[tuple[Visit, ...]]:
     """Yield endless batches of visits."""
     while True:
         yield tuple(itertools.islice(visits, batch_size))

@@ -18,7 +18,7 @@ from torch import Tensor
 from model.scene_tensors import SceneTensors, scene_tensors
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
-from storage.records.exr import FIRST_ILLEGAL, HALF_FLOATS, Stored, unpacked
+from storage.records.exr import FIRST_ILLEGAL, HALF_FLOATS, Stored, to_float32
 from storage.records.lights import light_rows
 from storage.records.sample import Sample, ViewRecord
 from storage.records.scene import Scene
@@ -134,7 +134,7 @@ def _scene_of(
         target_VRR3 = torch.from_numpy(pictures.view(np.int16))
         levels_L = stored_levels()
     else:
-        radiance_VRR3 = block_mean(unpacked(pictures), resolution)
+        radiance_VRR3 = block_mean(to_float32(pictures), resolution)
         target_VRR3 = torch.from_numpy(log10_radiance(radiance_VRR3).astype(np.float32))
     floors_db = np.array([view.noise_floor_db for view in views], np.float32)
     return TrainingScene(

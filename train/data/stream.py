@@ -17,21 +17,21 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from model.sky.known import lit_sky, require_known
+from model.sky.known import lit_sky, require_known_sky
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
 from storage.records.stored_sample import StoredSample
 from storage.seeds import rng_for
-from train.data.augment import augmented, withhold_inputs
+from train.data.augment import augment_scene, withhold_inputs
 from train.data.mixture import Mixture, mix_visits
 from train.data.open_shards import OpenShards
 from train.data.order import (
     OrderSettings,
-    RankShare,
+    RankSlice,
     Visit,
-    batched,
-    places_from,
+    batch_visits,
     shard_order,
+    visits_from,
     windows_from,
 )
 from train.data.scenes import (
@@ -40,7 +40,7 @@ from train.data.scenes import (
     scene_of_views,
     with_target,
 )
-from train.data.unusable import Unusable, count_lost_samples
+from train.data.unusable import BadSampleCounter, count_lost_samples
 
 if TYPE_CHECKING:
     from model.config import ModelConfig
@@ -85,9 +85,9 @@ def stream_batches(
     settings: StreamSettings,
     first: int,
     *,
-    share: RankShare,
+    rank_slice: RankSlice,
     workers: int,
-    unusable: Unusable,
+    unusable: BadSampleCounter,
     mixture: Mixture | None = None,
 ) -> Generator[list[TrainingScene], None, None]:
     """Yield this process's slice of the global batches first, first + 1, ... without end.
@@ -109,14 +109,16 @@ def stream_batches(
         TrilightError: a batch cannot be split equally, or too much data is unusable; the latter
             when the stream reaches it.
     """
-    share.require_equal(settings.batch_size)
+    rank_slice.require_equal(settings.batch_size)
     pool = ThreadPoolExecutor(workers, "decode") if workers else _InlineExecutor()
     with OpenShards(shards) as opened, pool as decoders:
         maker = _SceneMaker(shards, opened, settings, unusable)
         counted = _SampleCounts(shards, unusable)
-        plan = _plan_batches(counted, settings, mixture, first, share, opened)
+        plan = _plan_batches(counted, settings, mixture, first, rank_slice, opened)
         waiting: deque[tuple[list[Visit], list[Future[TrainingScene]]]] = deque()
-        depth = -(-PREFETCHED_SCENES * share.world_size // settings.batch_size) if workers else 0
+        depth = (
+            -(-PREFETCHED_SCENES * rank_slice.world_size // settings.batch_size) if workers else 0
+        )
         try:
             with closing(prefetch(plan, _plan_ahead(counted, settings, mixture))) as batches:
                 for mine in batches:
@@ -147,7 +149,7 @@ class _InlineExecutor(Executor):
 class _SampleCounts:
     """Sizes of the shards of each dataset; an unusable shard counts as empty."""
 
-    def __init__(self, shards: ShardSet, unusable: Unusable) -> None:
+    def __init__(self, shards: ShardSet, unusable: BadSampleCounter) -> None:
         self._shards = shards
         self._unusable = unusable
         self.parts = shards.parts
@@ -169,21 +171,21 @@ def _plan_batches(
     settings: StreamSettings,
     mixture: Mixture | None,
     first: int,
-    rank_slice: RankShare,
+    rank_slice: RankSlice,
     opened: OpenShards,
 ) -> Iterator[list[Visit]]:
     """Yield this process's visits batch by batch, and start to open their shards."""
     position = first * settings.batch_size
     begin = (position,) if mixture is None else mixture.counts_before(position)
     streams = [
-        places_from(windows_from(len(part), counted.in_part(part), settings.order, start), start)
+        visits_from(windows_from(len(part), counted.in_part(part), settings.order, start), start)
         for part, start in zip(counted.parts, begin, strict=True)
     ]
     if mixture is None:
         visits = streams[0]
     else:
         visits = mix_visits(mixture, streams, counted.parts, position)
-    for batch in batched(visits, settings.batch_size):
+    for batch in batch_visits(visits, settings.batch_size):
         mine = rank_slice.of_batch(batch)
         opened.plan(visit.shard for visit in mine)
         yield mine
@@ -207,7 +209,11 @@ class _SceneMaker:
     """Makes the scene of a visit; called in several threads."""
 
     def __init__(
-        self, shards: ShardSet, opened: OpenShards, settings: StreamSettings, unusable: Unusable
+        self,
+        shards: ShardSet,
+        opened: OpenShards,
+        settings: StreamSettings,
+        unusable: BadSampleCounter,
     ) -> None:
         self._shards = shards
         self._opened = opened
@@ -220,7 +226,7 @@ class _SceneMaker:
         settings = self._settings
         seen, rng = self._usable_scene(visit)
         if settings.augmentation:
-            seen = augmented(seen, settings.augmentation, rng)
+            seen = augment_scene(seen, settings.augmentation, rng)
         return self._with_traced_inputs(
             with_target(seen) if settings.lookup_in_threads else seen, rng
         )
@@ -291,7 +297,7 @@ class _SceneMaker:
             )
         require_few_triangles(sample.key, sample.scene, settings.most_triangles)
         if settings.network is not None:
-            require_known(lit_sky(sample.scene.environment), settings.network)
+            require_known_sky(lit_sky(sample.scene.environment), settings.network)
         views = np.sort(rng.permutation(num_views)[: settings.views_per_scene])
         per_light = settings.augmentation is not None and settings.augmentation.light_mix > 1
         return scene_of_views(sample, views.tolist(), settings.resolution, per_light=per_light)

@@ -15,7 +15,7 @@ from storage.errors import TrilightError
 from storage.records.sample import Sample
 
 
-class Unusable:
+class BadSampleCounter:
     """Counts the damaged samples and shards of a run, and stops it at a limit."""
 
     def __init__(
@@ -69,7 +69,7 @@ class Unusable:
             ) from error
 
 
-def first_samples(shards: ShardSet, limit: int, unusable: Unusable) -> Iterator[Sample]:
+def first_samples(shards: ShardSet, limit: int, unusable: BadSampleCounter) -> Iterator[Sample]:
     """Yield the first usable samples of a split, at most `limit`, in the order of the shards.
 
     Several datasets contribute equal numbers, or all that they have.
@@ -83,7 +83,7 @@ def first_samples(shards: ShardSet, limit: int, unusable: Unusable) -> Iterator[
 
 
 def _first_of_source(
-    shards: ShardSet, part: range, limit: int, unusable: Unusable
+    shards: ShardSet, part: range, limit: int, unusable: BadSampleCounter
 ) -> Iterator[Sample]:
     remaining = limit
     for number in part:

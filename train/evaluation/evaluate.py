@@ -25,17 +25,17 @@ from storage.records.scene import Scene
 from storage.seeds import rng_for
 from storage.settings.described import checked
 from train.data.scenes import TrainingScene, training_scene
-from train.data.unusable import Unusable, first_samples
-from train.evaluation.judge import JudgedScene, judged_scene, predict
-from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, facts_of
+from train.data.unusable import BadSampleCounter, first_samples
+from train.evaluation.judge import ValidationScene, predict, validation_scene
+from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, scene_facts
 from train.evaluation.metrics import noise_floors, picture_scores
 from train.evaluation.order import SceneCount, Width
-from train.evaluation.rivals import Rivals
+from train.evaluation.rivals import Baselines
 from train.evaluation.same_time import CAPTION, TRACER, TracedBeside
 from train.evaluation.sheet import SheetView
 from train.loss.lpips import Lpips
 
-RIVAL_SCENES = 256
+BASELINE_SCENES = 256
 """Number of training scenes for the baselines."""
 
 SHEET_VIEWS = 8
@@ -43,7 +43,7 @@ SHEET_VIEWS = 8
 
 
 @checked("evaluate")
-class Contest:
+class EvalConfig:
     """Network, data, baselines and metrics of an evaluation."""
 
     network: SkipValidation[RenderFormer]
@@ -52,7 +52,7 @@ class Contest:
     """Shards of the split to evaluate on."""
     resolution: Width
     """Width of the pictures in pixels, a divisor of the data's."""
-    rivals: SkipValidation[Rivals | None]
+    baselines: SkipValidation[Baselines | None]
     """Baselines from training data; None without such data."""
     lpips: SkipValidation[Lpips | None]
     """The LPIPS network; None without its weights: LPIPS is then n/a."""
@@ -63,22 +63,22 @@ class Contest:
 
     def samples(self) -> Iterator[Sample]:
         """Yield the samples; a damaged one raises, since the scores would be of another set."""
-        return first_samples(self.shards, self.most_scenes, Unusable(0))
+        return first_samples(self.shards, self.most_scenes, BadSampleCounter(0))
 
 
-def make_rivals(shards: ShardSet, resolution: int) -> Rivals:
+def make_baselines(shards: ShardSet, resolution: int) -> Baselines:
     """Return the baselines from the first scenes of a training split."""
-    samples = first_samples(shards, RIVAL_SCENES, Unusable(0))
-    return Rivals(training_scene(sample, resolution) for sample in samples)
+    samples = first_samples(shards, BASELINE_SCENES, BadSampleCounter(0))
+    return Baselines(training_scene(sample, resolution) for sample in samples)
 
 
 def stored_resolution(shards: ShardSet) -> int:
     """Return the width in pixels of the first sample's pictures."""
-    (sample,) = first_samples(shards, 1, Unusable(0))
+    (sample,) = first_samples(shards, 1, BadSampleCounter(0))
     return int(sample.radiance_rgb.shape[1])
 
 
-def judged_views(config: Contest, scene_done: Callable[[], None]) -> list[JudgedView]:
+def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[JudgedView]:
     """Score every view, in the order of the shards.
 
     Raises:
@@ -87,7 +87,7 @@ def judged_views(config: Contest, scene_done: Callable[[], None]) -> list[Judged
     rows: list[JudgedView] = []
     before: SceneTensors | None = None
     for sample in config.samples():
-        scene = judged_scene(sample, config.resolution)
+        scene = validation_scene(sample, config.resolution)
         if config.network.config.view_stage == "hits":
             scene = with_traced_views(scene, config.network.config, config.resolution)
         contestants = {NETWORK: predict(config.network, scene.scene)}
@@ -110,22 +110,22 @@ def judged_views(config: Contest, scene_done: Callable[[], None]) -> list[Judged
 
 
 def _judge_view(
-    config: Contest,
+    config: EvalConfig,
     sample: Sample,
-    judged: JudgedScene,
+    judged: ValidationScene,
     view: int,
     contestants: Mapping[str, NDArray[np.float64]],
 ) -> JudgedView:
     target = judged.target_VRR3[view]
     hits = judged.hits_VRR[view]
     pictures = {name: pictures_VRR3[view] for name, pictures_VRR3 in contestants.items()}
-    if config.rivals is not None:
-        pictures |= config.rivals.pictures(target)
+    if config.baselines is not None:
+        pictures |= config.baselines.pictures(target)
     if config.traced is not None:
         traced = config.traced.judged(sample, view)
         pictures |= {} if traced is None else {TRACER: traced}
     return JudgedView(
-        **facts_of(sample),
+        **scene_facts(sample),
         view=view,
         floors=noise_floors(
             sample.views[view],
@@ -142,7 +142,7 @@ def _judge_view(
 
 
 def _add_swapped_scores(
-    rows: Sequence[JudgedView], network: RenderFormer, judged: JudgedScene, other: SceneTensors
+    rows: Sequence[JudgedView], network: RenderFormer, judged: ValidationScene, other: SceneTensors
 ) -> list[JudgedView]:
     pictures_VRR3 = swapped_pictures(network, judged.scene, other)
     return [
@@ -151,7 +151,7 @@ def _add_swapped_scores(
     ]
 
 
-def sheet_views(config: Contest, chosen: Sequence[JudgedView]) -> list[SheetView]:
+def sheet_views(config: EvalConfig, chosen: Sequence[JudgedView]) -> list[SheetView]:
     """Render some views again for a sheet, in the order of their rows."""
     rows_of: dict[str, list[JudgedView]] = {}
     for row in chosen:
@@ -222,7 +222,9 @@ def grouped_pictures(
     return np.stack(pictures).astype(np.float64)
 
 
-def with_traced_views(judged: JudgedScene, config: ModelConfig, resolution: int) -> JudgedScene:
+def with_traced_views(
+    judged: ValidationScene, config: ModelConfig, resolution: int
+) -> ValidationScene:
     """Return a scene with traced inputs, so that later predictions share them."""
     tensors = with_traced(judged.scene.tensors, resolution, config)
     return dataclasses.replace(judged, scene=dataclasses.replace(judged.scene, tensors=tensors))

@@ -25,7 +25,7 @@ from train.evaluation.scores import (
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class JudgedScene:
+class ValidationScene:
     """Scene of the validation split, with the targets and masks of its scores."""
 
     scene: TrainingScene
@@ -54,7 +54,7 @@ class Judge:
     """Validation scenes, and the scores of the median picture on them."""
 
     def __init__(self, samples: Sequence[Sample], resolution: int, median_RR3: NDArray) -> None:
-        self.scenes = [judged_scene(sample, resolution) for sample in samples]
+        self.scenes = [validation_scene(sample, resolution) for sample in samples]
         stills = [np.broadcast_to(median_RR3, scene.target_VRR3.shape) for scene in self.scenes]
         self.median_views = score_pictures(stills, self.scenes)
         self.median_scores = summarize_scores(self.median_views)
@@ -86,10 +86,10 @@ class Judge:
         )
 
 
-def judged_scene(sample: Sample, resolution: int) -> JudgedScene:
+def validation_scene(sample: Sample, resolution: int) -> ValidationScene:
     """Return a sample with targets and hit masks, at the resolution of the run."""
     scene = training_scene(sample, resolution)
-    return JudgedScene(
+    return ValidationScene(
         scene=scene,
         target_VRR3=radiance_from_log10(scene.target_VRR3.double().numpy()),
         hits_VRR=hit_masks(sample.scene, resolution),
@@ -108,7 +108,9 @@ def predict(model: RenderFormer, scene: TrainingScene) -> NDArray[np.float64]:
     return np.maximum(radiance(log10_VRR3.double()).cpu().numpy(), 0)
 
 
-def score_pictures(pictures: Sequence[NDArray], judged: Sequence[JudgedScene]) -> list[ViewScore]:
+def score_pictures(
+    pictures: Sequence[NDArray], judged: Sequence[ValidationScene]
+) -> list[ViewScore]:
     """Score the pictures [V, R, R, 3] of each scene, view by view."""
     return [
         score_view(picture, target, hits)

@@ -52,7 +52,7 @@ class JudgedView:
         return floor - score if METRICS[metric].higher_is_better else score - floor
 
 
-def facts_of(sample: Sample) -> dict[str, Any]:
+def scene_facts(sample: Sample) -> dict[str, Any]:
     """Return the facts about a sample's scene, as fields of JudgedView."""
     scene = sample.scene
     reflecting = np.unique(scene.material_index[~scene.triangle_emits])
@@ -94,11 +94,11 @@ def by_group(views: Sequence[JudgedView]) -> dict[str, dict[str, dict[str, Any]]
         for view in views:
             parts.setdefault(part_of(view), []).append(view)
         ordered = sorted(parts.items(), key=lambda part: _order(part[0]))
-        groups[name] = {part: summary(members) for part, members in ordered}
+        groups[name] = {part: summarize_views(members) for part, members in ordered}
     return groups
 
 
-def summary(views: Sequence[JudgedView], contestant: str = NETWORK) -> dict[str, Any]:
+def summarize_views(views: Sequence[JudgedView], contestant: str = NETWORK) -> dict[str, Any]:
     """Return median, mean and worse 5th percentile of every metric, and the gap to the noise.
 
     A metric that is n/a for any view is None: a mean over the other views would be of another set.

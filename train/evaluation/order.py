@@ -16,7 +16,7 @@ TracedViews = Annotated[int, Within(0, 10**6, unit="views")]
 
 
 @checked()
-class EvaluationOrder:
+class EvaluationOptions:
     """Network to evaluate, and the data to use."""
 
     checkpoint: str
@@ -47,7 +47,7 @@ class EvaluationOrder:
     report of another network is, a number is added."""
 
     @property
-    def place(self) -> Path:
+    def report_folder(self) -> Path:
         """Folder of the report, unless it holds another network's report."""
         checkpoint = Path(self.checkpoint)
         for folder in (checkpoint, *list(checkpoint.parents)[:2]):

@@ -26,7 +26,7 @@ class PairedLead:
     """Fraction of the views in which the first method is better."""
 
 
-def pair(views: Sequence[JudgedView], first: str, second: str) -> PairedLead:
+def paired_lead(views: Sequence[JudgedView], first: str, second: str) -> PairedLead:
     """Return the lead of method `first` over `second`, on views that have both."""
     leads_db = [
         (view.scores[first][METRIC] or 0.0) - (view.scores[second][METRIC] or 0.0) for view in views

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from train.evaluation.judged_view import JudgedView, summary
+from train.evaluation.judged_view import JudgedView, summarize_views
 
 BENCHMARK = "benchmark-v1"
 """Name of our public test set (pipeline.builds.judging)."""
@@ -41,7 +41,7 @@ def compare_with_published(
     """Return published scores and the network's means; None if the data is not BENCHMARK."""
     if about.get("build") != BENCHMARK:
         return None
-    ours = summary(views)
+    ours = summarize_views(views)
     return {
         metric: {"published": figure, "ours": ours[metric]["mean"]}
         for metric, figure in PUBLISHED.items()

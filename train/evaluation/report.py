@@ -12,7 +12,7 @@ from train.evaluation.judged_view import (
     NETWORK,
     JudgedView,
     by_group,
-    summary,
+    summarize_views,
 )
 from train.evaluation.metrics import METRICS
 from train.evaluation.published import PUBLISHED_WHERE, compare_with_published
@@ -37,7 +37,7 @@ def record(
         "about": dict(about),
         "metrics": {name: metric.meaning for name, metric in METRICS.items()},
         "contestants": {
-            name: summary(views, name)
+            name: summarize_views(views, name)
             for name in views[0].scores
             if all(name in view.scores for view in views)
         },
@@ -194,7 +194,7 @@ def passes_compared(views: Sequence[JudgedView]) -> dict[str, Any] | None:
     both = [view for view in views if GROUPED in view.scores]
     if not both:
         return None
-    return {"one pass": summary(both, NETWORK), "groups": summary(both, GROUPED)}
+    return {"one pass": summarize_views(both, NETWORK), "groups": summarize_views(both, GROUPED)}
 
 
 def loss_by_swapping(views: Sequence[JudgedView]) -> dict[str, Any] | None:

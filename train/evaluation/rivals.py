@@ -21,7 +21,7 @@ COMPARED_PX = 32
 """Maximum width in pixels at which pictures are compared."""
 
 
-class Rivals:
+class Baselines:
     """Baseline pictures from some training scenes."""
 
     def __init__(self, scenes: Iterable[TrainingScene]) -> None:

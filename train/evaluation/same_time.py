@@ -11,8 +11,8 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from storage.records.sample import Sample
-from train.evaluation.judged_view import NETWORK, JudgedView, summary
-from train.evaluation.pairs import pair
+from train.evaluation.judged_view import NETWORK, JudgedView, summarize_views
+from train.evaluation.pairs import paired_lead
 
 TRACER = "path tracer, same time"
 """Name of the path tracer among the evaluated methods."""
@@ -38,7 +38,7 @@ class TracerTimes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Times:
+class SameTimeResult:
     """Median times on one CPU thread after a warm-up."""
 
     network_first_s: float
@@ -66,7 +66,7 @@ class TracedBeside(Protocol):
         """Release all resources; a later picture allocates them again."""
 
 
-def same_time(views: Sequence[JudgedView], times: Times, which: str) -> dict[str, Any]:
+def same_time(views: Sequence[JudgedView], times: SameTimeResult, which: str) -> dict[str, Any]:
     """Compare network and path tracer over the views that have both, as JSON values.
 
     Args:
@@ -80,10 +80,10 @@ def same_time(views: Sequence[JudgedView], times: Times, which: str) -> dict[str
         return figures
     if not both:
         return figures | {"missing": "none of the judged views could be traced"}
-    lead = pair(both, NETWORK, TRACER)
+    lead = paired_lead(both, NETWORK, TRACER)
     return figures | {
-        "network": summary(both, NETWORK),
-        "tracer": summary(both, TRACER),
+        "network": summarize_views(both, NETWORK),
+        "tracer": summarize_views(both, TRACER),
         "lead_db": {"mean": lead.mean, "low": lead.low, "high": lead.high},
         "share_better": lead.share_better,
     }

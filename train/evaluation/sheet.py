@@ -55,7 +55,7 @@ class SheetView:
     """[R, R, 3] linear radiance of other methods by name; all views of a sheet have the same."""
 
 
-def drawn_sheet(views: Sequence[SheetView], title: Sequence[str]) -> Image.Image:
+def draw_sheet(views: Sequence[SheetView], title: Sequence[str]) -> Image.Image:
     """Draw a sheet; `title` has one or more lines."""
     blocks = [_block(view) for view in views]
     height = blocks[0].height + GAP_PX
@@ -152,4 +152,4 @@ def draw_validation_sheet(
         f"{judge.median_scores['log_l1']:.4f}, "
         f"{validation.scores['better_than_median']:.0%} of views better than it",
     )
-    return drawn_sheet(views, title)
+    return draw_sheet(views, title)

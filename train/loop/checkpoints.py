@@ -25,7 +25,7 @@ from model.weights import TrainedRange, decode_config, encode_config, load_tenso
 from storage.atomic import atomic_writer, remove_leftovers
 from storage.digests import seal_of
 from storage.errors import TrilightError
-from storage.extensions import recorded, require_same_extensions
+from storage.extensions import extension_digests, require_same_extensions
 from storage.records.safe_read import read_plain, read_safetensors
 from storage.settings.described import from_record
 from storage.settings.ranges import Within
@@ -33,7 +33,7 @@ from storage.typed_json import FINITE, Sha256, read_json
 from train.data.mixture import RECORD, Mixture
 from train.folder import RunFolder
 from train.going_on import Event, ResumePlan, event_records
-from train.loop.crew import Crew
+from train.loop.crew import DistributedContext
 from train.loop.schedule import decay_start_step
 from train.loop.state import TrainState, new_state
 from train.loop.step import StepReport
@@ -96,7 +96,7 @@ def _encode_checkpoint(
         "step": state.step,
         "skipped_steps": state.skipped_steps,
         "skipped_in_a_row": state.skipped_in_a_row,
-        "unusable": dict(state.unusable.counts),
+        "unusable": dict(state.bad_samples.counts),
         "reports": [dataclasses.asdict(report) for report in state.reports],
         "settings": stored_settings(settings),
         "model": encode_config(settings.model),
@@ -106,7 +106,7 @@ def _encode_checkpoint(
         "world_size": world_size,
         "threads": torch.get_num_threads(),
         "muon_precision": state.updater.muon_precision,
-        **({"extensions": extensions} if (extensions := recorded("weights")) else {}),
+        **({"extensions": extensions} if (extensions := extension_digests("weights")) else {}),
         "sha256": UNSEALED,
     }
     contiguous = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
@@ -186,7 +186,9 @@ def restore_state(
     """
     header = checkpoint.header
     settings = plan.settings
-    require_same_extensions("resume: the run", header.get("extensions", {}), recorded("weights"))
+    require_same_extensions(
+        "resume: the run", header.get("extensions", {}), extension_digests("weights")
+    )
     state = new_state(
         settings, device, muon_precision=muon_precision, bad_counts=header["unusable"]
     )
@@ -227,7 +229,9 @@ def path_of_step(folder: Path, step: int) -> Path:
     return folder / f"{PREFIX}{step:09d}{SUFFIX}"
 
 
-def newest_checkpoint(folder: Path, dist_context: Crew, note: Callable[[str], None]) -> Checkpoint:
+def newest_checkpoint(
+    folder: Path, dist_context: DistributedContext, note: Callable[[str], None]
+) -> Checkpoint:
     """Return the newest checkpoint that is not damaged.
 
     Args:

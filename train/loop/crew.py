@@ -15,13 +15,13 @@ import torch.distributed as dist
 from torch import Tensor
 
 from storage.errors import TrilightError
-from train.data.order import RankShare
+from train.data.order import RankSlice
 
 Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Crew:
+class DistributedContext:
     """Rank and device of this process, and collective operations over all processes."""
 
     device: torch.device
@@ -39,9 +39,9 @@ class Crew:
         return self.rank == 0
 
     @property
-    def share(self) -> RankShare:
+    def rank_slice(self) -> RankSlice:
         """Slice of every global batch that this process takes."""
-        return RankShare(rank=self.rank, world_size=self.world_size)
+        return RankSlice(rank=self.rank, world_size=self.world_size)
 
     def mean(self, values: Sequence[float]) -> list[float]:
         """Return the means over all processes, equal on each; all must call it."""
@@ -99,7 +99,7 @@ class Crew:
 
 
 @contextmanager
-def join_crew(device: str | None = None) -> Iterator[Crew]:
+def join_processes(device: str | None = None) -> Iterator[DistributedContext]:
     """Join the processes that torchrun started; without torchrun, train alone.
 
     Args:
@@ -113,11 +113,11 @@ def join_crew(device: str | None = None) -> Iterator[Crew]:
     local_rank = int(os.environ.get("LOCAL_RANK", "0"))
     torch_device = choose_device(device, local_rank)
     if world_size == 1:
-        yield Crew(device=torch_device)
+        yield DistributedContext(device=torch_device)
         return
     dist.init_process_group("nccl" if torch_device.type == "cuda" else "gloo")
     try:
-        yield Crew(
+        yield DistributedContext(
             device=torch_device, rank=dist.get_rank(), world_size=world_size, local_rank=local_rank
         )
     finally:

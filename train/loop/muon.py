@@ -9,12 +9,12 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from train.loop.crew import Crew
+from train.loop.crew import DistributedContext
 from train.loop.decision import Decision, defers_sync, move_along, move_towards
 from train.settings import Precision
 
 
-def fitting_precision(dist_context: Crew) -> Precision:
+def choose_muon_precision(dist_context: DistributedContext) -> Precision:
     """Return the fastest precision of Muon's products that all processes support.
 
     bfloat16 on a GPU and on CPUs with AVX512_BF16, as all with AMX have. Elsewhere such a product

@@ -80,7 +80,7 @@ class Recorder:
 
     def note(self, step: int, text: str) -> None:
         """Report a sentence without its full stop, and append it to notes.jsonl."""
-        self.progress.noted(text)
+        self.progress.note(text)
         add_note(self._folder.notes, step, text)
 
     def has_validated(self, step: int) -> bool:
@@ -106,7 +106,7 @@ class Recorder:
         for board in self._boards:
             board.scalars({"step": state.step, "validation": median})
             board.sheet(state.step, sheet)
-        self.progress.validated(step=state.step, scores=validation.scores)
+        self.progress.report_validation(step=state.step, scores=validation.scores)
 
     def close(self) -> None:
         """Flush and close all loggers."""

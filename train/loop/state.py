@@ -16,7 +16,7 @@ from model.renderformer import RenderFormer
 from model.width_scales import scale_start, width_scales
 from storage.seeds import seed_for
 from train.data.mixture import Mixture
-from train.data.unusable import Unusable
+from train.data.unusable import BadSampleCounter
 from train.going_on import Event
 from train.loop.decision import Decision, Updates, move_towards
 from train.loop.optim import Updater
@@ -39,7 +39,7 @@ class TrainState:
     """Network that is trained."""
     updater: Updater
     """Optimizers of the weights of `model`."""
-    unusable: Unusable
+    bad_samples: BadSampleCounter
     """Counter of damaged samples so far, with its limit."""
     ema_model: RenderFormer | None = None
     """Exponential moving average (EMA) of the weights; None if `ema_decay` is 0."""
@@ -109,7 +109,7 @@ def new_state(
     """
     model = RenderFormer(settings.model)
     if begin_with is None:
-        model.initialise(torch.Generator().manual_seed(seed_for(settings.seed, "weights")))
+        model.initialize(torch.Generator().manual_seed(seed_for(settings.seed, "weights")))
         scale_start(model, width_scales(model, settings.base_widths))
     else:
         model.load_state_dict(begin_with.state_dict())
@@ -121,6 +121,6 @@ def new_state(
     return TrainState(
         model=model,
         updater=Updater(model, settings, muon_precision),
-        unusable=Unusable(settings.most_unusable, bad_counts, advice=_SKIP_ADVICE),
+        bad_samples=BadSampleCounter(settings.most_unusable, bad_counts, advice=_SKIP_ADVICE),
         ema_model=ema_model,
     )

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from model.precision import quick_products
+from model.precision import fast_float32_products
 from storage.errors import TrilightError
 from train.data.buckets import TrainingBatch
 from train.loop.compiled import compile_parts, is_compiler_error, undo_compiling
-from train.loop.crew import Crew
+from train.loop.crew import DistributedContext
 from train.loop.decision import defers_sync, make_decision
 from train.loop.state import TrainState
 from train.loss.objective import Objective
@@ -62,7 +62,11 @@ class Stepper:
     """Takes optimizer steps of a state's network, together with the other processes."""
 
     def __init__(
-        self, state: TrainState, settings: TrainSettings, objective: Objective, dist_context: Crew
+        self,
+        state: TrainState,
+        settings: TrainSettings,
+        objective: Objective,
+        dist_context: DistributedContext,
     ) -> None:
         self._state = state
         self._settings = settings
@@ -89,10 +93,10 @@ class Stepper:
 
     def step(self, batches: Sequence[TrainingBatch], learning_rate: float) -> StepReport:
         """Launch a step, wait for it, and return its report; see `launch`."""
-        (report,) = self.sync([self.take(batches, learning_rate)]).reports
+        (report,) = self.sync([self.launch(batches, learning_rate)]).reports
         return report
 
-    def take(
+    def launch(
         self,
         batches: Sequence[TrainingBatch],
         learning_rate: float,
@@ -193,8 +197,8 @@ class Stepper:
         self.activity.begin("backward")
         if last and self._dist_context.world_size > 1:
             prediction.register_hook(self._note_exchange)
-        with quick_products(
-            self._dist_context.device, wanted=self._settings.precision == "bfloat16"
+        with fast_float32_products(
+            self._dist_context.device, enabled=self._settings.precision == "bfloat16"
         ):
             (losses.total_BV.sum() / num_views).backward()
         self.activity.begin("other")

@@ -20,7 +20,7 @@ from train.data.arrival import CopyStream, StepScenes
 from train.folder import RunFolder
 from train.loop.background import BackgroundWriter
 from train.loop.checkpoints import save_checkpoint
-from train.loop.crew import Crew
+from train.loop.crew import DistributedContext
 from train.loop.enough_memory import explain_out_of_memory
 from train.loop.interrupts import Stopped, ValidationInterrupted, deferred_interrupts
 from train.loop.recorder import Recorder
@@ -130,7 +130,7 @@ class Trainer:
         state: TrainState,
         settings: TrainSettings,
         objective: Objective,
-        dist_context: Crew,
+        dist_context: DistributedContext,
         folder: RunFolder,
         data_digest: str,
         recorder: Recorder | None,
@@ -161,7 +161,7 @@ class Trainer:
             dist_context,
             folder,
             note=self._note,
-            report_hang=progress.hung,
+            report_hang=progress.report_hang,
         )
 
     def run(self, steps: Iterator[StepScenes]) -> None:
@@ -174,7 +174,7 @@ class Trainer:
         with (
             self.watch,
             self.writing,
-            deferred_interrupts(self.progress.interrupted) as asked_to_stop,
+            deferred_interrupts(self.progress.report_interrupt) as asked_to_stop,
         ):
             self._catch_up(asked_to_stop)
             while self.state.step < self.settings.num_steps:
@@ -229,7 +229,7 @@ class Trainer:
         with explain_out_of_memory(settings, step):
             batches = self.copies.send(scenes.batches)
             rate = learning_rate(step, settings)
-            stats = self.stepper.take(batches, rate, asked_to_stop=asked_to_stop())
+            stats = self.stepper.launch(batches, rate, asked_to_stop=asked_to_stop())
         self._note_unusable()
         while self.stepper.remarks:
             self._note(self.stepper.remarks.pop(0))
@@ -270,7 +270,7 @@ class Trainer:
 
     def _note_unusable(self) -> None:
         """Report each damaged sample or shard once, after it was left out."""
-        messages = self.state.unusable.messages
+        messages = self.state.bad_samples.messages
         for message in messages[self.num_reported_bad :]:
             self._note(f"left out: {message.rstrip('.')}")
         self.num_reported_bad = len(messages)

@@ -5,7 +5,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from train.loop.crew import Crew
+from train.loop.crew import DistributedContext
 
 OWN_PHASES = ("data", "forward", "backward", "device", "optimiser", "other")
 """Phases that do not wait for another process. On a GPU `device` does, since the exchange of
@@ -18,7 +18,9 @@ LEAST_LOST_S = 0.05
 """Minimum seconds per step that a slow process costs before it is reported."""
 
 
-def exchange_values(dist_context: Crew, values: Mapping[str, Any]) -> list[dict[str, Any]]:
+def exchange_values(
+    dist_context: DistributedContext, values: Mapping[str, Any]
+) -> list[dict[str, Any]]:
     """Return the values of each process, by rank; all must call it."""
     return [json.loads(text) for text in dist_context.gather_text(json.dumps(values))]
 

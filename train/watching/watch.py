@@ -6,7 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 from train.folder import RunFolder
-from train.loop.crew import Crew
+from train.loop.crew import DistributedContext
 from train.loop.step import Stepper, StepReport
 from train.settings import TrainSettings
 from train.watching.process_memory import memory_mb
@@ -25,7 +25,7 @@ class ProcessMonitor:
         settings: TrainSettings,
         watched: WatchSettings,
         stepper: Stepper,
-        dist_context: Crew,
+        dist_context: DistributedContext,
         folder: RunFolder,
         *,
         note: Callable[[str], None],

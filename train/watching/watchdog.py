@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from storage.errors import TrilightError
-from train.loop.crew import Crew
+from train.loop.crew import DistributedContext
 from train.watching.activity import PHASES, Activity
 from train.watching.settings import WatchSettings
 
@@ -76,7 +76,7 @@ class Watchdog:
         self,
         settings: WatchSettings,
         activity: Activity,
-        dist_context: Crew,
+        dist_context: DistributedContext,
         folder: Path,
         *,
         note: Callable[[str], None],

@@ -73,9 +73,9 @@ def _training_data(context: BenchContext) -> tuple[TrainingData, int]:
 
 def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
     """Read samples as training does, without the network."""
-    from train.data.order import RankShare
+    from train.data.order import RankSlice
     from train.data.stream import StreamSettings, stream_batches
-    from train.data.unusable import Unusable
+    from train.data.unusable import BadSampleCounter
 
     settings = StreamSettings(
         seed=0,
@@ -87,7 +87,12 @@ def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
     began = time.perf_counter()
     core_began = time.process_time()
     stream = stream_batches(
-        data.split("train"), settings, 0, share=RankShare(), workers=threads, unusable=Unusable(0)
+        data.split("train"),
+        settings,
+        0,
+        rank_slice=RankSlice(),
+        workers=threads,
+        unusable=BadSampleCounter(0),
     )
     with closing(stream) as batches:
         for _ in itertools.islice(batches, count // BATCH):

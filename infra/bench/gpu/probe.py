@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import torch
 
-from model.precision import quick_products
+from model.precision import fast_float32_products
 
 _ANSWER_S = 60
 REPEATS = 5
@@ -47,7 +47,7 @@ def product_figures(device: torch.device, kind: str, width: int) -> dict[str, fl
     """
     dtype = torch.float32 if kind == "tf32" else getattr(torch, kind)
     matrix = torch.randn(width, width, device=device).to(dtype)
-    with quick_products(device, wanted=kind == "tf32"):
+    with fast_float32_products(device, enabled=kind == "tf32"):
         seconds = best_s(lambda: matrix @ matrix, device)
     return {"ms": 1e3 * seconds, "teraflop_per_s": 2 * width**3 / seconds / 1e12}
 

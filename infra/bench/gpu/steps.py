@@ -14,7 +14,7 @@ from infra.bench.gpu.probe import wait_for
 from infra.bench.gpu.step_profile import marked_parts, profile_call
 from model.config import ModelConfig, hits_smoke, smoke, tiny
 from model.costs import training_flops
-from train.loop.crew import Crew
+from train.loop.crew import DistributedContext
 from train.loop.state import new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective
@@ -90,7 +90,7 @@ def _measure_steps(
     state = new_state(settings, device)
     lpips = drawn_lpips(settings) if device.type == "cuda" else drawn_lpips(settings, THIN)
     objective = Objective(settings.loss, lpips).to(device)
-    stepper = Stepper(state, settings, objective, Crew(device=device))
+    stepper = Stepper(state, settings, objective, DistributedContext(device=device))
     batch = drawn_batch(settings, scenes).to(device)  # a run sends the next while one is computed
 
     def step() -> None:

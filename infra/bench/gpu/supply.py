@@ -13,9 +13,9 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import shard_name
 from storage.dataset.staging import read_staged_scene
 from storage.dataset.training_data import open_training_data
-from train.data.order import RankShare
+from train.data.order import RankSlice
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import Unusable
+from train.data.unusable import BadSampleCounter
 from train.runs import named_run
 
 BUILD = "smoke"
@@ -69,8 +69,8 @@ def read_figures(data: str, threads: int, px: int, least_s: float) -> dict[str, 
         augmentation=run.augmentation,
     )
     stream = stream_batches(
-        open_training_data([data]).split("train"), settings, 0, share=RankShare(),
-        workers=threads, unusable=Unusable(0),
+        open_training_data([data]).split("train"), settings, 0, rank_slice=RankSlice(),
+        workers=threads, unusable=BadSampleCounter(0),
     )  # fmt: skip
     with closing(stream) as batches:
         for _ in itertools.islice(batches, 1 + 16 // BATCH):  # what is decoded ahead counts twice

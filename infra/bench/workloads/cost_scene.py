@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
-from pipeline.scenes.pieces import ScenePiece, emitter_piece, joined, object_piece, shell_piece
+from pipeline.scenes.pieces import (
+    ScenePiece,
+    concatenate_pieces,
+    emitter_piece,
+    object_piece,
+    shell_piece,
+)
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from storage.conventions import look_at_c2w
 from storage.records.scene import Scene, SceneObject
@@ -49,7 +55,7 @@ def cost_scene(num_triangles: int, num_lights: int) -> Scene:
     pieces = [*shell, *objects, *emitters]
     pose = look_at_c2w(eye=(1.4, -2.2, 1.3), target=(0, 0, 0.35), up=(0, 0, 1))
     scene = Scene(
-        **joined(pieces),
+        **concatenate_pieces(pieces),
         c2w=pose[None].astype(np.float32),
         fov_deg=np.array([40.0], np.float32),
         objects=tuple(piece.entry for piece in pieces),

@@ -59,7 +59,7 @@ def picture_db(meshes: Sequence[TriangleMesh], renders: RenderSettings) -> list[
 
 
 def _scene(mesh: TriangleMesh, *, floor_z: float) -> Scene:
-    from pipeline.scenes.pieces import emitter_piece, joined, object_piece, shell_piece
+    from pipeline.scenes.pieces import concatenate_pieces, emitter_piece, object_piece, shell_piece
     from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 
     rng = np.random.default_rng(0)  # for materials of many colours, which these are not
@@ -86,7 +86,7 @@ def _scene(mesh: TriangleMesh, *, floor_z: float) -> Scene:
     ]
     c2w = look_at_c2w(eye=_EYE, target=(0, 0, 0), up=(0, 0, 1))
     return Scene(
-        **joined(pieces),
+        **concatenate_pieces(pieces),
         c2w=c2w.astype(np.float32)[None],
         fov_deg=np.array([_FOV_DEG], np.float32),
         objects=tuple(piece.entry for piece in pieces),

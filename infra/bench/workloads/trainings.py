@@ -15,10 +15,10 @@ from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from train.data.buckets import bucket_scenes
 from train.data.stream import stream_batches
-from train.data.unusable import Unusable, first_samples
+from train.data.unusable import BadSampleCounter, first_samples
 from train.evaluation.judge import Judge
-from train.loop.crew import Crew
-from train.loop.muon import fitting_precision
+from train.loop.crew import DistributedContext
+from train.loop.muon import choose_muon_precision
 from train.loop.schedule import learning_rate
 from train.loop.state import new_state
 from train.loop.step import Stepper
@@ -44,10 +44,11 @@ def scenes_of(data: str, held_out: int, resolution: int) -> TrainingScenes:
         TrilightError: the validation split is empty.
     """
     opened = open_training_data([data])
-    samples = list(first_samples(opened.split("validation"), held_out, Unusable(0)))
+    samples = list(first_samples(opened.split("validation"), held_out, BadSampleCounter(0)))
     if not samples:
         raise TrilightError(
-            f"--data {opened.shown}: its validation split is empty; expected scenes to judge on."
+            f"--data {opened.display_name}: its validation split is empty; expected scenes to "
+            "judge on."
         )
     train = opened.split("train")
     count = sum(train.num_samples(number) for number in range(len(train.names)))
@@ -84,8 +85,8 @@ def training_figures(
 def _trained_network(
     shards: ShardSet, settings: TrainSettings, device: torch.device
 ) -> RenderFormer:
-    crew = Crew(device=device)
-    state = new_state(settings, device, muon_precision=fitting_precision(crew))
+    crew = DistributedContext(device=device)
+    state = new_state(settings, device, muon_precision=choose_muon_precision(crew))
     stepper = Stepper(state, settings, Objective(settings.loss, None), crew)
 
     def flops(triangles: int) -> int:
@@ -95,11 +96,16 @@ def _trained_network(
         return training_flops(settings.model, workload)
 
     stream = stream_batches(
-        shards, stream_settings(settings), 0, share=crew.share, workers=1, unusable=state.unusable
+        shards,
+        stream_settings(settings),
+        0,
+        rank_slice=crew.rank_slice,
+        workers=1,
+        unusable=state.bad_samples,
     )
     with closing(stream) as batches:
         for step in range(settings.num_steps):
             buckets = bucket_scenes(next(batches), flops, settings.scenes_per_pass)
-            stepper.take(buckets, learning_rate(step, settings))  # no step waits for its figures
+            stepper.launch(buckets, learning_rate(step, settings))  # no step waits for its figures
             state.step += 1
     return state.model.eval()

@@ -13,7 +13,7 @@ from infra.rendering import plan
 from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, pair_cameras
 from infra.rendering.engines import MitsubaPlan, NeuralPlan
 from infra.rendering.plan import plan_render
-from infra.rendering.request import Asked
+from infra.rendering.request import RenderOptions
 from infra.rendering.sources import scene_sources
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
@@ -129,7 +129,7 @@ def test_a_shard_without_a_key_is_all_of_its_scenes(tmp_path: Path) -> None:
 
 
 def test_one_picture_is_of_the_scenes_own_camera(source: Path, tmp_path: Path) -> None:
-    asked = Asked(source=str(source), out=tmp_path / "new/x.exr", view=1, threads=3)
+    asked = RenderOptions(source=str(source), out=tmp_path / "new/x.exr", view=1, threads=3)
     plan = plan_render(asked, HereReader())
     (shot,), (engine,) = plan.shots, plan.engines
     assert isinstance(engine, MitsubaPlan)
@@ -143,7 +143,7 @@ def test_both_engines_share_the_width_and_have_files_of_their_own(
     source: Path, tmp_path: Path
 ) -> None:
     network = str(write_network(tmp_path / "model.safetensors"))
-    asked = Asked(
+    asked = RenderOptions(
         source=str(source),
         out=tmp_path / "turn.webp",
         engine="both",
@@ -177,7 +177,7 @@ def test_the_pictures_of_a_turn_share_the_loading_of_its_scene(
     monkeypatch.setattr(plan, "priced_ways", priced_ways)
     for more in ({"out": tmp_path / "x.exr"}, {"out": tmp_path / "turn", "orbit": 3}):
         with pytest.raises(TrilightError, match="no way"):
-            plan_render(Asked(source=str(source), seconds=1.0, **more), HereReader())
+            plan_render(RenderOptions(source=str(source), seconds=1.0, **more), HereReader())
     assert told == [1, 3]
 
 

@@ -20,7 +20,7 @@ from pipeline.exchange.convert import write_scene
 from pipeline.making.progressive_tracer import ProgressiveTracer
 from pipeline.renders.variant import Variant, choose_variant
 from pipeline.shards.finished import FinishedDataset
-from pipeline.shards.listing import listed_scenes
+from pipeline.shards.listing import list_scenes
 from pipeline.shards.plans import Selection
 from storage.conventions import preview_srgb8
 from storage.dataset.dataset import Dataset
@@ -89,7 +89,7 @@ def test_what_is_shown_is_what_the_printed_command_selects(asker: Asker, dataset
                 where=options.get("--where"),
             )
             whole = FinishedDataset(folder=dataset.folder, manifest=dataset.manifest, objects={})
-            chosen = listed_scenes(whole, selection)
+            chosen = list_scenes(whole, selection)
             assert [row["key"] for row in found["rows"]] == [row["key"] for row in chosen.rows]
             for mine, theirs in zip(found["rows"], chosen.rows, strict=True):
                 for name in ("split", "template", "triangles", "lights", "spp"):

@@ -12,7 +12,7 @@ from model.config import ModelConfig
 from model.neural_renderer import NeuralRenderer
 from model.renderformer import radiance
 from model.scene_tensors import scene_tensors
-from model.sky.drawn import DrawnSky
+from model.sky.drawn import SkySampler
 from model.sky.symmetries import mirror_sky, permute_sky_channels, rotate_sky, scale_sky
 from scene_templates.rotations import uniform_rotation
 from storage.errors import TrilightError
@@ -46,13 +46,13 @@ def _light(sky: Environment) -> NDArray[np.float64]:
 @for_each("name", SKIES)
 def test_light_over_density_is_the_light_of_the_map(name: str) -> None:
     sky = SKIES[name]()
-    drawn = DrawnSky(sky)
-    direction = drawn.drawn(np.random.default_rng(0).random((2, 40_000), np.float32))
+    drawn = SkySampler(sky)
+    direction = drawn.sample_directions(np.random.default_rng(0).random((2, 40_000), np.float32))
     assert np.abs(np.linalg.norm(direction, axis=0) - 1).max() < 1e-6
     radiance = drawn.radiance(direction)
     expected = environment_values(sky, direction.T).T
     assert np.abs(radiance - expected).max() <= 1e-6 * expected.max()  # float32
-    ratio = radiance / drawn.density(direction)
+    ratio = radiance / drawn.pdf(direction)
     error = ratio.std(axis=1) / 200
     # Texels count with the mean over their area, the integral at centres: 1 % for a coarse map.
     assert (np.abs(ratio.mean(axis=1) - _light(sky)) < 5 * error + 0.01 * _light(sky)).all()
@@ -61,12 +61,12 @@ def test_light_over_density_is_the_light_of_the_map(name: str) -> None:
 @for_each("name", ["smooth", "night"])
 def test_directions_fall_into_texels_as_often_as_stated(name: str) -> None:
     sky = SKIES[name]()
-    drawn = DrawnSky(sky)
-    direction = drawn.drawn(np.random.default_rng(1).random((2, 100_000), np.float32))
+    drawn = SkySampler(sky)
+    direction = drawn.sample_directions(np.random.default_rng(1).random((2, 100_000), np.float32))
     up = direction[2] > 0.4
     other = np.random.default_rng(2).normal(size=(3, 100_000))
     other /= np.linalg.norm(other, axis=0)
-    density = drawn.density(other.astype(np.float32))
+    density = drawn.pdf(other.astype(np.float32))
     assert density.mean() * 4 * np.pi == pytest.approx(1, abs=0.05)
     expected = (density * (other[2] > 0.4)).mean() * 4 * np.pi
     assert up.mean() == pytest.approx(expected, abs=0.02)  # 100,000 draws: 0.2 %, peaked 2 %
@@ -76,15 +76,15 @@ def test_the_ends_of_the_unit_square_are_directions() -> None:
     last = np.nextafter(np.float32(1), np.float32(0))
     u = np.array([[0, 0, last, last], [0, last, 0, last]], np.float32)
     for make in SKIES.values():
-        drawn = DrawnSky(make())
-        direction = drawn.drawn(u)
+        drawn = SkySampler(make())
+        direction = drawn.sample_directions(u)
         assert np.isfinite(direction).all()
-        assert (drawn.density(direction) >= 0).all()
+        assert (drawn.pdf(direction) >= 0).all()
 
 
 def test_a_sun_is_found_by_most_draws() -> None:
-    drawn = DrawnSky(one_sun(1e6))
-    direction = drawn.drawn(np.random.default_rng(0).random((2, 1_000), np.float32))
+    drawn = SkySampler(one_sun(1e6))
+    direction = drawn.sample_directions(np.random.default_rng(0).random((2, 1_000), np.float32))
     assert np.mean(drawn.radiance(direction).max(axis=0) > 100) > 0.7
 
 
@@ -92,18 +92,18 @@ def test_a_sun_is_found_by_most_draws() -> None:
 def test_a_blurred_sky_has_as_much_light(height: int) -> None:
     rng = np.random.default_rng(height)
     sky = as_sky(rng.uniform(size=(height, 2 * height, 3)) ** 8)
-    drawn = DrawnSky(sky)
+    drawn = SkySampler(sky)
     other = rng.normal(size=(3, 50_000))
     other = (other / np.linalg.norm(other, axis=0)).astype(np.float32)
-    sharp, soft = drawn.radiance(other), drawn.blurred(other)
+    sharp, soft = drawn.radiance(other), drawn.blurred_radiance(other)
     assert soft.mean() == pytest.approx(sharp.mean(), rel=0.03)
     assert soft.std() <= sharp.std() + 1e-6
 
 
 def test_scene_and_sky_turned_together_have_the_same_draws_elsewhere() -> None:
     u = np.random.default_rng(0).random((2, 500), np.float32)
-    there = DrawnSky(smooth(rotation=TURN)).drawn(u)
-    assert np.abs(TURN @ DrawnSky(smooth()).drawn(u) - there).max() < 1e-6
+    there = SkySampler(smooth(rotation=TURN)).sample_directions(u)
+    assert np.abs(TURN @ SkySampler(smooth()).sample_directions(u) - there).max() < 1e-6
 
 
 SKY = smooth(rotation=uniform_rotation(np.random.default_rng(8)).astype(np.float32))

@@ -31,7 +31,7 @@ from pipeline.documents.html import (
     element,
     escape,
     image,
-    joined,
+    join_markup,
     outside_link,
     page,
     png_uri,
@@ -201,7 +201,7 @@ def test_what_a_card_knows() -> None:
 def test_text_is_escaped_once_and_attributes_cells_and_titles_cannot_be_left() -> None:
     assert escape("<&'\">") == "&lt;&amp;&#x27;&quot;&gt;"
     assert escape(escape("<")) == "&lt;"
-    assert joined(["<", Markup("<br>")]) == "&lt;\n<br>"
+    assert join_markup(["<", Markup("<br>")]) == "&lt;\n<br>"
     tags = read(element("p", HARM, id=HARM, class_="a").encode())
     assert (tags.tags, tags.names, tags.ids) == (["p"], {"id", "class"}, {HARM})
     assert read(image("data:,", HARM).encode()).tags == ["img"]

@@ -16,7 +16,7 @@ import pytest
 from pipeline.executors.array_job import MAX_TASKS, ArrayJob, array_job
 from pipeline.executors.registry import EXECUTORS, find_executor
 from pipeline.executors.slurm import shards_of_task
-from pipeline.executors.slurm_array import sbatch_environment, sbatch_words
+from pipeline.executors.slurm_array import sbatch_command, sbatch_environment
 from pipeline.making.dataset_order import DatasetOrder
 from storage.dataset.dataset import open_dataset
 from storage.dataset.progress import missing_shards
@@ -140,7 +140,7 @@ def test_settings_that_divide_the_dataset_count(cluster: Path) -> None:
     order = DatasetOrder(build="smoke", scenes=64, changes=changes, objects="my objects")
     job = array_job(order, per_task=2, at_once=3)
     assert job.tasks == [0, 1, 2, 3]
-    words = sbatch_words(job)
+    words = sbatch_command(job)
     assert words[:3] == ["sbatch", "--parsable", "--array=0-3%3"]
     assert words[4:] == ["--changes", "splits.scenes_per_shard=8"]
     given = sbatch_environment(job)

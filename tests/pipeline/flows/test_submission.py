@@ -29,7 +29,7 @@ from pipeline.flows.prefect_server import (
     prefect_server,
     wait_until_healthy,
 )
-from pipeline.flows.submission import looks, parameters, server, submit, workers_online
+from pipeline.flows.submission import parameters, poll_run, server, submit, workers_online
 from pipeline.making.dataset_order import DatasetOrder
 from storage.cache import open_private, private_folder
 from storage.errors import TrilightError
@@ -123,7 +123,7 @@ def test_a_run_is_looked_at_until_it_has_ended_and_one_that_failed_is_no_success
         SimpleNamespace(type="table", data=json.dumps(table), key="progress", updated=2),
     ]
     slept: list[float] = []
-    seen = list(looks(served, uuid4(), slept.append))  # type: ignore[arg-type]
+    seen = list(poll_run(served, uuid4(), slept.append))  # type: ignore[arg-type]
     assert [look.state for look in seen] == ["Scheduled", "Running", "Completed"]
     assert [look.is_final for look in seen] == [False, False, True]
     assert seen[-1].is_completed and seen[-1].message == "all there"
@@ -131,7 +131,7 @@ def test_a_run_is_looked_at_until_it_has_ended_and_one_that_failed_is_no_success
     assert seen[-1].tables == {"progress": [("scenes in shards", "3 of 4")]}
     assert len(slept) == 2
     served = Server(["local"], (Failed(message="no space"),))
-    (last,) = looks(served, uuid4())  # type: ignore[arg-type]
+    (last,) = poll_run(served, uuid4())  # type: ignore[arg-type]
     assert (last.is_final, last.is_completed, last.message) == (True, False, "no space")
 
 

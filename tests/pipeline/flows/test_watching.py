@@ -22,7 +22,7 @@ from pipeline.flows.prefect_runner import PrefectRunner
 from pipeline.flows.watching import RunArtifacts, report_url, small_picture, usd_per_core_hour
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.publication import DatasetProgress
-from pipeline.making.run import TaskOutcome
+from pipeline.making.run import TaskResult
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
@@ -80,8 +80,8 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
     return _shown_by(array_flow, monkeypatch)
 
 
-def _task(scenes: int, seconds: float) -> TaskOutcome:
-    return TaskOutcome(shards=(), scenes=scenes, seconds=seconds, core_s=seconds)
+def _task(scenes: int, seconds: float) -> TaskResult:
+    return TaskResult(shards=(), scenes=scenes, seconds=seconds, core_s=seconds)
 
 
 def test_a_page_that_cannot_be_shown_does_not_end_the_run(

@@ -21,7 +21,7 @@ from pipeline.isolation import (
     call_with_retries,
     confinement,
     deaths,
-    is_passing,
+    is_transient,
     reach,
     seccomp,
 )
@@ -175,9 +175,9 @@ def _until(happened: Callable[[], bool], most_s: float) -> None:
 def test_another_folder_costs_a_fresh_child_and_the_same_one_none(place: Path) -> None:
     with closing(confined(reach(files=[place / "in"]))) as child:
         first = child.call(called.process_id)
-        child.may(reach(files=[place / "in" / "file"]))
+        child.allow_files(reach(files=[place / "in" / "file"]))
         assert child.call(called.process_id) == first
-        child.may(reach(files=[place / "outside" / "file"]))
+        child.allow_files(reach(files=[place / "outside" / "file"]))
         assert child.call(called.read, place / "outside" / "file") == "outside"
         assert child.call(called.read, place / "in" / "file") == "in"
         assert child.call(called.process_id) != first
@@ -349,7 +349,7 @@ def test_every_end_has_tries_and_only_two_are_verdicts() -> None:
     assert all(1 <= end.tries <= 3 for end in ENDS.values())
     tries = {name: ENDS[name].tries for name in ("killed", "exception", "crashed_signal")}
     assert tries == {"killed": 3, "exception": 3, "crashed_signal": 2}
-    assert not is_passing("degenerate")
+    assert not is_transient("degenerate")
 
 
 def test_kills_while_a_child_is_set_up_are_tried_again_and_end_the_run_at_last(

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.builds.named import named_build
 from pipeline.making import bucket_publication
-from pipeline.making.bucket_publication import begin_dataset, joined
+from pipeline.making.bucket_publication import begin_dataset, hold_membership
 from pipeline.making.publication import DatasetWriter
 from pipeline.shards.pack import pack_shard
 from storage.dataset.layout import dataset_folder
@@ -64,7 +64,7 @@ class Writes:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.left = 0
-        put = remote_bucket.Bucket._put
+        put = remote_bucket.Bucket._upload
 
         def put_or_die(bucket: Any, *arguments: Any, **options: Any) -> None:
             self.left -= 1
@@ -92,7 +92,7 @@ class Machines:
         self.use(name)
         folder = dataset_folder(OUT)
         build = named_build("smoke", changes=changes) if changes else _build()
-        with joined(folder):
+        with hold_membership(folder):
             yield begin_dataset(folder, build, ENVIRONMENT, scenes, accept_environment=False)
 
 

@@ -13,7 +13,7 @@ from pipeline.assets.stage import PreparedAsset
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.making import object_batches
-from pipeline.making.asked_objects import AskedObjects
+from pipeline.making.asked_objects import ObjectOptions
 from pipeline.making.begin_publication import begin
 from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects
 from pipeline.making.object_batches import prepared_object
@@ -63,11 +63,9 @@ def begun(root: Path) -> DatasetWriter:
     return begin(DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False)
 
 
-def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> AskedObjects:
+def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> ObjectOptions:
     """Return what is asked for of objects."""
-    return AskedObjects(
-        source=source, licence=licence, settings=build(), publication=writer, workers=1
-    )
+    return ObjectOptions(source=source, licence=licence, settings=build(), writer=writer, workers=1)
 
 
 def frozen(writer: DatasetWriter, objects: Sequence[PreparedAsset]) -> AcceptedObjects:

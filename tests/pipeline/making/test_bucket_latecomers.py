@@ -122,7 +122,7 @@ def test_of_those_who_end_together_one_reads_the_notes(
 ) -> None:
     """The others wait for its list; one that died over its list is waited for in vain."""
     read: list[str] = []
-    fetched = mirror.fetched_notes
+    fetched = mirror.fetch_notes
     monkeypatch.setattr(
         mirror, "fetched_notes", lambda how, names, at: fetched(how, _told(names, read), at)
     )

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.making.derive_dataset import derive_dataset
-from pipeline.shards.derive import Derive, derive_shards
+from pipeline.shards.derive import DeriveOptions, derive_shards
 from pipeline.shards.finished import open_finished
 from pipeline.shards.pack import pack_shard
 from pipeline.shards.plans import Selection
@@ -103,17 +103,17 @@ def finished(
     return root
 
 
-MERGE = Derive(operation="merge")
+MERGE = DeriveOptions(operation="merge")
 
 
-def made(out: Path, derive: Derive, *places: Path) -> Dataset:
+def made(out: Path, derive: DeriveOptions, *places: Path) -> Dataset:
     """Make a whole dataset, documents and all."""
     derive_dataset([str(place) for place in places], derive, out)
     assert verify_dataset(out).problems == []
     return open_dataset(str(out))
 
 
-def shards_made(out: Path, derive: Derive, *places: Path) -> Dataset:
+def shards_made(out: Path, derive: DeriveOptions, *places: Path) -> Dataset:
     """Make all that a digest covers, without the documents, which take seconds."""
     derive_shards([open_finished(str(place)) for place in places], derive, DatasetFolder(out))
     assert verify_dataset(out).problems == []
@@ -192,8 +192,8 @@ def test_equal_inputs_give_equal_bytes_wherever_they_lie(tmp_path: Path) -> None
         a = finished(tmp_path / place / "a", scenes(0))
         b = finished(tmp_path / place / "b", scenes(1), seed=1)
         made(tmp_path / place / "merge", MERGE, a, b)
-        select = Derive(operation="select", selection=Selection(split="train"))
-        reshard = Derive(operation="reshard", scenes_per_shard=3)
+        select = DeriveOptions(operation="select", selection=Selection(split="train"))
+        reshard = DeriveOptions(operation="reshard", scenes_per_shard=3)
         for derive in (select, reshard):
             shards_made(tmp_path / place / derive.operation, derive, a)
         results.append(bytes_of(tmp_path / place))
@@ -217,7 +217,7 @@ def test_a_selection_keeps_keys_and_bytes(
     tmp_path: Path, selection: Selection, keys: list[int]
 ) -> None:
     a = finished(tmp_path / "a", scenes(0))
-    chosen = shards_made(tmp_path / "c", Derive(operation="select", selection=selection), a)
+    chosen = shards_made(tmp_path / "c", DeriveOptions(operation="select", selection=selection), a)
     whole = given(scenes(0))
     assert samples_of(chosen) == {sample_key(key): whole[sample_key(key)] for key in keys}
 
@@ -225,7 +225,7 @@ def test_a_selection_keeps_keys_and_bytes(
 def test_a_merge_after_a_selection_gives_no_key_twice(tmp_path: Path) -> None:
     """A selection keeps its keys, which then go beyond its number of scenes."""
     a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
-    derive = Derive(operation="select", selection=Selection(split="test"))
+    derive = DeriveOptions(operation="select", selection=Selection(split="test"))
     chosen = shards_made(tmp_path / "c", derive, a)
     merged = shards_made(tmp_path / "d", MERGE, chosen.folder.root, b)
     test_part = {"test-000002.tar": scenes(0)["test-000002.tar"]}
@@ -234,7 +234,7 @@ def test_a_merge_after_a_selection_gives_no_key_twice(tmp_path: Path) -> None:
 
 def test_a_selection_keeps_only_the_rights_of_what_it_holds(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", scenes(0))
-    derive = Derive(operation="select", selection=Selection(split="train"))
+    derive = DeriveOptions(operation="select", selection=Selection(split="train"))
     chosen = made(tmp_path / "c", derive, a)
     assert [entry.uid for entry in read_objects_lock(chosen.folder.objects_lock)] == ["a"]
     assert 'license: "cc0-1.0"' in chosen.folder.card.read_text()
@@ -243,14 +243,16 @@ def test_a_selection_keeps_only_the_rights_of_what_it_holds(tmp_path: Path) -> N
 
 def test_resharding_divides_each_split_evenly(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", scenes(0))
-    resharded = shards_made(tmp_path / "c", Derive(operation="reshard", scenes_per_shard=3), a)
+    resharded = shards_made(
+        tmp_path / "c", DeriveOptions(operation="reshard", scenes_per_shard=3), a
+    )
     assert [(s.name, s.num_samples) for s in resharded.manifest.shards] == [
         ("train-000000.tar", 3), ("train-000001.tar", 1), ("test-000002.tar", 2),
     ]  # fmt: skip
     assert samples_of(resharded) == given(scenes(0))
     assert resharded.manifest.settings["splits"]["scenes_per_shard"] == 3
     back = shards_made(
-        tmp_path / "d", Derive(operation="reshard", scenes_per_shard=2), tmp_path / "c"
+        tmp_path / "d", DeriveOptions(operation="reshard", scenes_per_shard=2), tmp_path / "c"
     )
     assert [shard.sha256 for shard in back.manifest.shards] == [
         shard.sha256 for shard in open_dataset(str(a)).manifest.shards
@@ -262,12 +264,14 @@ def test_many_shards_stand_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(layout, "FILES_PER_FOLDER", 2)
     of_training = {name: of for name, of in scenes(0).items() if "train" in name}
     a = finished(tmp_path / "a", of_training)
-    resharded = shards_made(tmp_path / "c", Derive(operation="reshard", scenes_per_shard=1), a)
+    resharded = shards_made(
+        tmp_path / "c", DeriveOptions(operation="reshard", scenes_per_shard=1), a
+    )
     assert [shard.name for shard in resharded.manifest.shards[1:4]] == [
         "train-000001.tar", "part-0001/train-000002.tar", "part-0001/train-000003.tar",
     ]  # fmt: skip
     assert samples_of(resharded) == given(of_training)
-    again = Derive(operation="reshard", scenes_per_shard=2)
+    again = DeriveOptions(operation="reshard", scenes_per_shard=2)
     back = shards_made(tmp_path / "d", again, tmp_path / "c")
     assert [s.sha256 for s in back.manifest.shards] == [
         s.sha256 for s in open_dataset(str(a)).manifest.shards
@@ -286,7 +290,7 @@ def test_rejections_follow_their_scenes(tmp_path: Path) -> None:
     items = [row.item for row in read_failures(merged.folder.failures)]
     assert items == ["e", "000000005.1", "000000001", "000000007"]  # 5 was given up in a
     assert "000000006" in samples_of(merged)
-    derive = Derive(operation="select", selection=Selection(template="wall"))
+    derive = DeriveOptions(operation="select", selection=Selection(template="wall"))
     chosen = shards_made(tmp_path / "d", derive, a)
     assert [row.item for row in read_failures(chosen.folder.failures)] == ["e", "000000001"]
 
@@ -334,25 +338,27 @@ def maps_in(dataset: Dataset) -> list[list[str]]:
 
 def test_a_selection_takes_the_maps_that_it_needs_and_no_other(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", textured_scenes())
-    chosen = Derive(operation="select", selection=Selection(where=f'key == "{sample_key(3)}"'))
+    chosen = DeriveOptions(
+        operation="select", selection=Selection(where=f'key == "{sample_key(3)}"')
+    )
     made = shards_made(tmp_path / "b", chosen, a)
     held = [colour_texture(1).sha256, number_texture().sha256, sky().sha256]
     assert sorted(maps_in(made)[0]) == sorted(f"__map-{sha256}__" for sha256 in held)
-    plain = Derive(operation="select", selection=Selection(where='template == "plane"'))
+    plain = DeriveOptions(operation="select", selection=Selection(where='template == "plane"'))
     left = shards_made(tmp_path / "c", plain, a)
     assert left.manifest.num_samples == 1 and maps_in(left) == [[]]
 
 
 def test_resharding_stores_each_map_once_in_each_new_shard(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", textured_scenes())
-    whole = shards_made(tmp_path / "b", Derive(operation="reshard", scenes_per_shard=4), a)
+    whole = shards_made(tmp_path / "b", DeriveOptions(operation="reshard", scenes_per_shard=4), a)
     (shard,) = whole.manifest.shards
     assert [len(names) for names in maps_in(whole)] == [4]
-    apart = shards_made(tmp_path / "c", Derive(operation="reshard", scenes_per_shard=1), a)
+    apart = shards_made(tmp_path / "c", DeriveOptions(operation="reshard", scenes_per_shard=1), a)
     assert [len(names) for names in maps_in(apart)] == [0, 3, 3, 3]
     assert samples_of(apart) == samples_of(whole) == given(textured_scenes())
     again = shards_made(
-        tmp_path / "d", Derive(operation="reshard", scenes_per_shard=4), tmp_path / "c"
+        tmp_path / "d", DeriveOptions(operation="reshard", scenes_per_shard=4), tmp_path / "c"
     )
     assert [each.sha256 for each in again.manifest.shards] == [shard.sha256]
 

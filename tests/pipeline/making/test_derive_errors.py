@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.making.begin_publication import begin
 from pipeline.making.derive_dataset import derive_dataset
-from pipeline.shards.derive import Derive
+from pipeline.shards.derive import DeriveOptions
 from pipeline.shards.plans import Selection
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
@@ -29,10 +29,10 @@ from tests.pipeline.making.test_derive_dataset import (
 )
 from tests.pipeline.making.test_publication import ENVIRONMENT, _build
 
-MERGE = Derive(operation="merge")
+MERGE = DeriveOptions(operation="merge")
 
 
-def refused(out: Path, derive: Derive, *places: Path | str) -> str:
+def refused(out: Path, derive: DeriveOptions, *places: Path | str) -> str:
     """Return the message of a refusal that leaves nothing where the dataset would be."""
     with pytest.raises(TrilightError) as caught:
         derive_dataset([str(place) for place in places], derive, out)
@@ -63,7 +63,7 @@ def test_a_leak_between_splits_is_named(tmp_path: Path, uid: str, sha256: str) -
     assert f"object '{uid}' is in test of" in message and "and in train of" in message
     assert "trilight shards select" in message
     train_only = tmp_path / "train"
-    derive = Derive(operation="select", selection=Selection(split="train"))
+    derive = DeriveOptions(operation="select", selection=Selection(split="train"))
     shards_made(train_only, derive, a)
     shards_made(tmp_path / "c", MERGE, train_only, b)  # as the message advises
 
@@ -94,7 +94,7 @@ def test_what_does_not_fit_together_is_named(
 
 def test_damage_and_what_is_not_finished_are_refused(tmp_path: Path) -> None:
     a, out = finished(tmp_path / "a", scenes(0)), tmp_path / "c"
-    reshard = Derive(operation="reshard", scenes_per_shard=3)
+    reshard = DeriveOptions(operation="reshard", scenes_per_shard=3)
     manifest = open_dataset(str(a)).manifest
     write_manifest(a / "manifest.json", dataclasses.replace(manifest, num_scenes=7))
     assert "3 of 4 shards" in refused(out, reshard, a)
@@ -116,12 +116,15 @@ def test_damage_and_what_is_not_finished_are_refused(tmp_path: Path) -> None:
 @for_each(
     ("derive", "expected"),
     [
-        (Derive(operation="select", selection=Selection(template="no")), "none of the 6 scenes"),
-        (Derive(operation="reshard", scenes_per_shard=0), "--scenes-per-shard is 0"),
+        (
+            DeriveOptions(operation="select", selection=Selection(template="no")),
+            "none of the 6 scenes",
+        ),
+        (DeriveOptions(operation="reshard", scenes_per_shard=0), "--scenes-per-shard is 0"),
     ],
 )
 def test_arguments_that_make_nothing_are_refused(
-    tmp_path: Path, derive: Derive, expected: str
+    tmp_path: Path, derive: DeriveOptions, expected: str
 ) -> None:
     assert expected in refused(tmp_path / "c", derive, finished(tmp_path / "a", scenes(0)))
     with pytest.raises(TrilightError, match="--split is 'tset'"):
@@ -130,7 +133,7 @@ def test_arguments_that_make_nothing_are_refused(
 
 def test_nothing_is_overwritten_and_nothing_grows(tmp_path: Path) -> None:
     a, out = finished(tmp_path / "a", scenes(0)), tmp_path / "c"
-    reshard = Derive(operation="reshard", scenes_per_shard=3)
+    reshard = DeriveOptions(operation="reshard", scenes_per_shard=3)
     out.mkdir()
     derive_dataset([str(a)], reshard, out)  # an empty folder is no reason to refuse
     with pytest.raises(TrilightError, match="is there already"):
@@ -162,7 +165,7 @@ def test_a_kill_leaves_no_dataset_and_the_next_run_makes_it(tmp_path: Path) -> N
         [sys.executable, "-c", KILLED, str(a), str(out)], stdout=subprocess.PIPE, text=True
     )
     assert run.stdout is not None and run.stdout.readline() == "here\n"
-    reshard = Derive(operation="reshard", scenes_per_shard=3)
+    reshard = DeriveOptions(operation="reshard", scenes_per_shard=3)
     with pytest.raises(TrilightError, match="another process"):
         derive_dataset([str(a)], reshard, out)
     os.kill(run.pid, signal.SIGKILL)

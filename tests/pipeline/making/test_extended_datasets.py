@@ -14,7 +14,7 @@ from pipeline.exchange.reader import file_child
 from pipeline.executors.threads import ThreadRunner
 from pipeline.isolation import call_with_retries
 from pipeline.making.begin_publication import begin
-from pipeline.making.bucket_publication import joined
+from pipeline.making.bucket_publication import hold_membership
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset, make_task, prepare_dataset
 from pipeline.shards.derive import _extensions
@@ -245,7 +245,7 @@ def test_what_was_only_begun_is_begun_anew(tmp_path: Path, monkeypatch: pytest.M
     """As a run leaves it that ended over its objects: other settings and fewer scenes are free."""
     without_rendering(monkeypatch)
     folder = DatasetFolder(tmp_path / "set")
-    with folder.joined():
+    with folder.hold_membership():
         begin(folder, named_build("smoke", seed=5), {}, 24, accept_environment=False)
     run = prepare_dataset(tiny_order(out=str(folder.root), scenes=4, seed=7))
     assert run.publication.manifest.settings["seed"] == 7
@@ -266,16 +266,16 @@ def test_what_has_objects_or_scenes_is_not(tmp_path: Path, monkeypatch: pytest.M
 
 def test_nobody_forgets_while_another_is_at_work(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path / "set")
-    with joined(folder):
+    with hold_membership(folder):
         begin(folder, named_build("smoke", seed=5), {}, 4, accept_environment=False)
-        with joined(folder):
+        with hold_membership(folder):
             assert read_manifest(folder.manifest).settings["seed"] == 5
 
 
 def test_who_was_replaced_all_the_same_stops(tmp_path: Path) -> None:
     """Locks do not reach every machine: a maker whose manifest has become another's says so."""
     folder = DatasetFolder(tmp_path / "set")
-    with folder.joined():
+    with folder.hold_membership():
         mine = begin(folder, named_build("smoke", seed=5), {}, 4, accept_environment=False)
         folder.manifest.unlink()
         begin(folder, named_build("smoke", seed=7), {}, 4, accept_environment=False)

@@ -28,7 +28,7 @@ from pipeline.objects.maps.prepared import MapFiles, prepare_map
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.fitting import draw_rows
 from pipeline.scenes.pool import PooledAsset, fits_of
-from scene_templates.own_maps import OwnMap, drawn_own
+from scene_templates.own_maps import UserMap, draw_user_map
 from storage.conventions import SPLITS
 from storage.dataset.manifest import Manifest
 from storage.dataset.verify import check_sample
@@ -358,17 +358,17 @@ def test_documents_name_them_and_a_stranger_in_a_scene_is_a_fault(accepted: Acce
 
 
 def test_share_alike_licences_never_meet() -> None:
-    def map_under(licence: str) -> OwnMap[int]:
-        return OwnMap(uid=licence, source=MapSource(licence=licence), load=lambda: 0)
+    def map_under(licence: str) -> UserMap[int]:
+        return UserMap(uid=licence, source=MapSource(licence=licence), load=lambda: 0)
 
     own = [map_under("CC-BY-SA-4.0"), map_under("CC-BY-SA-3.0"), map_under("CC0-1.0")]
     drawn = {
         found.uid
         for number in range(50)
-        if (found := drawn_own(rng_for(number, "own"), own, 1.0, ["CC-BY-SA-3.0", "MIT"]))
+        if (found := draw_user_map(rng_for(number, "own"), own, 1.0, ["CC-BY-SA-3.0", "MIT"]))
     }
     assert drawn == {"CC-BY-SA-3.0", "CC0-1.0"}
-    assert drawn_own(rng_for(0, "own"), own[:1], 1.0, ["CC-BY-SA-3.0"]) is None
+    assert draw_user_map(rng_for(0, "own"), own[:1], 1.0, ["CC-BY-SA-3.0"]) is None
 
 
 def test_folders_and_shares_belong_together() -> None:

@@ -182,7 +182,7 @@ def test_rendering() -> None:
     def picture() -> NDArray[np.float32]:
         return tracer.render(scene.c2w[0], float(scene.fov_deg[0]), "a view").radiance_rgb
 
-    tracer = PathTracer(settings, seed=0, variant=choose_variant(), threads=1, sampled=sampled)
+    tracer = PathTracer(settings, seed=0, variant=choose_variant(), threads=1, on_samples=sampled)
     try:
         tracer.open(scene, "a scene")
         undisturbed = picture()

@@ -75,9 +75,9 @@ def run(
         allowed_licences=DEFAULT_ALLOWED,
         licence=None,
         workers=workers,
-        downloaded=_nothing_to_fetch,
-        planned=counts.append,
-        done=lambda: counts.append(-1),
+        on_download=_nothing_to_fetch,
+        on_plan=counts.append,
+        on_object=lambda: counts.append(-1),
     )
     planned, *steps = counts
     assert steps == [-1] * planned

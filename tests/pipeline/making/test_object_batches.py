@@ -301,15 +301,19 @@ def test_a_claim_keeps_other_machines_off_until_it_ends(
     """It ends with its block, and for a machine that dies when the lease is over."""
     a, b = _claims(tmp_path, "a"), _claims(tmp_path, "b")
     for holder, other in ((a, b), (b, a)):
-        with holder.claimed("x") as ours, other.claimed("x") as theirs, other.claimed("y") as free:
+        with (
+            holder.hold_claim("x") as ours,
+            other.hold_claim("x") as theirs,
+            other.hold_claim("y") as free,
+        ):
             assert (ours, theirs, free) == (True, False, True)
     monkeypatch.setattr(claims.BucketClaims, "_free", lambda self, claim: None)
-    with a.claimed("z") as ours:
+    with a.hold_claim("z") as ours:
         assert ours
-    with b.claimed("z") as theirs, _claims(tmp_path, "a").claimed("z") as again:
+    with b.hold_claim("z") as theirs, _claims(tmp_path, "a").hold_claim("z") as again:
         assert (theirs, again) == (False, True), "a machine that is started again has its claims"
     monkeypatch.setattr(claims, "LEASE_S", 0.0)
-    with b.claimed("z") as theirs:
+    with b.hold_claim("z") as theirs:
         assert theirs
 
 

@@ -287,8 +287,8 @@ def test_staged_scenes_and_built_in_objects_stand_in_parts(tmp_path: Path) -> No
 
 def test_two_workers_are_kept_apart(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path)
-    with folder.locked():
-        with pytest.raises(TrilightError, match="another process"), folder.locked():
+    with folder.hold_exclusively():
+        with pytest.raises(TrilightError, match="another process"), folder.hold_exclusively():
             pass
-    with folder.locked():
+    with folder.hold_exclusively():
         pass

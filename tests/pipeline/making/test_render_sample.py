@@ -15,7 +15,7 @@ from pipeline.making import render_sample as module
 from pipeline.making import view_progress
 from pipeline.making.begin_publication import begin
 from pipeline.making.publication import DatasetWriter
-from pipeline.making.render_sample import BegunScene, render_sample
+from pipeline.making.render_sample import RenderInput, render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.results import RenderedView, Sampling
 from pipeline.renders.variant import activate, choose_variant
@@ -85,7 +85,7 @@ def test_a_record_says_all_three_floors_and_the_target_that_was_missed(scene: Sc
     records = []
     for each in (missed, reached):
         build = named_build("smoke", resolution=16, changes=each)
-        sample = render_sample(KEY, BegunScene(scene=scene), build, [], ViewProgress(None, 0))
+        sample = render_sample(KEY, RenderInput(scene=scene), build, [], ViewProgress(None, 0))
         records.append(decode_sample(KEY, encode_sample(sample)).views)
     assert [view.at_cap for view in records[0]] == [True] * scene.num_views
     assert [view.at_cap for view in records[1]] == [False] * scene.num_views
@@ -99,7 +99,7 @@ def test_a_refused_camera_is_replaced_and_told(
 ) -> None:
     monkeypatch.setattr(module, "SceneRenderer", _Renderer)
     failures: list[Failure] = []
-    sample = render_sample(KEY, BegunScene(scene=scene), BUILD, failures, ViewProgress(None, 0))
+    sample = render_sample(KEY, RenderInput(scene=scene), BUILD, failures, ViewProgress(None, 0))
     before = scene.provenance["camera_attempts"]
     after = sample.scene.provenance["camera_attempts"]
     assert [row.item for row in failures] == [f"{KEY}.1"] * 2
@@ -122,7 +122,7 @@ def test_a_refused_camera_of_a_file_ends_the_scene(
     failures: list[Failure] = []
     with pytest.raises(Rejected, match="black_view: view 1: seed "):
         render_sample(
-            KEY, BegunScene(scene=scene, kept_cameras=2), BUILD, failures, ViewProgress(None, 0)
+            KEY, RenderInput(scene=scene, kept_cameras=2), BUILD, failures, ViewProgress(None, 0)
         )
     assert failures == []
 
@@ -174,11 +174,11 @@ def test_a_rendered_sample_holds_what_is_asked() -> None:
     activate(choose_variant())
     scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
     sample = render_sample(
-        "000000007", BegunScene(scene=scene), build(**ASKED), [], ViewProgress(None, 7)
+        "000000007", RenderInput(scene=scene), build(**ASKED), [], ViewProgress(None, 7)
     )
     expected = tuple(passes_exr(scene, NAMES, view=view, resolution=16) for view in range(2))
     assert sample.passes_exr == expected
-    plain = render_sample("000000007", BegunScene(scene=scene), build(), [], ViewProgress(None, 7))
+    plain = render_sample("000000007", RenderInput(scene=scene), build(), [], ViewProgress(None, 7))
     assert plain.passes_exr is None
     np.testing.assert_array_equal(plain.radiance_rgb, sample.radiance_rgb)
 

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from infra.cli.changes import Shared
-from infra.cli.dataset_changes import with_shared
+from infra.cli.changes import BaseSettings
+from infra.cli.dataset_changes import with_base_settings
 from infra.repair import repair
 from pipeline.executors.threads import ThreadRunner
 from pipeline.isolation import IsolatedChild
 from pipeline.making import render_children
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset
-from pipeline.making.revisit_order import Revisit, revisit_order
+from pipeline.making.revisit_order import RevisitOptions, revisit_order
 from pipeline.renders.renderer import SceneRenderer
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.shard import iterate_samples
@@ -56,8 +56,8 @@ def generated(out: Path, num_views: int, **changes: Any) -> Dataset:
 
 
 def order_of(source: Path, out: Path, **asked: Any) -> DatasetOrder:
-    order = revisit_order(Revisit(dataset=str(source), out=str(out), **asked))
-    return dataclasses.replace(with_shared(order, Shared(like=str(source))), workers=1)
+    order = revisit_order(RevisitOptions(dataset=str(source), out=str(out), **asked))
+    return dataclasses.replace(with_base_settings(order, BaseSettings(like=str(source))), workers=1)
 
 
 def revisited(source: Path, out: Path, **asked: Any) -> Dataset:

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from infra.cli.changes import parse_changes
 from pipeline.making.dataset_order import DatasetOrder, generate_words
-from pipeline.making.machine import cores_owned, visible_gpus
+from pipeline.making.machine import available_cores, visible_gpus
 from pipeline.making.runner import in_window
-from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece, TaskBudget, TaskSizes, cut_tasks
+from pipeline.making.tasks import MAX_TASKS, TASK_S, Piece, TaskBudget, TaskSizes, cut_tasks
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
@@ -86,7 +86,7 @@ def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
                 sum(1 for _ in left.take_tasks(range(5000), splits, TaskSizes(), at_once=1))
             )
     assert rounds[:2] == [900, 90]
-    assert sum(rounds) == MOST_TASKS
+    assert sum(rounds) == MAX_TASKS
 
 
 @for_each(
@@ -176,17 +176,17 @@ def test_a_place_that_is_free_is_taken_before_the_result_is_looked_at() -> None:
 def test_cores_are_those_of_the_affinity_unless_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TRILIGHT_CORES", raising=False)
     before = os.sched_getaffinity(0)
-    assert 1 <= cores_owned() <= len(before)
+    assert 1 <= available_cores() <= len(before)
     try:
         os.sched_setaffinity(0, {min(before)})
-        assert cores_owned() == 1
+        assert available_cores() == 1
     finally:
         os.sched_setaffinity(0, before)
     monkeypatch.setenv("TRILIGHT_CORES", "3")
-    assert cores_owned() == 3
+    assert available_cores() == 3
     monkeypatch.setenv("TRILIGHT_CORES", "many")
     with pytest.raises(TrilightError, match="TRILIGHT_CORES is 'many'"):
-        cores_owned()
+        available_cores()
 
 
 @for_each(

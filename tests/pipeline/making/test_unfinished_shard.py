@@ -20,12 +20,12 @@ from pipeline.making.children import ChildPool
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.pipeline import make_dataset, make_piece
-from pipeline.making.run import Run, ShardJob, TaskOutcome
+from pipeline.making.run import Run, ShardJob, TaskResult
 from pipeline.making.tasks import Piece
 from pipeline.making.unfinished_shard import UnfinishedShard
 from pipeline.shards.pack import pack_shard
 from storage import claims
-from storage.claims import claimed
+from storage.claims import hold_claim
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry, index_shard
 from storage.dataset.progress import read_progress, read_status
@@ -108,7 +108,7 @@ def test_the_first_scene_can_be_looked_at_at_once(tmp_path: Path) -> None:
 def test_what_somebody_else_is_making_is_left_to_them(tmp_path: Path) -> None:
     made: Counter[int] = Counter()
     claim = DatasetFolder(tmp_path).staged_shard(NAME) / f"{sample_key(1)}.claim"
-    with claimed(claim):
+    with hold_claim(claim):
         assert _make(tmp_path, 0, 4, made) is None
     assert made == {0: 1, 2: 1, 3: 1}
     assert _make(tmp_path, 0, 4, made) is not None  # they died; now it is free
@@ -125,7 +125,7 @@ def test_who_waits_for_others_says_for_whom(
         publication=writer, settings=settings, missing_shards=lambda: missing.pop(0)
     )
     _make(tmp_path, 1, 4, Counter())
-    with claimed(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
+    with hold_claim(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
         tasks._wait_for_others(run, 0.0)
     assert f"{sample_key(0)}.claim: waiting for 0 s for process {os.getpid()} of" in caplog.text
 
@@ -155,9 +155,9 @@ def _somebody_quicker(
     @contextlib.contextmanager
     def claimed_late(claim: Path) -> Iterator[bool]:
         if claim.name == claim_name:
-            monkeypatch.setattr(unfinished_shard, "claimed", claimed)
+            monkeypatch.setattr(unfinished_shard, "claimed", hold_claim)
             work()
-        with claimed(claim) as ours:
+        with hold_claim(claim) as ours:
             yield ours
 
     monkeypatch.setattr(unfinished_shard, "claimed", claimed_late)
@@ -212,11 +212,11 @@ class Idle:
     def __init__(self) -> None:
         self.rounds: list[int] = []
 
-    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
+    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
         self.rounds.append(0)
         for _ in tasks:
             self.rounds[-1] += 1
-            yield TaskOutcome(shards=(), scenes=0, seconds=0.0, core_s=0.0)
+            yield TaskResult(shards=(), scenes=0, seconds=0.0, core_s=0.0)
 
     def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
         raise AssertionError("not finished")
@@ -233,7 +233,7 @@ def _run(root: Path, scenes: int) -> Run:
 
 
 def _claim(folder: DatasetFolder, scene: int) -> Any:
-    return claimed(folder.staged_shard(NAME) / f"{sample_key(scene)}.claim")
+    return hold_claim(folder.staged_shard(NAME) / f"{sample_key(scene)}.claim")
 
 
 def test_waiting_for_others_takes_few_looks_and_no_tasks(
@@ -283,7 +283,7 @@ def test_what_is_free_is_what_nobody_is_at(tmp_path: Path) -> None:
     assert shard.is_free()
     stage_scene(folder.staged_shard(NAME), 3, _sample(3), [], "lossless")
     assert shard.is_free()  # to be packed
-    with claimed(folder.staged_shard(NAME) / "pack.claim"):
+    with hold_claim(folder.staged_shard(NAME) / "pack.claim"):
         assert not shard.is_free()
     pack_shard(folder, NAME, range(4))
     assert not shard.is_free()

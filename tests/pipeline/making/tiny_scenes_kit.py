@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from pipeline.executors.threads import ThreadRunner
-from pipeline.making.asked_objects import AskedObjects
+from pipeline.making.asked_objects import ObjectOptions
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.run import ShardJob
@@ -51,9 +51,9 @@ def without_rendering(
     """
     scenes: list[tuple[str, int]] = []
 
-    def accept(order: AskedObjects, *more: Any) -> AcceptedObjects:
-        if not order.publication.manifest.objects_lock_sha256:
-            order.publication.lock_objects([_locked()])
+    def accept(order: ObjectOptions, *more: Any) -> AcceptedObjects:
+        if not order.writer.manifest.objects_lock_sha256:
+            order.writer.lock_objects([_locked()])
         return AcceptedObjects(num_objects=0, num_found=1)
 
     def make(split: str, scene: int, *more: Any) -> tuple[Sample, list[Failure]]:

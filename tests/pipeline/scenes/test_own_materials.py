@@ -8,8 +8,15 @@ import pytest
 import trimesh
 
 from pipeline.scenes.own_light import with_source_emission
-from pipeline.scenes.own_materials import own_skins
-from pipeline.scenes.pieces import ScenePiece, Skin, dressed, emitter_piece, joined, object_piece
+from pipeline.scenes.own_materials import source_skins
+from pipeline.scenes.pieces import (
+    ScenePiece,
+    Skin,
+    apply_skin,
+    concatenate_pieces,
+    emitter_piece,
+    object_piece,
+)
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.redrawn import with_new_lights
 from pipeline.scenes.subdivision import subdivide
@@ -113,9 +120,9 @@ def test_as_many_objects_keep_their_own_as_stated() -> None:
     found = []
     for index in range(60):
         name = {"seed": 0, "scene_index": index, "attempt": 0}
-        skins = own_skins(entries, levels, some.materials, **name)
+        skins = source_skins(entries, levels, some.materials, **name)
         found += [skin is not None for skin in skins]
-        everybody = own_skins(entries, levels, OWN.materials, **name)
+        everybody = source_skins(entries, levels, OWN.materials, **name)
         assert all(skin is not None for skin in everybody)
     require_plausible({"own": share(found, 0.3)})
 
@@ -127,7 +134,7 @@ def test_an_object_whose_textures_break_a_law_costs_scenes_by_its_name() -> None
     skin = dataclasses.replace(level.skin, packed=(broken, *level.skin.packed[1:]))
     levels = [dataclasses.replace(level, skin=skin)]
     with pytest.raises(Rejected, match=f"^law_broken: object {entries[0].locked.uid}: .*diffuse"):
-        own_skins(entries, levels, OWN.materials, seed=0, scene_index=0, attempt=0)
+        source_skins(entries, levels, OWN.materials, seed=0, scene_index=0, attempt=0)
 
 
 def test_subdivision_moves_no_colour() -> None:
@@ -137,9 +144,9 @@ def test_subdivision_moves_no_colour() -> None:
     box, rng = SceneObject(name="box", kind="object"), np.random.default_rng(0)
     piece = object_piece(box, positions, level.faces, LOOK, rng, 30.0)
     entries, name = [pooled("a", [trimesh.creation.box()])], {"seed": 0, "scene_index": 0}
-    (skin,) = own_skins(entries, [level], OWN.materials, **name, attempt=0)
+    (skin,) = source_skins(entries, [level], OWN.materials, **name, attempt=0)
     assert skin is not None
-    whole = dressed(piece, positions, level.faces, skin)
+    whole = apply_skin(piece, positions, level.faces, skin)
     more = subdivide(whole, 100)
     assert more.skin is not None and len(more.mesh.faces) > 90
 
@@ -243,7 +250,7 @@ def _object(emission: list[list[float]], name: str = "screen") -> ScenePiece:
         textures=(first, second, third),
         emission=np.array(emission, np.float32),
     )
-    return dressed(piece, QUAD, FACES, skin)
+    return apply_skin(piece, QUAD, FACES, skin)
 
 
 def _lamp(corners: np.ndarray, radiance: tuple[float, float, float]) -> ScenePiece:
@@ -257,8 +264,8 @@ def test_an_emissive_triangle_is_the_same_lamp_to_the_last_bit() -> None:
     piece = _object([[2, 1, 0], [0, 0, 0]])
     (left,), (own,) = with_source_emission([piece], [lamp], share=0.25)
     power = 0.25 * 8.0  # areas are equal, and (2 + 1 + 0) / 3 is 1
-    ours = joined([own])
-    twin = joined([_lamp(QUAD[FACES[0]], (2 * power, power, 0.0))])
+    ours = concatenate_pieces([own])
+    twin = concatenate_pieces([_lamp(QUAD[FACES[0]], (2 * power, power, 0.0))])
     for name in ("vertex_positions", "vertex_normals", "faces", "materials", "material_index"):
         assert np.array_equal(ours[name], twin[name]), name
     assert len(left.mesh.faces) == 1 and left.skin is not None and len(left.skin.uv) == 3

@@ -16,7 +16,7 @@ from pipeline.scenes.textured_pieces import cube_coordinates, with_drawn_texture
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose, ShellPart
 from scene_templates.rooms import PATCH_FACES, SIDES, patch
-from scene_templates.rotations import rotated
+from scene_templates.rotations import rotate_points
 from scene_templates.settings import SceneSettings
 from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
@@ -96,7 +96,7 @@ def test_an_objects_texture_turns_with_it() -> None:
     found = []
     for rotation in (np.eye(3), Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix()):
         centre = np.array([0.3, -0.2, 0.5])
-        placed = rotated(corners.reshape(-1, 3), rotation) + centre
+        placed = rotate_points(corners.reshape(-1, 3), rotation) + centre
         faces = np.arange(6, dtype=np.uint32).reshape(-1, 3)
         piece = ScenePiece(
             entry=SceneObject(name="box", kind="object"),

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.making.bucket_publication import begin_dataset, joined
+from pipeline.making.bucket_publication import begin_dataset, hold_membership
 from pipeline.making.dataset_order import DatasetOrder
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import dataset_folder
@@ -181,7 +181,7 @@ def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun
     folder = dataset_folder("gs://shards/made")
     with (
         pytest.raises(TrilightError, match="^out 'gs://shards/made': .*conditional writes"),
-        joined(folder),
+        hold_membership(folder),
     ):
         begin_dataset(folder, _build(), ENVIRONMENT, 8, accept_environment=False)
     assert Bucket(place("gs://shards/made")).names() == {".staging/once"}

@@ -18,10 +18,10 @@ from tests.train.toy import write_toy_dataset
 from train.data.mixture import RECORD, Mixture, plan_mixture
 from train.data.scenes import TrainingScene
 from train.data.stream import StreamSettings
-from train.data.unusable import Unusable, first_samples
+from train.data.unusable import BadSampleCounter, first_samples
 from train.loop.checkpoints import path_of_step, read_checkpoint
 from train.run import train_run
-from train.start import Start
+from train.start import StartOptions
 
 BATCH = 4
 SETTINGS = StreamSettings(seed=1, window=2, batch_size=BATCH, resolution=16, views_per_scene=1)
@@ -109,9 +109,11 @@ def test_it_goes_on_anywhere_with_any_ranks_and_threads(
 
 def test_first_samples_come_from_every_dataset(data: TrainingData) -> None:
     shards = data.split("train")
-    shown = [sample.radiance_rgb.shape[1] for sample in first_samples(shards, 5, Unusable(0))]
+    shown = [
+        sample.radiance_rgb.shape[1] for sample in first_samples(shards, 5, BadSampleCounter(0))
+    ]
     assert shown == [16, 16, 16, 32, 32]
-    assert len(list(first_samples(data.split("validation"), 99, Unusable(0)))) == 3
+    assert len(list(first_samples(data.split("validation"), 99, BadSampleCounter(0)))) == 3
 
 
 def test_a_dataset_that_is_known_goes_on_where_it_was(roots: list[str], data: TrainingData) -> None:
@@ -153,7 +155,7 @@ def test_a_damaged_shard_is_replaced_by_its_own_datasets(tmp_path: Path) -> None
             tmp_path / name, train=4, validation=1, per_shard=2, resolution=resolution
         )
     (tmp_path / "a" / "train-000001.tar").write_bytes(b"no shard")
-    mixed, unusable = open_mixture([str(tmp_path / "a"), str(tmp_path / "b")]), Unusable(2)
+    mixed, unusable = open_mixture([str(tmp_path / "a"), str(tmp_path / "b")]), BadSampleCounter(2)
     turns = list(itertools.islice(mixture(1.0, 1.0).sources_from(0), 16))
     found = take(mixed, SETTINGS, 4, workers=2, unusable=unusable, mixture=mixture(1.0, 1.0))
     keys = itertools.chain(*keys_of(found))
@@ -180,8 +182,8 @@ def test_a_run_of_two_datasets_resumes_to_the_bit_and_takes_up_a_third(
     three = [*roots, str(tmp_path / "third")]
     digest = open_mixture(three).digest
     with pytest.raises(TrilightError, match=r"--change data=mix:[0-9a-f]{12}"):
-        train_run(settings, data=three, out=out, start=Start(resume=True))
+        train_run(settings, data=three, out=out, start=StartOptions(resume=True))
     decided = {"data": digest[:16], "data_weights": (1.0, 2.0, 1.0), "num_steps": 10}
-    train_run(settings, data=three, out=out, start=Start(resume=True, decisions=decided))
+    train_run(settings, data=three, out=out, start=StartOptions(resume=True, decisions=decided))
     header = read_checkpoint(path_of_step(out / "checkpoints", 10)).header
     assert header[RECORD]["first"] == 24 and header[RECORD]["before"] == [8, 16, 0]

@@ -26,11 +26,11 @@ from tests.train.toy import toy_sample
 from train.data.open_shards import OpenShards
 from train.data.order import (
     OrderSettings,
-    RankShare,
+    RankSlice,
     ShardWindow,
     Visit,
-    batched,
-    places_from,
+    batch_visits,
+    visits_from,
     windows_from,
 )
 
@@ -99,11 +99,11 @@ def test_the_ranks_share_out_every_batch(sizes: list[int], first: int, window: i
     """Whatever their number: each place with one rank, equally many each, nobody left out."""
     chosen = OrderSettings(seed=1, window=window)
     stream = windows_from(len(sizes), lambda shard: sizes[shard], chosen, first)
-    for batch in itertools.islice(batched(places_from(stream, first), BATCH), 3):
+    for batch in itertools.islice(batch_visits(visits_from(stream, first), BATCH), 3):
         assert [place.position for place in batch] == list(range(first, first + BATCH))
         first += BATCH
         for world in WORLDS:
-            shares = [RankShare(rank=r, world_size=world).of_batch(batch) for r in range(world)]
+            shares = [RankSlice(rank=r, world_size=world).of_batch(batch) for r in range(world)]
             assert {len(share) for share in shares} == {BATCH // world}
             assert sorted(itertools.chain(*shares), key=lambda p: p.position) == list(batch)
 
@@ -115,9 +115,9 @@ def test_each_rank_reads_few_shards_of_a_window() -> None:
     stream = windows_from(8, lambda shard: sizes[shard], chosen, 0)
     read: list[set[int]] = [set(), set()]
     samples: list[list[int]] = [[], []]
-    for batch in itertools.islice(batched(places_from(stream, 0), 64), 8):
+    for batch in itertools.islice(batch_visits(visits_from(stream, 0), 64), 8):
         for rank in range(2):
-            mine = RankShare(rank=rank, world_size=2).of_batch(batch)
+            mine = RankSlice(rank=rank, world_size=2).of_batch(batch)
             read[rank] |= {place.shard for place in mine}
             samples[rank] += [place.arrival for place in mine]
     # measured: 5 and 5 of 8; a share drawn without regard to shards needs all 8
@@ -128,12 +128,12 @@ def test_each_rank_reads_few_shards_of_a_window() -> None:
 @for_each(("rank", "world_size"), [(1, 1), (-1, 2), (0, 0)])
 def test_ranks_that_do_not_exist_are_refused(rank: int, world_size: int) -> None:
     with pytest.raises(TrilightError, match="expected a rank from 0"):
-        RankShare(rank=rank, world_size=world_size)
+        RankSlice(rank=rank, world_size=world_size)
 
 
 def test_unequal_shares_and_empty_shards_are_refused() -> None:
     with pytest.raises(TrilightError, match="batch of 10 scenes is not divisible by 4 ranks"):
-        RankShare(rank=0, world_size=4).require_equal(10)
+        RankSlice(rank=0, world_size=4).require_equal(10)
     chosen = OrderSettings(seed=0, window=1)
     with pytest.raises(TrilightError, match="all 3 shards are empty"):
         next(windows_from(3, lambda shard: 0, chosen, 0))

@@ -25,7 +25,7 @@ from tests.for_each import for_each
 from tests.model.kit import tiny_config
 from tests.train.kit import take
 from tests.train.toy import toy_sample, write_toy_dataset
-from train.data.augment import augmented
+from train.data.augment import augment_scene
 from train.data.buckets import MOST_WASTE, bucket_scenes
 from train.data.resolution import block_mean
 from train.data.scenes import TrainingScene, scene_of_views, training_scene, with_target
@@ -280,8 +280,8 @@ def test_drawn_views_are_those_of_the_whole_sample_to_the_bit(
         full = training_scene(whole, resolution, lights_apart=lights_apart)
         drawn = scene_of_views(stored, [0, 2], resolution, per_light=lights_apart)
         rows_seen += drawn.levels_L is not None
-        wanted = augmented(full, settings, np.random.default_rng(seed))
-        got = with_target(augmented(drawn, settings, np.random.default_rng(seed)))
+        wanted = augment_scene(full, settings, np.random.default_rng(seed))
+        got = with_target(augment_scene(drawn, settings, np.random.default_rng(seed)))
         assert torch.equal(got.target_VRR3, wanted.target_VRR3[[0, 2]]) and got.levels_L is None
         assert torch.equal(got.noise_V, wanted.noise_V[[0, 2]])
         for name, tensor in tensors_of(wanted.tensors).items():

@@ -23,14 +23,14 @@ from tests.for_each import for_each
 from tests.train.kit import flip_a_bit, keys_of, take
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.stream import StreamSettings
-from train.data.unusable import Unusable
+from train.data.unusable import BadSampleCounter
 
 SETTINGS = StreamSettings(seed=0, window=2, batch_size=4, resolution=8, views_per_scene=1)
 BAD_KEY = "000000002"
 
 
 def keys(
-    data: TrainingData | Dataset, unusable: Unusable, *, count: int = 4, **ranks: int
+    data: TrainingData | Dataset, unusable: BadSampleCounter, *, count: int = 4, **ranks: int
 ) -> list[list[str]]:
     part: dict[str, Any] = ranks
     return keys_of(take(data, SETTINGS, count, workers=2, unusable=unusable, **part))
@@ -63,39 +63,39 @@ def spoil_sample(dataset: Dataset, suffixes: tuple[str, ...] = ("0.exr", "1.exr"
 def test_the_first_damage_ends_the_run_or_is_replaced_whatever_the_ranks(dataset: Dataset) -> None:
     spoil_sample(dataset)
     with pytest.raises(TrilightError, match=rf"train-000001\.tar: sample {BAD_KEY}: .*OpenEXR"):
-        keys(dataset, Unusable(0))
+        keys(dataset, BadSampleCounter(0))
     spoil_sample(dataset)
-    whole = keys(dataset, Unusable(1))
-    shares = [keys(dataset, Unusable(1), rank=r, world_size=2) for r in range(2)]
+    whole = keys(dataset, BadSampleCounter(1))
+    shares = [keys(dataset, BadSampleCounter(1), rank=r, world_size=2) for r in range(2)]
     for batch, first, second in zip(whole, *shares, strict=True):
         assert sorted(batch) == sorted([*first, *second])
 
 
 def test_a_sample_is_replaced_by_the_next_of_its_shard(dataset: Dataset) -> None:
-    whole = keys(dataset, Unusable(0))
+    whole = keys(dataset, BadSampleCounter(0))
     spoil_sample(dataset)
-    unusable = Unusable(1)
+    unusable = BadSampleCounter(1)
     found = keys(dataset, unusable)
     assert found == [[key.replace(BAD_KEY, "000000003") for key in batch] for batch in whole]
     assert len(unusable.messages) == 1 and BAD_KEY in unusable.messages[0]
 
 
 def test_damage_costs_only_the_visits_that_draw_its_view(dataset: Dataset) -> None:
-    whole = keys(dataset, Unusable(0))
+    whole = keys(dataset, BadSampleCounter(0))
     visits = [(batch, row) for batch in range(4) for row in range(4)]
     replaced = list[set[tuple[int, int]]]()
     for suffix in ("0.exr", "1.exr"):
         spoil_sample(dataset, (suffix,))
-        found = keys(dataset, Unusable(1))
+        found = keys(dataset, BadSampleCounter(1))
         replaced.append({at for at in visits if found[at[0]][at[1]] != whole[at[0]][at[1]]})
     drawn = {at for at in visits if whole[at[0]][at[1]] == BAD_KEY}
     assert replaced[0] | replaced[1] == drawn and not replaced[0] & replaced[1]
 
 
 def test_a_shard_is_replaced_and_counts_with_its_samples(dataset: Dataset) -> None:
-    whole = keys(dataset, Unusable(0))
+    whole = keys(dataset, BadSampleCounter(0))
     flip_a_bit(dataset.folder.shard("train-000001.tar"))
-    unusable = Unusable(2)
+    unusable = BadSampleCounter(2)
     found = keys(dataset, unusable)
     assert [len(batch) for batch in found] == [4, 4, 4, 4]
     kept = [k for batch in whole for k in batch]
@@ -105,13 +105,13 @@ def test_a_shard_is_replaced_and_counts_with_its_samples(dataset: Dataset) -> No
         assert lost or after == before
     assert "train-000001.tar" in unusable.messages[0] and "sha256" in unusable.messages[0]
     with pytest.raises(TrilightError, match="2 samples are unusable; expected at most 1"):
-        keys(dataset, Unusable(1))
+        keys(dataset, BadSampleCounter(1))
 
 
 def test_a_list_with_an_unreadable_shard_goes_on_without_it(dataset: Dataset) -> None:
     (dataset.folder.root / "train-000001.tar").write_bytes(b"no shard at all")
     data = open_training_data([f"{dataset.folder.root}/train-{{000000..000003}}.tar"])
-    unusable = Unusable(1)
+    unusable = BadSampleCounter(1)
     found = keys(data, unusable, count=3)
     assert {key for batch in found for key in batch} == {
         f"00000000{index}" for index in (0, 1, 4, 5, 6, 7)
@@ -125,7 +125,7 @@ def test_all_unusable_ends_the_run(dataset: Dataset) -> None:
     with pytest.raises(
         TrilightError, match="no sample of 4 shards is usable. The last that was tried: "
     ):
-        keys(dataset, Unusable(10**9))
+        keys(dataset, BadSampleCounter(10**9))
 
 
 BOTH_VIEWS = StreamSettings(seed=0, window=2, batch_size=2, resolution=8, views_per_scene=2)
@@ -210,7 +210,7 @@ def write_shards(folder: Path, spoil: Callable[[Members], object], bad_samples: 
     return [f"{folder}/{BAD}", f"{folder}/{GOOD}"]
 
 
-def spoilt_keys(paths: list[str], unusable: Unusable, count: int = 5) -> set[str]:
+def spoilt_keys(paths: list[str], unusable: BadSampleCounter, count: int = 5) -> set[str]:
     found = take(open_training_data(paths), BOTH_VIEWS, count, unusable=unusable)
     return set(itertools.chain(*keys_of(found)))
 
@@ -219,13 +219,13 @@ def spoilt_keys(paths: list[str], unusable: Unusable, count: int = 5) -> set[str
 def test_a_bad_sample_costs_itself_and_is_named(tmp_path: Path, case: str) -> None:
     spoil, reason = CASES[case]
     paths = write_shards(tmp_path, spoil, bad_samples=1)
-    unusable = Unusable(1)
+    unusable = BadSampleCounter(1)
     found = spoilt_keys(paths, unusable)
     assert found == {f"00000000{index}" for index in (1, 2, 3, 4)}
     (message,) = unusable.messages
     assert message.isprintable() and f"/{BAD}: sample 000000000: " in message
     with pytest.raises(TrilightError, match=reason):
-        spoilt_keys(paths, Unusable(0))
+        spoilt_keys(paths, BadSampleCounter(0))
 
 
 def test_a_shard_that_is_all_bad_is_given_up_once(
@@ -241,7 +241,7 @@ def test_a_shard_that_is_all_bad_is_given_up_once(
         return decode(shard, row)
 
     monkeypatch.setattr(OpenShard, "stored_sample", counted)
-    unusable = Unusable(3)
+    unusable = BadSampleCounter(3)
     found = spoilt_keys(paths, unusable, count=10)
     assert found == {"000000003", "000000004"}
     assert len(unusable.messages) == 3
@@ -254,6 +254,6 @@ def test_a_scene_with_fewer_views_than_are_drawn_is_replaced(tmp_path: Path) -> 
     (tmp_path / GOOD).unlink()
     few = toy_sample(3, resolution=8, views=1)
     write_shard(tmp_path / GOOD, [(few.key, encode_sample(few))])
-    unusable = Unusable(1)
+    unusable = BadSampleCounter(1)
     assert few.key not in spoilt_keys(paths, unusable)
     assert "1 views; the run draws 2 of each scene" in unusable.messages[0]

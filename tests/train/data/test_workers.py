@@ -25,10 +25,10 @@ from tests.train.fake_card import CARD, fake_card
 from tests.train.kit import CPU, tiny_run
 from tests.train.toy import write_toy_dataset
 from train.data.arrival import CopyStream, StepScenes, decodes_on_device, step_scenes
-from train.data.order import RankShare
+from train.data.order import RankSlice
 from train.data.scenes import stored_levels
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import Unusable
+from train.data.unusable import BadSampleCounter
 from train.data.workers import MAX_THREADS, Machine, choose_workers, detect_machine
 from train.settings import AugmentationSettings
 
@@ -126,9 +126,9 @@ def steps(
         open_training_data([str(dataset.folder.root)]).split("train"),
         settings,
         0,
-        share=RankShare(),
+        rank_slice=RankSlice(),
         workers=2,
-        unusable=Unusable(0),
+        unusable=BadSampleCounter(0),
     )
     with closing(batches), closing(step_scenes(batches, float, 3, device)) as found:
         yield found

@@ -40,7 +40,7 @@ from train.loop.checkpoints import (
     save_checkpoint,
     saved_steps,
 )
-from train.loop.crew import Crew
+from train.loop.crew import DistributedContext
 from train.loop.recorder import MetricsLog
 from train.loop.state import TrainState, new_state
 from train.settings import TrainSettings
@@ -194,7 +194,7 @@ def test_a_damaged_later_one_takes_nobodys_place(tmp_path: Path) -> None:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Two(Crew):
+class Two(DistributedContext):
     """Two processes, of which the other reads another step."""
 
     other: int

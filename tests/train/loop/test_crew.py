@@ -22,7 +22,7 @@ from train.folder import RunFolder
 from train.loop import checkpoints, interrupts
 from train.loop.background import BackgroundWriter
 from train.loop.checkpoints import read_checkpoint, saved_steps
-from train.loop.crew import Crew, choose_device, join_crew
+from train.loop.crew import DistributedContext, choose_device, join_processes
 from train.loop.interrupts import deferred_interrupts
 from train.progress import TrainProgress
 
@@ -31,12 +31,12 @@ def test_without_torchrun_a_process_is_alone_and_no_missing_device_is_taken(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("WORLD_SIZE", raising=False)
-    with join_crew("cpu") as crew:
+    with join_processes("cpu") as crew:
         assert (crew.rank, crew.world_size, crew.is_first) == (0, 1, True)
         assert crew.mean([1.0, 2.0]) == [1.0, 2.0]
         assert crew.any(True) and not crew.any(False)
         assert crew.gather_text("å") == ["å"]
-        assert (crew.share.rank, crew.share.world_size) == (0, 1)
+        assert (crew.rank_slice.rank, crew.rank_slice.world_size) == (0, 1)
     assert choose_device("cpu").type == "cpu"
     with pytest.raises(TrilightError, match="device 'tpu'; expected cpu or cuda"):
         choose_device("tpu")
@@ -55,8 +55,10 @@ def test_the_first_process_of_each_machine_makes_a_thing_before_the_others(
         done.append("made")
         return 7
 
-    monkeypatch.setattr(Crew, "any", lambda *_: done.append("waited"))
-    crew = Crew(device=torch.device("cpu"), rank=8, world_size=16, local_rank=local_rank)
+    monkeypatch.setattr(DistributedContext, "any", lambda *_: done.append("waited"))
+    crew = DistributedContext(
+        device=torch.device("cpu"), rank=8, world_size=16, local_rank=local_rank
+    )
     assert crew.run_once_per_machine(made) == 7
     assert done == order.split()
 

@@ -227,7 +227,7 @@ def taken(batches: list[TrainingBatch]) -> tuple[TrainState, list[bool]]:
     state = new_state(LATE, muon_precision="float32")
     late, unread = stepper(state, LATE), []
     for each in batches:
-        unread.append(late.take([each], 3e-3))
+        unread.append(late.launch([each], 3e-3))
         state.step += 1
     return state, [report.applied for report in late.sync(unread).reports]
 
@@ -292,7 +292,7 @@ def test_a_run_that_learns_late_is_the_same_run(
 ) -> None:
     """Whatever the window; skipped steps are named with their scenes; resumed to the bit."""
     write_toy_dataset(tmp_path / "data", train=6, validation=1)
-    original = Stepper.take
+    original = Stepper.launch
 
     def spoilt(self: Stepper, batches: list[TrainingBatch], *given: Any, **rest: Any) -> Tensor:
         for each in batches if self._state.step in (1, 6) else ():

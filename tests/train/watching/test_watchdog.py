@@ -20,7 +20,7 @@ from tests.train.kit import ALONE, CPU, tiny_run, trained
 from train.data import stream
 from train.data.scenes import TrainingScene
 from train.folder import RunFolder
-from train.loop.crew import Crew, join_crew
+from train.loop.crew import DistributedContext, join_processes
 from train.progress import TrainProgress
 from train.run import train_run
 from train.watching import spikes, watchdog
@@ -82,7 +82,7 @@ def test_words_of_other_processes_are_passed_on_and_the_run_stops_if_asked(
         path.write_text("process 1 of 2: in the loader\n\nThread 1\n")
     os.utime(others, (time.time() + 60, time.time() + 60))  # written while it hangs
     os.utime(old, (0, 0))  # of an earlier call
-    pair = Crew(device=CPU, world_size=2)
+    pair = DistributedContext(device=CPU, world_size=2)
     dog = Watchdog(settings, Activity(), pair, tmp_path, note=said.append, report_hang=ended.append)
     with dog:
         dog.begin("validation", 7)
@@ -170,12 +170,12 @@ SLEEP_S = 4.0
 class Said(TrainProgress):
     """Prints notes."""
 
-    def noted(self, text: str) -> None:
+    def note(self, text: str) -> None:
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()
 
 
-def slow_from(crew: Crew) -> None:
+def slow_from(crew: DistributedContext) -> None:
     """Let the second process's loader sleep a little at each scene, and once for long."""
     made, count = stream._SceneMaker.scene, 0
 
@@ -194,10 +194,12 @@ def main(data: str, out: Path) -> None:
         scenes_per_step=2, num_steps=16, log_every=4, validate_every=16, checkpoint_every=16
     )
     stream.PREFETCHED_SCENES = 1
-    with join_crew("cpu") as crew:
+    with join_processes("cpu") as crew:
         slow_from(crew)
         watched = WatchSettings(hang_after_s=1.0, hang_factor=2.0)
-        train_run(settings, data=[data], out=out, crew=crew, watched=watched, progress=Said())
+        train_run(
+            settings, data=[data], out=out, dist_context=crew, watched=watched, progress=Said()
+        )
 
 
 if __name__ == "__main__":
