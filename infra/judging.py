@@ -31,7 +31,7 @@ from train.evaluation.report import markdown, record
 from train.evaluation.same_time import same_time
 from train.evaluation.sheet import draw_sheet, write_picture
 from train.loop.checkpoints import network_of_run
-from train.loop.crew import choose_device
+from train.loop.distributed import choose_device
 from train.loss.lpips import load_lpips
 from train.result import pretty_json
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.settings import BuildSettings
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.machine import available_cores
-from pipeline.making.pipeline import make_task, prepare_dataset
-from pipeline.making.render_children import close_children
-from pipeline.making.tasks import MAX_TASKS, TASK_S, Piece
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.machine import available_cores
+from pipeline.generation.pipeline import make_task, prepare_dataset
+from pipeline.generation.render_children import close_children
+from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.dataset.progress import read_progress

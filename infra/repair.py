@@ -8,8 +8,8 @@ from pipeline.builds.named import named_build
 from pipeline.builds.settings import differences
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.executors.threads import ThreadRunner
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.pipeline import make_dataset
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import make_dataset
 from pipeline.objects.licences import BY_USER
 from storage.dataset.asked import read_asked, value_of
 from storage.dataset.dataset import Dataset, open_dataset

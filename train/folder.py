@@ -10,7 +10,7 @@ from storage.claims import describe_holder, hold_claim
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
-    from train.loop.crew import DistributedContext
+    from train.loop.distributed import DistributedContext
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from train.evaluation.judge import Judge
 from train.evaluation.scores import Lead
 from train.evaluation.sheet import draw_validation_sheet, write_picture
 from train.folder import RunFolder
-from train.going_on import Event
 from train.loop.state import TrainState
+from train.monitoring.rows import read_rows
+from train.resume import Event
 from train.settings import TrainSettings
-from train.watching.rows import read_rows
 
 LOSS_SHARE = 20
 """Divisor of the log's rows: the start and end losses average the first and last twentieth."""

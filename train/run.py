@@ -14,29 +14,29 @@ from model.sky.known import lit_sky, require_known_sky
 from storage.dataset.mixed_data import open_mixture
 from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
-from train.beginning import init_or_resume_state, plan_start
-from train.data.arrival import decodes_on_device, step_scenes
+from train.data.bad_samples import BadSampleCounter, first_samples
+from train.data.device_prefetch import decodes_on_device, step_scenes
 from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import BadSampleCounter, first_samples
 from train.data.workers import choose_workers, detect_machine
+from train.evaluation.baselines import median_picture
 from train.evaluation.judge import Judge
-from train.evaluation.rivals import median_picture
 from train.folder import RunFolder, claim_run
+from train.initial_state import init_or_resume_state, plan_start
 from train.loop.checkpoints import saved_steps
-from train.loop.crew import DistributedContext
+from train.loop.distributed import DistributedContext
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState
 from train.loop.trainer import Trainer, scene_flops
 from train.loss.lpips import load_lpips
 from train.loss.objective import Objective
+from train.monitoring.notes import add_note
+from train.monitoring.settings import WatchSettings
+from train.monitoring.weights_and_biases import require_wandb
 from train.progress import TrainProgress
 from train.result import TrainResult, finish_run
 from train.settings import TrainSettings
-from train.start import StartOptions
-from train.watching.notes import add_note
-from train.watching.settings import WatchSettings
-from train.watching.weights_and_biases import require_wandb
+from train.start_options import StartOptions
 
 MEDIAN_SCENES = 256
 """Number of training scenes for the median picture; more would not change it."""

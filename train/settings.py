@@ -3,7 +3,7 @@
 A run is a Python function that returns all settings (train.runs); the command line picks one and
 may replace fields. Fields marked EXECUTION may differ at every resume: the weights are equal up to
 rounding, or do not depend on them. All other fields are the meaning of the run, and change only by
-a decision that the run records (train.going_on).
+a decision that the run records (train.resume).
 """
 
 from dataclasses import field

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infra.torch_library import require_torch
+from train.monitoring.settings import WatchSettings
 from train.runs import changed_run, named_run
 from train.settings import TrainSettings
-from train.start import StartOptions
-from train.watching.settings import WatchSettings
+from train.start_options import StartOptions
 
 if TYPE_CHECKING:
     from infra.judging import Judgement
@@ -81,7 +81,7 @@ def train_network(
         lpips=lpips,
     )
     start.check(settings)
-    from train.loop.crew import DistributedContext, choose_device
+    from train.loop.distributed import DistributedContext, choose_device
     from train.run import train_run
 
     result = train_run(

@@ -18,8 +18,8 @@ from infra.bench_options import BenchOptions
 from infra.rendering.held_out_scenes import composing_child
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
+from pipeline.generation.prepare_isolated import preload_mesh_libraries
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
-from pipeline.making.prepare_isolated import preload_mesh_libraries
 from storage.errors import Rejected
 from storage.records.sample import Sample, encode_sample
 from storage.records.scene import Scene

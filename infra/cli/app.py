@@ -11,8 +11,8 @@ from types import FrameType
 from cyclopts import CycloptsError
 
 from infra.cli.commands import app, complaint
-from infra.cli.extending import load_extensions
-from infra.cli.leaving import InertFormatter, leave, open_missing_streams
+from infra.cli.extend_option import load_extensions
+from infra.cli.process_exit import InertFormatter, leave, open_missing_streams
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.extensions import mistake_in_extension
 

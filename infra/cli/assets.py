@@ -28,7 +28,7 @@ from storage.settings.described import checked, describe_fields
 from storage.settings.ranges import Within
 
 if TYPE_CHECKING:
-    from pipeline.making.make_assets import AssetFolder, AssetReport
+    from pipeline.generation.make_assets import AssetFolder, AssetReport
 
 _BUDGET = 1400
 """Triangles: the finest level of the dataset presets with 1536 triangles a scene."""
@@ -68,7 +68,7 @@ def assets(options: AssetOptions, output: OutputOptions) -> None:
     source = options.source
     out = options.out
     first_words(f"Meshes of {safe_url(source)} to {out}", silent=output.json)
-    from pipeline.making.make_assets import AssetFolder, make_assets
+    from pipeline.generation.make_assets import AssetFolder, make_assets
 
     folder = AssetFolder(out)
     with progress_bars() as bars:
@@ -123,7 +123,7 @@ def _print_report(
 
 
 def _unread_rows(report: "AssetReport", folder: "AssetFolder") -> list[tuple[str, str]]:
-    from pipeline.making.unread import format_unread
+    from pipeline.generation.unread_notes import format_unread
 
     lines = format_unread(report.unread, folder.logs)
     return [("" if row else "not read", line) for row, line in enumerate(lines)]
@@ -146,7 +146,7 @@ def _material_rows(
 ) -> list[tuple[str, str]]:
     if not settings.own_materials.keep:
         return []
-    from pipeline.making.unread import format_unread
+    from pipeline.generation.unread_notes import format_unread
 
     num_kept = sum(row.colours is not None for row in report.rows)
     reasons = {row.uid: row.materials.reason for row in report.rows if row.materials}

@@ -24,7 +24,7 @@ from rich.segment import Segment
 from rich.table import Column, Table
 from rich.text import Text
 
-from infra.cli.extending import extend_words
+from infra.cli.extend_option import extend_words
 
 _OBEYED = dict.fromkeys(
     [

@@ -5,7 +5,7 @@ from typing import Any, TypeVar
 
 from infra.cli.changes import BaseSettings, all_changes, dataset_record
 from pipeline.builds.named import named_build
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.renders.settings import asked_floors
 
 Order = TypeVar("Order", bound=DatasetOrder)

@@ -9,7 +9,7 @@ from rich.text import Text
 from infra.cli.console import console, first_words, look_at, print_json, progress_bars
 from infra.cli.options import OutputOptions, command
 from infra.torch_library import require_torch
-from train.evaluation.order import EvaluationOptions
+from train.evaluation.options import EvaluationOptions
 
 
 @command("checkpoint")

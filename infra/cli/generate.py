@@ -9,7 +9,7 @@ from infra.cli.generate_progress import show_progress
 from infra.cli.generate_report import report
 from infra.cli.options import OutputOptions, command
 from pipeline.executors.registry import find_executor
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import dataset_folder
 from storage.settings.described import checked

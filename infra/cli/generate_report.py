@@ -14,7 +14,7 @@ from storage.dataset.statistics import Statistics
 from storage.records.objects import count_by_reason, read_failures, read_objects_lock
 
 if TYPE_CHECKING:
-    from pipeline.making.run import Outcome
+    from pipeline.generation.run import Outcome
 
 _MAX_NOTES = 20
 """Maximum number of notes that are printed."""

@@ -117,7 +117,7 @@ def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | N
 def _inspect_scene(source: str, turntable: Path | None, *, json: bool) -> None:
     first_words(f"Reading {source}", silent=json)
     from pipeline.exchange.open_scene import scene_source
-    from pipeline.making.inspect_scene import inspect_scene
+    from pipeline.generation.inspect_scene import inspect_scene
 
     result = inspect_scene(scene_source(source), turntable)
     if json:

@@ -11,7 +11,7 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.options import OutputOptions, command
-from infra.leaderboard.order import LeaderboardOptions
+from infra.leaderboard.options import LeaderboardOptions
 from infra.torch_library import require_torch
 from storage.remote.safe_url import safe_url
 

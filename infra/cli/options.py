@@ -19,7 +19,7 @@ from typing import Annotated, Any
 from cyclopts import Group, Parameter, Token
 
 from infra.cli.completion import NAMES
-from infra.cli.extending import resolve_reference
+from infra.cli.extend_option import resolve_reference
 from infra.cli.words import FileName, choices_of, is_repeated, kind_of, takes_names, value_of
 from storage.errors import TrilightError
 from storage.settings.described import FieldDescription, checked, describe_fields, option_of

@@ -15,11 +15,11 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.dataset_changes import with_base_settings
-from infra.cli.leaving import temporary_folder
 from infra.cli.options import OutputOptions, command
-from pipeline.making.dataset_order import DatasetOrder, generate_words
-from pipeline.making.machine import available_cores
-from pipeline.making.price import CorePrice
+from infra.cli.process_exit import temporary_folder
+from pipeline.generation.dataset_order import DatasetOrder, generate_words
+from pipeline.generation.machine import available_cores
+from pipeline.generation.price import CorePrice
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
 from storage.settings.described import checked

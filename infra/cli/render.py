@@ -8,7 +8,7 @@ from rich.text import Text
 
 from infra.cli.console import progress_bars
 from infra.cli.options import OutputOptions, command
-from infra.rendering.request import RenderOptions
+from infra.rendering.options import RenderOptions
 
 if TYPE_CHECKING:
     from infra.rendering.ways import Choice

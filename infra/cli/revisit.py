@@ -5,7 +5,7 @@ from infra.cli.console import first_words
 from infra.cli.dataset_changes import with_base_settings
 from infra.cli.generate import ExecutorOptions, make
 from infra.cli.options import OutputOptions, command
-from pipeline.making.revisit_order import RevisitOptions, revisit_order
+from pipeline.generation.revisit_options import RevisitOptions, revisit_order
 
 
 @command("dataset")

@@ -17,7 +17,7 @@ from infra.cli.console import (
 )
 from infra.cli.options import OutputOptions, command
 from pipeline.shards.derive import DeriveOptions
-from pipeline.shards.finished import open_finished
+from pipeline.shards.finished_dataset import open_finished
 from pipeline.shards.listing import list_scenes as read_scene_rows
 from pipeline.shards.plans import Selection
 from storage.errors import TrilightError
@@ -141,7 +141,7 @@ def reshard(options: ReshardOptions, new: NewDatasetOptions, output: OutputOptio
 
 def _run(datasets: Sequence[Path], derive: DeriveOptions, out: Path, *, as_json: bool) -> None:
     first_words(f"Making {out}", silent=as_json)
-    from pipeline.making.derive_dataset import derive_dataset  # slow: matplotlib
+    from pipeline.generation.derive_dataset import derive_dataset  # slow: matplotlib
 
     places = [str(path) for path in datasets]
     with progress_bars() as bars:

@@ -14,7 +14,7 @@ from infra.cli.console import (
     print_rows,
 )
 from infra.cli.options import OutputOptions, command
-from pipeline.making.price import CorePrice
+from pipeline.generation.price import CorePrice
 from storage.dataset.progress import DatasetStatus, missing_shards, read_status
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges

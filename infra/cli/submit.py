@@ -13,7 +13,7 @@ from infra.cli.submit_array import ARRAYS, ArrayOptions, submit_to_array
 from pipeline.executors.array_job import DatasetByArray
 from pipeline.executors.kubernetes_array import KubernetesOptions
 from pipeline.flows.prefect_server import load_prefect
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.settings.described import checked
 

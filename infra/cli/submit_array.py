@@ -13,7 +13,7 @@ from pipeline.executors.kubernetes_array import (
     write_manifest,
 )
 from pipeline.executors.slurm_array import sbatch_command, sbatch_environment, submit_array
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
 from storage.settings.described import checked

@@ -17,18 +17,18 @@ from infra.cli.console import console, look_at, print_rows, progress_bars
 from infra.cli.options import OutputOptions, command
 from infra.run_record import tensorboard_command
 from infra.torch_library import require_torch
-from infra.train_order import TrainOptions
+from infra.train_options import TrainOptions
 from storage.errors import TrilightError
 from storage.installation import child_environment
 from storage.settings.described import option_words
+from train.monitoring.settings import WatchSettings
 from train.progress import TrainProgress
 from train.runs import named_run, scale_intervals
 from train.settings import TrainSettings
-from train.watching.settings import WatchSettings
 
 if TYPE_CHECKING:
-    from train.going_on import Event
     from train.result import TrainResult
+    from train.resume import Event
 
 
 class _BarProgress(TrainProgress):
@@ -136,7 +136,7 @@ def _run_training(
 ) -> "TrainResult | None":
     """Train by `train.run.train_run`; imports torch, which takes seconds."""
     require_torch("train")
-    from train.loop.crew import join_processes
+    from train.loop.distributed import join_processes
     from train.loop.interrupts import Stopped
     from train.run import train_run
 

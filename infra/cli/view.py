@@ -34,7 +34,7 @@ class ViewOptions:
 @command("source")
 def view(options: ViewOptions) -> None:
     first_words(f"Opening {safe_url(options.source)}")
-    from infra.viewer.later import DeferredHandlers, page_of
+    from infra.viewer.deferred_handlers import DeferredHandlers, page_of
     from infra.viewer.server import PageServer
 
     if options.checkpoint is not None:

@@ -18,7 +18,7 @@ from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
 from storage.records.sample import Sample
 from storage.seeds import rng_for
-from train.data.unusable import BadSampleCounter, first_samples
+from train.data.bad_samples import BadSampleCounter, first_samples
 from train.evaluation.judge import ValidationScene, validation_scene
 from train.evaluation.judged_view import JudgedView, scene_facts
 from train.evaluation.metrics import METRICS, noise_floors, picture_scores

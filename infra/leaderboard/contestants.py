@@ -31,7 +31,7 @@ from storage.records.scene import Scene
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
-    from train.evaluation.rivals import Baselines
+    from train.evaluation.baselines import Baselines
 
 TRACED_LIGHT = KINDS[1]
 TRACER = KINDS[2]

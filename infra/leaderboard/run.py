@@ -23,7 +23,7 @@ from infra.leaderboard.contestants import (
     NetworkContestant,
     SampledContestant,
 )
-from infra.leaderboard.order import LeaderboardOptions
+from infra.leaderboard.options import LeaderboardOptions
 from infra.leaderboard.page import page, pairs_csv, standings_csv
 from infra.leaderboard.picture_folder import folder_contestants
 from infra.leaderboard.rows import BoardRows

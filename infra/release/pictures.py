@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from infra.rendering.cameras import own_camera
 from infra.rendering.engines import Engine, MitsubaPlan, NeuralPlan
 from model.weights import MAX_LIGHTS
-from pipeline.documents.chosen import ChosenScene, choose_scenes, read_chosen
+from pipeline.documents.scene_choice import ChosenScene, choose_scenes, read_chosen
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.variant import choose_variant
 from storage.conventions import SPLITS

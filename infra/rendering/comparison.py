@@ -14,7 +14,7 @@ from infra.rendering.look import Look, display_pixels, enlarge
 from pipeline.exchange.formats import FORMATS, SceneSource
 from storage.conventions import log10_radiance
 from storage.metrics import flicker_log_db, psnr_log_db
-from train.evaluation.error_colours import ERROR_WHITE, error_picture
+from train.evaluation.error_colors import ERROR_WHITE, error_picture
 
 _CAPTION_PX = 24
 _GAP_PX = 8

@@ -23,7 +23,7 @@ from storage.records.scene import Scene
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
-    from pipeline.making.path_tracer import PathTracer
+    from pipeline.generation.path_tracer import PathTracer
     from pipeline.renders.results import Sampling
 
 Fact = str | int | float
@@ -98,7 +98,7 @@ class MitsubaPlan:
     name: str = "mitsuba"
 
     def start(self, sampled: "Callable[[Sampling], None]") -> "MitsubaEngine":
-        from pipeline.making.path_tracer import PathTracer
+        from pipeline.generation.path_tracer import PathTracer
 
         tracer = PathTracer(
             self.settings,

@@ -11,12 +11,12 @@ from pathlib import Path
 
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
+from pipeline.generation.accept_objects import accept_objects
+from pipeline.generation.attempt_scene import MAX_ATTEMPTS, SceneRecipe, assets_of, set_up_child
+from pipeline.generation.begin_dataset import begin
+from pipeline.generation.environment import environment
+from pipeline.generation.object_options import ObjectOptions
 from pipeline.isolation import ChildLimits, IsolatedChild
-from pipeline.making.accept_objects import accept_objects
-from pipeline.making.asked_objects import ObjectOptions
-from pipeline.making.attempt_scene import MAX_ATTEMPTS, SceneRecipe, assets_of, set_up_child
-from pipeline.making.begin_publication import begin
-from pipeline.making.environment import environment
 from pipeline.renders.variant import choose_variant
 from pipeline.scenes.compose import compose_scene
 from scene_templates.settings import SceneSettings

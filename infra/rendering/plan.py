@@ -9,8 +9,8 @@ from pathlib import Path
 from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, pair_cameras
 from infra.rendering.engines import EnginePlan, MitsubaPlan, NeuralPlan
 from infra.rendering.look import Look
-from infra.rendering.places import OutputPaths, output_paths
-from infra.rendering.request import EngineChoice, RenderOptions
+from infra.rendering.options import EngineChoice, RenderOptions
+from infra.rendering.output_paths import OutputPaths, output_paths
 from infra.rendering.sources import scene_sources
 from infra.rendering.way_table import known_costs, shipped_table
 from infra.rendering.ways import Choice, Way, chosen_way, priced_ways

@@ -12,6 +12,7 @@ from infra.rendering.cameras import own_camera
 from infra.rendering.comparison import Flicker, Frame, comparison_sheet, flicker, log_error
 from infra.rendering.engines import Engine, OpenedScene
 from infra.rendering.look import Look, display_pixels
+from infra.rendering.options import RenderOptions
 from infra.rendering.picture_file import (
     PictureFile,
     PictureKey,
@@ -20,7 +21,6 @@ from infra.rendering.picture_file import (
     write_picture,
 )
 from infra.rendering.plan import RenderPlan, Shot, plan_render
-from infra.rendering.request import RenderOptions
 from infra.rendering.video import write_video
 from infra.rendering.ways import Choice
 from pipeline.documents.png import encode_png

@@ -12,11 +12,11 @@ from prefect import flow
 from prefect.concurrency.sync import concurrency
 from prefect.logging import get_run_logger
 
-from infra.train_order import TrainOptions
+from infra.train_options import TrainOptions
 from pipeline.flows.forms import PublicUrl, changed_values, changes_form, parameters_of
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.process import run_to_end
-from pipeline.making.machine import visible_gpus
+from pipeline.generation.machine import visible_gpus
 from storage.errors import TrilightError
 from train.runs import RUNS, smoke
 from train.settings import TrainSettings

@@ -7,11 +7,11 @@ from infra.setup.command_line_page import command_line_page
 from infra.setup.settings_page import settings_page
 from pipeline.documents.markdown import table
 from pipeline.shards.expression import TEXTS
+from scene_templates.recorded_sampler import RecordedDraw
 from scene_templates.skies.draw import SkyMapSettings
 from scene_templates.skies.draws import PALEST, SkyDraws
 from scene_templates.skies.families import OUR_SKIES, SKIES
 from scene_templates.skies.texels import SkyTexels
-from scene_templates.stated_draws import RecordedDraw
 from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.surfaces.draws import LEAST_TINT, SurfaceDraws
 from scene_templates.surfaces.families import OUR_SURFACES, SURFACES

@@ -3,13 +3,13 @@
 import os
 from pathlib import Path
 
-from infra.viewer.dataset_room import DatasetHandlers
-from infra.viewer.folder_room import FolderHandlers, handlers_of_scene
-from infra.viewer.later import PageHandlers, page_of
+from infra.viewer.dataset_handlers import DatasetHandlers
+from infra.viewer.deferred_handlers import PageHandlers, page_of
+from infra.viewer.folder_handlers import FolderHandlers, handlers_of_scene
 from infra.viewer.scene_list import scene_list
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
-from pipeline.making.progressive_tracer import ProgressiveTracer
+from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders.variant import choose_variant
 from storage.dataset.dataset import open_dataset
 

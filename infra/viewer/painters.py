@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.viewer.wanted import PictureOptions
+from infra.viewer.picture_options import PictureOptions
 from pipeline.documents.scene_passes import PASS_VIEWS, PassView
-from pipeline.making.progressive_tracer import ProgressiveTracer
+from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders.preview import usual_filter
 from pipeline.renders.results import GrowingPicture, Sampling
 from pipeline.renders.settings import FIRST_SPP, RenderSettings, one_picture

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from model.hits.textures import SurfaceTextures
 from model.hits.vectors import Floats, as_rows, brightest, dot, unit
-from model.sky.drawn import SkySampler
+from model.sky.sampler import SkySampler
 from storage.records.environment import Environment
 from storage.records.lobes import lobes_of
 from storage.records.material import EMISSION, ROUGHNESS

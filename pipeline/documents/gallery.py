@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 
-from pipeline.documents.chosen import ChosenScene, choose_scenes, read_chosen
 from pipeline.documents.gallery_controls import (
     CardFacts,
     card_attributes,
@@ -10,6 +9,7 @@ from pipeline.documents.gallery_controls import (
     gallery_controls,
 )
 from pipeline.documents.html import Markup, element, image, join_markup, png_uri
+from pipeline.documents.scene_choice import ChosenScene, choose_scenes, read_chosen
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, preview
 from storage.atomic import write_atomically
 from storage.conventions import preview_gain

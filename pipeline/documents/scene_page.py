@@ -19,7 +19,7 @@ from pipeline.documents.html import (
     png_uri,
     table,
 )
-from pipeline.documents.pass_colours import id_colors
+from pipeline.documents.pass_colors import id_colors
 from pipeline.documents.scene_maps import MAPS_STYLE, maps_section
 from pipeline.documents.scene_passes import PASSES_STYLE, passes_section
 from storage.conventions import preview_gain, preview_srgb8, srgb8

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.documents.html import Markup, element, enlargeable, png_uri
-from pipeline.documents.pass_colours import (
+from pipeline.documents.pass_colors import (
     albedo_colors,
     depth_grays,
     finite_range,

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from pipeline.documents.chosen import choose_scenes, read_chosen
 from pipeline.documents.png import encode_png
+from pipeline.documents.scene_choice import choose_scenes, read_chosen
 from storage.atomic import write_atomically
 from storage.conventions import preview_gain, preview_srgb8
 from storage.dataset.dataset import Dataset

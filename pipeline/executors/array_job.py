@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pipeline.builds.named import BUILDS, named_build
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.dataset import dataset_files
 from storage.dataset.layout import dataset_folder
 from storage.dataset.progress import missing_shards

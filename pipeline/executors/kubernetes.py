@@ -13,9 +13,9 @@ import os
 from collections.abc import Mapping
 
 from pipeline.executors.threads import ThreadRunner
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.pipeline import make_dataset
-from pipeline.making.run import Outcome
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import make_dataset
+from pipeline.generation.run import Outcome
 from storage.errors import TrilightError
 from storage.number_ranges import MOST_NUMBERS, numbers_of
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar
 import yaml
 
 from pipeline.executors.array_job import ArrayJob
-from pipeline.making.dataset_order import DatasetOrder, generate_words
+from pipeline.generation.dataset_order import DatasetOrder, generate_words
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex
 from storage.errors import TrilightError

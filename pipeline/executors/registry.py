@@ -1,8 +1,8 @@
 """The executors that run a dataset's tasks, by the name that `--runner` takes.
 
-Each executor is a module with a function `make`; the engine (pipeline.making) imports none of them.
+Each executor is a module with a function `make`; the engine (pipeline.generation) imports none.
 `make` narrows the options or begins a flow, and then calls `make_dataset` with a `Runner`
-(pipeline.making.runner).
+(pipeline.generation.runner).
 """
 
 from collections.abc import Callable
@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.errors import TrilightError, expected_one_of
 from storage.installation import module_name
 from storage.registry import Registry
 
 if TYPE_CHECKING:
-    from pipeline.making.run import Outcome
+    from pipeline.generation.run import Outcome
 
 Make = Callable[[DatasetOrder, str | None], "Outcome"]
 

@@ -11,10 +11,10 @@ import os
 from collections.abc import Callable, Mapping
 
 from pipeline.executors.threads import ThreadRunner
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.pipeline import make_dataset, prepare_dataset
-from pipeline.making.run import Outcome
-from pipeline.making.tasks import shard_ranges
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import make_dataset, prepare_dataset
+from pipeline.generation.run import Outcome
+from pipeline.generation.tasks import shard_ranges
 from storage.errors import TrilightError
 
 

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.pipeline import make_dataset, make_task
-from pipeline.making.run import Outcome, ShardJob, TaskResult
-from pipeline.making.runner import in_window
-from pipeline.making.tasks import Piece
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import make_dataset, make_task
+from pipeline.generation.run import Outcome, ShardJob, TaskResult
+from pipeline.generation.runner import in_window
+from pipeline.generation.tasks import Piece
 from storage.dataset.statistics import Statistics
 
 

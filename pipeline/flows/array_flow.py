@@ -24,7 +24,7 @@ from pipeline.executors.kubernetes_array import options_from_environment, submit
 from pipeline.executors.slurm_array import submit_array
 from pipeline.flows.forms import parameters_of
 from pipeline.flows.orders import DATASET_FORMS, order_of, run_name
-from pipeline.flows.watching import BestEffort, small_picture
+from pipeline.flows.run_artifacts import BestEffort, small_picture
 from storage.dataset.layout import dataset_folder
 from storage.dataset.progress import DatasetStatus, missing_shards, read_status
 from storage.errors import TrilightError

@@ -16,11 +16,11 @@ from pipeline.flows.orders import (
     run_name,
 )
 from pipeline.flows.prefect_runner import PrefectRunner
-from pipeline.flows.watching import make_with_artifacts
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.pipeline import prepare_dataset
-from pipeline.making.run import Outcome
-from pipeline.making.tasks import shard_ranges
+from pipeline.flows.run_artifacts import make_with_artifacts
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import prepare_dataset
+from pipeline.generation.run import Outcome
+from pipeline.generation.tasks import shard_ranges
 from storage.dataset.progress import read_status
 
 

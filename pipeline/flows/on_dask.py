@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.flows.on_prefect import as_flow
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.render_children import close_idle_children
-from pipeline.making.run import Outcome
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.render_children import close_idle_children
+from pipeline.generation.run import Outcome
 from storage.atomic import write_atomically
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError

@@ -6,11 +6,11 @@ The server is the one of PREFECT_API_URL; where that is not set, a private one f
 from typing import TYPE_CHECKING, Any
 
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 
 if TYPE_CHECKING:
     from pipeline.flows.prefect_runner import PrefectRunner
-    from pipeline.making.run import Outcome
+    from pipeline.generation.run import Outcome
 
 
 def make(order: DatasetOrder, address: str | None) -> "Outcome":
@@ -28,7 +28,7 @@ def as_flow(order: DatasetOrder, runner: "PrefectRunner", **options: Any) -> "Ou
     """Make a dataset as a flow run, with its artifacts; `options` are Prefect's of a flow."""
     from prefect import flow
 
-    from pipeline.flows.watching import make_with_artifacts
+    from pipeline.flows.run_artifacts import make_with_artifacts
 
     def generate() -> "Outcome":
         return make_with_artifacts(order, runner)

@@ -10,7 +10,7 @@ from pipeline.flows.forms import (
     PublicUrl,
     changed_values,
 )
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.shard_places import MAX_SHARDS
 from storage.errors import TrilightError
 from storage.settings.described import checked

@@ -1,6 +1,6 @@
 """`PrefectRunner`: runs a dataset's tasks as Prefect tasks, with retries after transient errors.
 
-A task run is some minutes of scenes (pipeline.making.tasks). Native code runs in our own child
+A task run is some minutes of scenes (pipeline.generation.tasks). Native code runs in our own child
 processes, never in a process pool of Prefect's, which a single segfault breaks entirely.
 """
 
@@ -16,10 +16,10 @@ from prefect.futures import PrefectFuture, as_completed
 from prefect.tasks import Task, exponential_backoff
 
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
-from pipeline.making.pipeline import make_task
-from pipeline.making.run import ShardJob, TaskResult
-from pipeline.making.runner import in_window
-from pipeline.making.tasks import Piece
+from pipeline.generation.pipeline import make_task
+from pipeline.generation.run import ShardJob, TaskResult
+from pipeline.generation.runner import in_window
+from pipeline.generation.tasks import Piece
 from pipeline.renders.variant import choose_variant
 from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure

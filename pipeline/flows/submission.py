@@ -1,7 +1,7 @@
 """Submits a flow run to a Prefect server and polls its state and artifacts.
 
 The deployment is found by the flow's name alone, while Prefect needs FLOW/DEPLOYMENT. Prefect shows
-only states; the progress of a run is in its artifacts (pipeline.flows.watching).
+only states; the progress of a run is in its artifacts (pipeline.flows.run_artifacts).
 """
 
 import json

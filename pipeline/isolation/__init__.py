@@ -7,6 +7,7 @@
 - `deaths`: the ways a call can fail, the number of retries, and which failures are verdicts.
 """
 
+from pipeline.isolation.call_failures import ChildFailed, Result, is_transient, with_retries
 from pipeline.isolation.child import (
     ChildClosed,
     ChildLimits,
@@ -14,9 +15,8 @@ from pipeline.isolation.child import (
     call_with_retries,
     preload,
 )
+from pipeline.isolation.child_main import die_with_parent
 from pipeline.isolation.confinement import NO_FILES, Reach, reach
-from pipeline.isolation.deaths import ChildFailed, Result, is_transient, with_retries
-from pipeline.isolation.inside import die_with_parent
 
 __all__ = [
     "ChildClosed",

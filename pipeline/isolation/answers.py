@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.isolation.deaths import ENDS, ChildFailed
+from pipeline.isolation.call_failures import ENDS, ChildFailed
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.remote.safe_url import escape_lines
 
@@ -77,7 +77,7 @@ def decode_answer(parts: list[NDArray[np.uint8]], function: Callable[..., Any]) 
         ChildFailed: the function raised another error; or `nonsense`, if the bytes are no answer.
         MemoryError: this process has no memory for it.
     """
-    from pipeline.isolation.declared import first_wrong, result_reader  # children do without
+    from pipeline.isolation.result_schema import first_wrong, result_reader  # children do without
 
     try:
         heads = [part.tobytes() for part in parts[:2] if len(part) <= MOST_HEAD_BYTES]

@@ -22,10 +22,10 @@ from types import ModuleType
 from typing import Any
 
 from pipeline.isolation.answers import decode_answer
+from pipeline.isolation.call_failures import ChildFailed, Result, with_retries
+from pipeline.isolation.child_main import serve
 from pipeline.isolation.confinement import Reach, code_of, confine, should_confine
-from pipeline.isolation.deaths import ChildFailed, Result, with_retries
 from pipeline.isolation.frames import TooLong, receive, send, wait_within
-from pipeline.isolation.inside import serve
 from pipeline.isolation.waiting import CallTime
 from storage.errors import EnvironmentFailure
 from storage.extensions import load_same, loaded_files
@@ -176,7 +176,7 @@ class IsolatedChild:
     def _exchange(
         self, function: Callable[..., Result], args: tuple[Any, ...], wall_s: float
     ) -> Result:
-        from pipeline.isolation.declared import result_reader  # children do without
+        from pipeline.isolation.result_schema import result_reader  # children do without
 
         assert self._connection is not None
         result_reader(function)  # raises first if the declared result type cannot be checked

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pipeline.isolation.deaths import ChildFailed
+from pipeline.isolation.call_failures import ChildFailed
 
 log = logging.getLogger("trilight.children")
 

@@ -12,9 +12,6 @@ import numpy as np
 from pipeline.scenes.budget import levels_within
 from pipeline.scenes.drawn_columns import with_drawn_columns
 from pipeline.scenes.fitting import draw_rows
-from pipeline.scenes.laws import require_valid
-from pipeline.scenes.own_light import with_source_emission
-from pipeline.scenes.own_materials import source_skins
 from pipeline.scenes.pieces import (
     ScenePiece,
     Skin,
@@ -26,15 +23,18 @@ from pipeline.scenes.pieces import (
 )
 from pipeline.scenes.pool import PooledAsset, fits_of
 from pipeline.scenes.posing import pose_points
+from pipeline.scenes.scene_checks import require_valid
 from pipeline.scenes.shapes import MeshShape
+from pipeline.scenes.source_emission import with_source_emission
+from pipeline.scenes.source_materials import source_skins
 from pipeline.scenes.subdivision import fill_triangles
 from pipeline.scenes.textured_pieces import with_drawn_textures
 from pipeline.scenes.views import with_first_cameras
 from scene_templates.layout import Layout
 from scene_templates.layout_rand import ScenePlan, layout_rand, scene_plan
-from scene_templates.own_maps import NO_OWN_MAPS, OwnMaps
 from scene_templates.settings import SceneSettings
 from scene_templates.skies.drawn_scene import scene_sky
+from scene_templates.user_maps import NO_OWN_MAPS, OwnMaps
 from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.retextured import without_constant_textures

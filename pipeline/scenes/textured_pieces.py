@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import ScenePiece, Skin, with_skin
 from scene_templates.layout import Layout
-from scene_templates.own_maps import UserMap, UserTexture
 from scene_templates.surfaces.maps import SurfaceMaps
 from scene_templates.textures import MOST_TEXTURED, TexturedLook, TextureSettings, draw_look
+from scene_templates.user_maps import UserMap, UserTexture
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.records.texture import Texture
 from storage.seeds import rng_for

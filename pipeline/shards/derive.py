@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pipeline.shards.finished import FinishedDataset, SampleReader
+from pipeline.shards.finished_dataset import FinishedDataset, SampleReader
 from pipeline.shards.plans import (
     SelectedScene,
     Selection,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.shards.finished import FinishedDataset
+from pipeline.shards.finished_dataset import FinishedDataset
 from pipeline.shards.plans import Selection, select_scenes
 from storage.records.quantities import QUANTITIES
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from pipeline.shards.expression import Condition, condition
-from pipeline.shards.finished import FinishedDataset, SampleReader, SceneFacts, read_facts
+from pipeline.shards.finished_dataset import FinishedDataset, SampleReader, SceneFacts, read_facts
 from storage.conventions import SPLITS
 from storage.dataset.derived import derivation_of
 from storage.errors import TrilightError

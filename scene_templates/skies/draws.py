@@ -3,8 +3,8 @@
 import numpy as np
 
 from scene_templates.exact import Numbers
+from scene_templates.recorded_sampler import RecordedSampler
 from scene_templates.skies.colour import planckian_rgb
-from scene_templates.stated_draws import RecordedSampler
 
 PALEST = 0.1
 """Least channel of a coloured light before its mean is made 1: no light is quite monochrome."""

@@ -5,7 +5,7 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.stated_draws import RecordedSampler
+from scene_templates.recorded_sampler import RecordedSampler
 from scene_templates.surfaces.maps import Finish, finish
 
 RGB = tuple[float, float, float]

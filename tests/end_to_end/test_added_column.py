@@ -19,8 +19,8 @@ from model.open import open_network, save_published
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import load_source, scene_source
-from pipeline.making.inspect_scene import _facts
-from pipeline.making.path_tracer import PathTracer
+from pipeline.generation.inspect_scene import _facts
+from pipeline.generation.path_tracer import PathTracer
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.dataset.dataset import Dataset
@@ -37,10 +37,10 @@ from tests.scenes_by_hand import FLOOR, tiny_scene
 from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.augment import permute_channels, scale_light
+from train.data.bad_samples import BadSampleCounter
 from train.data.order import RankSlice
 from train.data.scenes import training_scene
 from train.data.stream import stream_batches
-from train.data.unusable import BadSampleCounter
 from train.loop.checkpoints import network_of_run
 from train.loop.state import new_state
 from train.run import stream_settings

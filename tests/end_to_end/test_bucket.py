@@ -13,7 +13,7 @@ from tests.conftest import ROOT
 from tests.end_to_end.production_kit import FEW_SAMPLES, FEW_SAMPLES_CHANGES, call
 from tests.http_server import serve
 from tests.pipeline.assets.meshes_by_hand import knot, write_obj
-from tests.pipeline.making.bucket_kit import empty_bucket
+from tests.pipeline.generation.bucket_kit import empty_bucket
 from tests.s3_server import control, s3_server
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")

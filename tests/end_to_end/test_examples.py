@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from infra.cli.extending import load_extensions
+from infra.cli.extend_option import load_extensions
 from model.config import SIZES, ModelConfig
 from pipeline.builds.named import BUILDS, named_build, typed_build
 from pipeline.exchange.convert import write_scene

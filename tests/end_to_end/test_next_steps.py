@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from infra.cli.leaving import temporary_folder
+from infra.cli.process_exit import temporary_folder
 from storage.dataset.manifest import read_manifest
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import Trilight, command

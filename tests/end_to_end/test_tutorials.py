@@ -20,7 +20,7 @@ import pytest
 
 from infra.leaderboard.contestants import TRACER
 from infra.release.__main__ import main as release
-from infra.viewer.later import page_of
+from infra.viewer.deferred_handlers import page_of
 from infra.viewer.open_source import open_handlers
 from pipeline.builds.named import named_build
 from storage.dataset.verify import verify_dataset

@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.making.pipeline import make_dataset
-from pipeline.making.run import ShardJob, TaskResult
-from pipeline.making.tasks import Piece
+from pipeline.generation.pipeline import make_dataset
+from pipeline.generation.run import ShardJob, TaskResult
+from pipeline.generation.tasks import Piece
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.scene_logs import decode_scene_log
@@ -33,7 +33,7 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.sample import sample_key
 from tests.for_each import case
-from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
+from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 from tests.train.kit import keys_of, take
 from tests.train.toy import write_toy_dataset
 from train.data.order import OrderSettings, batch_visits, visits_from, windows_from

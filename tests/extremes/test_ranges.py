@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.leaderboard.order import LeaderboardOptions
-from infra.rendering.request import RenderOptions
+from infra.leaderboard.options import LeaderboardOptions
+from infra.rendering.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from infra.setup.settings_page import ROOTS, reachable
 from model.base_widths import BaseWidths
@@ -27,8 +27,8 @@ from pipeline.builds.named import named_build
 from pipeline.builds.revisit import GivenCamera, RevisitSettings
 from pipeline.builds.settings import BuildSettings
 from pipeline.flows.orders import DatasetInRuns
-from pipeline.making.price import CorePrice
-from pipeline.making.revisit_order import RevisitOptions
+from pipeline.generation.price import CorePrice
+from pipeline.generation.revisit_options import RevisitOptions
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from scene_templates.cameras import CameraSettings
 from scene_templates.families import Family
@@ -54,10 +54,10 @@ from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import textured_scene
-from train.evaluation.order import EvaluationOptions
+from train.evaluation.options import EvaluationOptions
+from train.monitoring.settings import WatchSettings
 from train.runs import named_run
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
-from train.watching.settings import WatchSettings
 
 End = Literal["low", "high"]
 

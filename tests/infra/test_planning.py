@@ -8,16 +8,16 @@ import pytest
 from infra import doctor
 from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict
 from pipeline.executors.threads import ThreadRunner
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.machine import available_cores
+from pipeline.generation.pipeline import make_dataset
+from pipeline.generation.tasks import MAX_TASKS
 from pipeline.isolation import confinement
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.machine import available_cores
-from pipeline.making.pipeline import make_dataset
-from pipeline.making.tasks import MAX_TASKS
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.shard import scan_members
 from tests.for_each import case
-from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
+from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
 def _measured(core_s: tuple[float, ...], num_bytes: int = 150_000) -> MeasuredScenes:
@@ -81,7 +81,7 @@ def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
     """Ten scenes reach the third shard, which is for validation. The clock moves on by 1000 s for
     the first scene, which a prediction leaves out, and by its number for each other one."""
     clock = _Clock()
-    monkeypatch.setattr("pipeline.making.pipeline.time", clock)
+    monkeypatch.setattr("pipeline.generation.pipeline.time", clock)
 
     def work(scene: int) -> None:
         clock.now += scene or 1000

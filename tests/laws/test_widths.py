@@ -22,7 +22,7 @@ from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
-from train.loop.crew import DistributedContext
+from train.loop.distributed import DistributedContext
 from train.loop.state import new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective

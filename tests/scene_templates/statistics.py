@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from scene_templates.stated_draws import RecordedDraw
+from scene_templates.recorded_sampler import RecordedDraw
 
 FALSE_ALARM = 1e-6
 """Probability that any p-value of the whole suite falls below LEVEL although all is as stated."""

@@ -28,7 +28,7 @@ from storage.remote.url import RemoteUrl, parse_url
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from train.folder import RunFolder, claim_run
-from train.loop.crew import DistributedContext
+from train.loop.distributed import DistributedContext
 
 HOLD = """
 import sys, time

@@ -12,12 +12,12 @@ import torch
 from model.config import ModelConfig
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import TrainingData, open_training_data
+from train.data.bad_samples import BadSampleCounter
 from train.data.mixture import Mixture
 from train.data.order import RankSlice
 from train.data.scenes import TrainingScene
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import BadSampleCounter
-from train.loop.crew import DistributedContext
+from train.loop.distributed import DistributedContext
 from train.loop.state import TrainState
 from train.loop.step import Stepper
 from train.loss.objective import Objective
@@ -25,7 +25,7 @@ from train.progress import TrainProgress
 from train.result import TrainResult
 from train.run import train_run
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
-from train.start import StartOptions
+from train.start_options import StartOptions
 
 CPU = torch.device("cpu")
 ALONE = DistributedContext(device=CPU)

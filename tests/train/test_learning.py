@@ -49,19 +49,19 @@ from tests.train.toy import (
 )
 from train.data.buckets import make_batch
 from train.data.scenes import TrainingScene, training_scene
+from train.evaluation.baselines import MEDIAN, NEAREST
 from train.evaluation.evaluate import EvalConfig, judge_views, make_baselines
 from train.evaluation.judge import predict
 from train.evaluation.judged_view import NETWORK, summarize_views
-from train.evaluation.rivals import MEDIAN, NEAREST
 from train.loop.checkpoints import network_of_run, path_of_step
-from train.loop.crew import DistributedContext
+from train.loop.distributed import DistributedContext
 from train.loop.schedule import learning_rate
 from train.loop.state import TrainState, new_state
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE, load_lpips
 from train.run import stream_settings, train_run
 from train.runs import changed_run
 from train.settings import AugmentationSettings, TrainSettings
-from train.start import StartOptions
+from train.start_options import StartOptions
 
 SMALL = dataclasses.replace(
     smoke_model(), width=64, num_heads=1, hidden_width=192, encoder_layers=2, decoder_layers=2

@@ -24,10 +24,10 @@ from tests.train.toy import write_toy_dataset
 from train.evaluation import judge
 from train.loop import trainer
 from train.loop.interrupts import Stopped
+from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
 from train.result import TrainResult
-from train.start import StartOptions
-from train.watching.rows import read_rows
+from train.start_options import StartOptions
 
 TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share", "time_s", "memory_mb"}
 

@@ -33,7 +33,7 @@ from train.loop.checkpoints import (
 )
 from train.progress import TrainProgress
 from train.settings import LossSettings
-from train.start import StartOptions
+from train.start_options import StartOptions
 
 
 def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from model.open import open_network
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.train.data.test_unusable import BAD_KEY, spoil_sample
+from tests.train.data.test_bad_samples import BAD_KEY, spoil_sample
 from tests.train.kit import Heard, Killed, tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train import run as run_module
@@ -28,7 +28,7 @@ from train.loop.step import PendingStats, Stepper
 from train.progress import TrainProgress
 from train.result import TrainResult
 from train.settings import TrainSettings
-from train.start import StartOptions
+from train.start_options import StartOptions
 
 
 def run(
@@ -217,7 +217,7 @@ def test_ten_skipped_steps_go_on_by_a_decision(
             return torch.tensor([math.nan, math.nan, 0.0, 0.0, math.nan, 0.0, 0.0]).double()
         return original(self, *given, **rest)
 
-    monkeypatch.setattr(Stepper, "take", diverging)
+    monkeypatch.setattr(Stepper, "launch", diverging)
     ways = r"10 steps in a row up to step 14.*--change learning_rate=0\.001.*seed=1.*--branch"
     for again in (False, True):
         with pytest.raises(TrilightError, match=ways):

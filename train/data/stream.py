@@ -23,6 +23,7 @@ from storage.errors import TrilightError
 from storage.records.stored_sample import StoredSample
 from storage.seeds import rng_for
 from train.data.augment import augment_scene, withhold_inputs
+from train.data.bad_samples import BadSampleCounter, count_lost_samples
 from train.data.mixture import Mixture, mix_visits
 from train.data.open_shards import OpenShards
 from train.data.order import (
@@ -40,7 +41,6 @@ from train.data.scenes import (
     scene_of_views,
     with_target,
 )
-from train.data.unusable import BadSampleCounter, count_lost_samples
 
 if TYPE_CHECKING:
     from model.config import ModelConfig

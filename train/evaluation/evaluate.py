@@ -24,13 +24,13 @@ from storage.records.sample import Sample
 from storage.records.scene import Scene
 from storage.seeds import rng_for
 from storage.settings.described import checked
+from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.scenes import TrainingScene, training_scene
-from train.data.unusable import BadSampleCounter, first_samples
+from train.evaluation.baselines import Baselines
 from train.evaluation.judge import ValidationScene, predict, validation_scene
 from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, scene_facts
 from train.evaluation.metrics import noise_floors, picture_scores
-from train.evaluation.order import SceneCount, Width
-from train.evaluation.rivals import Baselines
+from train.evaluation.options import SceneCount, Width
 from train.evaluation.same_time import CAPTION, TRACER, TracedBeside
 from train.evaluation.sheet import SheetView
 from train.loss.lpips import Lpips

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from storage.atomic import write_atomically
 from storage.conventions import preview_srgb8
-from train.evaluation.error_colours import (
+from train.evaluation.error_colors import (
     ERROR_WHITE,
     error_picture,
     heat_colors,

@@ -1,7 +1,7 @@
 """Checkpoints of a run: one safetensors file each, with the whole mutable state.
 
 A checkpoint appears by rename, so that a kill while saving leaves the previous one intact. It also
-holds the settings, the digest of the data and the decisions about them (train.going_on), so that a
+holds the settings, the digest of the data and the decisions about them (train.resume), so that a
 resume with others is detected; and its own sha256, because safetensors does not detect a weight
 that a disk changed.
 """
@@ -32,11 +32,11 @@ from storage.settings.ranges import Within
 from storage.typed_json import FINITE, Sha256, read_json
 from train.data.mixture import RECORD, Mixture
 from train.folder import RunFolder
-from train.going_on import Event, ResumePlan, event_records
-from train.loop.crew import DistributedContext
+from train.loop.distributed import DistributedContext
 from train.loop.schedule import decay_start_step
 from train.loop.state import TrainState, new_state
 from train.loop.step import StepReport
+from train.resume import Event, ResumePlan, event_records
 from train.settings import Precision, TrainSettings
 from train.stored_settings import known_settings, stored_settings
 
@@ -176,7 +176,7 @@ def restore_state(
 
     Args:
         checkpoint: checkpoint to restore.
-        plan: settings and history (train.going_on). If the checkpoint has no EMA and the settings
+        plan: settings and history (train.resume). If the checkpoint has no EMA and the settings
             ask for one, it starts as a copy of the weights.
         device: as in `new_state`.
         muon_precision: as in `new_state`.

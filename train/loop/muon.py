@@ -9,8 +9,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from train.loop.crew import DistributedContext
 from train.loop.decision import Decision, defers_sync, move_along, move_towards
+from train.loop.distributed import DistributedContext
 from train.settings import Precision
 
 

@@ -14,12 +14,12 @@ from train.evaluation.judge import Judge
 from train.evaluation.sheet import draw_validation_sheet
 from train.folder import RunFolder
 from train.loop.state import TrainState
+from train.monitoring.notes import add_note
+from train.monitoring.rows import read_rows
+from train.monitoring.scalars import scalars
+from train.monitoring.weights_and_biases import WandbLogger
 from train.progress import TrainProgress
 from train.settings import TrainSettings
-from train.watching.notes import add_note
-from train.watching.rows import read_rows
-from train.watching.scalars import scalars
-from train.watching.weights_and_biases import WandbLogger
 
 
 class TensorBoardLogger:

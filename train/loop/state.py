@@ -15,11 +15,11 @@ from torch import Tensor
 from model.renderformer import RenderFormer
 from model.width_scales import scale_start, width_scales
 from storage.seeds import seed_for
+from train.data.bad_samples import BadSampleCounter
 from train.data.mixture import Mixture
-from train.data.unusable import BadSampleCounter
-from train.going_on import Event
 from train.loop.decision import Decision, Updates, move_towards
 from train.loop.optim import Updater
+from train.resume import Event
 from train.settings import Precision, TrainSettings
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class TrainState:
     reports: "list[StepReport]" = field(default_factory=list)
     """Reports of the steps since the last row of the log, which the next row averages."""
     history: tuple[Event, ...] = ()
-    """Events of the run, oldest first (train.going_on)."""
+    """Events of the run, oldest first (train.resume)."""
     mixture: Mixture | None = None
     """Mixture of its datasets; None if there has only been one."""
 

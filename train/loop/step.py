@@ -18,13 +18,13 @@ from model.precision import fast_float32_products
 from storage.errors import TrilightError
 from train.data.buckets import TrainingBatch
 from train.loop.compiled import compile_parts, is_compiler_error, undo_compiling
-from train.loop.crew import DistributedContext
 from train.loop.decision import defers_sync, make_decision
+from train.loop.distributed import DistributedContext
 from train.loop.state import TrainState
 from train.loss.objective import Objective
+from train.monitoring.activity import Activity
+from train.monitoring.layers import LayerNorms
 from train.settings import Precision, TrainSettings
-from train.watching.activity import Activity
-from train.watching.layers import LayerNorms
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,23 +16,23 @@ import torch
 
 from model.costs import Workload, training_flops
 from storage.errors import TrilightError
-from train.data.arrival import CopyStream, StepScenes
+from train.data.device_prefetch import CopyStream, StepScenes
 from train.folder import RunFolder
 from train.loop.background import BackgroundWriter
 from train.loop.checkpoints import save_checkpoint
-from train.loop.crew import DistributedContext
-from train.loop.enough_memory import explain_out_of_memory
+from train.loop.distributed import DistributedContext
 from train.loop.interrupts import Stopped, ValidationInterrupted, deferred_interrupts
+from train.loop.out_of_memory import explain_out_of_memory
 from train.loop.recorder import Recorder
 from train.loop.schedule import decay_start_step, learning_rate
 from train.loop.state import TrainState
 from train.loop.step import PendingStats, Stepper, StepReport
 from train.loop.window import Window, device_peak
 from train.loss.objective import Objective
+from train.monitoring.process_monitor import ProcessMonitor
+from train.monitoring.settings import WatchSettings
 from train.progress import TrainProgress
 from train.settings import TrainSettings
-from train.watching.settings import WatchSettings
-from train.watching.watch import ProcessMonitor
 
 WATCHED_STEPS = 50
 """Number of steps after the warm-up whose pictures are checked, once."""

@@ -20,8 +20,8 @@ from infra.bench.experiment import (
     Point,
     percent,
 )
+from infra.bench.workloads.cached_references import kept_reference
 from infra.bench.workloads.judged_pictures import figures, shrunk
-from infra.bench.workloads.kept_references import kept_reference
 from infra.bench.workloads.named_scenes import given_scenes, sampled_trials
 from infra.bench.workloads.plain_mitsuba import PlainPicture, render_levels
 from infra.bench.workloads.shots import SEED, shots

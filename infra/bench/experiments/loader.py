@@ -73,9 +73,9 @@ def _training_data(context: BenchContext) -> tuple[TrainingData, int]:
 
 def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
     """Read samples as training does, without the network."""
+    from train.data.bad_samples import BadSampleCounter
     from train.data.order import RankSlice
     from train.data.stream import StreamSettings, stream_batches
-    from train.data.unusable import BadSampleCounter
 
     settings = StreamSettings(
         seed=0,

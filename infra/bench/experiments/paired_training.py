@@ -79,7 +79,7 @@ def _train(context: BenchContext, side: str, seed: int) -> Sequence[Mapping[str,
     import torch
 
     from infra.bench.workloads.trainings import training_figures
-    from train.loop.crew import choose_device
+    from train.loop.distributed import choose_device
 
     options = context.options
     settings = settings_of(side, seed, context.scale, options)

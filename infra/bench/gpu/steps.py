@@ -14,7 +14,7 @@ from infra.bench.gpu.probe import wait_for
 from infra.bench.gpu.step_profile import marked_parts, profile_call
 from model.config import ModelConfig, hits_smoke, smoke, tiny
 from model.costs import training_flops
-from train.loop.crew import DistributedContext
+from train.loop.distributed import DistributedContext
 from train.loop.state import new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective

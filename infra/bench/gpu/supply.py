@@ -8,14 +8,14 @@ from pathlib import Path
 from infra.bench.workloads.manifests import write_copies
 from infra.planning import measure_scenes
 from pipeline.builds.named import named_build
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import shard_name
 from storage.dataset.staging import read_staged_scene
 from storage.dataset.training_data import open_training_data
+from train.data.bad_samples import BadSampleCounter
 from train.data.order import RankSlice
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import BadSampleCounter
 from train.runs import named_run
 
 BUILD = "smoke"

@@ -12,8 +12,8 @@ from pipeline.builds.training import smoke
 from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
 from pipeline.exchange.gltf.read import read_gltf
 from pipeline.exchange.scene_files import build_scene
+from pipeline.generation.attempt_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.isolation import IsolatedChild
-from pipeline.making.attempt_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.objects.licences import USER_PROVIDED
 from storage.errors import Rejected, TrilightError
 from storage.records.sample import Sample

@@ -13,11 +13,11 @@ from model.renderformer import RenderFormer
 from storage.dataset.shard_set import ShardSet
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
+from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.buckets import bucket_scenes
 from train.data.stream import stream_batches
-from train.data.unusable import BadSampleCounter, first_samples
 from train.evaluation.judge import Judge
-from train.loop.crew import DistributedContext
+from train.loop.distributed import DistributedContext
 from train.loop.muon import choose_muon_precision
 from train.loop.schedule import learning_rate
 from train.loop.state import new_state

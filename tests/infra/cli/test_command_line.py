@@ -207,7 +207,7 @@ def test_an_optional_field_takes_the_words_that_it_takes_otherwise() -> None:
 
 INTERRUPTED_WRITE = """
 import io, os, signal, sys
-from infra.cli.leaving import leave
+from infra.cli.process_exit import leave
 
 class Interrupted(io.RawIOBase):
     def writable(self):

@@ -14,9 +14,9 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from infra.rendering.request import RenderOptions
+from infra.rendering.options import RenderOptions
 from pipeline.exchange.open_scene import load_source, scene_source
-from pipeline.making import path_tracer
+from pipeline.generation import path_tracer
 from storage.conventions import preview_srgb8
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError

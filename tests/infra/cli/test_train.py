@@ -21,7 +21,7 @@ from infra.cli.dataset_changes import with_base_settings
 from infra.cli.settings_file import read_settings_file
 from infra.cli.train import _BarProgress, _QuietProgress, _validation_rows
 from pipeline.builds.named import BUILDS, named_build
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
 from storage.settings.changes import changed
@@ -29,13 +29,13 @@ from storage.settings.described import settings_record
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.for_each import case
-from tests.pipeline.making.test_publication import begin_tiny
+from tests.pipeline.generation.test_dataset_writer import begin_tiny
 from tests.train.toy import write_toy_dataset
 from train.evaluation.scores import Lead
 from train.loop.checkpoints import saved_steps
 from train.loop.interrupts import SAVED_STATUS
+from train.monitoring.rows import read_rows
 from train.runs import RUNS, named_run
-from train.watching.rows import read_rows
 
 TRILIGHT = [sys.executable, "-m", "trilight"]
 TINY = {

@@ -16,7 +16,7 @@ from infra.leaderboard import contest as contest_module
 from infra.leaderboard import run as run_module
 from infra.leaderboard.chart import plot_leaderboard
 from infra.leaderboard.contest import NOISE
-from infra.leaderboard.order import LeaderboardOptions
+from infra.leaderboard.options import LeaderboardOptions
 from infra.leaderboard.picture_folder import FolderContestant, folder_contestants
 from infra.leaderboard.rows import UNKNOWN_MACHINE, BoardRow, BoardRows, RowKey
 from infra.leaderboard.run import (

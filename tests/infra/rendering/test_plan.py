@@ -12,8 +12,8 @@ import pytest
 from infra.rendering import plan
 from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, pair_cameras
 from infra.rendering.engines import MitsubaPlan, NeuralPlan
+from infra.rendering.options import RenderOptions
 from infra.rendering.plan import plan_render
-from infra.rendering.request import RenderOptions
 from infra.rendering.sources import scene_sources
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader

@@ -13,7 +13,7 @@ from infra.rendering.cameras import ShotCamera, orbit, own_camera, pair_cameras
 from infra.rendering.comparison import comparison_sheet
 from infra.rendering.engines import Facts, OpenedScene, Rendered
 from infra.rendering.look import Look, enlarge, enlargement, tone_mapped
-from infra.rendering.places import OutputPaths, output_paths
+from infra.rendering.output_paths import OutputPaths, output_paths
 from infra.rendering.plan import RenderPlan, shots
 from infra.rendering.run import FinishedShot, run_plan
 from infra.rendering.video import write_video

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-from infra.viewer.later import DeferredHandlers, PageHandlers
+from infra.viewer.deferred_handlers import DeferredHandlers, PageHandlers
 from infra.viewer.server import PageServer
 
 

@@ -13,13 +13,13 @@ from PIL import Image
 
 from infra.viewer import scene_list as list_module
 from infra.viewer.dataset_filter import filter_of
-from infra.viewer.dataset_room import DatasetHandlers
-from infra.viewer.folder_room import THUMBNAIL_PX, FolderHandlers
+from infra.viewer.dataset_handlers import DatasetHandlers
+from infra.viewer.folder_handlers import THUMBNAIL_PX, FolderHandlers
 from infra.viewer.scene_list import scene_list
 from pipeline.exchange.convert import write_scene
-from pipeline.making.progressive_tracer import ProgressiveTracer
+from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders.variant import Variant, choose_variant
-from pipeline.shards.finished import FinishedDataset
+from pipeline.shards.finished_dataset import FinishedDataset
 from pipeline.shards.listing import list_scenes
 from pipeline.shards.plans import Selection
 from storage.conventions import preview_srgb8

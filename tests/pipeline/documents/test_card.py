@@ -33,7 +33,7 @@ from tests.pipeline.documents.dataset_by_hand import (
     sample,
     write_dataset,
 )
-from tests.pipeline.making.test_derive_dataset import finished
+from tests.pipeline.generation.test_derive_dataset import finished
 from tests.scenes_by_hand import tiny_scene
 from tests.textured_by_hand import sky, textured_scene
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.documents.distributions import dataset_distributions
-from pipeline.documents.pass_colours import (
+from pipeline.documents.pass_colors import (
     depth_grays,
     finite_range,
     id_colors,

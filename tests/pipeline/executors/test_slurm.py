@@ -17,7 +17,7 @@ from pipeline.executors.array_job import MAX_TASKS, ArrayJob, array_job
 from pipeline.executors.registry import EXECUTORS, find_executor
 from pipeline.executors.slurm import shards_of_task
 from pipeline.executors.slurm_array import sbatch_command, sbatch_environment
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.dataset import open_dataset
 from storage.dataset.progress import missing_shards
 from storage.dataset.verify import verify_dataset
@@ -26,7 +26,7 @@ from storage.number_ranges import number_ranges, numbers_of
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.for_each import for_each
-from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
+from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
 def _array(task: int, first: int, last: int, count: int, **more: str) -> dict[str, str]:
@@ -259,7 +259,7 @@ def test_names_of_executors_load_neither_prefect_nor_the_stages() -> None:
     """They are asked for at every press of the tab key."""
     code = (
         "import sys, pipeline.executors.registry;"
-        "print([name for name in ('prefect', 'distributed', 'pipeline.making.pipeline') "
+        "print([name for name in ('prefect', 'distributed', 'pipeline.generation.pipeline') "
         "if name in sys.modules])"
     )
     done = subprocess.run(

@@ -13,7 +13,7 @@ from pipeline.flows.dataset_flows import build_dataset, generate_scenes, prepare
 from pipeline.flows.forms import BuildChanges, changed_values
 from pipeline.flows.orders import dataset_order
 from pipeline.flows.prefect_runner import is_retryable
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.for_each import for_each
 

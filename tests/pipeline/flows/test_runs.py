@@ -16,8 +16,8 @@ from pipeline.flows import prefect_runner as runner
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.orders import DatasetInRuns, dataset_in_runs
 from pipeline.flows.process import run_to_end
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.tasks import shard_ranges
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.tasks import shard_ranges
 from storage.errors import TrilightError
 from tests.for_each import for_each
 

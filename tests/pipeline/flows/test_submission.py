@@ -30,7 +30,7 @@ from pipeline.flows.prefect_server import (
     wait_until_healthy,
 )
 from pipeline.flows.submission import parameters, poll_run, server, submit, workers_online
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.cache import open_private, private_folder
 from storage.errors import TrilightError
 from tests.for_each import case, for_each

@@ -13,22 +13,22 @@ from types import SimpleNamespace
 
 import pytest
 
+from pipeline.generation.prepare_isolated import asset_child
 from pipeline.isolation import (
     ChildFailed,
     ChildLimits,
     IsolatedChild,
     Reach,
+    call_failures,
     call_with_retries,
     confinement,
-    deaths,
     is_transient,
     reach,
     seccomp,
 )
-from pipeline.isolation.deaths import ENDS, with_retries
+from pipeline.isolation.call_failures import ENDS, with_retries
 from pipeline.isolation.landlock import landlock_version
 from pipeline.isolation.seccomp import seccomp_works
-from pipeline.making.prepare_isolated import asset_child
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.conftest import ROOT
 from tests.for_each import for_each
@@ -279,7 +279,7 @@ def child_with(setup, *args: object) -> IsolatedChild:  # type: ignore[no-untype
 
 @pytest.fixture(autouse=True)
 def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(deaths, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(call_failures, "_PAUSE_S", 0.0)
 
 
 @pytest.fixture
@@ -328,7 +328,7 @@ def test_the_same_call_is_made_again(plain_child: IsolatedChild, tmp_path: Path)
 
 
 @for_each(("reason", "end"), ENDS.items())
-def test_tries_end(reason: str, end: deaths.End) -> None:
+def test_tries_end(reason: str, end: call_failures.End) -> None:
     calls: list[str] = []
 
     def fail() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.builds.named import named_build
-from pipeline.making.render_sample import RenderInput, render_sample
-from pipeline.making.view_progress import ViewProgress
+from pipeline.generation.render_sample import RenderInput, render_sample
+from pipeline.generation.view_progress import ViewProgress
 from pipeline.renders import vector_tracer
 from pipeline.renders.camera import Camera
 from pipeline.renders.renderer import SceneRenderer

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.making import progressive_tracer as module
-from pipeline.making.progressive_tracer import ProgressiveTracer
+from pipeline.generation import progressive_tracer as module
+from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders import preview
 from pipeline.renders.camera import Camera
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings, usual_filter

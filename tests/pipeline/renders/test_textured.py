@@ -14,9 +14,9 @@ from pipeline.renders.kernel_textures import KernelTextures
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
-from pipeline.scenes.own_materials import source_skins
 from pipeline.scenes.pieces import apply_skin, concatenate_pieces, emitter_piece, object_piece
 from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.source_materials import source_skins
 from scene_templates.layout import Emitter
 from scene_templates.materials import MaterialSettings
 from storage.conventions import look_at_c2w

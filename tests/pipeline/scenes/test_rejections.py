@@ -13,8 +13,8 @@ import pytest
 
 from pipeline.builds.named import named_build
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.laws import require_valid
 from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.scene_checks import require_valid
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.records.scene import Scene

@@ -9,9 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
-from pipeline.scenes.laws import require_valid
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
-from pipeline.scenes.sight import Visibility
+from pipeline.scenes.scene_checks import require_valid
 from pipeline.scenes.views import (
     CAMERA_ATTEMPTS,
     ViewCamera,
@@ -19,6 +18,7 @@ from pipeline.scenes.views import (
     view_problem,
     with_cameras,
 )
+from pipeline.scenes.visibility import Visibility
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.templates import TEMPLATES

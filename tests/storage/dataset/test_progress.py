@@ -27,7 +27,7 @@ from storage.dataset.scene_logs import SceneLog, log_scene, sample_logs
 from storage.dataset.shard_notes import note_of
 from storage.errors import TrilightError
 from tests.http_server import serve
-from tests.pipeline.making.test_publication import begin_tiny, make_tiny_shard
+from tests.pipeline.generation.test_dataset_writer import begin_tiny, make_tiny_shard
 
 
 def test_downloads_and_objects_are_counted_from_the_start_of_each_run(tmp_path: Path) -> None:

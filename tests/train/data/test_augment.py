@@ -37,9 +37,9 @@ from train.data.augment import (
     rotate_vertex_order,
     scale_light,
 )
+from train.data.bad_samples import BadSampleCounter
 from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, _SceneMaker
-from train.data.unusable import BadSampleCounter
 from train.settings import AugmentationSettings
 
 RESOLUTION = 32

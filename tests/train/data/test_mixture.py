@@ -15,13 +15,13 @@ from tests.for_each import for_each
 from tests.train.data.test_stream import by_key, identity, same_batches
 from tests.train.kit import keys_of, take, tiny_run, trained
 from tests.train.toy import write_toy_dataset
+from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.mixture import RECORD, Mixture, plan_mixture
 from train.data.scenes import TrainingScene
 from train.data.stream import StreamSettings
-from train.data.unusable import BadSampleCounter, first_samples
 from train.loop.checkpoints import path_of_step, read_checkpoint
 from train.run import train_run
-from train.start import StartOptions
+from train.start_options import StartOptions
 
 BATCH = 4
 SETTINGS = StreamSettings(seed=1, window=2, batch_size=BATCH, resolution=16, views_per_scene=1)

@@ -198,7 +198,7 @@ from contextlib import closing
 from storage.dataset.training_data import open_training_data
 from train.data.order import RankShare
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import Unusable
+from train.data.bad_samples import Unusable
 settings = StreamSettings(seed=0, window=2, batch_size=8, resolution=16, views_per_scene=2)
 data = open_training_data([sys.argv[1]]).split("train")
 batches = stream_batches(

@@ -24,11 +24,11 @@ from tests.for_each import for_each
 from tests.train.fake_card import CARD, fake_card
 from tests.train.kit import CPU, tiny_run
 from tests.train.toy import write_toy_dataset
-from train.data.arrival import CopyStream, StepScenes, decodes_on_device, step_scenes
+from train.data.bad_samples import BadSampleCounter
+from train.data.device_prefetch import CopyStream, StepScenes, decodes_on_device, step_scenes
 from train.data.order import RankSlice
 from train.data.scenes import stored_levels
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import BadSampleCounter
 from train.data.workers import MAX_THREADS, Machine, choose_workers, detect_machine
 from train.settings import AugmentationSettings
 

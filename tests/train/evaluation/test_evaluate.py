@@ -28,6 +28,7 @@ from tests.train.kit import tiny_run
 from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
+from train.evaluation.baselines import MEDIAN, NEAREST, Baselines, median_picture
 from train.evaluation.evaluate import (
     GROUPED,
     EvalConfig,
@@ -40,10 +41,9 @@ from train.evaluation.evaluate import (
 from train.evaluation.judge import predict, validation_scene
 from train.evaluation.judged_view import NETWORK, JudgedView, by_group, scene_facts, summarize_views
 from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
-from train.evaluation.order import EvaluationOptions
+from train.evaluation.options import EvaluationOptions
 from train.evaluation.published import BENCHMARK
 from train.evaluation.report import markdown, record
-from train.evaluation.rivals import MEDIAN, NEAREST, Baselines, median_picture
 from train.evaluation.same_time import TRACER
 from train.loop.state import new_state
 from train.loss.lpips import Lpips

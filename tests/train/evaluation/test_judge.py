@@ -22,13 +22,13 @@ from tests.train.kit import tiny_run
 from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
-from train.evaluation.error_colours import ERROR_WHITE, error_picture
+from train.evaluation.baselines import median_picture
+from train.evaluation.error_colors import ERROR_WHITE, error_picture
 from train.evaluation.evaluate import EvalConfig, judge_views, sheet_views
 from train.evaluation.judge import hit_masks
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.metrics import METRICS, noise_floors, picture_scores
 from train.evaluation.report import markdown, record
-from train.evaluation.rivals import median_picture
 from train.evaluation.same_time import (
     CAPTION,
     TRACER,

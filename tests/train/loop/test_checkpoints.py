@@ -28,7 +28,6 @@ from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
 from train.folder import RunFolder
-from train.going_on import plan_resume
 from train.loop.checkpoints import (
     HEADER_KEY,
     UNSEALED,
@@ -40,12 +39,13 @@ from train.loop.checkpoints import (
     save_checkpoint,
     saved_steps,
 )
-from train.loop.crew import DistributedContext
+from train.loop.distributed import DistributedContext
 from train.loop.recorder import MetricsLog
 from train.loop.state import TrainState, new_state
+from train.monitoring.rows import read_rows
+from train.resume import plan_resume
 from train.settings import TrainSettings
 from train.stored_settings import known_settings
-from train.watching.rows import read_rows
 
 CASES = [("fsync", "before"), ("replace", "before"), ("replace", "after"), ("unlink", "before")]
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tests.for_each import for_each
 from train.loop import muon as muon_file
-from train.loop.crew import DistributedContext
+from train.loop.distributed import DistributedContext
 from train.loop.muon import choose_muon_precision, muon, orthogonal, split_over_ranks
 
 JORDAN = (3.4445, -4.7750, 2.0315)

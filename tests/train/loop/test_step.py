@@ -31,8 +31,8 @@ from train.loop.decision import Decision, move_along, move_towards
 from train.loop.optim import Updater
 from train.loop.state import TrainState, ema_step, new_state
 from train.loop.step import Stepper, StepReport, predict_log10
+from train.monitoring.rows import read_rows
 from train.settings import Precision
-from train.watching.rows import read_rows
 
 RESOLUTION = 16
 
@@ -299,7 +299,7 @@ def test_a_run_that_learns_late_is_the_same_run(
             each.target_BVRR3[:] = math.inf
         return original(self, batches, *given, **rest)
 
-    monkeypatch.setattr(Stepper, "take", spoilt)
+    monkeypatch.setattr(Stepper, "launch", spoilt)
 
     def run(log_every: int, *, resume: bool = False) -> RunFolder:
         settings = tiny_run(num_steps=8, schedule="wsd", decay_share=0.4, log_every=log_every)
