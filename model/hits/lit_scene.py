@@ -13,7 +13,7 @@ from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_textures import DeviceTextures
 from model.hits.textures import SurfaceTextures
 from model.hits.vectors import Floats, as_rows, brightest, dot, unit
-from model.sky.drawn import DrawnSky
+from model.sky.sampler import SkySampler
 from storage.records.environment import Environment
 from storage.records.lobes import lobes_of
 from storage.records.material import EMISSION, ROUGHNESS
@@ -174,10 +174,10 @@ class LitScene:
         return DeviceArray(self.place.tensor(array), self.place)
 
     @cached_property
-    def drawn_sky(self) -> DrawnSky:
+    def drawn_sky(self) -> SkySampler:
         """The sky of a scene that has one, for rays."""
         assert self.sky is not None
-        return DrawnSky(self.sky)
+        return SkySampler(self.sky)
 
     @cached_property
     def seen(self) -> Triangles:
