@@ -1,7 +1,7 @@
 """Rays that a card traces: a tree of boxes, built by torch, and a kernel that walks through it.
 
-The tree is complete: triangles are halved by their middles along the longest side of each box, as
-often as leaves need. A node's halves are nodes 2n and 2n + 1. Whether a ray meets a triangle is
+A node has four children: its triangles are halved twice, each time where the surface of the halves'
+boxes, weighed by their triangles, is least (binned, Wald 2007). Whether a ray meets a triangle is
 asked of the volumes that it spans with the edges, seen from the ray's start: two triangles of one
 edge get the same number with opposite signs, so no ray slips between them.
 """
@@ -20,15 +20,23 @@ from model.hits.device_arrays import DeviceArray, DevicePlace
 from storage.records.surfaces import MISS
 
 LEAF = 4
-"""Triangles of a leaf."""
+"""Most triangles of a leaf; at most 7, as a leaf's number has three bits for them."""
+
+BINS = 16
+"""Places along each axis between which a cut may be."""
+
+LEVELS = 10
+"""Levels whose cuts are chosen; below them halves are even, so that rays' stacks end."""
 
 THREADS = 128
 
 SOURCE = """
-#define LEAF 4
 #define FAR 3e38f
+#define STACK 64
 
 struct V { float x, y, z; };
+struct alignas(16) Floats { float at[4]; };
+struct alignas(16) Ints { int at[4]; };
 __device__ inline V between(V a, V b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
 __device__ inline V both(V a, V b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 __device__ inline float dot(V a, V b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
@@ -40,12 +48,12 @@ __device__ inline float inverse(float a) {
 }
 
 /* Where a ray enters a box, or FAR where it passes. */
-__device__ inline float enters(const float* box, V start, V inverted, float nearest) {
-    float a = (box[0] - start.x) * inverted.x, b = (box[3] - start.x) * inverted.x;
+__device__ inline float enters(V least, V most, V start, V inverted, float nearest) {
+    float a = (least.x - start.x) * inverted.x, b = (most.x - start.x) * inverted.x;
     float first = fminf(a, b), last = fmaxf(a, b);
-    a = (box[1] - start.y) * inverted.y; b = (box[4] - start.y) * inverted.y;
+    a = (least.y - start.y) * inverted.y; b = (most.y - start.y) * inverted.y;
     first = fmaxf(first, fminf(a, b)); last = fminf(last, fmaxf(a, b));
-    a = (box[2] - start.z) * inverted.z; b = (box[5] - start.z) * inverted.z;
+    a = (least.z - start.z) * inverted.z; b = (most.z - start.z) * inverted.z;
     first = fmaxf(first, fminf(a, b)); last = fminf(last, fmaxf(a, b));
     first = fmaxf(first, 0.0f);
     return first <= fminf(last * 1.000001f, nearest) ? first : FAR;
@@ -54,9 +62,10 @@ __device__ inline float enters(const float* box, V start, V inverted, float near
 /* Rays are [rays, 3], and uv is [2, rays]. With limits, a ray is asked only whether it meets
    nothing before its limit, which `is_free` says. */
 extern "C" __global__ void trace(
-    const float* starts, const float* directions, const float* limits,
-    const float* boxes, const float* corners, const long long* rows,
-    long long* triangle, float* uv, unsigned char* is_free, int rays, int leaves, int asks_free)
+    const float* __restrict__ starts, const float* __restrict__ directions,
+    const float* __restrict__ limits, const Floats* __restrict__ nodes,
+    const Floats* __restrict__ corners, const long long* __restrict__ rows,
+    long long* triangle, float* uv, unsigned char* is_free, int rays, int asks_free)
 {
     int ray = blockIdx.x * blockDim.x + threadIdx.x;
     if (ray >= rays) return;
@@ -64,22 +73,39 @@ extern "C" __global__ void trace(
     V along = {directions[3 * ray], directions[3 * ray + 1], directions[3 * ray + 2]};
     V inverted = {inverse(along.x), inverse(along.y), inverse(along.z)};
     float nearest = asks_free ? limits[ray] : FAR, u = 0, v = 0;
-    int met = -1, waiting[32], count = 0, node = 1;
-    float entry[32];
+    int met = -1, count = 0, child = 0, waiting[STACK];
+    float entry[STACK];
     for (;;) {
-        if (node < leaves) {
-            float a = enters(boxes + 12 * node, start, inverted, nearest);
-            float b = enters(boxes + 12 * node + 6, start, inverted, nearest);
-            int nearer = 2 * node + (b < a), other = 2 * node + (b >= a);
-            if (fmaxf(a, b) < FAR) { waiting[count] = other; entry[count++] = fmaxf(a, b); }
-            if (fminf(a, b) < FAR) { node = nearer; continue; }
+        if (child >= 0) {
+            const Floats* node = nodes + 8 * child;
+            Floats box[6];
+            #pragma unroll
+            for (int k = 0; k < 6; k++) box[k] = node[k];
+            Ints children = *(const Ints*)(node + 6);
+            float least = FAR;
+            #pragma unroll
+            for (int k = 0; k < 4; k++) {
+                float far = enters(
+                    {box[0].at[k], box[1].at[k], box[2].at[k]},
+                    {box[3].at[k], box[4].at[k], box[5].at[k]}, start, inverted, nearest);
+                if (far >= FAR) continue;
+                int other = children.at[k];
+                if (far < least) {
+                    int nearer = other; other = child; child = nearer;
+                    float nearer_entry = far; far = least; least = nearer_entry;
+                }
+                if (far < FAR) { waiting[count] = other; entry[count++] = far; }
+            }
+            if (least < FAR) continue;
         } else {
-            for (int k = 0; k < LEAF; k++) {
-                int row = (node - leaves) * LEAF + k;
-                const float* at = corners + 9 * row;
-                V a = between({at[0], at[1], at[2]}, start);
-                V b = between({at[3], at[4], at[5]}, start);
-                V c = between({at[6], at[7], at[8]}, start);
+            int first = ~child >> 3, last = first + (~child & 7);
+            for (int row = first; row < last; row++) {
+                Floats at[3];
+                #pragma unroll
+                for (int k = 0; k < 3; k++) at[k] = corners[3 * row + k];
+                V a = between({at[0].at[0], at[0].at[1], at[0].at[2]}, start);
+                V b = between({at[0].at[3], at[1].at[0], at[1].at[1]}, start);
+                V c = between({at[1].at[2], at[1].at[3], at[2].at[0]}, start);
                 float of_b = dot(cross(between(c, a), both(c, a)), along);
                 float of_c = dot(cross(between(a, b), both(a, b)), along);
                 float of_a = dot(cross(between(b, c), both(b, c)), along);
@@ -96,7 +122,7 @@ extern "C" __global__ void trace(
             }
         }
         do { if (!count) goto done; --count; } while (entry[count] > nearest);
-        node = waiting[count];
+        child = waiting[count];
     }
 done:
     if (asks_free) { is_free[ray] = 1; return; }
@@ -109,50 +135,111 @@ done:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tree:
-    """T triangles in a complete tree of 2^d leaves, padded with the last one."""
+    """T triangles in a tree of N nodes, of which the first is its root."""
 
-    boxes: Tensor
-    """[2 leaves, 6] least and greatest corner of each node's box; the first stands for nothing."""
-    corners: Tensor
-    """[LEAF leaves, 9] of the triangles, leaf by leaf."""
-    rows: Tensor
-    """[LEAF leaves] which triangle each is; int64."""
-
-    @property
-    def leaves(self) -> int:
-        return len(self.boxes) // 2
+    nodes: NDArray[np.float32]
+    """[N, 32] of four children each: the boxes' least x, y and z, their greatest, and as integers
+    another node's row, or ~(8 first + count) of a leaf; then four unused."""
+    corners: NDArray[np.float32]
+    """[T, 12] of the triangles, leaf by leaf; three unused."""
+    rows: NDArray[np.int64]
+    """[T] which triangle each is."""
 
 
-def build_tree(corners_T33: Tensor, rows_T: Tensor) -> Tree:
-    """Return the tree of triangles, where they are; without any, one that no ray meets."""
+def build_tree(corners_T33: NDArray[np.float32], rows_T: NDArray[np.intp]) -> Tree:
+    """Return the tree of triangles; without any, one that no ray meets."""
     if not len(rows_T):
-        corners_T33, rows_T = corners_T33.new_zeros(1, 3, 3), rows_T.new_full((1,), MISS)
-    count = len(rows_T)
-    depth = max(-(-count // LEAF) - 1, 0).bit_length()
-    order = torch.arange(LEAF << depth, device=rows_T.device).clamp(max=count - 1)
-    middle_T3 = (corners_T33.amin(dim=1) + corners_T33.amax(dim=1)) / 2
-    for level in range(depth):
-        order = order.unflatten(0, (1 << level, -1))
-        middles = middle_T3[order]
-        longest = (middles.amax(dim=1) - middles.amin(dim=1)).argmax(dim=-1)
-        along = middles.gather(2, longest[:, None, None].expand(-1, middles.shape[1], 1))
-        order = order.gather(1, along[..., 0].argsort(dim=1, stable=True)).flatten()
-    corners = corners_T33[order]
-    least = corners.flatten(0, 1).unflatten(0, (-1, 3 * LEAF)).amin(dim=1)
-    most = corners.flatten(0, 1).unflatten(0, (-1, 3 * LEAF)).amax(dim=1)
-    levels = [torch.cat([least, most], dim=-1)]
-    while len(least) > 1:
-        least, most = (
-            least.unflatten(0, (-1, 2)).amin(dim=1),
-            most.unflatten(0, (-1, 2)).amax(dim=1),
-        )
-        levels.append(torch.cat([least, most], dim=-1))
-    levels.append(torch.zeros_like(levels[-1]))
-    return Tree(
-        boxes=torch.cat(levels[::-1]).contiguous(),
-        corners=corners.reshape(-1, 9).contiguous(),
-        rows=rows_T[order].contiguous(),
-    )
+        corners_T33, rows_T = np.zeros((1, 3, 3), np.float32), np.array([MISS])
+    least, most = corners_T33.min(axis=1), corners_T33.max(axis=1)
+    waiting, node = np.arange(len(rows_T)), np.zeros(len(rows_T), np.int64)
+    order: list[NDArray] = []
+    levels: list[NDArray] = []
+    num_nodes, num_placed, count = 0, 0, 1
+    while count:
+        boxes = least[waiting], most[waiting]
+        for halving in (1, 2):
+            is_even = len(levels) >= LEVELS
+            node = 2 * node + goes_right(*boxes, node, halving * count, is_even=is_even)
+        sizes = np.bincount(node, minlength=4 * count)
+        is_leaf = sizes <= LEAF
+        placed = np.where(is_leaf, sizes, 0)
+        first, number = num_placed + placed.cumsum() - placed, (~is_leaf).cumsum() - 1
+        children = np.where(is_leaf, ~(8 * first + sizes), num_nodes + count + number)
+        low, high = _boxes(*boxes, node, 4 * count)
+        high[sizes == 0] = np.inf  # a point that no ray meets
+        sides = np.concatenate([low, high], axis=1).reshape(count, 4, 6).swapaxes(1, 2)
+        level = np.zeros((count, 8, 4), np.float32)
+        level[:, :6], level.view(np.int32)[:, 6] = sides, children.reshape(count, 4)
+        levels.append(level.reshape(count, 32))
+        in_leaf = is_leaf[node]
+        order.append(waiting[in_leaf][node[in_leaf].argsort(kind="stable")])
+        waiting, node = waiting[~in_leaf], number[node[~in_leaf]]
+        num_nodes, num_placed = num_nodes + count, num_placed + int(placed.sum())
+        count = len(sizes) - int(is_leaf.sum())
+    order_T = np.concatenate(order)
+    corners = np.zeros((len(order_T), 12), np.float32)
+    corners[:, :9] = corners_T33[order_T].reshape(-1, 9)
+    return Tree(nodes=np.concatenate(levels), corners=corners, rows=rows_T[order_T])
+
+
+def goes_right(
+    least: NDArray, most: NDArray, group: NDArray, num_groups: int, *, is_even: bool
+) -> NDArray[np.bool_]:
+    """Return which of A triangles are of the second half of their group; of a leaf's, none.
+
+    Args:
+        least, most: [A, 3] corners of their boxes.
+        group: [A] of `num_groups`.
+        num_groups: how many there are.
+        is_even: whether halves are to have as many triangles as each other.
+    """
+    size = np.bincount(group, minlength=num_groups)
+    by_group = group.argsort(kind="stable")
+    rank = np.empty_like(group)
+    rank[by_group] = np.arange(len(group)) - (size.cumsum() - size)[group[by_group]]
+    is_right = 2 * rank >= size[group]
+    if not is_even:
+        middle = (least + most) / 2
+        first, last = (each[group] for each in _boxes(middle, middle, group, num_groups))
+        share = (middle - first) / np.maximum(last - first, 1e-30)
+        place_A3 = np.minimum((share * BINS).astype(np.int64), BINS - 1)
+        cost_GC = _costs(least, most, group, place_A3, num_groups)
+        axis, cut = np.divmod(cost_GC.argmin(axis=1), BINS - 1)
+        is_beyond = place_A3[np.arange(len(group)), axis[group]] > cut[group]
+        is_right = np.where(np.isfinite(cost_GC.min(axis=1))[group], is_beyond, is_right)
+    return is_right & (size[group] > LEAF)
+
+
+def _costs(
+    least: NDArray, most: NDArray, group: NDArray, place_A3: NDArray, num_groups: int
+) -> NDArray[np.float32]:
+    """Return what each cut of a group costs [groups, 3 axes x (BINS - 1)]; infinite: no cut."""
+    cell = ((group[:, None] * 3 + np.arange(3)) * BINS + place_A3).ravel()
+    shape = num_groups, 3, BINS
+    count = np.bincount(cell, minlength=3 * BINS * num_groups).reshape(shape)
+    low, high = _boxes(least.repeat(3, axis=0), most.repeat(3, axis=0), cell, count.size)
+    low, high = low.reshape(*shape, 3), high.reshape(*shape, 3)
+    costs = []
+    for along in (slice(None), slice(None, None, -1)):
+        extent = np.maximum.accumulate(high[:, :, along], axis=2)
+        extent = np.maximum(extent - np.minimum.accumulate(low[:, :, along], axis=2), 0)
+        x, y, z = np.moveaxis(extent, -1, 0)
+        number = count[:, :, along].cumsum(axis=2)
+        cost = np.where(number > 0, (x * y + y * z + z * x) * number, np.inf)
+        costs.append(cost[:, :, along])
+    return (costs[0][..., :-1] + costs[1][..., 1:]).reshape(num_groups, -1)
+
+
+def _boxes(
+    least: NDArray, most: NDArray, group: NDArray, count: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the boxes of groups, [count, 3] each; of an empty one, infinite and -infinite."""
+    low = np.full((3, count), np.inf, np.float32)
+    high = np.full((3, count), -np.inf, np.float32)
+    for axis in range(3):
+        np.minimum.at(low[axis], group, least[:, axis])
+        np.maximum.at(high[axis], group, most[:, axis])
+    return low.T.copy(), high.T.copy()
 
 
 @functools.cache
@@ -186,14 +273,14 @@ class DeviceTriangles:
     ):
         """Take the corners of triangles, world space, and the rows of those that are there."""
         self._place = place
-        corners = torch.tensor(corners_T33[rows], device=place.device)
-        self._tree = build_tree(corners, torch.tensor(rows, device=place.device))
+        tree = build_tree(corners_T33[rows], rows)
+        self._tree = [place.array(each).tensor for each in vars(tree).values()]
 
     def met(self, origins: DeviceArray, directions: DeviceArray) -> MetOnDevice:
         """Return what rays [N, 3] from `origins` [N, 3] meet first, from either side."""
         count = len(directions)
-        triangle = self._tree.rows.new_empty(count)
-        uv = self._tree.boxes.new_empty(2, count)
+        triangle = torch.empty(count, dtype=torch.long, device=self._place.device)
+        uv = torch.empty(2, count, device=self._place.device)
         self._launch(origins, directions, uv, triangle, uv, triangle, 0)
         return MetOnDevice(
             triangle=DeviceArray(triangle, self._place), uv=DeviceArray(uv, self._place)
@@ -203,9 +290,9 @@ class DeviceTriangles:
         self, origins: DeviceArray, directions: DeviceArray, distances_m: DeviceArray
     ) -> DeviceArray:
         """Return [N] whether rays meet nothing up to a distance [N], in lengths of directions."""
-        free = self._tree.rows.new_empty(len(directions), dtype=torch.bool)
+        free = torch.empty(len(directions), dtype=torch.bool, device=self._place.device)
         limits = distances_m.tensor.contiguous()
-        self._launch(origins, directions, limits, self._tree.rows, limits, free, 1)
+        self._launch(origins, directions, limits, free, limits, free, 1)
         return DeviceArray(free, self._place)
 
     def _launch(
@@ -218,7 +305,7 @@ class DeviceTriangles:
         free: Tensor,
         asks_free: int,
     ) -> None:
-        tree, count = self._tree, len(directions)
+        count = len(directions)
         kernel = compiled_kernel(self._place.device)
         assert kernel is not None
         rays = [each.tensor.contiguous() for each in (origins, directions)]
@@ -226,7 +313,6 @@ class DeviceTriangles:
             grid=(-(-count // THREADS), 1, 1),
             block=(THREADS, 1, 1),
             args=[
-                *rays, limits, tree.boxes, tree.corners, tree.rows,
-                triangle, uv, free, count, tree.leaves, asks_free,
+                *rays, limits, *self._tree, triangle, uv, free, count, asks_free,
             ],
         )  # fmt: skip

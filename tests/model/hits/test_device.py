@@ -83,17 +83,17 @@ def test_the_kernel_meets_what_embree_meets(count: int, tmp_path: Path) -> None:
     subprocess.run(command, check=True)
     compiled = ctypes.CDLL(str(library))
     corners, rows = _corners(), np.arange(count)
-    tree = build_tree(torch.tensor(corners[rows]), torch.tensor(rows))
+    tree = build_tree(corners[rows], rows)
     starts, directions, limits = _rays(corners, 4000)
     triangle, uv = np.zeros(4000, np.int64), np.zeros((2, 4000), np.float32)
     free = np.zeros(4000, np.bool_)
-    arrays = (starts, directions, limits, tree.boxes.numpy(), tree.corners.numpy(),
-              tree.rows.numpy(), triangle, uv, free)  # fmt: skip
+    arrays = (starts, directions, limits, tree.nodes, tree.corners,
+              tree.rows, triangle, uv, free)  # fmt: skip
     pointers = [ctypes.c_void_p(each.ctypes.data) for each in arrays]
     for ray in range(4000):
         compiled.at(ray)
         for asks_free in (0, 1):
-            compiled.trace(*pointers, 4000, tree.leaves, asks_free)
+            compiled.trace(*pointers, 4000, asks_free)
     embree = Triangles(corners, rows)
     met = embree.met(starts, directions)
     # where the box stands on the floor, either is right
