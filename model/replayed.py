@@ -3,7 +3,8 @@
 A view of `hits` is two thousand small kernels; submitting them one by one takes longer than they.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -37,3 +38,19 @@ class Replayed:
             held.copy_(new)
         self._graph.replay()
         return self._result
+
+
+@contextmanager
+def aside(device: torch.device | None) -> Iterator[Callable[[], None]]:
+    """Let a graph that is being recorded do the block beside what follows it; else, in order.
+
+    Arrays that the block reads have to live until the function that it yields was called, from
+    which on its results may be read.
+    """
+    if device is None or device.type != "cuda" or not torch.cuda.is_current_stream_capturing():
+        yield lambda: None
+        return
+    main, beside = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+    beside.wait_stream(main)
+    with torch.cuda.stream(beside):
+        yield lambda: main.wait_stream(beside)

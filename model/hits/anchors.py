@@ -7,7 +7,7 @@ Ward et al. 1988), and costs the same for a picture of any width.
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.camera import Rays
+from model.hits.first_hits import FirstHits
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
 from model.hits.second_hits import blocks, brought
@@ -41,7 +41,7 @@ def anchor_pixels(coverage_RR: NDArray[np.float32], anchors_a_side: int) -> NDAr
 def gathered_at(
     scene: LitScene,
     light: SceneLight,
-    rays: Rays,
+    hits: FirstHits,
     anchor: NDArray[np.int64],
     gather_rays: int,
     seed: int,
@@ -50,27 +50,22 @@ def gathered_at(
 
     Args:
         scene, light: the scene.
-        rays: of the camera.
+        hits: of the camera.
         anchor: [A] pixels.
         gather_rays: of each anchor; 0 gives 0.
         seed: of the noise.
     """
-    total = np.zeros_like(rays.origin, shape=(3, len(anchor)))
+    total = np.zeros_like(hits.along, shape=(3, len(anchor)))
     if not gather_rays:
         return total.T
     shift = scene.here(rng_for(seed, "gather").random((5, len(anchor)), np.float32))
-    direction = rays.direction(0, anchor)
-    found = scene.first_hits(rays.origin, direction)
-    triangle, uv = found.triangle, found.uv
-    first = np.where(triangle >= 0, 0, rays.turns)
-    for turn in range(1, rays.turns):
-        other = rays.direction(turn, anchor)
-        found, waits = scene.first_hits(rays.origin, other), triangle < 0
-        triangle = np.where(waits, found.triangle, triangle)
-        uv, direction = np.where(waits, found.uv, uv), np.where(waits, other, direction)
-        first = np.where(waits & (triangle >= 0), turn, first)
+    seen, count = hits.triangle[:, anchor], len(hits.triangle)
+    first = count - ((seen >= 0) * np.arange(count, 0, -1)[:, None]).max(axis=0)
+    turn = np.minimum(first, count - 1)
+    triangle, uv = hits.triangle[turn, anchor], hits.uv[:, turn, anchor].copy()
+    direction = hits.along[turn, :, anchor].T.copy()
     # on a processor turn by turn: numpy's sums depend on how many stand side by side
-    turns = [first < rays.turns] if scene.place else [first == turn for turn in range(rays.turns)]
+    turns = [first < count] if scene.place else [first == turn for turn in range(count)]
     for stands in turns:
         met = np.flatnonzero(stands)
         if len(met):

@@ -26,6 +26,14 @@ class DeviceTextures:
             texels.append(np.broadcast_to(linear, (len(linear), 3)))
             sizes.append((first, height, width))
             first += len(linear)
+        places = {column.name: part for column, part in laid_out()}
+        written = [
+            (number, channel, column)
+            for number, name in enumerate(TEXTURED)
+            for channel, column in enumerate(range(places[name].start, places[name].stop))
+        ]
+        table = place.array(np.array(written, np.int64).T.copy()).tensor
+        self._place, self._channel, self._column = table
         self._texels = place.array(np.concatenate(texels)).tensor
         self._sizes = place.array(np.array(sizes, np.int64)).tensor
 
@@ -36,25 +44,21 @@ class DeviceTextures:
         rows = materials_TM.tensor[triangle.tensor]
         weights_P31 = weights.tensor.double().T[..., None]
         uv = (weights_P31 * self._uv_T32[triangle.tensor]).sum(dim=1).nan_to_num(0, 0, 0)
-        places = {column.name: part for column, part in laid_out()}
-        for place, name in enumerate(TEXTURED):
-            texture, part = self._rows_T3[triangle.tensor, place], places[name]
-            values = self._values(texture.clamp(min=0), uv)[:, : part.stop - part.start]
-            textured = (texture != CONSTANT)[:, None]
-            rows[:, part] = torch.where(textured, values.float(), rows[:, part])
+        texture_P3 = self._rows_T3[triangle.tensor]
+        values = self._values(texture_P3.clamp(min=0), uv[:, None])[:, self._place, self._channel]
+        textured = (texture_P3 != CONSTANT)[:, self._place]
+        rows[:, self._column] = torch.where(textured, values.float(), rows[:, self._column])
         return DeviceArray(rows, triangle.place)
 
     def _values(self, texture: Tensor, uv: Tensor) -> Tensor:
-        """Return values [P, 3] of textures [P] at [P, 2], as storage.records.lookup has them."""
-        first, height, width = self._sizes[texture].unbind(dim=1)
-        x, y = (uv - uv.floor()).unbind(dim=1)
+        """Return values [P, K, 3] of textures [P, K] at [P, 1, 2], as storage.records.lookup."""
+        first, height, width = self._sizes[texture].unbind(dim=-1)
+        x, y = (uv - uv.floor()).unbind(dim=-1)
         x, y = x * width - 0.5, y * height - 0.5
-        column, row = x.floor().long(), y.floor().long()
-        along, across = (x - column)[:, None], (y - row)[:, None]
-
-        def texels(down: int, right: int) -> Tensor:
-            return self._texels[first + (row + down) % height * width + (column + right) % width]
-
-        low = (1 - along) * texels(0, 0) + along * texels(0, 1)
-        high = (1 - along) * texels(1, 0) + along * texels(1, 1)
-        return (1 - across) * low + across * high
+        left, low = x.floor(), y.floor()
+        along, across = (x - left)[..., None], (y - low)[..., None]
+        columns = [(left.long() + right) % width for right in (0, 1)]
+        rows = [first + (low.long() + down) % height * width for down in (0, 1)]
+        texels = [[self._texels[row + column] for column in columns] for row in rows]
+        sides = [(1 - along) * left + along * right for left, right in texels]
+        return (1 - across) * sides[0] + across * sides[1]

@@ -5,7 +5,7 @@ from other surfaces is smooth but where it is mirrored. So it is gathered by man
 anchors, a grid over the picture, and mirrored by one ray for each pixel.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,14 @@ from model.hits.anchors import anchor_pixels, gathered_at
 from model.hits.camera import Rays
 from model.hits.device_arrays import DeviceArray, MaskedRows
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
+from model.hits.first_hits import FirstHits, first_hits
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
 from model.hits.reflectance import Gloss, drawn, gloss_at, lobe
 from model.hits.second_hits import DIMMEST, SMOOTH_ALPHA, blocks, brought
 from model.hits.sky_light import add_sky_light, escaped_light
 from model.hits.vectors import Floats, brightest, dot, spread
+from model.replayed import aside
 from storage.seeds import rng_for
 
 
@@ -103,15 +105,18 @@ def view_inputs(
         seed: of the noise, which stays where it is on the picture from view to view.
     """
     rays = Rays(c2w, fov_deg, resolution, rays_a_side)
+    device = None if scene.place is None else scene.place.device
+    hits = first_hits(scene, rays)
+    anchor = anchor_pixels(hits.coverage.reshape(resolution, resolution), anchors_a_side)
+    with aside(device) as gather:
+        gathered = gathered_at(scene, light, hits, anchor, gather_rays, seed)
     rng = rng_for(seed, "hits", resolution)
     on_lamps = scene.here(rng.random((2, len(scene.lamps), resolution**2), np.float32))
     chance = scene.here(rng.random((6, resolution**2), np.float32))
     to_sky = _towards_sky(scene, resolution, seed)
     sums = np.zeros_like(chance, shape=(NUM_CHANNELS, resolution**2))
-    directions = [rays.direction(turn) for turn in range(rays.turns)]
     for part in blocks(scene, resolution**2):
-        along = np.stack([direction[:, part] for direction in directions])
-        shaded = _shaded(scene, rays.origin, along, chance[5, part])
+        shaded = _shaded(scene, hits.only(part), chance[5, part])
         if len(shaded.pixel):
             block = _Block(
                 points=shaded.points,
@@ -122,22 +127,26 @@ def view_inputs(
                 of_pixels=shaded.of_pixels,
             )
             pixel, turn = shaded.pixel + part.start, shaded.turn
-            _add_surface(block, scene, rays.origin)
             lobe_rays = 1 if gather_rays else 0
-            _add_direct(block, scene, spread(on_lamps[:, :, pixel], turn), lobe_rays)
-            if to_sky is not None:
-                _add_sky(block, scene, to_sky[:, pixel], turn, sky_rays, lobe_rays)
+            with aside(device) as add_direct:
+                _add_surface(block, scene, rays.origin)
+                _add_direct(block, scene, spread(on_lamps[:, :, pixel], turn), lobe_rays)
+                if to_sky is not None:
+                    _add_sky(block, scene, to_sky[:, pixel], turn, sky_rays, lobe_rays)
+            by_lobe = block if scene.place is None else block.beside()
             if gather_rays:
                 u = chance[:5, pixel]
                 u[:2] = spread(u[:2], turn)
                 shading = shaded.chosen * np.float32(rays.turns)
-                _add_lobe_rays(block, scene, light, u, shading, sky_rays)
-    pixels = _averaged(sums, rays.turns)
-    anchor = anchor_pixels(pixels[0].reshape(resolution, resolution), anchors_a_side)
+                _add_lobe_rays(by_lobe, scene, light, u, shading, sky_rays)
+            add_direct()
+            if by_lobe is not block:
+                sums[:, part] += by_lobe.sums
+    gather()
     return ViewInputs(
-        pixels=pixels.T.copy().reshape(resolution, resolution, NUM_CHANNELS),
+        pixels=_averaged(sums, rays.turns).T.copy().reshape(resolution, resolution, NUM_CHANNELS),
         anchor=anchor,
-        gathered=gathered_at(scene, light, rays, anchor, gather_rays, seed),
+        gathered=gathered,
     )
 
 
@@ -171,14 +180,12 @@ class _Shaded:
 
 def _shaded(
     scene: LitScene,
-    origin: NDArray[np.float32],
-    along: NDArray[np.float32],
+    hits: FirstHits,
     chance: NDArray[np.float32],
 ) -> _Shaded:
-    """Return the points of a block of pixels, from rays [turns, 3, pixels]."""
-    turns, _, count = along.shape
-    found = scene.first_hits(origin, along.swapaxes(0, 1).reshape(3, -1))
-    triangle = found.triangle.reshape(turns, count)
+    """Return the points of a block of pixels."""
+    triangle = hits.triangle
+    turns, count = triangle.shape
     drawn_turn = np.minimum((chance * turns).astype(np.intp), turns - 1)
     alone = np.arange(turns)[:, None] == drawn_turn
     is_one = (triangle == triangle[0]).all(axis=0)
@@ -188,9 +195,9 @@ def _shaded(
     turn, pixel = np.nonzero(stands)
     ray = turn * count + pixel
     points = scene.points(
-        np.maximum(found.triangle[ray], 0),
-        found.uv[:, ray],
-        along[turn, :, pixel].T.copy(),
+        np.maximum(triangle.reshape(-1)[ray], 0),
+        hits.uv.reshape(2, -1)[:, ray],
+        hits.along[turn, :, pixel].T.copy(),
     )
     return _Shaded(
         points=points,
@@ -216,6 +223,10 @@ class _Block:
     """[P] how many rays each stands for."""
     of_pixels: Floats
     """[pixels] on a card: the point of each pixel that stands for all in what one ray brings."""
+
+    def beside(self) -> "_Block":
+        """Return the same points with sums of their own, to which others' may be added later."""
+        return replace(self, sums=np.zeros_like(self.sums))
 
     def add(
         self, channel: slice, values: NDArray[np.float32], rows: NDArray[np.intp] | None = None

@@ -1,0 +1,49 @@
+"""What the rays of a camera see first: the triangle of each, and where on it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.hits.camera import Rays
+from model.hits.lit_scene import LitScene
+from model.hits.second_hits import blocks
+from model.hits.vectors import Floats
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FirstHits:
+    """The first hits of the rays of P pixels, each of which has some `turns`."""
+
+    along: Floats
+    """[turns, 3, P] unit directions of the rays."""
+    triangle: NDArray[np.intp]
+    """[turns, P] row of the triangle, or MISS."""
+    uv: Floats
+    """[2, turns, P] weights of its second and third corner."""
+
+    def only(self, part: slice) -> "FirstHits":
+        """Return those of some pixels."""
+        return FirstHits(
+            along=self.along[:, :, part], triangle=self.triangle[:, part], uv=self.uv[:, :, part]
+        )
+
+    @property
+    def coverage(self) -> Floats:
+        """[P] share of each pixel's rays that meet something."""
+        met = (self.triangle >= 0).sum(axis=0)
+        return met.astype(np.float32) / np.float32(len(self.triangle))
+
+
+def first_hits(scene: LitScene, rays: Rays) -> FirstHits:
+    """Return what all rays of a camera see first; emitters are hidden from them."""
+    along = np.stack([rays.direction(turn) for turn in range(rays.turns)])
+    triangle, uv = [], []
+    for part in blocks(scene, rays.resolution**2):
+        directions = along[:, :, part].swapaxes(0, 1).reshape(3, -1)
+        hits = scene.first_hits(rays.origin, directions)
+        triangle.append(hits.triangle.reshape(rays.turns, -1))
+        uv.append(hits.uv.reshape(2, rays.turns, -1))
+    return FirstHits(
+        along=along, triangle=np.concatenate(triangle, axis=1), uv=np.concatenate(uv, axis=2)
+    )
