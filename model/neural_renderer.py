@@ -9,7 +9,7 @@ All of the network that is used here is in `_encode` and `_decode`.
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from model.encoded_scene import EncodedScene
 from model.light_groups import LightGroup, light_groups
-from model.open import Finder, find_network
+from model.open import find_network
 from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
 from model.replayed import Replayed
@@ -65,7 +65,6 @@ class NeuralRenderer:
         *,
         device: str | None = None,
         precision: str = "float32",
-        finders: Sequence[Finder] = (),
     ) -> "NeuralRenderer":
         """Read a checkpoint.
 
@@ -73,12 +72,11 @@ class NeuralRenderer:
             checkpoint: as `model.open.find_network`.
             device: of torch; by default the graphics card where there is one.
             precision: a name of model.precision.PRECISIONS.
-            finders: as `model.open.find_network`.
 
         Raises:
             TrilightError: no such file, or no network.
         """
-        found = find_network(checkpoint, *finders)
+        found = find_network(checkpoint)
         place = device or ("cuda" if torch.cuda.is_available() else "cpu")
         return cls(set_precision(found.open().to(place), precision), found.trained)
 
