@@ -15,7 +15,7 @@ from pipeline.renders.settings import one_picture
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError
-from storage.records.first_hits import FirstHits, first_hits
+from storage.raycast.first_hits import FirstHits, first_hits
 from storage.records.passes.declared import Pass, declared_passes
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene

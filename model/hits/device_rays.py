@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.hits.device_arrays import DeviceArray, DevicePlace
-from storage.records.surfaces import MISS
+from storage.raycast.caster import MISS, RayHits
 
 LEAF = 4
 """Most triangles of a leaf; at most 7, as a leaf's number has three bits for them."""
@@ -255,18 +255,8 @@ def compiled_kernel(device: torch.device) -> Any | None:
         return None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MetOnDevice:
-    """What N rays meet first."""
-
-    triangle: DeviceArray
-    """[N] row, or MISS; int64."""
-    uv: DeviceArray
-    """[2, N] weights of the second and third corner; 0 where nothing is met."""
-
-
 class DeviceTriangles:
-    """Some triangles of many, as rays on a card meet them (as storage.records.surfaces)."""
+    """Some triangles of many, as rays on a card meet them: a `RayCaster` of `DeviceArray`s."""
 
     def __init__(
         self, corners_T33: NDArray[np.float32], rows: NDArray[np.intp], place: DevicePlace
@@ -276,15 +266,13 @@ class DeviceTriangles:
         tree = build_tree(corners_T33[rows], rows)
         self._tree = [place.array(each).tensor for each in vars(tree).values()]
 
-    def met(self, origins: DeviceArray, directions: DeviceArray) -> MetOnDevice:
+    def intersect(self, origins: DeviceArray, directions: DeviceArray) -> RayHits:
         """Return what rays [N, 3] from `origins` [N, 3] meet first, from either side."""
         count = len(directions)
         triangle = torch.empty(count, dtype=torch.long, device=self._place.device)
         uv = torch.empty(2, count, device=self._place.device)
         self._launch(origins, directions, uv, triangle, uv, triangle, 0)
-        return MetOnDevice(
-            triangle=DeviceArray(triangle, self._place), uv=DeviceArray(uv, self._place)
-        )
+        return RayHits(triangle=DeviceArray(triangle, self._place), uv=DeviceArray(uv, self._place))
 
     def is_free(
         self, origins: DeviceArray, directions: DeviceArray, distances_m: DeviceArray

@@ -14,11 +14,12 @@ from model.hits.device_textures import DeviceTextures
 from model.hits.textures import SurfaceTextures
 from model.hits.vectors import Floats, as_rows, brightest, dot, unit
 from model.sky.sampler import SkySampler
+from storage.optics.lobes import lobes_of
+from storage.optics.multiscatter import scattered_again
+from storage.raycast.caster import RayCaster, RayHits
+from storage.raycast.embree import Triangles
 from storage.records.environment import Environment
-from storage.records.lobes import lobes_of
 from storage.records.material import EMISSION, ROUGHNESS
-from storage.records.multiscatter import scattered_again
-from storage.records.surfaces import MetSurfaces, Triangles
 
 _OFFSET = np.float32(1500 * 2.0**-24)
 """How far rays start off a surface, as a share of 1 m plus their distance from the origin: the
@@ -36,7 +37,7 @@ class Reflecting:
     alpha: Floats
     """[N] GGX width."""
     again: Floats
-    """[3, N] Fms of storage.records.multiscatter."""
+    """[3, N] Fms of storage.optics.multiscatter."""
     roughness: Floats
     """[N] roughness."""
 
@@ -154,7 +155,7 @@ class LitScene:
     def num_triangles(self) -> int:
         return len(self.area)
 
-    def on(self, place: DevicePlace, caster: Callable[..., Any]) -> "LitScene":
+    def on(self, place: DevicePlace, caster: Callable[..., RayCaster]) -> "LitScene":
         """Return the scene, which has no sky, on a device, where `caster` prepares its rays."""
         moved = copy.copy(self)
         for name, table in vars(self).items():
@@ -180,12 +181,12 @@ class LitScene:
         return SkySampler(self.sky)
 
     @cached_property
-    def seen(self) -> Triangles:
+    def seen(self) -> RayCaster:
         """What cameras see: all but emitters, which are hidden from them."""
         return Triangles(self._corner_rows, np.flatnonzero(~self.emits))
 
     @cached_property
-    def everything(self) -> Triangles:
+    def everything(self) -> RayCaster:
         """What blocks light and reflects it."""
         return Triangles(self._corner_rows, np.arange(self.num_triangles))
 
@@ -251,17 +252,17 @@ class LitScene:
             return None
         return reflecting(self.textures.materials(triangle, weights, self._materials_TM))
 
-    def first_hits(self, origin: Floats, direction: Floats) -> MetSurfaces:
+    def first_hits(self, origin: Floats, direction: Floats) -> RayHits:
         """Return what rays [3, P] from one camera [3] see first."""
         start = np.broadcast_to(origin, (direction.shape[1], 3))
-        return self.seen.met(start.copy(), as_rows(direction))
+        return self.seen.intersect(start.copy(), as_rows(direction))
 
-    def meet(self, among: Triangles, start: Floats, direction: Floats) -> tuple[Points, NDArray]:
+    def meet(self, among: RayCaster, start: Floats, direction: Floats) -> tuple[Points, NDArray]:
         """Return the points that rays [3, P] meet first among triangles, and which rays do.
 
         Of a ray that meets nothing, the point is one of the first triangle and means nothing.
         """
-        found = among.met(as_rows(start), as_rows(direction))
+        found = among.intersect(as_rows(start), as_rows(direction))
         met = found.triangle >= 0
         return self.points(np.maximum(found.triangle, 0), found.uv, direction), met
 

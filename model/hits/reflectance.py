@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from model.hits.lit_scene import LitScene, Points
 from model.hits.vectors import Floats, dot, tangents, unit
-from storage.records.multiscatter import ROUGHNESS_STEPS, X_STEPS, albedo_table
+from storage.optics.multiscatter import ROUGHNESS_STEPS, X_STEPS, albedo_table
 
 _INV_PI = np.float32(1 / np.pi)
 _LEAST_COSINE = np.float32(1e-4)

@@ -21,6 +21,7 @@ from model.hits.view_inputs import ViewInputs, view_inputs
 from model.scene_tensors import Cameras, SceneBatch, SceneTensors
 from model.sky.known import require_known_sky
 from storage.conventions import radiance_from_log10
+from storage.raycast.caster import RayCaster
 from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
 
@@ -49,7 +50,7 @@ class TracedScene:
             return self
         return self.on_place(DevicePlace(device), DeviceTriangles)
 
-    def on_place(self, place: DevicePlace, caster: Callable[..., Any]) -> "TracedScene":
+    def on_place(self, place: DevicePlace, caster: Callable[..., RayCaster]) -> "TracedScene":
         """Return the scene there, with rays as `caster` prepares them."""
         tables = {each.name: getattr(self.light, each.name) for each in fields(SceneLight)}
         held: dict[str, Any] = {

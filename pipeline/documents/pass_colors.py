@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from storage.conventions import srgb8
-from storage.records.surfaces import MISS
+from storage.raycast.caster import MISS
 
 _DARKEST = 40
 """Gray of the farthest point and of roughness 0, distinct from black."""

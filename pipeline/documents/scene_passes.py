@@ -19,10 +19,10 @@ from pipeline.documents.pass_colors import (
     id_colors,
     normal_colors,
 )
+from storage.raycast.caster import MISS
 from storage.records.passes.declared import pass_names
 from storage.records.passes.pictures import view_passes
 from storage.records.sample import Sample
-from storage.records.surfaces import MISS
 
 PASSES_STYLE = """
 .passes { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fill, 192px);

@@ -9,7 +9,7 @@ from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
 from storage.atomic import write_atomically
 from storage.dataset.dataset import open_dataset
-from storage.records.first_hits import require_row
+from storage.raycast.first_hits import require_row
 from storage.records.passes.stored import passes_exr
 from storage.records.scene import Scene
 

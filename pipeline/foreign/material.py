@@ -1,6 +1,6 @@
 """What a file says of a surface, and what that is in Trilight's columns.
 
-Its Fresnel term becomes albedos that are the same at every angle (storage.records.fresnel).
+Its Fresnel term becomes albedos that are the same at every angle (storage.optics.fresnel).
 """
 
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.picture import Picture
-from storage.records.fresnel import constant_albedos
+from storage.optics.fresnel import constant_albedos
 
 RGB = tuple[float, float, float]
 

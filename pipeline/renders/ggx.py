@@ -3,7 +3,7 @@
     f = diffuse / pi + scale * specular * D * G2 / (4 cos_i cos_o)
 
 D is that of GGX and G2 the height-correlated Smith term (Heitz 2014), alpha = roughness^2; the
-scale gives back what single scattering loses (storage.records.multiscatter). This is the material
+scale gives back what single scattering loses (storage.optics.multiscatter). This is the material
 of Cycles with its "Multiscatter GGX" and a constant colour. The diffuse lobe is reciprocal, the
 specular one is not, because its scale depends on the viewer's side alone: a path from a light must
 say which side that is. Directions are in the shading frame, the normal is +z.
@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from pipeline.renders.device_memory import own_floats
-from storage.records.multiscatter import ROUGHNESS_STEPS, X_STEPS, albedo_table
+from storage.optics.multiscatter import ROUGHNESS_STEPS, X_STEPS, albedo_table
 
 _INV_PI = 0.3183098861837907
 
@@ -35,11 +35,11 @@ class KernelLobes:
     weight: Any
     """Float: share of the specular lobe."""
     again: Any
-    """Color3f: Fms of storage.records.multiscatter."""
+    """Color3f: Fms of storage.optics.multiscatter."""
 
 
 class AlbedoLookup:
-    """The table of storage.records.multiscatter, for kernels.
+    """The table of storage.optics.multiscatter, for kernels.
 
     An entry holds its three upper neighbours too, so that a lane loads all four at once.
     """

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import own_floats
 from pipeline.renders.ggx import KernelLobes
-from storage.records.lobes import lobes_of
-from storage.records.multiscatter import scattered_again
+from storage.optics.lobes import lobes_of
+from storage.optics.multiscatter import scattered_again
 from storage.records.scene import Scene
 
 _GROUPS = 8

@@ -16,8 +16,8 @@ from pipeline.renders.device_memory import own_floats
 from pipeline.renders.ggx import KernelLobes
 from pipeline.renders.kernel_textures import KernelTextures
 from pipeline.renders.surface_table import SurfaceTable
-from storage.records.lobes import MIN_ALPHA
-from storage.records.multiscatter import ROUGHNESS_STEPS, mean_albedo
+from storage.optics.lobes import MIN_ALPHA
+from storage.optics.multiscatter import ROUGHNESS_STEPS, mean_albedo
 from storage.records.scene import Scene
 
 
@@ -46,7 +46,7 @@ class TexturedTable(SurfaceTable):
         )
 
     def _scattered_again(self, specular: Any, alpha: Any, active: Any) -> Any:
-        """Return Fms (Color3f) of storage.records.multiscatter."""
+        """Return Fms (Color3f) of storage.optics.multiscatter."""
         place = dr.sqrt(alpha) * (ROUGHNESS_STEPS - 1)
         row = dr.minimum(mi.UInt32(place), ROUGHNESS_STEPS - 2)
         low = dr.gather(mi.Float, self._mean_albedo, row, active)

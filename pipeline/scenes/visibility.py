@@ -2,7 +2,7 @@
 
 A grid of 32 x 32 rays costs about a millisecond, and decides only if a picture is worth rendering:
 it may miss anything smaller than a grid cell. Everything is computed in the single precision of
-storage.records.surfaces: the cameras of a dataset depend on each bit of it.
+storage.raycast.embree: the cameras of a dataset depend on each bit of it.
 """
 
 from dataclasses import dataclass
@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import camera_rays, latlong_direction
+from storage.raycast.caster import MISS
+from storage.raycast.embree import MetSurfaces, Surfaces
 from storage.records.scene import Scene
-from storage.records.surfaces import MISS, MetSurfaces, Surfaces
 
 SHADOW_OFFSET = 1e-4
 """Height of a shadow ray's start above its surface; hits in single precision are exact to about
@@ -58,7 +59,7 @@ class Visibility:
         origin, directions = camera_rays(c2w, fov_deg, grid)
         toward = directions.reshape(-1, 3).astype(np.float32)
         start = np.tile(origin.astype(np.float32), (len(toward), 1))
-        hits = self._surfaces.met(start, toward)
+        hits = self._surfaces.intersect(start, toward)
         is_hit = hits.triangle != MISS
         is_object = is_hit & self._face_is_object[hits.triangle]
         behind = is_hit & (np.sum(hits.normal * toward, axis=1) > 0)

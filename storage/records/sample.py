@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from storage.conventions import require_readable
 from storage.digests import canonical_json
 from storage.errors import TrilightError
+from storage.raycast.first_hits import require_row
 from storage.records.exr import decode_exr
-from storage.records.first_hits import require_row
 from storage.records.held_maps import HeldMaps
 from storage.records.lights import decode_lights_exr, encode_lights_exr, num_lights
 from storage.records.packed_maps import packed_maps, unpacked_maps

@@ -11,8 +11,8 @@ from pipeline.renders import surface_table
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.tracer import Tracer
 from storage.conventions import alpha_ggx
-from storage.records.lobes import MIN_ALPHA, lobes_of
-from storage.records.multiscatter import scattered_again
+from storage.optics.lobes import MIN_ALPHA, lobes_of
+from storage.optics.multiscatter import scattered_again
 from storage.records.scene import Scene
 from tests.oracle import plugin_scene
 from tests.oracle.plugin_scene import scaled_albedos
@@ -29,13 +29,13 @@ from tests.pipeline.renders.scene_kit import (
     quad,
     sphere,
 )
-from tests.storage.records.test_multiscatter import slow_albedo
+from tests.storage.optics.test_multiscatter import slow_albedo
 
 PLATE = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
 
 
 def _albedo(row: NDArray, cos_in: float) -> NDArray[np.float64]:
-    """Directional albedo [3] by brute force and by the formula of storage.records.multiscatter."""
+    """Directional albedo [3] by brute force and by the formula of storage.optics.multiscatter."""
     alpha = max(float(alpha_ggx(row[6])), MIN_ALPHA)
     single = slow_albedo(cos_in, alpha, "correlated")
     again = scattered_again(row[None, 3:6], np.array([alpha]), "correlated")[0]

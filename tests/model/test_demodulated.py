@@ -13,7 +13,7 @@ from model.image_head import BilinearUpsample, DptHead, Fusion
 from model.neural_renderer import NeuralRenderer
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
-from storage.records.first_hits import first_hits
+from storage.raycast.first_hits import first_hits
 from storage.records.material import DIFFUSE, SPECULAR
 from storage.records.scene import Scene
 from tests.for_each import for_each

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from pipeline.renders.sky_share import lamp_power, shining_sky, sky_share
 from pipeline.renders.tracer import split_triangles
 from storage.errors import Rejected
-from storage.records.lobes import Lobes, lobes_of
+from storage.optics.lobes import Lobes, lobes_of
+from storage.optics.multiscatter import Smith, scattered_again
 from storage.records.material import EMISSION
-from storage.records.multiscatter import Smith, scattered_again
 from storage.records.scene import Scene
 from tests.oracle.plugin_textures import (
     PLUGIN,
@@ -41,7 +41,7 @@ _SMITH: Smith = "separable"
 
 
 def _blend(textures: dict[str, Any]) -> dict[str, Any]:
-    """Return diffuse and specular lobe as the blend of storage.records.lobes."""
+    """Return diffuse and specular lobe as the blend of storage.optics.lobes."""
     specular = {name: textures[name] for name in ("specular", "again", "alpha")}
     return {
         "type": "blendbsdf",

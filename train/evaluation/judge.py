@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from model.renderformer import RenderFormer, radiance
 from storage.conventions import radiance_from_log10
-from storage.records.first_hits import first_hits
+from storage.raycast.first_hits import first_hits
 from storage.records.sample import Sample
 from storage.records.scene import Scene
 from train.data.buckets import make_batch

@@ -32,7 +32,7 @@ from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.noise_floor import clamped_radiance
 from storage.conventions import log10_radiance
-from storage.records.first_hits import first_hits
+from storage.raycast.first_hits import first_hits
 from storage.records.scene import Scene
 
 WIDTHS = (64, 256)

@@ -2,7 +2,7 @@
 
 The base colour is sRGB-encoded, all else is linear. Means are of linear values, and of roughness
 the mean is that of the GGX width, its square. There is no Fresnel term here: a surface with a
-metallic map, or with a base colour alone, gets albedos as storage.records.fresnel has them.
+metallic map, or with a base colour alone, gets albedos as storage.optics.fresnel has them.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.objects.maps.resample import area_means
-from storage.records.fresnel import constant_albedos
+from storage.optics.fresnel import constant_albedos
 from storage.records.texture import content_digest
 
 

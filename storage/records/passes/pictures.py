@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
-from storage.records.first_hits import SeenFrom, require_row
+from storage.raycast.first_hits import SeenFrom, require_row
 from storage.records.passes.declared import MOTION, UV, Pass, declared_passes
 from storage.records.passes.motion import require_same_triangles
 from storage.records.passes.rays import Later, PassRays

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.records.first_hits import FirstHits, corner_table
+from storage.raycast.first_hits import FirstHits, corner_table
 from storage.records.scene import Scene
 
 

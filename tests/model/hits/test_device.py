@@ -12,11 +12,12 @@ import torch
 from numpy.typing import NDArray
 
 from model.hits.device_arrays import DeviceArray, DevicePlace
-from model.hits.device_rays import SOURCE, DeviceTriangles, MetOnDevice, build_tree
+from model.hits.device_rays import SOURCE, DeviceTriangles, build_tree
 from model.hits.tracing import traced_scene
 from model.neural_renderer import NeuralRenderer
+from storage.raycast.caster import RayHits
+from storage.raycast.embree import Triangles
 from storage.records.scene import Scene
-from storage.records.surfaces import Triangles
 from tests.for_each import for_each
 from tests.model.hits.kit import corner, lit_scene
 from tests.model.hits.test_decoder import hits_config
@@ -32,10 +33,10 @@ class _OnHost:
     def __init__(self, corners: NDArray, rows: NDArray, place: DevicePlace) -> None:
         self._embree, self._place = Triangles(corners, rows), place
 
-    def met(self, origins: DeviceArray, directions: DeviceArray) -> MetOnDevice:
-        met = self._embree.met(origins.tensor.numpy(), directions.tensor.numpy())
+    def intersect(self, origins: DeviceArray, directions: DeviceArray) -> RayHits:
+        met = self._embree.intersect(origins.tensor.numpy(), directions.tensor.numpy())
         uv = np.where(met.triangle >= 0, met.uv, np.float32(0))
-        return MetOnDevice(triangle=self._place.array(met.triangle), uv=self._place.array(uv))
+        return RayHits(triangle=self._place.array(met.triangle), uv=self._place.array(uv))
 
     def is_free(self, *rays: DeviceArray) -> DeviceArray:
         return self._place.array(self._embree.is_free(*(each.tensor.numpy() for each in rays)))
@@ -95,7 +96,7 @@ def test_the_kernel_meets_what_embree_meets(count: int, tmp_path: Path) -> None:
         for asks_free in (0, 1):
             compiled.trace(*pointers, 4000, asks_free)
     embree = Triangles(corners, rows)
-    met = embree.met(starts, directions)
+    met = embree.intersect(starts, directions)
     # where the box stands on the floor, either is right
     assert (triangle == met.triangle).mean() > 0.99
     assert (free == embree.is_free(starts, directions, limits)).mean() > 0.999
@@ -109,8 +110,10 @@ def test_a_card_shows_the_processors_picture() -> None:
     corners = _corners()
     starts, directions, _ = _rays(corners, 4000)
     rows, place = np.arange(len(corners)), DevicePlace(card)
-    met = DeviceTriangles(corners, rows, place).met(place.array(starts), place.array(directions))
-    expected = Triangles(corners, rows).met(starts, directions).triangle
+    met = DeviceTriangles(corners, rows, place).intersect(
+        place.array(starts), place.array(directions)
+    )
+    expected = Triangles(corners, rows).intersect(starts, directions).triangle
     assert (met.triangle.tensor.cpu().numpy() == expected).mean() > 0.99
     slow = NeuralRenderer.load("builtin:hits", device="cpu").render(scene, 64)[0]
     renderer = NeuralRenderer.load("builtin:hits", device="cuda")

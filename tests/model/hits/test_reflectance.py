@@ -20,7 +20,7 @@ from model.hits.radiosity import BOUNCES, scene_light
 from model.hits.reflectance import drawn, gloss_at, lobe
 from model.hits.vectors import dot, unit
 from model.hits.view_inputs import Channel
-from storage.records.multiscatter import directional_albedo
+from storage.optics.multiscatter import directional_albedo
 from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, LAMP, corner, lit_scene, traced
 from tests.pipeline.renders.closed_forms import lambert_irradiance

@@ -12,7 +12,7 @@ from model.hits.tracing import TracedScene, traced_batch
 from model.hits.view_inputs import NUM_CHANNELS, Channel, view_inputs
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from storage.conventions import pixel_places
-from storage.records.first_hits import first_hits
+from storage.raycast.first_hits import first_hits
 from storage.records.material import EMISSION
 from storage.records.retextured import with_textures
 from storage.records.scene import Scene

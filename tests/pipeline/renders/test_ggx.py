@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from pipeline.renders import ggx
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
-from storage.records.lobes import lobes_of
-from storage.records.multiscatter import directional_albedo, scattered_again
+from storage.optics.lobes import lobes_of
+from storage.optics.multiscatter import directional_albedo, scattered_again
 from tests.pipeline.renders.scene_kit import material
-from tests.storage.records.test_multiscatter import stretched
+from tests.storage.optics.test_multiscatter import stretched
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders.load_tracer import load_tracer
-from storage.records.first_hits import first_hits
+from storage.raycast.first_hits import first_hits
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
 from tests.oracle import plugin_scene, plugin_tracer

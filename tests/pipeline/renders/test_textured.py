@@ -21,8 +21,8 @@ from scene_templates.layout import Emitter
 from scene_templates.materials import MaterialSettings
 from storage.conventions import look_at_c2w
 from storage.errors import Rejected, TrilightError
+from storage.raycast.first_hits import first_hits
 from storage.records.environment import Environment
-from storage.records.first_hits import first_hits
 from storage.records.lookup import texture_values
 from storage.records.retextured import with_textures, without_constant_textures
 from storage.records.scene import Scene, SceneObject

@@ -9,8 +9,8 @@ import pytest
 
 from storage.dataset.settings import StorageSettings
 from storage.errors import TrilightError
+from storage.raycast.first_hits import first_hits
 from storage.records.exr import channel_names, decode_channels, encode_channels
-from storage.records.first_hits import first_hits
 from storage.records.lookup import texture_values
 from storage.records.passes import stored
 from storage.records.passes.declared import MOTION, declared_passes, pass_names

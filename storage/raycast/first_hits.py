@@ -1,6 +1,6 @@
 """What the pixels of a camera see first: triangle, object, depth, position, normals, material.
 
-Embree finds the triangle, in single precision (storage.records.surfaces); where on it, is then
+Embree finds the triangle, in single precision (storage.raycast.embree); where on it, is then
 computed in double precision from the triangle's stored corners. Emitters are hidden from cameras,
 so rays pass through them. Each quantity is computed when it is first asked for.
 """
@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
+from storage.raycast.caster import MISS
+from storage.raycast.embree import Surfaces
 from storage.records.lookup import textured_rows
 from storage.records.scene import Scene
-from storage.records.surfaces import MISS, Surfaces
 
 
 class SeenFrom:
@@ -32,7 +33,7 @@ class SeenFrom:
         """Return what rays along unit `directions` [..., 3] meet first."""
         toward = directions.reshape(-1, 3).astype(np.float32)
         start = np.tile(self.origin.astype(np.float32), (len(toward), 1))
-        triangle = self.surfaces.met(start, toward).triangle
+        triangle = self.surfaces.intersect(start, toward).triangle
         return FirstHits(
             seen=self, directions=directions, triangle=triangle.reshape(directions.shape[:-1])
         )

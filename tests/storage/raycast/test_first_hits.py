@@ -6,9 +6,10 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import TrilightError
-from storage.records.first_hits import FirstHits, SeenFrom, first_hits
+from storage.raycast.caster import MISS
+from storage.raycast.embree import Surfaces
+from storage.raycast.first_hits import FirstHits, SeenFrom, first_hits
 from storage.records.scene import Scene
-from storage.records.surfaces import MISS, Surfaces
 from tests.for_each import for_each
 from tests.pipeline.renders.scene_kit import join, light
 from tests.scenes_by_hand import tiny_scene
@@ -180,7 +181,9 @@ DOWN = np.array([[0, 0, -1]], np.float32)
 
 def test_rays_from_both_sides_and_past_the_floor() -> None:
     origins = np.array([[0.5, -0.2, 3], [0.5, -0.2, -3], [5, 0, 3]], np.float32)
-    met = Surfaces(tiny_scene()).met(origins, np.array([[0, 0, -2], [0, 0, 1], [0, 0, -1]], "f4"))
+    met = Surfaces(tiny_scene()).intersect(
+        origins, np.array([[0, 0, -2], [0, 0, 1], [0, 0, -1]], "f4")
+    )
     assert met.triangle.tolist() == [0, 0, MISS]
     # in lengths of the direction; processors of other vector widths round the last bits otherwise
     np.testing.assert_allclose(met.distance_m[:2], [1.5, 3], rtol=4 * 2**-23)
@@ -196,7 +199,7 @@ def test_rows_are_those_of_the_scene_where_lights_stand_first() -> None:
         object_index=scene.object_index[order],
     )
     above = np.array([[0, 0, 3], [0.5, -0.2, 3], [-0.5, 0.2, 3]], np.float32)
-    met = Surfaces(moved).met(above, np.repeat(DOWN, 3, axis=0))
+    met = Surfaces(moved).intersect(above, np.repeat(DOWN, 3, axis=0))
     assert met.triangle[1:].tolist() == [1, 2]
     assert met.triangle[0] in (1, 2), "the lamp lets rays pass"
 
@@ -213,5 +216,5 @@ def test_lights_alone() -> None:
     surfaces = Surfaces(join([light([[-1, 0, -1], [1, 0, -1], [0, 0, 1]], 1.0)]))
     origin = np.array([[0, 1, 0]], np.float32)
     toward = np.array([[0, -1, 0]], np.float32)
-    assert surfaces.met(origin, toward).triangle.tolist() == [MISS]
+    assert surfaces.intersect(origin, toward).triangle.tolist() == [MISS]
     assert surfaces.is_free(origin, toward, np.array([9], np.float32)).all()

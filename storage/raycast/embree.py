@@ -9,20 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.raycast.caster import MISS, RayHits
 from storage.records.scene import Scene
-
-MISS = -1
-"""Triangle and object of a ray that meets nothing."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class MetSurfaces:
+class MetSurfaces(RayHits):
     """What N rays meet first, in Embree's own precision."""
 
-    triangle: NDArray[np.int64]
-    """[N] row of the triangle, or MISS."""
-    uv: NDArray[np.float32]
-    """[2, N] weights of its second and third corner; undefined where nothing is met."""
     distance_m: NDArray[np.float32]
     """[N] along the ray, in lengths of its direction; beyond all measure where nothing is met."""
     normal: NDArray[np.float32]
@@ -31,7 +25,7 @@ class MetSurfaces:
 
 
 class Triangles:
-    """Some triangles of many, as rays meet them."""
+    """Some triangles of many, as Embree's rays meet them: a `RayCaster`."""
 
     def __init__(self, corners_T33: NDArray[np.float32], rows: NDArray[np.intp]) -> None:
         """Take the corners of triangles, world space, and the rows of those that are there."""
@@ -53,7 +47,9 @@ class Triangles:
         if len(rows):
             TriangleMesh(self._embree, vertices, faces)
 
-    def met(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> MetSurfaces:
+    def intersect(
+        self, origins: NDArray[np.float32], directions: NDArray[np.float32]
+    ) -> MetSurfaces:
         """Return what rays [N, 3] from `origins` [N, 3] meet first, from either side."""
         found = self._embree.run(origins, directions, output=True)
         return MetSurfaces(

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from storage.records import multiscatter
-from storage.records.fresnel import constant_albedos
-from storage.records.multiscatter import (
+from storage.optics import multiscatter
+from storage.optics.fresnel import constant_albedos
+from storage.optics.multiscatter import (
     ROUGHNESS_STEPS,
     X_STEPS,
     Smith,

@@ -1,0 +1,1 @@
+"""Materials as numbers of light: lobes, Fresnel terms and multiple scattering."""

@@ -1,0 +1,1 @@
+"""Which triangles rays meet, and what the pixels of a camera see first."""
