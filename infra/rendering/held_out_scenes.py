@@ -24,6 +24,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import JUDGED_SPLIT
 from storage.errors import Rejected
 from storage.records.scene import Scene
+from storage.seeds import SceneKey
 from storage.settings.changes import changed
 
 TRIANGLES = 768
@@ -92,7 +93,5 @@ def first_composed(
     pool = assets_of(split)
     for attempt in range(MAX_ATTEMPTS):
         with contextlib.suppress(Rejected):
-            return compose_scene(
-                settings, pool, seed=seed, scene_index=scene_index, attempt=attempt
-            )
+            return compose_scene(settings, pool, SceneKey(seed, scene_index, attempt))
     return None

@@ -23,6 +23,7 @@ from storage.errors import Rejected
 from storage.records.objects import Failure, LockedObject
 from storage.records.sample import Sample, sample_key
 from storage.records.scene import Scene
+from storage.seeds import SceneKey
 
 MAX_ATTEMPTS = 16
 """Attempts at a scene before it is given up."""
@@ -136,9 +137,7 @@ def _scene(split: str, scene_index: int, attempt: int, from_file: Scene | None) 
     scene = compose_scene(
         settings.scenes,
         assets_of(split),
-        seed=settings.seed,
-        scene_index=scene_index,
-        attempt=attempt,
+        SceneKey(settings.seed, scene_index, attempt),
         user_maps=maps_of(split),
     )
     return RenderInput(scene=scene)

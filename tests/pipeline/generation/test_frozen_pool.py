@@ -44,7 +44,7 @@ from storage.records.objects import (
     read_objects_lock,
 )
 from storage.records.texture import MapSource
-from storage.seeds import rng_for
+from storage.seeds import SceneKey, rng_for
 from tests.infra.child_here import ChildHere
 from tests.pipeline.documents.dataset_by_hand import locked
 from tests.pipeline.generation.frozen_kit import SOURCE, asked, begun, build, frozen, prepared
@@ -295,9 +295,7 @@ def test_no_texture_or_map_of_test_is_in_train(
                 scene = compose_scene(
                     settings.scenes,
                     small_pool(),
-                    seed=0,
-                    scene_index=index,
-                    attempt=0,
+                    SceneKey(0, index),
                     user_maps=own,
                 )
             except Rejected:
@@ -327,7 +325,7 @@ def test_without_own_ones_a_scene_is_what_it_was(
     plain = named_build("smoke", changes=SHARES | changes).scenes
     own = user_maps(accepted.rows, "train")
     first, second = (
-        compose_scene(plain, small_pool(), seed=0, scene_index=3, attempt=0, **given)
+        compose_scene(plain, small_pool(), SceneKey(0, 3), **given)
         for given in ({}, {"user_maps": own})
     )
     assert [t.sha256 for t in first.textures] == [t.sha256 for t in second.textures]
