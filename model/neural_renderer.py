@@ -42,7 +42,7 @@ class PreparedScene:
     notes: tuple[str, ...]
     """What a person should know of this scene and this network."""
     views: dict[int, Callable[[Tensor, Tensor], Tensor]] = field(default_factory=dict)
-    """By resolution: camera and angle -> picture, where the network is."""
+    """Functions from camera and angle to a picture on the network's device, by resolution."""
 
 
 class NeuralRenderer:

@@ -1,6 +1,6 @@
 """`Replayed`: a function of tensors that a card repeats as one recorded graph.
 
-A view of `hits` is two thousand small kernels; submitting them one by one takes longer than they.
+A view of `hits` is four thousand small kernels; submitting them one by one takes longer than they.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,21 +20,21 @@ class Replayed:
     def __init__(self, function: Callable[..., Tensor]) -> None:
         self._function = function
         self._calls = 0
-        self._given: tuple[Tensor, ...] = ()
+        self._inputs: tuple[Tensor, ...] = ()
         self._graph: torch.cuda.CUDAGraph | None = None
 
-    def __call__(self, *given: Tensor) -> Tensor:
+    def __call__(self, *inputs: Tensor) -> Tensor:
         """Return what the function does of tensors of always the same shapes, on one card."""
         self._calls += 1
         if self._calls == 1:
-            return self._function(*given)
+            return self._function(*inputs)
         if self._graph is None:
-            self._given = tuple(each.clone() for each in given)
+            self._inputs = tuple(each.clone() for each in inputs)
             graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(graph):
-                self._result = self._function(*self._given)
+                self._result = self._function(*self._inputs)
             self._graph = graph
-        for held, new in zip(self._given, given, strict=True):
+        for held, new in zip(self._inputs, inputs, strict=True):
             held.copy_(new)
         self._graph.replay()
         return self._result
@@ -50,7 +50,8 @@ def aside(device: torch.device | None) -> Iterator[Callable[[], None]]:
     if device is None or device.type != "cuda" or not torch.cuda.is_current_stream_capturing():
         yield lambda: None
         return
-    main, beside = torch.cuda.current_stream(device), torch.cuda.Stream(device)
-    beside.wait_stream(main)
-    with torch.cuda.stream(beside):
-        yield lambda: main.wait_stream(beside)
+    main = torch.cuda.current_stream(device)
+    branch = torch.cuda.Stream(device)
+    branch.wait_stream(main)
+    with torch.cuda.stream(branch):
+        yield lambda: main.wait_stream(branch)

@@ -7,7 +7,7 @@ Ward et al. 1988), and costs the same for a picture of any width.
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.first_hits import FirstHits
+from model.hits.camera_hits import CameraHits
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
 from model.hits.second_hits import blocks, brought
@@ -41,7 +41,7 @@ def anchor_pixels(coverage_RR: NDArray[np.float32], anchors_a_side: int) -> NDAr
 def gathered_at(
     scene: LitScene,
     light: SceneLight,
-    hits: FirstHits,
+    hits: CameraHits,
     anchor: NDArray[np.int64],
     gather_rays: int,
     seed: int,
@@ -59,11 +59,13 @@ def gathered_at(
     if not gather_rays:
         return total.T
     shift = scene.here(rng_for(seed, "gather").random((5, len(anchor)), np.float32))
-    seen, count = hits.triangle[:, anchor], len(hits.triangle)
-    first = count - ((seen >= 0) * np.arange(count, 0, -1)[:, None]).max(axis=0)
-    turn = np.minimum(first, count - 1)
-    triangle, uv = hits.triangle[turn, anchor], hits.uv[:, turn, anchor].copy()
-    direction = hits.along[turn, :, anchor].T.copy()
+    count = len(hits.triangle)
+    is_hit = hits.triangle[:, anchor] >= 0
+    first = count - (is_hit * np.arange(count, 0, -1)[:, None]).max(axis=0)
+    ray = np.minimum(first, count - 1), anchor
+    triangle = hits.triangle[ray]
+    uv = hits.uv[:, ray[0], anchor].copy()
+    direction = hits.along[ray[0], :, anchor].T.copy()
     # on a processor turn by turn: numpy's sums depend on how many stand side by side
     turns = [first < count] if scene.place else [first == turn for turn in range(count)]
     for stands in turns:

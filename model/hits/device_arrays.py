@@ -52,7 +52,8 @@ class MaskedRows:
     """
 
     def __init__(self, mask: Tensor, within: Tensor | None = None) -> None:
-        self.mask, self.within = mask, within
+        self.mask = mask
+        self.within = within
 
     def __len__(self) -> int:
         return len(self.mask)
@@ -65,7 +66,7 @@ class MaskedRows:
         """[A] which of the rows that are asked do count."""
         return self.mask if self.within is None else self.mask[self.within]
 
-    def kept(self, values: "DeviceArray") -> "DeviceArray":
+    def zero_others(self, values: "DeviceArray") -> "DeviceArray":
         """Return the values [..., A] of the rows that are asked, 0 for those that do not count."""
         zero = values.tensor.new_zeros(())
         return DeviceArray(torch.where(self.counts, values.tensor, zero), values.place)
@@ -75,7 +76,8 @@ class DeviceArray(NDArrayOperatorsMixin):
     """A tensor in the place of a numpy array; its methods are those of numpy's that rays need."""
 
     def __init__(self, tensor: Tensor, place: DevicePlace) -> None:
-        self.tensor, self.place = tensor, place
+        self.tensor = tensor
+        self.place = place
 
     shape = property(lambda self: tuple(self.tensor.shape))
     ndim = property(lambda self: self.tensor.ndim)
@@ -84,11 +86,11 @@ class DeviceArray(NDArrayOperatorsMixin):
     def __len__(self) -> int:
         return len(self.tensor)
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *given: Any, **named: Any) -> Any:
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **named: Any) -> Any:
         operation = _UFUNCS.get(ufunc.__name__)
         if method != "__call__" or operation is None:
             return NotImplemented
-        operands = [_operand(each, self.place) for each in given]
+        operands = [_operand(each, self.place) for each in inputs]
         if "dtype" in named:
             operands = [each.to(_TYPES[np.dtype(named["dtype"])]) for each in operands]
         result = operation(*operands)
@@ -101,11 +103,11 @@ class DeviceArray(NDArrayOperatorsMixin):
         target.tensor = result.to(target.tensor.dtype)
         return target
 
-    def __array_function__(self, function: Any, types: Any, given: Any, named: Any) -> Any:
+    def __array_function__(self, function: Any, types: Any, inputs: Any, named: Any) -> Any:
         operation = _FUNCTIONS.get(function)
         if operation is None:
             return NotImplemented
-        result = operation(self.place, *given, **named)
+        result = operation(self.place, *inputs, **named)
         return self._like(result) if isinstance(result, Tensor) else result
 
     def __getitem__(self, key: Any) -> "DeviceArray":
@@ -122,12 +124,14 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     def _index(self, key: Any) -> tuple[Any, Tensor | None]:
         """Return what torch is asked for, and which of its rows count."""
-        keys, mask = [], None
-        others = key if isinstance(key, tuple) else (key,)
-        gathers = any(isinstance(each, DeviceArray | np.ndarray) for each in others)
-        for each in others:
+        keys: list[Any] = []
+        mask = None
+        parts = key if isinstance(key, tuple) else (key,)
+        gathers = any(isinstance(each, DeviceArray | np.ndarray) for each in parts)
+        for each in parts:
             if isinstance(each, MaskedRows):
-                mask, rows = each.counts, each.within
+                mask = each.counts
+                rows = each.within
                 if rows is None and gathers:
                     rows = self.place.tensor(np.arange(len(each)))
                 keys.append(slice(None) if rows is None else rows)
@@ -181,16 +185,16 @@ class DeviceArray(NDArrayOperatorsMixin):
         return True
 
 
-def _operand(given: Any, place: DevicePlace) -> Any:
+def _operand(value: Any, place: DevicePlace) -> Any:
     """Return a tensor, or a number of Python."""
-    if isinstance(given, DeviceArray):
-        return given.tensor
-    if isinstance(given, np.ndarray) and given.ndim:
-        return place.tensor(given)
-    return given.item() if isinstance(given, np.ndarray | np.generic) else given
+    if isinstance(value, DeviceArray):
+        return value.tensor
+    if isinstance(value, np.ndarray) and value.ndim:
+        return place.tensor(value)
+    return value.item() if isinstance(value, np.ndarray | np.generic) else value
 
 
-def _bounded(least: Callable, number: str) -> Callable:
+def _clamp_or(least: Callable, number: str) -> Callable:
     """Return a maximum or minimum that takes numbers too."""
 
     def of(a: Any, b: Any) -> Tensor:
@@ -222,8 +226,8 @@ _UFUNCS: dict[str, Callable] = {
     "bitwise_and": operator.and_,
     "bitwise_or": operator.or_,
     "invert": operator.invert,
-    "maximum": _bounded(torch.maximum, "min"),
-    "minimum": _bounded(torch.minimum, "max"),
+    "maximum": _clamp_or(torch.maximum, "min"),
+    "minimum": _clamp_or(torch.minimum, "max"),
     "absolute": torch.abs,
     "copysign": torch.copysign,
     "cos": torch.cos,
@@ -236,8 +240,8 @@ _UFUNCS: dict[str, Callable] = {
 }
 
 
-def _all(given: Any, place: DevicePlace) -> list[Tensor]:
-    return [_operand(each, place) for each in given]
+def _all(inputs: Any, place: DevicePlace) -> list[Tensor]:
+    return [_operand(each, place) for each in inputs]
 
 
 def _where(place: DevicePlace, condition: Any, a: Any, b: Any) -> Tensor:
@@ -250,8 +254,8 @@ def _take(place: DevicePlace, array: Any, index: Any, axis: int = 0) -> Tensor:
     return _operand(array, place)[(slice(None),) * dim + (_operand(index, place),)]
 
 
-def _interp(place: DevicePlace, *given: Any) -> Tensor:
-    x, known, values = _all(given, place)
+def _interp(place: DevicePlace, *inputs: Any) -> Tensor:
+    x, known, values = _all(inputs, place)
     right = torch.searchsorted(known, x.contiguous()).clamp(1, len(known) - 1)
     share = ((x - known[right - 1]) / (known[right] - known[right - 1])).clamp(0, 1)
     return values[right - 1] + share * (values[right] - values[right - 1])
@@ -264,14 +268,14 @@ def _nonzero(place: DevicePlace, mask: DeviceArray) -> tuple[NDArray, ...]:
 
 _FUNCTIONS: dict[Any, Callable] = {
     np.broadcast_to: lambda place, a, shape: a.tensor.expand(shape),
-    np.concatenate: lambda place, given, axis=0: torch.cat(_all(given, place), dim=axis),
+    np.concatenate: lambda place, a, axis=0: torch.cat(_all(a, place), dim=axis),
     np.cumsum: lambda place, a, axis: a.tensor.cumsum(dim=axis),
     np.flatnonzero: lambda place, mask: MaskedRows(mask.tensor.flatten() != 0),
     np.interp: _interp,
     np.nonzero: _nonzero,
     np.ones_like: lambda place, a: torch.ones_like(a.tensor),
     np.searchsorted: lambda place, a, v: torch.searchsorted(*_all((a, v), place)),
-    np.stack: lambda place, given, axis=0: torch.stack(_all(given, place), dim=axis),
+    np.stack: lambda place, a, axis=0: torch.stack(_all(a, place), dim=axis),
     np.take: _take,
     np.take_along_axis: lambda place, a, index, axis: a.tensor.gather(axis, index.tensor),
     np.tile: lambda place, a, count: a.tensor.repeat(count),

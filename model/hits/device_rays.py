@@ -149,12 +149,15 @@ class Tree:
 def build_tree(corners_T33: NDArray[np.float32], rows_T: NDArray[np.intp]) -> Tree:
     """Return the tree of triangles; without any, one that no ray meets."""
     if not len(rows_T):
-        corners_T33, rows_T = np.zeros((1, 3, 3), np.float32), np.array([MISS])
-    least, most = corners_T33.min(axis=1), corners_T33.max(axis=1)
-    waiting, node = np.arange(len(rows_T)), np.zeros(len(rows_T), np.int64)
+        return build_tree(np.zeros((1, 3, 3), np.float32), np.array([MISS]))
+    least = corners_T33.min(axis=1)
+    most = corners_T33.max(axis=1)
+    waiting = np.arange(len(rows_T))
+    node = np.zeros(len(rows_T), np.int64)
     order: list[NDArray] = []
     levels: list[NDArray] = []
-    num_nodes, num_placed, count = 0, 0, 1
+    num_nodes = num_placed = 0
+    count = 1
     while count:
         boxes = least[waiting], most[waiting]
         for halving in (1, 2):
@@ -163,18 +166,22 @@ def build_tree(corners_T33: NDArray[np.float32], rows_T: NDArray[np.intp]) -> Tr
         sizes = np.bincount(node, minlength=4 * count)
         is_leaf = sizes <= LEAF
         placed = np.where(is_leaf, sizes, 0)
-        first, number = num_placed + placed.cumsum() - placed, (~is_leaf).cumsum() - 1
+        first = num_placed + placed.cumsum() - placed
+        number = (~is_leaf).cumsum() - 1
         children = np.where(is_leaf, ~(8 * first + sizes), num_nodes + count + number)
         low, high = _boxes(*boxes, node, 4 * count)
         high[sizes == 0] = np.inf  # a point that no ray meets
         sides = np.concatenate([low, high], axis=1).reshape(count, 4, 6).swapaxes(1, 2)
         level = np.zeros((count, 8, 4), np.float32)
-        level[:, :6], level.view(np.int32)[:, 6] = sides, children.reshape(count, 4)
+        level[:, :6] = sides
+        level.view(np.int32)[:, 6] = children.reshape(count, 4)
         levels.append(level.reshape(count, 32))
         in_leaf = is_leaf[node]
         order.append(waiting[in_leaf][node[in_leaf].argsort(kind="stable")])
-        waiting, node = waiting[~in_leaf], number[node[~in_leaf]]
-        num_nodes, num_placed = num_nodes + count, num_placed + int(placed.sum())
+        waiting = waiting[~in_leaf]
+        node = number[node[~in_leaf]]
+        num_nodes += count
+        num_placed += int(placed.sum())
         count = len(sizes) - int(is_leaf.sum())
     order_T = np.concatenate(order)
     corners = np.zeros((len(order_T), 12), np.float32)
@@ -217,8 +224,8 @@ def _costs(
     cell = ((group[:, None] * 3 + np.arange(3)) * BINS + place_A3).ravel()
     shape = num_groups, 3, BINS
     count = np.bincount(cell, minlength=3 * BINS * num_groups).reshape(shape)
-    low, high = _boxes(least.repeat(3, axis=0), most.repeat(3, axis=0), cell, count.size)
-    low, high = low.reshape(*shape, 3), high.reshape(*shape, 3)
+    boxes = _boxes(least.repeat(3, axis=0), most.repeat(3, axis=0), cell, count.size)
+    low, high = (each.reshape(*shape, 3) for each in boxes)
     costs = []
     for along in (slice(None), slice(None, None, -1)):
         extent = np.maximum.accumulate(high[:, :, along], axis=2)

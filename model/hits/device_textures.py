@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from model.hits.device_arrays import DeviceArray, DevicePlace
@@ -17,7 +18,9 @@ class DeviceTextures:
         self.is_textured = place.array(textures.is_textured)
         self._uv_T32 = place.array(textures.uv_T32).tensor.double()
         self._rows_T3 = place.array(textures.rows_T3).tensor.long()
-        texels, sizes, first = [], [], 0
+        texels: list[NDArray] = []
+        sizes: list[tuple[int, int, int]] = []
+        first = 0
         for texture in textures.textures:
             height, width = texture.texels.shape[:2]
             linear = texture.linear(texture.texels).reshape(height * width, -1)
@@ -53,12 +56,12 @@ class DeviceTextures:
     def _values(self, texture: Tensor, uv: Tensor) -> Tensor:
         """Return values [P, K, 3] of textures [P, K] at [P, 1, 2], as storage.records.lookup."""
         first, height, width = self._sizes[texture].unbind(dim=-1)
-        x, y = (uv - uv.floor()).unbind(dim=-1)
-        x, y = x * width - 0.5, y * height - 0.5
-        left, low = x.floor(), y.floor()
-        along, across = (x - left)[..., None], (y - low)[..., None]
-        columns = [(left.long() + right) % width for right in (0, 1)]
-        rows = [first + (low.long() + down) % height * width for down in (0, 1)]
-        texels = [[self._texels[row + column] for column in columns] for row in rows]
-        sides = [(1 - along) * left + along * right for left, right in texels]
-        return (1 - across) * sides[0] + across * sides[1]
+        place = (uv - uv.floor()) * torch.stack([width, height], dim=-1) - 0.5
+        corner = place.floor()
+        along, across = (place - corner)[..., None].unbind(dim=-2)
+        column, row = corner.long().unbind(dim=-1)
+        columns = [(column + step) % width for step in (0, 1)]
+        starts = [first + (row + step) % height * width for step in (0, 1)]
+        texels = [[self._texels[start + each] for each in columns] for start in starts]
+        rows = [(1 - along) * a + along * b for a, b in texels]
+        return (1 - across) * rows[0] + across * rows[1]

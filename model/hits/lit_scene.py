@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from model.hits.device_arrays import DeviceArray, DevicePlace
@@ -154,6 +155,11 @@ class LitScene:
     @property
     def num_triangles(self) -> int:
         return len(self.area)
+
+    @property
+    def device(self) -> torch.device | None:
+        """The card where its rays are traced; None: the CPU."""
+        return None if self.place is None else self.place.device
 
     def on(self, place: DevicePlace, caster: Callable[..., RayCaster]) -> "LitScene":
         """Return the scene, which has no sky, on a device, where `caster` prepares its rays."""

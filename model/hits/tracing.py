@@ -142,15 +142,26 @@ def lit_scenes(batch: SceneBatch) -> tuple[LitScene, ...]:
 
 
 def with_traced(
-    scene: SceneTensors, resolution: int, config: ModelConfig, seed: int = 0
+    scene: SceneTensors,
+    resolution: int,
+    config: ModelConfig,
+    seed: int = 0,
+    device: torch.device | None = None,
 ) -> SceneTensors:
     """Return a scene with what is traced of its views: what a trainer's threads do ahead.
 
-    `seed` is that of the noise: a network that saw one noise alone might learn it.
+    Args:
+        scene, resolution, config: of the views.
+        seed: of the noise: a network that saw one noise alone might learn it.
+        device: what traces, if it can; the result is where the scene is.
     """
     require_known_sky(scene.sky, config)
     ready = traced_scene(lit_scene_of(scene))
-    traced = traced_views(ready, scene.c2w_V44, scene.fov_deg_V, resolution, config, seed)
+    if device is not None:
+        ready = ready.on(device)
+    cameras = [each.to(ready.unit_3.device) for each in (scene.c2w_V44, scene.fov_deg_V)]
+    traced = traced_views(ready, cameras[0], cameras[1], resolution, config, seed)
+    traced = traced.converted(lambda each: each.to(scene.c2w_V44.device))
     return dataclasses.replace(scene, traced=traced)
 
 
@@ -202,14 +213,14 @@ def traced_views(
     return Traced(
         sides_T12=scene.sides_T12,
         unit_3=scene.unit_3,
-        pixels_VRRC=_stacked([view.pixels for view in views]),
-        anchor_VA=_stacked([view.anchor for view in views]),
-        gathered_VA3=_stacked([view.gathered for view in views]),
+        pixels_VRRC=_stack([view.pixels for view in views]),
+        anchor_VA=_stack([view.anchor for view in views]),
+        gathered_VA3=_stack([view.gathered for view in views]),
         given_VI=torch.ones(len(views), len(INPUTS), device=scene.unit_3.device),
     )
 
 
-def _stacked(arrays: list[NDArray]) -> Tensor:
+def _stack(arrays: list[NDArray]) -> Tensor:
     stacked: Any = np.stack(arrays)
     return stacked.tensor if isinstance(stacked, DeviceArray) else torch.from_numpy(stacked)
 

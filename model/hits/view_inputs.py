@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from model.hits.anchors import anchor_pixels, gathered_at
 from model.hits.camera import Rays
+from model.hits.camera_hits import CameraHits, camera_hits
 from model.hits.device_arrays import DeviceArray, MaskedRows
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
-from model.hits.first_hits import FirstHits, first_hits
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
 from model.hits.reflectance import Gloss, drawn, gloss_at, lobe
@@ -105,44 +105,21 @@ def view_inputs(
         seed: of the noise, which stays where it is on the picture from view to view.
     """
     rays = Rays(c2w, fov_deg, resolution, rays_a_side)
-    device = None if scene.place is None else scene.place.device
-    hits = first_hits(scene, rays)
+    hits = camera_hits(scene, rays)
     anchor = anchor_pixels(hits.coverage.reshape(resolution, resolution), anchors_a_side)
-    with aside(device) as gather:
+    with aside(scene.device) as join_gathered:
         gathered = gathered_at(scene, light, hits, anchor, gather_rays, seed)
     rng = rng_for(seed, "hits", resolution)
-    on_lamps = scene.here(rng.random((2, len(scene.lamps), resolution**2), np.float32))
-    chance = scene.here(rng.random((6, resolution**2), np.float32))
-    to_sky = _towards_sky(scene, resolution, seed)
-    sums = np.zeros_like(chance, shape=(NUM_CHANNELS, resolution**2))
+    noise = _Noise(
+        on_lamps=scene.here(rng.random((2, len(scene.lamps), resolution**2), np.float32)),
+        chance=scene.here(rng.random((6, resolution**2), np.float32)),
+        to_sky=_towards_sky(scene, resolution, seed),
+    )
+    sums = np.zeros_like(noise.chance, shape=(NUM_CHANNELS, resolution**2))
     for part in blocks(scene, resolution**2):
-        shaded = _shaded(scene, hits.only(part), chance[5, part])
-        if len(shaded.pixel):
-            block = _Block(
-                points=shaded.points,
-                gloss=gloss_at(scene, shaded.points),
-                sums=sums[:, part],
-                pixel=shaded.pixel,
-                weight=shaded.weight,
-                of_pixels=shaded.of_pixels,
-            )
-            pixel, turn = shaded.pixel + part.start, shaded.turn
-            lobe_rays = 1 if gather_rays else 0
-            with aside(device) as add_direct:
-                _add_surface(block, scene, rays.origin)
-                _add_direct(block, scene, spread(on_lamps[:, :, pixel], turn), lobe_rays)
-                if to_sky is not None:
-                    _add_sky(block, scene, to_sky[:, pixel], turn, sky_rays, lobe_rays)
-            by_lobe = block if scene.place is None else block.beside()
-            if gather_rays:
-                u = chance[:5, pixel]
-                u[:2] = spread(u[:2], turn)
-                shading = shaded.chosen * np.float32(rays.turns)
-                _add_lobe_rays(by_lobe, scene, light, u, shading, sky_rays)
-            add_direct()
-            if by_lobe is not block:
-                sums[:, part] += by_lobe.sums
-    gather()
+        of_part = hits.only(part), noise.only(part)
+        _add_pixels(sums[:, part], scene, light, rays, *of_part, sky_rays, int(gather_rays > 0))
+    join_gathered()
     return ViewInputs(
         pixels=_averaged(sums, rays.turns).T.copy().reshape(resolution, resolution, NUM_CHANNELS),
         anchor=anchor,
@@ -155,6 +132,65 @@ def _towards_sky(scene: LitScene, resolution: int, seed: int) -> NDArray[np.floa
     if scene.sky is None:
         return None
     return rng_for(seed, "hits of a sky", resolution).random((2, resolution**2), np.float32)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Noise:
+    """Uniform numbers of P pixels."""
+
+    on_lamps: Floats
+    """[2, lamps, P] where on each lamp."""
+    chance: Floats
+    """[6, P] for the rays that lobes draw, and for the one ray of each pixel."""
+    to_sky: Floats | None
+    """[2, P] for rays to the sky; None without a sky."""
+
+    def only(self, part: slice) -> "_Noise":
+        """Return those of some pixels."""
+        to_sky = None if self.to_sky is None else self.to_sky[:, part]
+        return _Noise(
+            on_lamps=self.on_lamps[:, :, part], chance=self.chance[:, part], to_sky=to_sky
+        )
+
+
+def _add_pixels(
+    sums: Floats,
+    scene: LitScene,
+    light: SceneLight,
+    rays: Rays,
+    hits: CameraHits,
+    noise: _Noise,
+    sky_rays: int,
+    lobe_rays: int,
+) -> None:
+    """Add what rays find of a block of pixels to its sums [40, P]; on a card, in two branches."""
+    shaded = _shaded(scene, hits, noise.chance[5])
+    if not len(shaded.pixel):
+        return
+    block = _Block(
+        points=shaded.points,
+        gloss=gloss_at(scene, shaded.points),
+        sums=sums,
+        pixel=shaded.pixel,
+        weight=shaded.weight,
+        of_pixels=shaded.of_pixels,
+    )
+    pixel = shaded.pixel
+    with aside(scene.device) as join_direct:
+        _add_surface(block, scene, rays.origin)
+        on_lamps = spread(noise.on_lamps[:, :, pixel], shaded.turn)
+        _add_direct(block, scene, on_lamps, lobe_rays)
+        if noise.to_sky is not None:
+            _add_sky(block, scene, noise.to_sky[:, pixel], shaded.turn, sky_rays, lobe_rays)
+    by_lobe = block if scene.place is None else block.with_own_sums()
+    if lobe_rays:
+        u = noise.chance[:5, pixel]
+        u[:2] = spread(u[:2], shaded.turn)
+        shading = shaded.chosen * np.float32(rays.turns)
+        _add_lobe_rays(by_lobe, scene, light, u, shading, sky_rays)
+    join_direct()
+    if by_lobe is not block:
+        sums[:] += by_lobe.sums
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -180,7 +216,7 @@ class _Shaded:
 
 def _shaded(
     scene: LitScene,
-    hits: FirstHits,
+    hits: CameraHits,
     chance: NDArray[np.float32],
 ) -> _Shaded:
     """Return the points of a block of pixels."""
@@ -224,7 +260,7 @@ class _Block:
     of_pixels: Floats
     """[pixels] on a card: the point of each pixel that stands for all in what one ray brings."""
 
-    def beside(self) -> "_Block":
+    def with_own_sums(self) -> "_Block":
         """Return the same points with sums of their own, to which others' may be added later."""
         return replace(self, sums=np.zeros_like(self.sums))
 
@@ -244,7 +280,7 @@ class _Block:
         """Add those of all rays of the block, turn after turn; where none count, nothing."""
         counts: Any = np.flatnonzero(self.weight)
         rows = counts if rows is None else counts[rows]
-        weighed = rows.kept(values * self.weight[rows])
+        weighed = rows.zero_others(values * self.weight[rows])
         shape = (len(values), -1, self.sums.shape[1])
         self.sums[channel] += weighed.reshape(shape).sum(axis=1)
 

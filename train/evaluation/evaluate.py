@@ -8,7 +8,6 @@ import torch
 from numpy.typing import NDArray
 from pydantic import SkipValidation
 
-from model.config import ModelConfig
 from model.hits.traced import INPUTS, with_others_tokens
 from model.hits.tracing import with_traced
 from model.light_groups import light_groups
@@ -89,7 +88,7 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
     for sample in config.samples():
         scene = validation_scene(sample, config.resolution)
         if config.network.config.view_stage == "hits":
-            scene = with_traced_views(scene, config.network.config, config.resolution)
+            scene = with_traced_views(scene, config.network, config.resolution)
         contestants = {NETWORK: predict(config.network, scene.scene)}
         contestants |= withheld_pictures(config.network, scene.scene)
         grouped_VRR3 = grouped_pictures(config.network, sample.scene, config.resolution)
@@ -223,10 +222,11 @@ def grouped_pictures(
 
 
 def with_traced_views(
-    judged: ValidationScene, config: ModelConfig, resolution: int
+    judged: ValidationScene, network: RenderFormer, resolution: int
 ) -> ValidationScene:
     """Return a scene with traced inputs, so that later predictions share them."""
-    tensors = with_traced(judged.scene.tensors, resolution, config)
+    device = next(network.parameters()).device
+    tensors = with_traced(judged.scene.tensors, resolution, network.config, device=device)
     return dataclasses.replace(judged, scene=dataclasses.replace(judged.scene, tensors=tensors))
 
 

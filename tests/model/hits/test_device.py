@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import SOURCE, DeviceTriangles, build_tree
-from model.hits.tracing import traced_scene
+from model.hits.tracing import traced_scene, with_traced
 from model.neural_renderer import NeuralRenderer
+from model.scene_tensors import scene_tensors
 from storage.raycast.caster import RayHits
 from storage.raycast.embree import Triangles
 from storage.records.scene import Scene
@@ -121,3 +122,8 @@ def test_a_card_shows_the_processors_picture() -> None:
     for _ in range(3):  # one by one, recorded, repeated
         quick = renderer.view(prepared, scene.c2w[0], float(scene.fov_deg[0]), 64)
         assert np.abs(quick - slow).mean() < 1e-4 * slow.mean()
+    tensors, config = scene_tensors(scene), hits_config()
+    by_card = with_traced(tensors, 32, config, device=card).traced
+    by_processor = with_traced(tensors, 32, config).traced
+    assert by_card is not None and by_processor is not None
+    torch.testing.assert_close(by_card.pixels_VRRC, by_processor.pixels_VRRC, rtol=1e-3, atol=1e-3)

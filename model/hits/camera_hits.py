@@ -12,7 +12,7 @@ from model.hits.vectors import Floats
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FirstHits:
+class CameraHits:
     """The first hits of the rays of P pixels, each of which has some `turns`."""
 
     along: Floats
@@ -22,28 +22,29 @@ class FirstHits:
     uv: Floats
     """[2, turns, P] weights of its second and third corner."""
 
-    def only(self, part: slice) -> "FirstHits":
+    def only(self, part: slice) -> "CameraHits":
         """Return those of some pixels."""
-        return FirstHits(
+        return CameraHits(
             along=self.along[:, :, part], triangle=self.triangle[:, part], uv=self.uv[:, :, part]
         )
 
     @property
     def coverage(self) -> Floats:
         """[P] share of each pixel's rays that meet something."""
-        met = (self.triangle >= 0).sum(axis=0)
-        return met.astype(np.float32) / np.float32(len(self.triangle))
+        share: Floats = (self.triangle >= 0).sum(axis=0).astype(np.float32)
+        return share / np.float32(len(self.triangle))
 
 
-def first_hits(scene: LitScene, rays: Rays) -> FirstHits:
+def camera_hits(scene: LitScene, rays: Rays) -> CameraHits:
     """Return what all rays of a camera see first; emitters are hidden from them."""
-    along = np.stack([rays.direction(turn) for turn in range(rays.turns)])
-    triangle, uv = [], []
+    along = np.stack([rays.direction(number) for number in range(rays.turns)])
+    triangle: list[NDArray] = []
+    uv: list[Floats] = []
     for part in blocks(scene, rays.resolution**2):
         directions = along[:, :, part].swapaxes(0, 1).reshape(3, -1)
         hits = scene.first_hits(rays.origin, directions)
         triangle.append(hits.triangle.reshape(rays.turns, -1))
         uv.append(hits.uv.reshape(2, rays.turns, -1))
-    return FirstHits(
+    return CameraHits(
         along=along, triangle=np.concatenate(triangle, axis=1), uv=np.concatenate(uv, axis=2)
     )
