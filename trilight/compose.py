@@ -92,15 +92,15 @@ class SceneBuilder:
         """
         if isinstance(mesh, tuple):
             name = name or f"object{len(self._objects)}"
-            found: LoadedMesh | _MeshFile = mesh_of_arrays(*mesh, uid=name, licence=licence)
+            loaded: LoadedMesh | _MeshFile = mesh_of_arrays(*mesh, uid=name, licence=licence)
         else:
-            found = _MeshFile(path=Path(mesh), licence=licence)
-            if not found.path.is_file():
-                raise TrilightError(f"{found.path}: no such file; expected a mesh.")
-            name = name or self._unused(found.path.stem)
+            loaded = _MeshFile(path=Path(mesh), licence=licence)
+            if not loaded.path.is_file():
+                raise TrilightError(f"{loaded.path}: no such file; expected a mesh.")
+            name = name or self._unused(loaded.path.stem)
         if size is not None and not 0 < size < np.inf:
             raise TrilightError(f"{name}: size is {size}; expected metres above 0.")
-        if size is not None and isinstance(found, LoadedMesh) and found.reach == 0:
+        if size is not None and isinstance(loaded, LoadedMesh) and loaded.reach == 0:
             raise TrilightError(f"{name}: all vertices are one point; expected a mesh.")
         scale = 1.0 if size is None else float(size)
         transform = DescribedTransform(
@@ -109,7 +109,7 @@ class SceneBuilder:
             scale=(scale, scale, scale),
             normalize=size is not None,
         )
-        return self._add(name, found, transform, material or Material())
+        return self._add(name, loaded, transform, material or Material())
 
     def add_builtin(
         self,

@@ -67,8 +67,8 @@ def mesh_of_arrays(positions: ArrayLike, faces: ArrayLike, *, uid: str, licence:
         raise TrilightError(
             f"{uid}: vertices have shape {points.shape}; expected [V, 3] finite metres."
         )
-    whole = np.issubdtype(rows.dtype, np.integer)
-    if rows.ndim != 2 or rows.shape[1:] != (3,) or len(rows) == 0 or not whole:
+    is_integer = np.issubdtype(rows.dtype, np.integer)
+    if rows.ndim != 2 or rows.shape[1:] != (3,) or len(rows) == 0 or not is_integer:
         raise TrilightError(
             f"{uid}: triangles have shape {rows.shape} and dtype {rows.dtype}; expected [F, 3] "
             "whole numbers."

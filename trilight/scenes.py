@@ -43,8 +43,8 @@ def read_scenes(source: str | os.PathLike[str]) -> Iterator[Scene]:
         source: such as `train-000000.tar`, `stage.usdc`, `scenes/` or `scenes/{000..119}.json`.
     """
     with SceneReader() as reader:
-        for found in scene_sources(os.fspath(source), reader):
-            yield _noted(reader.load(found))
+        for entry in scene_sources(os.fspath(source), reader):
+            yield _noted(reader.load(entry))
 
 
 def write_scene(

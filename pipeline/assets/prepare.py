@@ -47,11 +47,11 @@ def prepare_asset(
     check_clean(cleaned)
     mesh, front_share = orient_outward(cleaned)
     measured = MeasuredSource(mesh)
-    used = safe_method(mesh, method)
-    levels, missed = _levels(measured, settings, used)
+    safe = safe_method(mesh, method)
+    levels, missed = _levels(measured, settings, safe)
     levels, missed, materials = with_own_materials(levels, missed, source, mesh, settings)
     return AssetAttempt(
-        method=used,
+        method=safe,
         asset=Asset(
             geometry_sha256=geometry_sha256(cleaned),
             source_sha256=source.sha256,
@@ -127,10 +127,10 @@ class _LevelMaker:
             return self.level(budget)
         largest = min(budget, len(self._mesh.faces)) if self._keeps_source else budget
         try:
-            found = smallest_passing(lambda faces: self._make(faces, epsilon), largest)
+            best = smallest_passing(lambda faces: self._make(faces, epsilon), largest)
         except Rejected:
             return self.level(budget)
-        return _level(budget, *found)
+        return _level(budget, *best)
 
     def level(self, budget: int) -> Level:
         """Return the level of a budget; raises Rejected where it fails the gate."""

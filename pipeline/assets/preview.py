@@ -54,18 +54,18 @@ def _coloured(mesh: TriangleMesh, skin: LevelSkin, width_px: int) -> NDArray[np.
     origins, directions, _ = _camera_rays(wide)
     face = first_faces(mesh, origins.astype(np.float32), directions.astype(np.float32))
     hit = face >= 0
-    colour = np.full((len(face), 3), _BACKGROUND)
+    color = np.full((len(face), 3), _BACKGROUND)
     corners, normals = mesh.corners[face[hit]], mesh.double_area_vectors[face[hit]]
     facing = np.einsum("ij,ij->i", normals, -directions[hit])
     facing /= np.linalg.norm(normals, axis=1)
-    away = np.einsum("ij,ij->i", normals, origins[hit] - corners[:, 0])
+    offset = np.einsum("ij,ij->i", normals, origins[hit] - corners[:, 0])
     steep = np.einsum("ij,ij->i", normals, -directions[hit])
-    distance = away / np.where(np.abs(steep) > 1e-12, steep, 1e-12)
+    distance = offset / np.where(np.abs(steep) > 1e-12, steep, 1e-12)
     points = origins[hit] + distance[:, None] * directions[hit]
     uv = np.einsum("nc,ncd->nd", barycentric(corners, points), skin.uv[face[hit]])
     diffuse, specular = (texture_values(texture, uv) for texture in skin.textures[:2])
-    colour[hit] = (diffuse + specular) * (0.25 + 0.75 * np.abs(facing))[:, None]
-    blocks = colour.reshape(width_px, _SUPERSAMPLE, width_px, _SUPERSAMPLE, 3).mean(axis=(1, 3))
+    color[hit] = (diffuse + specular) * (0.25 + 0.75 * np.abs(facing))[:, None]
+    blocks = color.reshape(width_px, _SUPERSAMPLE, width_px, _SUPERSAMPLE, 3).mean(axis=(1, 3))
     return srgb8(blocks)
 
 

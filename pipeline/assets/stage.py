@@ -146,8 +146,8 @@ def source_digest(
         Rejected: as `read_source`.
         OSError: it cannot be read.
     """
-    found = read_source(source, settings.read_limits, root)
-    return found.kind, found.sha256
+    source_file = read_source(source, settings.read_limits, root)
+    return source_file.kind, source_file.sha256
 
 
 def _outcome(
@@ -199,11 +199,13 @@ def _by_any_method(
     while waiting:
         method = waiting.pop(0)
         finest = missing[0] == settings.budgets[0]  # epsilon is about this level
-        wanted = dataclasses.replace(
+        attempt_settings = dataclasses.replace(
             settings, budgets=missing, epsilon=settings.epsilon if finest else None
         )
         try:
-            attempt = call_with_retries(child, attempt_in_child, source, wanted, method, root)
+            attempt = call_with_retries(
+                child, attempt_in_child, source, attempt_settings, method, root
+            )
         except ChildFailed as failure:
             if not failure.is_verdict:
                 raise
@@ -239,11 +241,11 @@ def _rising(levels: list[Level]) -> tuple[Level, ...]:
 
     Another method may leave fewer faces at a budget than the first one at a smaller budget.
     """
-    kept: list[Level] = []
+    useful: list[Level] = []
     for level in sorted(levels, key=lambda level: level.record.budget):
-        if not kept or len(level.faces) > len(kept[-1].faces):
-            kept.append(level)
-    return tuple(reversed(kept))
+        if not useful or len(level.faces) > len(useful[-1].faces):
+            useful.append(level)
+    return tuple(reversed(useful))
 
 
 def attempt_in_child(

@@ -61,9 +61,9 @@ def encode_glb(
 def _material(
     file: "GlbFile", diffuse: Texture, specular: Texture, roughness: Texture
 ) -> dict[str, Any]:
-    shown = [texture.linear(texture.texels).astype(np.float64) for texture in (diffuse, specular)]
-    base = np.clip(shown[0] / np.maximum(1 - shown[1], 1e-6), 0, 1)
-    f0 = np.clip((21 * shown[1] - 1) / 20, 0, 1)
+    albedos = [texture.linear(texture.texels).astype(np.float64) for texture in (diffuse, specular)]
+    base = np.clip(albedos[0] / np.maximum(1 - albedos[1], 1e-6), 0, 1)
+    f0 = np.clip((21 * albedos[1] - 1) / 20, 0, 1)
     metal: dict[str, Any] = {"metallicFactor": 0}
     if base.shape[:2] == (1, 1):
         metal["baseColorFactor"] = [*base[0, 0].tolist(), 1]

@@ -100,13 +100,13 @@ def refuse_licences(
     `MIT OR Apache-2.0` are not taken apart: they are allowed when listed as they stand.
     """
     names = {name.casefold() for name in allowed}
-    kept = [record for record in records if record.licence.casefold() in names]
+    allowed_records = [record for record in records if record.licence.casefold() in names]
     refused = [
         failure(record.uid, "licence_refused", _refusal(record.licence))
         for record in records
         if record.licence.casefold() not in names
     ]
-    return kept, refused
+    return allowed_records, refused
 
 
 def _refusal(licence: str) -> str:

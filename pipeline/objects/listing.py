@@ -106,7 +106,7 @@ def fetch_all(
     Raises:
         Exception: any other error of `fetch`; fetches that have not begun are cancelled.
     """
-    here: list[ObjectRecord] = []
+    fetched: list[ObjectRecord] = []
     failures: list[Failure] = []
     downloaded(0, len(records))
     with ThreadPoolExecutor(threads) as pool:
@@ -114,7 +114,7 @@ def fetch_all(
         try:
             for done, future in enumerate(as_completed(waiting), start=1):
                 try:
-                    here.append(future.result())
+                    fetched.append(future.result())
                 except TransferFailed as error:
                     failures.append(failure(waiting[future].uid, error.reason, error.message))
                 downloaded(done, len(records))
@@ -122,4 +122,4 @@ def fetch_all(
             stop.set()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    return here, failures
+    return fetched, failures

@@ -77,12 +77,14 @@ def drop_outputs(names: Iterable[str]) -> list[str]:
     inside: dict[str, set[str]] = defaultdict(set)
     for name in names:
         inside[_folder(name)].add(name.rpartition("/")[2])
-    ours = {folder for folder in inside if folder and _is_output(folder, inside)}
-    kept = [name for name in names if ours.isdisjoint(map(str, PurePosixPath(name).parents))]
-    if len(kept) < len(names):
-        shown = ", ".join(printable(folder) for folder in sorted(ours)[:3])
-        say_once(f"left out as outputs of Trilight: {shown}{_and_more(len(ours) - 3)}")
-    return kept
+    outputs = {folder for folder in inside if folder and _is_output(folder, inside)}
+    remaining = [
+        name for name in names if outputs.isdisjoint(map(str, PurePosixPath(name).parents))
+    ]
+    if len(remaining) < len(names):
+        examples = ", ".join(printable(folder) for folder in sorted(outputs)[:3])
+        say_once(f"left out as outputs of Trilight: {examples}{_and_more(len(outputs) - 3)}")
+    return remaining
 
 
 def _is_output(folder: str, inside: Mapping[str, set[str]]) -> bool:
@@ -104,18 +106,18 @@ def say_unread(names: Sequence[str], objects: Sequence[str]) -> None:
     """Name files of other formats for objects, and archives, that no object file stands beside."""
     stems = {_stem(name) for name in objects}
     stems |= {stem for name in names if (stem := _stem(name)).startswith(".")}  # hidden
-    others = sorted(n for n in names if _suffix(n) in _UNREAD and _stem(n) not in stems)
-    if others:
-        shown = f"{printable(others[0])}{_and_more(len(others) - 1)}"
-        say_once(f"left out as formats that are not read: {shown}; convert or unpack them")
+    unread = sorted(n for n in names if _suffix(n) in _UNREAD and _stem(n) not in stems)
+    if unread:
+        example = f"{printable(unread[0])}{_and_more(len(unread) - 1)}"
+        say_once(f"left out as formats that are not read: {example}; convert or unpack them")
 
 
 def drop_scenes(root: Path, names: Sequence[str]) -> list[str]:
     """Return object files without USD and GLB files of whole scenes that Trilight wrote."""
     scenes = [name for name in names if _suffix(name) in (*_USD, "glb") and _is_scene(root / name)]
     if scenes:
-        shown = f"{printable(scenes[0])}{_and_more(len(scenes) - 1)}"
-        say_once(f"left out as scenes that Trilight wrote: {shown}")
+        example = f"{printable(scenes[0])}{_and_more(len(scenes) - 1)}"
+        say_once(f"left out as scenes that Trilight wrote: {example}")
     return [name for name in names if name not in set(scenes)]
 
 
@@ -163,8 +165,8 @@ def _collisions(names: Sequence[str]) -> Iterator[str]:
         folder = _folder(name)
         above, _, last = folder.rpartition("/")
         twin = re.sub(r"(?i)collisions?", "visual", last)
-        beside = {f"{above}/{each}".lstrip("/") for each in (twin, f"{twin}s")}
-        if (name in shapes and folder in seen) or (twin != last and beside & seen):
+        visual_folders = {f"{above}/{each}".lstrip("/") for each in (twin, f"{twin}s")}
+        if (name in shapes and folder in seen) or (twin != last and visual_folders & seen):
             yield name
 
 
@@ -180,11 +182,11 @@ def _levels(names: Sequence[str]) -> Iterator[str]:
 
 def _twins(names: Sequence[str]) -> Iterator[str]:
     """Yield further files of one object in the layouts of known collections."""
-    there = set(names)
+    present = set(names)
     for name in names:
         for pattern, better in _TWINS:
             other = pattern.sub(better, name)
-            if other != name and other in there:
+            if other != name and other in present:
                 yield name
 
 

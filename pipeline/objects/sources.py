@@ -64,21 +64,21 @@ class ObjectSource:
     is_place: bool = False
     """Whether the name is the scheme of a URL, which may hold a secret."""
 
-    def asked(self, asked: SourceQuery, *, only_look: bool) -> Listing | None:
+    def asked(self, query: SourceQuery, *, only_look: bool) -> Listing | None:
         """Return what `list` does, or have a look; raises TrilightError as they do."""
         if self.states_licences:
-            require_unstated(asked.licence, f"{asked.source.partition(':')[0]}:")
+            require_unstated(query.licence, f"{query.source.partition(':')[0]}:")
         if only_look and self.look:
-            self.look(asked)
+            self.look(query)
             return None
-        return self.list(asked)
+        return self.list(query)
 
 
-def _list_place(asked: SourceQuery) -> Listing:
-    place = parse_url(asked.source, what="objects")
+def _list_place(query: SourceQuery) -> Listing:
+    place = parse_url(query.source, what="objects")
     if isinstance(place, Path):
-        return list_folder(place, asked.licence)
-    return list_remote(place, asked.licence)
+        return list_folder(place, query.licence)
+    return list_remote(place, query.licence)
 
 
 PLACE = ObjectSource(list=_list_place, states_licences=False, is_place=True)
@@ -89,13 +89,13 @@ SOURCES: Registry[ObjectSource] = Registry(
     ObjectSource,
     {
         "builtin": ObjectSource(
-            list=lambda asked: Listing(
-                records=generate_objects(asked.source, asked.work_dir), failures=[]
+            list=lambda query: Listing(
+                records=generate_objects(query.source, query.work_dir), failures=[]
             ),
-            look=lambda asked: num_builtin(asked.source),
+            look=lambda query: num_builtin(query.source),
         ),
         "objaverse": ObjectSource(
-            list=lambda asked: list_objaverse(asked.source, asked.allowed_licences)
+            list=lambda query: list_objaverse(query.source, query.allowed_licences)
         ),
         **dict.fromkeys(("file", *PACKAGES, "pipe", "env"), PLACE),
     },
@@ -178,10 +178,10 @@ class ListedObjects:
         """
         records = [record for record in self.allowed if wanted(record.uid)]
         failures = [failure for failure in self.refused if wanted(failure.item)]
-        here, lost = self.fetch(records, downloaded)
-        self.require_some(len(here), [*failures, *lost])
+        fetched, lost = self.fetch(records, downloaded)
+        self.require_some(len(fetched), [*failures, *lost])
         return FoundObjects(
-            records=tuple(sorted(here, key=attrgetter("uid"))),
+            records=tuple(sorted(fetched, key=attrgetter("uid"))),
             failures=tuple(sorted([*failures, *lost], key=attrgetter("item"))),
         )
 
@@ -285,29 +285,29 @@ def _value(source: str) -> str:
     """Return the source, read from the environment variable where one is named."""
     if not source.startswith(ENVIRONMENT):
         return source
-    name, shown = source.removeprefix(ENVIRONMENT), printable(source)
+    name, label = source.removeprefix(ENVIRONMENT), printable(source)
     if not name.startswith(VARIABLES):
         raise TrilightError(
-            f"objects {shown!r} names a variable that is not for sources; expected one whose name "
+            f"objects {label!r} names a variable that is not for sources; expected one whose name "
             f"begins with {VARIABLES}. Set the source under such a name."
         )
-    if not (found := os.environ.get(name)):
+    if not (value := os.environ.get(name)):
         raise TrilightError(
-            f"objects {shown!r}: the environment variable {printable(name)!r} is not set here; "
+            f"objects {label!r}: the environment variable {printable(name)!r} is not set here; "
             "expected it to name a source of objects."
         )
-    return found
+    return value
 
 
 def _without_value(message: str, source: str, value: str) -> str:
     """Return a message about a source that a variable says, with the variable instead of it."""
-    shown = f"objects {printable(source)!r}"
-    told = _QUOTED.sub(lambda _: shown, message)
-    rest = told.removeprefix(shown)
-    if rest != told and not any(word in rest for word in _WORD.findall(value)):
-        return told
+    label = f"objects {printable(source)!r}"
+    redacted = _QUOTED.sub(lambda _: label, message)
+    rest = redacted.removeprefix(label)
+    if rest != redacted and not any(word in rest for word in _WORD.findall(value)):
+        return redacted
     return (
-        f"{shown} cannot be used as what it says; expected a source of objects. Name that source "
+        f"{label} cannot be used as what it says; expected a source of objects. Name that source "
         "itself in a terminal of this machine to be told what is wrong: trilight assets SOURCE."
     )
 
@@ -327,10 +327,10 @@ def _listed(
     """
     check_allowed(allowed_licences)
     stated_licence(licence)
-    asked = SourceQuery(
+    query = SourceQuery(
         source=source, work_dir=work_dir, licence=licence, allowed_licences=allowed_licences
     )
-    listing = source_of(source).asked(asked, only_look=only_look)
+    listing = source_of(source).asked(query, only_look=only_look)
     if listing and not listing.records and not listing.failures:
         raise TrilightError(
             f"objects {printable(safe_url(source))!r} holds no object; expected "

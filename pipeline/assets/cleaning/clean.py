@@ -59,9 +59,9 @@ def clean(mesh: TriangleMesh) -> TriangleMesh:
 
 def canonical(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rotate every face to start at its lowest vertex, and sort the faces."""
-    turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    turned = np.take_along_axis(faces, turn, axis=1)
-    return turned[np.lexsort(turned.T[::-1])]
+    corner_order = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    rotated = np.take_along_axis(faces, corner_order, axis=1)
+    return rotated[np.lexsort(rotated.T[::-1])]
 
 
 def geometry_sha256(mesh: TriangleMesh) -> str:

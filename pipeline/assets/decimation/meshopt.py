@@ -29,13 +29,13 @@ def simplify_sloppily(mesh: TriangleMesh, budget: int) -> TriangleMesh:
 def _run(function, mesh: TriangleMesh, budget: int) -> TriangleMesh:  # type: ignore[no-untyped-def]
     """The library works on float32; clean positions lie on a grid that float32 holds exactly."""
     corners = np.ascontiguousarray(mesh.faces, np.uint32).reshape(-1)
-    kept = np.zeros_like(corners)
+    simplified = np.zeros_like(corners)
     count = function(
-        kept,
+        simplified,
         corners,
         np.ascontiguousarray(mesh.positions, np.float32),
         target_index_count=3 * budget,
         target_error=_ANY_ERROR,
     )
-    faces = kept[:count].reshape(-1, 3).astype(np.int64)
+    faces = simplified[:count].reshape(-1, 3).astype(np.int64)
     return TriangleMesh(positions=mesh.positions, faces=faces)

@@ -39,8 +39,8 @@ def smallest_passing(attempt: Callable[[int], Result], largest: int) -> Result:
 
 def _ladder(largest: int) -> list[int]:
     """Return falling budgets from `largest` down to the fewest faces."""
-    budgets, rung = [largest], float(largest)
-    while (rung := rung / _STEP) >= _FEWEST:
-        if round(rung) < budgets[-1]:
-            budgets.append(round(rung))
+    budgets, budget = [largest], float(largest)
+    while (budget := budget / _STEP) >= _FEWEST:
+        if round(budget) < budgets[-1]:
+            budgets.append(round(budget))
     return budgets

@@ -176,8 +176,8 @@ def _textures(
     stored = [srgb8(values[..., DIFFUSE])]
     stored += [np.round(values[..., part] * 255).astype(np.uint8) for part in _PARTS[1:]]
     if constants[0] is None:
-        shown = stored[1] / 255 if constants[1] is None else constants[1]
-        stored[0] = _lowered(stored[0], shown)
+        specular = stored[1] / 255 if constants[1] is None else constants[1]
+        stored[0] = _lowered(stored[0], specular)
     elif constants[1] is None:
         over = np.minimum(constants[0] + stored[1] / 255, 1) - constants[0]
         stored[1] = np.floor(over * 255 + 1e-6).astype(np.uint8)

@@ -32,16 +32,16 @@ def with_own_materials(
     Raises:
         Rejected: as `skin_maker`, where such objects are refused.
     """
-    asked = settings.own_materials
-    if not asked.keep:
+    material_settings = settings.own_materials
+    if not material_settings.keep:
         return levels, dict(missed), None
     try:
-        maker, materials = skin_maker(source, mesh, asked)
+        maker, materials = skin_maker(source, mesh, material_settings)
     except Rejected as lost:
-        if asked.if_lost == "reject":
+        if material_settings.if_lost == "reject":
             raise
         return levels, dict(missed), OwnMaterials(reason=lost.reason, message=lost.message)
-    return _skinned(levels, missed, maker, materials, refuse=asked.if_lost == "reject")
+    return _skinned(levels, missed, maker, materials, refuse=material_settings.if_lost == "reject")
 
 
 def _skinned(
@@ -52,14 +52,14 @@ def _skinned(
     *,
     refuse: bool,
 ) -> tuple[tuple[Level, ...], Missed, OwnMaterials]:
-    found, reasons = list[Level](), dict(missed)
+    with_skins, reasons = list[Level](), dict(missed)
     for level in levels:
         try:
-            found.append(maker.skinned(level))
+            with_skins.append(maker.skinned(level))
         except Rejected as lost:
             if refuse:
                 reasons[level.record.budget] = (lost.reason, lost.message)
                 continue
-            found.append(level)
+            with_skins.append(level)
             materials = OwnMaterials(reason=lost.reason, message=lost.message, lost=materials.lost)
-    return tuple(found), reasons, materials
+    return tuple(with_skins), reasons, materials

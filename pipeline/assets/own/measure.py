@@ -38,17 +38,17 @@ def skin_quality(
 
 def _colour_errors(level: TriangleMesh, baked: Baked, source: SourceSurface) -> NDArray[np.float64]:
     """Return the difference [N] at points spread evenly over the source."""
-    drawn = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
-    points = sample_surface(source.mesh, drawn)
+    uniform = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
+    points = sample_surface(source.mesh, uniform)
     weights = barycentric(source.mesh.corners[points.faces], points.positions)
-    there = source.columns(points.faces, weights, 1 / baked.density)[:, DIFFUSE]
+    source_rgb = source.columns(points.faces, weights, 1 / baked.density)[:, DIFFUSE]
     _, faces, places = igl.point_mesh_squared_distance(
         points.positions, level.positions, level.faces
     )
     faces = np.asarray(faces, np.int64).ravel()
     uv = np.einsum("nc,ncd->nd", barycentric(level.corners[faces], places), baked.uv[faces])
-    here = texture_values(baked.textures[0], uv)
-    error: NDArray[np.float64] = np.abs(here - there).mean(axis=1)
+    level_rgb = texture_values(baked.textures[0], uv)
+    error: NDArray[np.float64] = np.abs(level_rgb - source_rgb).mean(axis=1)
     return error
 
 
@@ -73,14 +73,14 @@ def _torn_seams(
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     along = np.array(_ALONG)[:, None, None]
     points = ((1 - along) * inner[:, 0] + along * inner[:, 1]).reshape(-1, 3)
-    shown = []
+    side_positions = []
     for side in sides.T:
         places = nearest.of(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
         corners = source.mesh.corners[places.faces]
-        shown.append(np.einsum("nc,ncd->nd", places.weights, corners))
-    apart = np.linalg.norm(shown[0] - shown[1], axis=1).reshape(len(_ALONG), -1)
+        side_positions.append(np.einsum("nc,ncd->nd", places.weights, corners))
+    gap = np.linalg.norm(side_positions[0] - side_positions[1], axis=1).reshape(len(_ALONG), -1)
     length = np.linalg.norm(inner[:, 1] - inner[:, 0], axis=1)
-    torn = (apart > _TORN_TEXELS * texel).mean(axis=0)
+    torn = (gap > _TORN_TEXELS * texel).mean(axis=0)
     return float((torn * length).sum() / length.sum())
 
 

@@ -52,16 +52,16 @@ class NearestPlaces:
             normals: of the level there.
             reach: farthest that a surface may be away, in the unit box.
         """
-        found = self._closest(points, normals, reach)
+        result = self._closest(points, normals, reach)
         best = np.full(len(points), np.inf)
         for sign in (1.0, -1.0):
-            face, weights, away = self._met(points, sign * normals)
+            face, weights, distance = self._met(points, sign * normals)
             facing = (self._normals[face] * normals).sum(axis=1) > 0
-            taken = facing & (away <= reach) & (away < best)
-            best[taken] = away[taken]
-            found.faces[taken], found.weights[taken] = face[taken], weights[taken]
-            found.is_missed[taken] = False
-        return found
+            taken = facing & (distance <= reach) & (distance < best)
+            best[taken] = distance[taken]
+            result.faces[taken], result.weights[taken] = face[taken], weights[taken]
+            result.is_missed[taken] = False
+        return result
 
     def _met(
         self, points: NDArray[np.float64], directions: NDArray[np.float64]
@@ -71,8 +71,8 @@ class NearestPlaces:
         hit = self._embree.run(origins, directions.astype(np.float32), output=True)
         face = np.asarray(hit["primID"], np.int64)
         u, v = np.asarray(hit["u"], np.float64), np.asarray(hit["v"], np.float64)
-        away = np.where(face < 0, np.inf, np.abs(np.asarray(hit["tfar"], np.float64) - _BEHIND))
-        return np.maximum(face, 0), np.stack([1 - u - v, u, v], axis=1), away
+        distance = np.where(face < 0, np.inf, np.abs(np.asarray(hit["tfar"], np.float64) - _BEHIND))
+        return np.maximum(face, 0), np.stack([1 - u - v, u, v], axis=1), distance
 
     def _closest(
         self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float

@@ -24,9 +24,9 @@ class SourceSurface:
     """In the unit box."""
     parts: TexturedParts
     """The file's faces."""
-    origin: NDArray[np.int64]
+    source_face: NDArray[np.int64]
     """[F] which of those each face is."""
-    turn: NDArray[np.int64]
+    source_corner: NDArray[np.int64]
     """[F, 3] which corner of that face each corner is."""
 
     def columns(
@@ -39,17 +39,17 @@ class SourceSurface:
             weights: [N, 3] barycentric coordinates there.
             cell: width in the unit box over which pictures are averaged.
         """
-        origin = self.origin[faces]
-        own = np.zeros((len(faces), 3))  # the weights of the file's own corners
-        np.put_along_axis(own, self.turn[faces], weights, axis=1)
-        found = np.zeros((len(faces), 7))
-        of_place = self.parts.material[origin]
+        source_face = self.source_face[faces]
+        source_weights = np.zeros((len(faces), 3))  # the weights of the file's own corners
+        np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
+        result = np.zeros((len(faces), 7))
+        of_place = self.parts.material[source_face]
         for row in np.unique(of_place):
             chosen = np.flatnonzero(of_place == row)
-            found[chosen] = self._of_material(
-                self.parts.materials[row], origin[chosen], own[chosen], cell
+            result[chosen] = self._of_material(
+                self.parts.materials[row], source_face[chosen], source_weights[chosen], cell
             )
-        return found
+        return result
 
     @property
     def emits(self) -> bool:
@@ -60,26 +60,26 @@ class SourceSurface:
         self, faces: NDArray[np.int64], weights: NDArray[np.float64], cell: float
     ) -> NDArray[np.float64]:
         """Return the radiance [N, 3] at places on faces; arguments as those of `columns`."""
-        origin = self.origin[faces]
-        own = np.zeros((len(faces), 3))
-        np.put_along_axis(own, self.turn[faces], weights, axis=1)
-        found = np.zeros((len(faces), 3))
+        source_face = self.source_face[faces]
+        source_weights = np.zeros((len(faces), 3))
+        np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
+        result = np.zeros((len(faces), 3))
         for row, material in enumerate(self.parts.materials):
-            chosen = np.flatnonzero(self.parts.material[origin] == row)
+            chosen = np.flatnonzero(self.parts.material[source_face] == row)
             if not material.emits or not len(chosen):
                 continue
-            found[chosen] = material.emission_rgb
+            result[chosen] = material.emission_rgb
             if material.emission is not None:
-                found[chosen] *= self._shown(material.emission, origin[chosen], own[chosen], cell)[
-                    :, :3
-                ]
-        return found
+                result[chosen] *= self._shown(
+                    material.emission, source_face[chosen], source_weights[chosen], cell
+                )[:, :3]
+        return result
 
     def _of_material(
         self,
         material: SourceMaterial,
-        origin: NDArray[np.int64],
-        own: NDArray[np.float64],
+        source_face: NDArray[np.int64],
+        source_weights: NDArray[np.float64],
         cell: float,
     ) -> NDArray[np.float64]:
         known: dict[tuple[object, ...], NDArray[np.float32]] = {}
@@ -89,13 +89,13 @@ class SourceSurface:
                 return None
             place = (id(slot.picture), slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())
             if place not in known:  # one picture often holds several numbers
-                known[place] = self._shown(slot, origin, own, cell)
+                known[place] = self._shown(slot, source_face, source_weights, cell)
             return known[place]
 
         base = shown(material.base)
         if self.parts.colour is not None:
-            tint = np.einsum("nc,ncd->nd", own, self.parts.colour[origin])
-            base = np.ones((len(origin), 4), np.float32) if base is None else base
+            tint = np.einsum("nc,ncd->nd", source_weights, self.parts.colour[source_face])
+            base = np.ones((len(source_face), 4), np.float32) if base is None else base
             base = np.concatenate([base[:, :3] * tint, base[:, 3:]], axis=1).astype(np.float32)
         seen = Seen(
             base=base,
@@ -105,14 +105,18 @@ class SourceSurface:
             specular_strength=shown(material.specular_strength_map),
             glossiness=shown(material.glossiness),
         )
-        return columns(material, seen, len(origin))
+        return columns(material, seen, len(source_face))
 
     def _shown(
-        self, slot: Slot, origin: NDArray[np.int64], own: NDArray[np.float64], cell: float
+        self,
+        slot: Slot,
+        source_face: NDArray[np.int64],
+        source_weights: NDArray[np.float64],
+        cell: float,
     ) -> NDArray[np.float32]:
-        corners = self.parts.uv[origin, slot.uv_set] @ slot.turn.T + slot.shift
-        uv = np.einsum("nc,ncd->nd", own, corners)
-        return slot.picture.at(uv, _halvings(slot, corners, self._areas[origin], cell))
+        corners = self.parts.uv[source_face, slot.uv_set] @ slot.turn.T + slot.shift
+        uv = np.einsum("nc,ncd->nd", source_weights, corners)
+        return slot.picture.at(uv, _halvings(slot, corners, self._areas[source_face], cell))
 
     @cached_property
     def _areas(self) -> NDArray[np.float64]:
@@ -152,55 +156,57 @@ def source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurface:
     place = np.minimum(np.searchsorted(known[order], keys), len(known) - 1)
     vertex = np.where(known[order][place] == keys, order[place], -1)
     corners = vertex[raw.faces]
-    origin = np.full(len(mesh.faces), -1)
+    source_face = np.full(len(mesh.faces), -1)
     for candidate in (corners, corners[:, [0, 2, 1]]):  # those that face the same way come first
-        found = _matching(mesh.faces, candidate)
-        origin = np.where(origin < 0, found, origin)
-    missing = origin < 0
+        matched = _matching(mesh.faces, candidate)
+        source_face = np.where(source_face < 0, matched, source_face)
+    missing = source_face < 0
     if missing.mean() > 1 - _LEAST_FOUND:
         raise Rejected(
             "materials_unreadable",
             f"{missing.mean():.1%} of the faces are not found again beside their materials",
         )
-    origin = np.where(missing, _any_neighbour(mesh, missing, origin), origin)
-    turn = (corners[origin][:, None, :] == mesh.faces[:, :, None]).argmax(axis=2)
-    turn[missing] = np.arange(3)
-    _require_coordinates(parts, origin)
-    return SourceSurface(mesh=mesh, parts=parts, origin=origin, turn=turn)
+    source_face = np.where(missing, _any_neighbour(mesh, missing, source_face), source_face)
+    source_corner = (corners[source_face][:, None, :] == mesh.faces[:, :, None]).argmax(axis=2)
+    source_corner[missing] = np.arange(3)
+    _require_coordinates(parts, source_face)
+    return SourceSurface(
+        mesh=mesh, parts=parts, source_face=source_face, source_corner=source_corner
+    )
 
 
-def _matching(wanted: NDArray[np.int64], among: NDArray[np.int64]) -> NDArray[np.int64]:
+def _matching(faces: NDArray[np.int64], candidates: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the first row of `among` that is each wanted face but for its first corner, or -1."""
-    rows = np.concatenate([_rolled(among), _rolled(wanted)])
+    rows = np.concatenate([_rolled(candidates), _rolled(faces)])
     _, number = np.unique(rows, axis=0, return_inverse=True)
-    first = np.full(int(number.max()) + 1, len(among))
-    np.minimum.at(first, number.ravel()[: len(among)], np.arange(len(among)))
-    found = first[number.ravel()[len(among) :]]
-    return np.where(found < len(among), found, -1)
+    first = np.full(int(number.max()) + 1, len(candidates))
+    np.minimum.at(first, number.ravel()[: len(candidates)], np.arange(len(candidates)))
+    first_match = first[number.ravel()[len(candidates) :]]
+    return np.where(first_match < len(candidates), first_match, -1)
 
 
 def _rolled(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    return np.take_along_axis(faces, turn, axis=1)
+    corner_order = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    return np.take_along_axis(faces, corner_order, axis=1)
 
 
 def _any_neighbour(
-    mesh: TriangleMesh, missing: NDArray[np.bool_], origin: NDArray[np.int64]
+    mesh: TriangleMesh, missing: NDArray[np.bool_], source_face: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """Return the origin of the face whose centre is nearest, for each missing one."""
     if not missing.any():
-        return origin
+        return source_face
     centres = mesh.corners.mean(axis=1)
     known = np.flatnonzero(~missing)
-    filled = origin.copy()
+    filled = source_face.copy()
     for row in np.flatnonzero(missing):
-        away = np.square(centres[known] - centres[row]).sum(axis=1)
-        filled[row] = origin[known[away.argmin()]]
+        squared = np.square(centres[known] - centres[row]).sum(axis=1)
+        filled[row] = source_face[known[squared.argmin()]]
     return filled
 
 
-def _require_coordinates(parts: TexturedParts, origin: NDArray[np.int64]) -> None:
-    used = np.unique(origin)
+def _require_coordinates(parts: TexturedParts, source_face: NDArray[np.int64]) -> None:
+    used = np.unique(source_face)
     for row in np.unique(parts.material[used]):
         mine = used[parts.material[used] == row]
         for slot in parts.materials[row].slots:

@@ -28,8 +28,8 @@ def cells_of(corners: NDArray[np.float64], density: float) -> NDArray[np.int64]:
         density: cells for each unit of length.
     """
     legs = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=2).max(axis=1)
-    wanted = np.ceil(legs * density - 1e-9).astype(np.int64)
-    place = np.searchsorted(SIDES, np.clip(wanted, 1, SIDES[-1]))
+    cells = np.ceil(legs * density - 1e-9).astype(np.int64)
+    place = np.searchsorted(SIDES, np.clip(cells, 1, SIDES[-1]))
     return np.asarray(SIDES, np.int64)[place]
 
 

@@ -28,10 +28,10 @@ class SurfacePoints:
 class Deviation:
     """What separates a surface from another one, point by point."""
 
-    there: NDArray[np.float64]
+    to_other: NDArray[np.float64]
     """[N] distances from points of the first surface to the second, as shares of the diagonal of
     the first one's bounding box."""
-    back: NDArray[np.float64]
+    from_other: NDArray[np.float64]
     """[N] distances from points of the second surface to the first, likewise."""
     angle_deg: NDArray[np.float64]
     """[N] between the normal at each point of the first surface and at the nearest point of the
@@ -39,7 +39,12 @@ class Deviation:
 
     def two_way(self, percentile: float) -> float:
         """Return the larger of the two directions' percentiles."""
-        return float(max(np.percentile(way, percentile) for way in (self.there, self.back)))
+        return float(
+            max(
+                np.percentile(distances, percentile)
+                for distances in (self.to_other, self.from_other)
+            )
+        )
 
 
 def sample_surface(mesh: TriangleMesh, uniform: NDArray[np.float64]) -> SurfacePoints:
@@ -80,8 +85,8 @@ class Surface:
             self.mesh.positions, self.mesh.faces, sample_surface(other, self._uniform).positions
         )[0]
         return Deviation(
-            there=np.sqrt(squared) / self.mesh.diagonal,
-            back=np.sqrt(back) / self.mesh.diagonal,
+            to_other=np.sqrt(squared) / self.mesh.diagonal,
+            from_other=np.sqrt(back) / self.mesh.diagonal,
             angle_deg=np.degrees(np.arccos(np.minimum(np.abs(cosine), 1.0))),
         )
 

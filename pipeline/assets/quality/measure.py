@@ -40,19 +40,19 @@ class MeasuredSource:
     def own_quality(self) -> LevelQuality:
         """Return the measures of the source as a level of itself: exactly no error."""
         none = np.zeros(len(self.surface.points.faces))
-        return self.quality(self.mesh, Deviation(there=none, back=none, angle_deg=none))
+        return self.quality(self.mesh, Deviation(to_other=none, from_other=none, angle_deg=none))
 
     def quality(self, result: TriangleMesh, deviation: Deviation | None = None) -> LevelQuality:
         """Return all measures of a clean result; `deviation` saves the time to find it again."""
-        found = deviation or self.surface.deviation(result)
+        measured = deviation or self.surface.deviation(result)
         return LevelQuality(
-            error_mean=_rounded(max(found.there.mean(), found.back.mean())),
-            error_p99=_rounded(found.two_way(99)),
-            error_max=_rounded(found.two_way(100)),
-            normal_error_deg=_rounded(found.angle_deg.mean()),
+            error_mean=_rounded(max(measured.to_other.mean(), measured.from_other.mean())),
+            error_p99=_rounded(measured.two_way(99)),
+            error_max=_rounded(measured.two_way(100)),
+            normal_error_deg=_rounded(measured.angle_deg.mean()),
             area_ratio=_rounded(self.area_ratio(result)),
             silhouette_iou=_rounded(self.silhouette_iou(result)),
-            lost_area=_rounded(self.parts.lost_area(found.there)),
+            lost_area=_rounded(self.parts.lost_area(measured.to_other)),
             area_variation=_rounded(area_variation(result)),
             min_angle_p5_deg=_rounded(np.percentile(smallest_angles_deg(result), 5)),
             open_edges=count_edges(result).open,

@@ -28,7 +28,7 @@ class Parts:
         self._part_of_point = part[surface.points.faces]
         self._extent = _diagonals(surface.mesh, part, self.count) / surface.mesh.diagonal
 
-    def lost_area(self, there: NDArray[np.float64]) -> float:
+    def lost_area(self, distances: NDArray[np.float64]) -> float:
         """Return the share of the source's area that lies in lost parts.
 
         Args:
@@ -37,7 +37,7 @@ class Parts:
         A part without a sample point (below about one part in 8000 of the area) is not missed.
         """
         limit = np.maximum(_OWN_SIZE * self._extent, _VISIBLE)[self._part_of_point]
-        far = np.bincount(self._part_of_point, weights=there > limit, minlength=self.count)
+        far = np.bincount(self._part_of_point, weights=distances > limit, minlength=self.count)
         points = np.bincount(self._part_of_point, minlength=self.count)
         return float(points[2 * far > points].sum() / points.sum())
 

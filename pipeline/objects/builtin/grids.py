@@ -16,13 +16,13 @@ def torus_faces(rows: int, columns: int) -> NDArray[np.int64]:
     They face the side from which rows run upwards and columns to the left.
     """
     row, column = np.divmod(np.arange(rows * columns), columns)
-    above, beside = (row + 1) % rows, (column + 1) % columns
+    next_row, next_column = (row + 1) % rows, (column + 1) % columns
     corners = np.stack(
         [
             row * columns + column,
-            above * columns + column,
-            above * columns + beside,
-            row * columns + beside,
+            next_row * columns + column,
+            next_row * columns + next_column,
+            row * columns + next_column,
         ],
         axis=1,
     )
@@ -37,10 +37,10 @@ def sphere_faces(rings: int, columns: int) -> NDArray[np.int64]:
     """
     body = torus_faces(rings, columns)[: 2 * (rings - 1) * columns]
     column = np.arange(columns)
-    beside = (column + 1) % columns
+    next_column = (column + 1) % columns
     first, last, start = rings * columns, rings * columns + 1, (rings - 1) * columns
-    bottom = np.stack([np.full(columns, first), column, beside], axis=1)
-    top = np.stack([np.full(columns, last), start + beside, start + column], axis=1)
+    bottom = np.stack([np.full(columns, first), column, next_column], axis=1)
+    top = np.stack([np.full(columns, last), start + next_column, start + column], axis=1)
     return np.concatenate([bottom, body, top])[:, ::-1]
 
 

@@ -133,6 +133,6 @@ def _warped(unit: NDArray[np.float64], params: LatticeParams) -> NDArray[np.floa
     points[:, 1] = np.sin(angle) * x + np.cos(angle) * y
     if params.bend_rad:
         radius = 2 * params.half_sizes[0] / params.bend_rad
-        turn, x = points[:, 0] / radius, radius - points[:, 1]
-        points[:, 0], points[:, 1] = x * np.sin(turn), radius - x * np.cos(turn)
+        arc_angle, x = points[:, 0] / radius, radius - points[:, 1]
+        points[:, 0], points[:, 1] = x * np.sin(arc_angle), radius - x * np.cos(arc_angle)
     return points

@@ -142,9 +142,9 @@ def _leaf_on_stalk(
     stalk = params.stalk * size
     # Without a stalk it begins just inside the stem or the earth.
     start = foot + (direction * stalk if stalk else 0.025 * ahead - [0.0, 0.0, 0.01])
-    own = replace(params.leaf, length=params.leaf.length * size)
+    scaled = replace(params.leaf, length=params.leaf.length * size)
     # A leaf at the end of a stalk hangs from it, the others go on in their own direction.
-    positions, faces = leaf_sheet(own, rise - 0.5 if stalk > 0.2 else rise)
+    positions, faces = leaf_sheet(scaled, rise - 0.5 if stalk > 0.2 else rise)
     aside = np.array([-ahead[1], ahead[0], 0.0])
     turned = positions @ np.stack([ahead, aside, [0.0, 0.0, 1.0]])
     parts: list[Mesh] = [(turned + start, faces)]

@@ -38,10 +38,10 @@ def shell(params: ShellParams) -> Mesh:
     """
     rings = int(params.turns * params.rings_per_turn)
     inside = params.rings_per_turn // 2
-    turn = np.linspace(-params.turns, 0, rings)
-    outer = _rings(turn, 1 + _relief(turn, params), params)
+    winding = np.linspace(-params.turns, 0, rings)
+    outer = _rings(winding, 1 + _relief(winding, params), params)
     # The lip's two edges lie on one ring of angles, the mouth's.
-    back = turn[: -inside - 1 : -1]
+    back = winding[: -inside - 1 : -1]
     fade = np.linspace(1 - params.wall, 0.5 * (1 - params.wall), inside)[:, None]
     inner = _rings(back, np.broadcast_to(fade, (inside, params.columns)), params)
     poles = np.stack([outer[0].mean(axis=0), inner[-1].mean(axis=0)])
@@ -86,12 +86,12 @@ def shell_rand(rng: np.random.Generator) -> Mesh:
     )
 
 
-def _relief(turn: NDArray[np.float64], params: ShellParams) -> NDArray[np.float64]:
+def _relief(winding: NDArray[np.float64], params: ShellParams) -> NDArray[np.float64]:
     """Return the height [rings, columns] of ribs, spines and cords, at least 0."""
     around = 2 * np.pi * np.arange(params.columns) / params.columns
-    relief = np.zeros((len(turn), params.columns))
+    relief = np.zeros((len(winding), params.columns))
     if params.ribs:
-        crest = (0.5 + 0.5 * np.cos(2 * np.pi * params.ribs * turn)) ** 2
+        crest = (0.5 + 0.5 * np.cos(2 * np.pi * params.ribs * winding)) ** 2
         shoulder = np.maximum(np.cos(around + 0.7), 0) ** 6
         relief += params.rib_height * crest[:, None] * (1 + params.spines * shoulder)
     if params.cords:
@@ -100,10 +100,10 @@ def _relief(turn: NDArray[np.float64], params: ShellParams) -> NDArray[np.float6
 
 
 def _rings(
-    turn: NDArray[np.float64], radius: NDArray[np.float64], params: ShellParams
+    winding: NDArray[np.float64], radius: NDArray[np.float64], params: ShellParams
 ) -> NDArray[np.float64]:
     """Return points [rings, columns, 3] of the tube at `turn` [rings], 0 being the mouth."""
-    angle, size = 2 * np.pi * turn, params.growth**turn
+    angle, size = 2 * np.pi * winding, params.growth**winding
     around = 2 * np.pi * np.arange(params.columns) / params.columns
     outwards = 1 + params.tube * radius * np.cos(around)
     height = -params.drop - params.tube * params.stretch * radius * np.sin(around)

@@ -33,8 +33,8 @@ def lathe(outline: Sequence[tuple[float, float]], columns: int) -> Mesh:
         columns: vertices of a ring.
     """
     rings = np.array(outline)
-    turn = 2 * np.pi * np.arange(columns) / columns
-    flat = rings[:, :1, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)[None]
+    azimuth = 2 * np.pi * np.arange(columns) / columns
+    flat = rings[:, :1, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)[None]
     grid = np.concatenate(
         [flat, np.broadcast_to(rings[:, 1:, None], (*flat.shape[:2], 1))], axis=2
     ).reshape(-1, 3)
@@ -57,8 +57,11 @@ def tube(path: NDArray[np.float64], radii: NDArray[np.float64], sides: int) -> M
         last = last / np.linalg.norm(last)
         side[index] = last
     up = np.cross(tangent, side)
-    turn = 2 * np.pi * np.arange(sides) / sides
-    ring = np.cos(turn)[None, :, None] * side[:, None] + np.sin(turn)[None, :, None] * up[:, None]
+    azimuth = 2 * np.pi * np.arange(sides) / sides
+    ring = (
+        np.cos(azimuth)[None, :, None] * side[:, None]
+        + np.sin(azimuth)[None, :, None] * up[:, None]
+    )
     grid = (path[:, None] + radii[:, None, None] * ring).reshape(-1, 3)
     return np.concatenate([grid, path[[0, -1]]]), sphere_faces(len(path), sides)
 
@@ -102,7 +105,7 @@ def icosphere(frequency: int) -> Mesh:
     """Return the unit sphere of 20 frequency^2 even triangles."""
     golden = (1 + np.sqrt(5)) / 2
     flat = np.array([[0.0, a, b * golden] for a in (-1, 1) for b in (-1, 1)])
-    corners = np.concatenate([np.roll(flat, turn, axis=1) for turn in range(3)])
+    corners = np.concatenate([np.roll(flat, shift, axis=1) for shift in range(3)])
     distance = np.linalg.norm(corners[:, None] - corners[None], axis=2)
     near = np.abs(distance - 2) < 1e-9
     sides = np.array(

@@ -86,8 +86,8 @@ def _largest_radius(params: TorusKnotParams, points: int = 512) -> float:
     centre, _ = _strand(2 * np.pi * np.arange(points) / points, params)
     step = np.roll(centre, -1, axis=0) - centre
     length = np.linalg.norm(step, axis=1)
-    turn = np.linalg.norm(np.roll(step, -1, axis=0) - step, axis=1)
-    bend = float((length**2 / np.maximum(turn, 1e-12)).min())
+    change = np.linalg.norm(np.roll(step, -1, axis=0) - step, axis=1)
+    bend = float((length**2 / np.maximum(change, 1e-12)).min())
     chord = np.linalg.norm(centre[:, None] - centre[None], axis=2)
     place = np.cumsum(length)
     arc = np.abs(place[:, None] - place[None])

@@ -121,12 +121,14 @@ def _children(
         step = place * (len(path) - 1)
         index = min(int(step), len(path) - 2)
         ahead = path[index + 1] - path[index]
-        turn = first + (_GOLDEN if trunk else 2 * np.pi / count) * number + rng.uniform(-0.3, 0.3)
+        azimuth = (
+            first + (_GOLDEN if trunk else 2 * np.pi / count) * number + rng.uniform(-0.3, 0.3)
+        )
         spread = params.spread_rad * rng.uniform(0.75, 1.2)
         branches.append(
             _Branch(
                 foot=path[index] + (step - index) * ahead,
-                direction=_turned(ahead, spread, turn),
+                direction=_turned(ahead, spread, azimuth),
                 length=params.shrink * rng.uniform(0.85, 1.1) * parent.length,
                 # Thinner than the parent there, so that the foot is hidden in it.
                 radius=0.75 * parent.radius * (1 - _TAPER * place),
@@ -136,12 +138,12 @@ def _children(
     return branches
 
 
-def _turned(axis: NDArray[np.float64], spread: float, turn: float) -> NDArray[np.float64]:
+def _turned(axis: NDArray[np.float64], spread: float, azimuth: float) -> NDArray[np.float64]:
     """Return the direction at the angle `spread` from `axis`, turned about it."""
     axis = axis / np.linalg.norm(axis)
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     side /= np.linalg.norm(side)
-    across = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
+    across = np.cos(azimuth) * side + np.sin(azimuth) * np.cross(axis, side)
     return np.cos(spread) * axis + np.sin(spread) * across
 
 
@@ -157,19 +159,19 @@ def _mass(centre: NDArray[np.float64], params: TreeParams, rng: np.random.Genera
 def _tiers(params: TreeParams, rng: np.random.Generator) -> list[Mesh]:
     """Return cones with folds whose lower rim hangs, each reaching into the next."""
     columns = 4 * params.folds
-    turn = 2 * np.pi * np.arange(columns) / columns
+    azimuth = 2 * np.pi * np.arange(columns) / columns
     reach, rim = _TIER[:, :1], _TIER[:, :1] > 0.9
     parts = []
     for number in range(params.tiers):
         share = number / params.tiers
         size = (1 - share) ** 0.8 * (0.25 + params.mass)
         height = 1.7 / params.tiers * (1.25 - 0.4 * share)
-        fold = 0.14 * np.cos(params.folds * turn + rng.uniform(0, 6))
+        fold = 0.14 * np.cos(params.folds * azimuth + rng.uniform(0, 6))
         fold += rng.normal(size=columns) * 0.02
         radius = reach * (1 + fold * reach) * size
         level = 0.3 + 1.4 * share
         upright = level + _TIER[:, 1:] * height - 0.12 * size * fold * rim
-        grid = np.stack([radius * np.cos(turn), radius * np.sin(turn), upright], axis=2)
+        grid = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), upright], axis=2)
         poles = [[0.0, 0.0, level + 0.14 * height], [0.0, 0.0, level + height]]
         faces = sphere_faces(len(_TIER), columns)
         parts.append((np.concatenate([grid.reshape(-1, 3), poles]), faces))

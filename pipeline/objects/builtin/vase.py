@@ -34,12 +34,12 @@ def vase(params: VaseParams) -> Mesh:
     inner = _smooth(np.array(params.radii), inner_height / params.height) - params.wall
     radius = np.concatenate([outer, inner[::-1]])
     height = np.concatenate([params.height * level, inner_height[::-1]])
-    turn = 2 * np.pi * np.arange(params.columns) / params.columns
-    phase = params.flutes * (turn[None] + params.swirl_rad * height[:, None] / params.height)
+    azimuth = 2 * np.pi * np.arange(params.columns) / params.columns
+    phase = params.flutes * (azimuth[None] + params.swirl_rad * height[:, None] / params.height)
     fold = 1 - params.flute_depth * (0.5 - 0.5 * np.cos(phase)) * bool(params.flutes)
     rings = radius[:, None] * fold
     upright = np.broadcast_to(height[:, None], rings.shape)
-    grid = np.stack([rings * np.cos(turn), rings * np.sin(turn), upright], axis=-1)
+    grid = np.stack([rings * np.cos(azimuth), rings * np.sin(azimuth), upright], axis=-1)
     poles = [[0.0, 0.0, 0.0], [0.0, 0.0, params.wall]]
     positions = np.concatenate([grid.reshape(-1, 3), poles])
     return positions, sphere_faces(2 * params.rings, params.columns)
@@ -71,7 +71,7 @@ def _smooth(values: NDArray[np.float64], where: NDArray[np.float64]) -> NDArray[
     """
     padded = np.concatenate([[2 * values[0] - values[1]], values, [2 * values[-1] - values[-2]]])
     place = np.clip(where, 0, 1) * (len(values) - 1)
-    left = np.minimum(place.astype(np.int64), len(values) - 2)
-    step = (place - left)[:, None] ** np.arange(4)
+    segment = np.minimum(place.astype(np.int64), len(values) - 2)
+    step = (place - segment)[:, None] ** np.arange(4)
     basis = 0.5 * np.array([[0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]])
-    return np.einsum("nk,kj,nj->n", step, basis, padded[left[:, None] + np.arange(4)])
+    return np.einsum("nk,kj,nj->n", step, basis, padded[segment[:, None] + np.arange(4)])

@@ -30,12 +30,12 @@ def only_catalogue(exists: Callable[[str], bool]) -> str | None:
     Raises:
         TrilightError: it has both.
     """
-    found = [name for name in CATALOGUE_NAMES if exists(name)]
-    if len(found) > 1:
+    present = [name for name in CATALOGUE_NAMES if exists(name)]
+    if len(present) > 1:
         raise TrilightError(
-            f"objects: the folder has {' and '.join(found)}; expected one catalogue. Remove one."
+            f"objects: the folder has {' and '.join(present)}; expected one catalogue. Remove one."
         )
-    return found[0] if found else None
+    return present[0] if present else None
 
 
 def read_catalogue(path: Path) -> list[ObjectRecord]:
@@ -92,22 +92,22 @@ def _published(row: dict[str, Any], field: str, place: str, default: str) -> str
 def _text(row: dict[str, Any], field: str, place: str, default: str | None = None) -> str:
     value = row.get(field, default)
     if not isinstance(value, str):
-        found = f"a {type(value).__name__}" if field in row else "missing"
-        raise TrilightError(f"{place}: field {field!r} is {found}; expected text.")
+        actual = f"a {type(value).__name__}" if field in row else "missing"
+        raise TrilightError(f"{place}: field {field!r} is {actual}; expected text.")
     return value
 
 
 def _inside(root: Path, path: str, place: str) -> Path:
     """Return the absolute place of a catalogue path; links are followed before it is judged."""
-    shown = printable(path)
+    display_path = printable(path)
     if not path or "\x00" in path or path != path.encode("utf-8", "ignore").decode():
-        raise TrilightError(f"{place}: path is {shown!r}; expected the name of a file.")
+        raise TrilightError(f"{place}: path is {display_path!r}; expected the name of a file.")
     target = Path(os.path.realpath(root / path))
     if "\\" in path and not target.exists():  # as a program on Windows writes it
         target = Path(os.path.realpath(root / path.replace("\\", "/")))
     if not target.is_relative_to(root) or target == root:
         raise TrilightError(
-            f"{place}: path {shown!r} leads out of the folder; expected a path below it. "
+            f"{place}: path {display_path!r} leads out of the folder; expected a path below it. "
             "Copy the file into the folder."
         )
     return target
@@ -159,14 +159,14 @@ def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 
 def _header(cells: list[str], place: str) -> list[str]:
     names = [cell.strip() for cell in cells]
-    shown = printable(", ".join(names))
+    columns = printable(", ".join(names))
     if not {"uid", "path"} <= set(names):
         raise TrilightError(
-            f"{place}: the columns are {shown!r}; expected uid and path among them, with commas "
+            f"{place}: the columns are {columns!r}; expected uid and path among them, with commas "
             "between them."
         )
     if len(set(names)) < len(names):
-        raise TrilightError(f"{place}: the columns are {shown!r}; expected each name once.")
+        raise TrilightError(f"{place}: the columns are {columns!r}; expected each name once.")
     return names
 
 

@@ -24,11 +24,11 @@ def list_folder(folder: Path, licence: str | None) -> Listing:
         TrilightError: the folder is missing or is no folder, its catalogue is wrong, there are
             two, or has a licence stated from outside.
     """
-    shown = printable(str(folder))
+    display_path = printable(str(folder))
     if not folder.is_dir():
-        found = "is not a folder" if folder.exists() else "does not exist"
+        problem = "is not a folder" if folder.exists() else "does not exist"
         raise TrilightError(
-            f"objects {shown!r} {found}; expected a folder of {' '.join(SUFFIXES)} files, or "
+            f"objects {display_path!r} {problem}; expected a folder of {' '.join(SUFFIXES)} files, or "
             "builtin: for built-in objects."
         )
     catalogue = only_catalogue(lambda name: (folder / name).exists())

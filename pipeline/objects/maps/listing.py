@@ -76,11 +76,11 @@ def find_maps(
     Raises:
         TrilightError: the folder is missing or holds nothing, or its catalogue has a mistake.
     """
-    root, shown, plural = Path(os.path.realpath(folder)), printable(folder), PLURALS[kind]
+    root, display_path, plural = Path(os.path.realpath(folder)), printable(folder), PLURALS[kind]
     suffixes = " ".join(SUFFIXES[kind])
     if "://" in folder or not root.is_dir():
         raise TrilightError(
-            f"{plural} {shown!r}: no such folder on this machine; expected one with {suffixes} "
+            f"{plural} {display_path!r}: no such folder on this machine; expected one with {suffixes} "
             "files. Download them first where they are on a server."
         )
     stated, catalogue = stated_licence(licence), _only_catalogue(root, plural)
@@ -92,7 +92,7 @@ def find_maps(
         records = [replace(row, uid=f"{kind}:{row.uid}") for row in read_catalogue(catalogue)]
     if not records and not failures:
         raise TrilightError(
-            f"{plural} {shown!r} holds none; expected {suffixes} files, or a catalogue "
+            f"{plural} {display_path!r} holds none; expected {suffixes} files, or a catalogue "
             f"{plural}.csv that lists some."
         )
     allowed, refused = refuse_licences(records, allowed_licences)
@@ -103,13 +103,13 @@ def find_maps(
 
 
 def _only_catalogue(root: Path, plural: str) -> Path | None:
-    found = [path for end in ("jsonl", "csv") if (path := root / f"{plural}.{end}").exists()]
-    if len(found) > 1:
+    present = [path for end in ("jsonl", "csv") if (path := root / f"{plural}.{end}").exists()]
+    if len(present) > 1:
         raise TrilightError(
-            f"{plural}: the folder has {found[0].name} and {found[1].name}; expected one "
+            f"{plural}: the folder has {present[0].name} and {present[1].name}; expected one "
             "catalogue. Remove one."
         )
-    return found[0] if found else None
+    return present[0] if present else None
 
 
 def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[FoundMap]:
@@ -130,8 +130,10 @@ def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[
     for row in records:
         base = Path(row.path)
         files = textures.get(base.relative_to(root).as_posix(), {})
-        beside = {part: root / name for part, name in files.items() if _is_below(root, root / name)}
-        maps.append(FoundMap(record=row, files={**beside, "base": base}))
+        companions = {
+            part: root / name for part, name in files.items() if _is_below(root, root / name)
+        }
+        maps.append(FoundMap(record=row, files={**companions, "base": base}))
     return maps
 
 
@@ -152,8 +154,11 @@ def _scanned(
     unused |= dict.fromkeys(sorted(outside), ("link_outside", message))
     bases = {name.rpartition(".")[0]: name for name in reversed(names)}
     if kind == TEXTURE:
-        textures, left = group_textures(names)
-        bases, unused = {stem: files["base"] for stem, files in textures.items()}, unused | left
+        textures, unused_pictures = group_textures(names)
+        bases, unused = (
+            {stem: files["base"] for stem, files in textures.items()},
+            unused | unused_pictures,
+        )
     else:
         message = "another file of the same name is taken; rename one of them"
         twins = [name for name in names if bases[name.rpartition(".")[0]] != name]

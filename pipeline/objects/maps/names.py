@@ -212,13 +212,13 @@ def _add_letters(stems: Mapping[str, str], named: dict[str, _Named]) -> None:
         if match is not None:
             key = f"{match['set']}{match['tail']}"
             letters[key][name] = match["letter"].lower(), f"{match['set']}{match['tail']}"
-    others = {entry.key for entry in named.values()}
+    parsed_keys = {entry.key for entry in named.values()}
     bare = {stem for name, stem in stems.items() if name not in named}
     for key, files in letters.items():
         said = {letter for letter, _ in files.values()}
         is_set = said <= {*_LETTERS, *_UNCLEAR} and len(said & {"b", "c", "d"}) == 1
         beside_color = key in bare and said <= {"n", "s", "r", "h", "e"}
-        if beside_color or (is_set and ("n" in said or key in others)):
+        if beside_color or (is_set and ("n" in said or key in parsed_keys)):
             for name, (letter, stem) in files.items():
                 named[name] = _Named(key, stem, _LETTERS.get(letter, "other"))
 

@@ -67,39 +67,39 @@ def decode_prepared(data: bytes, name: str) -> PreparedMap:
     return PreparedMap(content_sha256=metadata["content"], arrays=arrays)
 
 
-def outcome_name(asked: MapFiles) -> str:
+def outcome_name(map_files: MapFiles) -> str:
     """Return the name of the outcome: of the bytes of the files, the size and the recipe.
 
     Raises:
         Rejected: missing_file, too_large_bytes.
     """
-    digests = {part: sha256_hex(_read(path)) for part, path in asked.files.items()}
-    parts = [asked.kind, digests, asked.size, _RECIPE]
+    digests = {part: sha256_hex(_read(path)) for part, path in map_files.files.items()}
+    parts = [map_files.kind, digests, map_files.size, _RECIPE]
     return sha256_hex(canonical_json(parts))[:32]
 
 
-def prepare_map(asked: MapFiles) -> tuple[bytes, tuple[str, ...]]:
+def prepare_map(map_files: MapFiles) -> tuple[bytes, tuple[str, ...]]:
     """Return the file of a texture or map, and what is not read; only children come here.
 
     Raises:
         Rejected: the reason, and what the user can do; see `usable_map`, `texture_set` and the
             readers.
     """
-    if asked.kind == SKY:
-        return _prepare_sky(_read(asked.files["map"]), asked.size)
+    if map_files.kind == SKY:
+        return _prepare_sky(_read(map_files.files["map"]), map_files.size)
     pictures: dict[str, NDArray[np.float32]] = {}
     unread: list[str] = []
-    for part, path in sorted(asked.files.items()):
+    for part, path in sorted(map_files.files.items()):
         values, notes = _picture_of(part, path)
         unread += [f"{note} of its {part}" for note in notes]
         if packed_channels(part) and values.shape[2] < 3:
             unread.append(f"its {part}, which is grey: it has no channels")
         pictures[part] = values
-    made = texture_set(unpack_parts(pictures), asked.size)
-    maps = {"diffuse": made.diffuse_rgb, "specular": made.specular_rgb}
-    if made.roughness is not None:
-        maps["roughness"] = made.roughness
-    prepared = PreparedMap(content_sha256=made.content_sha256, arrays=maps)
+    result = texture_set(unpack_parts(pictures), map_files.size)
+    maps = {"diffuse": result.diffuse_rgb, "specular": result.specular_rgb}
+    if result.roughness is not None:
+        maps["roughness"] = result.roughness
+    prepared = PreparedMap(content_sha256=result.content_sha256, arrays=maps)
     return prepared.encoded(), tuple(unread)
 
 

@@ -41,15 +41,15 @@ def usable_map(radiance: NDArray[np.float32], height: int) -> NDArray[np.float32
         "is infinite; write the map in 32 bits, or as .hdr: half floats end at 65504",
     )
     lawful = np.maximum(radiance, 0)
-    whole, negative = flux(lawful), flux(lawful - radiance)
-    if (negative > MOST_NEGATIVE * whole).any() and negative.any():
+    total, negative = flux(lawful), flux(lawful - radiance)
+    if (negative > MOST_NEGATIVE * total).any() and negative.any():
         raise Rejected(
             "negative_radiance",
             f"negative values take more than {MOST_NEGATIVE:g} of the light of a channel; set them "
             "to 0 in a picture editor",
         )
     _refuse(lawful > MAX_RADIANCE, "too_bright", f"is over {MAX_RADIANCE:g}; scale the map down")
-    if not whole.sum() > 0:
+    if not total.sum() > 0:
         raise Rejected("black_map", "the map is black; expected some light")
     return lawful if rows <= height else solid_angle_means(lawful, height).astype(np.float32)
 

@@ -31,10 +31,10 @@ def flux(radiance: NDArray) -> NDArray[np.float64]:
 def _means(values: NDArray, rows: csr_array, width: int) -> NDArray[np.float64]:
     height, channels = rows.shape[0], values.shape[2]
     columns = _overlaps(_even(values.shape[1]), _even(width))
-    found = np.zeros((height, width, channels))
+    result = np.zeros((height, width, channels))
     for channel in range(channels):  # one at a time: the largest maps take a gigabyte
-        found[..., channel] = (columns @ (rows @ values[..., channel].astype(np.float64)).T).T
-    return found
+        result[..., channel] = (columns @ (rows @ values[..., channel].astype(np.float64)).T).T
+    return result
 
 
 def _even(count: int) -> NDArray[np.float64]:

@@ -44,14 +44,14 @@ def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> Textu
     def means(values: NDArray) -> NDArray[np.float64]:
         return area_means(values, height, width)
 
-    colour = _three(means(_linear(base)))
+    color = _three(means(_linear(base)))
     metallic = means(_grey(pictures["metallic"])) if "metallic" in pictures else np.zeros(1)
     if "specular" in pictures:
-        diffuse = colour * (1 - metallic)
+        diffuse = color * (1 - metallic)
         # where both are over 1, the lobe gives way
         specular = np.minimum(_three(means(pictures["specular"])), 1 - diffuse)
     else:
-        diffuse, specular = constant_albedos(colour, metallic)
+        diffuse, specular = constant_albedos(color, metallic)
         specular = np.broadcast_to(specular, diffuse.shape)
     roughness = None
     if "roughness" in pictures:

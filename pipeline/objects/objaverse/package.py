@@ -122,7 +122,7 @@ class ObjaversePackage:
         if hasattr(self, "_paths"):
             replaced["_load_object_paths"] = lambda: self._paths
         missing = object()
-        kept = {name: self._package.__dict__.get(name, missing) for name in replaced}
+        originals = {name: self._package.__dict__.get(name, missing) for name in replaced}
         with hold_claim(self._root / ".trilight.lock", wait=True):
             socket.setdefaulttimeout(_SILENCE_S)
             self._package.__dict__.update(replaced)
@@ -130,7 +130,7 @@ class ObjaversePackage:
                 yield
             finally:
                 socket.setdefaulttimeout(before)
-                for name, value in kept.items():
+                for name, value in originals.items():
                     if value is missing:
                         del self._package.__dict__[name]
                     else:

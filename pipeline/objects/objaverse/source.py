@@ -73,24 +73,24 @@ def _records(
 ) -> tuple[list[ObjectRecord], list[Failure]]:
     """Read annotations, file by file as they are needed, until `count` licences are allowed."""
     group_of = {uid: group for group in package.groups(uids) for uid in group}
-    found: dict[str, dict[str, Any]] = {}
+    known: dict[str, dict[str, Any]] = {}
     broken: dict[str, TransferFailed] = {}
     records: list[ObjectRecord] = []
     failures: list[Failure] = []
     usable = 0
     for uid in uids:
-        if uid not in found and uid not in broken:
+        if uid not in known and uid not in broken:
             group = group_of[uid]
             try:
                 annotations = package.annotations(group)
-                found |= {member: annotations.get(member) or {} for member in group}
+                known |= {member: annotations.get(member) or {} for member in group}
             except TransferFailed as error:
                 broken |= dict.fromkeys(group, error)
         if uid in broken:
             message = f"annotations: {broken[uid].message}"
             failures.append(failure(_name(uid), broken[uid].reason, message))
             continue
-        record = _record(uid, found[uid])
+        record = _record(uid, known[uid])
         records.append(record)
         usable += len(refuse_licences([record], allowed)[0])
         if usable == count:

@@ -151,10 +151,10 @@ class RemoteFiles:
                 raise
             # Errors of the network are OSErrors too, and must not pass for those of the disk.
             raise Interrupted from error
-        found = temporary.stat().st_size
-        self._check_size(found)
-        if size is not None and found != size:
-            raise Interrupted from EOFError(f"got {found} of {size} bytes")
+        received = temporary.stat().st_size
+        self._check_size(received)
+        if size is not None and received != size:
+            raise Interrupted from EOFError(f"got {received} of {size} bytes")
 
     def _check_size(self, size: int) -> None:
         if size > self._max_bytes:
@@ -221,13 +221,13 @@ def buffer_names(path: Path, name: str) -> list[str]:
         return []
     buffers = tree.get("buffers") if isinstance(tree, dict) else None
     folder = posixpath.dirname(name)
-    found: dict[str, None] = {}
+    names: dict[str, None] = {}
     for buffer in buffers if isinstance(buffers, list) else ():
         uri = buffer.get("uri") if isinstance(buffer, dict) else None
         inner = _inner(uri) if isinstance(uri, str) else None
         if inner is not None:
-            found[posixpath.join(folder, inner)] = None
-    return list(found)
+            names[posixpath.join(folder, inner)] = None
+    return list(names)
 
 
 def _inner(uri: str) -> str | None:

@@ -80,8 +80,8 @@ class RemoteFolder:
 
     def _names_by_find(self) -> list[str]:
         start = f"{self.url.root}/"
-        found = with_tries(lambda: self.driver.find(self.url.root, detail=True))
-        for address, facts in found.items():
+        listing = with_tries(lambda: self.driver.find(self.url.root, detail=True))
+        for address, facts in listing.items():
             name = address.removeprefix(start)
             if address.startswith(start) and name:
                 self._addresses[name], self._facts[name] = address, facts
