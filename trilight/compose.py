@@ -97,7 +97,7 @@ class SceneBuilder:
             loaded = _MeshFile(path=Path(mesh), licence=licence)
             if not loaded.path.is_file():
                 raise TrilightError(f"{loaded.path}: no such file; expected a mesh.")
-            name = name or self._unused(loaded.path.stem)
+            name = name or self._unique_name(loaded.path.stem)
         if size is not None and not 0 < size < np.inf:
             raise TrilightError(f"{name}: size is {size}; expected metres above 0.")
         if size is not None and isinstance(loaded, LoadedMesh) and loaded.reach == 0:
@@ -135,7 +135,7 @@ class SceneBuilder:
         return self.add_mesh(
             builtin_mesh(family, number),
             material,
-            name=name or self._unused(family),
+            name=name or self._unique_name(family),
             at=at,
             size=size,
             rotation_deg=rotation_deg,
@@ -158,7 +158,7 @@ class SceneBuilder:
             scale=(size, size, 1),
             translation=(0, 0, 1 + 2 * height),
         )
-        name = self._unused("floor")
+        name = self._unique_name("floor")
         square = (patch(SIDES["floor"], placement), PATCH_FACES)
         mesh = mesh_of_arrays(*square, uid=f"{SHELL_FOLDER}{name}", licence=_CC0)
         flat = dataclasses.replace(material or Material(), smooth=False)
@@ -183,7 +183,7 @@ class SceneBuilder:
         Raises:
             TrilightError: invalid numbers.
         """
-        name = self._unused("lamp")
+        name = self._unique_name("lamp")
         middle, target = (
             vector(f"{name}: {what}", value) for what, value in (("at", at), ("towards", towards))
         )
@@ -279,7 +279,7 @@ class SceneBuilder:
         self._meshes.append(mesh)
         return self
 
-    def _unused(self, name: str) -> str:
+    def _unique_name(self, name: str) -> str:
         """Return a name that no object has yet: `name`, `name1`, `name2`."""
         taken = {described.name for described in self._objects}
         tries = (f"{name}{number or ''}" for number in range(len(taken) + 1))

@@ -31,7 +31,7 @@ def read_scene(source: str | os.PathLike[str]) -> Scene:
         TrilightError: anything in the file is unusable, or breaks a law of scenes.
     """
     with SceneReader() as reader:
-        return _noted(reader.load(scene_source(os.fspath(source))))
+        return _warn_notes(reader.load(scene_source(os.fspath(source))))
 
 
 def read_scenes(source: str | os.PathLike[str]) -> Iterator[Scene]:
@@ -44,7 +44,7 @@ def read_scenes(source: str | os.PathLike[str]) -> Iterator[Scene]:
     """
     with SceneReader() as reader:
         for entry in scene_sources(os.fspath(source), reader):
-            yield _noted(reader.load(entry))
+            yield _warn_notes(reader.load(entry))
 
 
 def write_scene(
@@ -79,10 +79,10 @@ def within_budget(scene: Scene, max_triangles: int) -> Scene:
         TrilightError: emitters alone are more, or an object cannot be reduced that far.
     """
     with SceneReader() as reader:
-        return _noted(reader.within_budget(scene, max_triangles))
+        return _warn_notes(reader.within_budget(scene, max_triangles))
 
 
-def _noted(loaded: LoadedScene) -> Scene:
+def _warn_notes(loaded: LoadedScene) -> Scene:
     for note in loaded.notes:
         warnings.warn(note, stacklevel=3)
     return loaded.scene

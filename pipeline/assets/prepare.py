@@ -11,7 +11,7 @@ from pipeline.assets.cleaning.guards import check_clean, check_raw
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.decimation.smallest import smallest_passing
-from pipeline.assets.own.levels import with_own_materials
+from pipeline.assets.own.levels import add_source_materials
 from pipeline.assets.quality.gate import check_level
 from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.quality.triangles import count_edges
@@ -49,7 +49,7 @@ def prepare_asset(
     measured = MeasuredSource(mesh)
     safe = safe_method(mesh, method)
     levels, missed = _levels(measured, settings, safe)
-    levels, missed, materials = with_own_materials(levels, missed, source, mesh, settings)
+    levels, missed, materials = add_source_materials(levels, missed, source, mesh, settings)
     return AssetAttempt(
         method=safe,
         asset=Asset(
@@ -72,7 +72,7 @@ def _facts(
     return SourceFacts(
         num_faces_read=len(raw.faces),
         num_faces=len(source.mesh.faces),
-        num_faces_turned=_count_turned(cleaned, source.mesh),
+        num_faces_turned=_count_flipped(cleaned, source.mesh),
         num_parts=source.parts.count,
         open_edges=edges.open,
         nonmanifold_edges=edges.nonmanifold,
@@ -80,7 +80,7 @@ def _facts(
     )
 
 
-def _count_turned(before: TriangleMesh, after: TriangleMesh) -> int:
+def _count_flipped(before: TriangleMesh, after: TriangleMesh) -> int:
     """Count the faces that changed their winding: canonical rows differ in their last two."""
 
     def second_corners(faces: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -97,7 +97,7 @@ def _levels(
 
     A budget that the level before it meets as well gets no level of its own.
     """
-    maker = _LevelMaker(source, settings, method)
+    maker = _LevelBuilder(source, settings, method)
     levels: list[Level] = []
     missed: dict[int, tuple[str, str]] = {}
     for budget in settings.budgets:
@@ -111,7 +111,7 @@ def _levels(
     return tuple(levels), missed
 
 
-class _LevelMaker:
+class _LevelBuilder:
     """Makes levels of one source by one method."""
 
     def __init__(self, source: MeasuredSource, settings: AssetSettings, method: str) -> None:
@@ -143,7 +143,7 @@ class _LevelMaker:
 
     def _make(self, faces: int, max_error_p99: float) -> tuple[str, TriangleMesh, LevelQuality]:
         if self._keeps_source and len(self._mesh.faces) <= faces:
-            return "source", self._mesh, self._source.own_quality()
+            return "source", self._mesh, self._source.source_quality()
         result = decimate(self._mesh, faces, self._method)
         gate = self._settings.gate
         mesh, quality = check_level(result, self._source, faces, gate, max_error_p99)

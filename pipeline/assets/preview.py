@@ -45,10 +45,10 @@ def preview_level(level: Level, width_px: int) -> NDArray[np.uint8]:
         positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
     )
     grey = preview(mesh, width_px)
-    return grey if level.skin is None else _coloured(mesh, level.skin, width_px)
+    return grey if level.skin is None else _preview_colors(mesh, level.skin, width_px)
 
 
-def _coloured(mesh: TriangleMesh, skin: LevelSkin, width_px: int) -> NDArray[np.uint8]:
+def _preview_colors(mesh: TriangleMesh, skin: LevelSkin, width_px: int) -> NDArray[np.uint8]:
     """Return a picture [W, W, 3] of a mesh in its own colours, without lines."""
     wide = width_px * _SUPERSAMPLE
     origins, directions, _ = _camera_rays(wide)

@@ -11,10 +11,10 @@ _LIBRARIES = ("embreex", "libigl", "meshoptimizer", "numpy", "pymeshlab", "trime
 
 def library_versions() -> dict[str, str]:
     """Return the version of each library that the mesh stage calls, or `absent`."""
-    return {name: _installed(name) for name in _LIBRARIES}
+    return {name: _installed_version(name) for name in _LIBRARIES}
 
 
-def _installed(name: str) -> str:
+def _installed_version(name: str) -> str:
     try:
         return version(name)
     except PackageNotFoundError:
@@ -33,7 +33,7 @@ Where a source gives another outcome, by a change here or in a library, the next
 
 RECIPE = (
     _WITH_PYMESHLAB
-    if _installed("pymeshlab") != "absent"
+    if _installed_version("pymeshlab") != "absent"
     else _WITH_PYMESHLAB.replace("pymeshlab=2025.7.post1", "pymeshlab=absent")
 )
 """What asset files and their names in the asset store say of how they were made."""
@@ -61,7 +61,7 @@ def methods_of(profile: Profile) -> tuple[str, ...]:
     Raises:
         TrilightError: `uniform` without pymeshlab, since nothing else here makes triangles even.
     """
-    if _installed("pymeshlab") != "absent":
+    if _installed_version("pymeshlab") != "absent":
         return _METHODS[profile]
     if profile == "uniform":
         raise TrilightError(

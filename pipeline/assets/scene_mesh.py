@@ -58,7 +58,7 @@ def load_scene_mesh(path: Path, settings: AssetSettings, remesh_faces: int | Non
         raise Rejected("nonfinite_vertices", "a vertex without a triangle is not finite")
     centre = raw.positions.mean(axis=0)
     reach = float(np.sqrt(np.sum(np.square(raw.positions - centre), axis=1).max()))
-    mesh = raw if remesh_faces is None else remeshed(raw, remesh_faces)
+    mesh = raw if remesh_faces is None else remesh(raw, remesh_faces)
     return SceneMesh(
         mesh=mesh,
         centre=centre,
@@ -68,7 +68,7 @@ def load_scene_mesh(path: Path, settings: AssetSettings, remesh_faces: int | Non
     )
 
 
-def remeshed(raw: TriangleMesh, num_faces: int) -> TriangleMesh:
+def remesh(raw: TriangleMesh, num_faces: int) -> TriangleMesh:
     """Return the surface with at most `num_faces` triangles of even size, where the file has it.
 
     Raises:

@@ -92,17 +92,17 @@ def _prepare_once(
     source, root = Path(record.path), Path(record.root) if record.root else None
     key = _key(source, root, settings, store, borrow_child)
     path = store.asset_path(key)
-    with store.making(key):
+    with store.lock(key):
         if refusal := store.refusal(key):
             raise refusal
         if not path.exists():
-            outcome = _outcome(source, root, settings, methods, borrow_child)
+            outcome = _prepare_in_child(source, root, settings, methods, borrow_child)
             if _key(source, root, settings, store, borrow_child) != key:
                 raise Rejected("unreadable_file", "it changed while it was being prepared")
             if isinstance(outcome, Rejected):
-                store.refuse(key, outcome.reason, outcome.message)
+                store.save_refusal(key, outcome.reason, outcome.message)
                 raise outcome
-            store.keep(key, *outcome)
+            store.save_asset(key, *outcome)
     data = path.read_bytes()
     asset = decode_asset(data)
     return PreparedAsset(
@@ -150,7 +150,7 @@ def source_digest(
     return source_file.kind, source_file.sha256
 
 
-def _outcome(
+def _prepare_in_child(
     source: Path,
     root: Path | None,
     settings: AssetSettings,
@@ -165,7 +165,7 @@ def _outcome(
     try:
         with borrow_child() as child:
             child.allow_files(reach(files=[source, root or source]))
-            return _by_any_method(child, source, root, settings, methods)
+            return _try_methods(child, source, root, settings, methods)
     except Rejected as rejection:
         return rejection
     except ChildFailed as failure:
@@ -175,7 +175,7 @@ def _outcome(
         raise refusal from failure
 
 
-def _by_any_method(
+def _try_methods(
     child: IsolatedChild,
     source: Path,
     root: Path | None,
@@ -211,7 +211,7 @@ def _by_any_method(
                 raise
             death = failure
             continue
-        asset, unread = _remembering(asset, attempt.asset), attempt.unread
+        asset, unread = _carry_materials_reason(asset, attempt.asset), attempt.unread
         if attempt.method in waiting:  # it stood in for what is not safe for this mesh
             waiting = waiting[waiting.index(attempt.method) + 1 :]
         levels += asset.levels
@@ -226,17 +226,17 @@ def _by_any_method(
     if not levels:
         assert first_miss is not None
         raise Rejected(*first_miss)
-    return dataclasses.replace(asset, levels=_rising(levels)), unread
+    return dataclasses.replace(asset, levels=_drop_wasteful_levels(levels)), unread
 
 
-def _remembering(before: Asset | None, now: Asset) -> Asset:
+def _carry_materials_reason(before: Asset | None, now: Asset) -> Asset:
     """Return what an attempt found, and why an earlier one kept no materials of its own."""
     if before is None or before.materials is None or not before.materials.reason:
         return now
     return dataclasses.replace(now, materials=before.materials)
 
 
-def _rising(levels: list[Level]) -> tuple[Level, ...]:
+def _drop_wasteful_levels(levels: list[Level]) -> tuple[Level, ...]:
     """Return the levels from the largest budget, without those that waste theirs.
 
     Another method may leave fewer faces at a budget than the first one at a smaller budget.

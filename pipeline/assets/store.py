@@ -60,15 +60,15 @@ class AssetStore:
         path = self._refusal_path(key)
         if not path.exists():
             return None
-        refusal = read_json(path.read_bytes(), _Refusal, _named(path))
+        refusal = read_json(path.read_bytes(), _Refusal, _label(path))
         return Rejected(refusal.reason, refusal.message)
 
     def unread(self, key: str) -> tuple[str, ...]:
         """Return what of the source no code has read; TrilightError of a damaged file."""
         path = self._unread_path(key)
-        return tuple(read_json(path.read_bytes(), list[str], _named(path))) if path.exists() else ()
+        return tuple(read_json(path.read_bytes(), list[str], _label(path))) if path.exists() else ()
 
-    def keep(self, key: str, asset: Asset, unread: tuple[str, ...] = ()) -> None:
+    def save_asset(self, key: str, asset: Asset, unread: tuple[str, ...] = ()) -> None:
         """Store an asset; raises TrilightError where that cannot be written."""
         path = self.asset_path(key)
         if unread:
@@ -76,13 +76,13 @@ class AssetStore:
         write_atomically(path, encode_asset(asset))
         _remove_old_leftovers(path.parent)
 
-    def refuse(self, key: str, reason: str, message: str) -> None:
+    def save_refusal(self, key: str, reason: str, message: str) -> None:
         """Store a refusal; raises TrilightError where that cannot be written."""
         outcome = canonical_json({"reason": reason, "message": message})
         write_atomically(self._refusal_path(key), outcome)
 
     @contextlib.contextmanager
-    def making(self, key: str) -> Iterator[None]:
+    def lock(self, key: str) -> Iterator[None]:
         """Wait until nobody else makes the outcome of this key, and keep others out meanwhile.
 
         Raises:
@@ -98,7 +98,7 @@ class AssetStore:
         return self.asset_path(key).with_suffix(".json")
 
 
-def _named(path: Path) -> str:
+def _label(path: Path) -> str:
     return f"{path} of the asset store (delete it, and it is made again)"
 
 

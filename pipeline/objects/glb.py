@@ -55,7 +55,7 @@ def encode_glb(
         "materials": [_material(file, *textures)],
         "extensionsUsed": ["KHR_materials_specular"],
     }
-    return file.encoded()
+    return file.encode()
 
 
 def _material(
@@ -114,7 +114,7 @@ class GlbFile:
         textures.append({"source": len(images) - 1})
         return len(textures) - 1
 
-    def encoded(self) -> bytes:
+    def encode(self) -> bytes:
         """Return the file."""
         self.tree["buffers"] = [{"byteLength": len(self._data)}]
         text = json.dumps(self.tree, sort_keys=True).encode()

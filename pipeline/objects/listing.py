@@ -13,7 +13,7 @@ Fetched = tuple[list[ObjectRecord], list[Failure]]
 CountDone = Callable[[int, int], None]
 
 
-def _here_already(records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
+def _already_local(records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
     return records, []
 
 
@@ -25,14 +25,14 @@ class Listing:
     """In any order. The path of an object that must be fetched means nothing yet."""
     failures: list[Failure]
     """Objects that cannot be used, whatever their licence."""
-    fetch: Callable[[list[ObjectRecord], CountDone], Fetched] = _here_already
+    fetch: Callable[[list[ObjectRecord], CountDone], Fetched] = _already_local
     """Brings objects to this machine; returns them with their paths, and a failure for each that
     could not be fetched. Files of this machine are left where they are."""
 
     @property
     def is_here(self) -> bool:
         """Whether the files of all objects are on this machine, with nothing to fetch."""
-        return self.fetch is _here_already
+        return self.fetch is _already_local
 
 
 def failure(uid: str, reason: str, message: str) -> Failure:

@@ -60,7 +60,7 @@ log = logging.getLogger("trilight.objects")
 
 
 @functools.cache
-def say_once(message: str) -> None:
+def warn_once(message: str) -> None:
     """Log a warning, once in a process."""
     log.warning("%s", message)
 
@@ -83,7 +83,7 @@ def drop_outputs(names: Iterable[str]) -> list[str]:
     ]
     if len(remaining) < len(names):
         examples = ", ".join(printable(folder) for folder in sorted(outputs)[:3])
-        say_once(f"left out as outputs of Trilight: {examples}{_and_more(len(outputs) - 3)}")
+        warn_once(f"left out as outputs of Trilight: {examples}{_and_more(len(outputs) - 3)}")
     return remaining
 
 
@@ -102,14 +102,14 @@ def _is_output(folder: str, inside: Mapping[str, set[str]]) -> bool:
     )
 
 
-def say_unread(names: Sequence[str], objects: Sequence[str]) -> None:
+def warn_unread_formats(names: Sequence[str], objects: Sequence[str]) -> None:
     """Name files of other formats for objects, and archives, that no object file stands beside."""
     stems = {_stem(name) for name in objects}
     stems |= {stem for name in names if (stem := _stem(name)).startswith(".")}  # hidden
     unread = sorted(n for n in names if _suffix(n) in _UNREAD and _stem(n) not in stems)
     if unread:
         example = f"{printable(unread[0])}{_and_more(len(unread) - 1)}"
-        say_once(f"left out as formats that are not read: {example}; convert or unpack them")
+        warn_once(f"left out as formats that are not read: {example}; convert or unpack them")
 
 
 def drop_scenes(root: Path, names: Sequence[str]) -> list[str]:
@@ -117,7 +117,7 @@ def drop_scenes(root: Path, names: Sequence[str]) -> list[str]:
     scenes = [name for name in names if _suffix(name) in (*_USD, "glb") and _is_scene(root / name)]
     if scenes:
         example = f"{printable(scenes[0])}{_and_more(len(scenes) - 1)}"
-        say_once(f"left out as scenes that Trilight wrote: {example}")
+        warn_once(f"left out as scenes that Trilight wrote: {example}")
     return [name for name in names if name not in set(scenes)]
 
 
@@ -153,7 +153,7 @@ def drop_copies(names: Sequence[str]) -> list[str]:
         if copies:
             notes.append(f"{len(copies)} {what} (such as {printable(copies[0])})")
     if notes:
-        say_once(f"left out as copies of objects that are there: {'; '.join(notes)}")
+        warn_once(f"left out as copies of objects that are there: {'; '.join(notes)}")
     return [name for name in names if name not in dropped]
 
 

@@ -64,11 +64,11 @@ class ObjectSource:
     is_place: bool = False
     """Whether the name is the scheme of a URL, which may hold a secret."""
 
-    def asked(self, query: SourceQuery, *, only_look: bool) -> Listing | None:
+    def run_query(self, query: SourceQuery, *, check_only: bool) -> Listing | None:
         """Return what `list` does, or have a look; raises TrilightError as they do."""
         if self.states_licences:
             require_unstated(query.licence, f"{query.source.partition(':')[0]}:")
-        if only_look and self.look:
+        if check_only and self.look:
             self.look(query)
             return None
         return self.list(query)
@@ -118,7 +118,7 @@ VARIABLES = "TRILIGHT_SOURCE_"
 _QUOTED = re.compile(r"^objects (?:is )?(?:'[^']*'|\"[^\"]*\")")
 """How messages about a source begin."""
 _WORD = re.compile(r"\w{3,}")
-_NOT_HAD = ("download_failed", "too_large_bytes", "too_many_buffers", "unsafe_name")
+_DOWNLOAD_REASONS = ("download_failed", "too_large_bytes", "too_many_buffers", "unsafe_name")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,11 +137,11 @@ class FoundObjects:
         return len(self.records) + len(self.failures)
 
 
-def _silent(done: int, total: int) -> None:
+def _ignore_progress(done: int, total: int) -> None:
     """Show no progress."""
 
 
-def _every(uid: str) -> bool:
+def _select_all(uid: str) -> bool:
     return True
 
 
@@ -160,8 +160,8 @@ class ListedObjects:
 
     def found(
         self,
-        wanted: Callable[[str], bool] = _every,
-        downloaded: Callable[[int, int], None] = _silent,
+        wanted: Callable[[str], bool] = _select_all,
+        downloaded: Callable[[int, int], None] = _ignore_progress,
     ) -> FoundObjects:
         """Return the objects that may be used, after bringing them here.
 
@@ -192,16 +192,16 @@ class ListedObjects:
 
     def fetch(self, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
         """Bring some of the allowed objects here; as `Listing.fetch`."""
-        with _said_by(self.source):
+        with _resolve_source(self.source):
             return self.listing.fetch(records, downloaded)
 
     def require_some(self, num_here: int, failures: Sequence[Failure]) -> None:
         """Raise TrilightError where downloads were tried and none came through."""
-        lost = [failure for failure in failures if failure.reason in _NOT_HAD]
+        lost = [failure for failure in failures if failure.reason in _DOWNLOAD_REASONS]
         if num_here or not lost:
             return
         first = min(lost, key=attrgetter("item"))
-        with _said_by(self.source) as value:
+        with _resolve_source(self.source) as value:
             raise TrilightError(
                 f"objects {printable(safe_url(value))!r}: none of {len(lost)} objects could be "
                 f"downloaded; the first is {first.reason} ({first.message}); expected at least "
@@ -233,8 +233,8 @@ def list_objects(
             licence identifier is malformed, or is stated where the source states its own; a package
             is missing, or a server does not answer.
     """
-    with _said_by(source) as value:
-        listing = _listed(value, work_dir, licence, allowed_licences)
+    with _resolve_source(source) as value:
+        listing = _query_source(value, work_dir, licence, allowed_licences)
     assert listing is not None
     allowed, refused = refuse_licences(listing.records, allowed_licences)
     return ListedObjects(
@@ -248,7 +248,7 @@ def find_objects(
     work_dir: Path,
     allowed_licences: Sequence[str],
     licence: str | None = None,
-    downloaded: Callable[[int, int], None] = _silent,
+    downloaded: Callable[[int, int], None] = _ignore_progress,
 ) -> FoundObjects:
     """Return all objects of a source that may be used; as `list_objects` and what it `found`."""
     listed = list_objects(
@@ -265,23 +265,23 @@ def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str
     Raises:
         TrilightError: as `list_objects`.
     """
-    with _said_by(source) as value:
-        _listed(value, cache_folder("objects"), licence, allowed_licences, only_look=True)
+    with _resolve_source(source) as value:
+        _query_source(value, cache_folder("objects"), licence, allowed_licences, check_only=True)
 
 
 @contextlib.contextmanager
-def _said_by(source: str) -> Iterator[str]:
+def _resolve_source(source: str) -> Iterator[str]:
     """Yield the source, or what its environment variable holds; no message quotes that."""
-    value = _value(source)
+    value = _read_variable(source)
     try:
         yield value
     except TrilightError as mistake:
         if value == source:
             raise
-        raise type(mistake)(_without_value(str(mistake), source, value)) from None
+        raise type(mistake)(_redact_value(str(mistake), source, value)) from None
 
 
-def _value(source: str) -> str:
+def _read_variable(source: str) -> str:
     """Return the source, read from the environment variable where one is named."""
     if not source.startswith(ENVIRONMENT):
         return source
@@ -299,7 +299,7 @@ def _value(source: str) -> str:
     return value
 
 
-def _without_value(message: str, source: str, value: str) -> str:
+def _redact_value(message: str, source: str, value: str) -> str:
     """Return a message about a source that a variable says, with the variable instead of it."""
     label = f"objects {printable(source)!r}"
     redacted = _QUOTED.sub(lambda _: label, message)
@@ -312,13 +312,13 @@ def _without_value(message: str, source: str, value: str) -> str:
     )
 
 
-def _listed(
+def _query_source(
     source: str,
     work_dir: Path,
     licence: str | None,
     allowed_licences: Sequence[str],
     *,
-    only_look: bool = False,
+    check_only: bool = False,
 ) -> Listing | None:
     """Return what a source says that it holds, where a look does not do.
 
@@ -330,7 +330,7 @@ def _listed(
     query = SourceQuery(
         source=source, work_dir=work_dir, licence=licence, allowed_licences=allowed_licences
     )
-    listing = source_of(source).asked(query, only_look=only_look)
+    listing = source_of(source).run_query(query, check_only=check_only)
     if listing and not listing.records and not listing.failures:
         raise TrilightError(
             f"objects {printable(safe_url(source))!r} holds no object; expected "

@@ -30,7 +30,7 @@ class Decimation:
     """Whether it ends on every mesh."""
 
 
-def _pre_simplified(mesh: TriangleMesh, budget: int) -> TriangleMesh:
+def _simplify_first(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     if len(mesh.faces) > 1.25 * _DETOUR * budget:
         return clean(meshopt.simplify(mesh, _DETOUR * budget))
     return mesh
@@ -39,13 +39,13 @@ def _pre_simplified(mesh: TriangleMesh, budget: int) -> TriangleMesh:
 def _remesh_evenly(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     from pipeline.assets.decimation import pymeshlab_filters  # may not be installed
 
-    return pymeshlab_filters.remesh_evenly(_pre_simplified(mesh, budget), budget)
+    return pymeshlab_filters.remesh_evenly(_simplify_first(mesh, budget), budget)
 
 
 def _collapse(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     from pipeline.assets.decimation import pymeshlab_filters  # may not be installed
 
-    return pymeshlab_filters.collapse(_pre_simplified(mesh, budget), budget)
+    return pymeshlab_filters.collapse(_simplify_first(mesh, budget), budget)
 
 
 DECIMATIONS: Mapping[str, Decimation] = {

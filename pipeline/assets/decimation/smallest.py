@@ -25,7 +25,7 @@ def smallest_passing(attempt: Callable[[int], Result], largest: int) -> Result:
     Raises:
         Rejected: `largest` itself does not pass.
     """
-    budgets = _ladder(largest)
+    budgets = _falling_budgets(largest)
     best = attempt(budgets[0])
     passed, failed = 0, len(budgets)
     while failed - passed > 1:
@@ -37,7 +37,7 @@ def smallest_passing(attempt: Callable[[int], Result], largest: int) -> Result:
     return best
 
 
-def _ladder(largest: int) -> list[int]:
+def _falling_budgets(largest: int) -> list[int]:
     """Return falling budgets from `largest` down to the fewest faces."""
     budgets, budget = [largest], float(largest)
     while (budget := budget / _STEP) >= _FEWEST:

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.nearest import NearestPlaces
+from pipeline.assets.own.nearest import SurfaceLookup
 from pipeline.assets.own.source_surface import SourceSurface
-from pipeline.assets.own.tiles import FLAT, Atlas, atlas, cells_of, tile_weights, turned
+from pipeline.assets.own.tiles import FLAT, Atlas, pack_atlas, cells_per_side, tile_weights, longest_edge_order
 from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.conventions import linear_from_srgb8, srgb8
@@ -25,7 +25,7 @@ DIFFUSE, SPECULAR, ROUGHNESS = slice(0, 3), slice(3, 6), slice(6, 7)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Baked:
+class BakedTextures:
     """What was baked, before it is measured."""
 
     uv: NDArray[np.float32]
@@ -51,10 +51,10 @@ class _Texels:
 def bake(
     level: TriangleMesh,
     source: SourceSurface,
-    nearest: NearestPlaces,
+    nearest: SurfaceLookup,
     settings: OwnMaterialSettings,
     reach: float,
-) -> Baked:
+) -> BakedTextures:
     """Return the colours of a level.
 
     Args:
@@ -64,16 +64,16 @@ def bake(
         settings: texels and greatest size.
         reach: how far the source may be away, in the unit box.
     """
-    order = turned(level.corners)
+    order = longest_edge_order(level.corners)
     corners = np.take_along_axis(level.corners, order[..., None], axis=1)
     cells, density = _cells(corners, settings)
-    texels = _coloured(corners, cells, source, nearest, reach, density)
+    texels = _bake_texels(corners, cells, source, nearest, reach, density)
     tile_of, first_of = _tiles(cells, texels)
-    plan = atlas(np.where(_is_flat(texels), 0, cells)[first_of])
+    plan = pack_atlas(np.where(_is_flat(texels), 0, cells)[first_of])
     uv = np.zeros((len(corners), 3, 2))
     for face, tile in enumerate(tile_of):
         uv[face, order[face]] = plan.uv(int(tile))
-    return Baked(
+    return BakedTextures(
         uv=uv.astype(np.float32),
         textures=_textures(plan, first_of, texels),
         missed=texels.missed,
@@ -87,18 +87,18 @@ def _cells(
     """Return the cells of each tile, and the density at which the atlas is within its size."""
     density = float(settings.texels)
     while True:
-        cells = cells_of(corners, density)
-        plan = atlas(cells)
+        cells = cells_per_side(corners, density)
+        plan = pack_atlas(cells)
         if max(plan.width, plan.height) <= settings.size or (cells == 1).all():
             return cells, density
         density *= _SHRINK
 
 
-def _coloured(
+def _bake_texels(
     corners: NDArray[np.float64],
     cells: NDArray[np.int64],
     source: SourceSurface,
-    nearest: NearestPlaces,
+    nearest: SurfaceLookup,
     reach: float,
     density: float,
 ) -> _Texels:
@@ -114,7 +114,7 @@ def _coloured(
     columns, missed = np.zeros((len(points), 7)), 0
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
-        places = nearest.of(points[part], normals[part], reach)
+        places = nearest.find(points[part], normals[part], reach)
         columns[part] = source.columns(places.faces, places.weights, 1 / density)
         missed += int(places.is_missed.sum())
     codes = np.concatenate(
@@ -177,7 +177,7 @@ def _textures(
     stored += [np.round(values[..., part] * 255).astype(np.uint8) for part in _PARTS[1:]]
     if constants[0] is None:
         specular = stored[1] / 255 if constants[1] is None else constants[1]
-        stored[0] = _lowered(stored[0], specular)
+        stored[0] = _limit_diffuse(stored[0], specular)
     elif constants[1] is None:
         over = np.minimum(constants[0] + stored[1] / 255, 1) - constants[0]
         stored[1] = np.floor(over * 255 + 1e-6).astype(np.uint8)
@@ -202,7 +202,7 @@ def _constant(texels: _Texels, part: slice) -> NDArray[np.float32] | None:
     return (columns[0] if same else columns.mean(axis=0)).astype(np.float32)
 
 
-def _lowered(diffuse: NDArray[np.uint8], specular: NDArray[np.floating]) -> NDArray[np.uint8]:
+def _limit_diffuse(diffuse: NDArray[np.uint8], specular: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Return sRGB codes that add up to at most 1 with the specular albedo after rounding."""
     table = linear_from_srgb8()
     room = 1 + 1e-6 - np.broadcast_to(specular, diffuse.shape)

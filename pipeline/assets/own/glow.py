@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.nearest import NearestPlaces
+from pipeline.assets.own.nearest import SurfaceLookup
 from pipeline.assets.own.source_surface import SourceSurface
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
@@ -17,7 +17,7 @@ _MOST = 1e30
 
 
 def level_emission(
-    level: TriangleMesh, source: SourceSurface, nearest: NearestPlaces, reach: float
+    level: TriangleMesh, source: SourceSurface, nearest: SurfaceLookup, reach: float
 ) -> NDArray[np.float32] | None:
     """Return the radiance [F, 3] of a level's triangles; None where nothing emits.
 
@@ -38,7 +38,7 @@ def level_emission(
     normal = level.double_area_vectors
     areas = 0.5 * np.linalg.norm(normal, axis=1)
     normals = np.repeat(normal / (2 * areas[:, None]), len(weights), axis=0)
-    places = nearest.of(points.reshape(-1, 3), normals, reach)
+    places = nearest.find(points.reshape(-1, 3), normals, reach)
     cell = float(np.sqrt(np.median(areas) / len(weights)))
     seen = source.emission(places.faces, places.weights, cell).reshape(len(corners), -1, 3)
     mean = seen.mean(axis=1)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from pipeline.assets.own.skin import SkinMaker, skin_maker
+from pipeline.assets.own.skin import SkinBaker, open_skin_baker
 from pipeline.assets.settings import AssetSettings
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import SourceFile
@@ -13,7 +13,7 @@ from storage.records.skin import OwnMaterials
 Missed = dict[int, tuple[str, str]]
 
 
-def with_own_materials(
+def add_source_materials(
     levels: tuple[Level, ...],
     missed: Mapping[int, tuple[str, str]],
     source: SourceFile,
@@ -36,18 +36,18 @@ def with_own_materials(
     if not material_settings.keep:
         return levels, dict(missed), None
     try:
-        maker, materials = skin_maker(source, mesh, material_settings)
+        maker, materials = open_skin_baker(source, mesh, material_settings)
     except Rejected as lost:
         if material_settings.if_lost == "reject":
             raise
         return levels, dict(missed), OwnMaterials(reason=lost.reason, message=lost.message)
-    return _skinned(levels, missed, maker, materials, refuse=material_settings.if_lost == "reject")
+    return _add_skins(levels, missed, maker, materials, refuse=material_settings.if_lost == "reject")
 
 
-def _skinned(
+def _add_skins(
     levels: tuple[Level, ...],
     missed: Mapping[int, tuple[str, str]],
-    maker: SkinMaker,
+    maker: SkinBaker,
     materials: OwnMaterials,
     *,
     refuse: bool,
@@ -55,7 +55,7 @@ def _skinned(
     with_skins, reasons = list[Level](), dict(missed)
     for level in levels:
         try:
-            with_skins.append(maker.skinned(level))
+            with_skins.append(maker.add_skin(level))
         except Rejected as lost:
             if refuse:
                 reasons[level.record.budget] = (lost.reason, lost.message)

@@ -4,8 +4,8 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.bake import DIFFUSE, Baked
-from pipeline.assets.own.nearest import NearestPlaces, barycentric
+from pipeline.assets.own.bake import DIFFUSE, BakedTextures
+from pipeline.assets.own.nearest import SurfaceLookup, barycentric
 from pipeline.assets.own.source_surface import SourceSurface
 from pipeline.assets.quality.distance import sample_surface
 from pipeline.foreign.mesh import TriangleMesh
@@ -20,23 +20,23 @@ _TORN_TEXELS = 2.0
 
 def skin_quality(
     level: TriangleMesh,
-    baked: Baked,
+    baked: BakedTextures,
     source: SourceSurface,
-    nearest: NearestPlaces,
+    nearest: SurfaceLookup,
     reach: float,
 ) -> SkinQuality:
     """Return the measures of a baked level; arguments as those of `bake`."""
-    error = _colour_errors(level, baked, source)
+    error = _color_errors(level, baked, source)
     return SkinQuality(
-        colour_error=_rounded(error.mean()),
-        colour_error_p95=_rounded(np.percentile(error, 95)),
-        missed_cells=_rounded(baked.missed),
-        torn_seams=_rounded(_torn_seams(level, nearest, source, reach, 1 / baked.density)),
-        texels_per_length=_rounded(baked.density),
+        colour_error=_round_digits(error.mean()),
+        colour_error_p95=_round_digits(np.percentile(error, 95)),
+        missed_cells=_round_digits(baked.missed),
+        torn_seams=_round_digits(_torn_seams(level, nearest, source, reach, 1 / baked.density)),
+        texels_per_length=_round_digits(baked.density),
     )
 
 
-def _colour_errors(level: TriangleMesh, baked: Baked, source: SourceSurface) -> NDArray[np.float64]:
+def _color_errors(level: TriangleMesh, baked: BakedTextures, source: SourceSurface) -> NDArray[np.float64]:
     """Return the difference [N] at points spread evenly over the source."""
     uniform = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
     points = sample_surface(source.mesh, uniform)
@@ -54,7 +54,7 @@ def _colour_errors(level: TriangleMesh, baked: Baked, source: SourceSurface) -> 
 
 def _torn_seams(
     level: TriangleMesh,
-    nearest: NearestPlaces,
+    nearest: SurfaceLookup,
     source: SourceSurface,
     reach: float,
     texel: float,
@@ -75,7 +75,7 @@ def _torn_seams(
     points = ((1 - along) * inner[:, 0] + along * inner[:, 1]).reshape(-1, 3)
     side_positions = []
     for side in sides.T:
-        places = nearest.of(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
+        places = nearest.find(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
         corners = source.mesh.corners[places.faces]
         side_positions.append(np.einsum("nc,ncd->nd", places.weights, corners))
     gap = np.linalg.norm(side_positions[0] - side_positions[1], axis=1).reshape(len(_ALONG), -1)
@@ -84,5 +84,5 @@ def _torn_seams(
     return float((torn * length).sum() / length.sum())
 
 
-def _rounded(value: float) -> float:
+def _round_digits(value: float) -> float:
     return float(f"{value:.6g}")

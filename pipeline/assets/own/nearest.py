@@ -20,7 +20,7 @@ _BEHIND = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Places:
+class SurfaceLocations:
     """Places on a surface."""
 
     faces: NDArray[np.int64]
@@ -31,7 +31,7 @@ class Places:
     """[N] whether nothing near faced the same way."""
 
 
-class NearestPlaces:
+class SurfaceLookup:
     """The places of one source; its search trees are made once."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
@@ -44,7 +44,7 @@ class NearestPlaces:
         self._embree = EmbreeScene(robust=True)
         EmbreeMesh(self._embree, mesh.corners.astype(np.float32))
 
-    def of(self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float) -> Places:
+    def find(self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float) -> SurfaceLocations:
         """Return the places that points [N, 3] with unit normals [N, 3] show.
 
         Args:
@@ -55,7 +55,7 @@ class NearestPlaces:
         result = self._closest(points, normals, reach)
         best = np.full(len(points), np.inf)
         for sign in (1.0, -1.0):
-            face, weights, distance = self._met(points, sign * normals)
+            face, weights, distance = self._cast_rays(points, sign * normals)
             facing = (self._normals[face] * normals).sum(axis=1) > 0
             taken = facing & (distance <= reach) & (distance < best)
             best[taken] = distance[taken]
@@ -63,7 +63,7 @@ class NearestPlaces:
             result.is_missed[taken] = False
         return result
 
-    def _met(
+    def _cast_rays(
         self, points: NDArray[np.float64], directions: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
         """Return face, weights and distance of what rays meet first; infinite where nothing."""
@@ -76,13 +76,13 @@ class NearestPlaces:
 
     def _closest(
         self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
-    ) -> Places:
+    ) -> SurfaceLocations:
         squared, face, nearest = self._tree.squared_distance(
             self._mesh.positions, self._mesh.faces, points
         )
         face = np.asarray(face, np.int64).ravel()
         facing = (self._normals[face] * normals).sum(axis=1) > 0
-        return Places(
+        return SurfaceLocations(
             faces=face,
             weights=barycentric(self._mesh.corners[face], np.asarray(nearest)),
             is_missed=~(facing & (np.sqrt(np.asarray(squared).ravel()) <= reach)),

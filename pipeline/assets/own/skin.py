@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pipeline.assets.own.bake import bake
 from pipeline.assets.own.glow import level_emission
 from pipeline.assets.own.measure import skin_quality
-from pipeline.assets.own.nearest import NearestPlaces
-from pipeline.assets.own.source_surface import SourceSurface, source_surface
+from pipeline.assets.own.nearest import SurfaceLookup
+from pipeline.assets.own.source_surface import SourceSurface, match_source_surface
 from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.foreign.gltf.materials import GltfMaterials
 from pipeline.foreign.gltf.objects import gltf_parts
@@ -32,15 +32,15 @@ _LEAST_REACH = 1e-3
 """
 
 
-class SkinMaker:
+class SkinBaker:
     """Makes the skins of the levels of one source."""
 
     def __init__(self, surface: SourceSurface, settings: OwnMaterialSettings) -> None:
         """Take a source with its colours."""
         self._surface, self._settings = surface, settings
-        self._nearest = NearestPlaces(surface.mesh)
+        self._nearest = SurfaceLookup(surface.mesh)
 
-    def skinned(self, level: Level) -> Level:
+    def add_skin(self, level: Level) -> Level:
         """Return a level with its skin.
 
         Raises:
@@ -86,9 +86,9 @@ def _require_lawful(textures: Sequence[Texture], emission: NDArray[np.float32] |
         raise Rejected("materials_unreadable", f"it emits {emission.max()}; expected {FINITE}")
 
 
-def skin_maker(
+def open_skin_baker(
     source: SourceFile, mesh: TriangleMesh, settings: OwnMaterialSettings
-) -> tuple[SkinMaker, OwnMaterials]:
+) -> tuple[SkinBaker, OwnMaterials]:
     """Return what makes the skins of a source, and what of its materials is lost.
 
     Args:
@@ -104,8 +104,8 @@ def skin_maker(
     parts = _parts(source, Decoder(settings.max_pixels), emission=settings.emission)
     lost = {word for material in parts.materials for word in material.lost}
     lost -= {"emission"} if settings.emission else set()
-    surface = source_surface(mesh, parts)
-    return SkinMaker(surface, settings), OwnMaterials(lost=tuple(sorted(lost)))
+    surface = match_source_surface(mesh, parts)
+    return SkinBaker(surface, settings), OwnMaterials(lost=tuple(sorted(lost)))
 
 
 def _parts(

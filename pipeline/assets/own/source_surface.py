@@ -46,7 +46,7 @@ class SourceSurface:
         of_place = self.parts.material[source_face]
         for row in np.unique(of_place):
             chosen = np.flatnonzero(of_place == row)
-            result[chosen] = self._of_material(
+            result[chosen] = self._material_columns(
                 self.parts.materials[row], source_face[chosen], source_weights[chosen], cell
             )
         return result
@@ -70,12 +70,12 @@ class SourceSurface:
                 continue
             result[chosen] = material.emission_rgb
             if material.emission is not None:
-                result[chosen] *= self._shown(
+                result[chosen] *= self._sample_picture(
                     material.emission, source_face[chosen], source_weights[chosen], cell
                 )[:, :3]
         return result
 
-    def _of_material(
+    def _material_columns(
         self,
         material: SourceMaterial,
         source_face: NDArray[np.int64],
@@ -84,30 +84,30 @@ class SourceSurface:
     ) -> NDArray[np.float64]:
         known: dict[tuple[object, ...], NDArray[np.float32]] = {}
 
-        def shown(slot: Slot | None) -> NDArray[np.float32] | None:
+        def sample(slot: Slot | None) -> NDArray[np.float32] | None:
             if slot is None:
                 return None
             place = (id(slot.picture), slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())
             if place not in known:  # one picture often holds several numbers
-                known[place] = self._shown(slot, source_face, source_weights, cell)
+                known[place] = self._sample_picture(slot, source_face, source_weights, cell)
             return known[place]
 
-        base = shown(material.base)
+        base = sample(material.base)
         if self.parts.colour is not None:
             tint = np.einsum("nc,ncd->nd", source_weights, self.parts.colour[source_face])
             base = np.ones((len(source_face), 4), np.float32) if base is None else base
             base = np.concatenate([base[:, :3] * tint, base[:, 3:]], axis=1).astype(np.float32)
         seen = Seen(
             base=base,
-            metallic=shown(material.metallic_map),
-            roughness=shown(material.roughness_map),
-            specular_colour=shown(material.specular_colour),
-            specular_strength=shown(material.specular_strength_map),
-            glossiness=shown(material.glossiness),
+            metallic=sample(material.metallic_map),
+            roughness=sample(material.roughness_map),
+            specular_colour=sample(material.specular_colour),
+            specular_strength=sample(material.specular_strength_map),
+            glossiness=sample(material.glossiness),
         )
         return columns(material, seen, len(source_face))
 
-    def _shown(
+    def _sample_picture(
         self,
         slot: Slot,
         source_face: NDArray[np.int64],
@@ -138,7 +138,7 @@ def _halvings(
     return np.minimum(halvings, slot.picture.most_halvings)
 
 
-def source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurface:
+def match_source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurface:
     """Find the faces of a clean mesh among those of its file.
 
     Args:
@@ -158,7 +158,7 @@ def source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurface:
     corners = vertex[raw.faces]
     source_face = np.full(len(mesh.faces), -1)
     for candidate in (corners, corners[:, [0, 2, 1]]):  # those that face the same way come first
-        matched = _matching(mesh.faces, candidate)
+        matched = _first_matches(mesh.faces, candidate)
         source_face = np.where(source_face < 0, matched, source_face)
     missing = source_face < 0
     if missing.mean() > 1 - _LEAST_FOUND:
@@ -166,7 +166,7 @@ def source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurface:
             "materials_unreadable",
             f"{missing.mean():.1%} of the faces are not found again beside their materials",
         )
-    source_face = np.where(missing, _any_neighbour(mesh, missing, source_face), source_face)
+    source_face = np.where(missing, _nearest_matched(mesh, missing, source_face), source_face)
     source_corner = (corners[source_face][:, None, :] == mesh.faces[:, :, None]).argmax(axis=2)
     source_corner[missing] = np.arange(3)
     _require_coordinates(parts, source_face)
@@ -175,9 +175,9 @@ def source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurface:
     )
 
 
-def _matching(faces: NDArray[np.int64], candidates: NDArray[np.int64]) -> NDArray[np.int64]:
+def _first_matches(faces: NDArray[np.int64], candidates: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the first row of `among` that is each wanted face but for its first corner, or -1."""
-    rows = np.concatenate([_rolled(candidates), _rolled(faces)])
+    rows = np.concatenate([_start_at_lowest(candidates), _start_at_lowest(faces)])
     _, number = np.unique(rows, axis=0, return_inverse=True)
     first = np.full(int(number.max()) + 1, len(candidates))
     np.minimum.at(first, number.ravel()[: len(candidates)], np.arange(len(candidates)))
@@ -185,12 +185,12 @@ def _matching(faces: NDArray[np.int64], candidates: NDArray[np.int64]) -> NDArra
     return np.where(first_match < len(candidates), first_match, -1)
 
 
-def _rolled(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+def _start_at_lowest(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     corner_order = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
     return np.take_along_axis(faces, corner_order, axis=1)
 
 
-def _any_neighbour(
+def _nearest_matched(
     mesh: TriangleMesh, missing: NDArray[np.bool_], source_face: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """Return the origin of the face whose centre is nearest, for each missing one."""

@@ -20,7 +20,7 @@ FLAT = 2
 """Width of the square of one colour."""
 
 
-def cells_of(corners: NDArray[np.float64], density: float) -> NDArray[np.int64]:
+def cells_per_side(corners: NDArray[np.float64], density: float) -> NDArray[np.int64]:
     """Return the cells a side [F] of triangles with corners [F, 3, 3], the longest edge last.
 
     Args:
@@ -33,7 +33,7 @@ def cells_of(corners: NDArray[np.float64], density: float) -> NDArray[np.int64]:
     return np.asarray(SIDES, np.int64)[place]
 
 
-def turned(corners: NDArray[np.float64]) -> NDArray[np.int64]:
+def longest_edge_order(corners: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the order [F, 3] of corners [F, 3, 3] that begins opposite the longest edge."""
     opposite = np.linalg.norm(np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1), axis=2)
     return (opposite.argmax(axis=1)[:, None] + np.arange(3)) % 3
@@ -81,7 +81,7 @@ class Atlas:
         return at / np.array([self.width, self.height])
 
 
-def atlas(cells: NDArray[np.int64]) -> Atlas:
+def pack_atlas(cells: NDArray[np.int64]) -> Atlas:
     """Lay out tiles of so many cells a side [K], as nearly square as rows of squares allow."""
     order = np.argsort(-cells, kind="stable")
     squares, square_of, is_turned = _squares(cells, order)

@@ -37,7 +37,7 @@ class MeasuredSource:
         """Return how far the outlines agree, 0 to 1."""
         return intersection_over_union(self._silhouette, silhouette(result))
 
-    def own_quality(self) -> LevelQuality:
+    def source_quality(self) -> LevelQuality:
         """Return the measures of the source as a level of itself: exactly no error."""
         none = np.zeros(len(self.surface.points.faces))
         return self.quality(self.mesh, Deviation(to_other=none, from_other=none, angle_deg=none))
@@ -46,15 +46,15 @@ class MeasuredSource:
         """Return all measures of a clean result; `deviation` saves the time to find it again."""
         measured = deviation or self.surface.deviation(result)
         return LevelQuality(
-            error_mean=_rounded(max(measured.to_other.mean(), measured.from_other.mean())),
-            error_p99=_rounded(measured.two_way(99)),
-            error_max=_rounded(measured.two_way(100)),
-            normal_error_deg=_rounded(measured.angle_deg.mean()),
-            area_ratio=_rounded(self.area_ratio(result)),
-            silhouette_iou=_rounded(self.silhouette_iou(result)),
-            lost_area=_rounded(self.parts.lost_area(measured.to_other)),
-            area_variation=_rounded(area_variation(result)),
-            min_angle_p5_deg=_rounded(np.percentile(smallest_angles_deg(result), 5)),
+            error_mean=_round_digits(max(measured.to_other.mean(), measured.from_other.mean())),
+            error_p99=_round_digits(measured.two_way(99)),
+            error_max=_round_digits(measured.two_way(100)),
+            normal_error_deg=_round_digits(measured.angle_deg.mean()),
+            area_ratio=_round_digits(self.area_ratio(result)),
+            silhouette_iou=_round_digits(self.silhouette_iou(result)),
+            lost_area=_round_digits(self.parts.lost_area(measured.to_other)),
+            area_variation=_round_digits(area_variation(result)),
+            min_angle_p5_deg=_round_digits(np.percentile(smallest_angles_deg(result), 5)),
             open_edges=count_edges(result).open,
         )
 
@@ -63,6 +63,6 @@ def _area(mesh: TriangleMesh) -> float:
     return 0.5 * float(np.linalg.norm(mesh.double_area_vectors, axis=1).sum())
 
 
-def _rounded(value: float) -> float:
+def _round_digits(value: float) -> float:
     """Six digits: more than any of these measures has, and short in a file."""
     return float(f"{value:.6g}")

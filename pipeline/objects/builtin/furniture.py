@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.objects.builtin.grids import Mesh
-from pipeline.objects.builtin.solids import beam, box, join, lathe, moved
+from pipeline.objects.builtin.solids import beam, box, join, lathe, scale_and_move
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ def _top(params: FurnitureParams) -> list[Mesh]:
         radius, cut = params.width / 2, 0.3 * params.board
         outline = [(radius - cut, -half), (radius, cut - half)]
         outline += [(r, -z) for r, z in reversed(outline)]
-        return [moved(lathe(outline, 32), [0, 0, high - half])]
+        return [scale_and_move(lathe(outline, 32), [0, 0, high - half])]
     if params.kind == "chair" or params.slats == 1:
         size = [params.width / 2, params.depth / 2, half]
         return [box([0, 0, high - half], size, 0.25 * params.board)]

@@ -43,7 +43,7 @@ def lattice(params: LatticeParams) -> Mesh:
         solid[1:-1, 1:-1, -1] = False
     corner, faces = _surface(solid)
     unit = np.stack([np.array(places[axis])[corner[:, axis]] for axis in range(3)], axis=1)
-    return _warped(unit, params), faces
+    return _warp(unit, params), faces
 
 
 def lattice_rand(rng: np.random.Generator) -> Mesh:
@@ -120,7 +120,7 @@ def _surface(solid: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.in
     return points, flat.reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
-def _warped(unit: NDArray[np.float64], params: LatticeParams) -> NDArray[np.float64]:
+def _warp(unit: NDArray[np.float64], params: LatticeParams) -> NDArray[np.float64]:
     """Return points [V, 3] of the cube from -1 to 1 rounded, scaled, tapered, twisted, bent."""
     largest = np.abs(unit).max(axis=1, keepdims=True)
     length = np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)

@@ -19,7 +19,7 @@ def join(parts: Sequence[Mesh]) -> Mesh:
     return np.concatenate([positions for positions, _ in parts]), np.concatenate(faces)
 
 
-def moved(mesh: Mesh, offset: ArrayLike, scale: ArrayLike = 1.0) -> Mesh:
+def scale_and_move(mesh: Mesh, offset: ArrayLike, scale: ArrayLike = 1.0) -> Mesh:
     """Return the mesh scaled (positive numbers) and then moved."""
     return mesh[0] * np.asarray(scale) + np.asarray(offset), mesh[1]
 

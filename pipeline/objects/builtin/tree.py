@@ -128,7 +128,7 @@ def _children(
         branches.append(
             _Branch(
                 foot=path[index] + (step - index) * ahead,
-                direction=_turned(ahead, spread, azimuth),
+                direction=_branch_direction(ahead, spread, azimuth),
                 length=params.shrink * rng.uniform(0.85, 1.1) * parent.length,
                 # Thinner than the parent there, so that the foot is hidden in it.
                 radius=0.75 * parent.radius * (1 - _TAPER * place),
@@ -138,7 +138,7 @@ def _children(
     return branches
 
 
-def _turned(axis: NDArray[np.float64], spread: float, azimuth: float) -> NDArray[np.float64]:
+def _branch_direction(axis: NDArray[np.float64], spread: float, azimuth: float) -> NDArray[np.float64]:
     """Return the direction at the angle `spread` from `axis`, turned about it."""
     axis = axis / np.linalg.norm(axis)
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])

@@ -74,17 +74,17 @@ def _record(root: Path, row: dict[str, Any], place: str, name: str) -> ObjectRec
         )
     return ObjectRecord(
         uid=uid,
-        path=str(_inside(root, path, place)),
+        path=str(_path_below(root, path, place)),
         root=str(root),
-        title=_published(row, "title", place, uid),
-        licence=_published(row, "licence", place, UNKNOWN),
-        licence_source=_published(row, "licence_source", place, name),
-        attribution=_published(row, "attribution", place, ""),
-        source_url=_published(row, "source_url", place, ""),
+        title=_public_field(row, "title", place, uid),
+        licence=_public_field(row, "licence", place, UNKNOWN),
+        licence_source=_public_field(row, "licence_source", place, name),
+        attribution=_public_field(row, "attribution", place, ""),
+        source_url=_public_field(row, "source_url", place, ""),
     )
 
 
-def _published(row: dict[str, Any], field: str, place: str, default: str) -> str:
+def _public_field(row: dict[str, Any], field: str, place: str, default: str) -> str:
     """Return a text that stands in the dataset's documents: printable, without passwords."""
     return printable(public_text(_text(row, field, place, default)))
 
@@ -97,7 +97,7 @@ def _text(row: dict[str, Any], field: str, place: str, default: str | None = Non
     return value
 
 
-def _inside(root: Path, path: str, place: str) -> Path:
+def _path_below(root: Path, path: str, place: str) -> Path:
     """Return the absolute place of a catalogue path; links are followed before it is judged."""
     display_path = printable(path)
     if not path or "\x00" in path or path != path.encode("utf-8", "ignore").decode():

@@ -7,7 +7,7 @@ from pathlib import Path
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
 from pipeline.objects.listing import SUFFIXES, Listing, assign_uids, failure, is_object_file
 from pipeline.objects.local.catalogue import only_catalogue, read_catalogue
-from pipeline.objects.selection import drop_copies, drop_outputs, drop_scenes, say_unread
+from pipeline.objects.selection import drop_copies, drop_outputs, drop_scenes, warn_unread_formats
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
 from storage.remote.safe_url import printable
@@ -50,7 +50,7 @@ def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
     root = Path(os.path.realpath(folder))
     names = drop_outputs(walk_files(root))
     files = [name for name in names if is_object_file(name)]
-    say_unread(names, files)
+    warn_unread_formats(names, files)
     uids, failures = assign_uids(drop_copies(drop_scenes(root, files)))
     records = []
     for name, uid in uids.items():

@@ -86,7 +86,7 @@ def find_maps(
     stated, catalogue = stated_licence(licence), _only_catalogue(root, plural)
     failures: list[Failure] = []
     if catalogue is None:
-        records = _scanned(kind, root, stated, failures)
+        records = _scan_pictures(kind, root, stated, failures)
     else:
         require_unstated(licence, catalogue.name)
         records = [replace(row, uid=f"{kind}:{row.uid}") for row in read_catalogue(catalogue)]
@@ -137,7 +137,7 @@ def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[
     return maps
 
 
-def _scanned(
+def _scan_pictures(
     kind: str, root: Path, stated: StatedLicence, failures: list[Failure]
 ) -> list[ObjectRecord]:
     """Return a record of each set of textures, or of each map, and add what is no part of one."""

@@ -95,7 +95,7 @@ _NO_COLOR = re.compile(
 
 
 @dataclass(frozen=True)
-class _Named:
+class _ParsedName:
     """What the name of a file says."""
 
     key: str
@@ -126,14 +126,14 @@ def group_textures(
     """
     names = sorted(names, key=lambda name: (name.lower().endswith(_LATER), name))
     stems = {name: name.rpartition(".")[0] for name in names}
-    named = {name: entry for name in names if (entry := _named(stems[name])) is not None}
+    named = {name: entry for name in names if (entry := _parse_name(stems[name])) is not None}
     _add_letters(stems, named)
-    bare = _Bare(stems, named)
+    bare = _UnlabeledFiles(stems, named)
     parts: dict[tuple[str, str], dict[str, str]] = defaultdict(dict)
     bases: dict[tuple[str, str], tuple[str, str]] = {}
     unused: dict[str, tuple[str, str]] = {}
     for name in (*named, *bare.colors):
-        entry = named.get(name) or _Named(bare.colors[name], bare.colors[name], "base")
+        entry = named.get(name) or _ParsedName(bare.colors[name], bare.colors[name], "base")
         at = entry.key, entry.kind
         if entry.part not in _READ:
             message = f"it is a map of {entry.part}; expected colors, metallic and roughness"
@@ -161,10 +161,10 @@ def group_textures(
     return textures, unused
 
 
-class _Bare:
+class _UnlabeledFiles:
     """Files whose names say no part: those that are colors all the same, and the others."""
 
-    def __init__(self, stems: Mapping[str, str], named: Mapping[str, _Named]) -> None:
+    def __init__(self, stems: Mapping[str, str], named: Mapping[str, _ParsedName]) -> None:
         """Judge each by what is beside it."""
         with_color = {entry.key for entry in named.values() if entry.part == "base"}
         keys = {entry.key for entry in named.values()}
@@ -183,7 +183,7 @@ class _Bare:
                 self.unknown.append(name)
 
 
-def _named(path: str) -> _Named | None:
+def _parse_name(path: str) -> _ParsedName | None:
     folder, slash, name = path.rpartition("/")
     inner = f"{folder}{slash}"
     match = _NAME.fullmatch(_CAMEL.sub("_", name))
@@ -192,19 +192,19 @@ def _named(path: str) -> _Named | None:
         if match["set"] is not None:
             key = f"{inner}{match['set']}{match['tail']}"
             stem = f"{inner}{match['set']}{match['kind']}{match['tail']}"
-            return _Named(key, stem, part, match["kind"])
+            return _ParsedName(key, stem, part, match["kind"])
         if part not in ("other", "preview") and not _PLAIN.fullmatch(match[part]):
             # `oak/color.png`: the folder is the set
-            return _Named(f"{inner}{match['tail']}", path, part, match["kind"])
+            return _ParsedName(f"{inner}{match['tail']}", path, part, match["kind"])
     above, slash, last = folder.rpartition("/")
     within = _FOLDERS.fullmatch(last)
     if within is not None:
         part = next(part for part, word in within.groupdict().items() if word)
-        return _Named(f"{above}{slash}{name}", path, part)
+        return _ParsedName(f"{above}{slash}{name}", path, part)
     return None
 
 
-def _add_letters(stems: Mapping[str, str], named: dict[str, _Named]) -> None:
+def _add_letters(stems: Mapping[str, str], named: dict[str, _ParsedName]) -> None:
     """Add files whose names end in a letter, where one set or the color beside it says what."""
     letters: dict[str, dict[str, tuple[str, str]]] = defaultdict(dict)
     for name, stem in stems.items():
@@ -220,7 +220,7 @@ def _add_letters(stems: Mapping[str, str], named: dict[str, _Named]) -> None:
         beside_color = key in bare and said <= {"n", "s", "r", "h", "e"}
         if beside_color or (is_set and ("n" in said or key in parsed_keys)):
             for name, (letter, stem) in files.items():
-                named[name] = _Named(key, stem, _LETTERS.get(letter, "other"))
+                named[name] = _ParsedName(key, stem, _LETTERS.get(letter, "other"))
 
 
 def _drop_packed(parts: Iterable[dict[str, str]], unused: dict[str, tuple[str, str]]) -> None:

@@ -56,7 +56,7 @@ class PreparedMap:
     arrays: Mapping[str, NDArray[np.float32]]
     """Of a texture "diffuse", "specular" and perhaps "roughness"; of a map "radiance"."""
 
-    def encoded(self) -> bytes:
+    def encode(self) -> bytes:
         """Return the file of it."""
         return save(dict(self.arrays), {"content": self.content_sha256})
 
@@ -100,7 +100,7 @@ def prepare_map(map_files: MapFiles) -> tuple[bytes, tuple[str, ...]]:
     if result.roughness is not None:
         maps["roughness"] = result.roughness
     prepared = PreparedMap(content_sha256=result.content_sha256, arrays=maps)
-    return prepared.encoded(), tuple(unread)
+    return prepared.encode(), tuple(unread)
 
 
 def _prepare_sky(data: bytes, rows: int) -> tuple[bytes, tuple[str, ...]]:
@@ -113,7 +113,7 @@ def _prepare_sky(data: bytes, rows: int) -> tuple[bytes, tuple[str, ...]]:
         content_sha256=content_digest("radiance", radiance),
         arrays={"radiance": np.ascontiguousarray(usable_map(radiance, rows))},
     )
-    return prepared.encoded(), picture.unread
+    return prepared.encode(), picture.unread
 
 
 def unpack_parts(

@@ -39,7 +39,7 @@ def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> Textu
         size: most texels along a side of what is returned.
     """
     base = pictures["base"]
-    height, width = _fitting(base.shape[:2], size)
+    height, width = _fitting_size(base.shape[:2], size)
 
     def means(values: NDArray) -> NDArray[np.float64]:
         return area_means(values, height, width)
@@ -64,7 +64,7 @@ def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> Textu
     )
 
 
-def _fitting(shape: tuple[int, ...], size: int) -> tuple[int, int]:
+def _fitting_size(shape: tuple[int, ...], size: int) -> tuple[int, int]:
     """Return height and width with the proportions of a picture and no side over `size`."""
     shrink = min(1.0, size / max(shape))
     height, width = (max(1, round(side * shrink)) for side in shape)

@@ -76,7 +76,7 @@ class ObjaversePackage:
         """
 
         def load() -> Path:
-            with self._guarded():
+            with self._guard_package():
                 # One process: with more, the package forks a pool that nobody can end.
                 return Path(self._package.load_objects([uid], download_processes=1)[uid])
 
@@ -96,7 +96,7 @@ class ObjaversePackage:
 
         def attempt() -> Result:
             try:
-                with self._guarded():
+                with self._guard_package():
                     return load()
             except TrilightError:
                 raise
@@ -111,7 +111,7 @@ class ObjaversePackage:
         return Path(self._package._VERSIONED_PATH)
 
     @contextlib.contextmanager
-    def _guarded(self) -> Iterator[None]:
+    def _guard_package(self) -> Iterator[None]:
         """Lock the package's folder, silence its output and bound its waiting while it works.
 
         Only names of the package are replaced, not `sys.stdout`, so that a progress bar of ours

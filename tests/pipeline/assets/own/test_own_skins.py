@@ -11,7 +11,7 @@ from pxr import Gf, Sdf, Usd, UsdShade
 
 from pipeline.assets.cleaning.clean import clean, normalise
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.own.skin import skin_maker
+from pipeline.assets.own.skin import open_skin_baker
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
@@ -237,11 +237,11 @@ def test_a_level_that_lies_nowhere_near_its_source_is_told(tmp_path: Path) -> No
     path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS), uv, ball)
     source = read_source(path, KEEP.read_limits)
     mesh, _ = orient_outward(clean(normalise(load_mesh(source))))
-    maker, _ = skin_maker(source, mesh, dataclasses.replace(OWN, max_colour_error=1.0))
+    maker, _ = open_skin_baker(source, mesh, dataclasses.replace(OWN, max_colour_error=1.0))
     level = prepare(path, KEEP).levels[0]
-    assert maker.skinned(level).skin is not None
+    assert maker.add_skin(level).skin is not None
     with pytest.raises(Rejected, match="colours_missed"):
-        maker.skinned(dataclasses.replace(level, positions=0.8 * level.positions))
+        maker.add_skin(dataclasses.replace(level, positions=0.8 * level.positions))
 
 
 GLOW = AssetSettings(own_materials=dataclasses.replace(OWN, emission=True))
