@@ -84,7 +84,8 @@ def _count_flipped(before: TriangleMesh, after: TriangleMesh) -> int:
     """Count the faces that changed their winding: canonical rows differ in their last two."""
 
     def second_corners(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-        low, high = faces[:, 1:].min(axis=1), faces[:, 1:].max(axis=1)
+        low = faces[:, 1:].min(axis=1)
+        high = faces[:, 1:].max(axis=1)
         return faces[np.lexsort((high, low, faces[:, 0])), 1]
 
     return int((second_corners(before.faces) != second_corners(after.faces)).sum())

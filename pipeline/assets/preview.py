@@ -55,7 +55,8 @@ def _preview_colors(mesh: TriangleMesh, skin: LevelSkin, width_px: int) -> NDArr
     face = first_faces(mesh, origins.astype(np.float32), directions.astype(np.float32))
     hit = face >= 0
     color = np.full((len(face), 3), _BACKGROUND)
-    corners, normals = mesh.corners[face[hit]], mesh.double_area_vectors[face[hit]]
+    corners = mesh.corners[face[hit]]
+    normals = mesh.double_area_vectors[face[hit]]
     facing = np.einsum("ij,ij->i", normals, -directions[hit])
     facing /= np.linalg.norm(normals, axis=1)
     offset = np.einsum("ij,ij->i", normals, origins[hit] - corners[:, 0])

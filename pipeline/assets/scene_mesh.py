@@ -76,7 +76,8 @@ def remesh(raw: TriangleMesh, num_faces: int) -> TriangleMesh:
         TrilightError: pymeshlab is not installed.
     """
     used = raw.positions[np.unique(raw.faces)]
-    low, high = used.min(axis=0), used.max(axis=0)
+    low = used.min(axis=0)
+    high = used.max(axis=0)
     unit = clean(normalise(raw))
     if len(unit.faces):
         for method in methods_of("uniform"):

@@ -89,7 +89,8 @@ def _prepare_once(
     borrow_child: BorrowChild,
 ) -> PreparedAsset:
     """Find or make the outcome of an object; raises Rejected where there is no asset."""
-    source, root = Path(record.path), Path(record.root) if record.root else None
+    source = Path(record.path)
+    root = Path(record.root) if record.root else None
     key = _key(source, root, settings, store, borrow_child)
     path = store.asset_path(key)
     with store.lock(key):
@@ -195,7 +196,8 @@ def _try_methods(
     levels: list[Level] = []
     first_miss: tuple[str, str] | None = None
     death: ChildFailed | None = None
-    missing, waiting = settings.budgets, list(methods)
+    missing = settings.budgets
+    waiting = list(methods)
     while waiting:
         method = waiting.pop(0)
         finest = missing[0] == settings.budgets[0]  # epsilon is about this level
@@ -211,7 +213,8 @@ def _try_methods(
                 raise
             death = failure
             continue
-        asset, unread = _carry_materials_reason(asset, attempt.asset), attempt.unread
+        asset = _carry_materials_reason(asset, attempt.asset)
+        unread = attempt.unread
         if attempt.method in waiting:  # it stood in for what is not safe for this mesh
             waiting = waiting[waiting.index(attempt.method) + 1 :]
         levels += asset.levels

@@ -66,7 +66,8 @@ def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
     group = "builtin" if source != BENCHMARK else "builtin-benchmark-v1"
     records = []
     for index in range(num_builtin(source)):
-        family, number = names[index % len(names)], index // len(names)
+        family = names[index % len(names)]
+        number = index // len(names)
         path = work_dir / group / numbered_path(index, f"{family}-{number:05d}.ply")
         data = encode_ply(*builtin_mesh(family, number, group))
         if not path.is_file() or path.read_bytes() != data:

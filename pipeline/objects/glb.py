@@ -20,8 +20,10 @@ from storage.records.texture import Texture
 
 MOST_SPECULAR = 25.0
 """Times F0 = 0.04 of an ordinary dielectric is a mirror."""
-_JSON, _BIN = 0x4E4F534A, 0x004E4942
-FLOAT, UNSIGNED = 5126, 5125
+_JSON = 0x4E4F534A
+_BIN = 0x004E4942
+FLOAT = 5126
+UNSIGNED = 5125
 """Kinds of numbers."""
 
 

@@ -31,7 +31,8 @@ _SCENE = b"trilight:sceneSha256"
 """What every USD file of a scene of ours holds."""
 _GLB_SCENE = (b'"generator": "trilight"', b'"cameras": [')
 """What every GLB of a scene of ours holds, and no object of ours."""
-_MOST_HEAD, _MOST_TAIL = 1 << 14, 1 << 20
+_MOST_HEAD = 1 << 14
+_MOST_TAIL = 1 << 20
 
 _MESH = re.compile(r".*-[0-9a-f]{8}\.(?:ply|glb)")
 """How `assets` calls its meshes."""
@@ -146,7 +147,8 @@ def drop_copies(names: Sequence[str]) -> list[str]:
         "lower levels of detail": _levels,
         "other files of one object": _twins,
     }
-    notes, dropped = [], set[str]()
+    notes = []
+    dropped = set[str]()
     for what, rule in rules.items():
         copies = sorted(set(rule(names)) - dropped)
         dropped.update(copies)

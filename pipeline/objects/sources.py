@@ -285,7 +285,8 @@ def _read_variable(source: str) -> str:
     """Return the source, read from the environment variable where one is named."""
     if not source.startswith(ENVIRONMENT):
         return source
-    name, label = source.removeprefix(ENVIRONMENT), printable(source)
+    name = source.removeprefix(ENVIRONMENT)
+    label = printable(source)
     if not name.startswith(VARIABLES):
         raise TrilightError(
             f"objects {label!r} names a variable that is not for sources; expected one whose name "

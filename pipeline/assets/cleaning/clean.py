@@ -33,7 +33,8 @@ def normalise(mesh: TriangleMesh) -> TriangleMesh:
     """
     used, flat = np.unique(mesh.faces, return_inverse=True)
     positions = mesh.positions[used]
-    low, high = positions.min(axis=0), positions.max(axis=0)
+    low = positions.min(axis=0)
+    high = positions.max(axis=0)
     positions = (positions - (low + high) / 2) / (high - low).max()
     return TriangleMesh(positions=positions, faces=flat.reshape(-1, 3))
 
@@ -47,7 +48,8 @@ def clean(mesh: TriangleMesh) -> TriangleMesh:
     cells = np.rint(mesh.positions * GRID).astype(np.int64)
     keys = _keys(cells)
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    cells, faces = cells[first], inverse[mesh.faces]
+    cells = cells[first]
+    faces = inverse[mesh.faces]
     faces = faces[_has_area(cells, faces)]
     faces = canonical(faces)
     if len(faces):

@@ -38,7 +38,8 @@ def check_raw(mesh: TriangleMesh, settings: AssetSettings, *, is_single: bool) -
         bad = int((~np.isfinite(used)).any(axis=1).sum())
         raise Rejected("nonfinite_vertices", f"{bad} of {len(used)} vertices are not finite")
     with np.errstate(over="ignore"):
-        low, high = used.min(axis=0), used.max(axis=0)
+        low = used.min(axis=0)
+        high = used.max(axis=0)
         extent = float((high - low).max())
         offset = float(np.abs(0.5 * low + 0.5 * high).max())
     if not EXTENT_RANGE[0] <= extent <= EXTENT_RANGE[1]:

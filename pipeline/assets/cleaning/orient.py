@@ -33,7 +33,8 @@ def orient_outward(mesh: TriangleMesh) -> tuple[TriangleMesh, float]:
     volume = np.bincount(patch, weights=_signed_volume(turned, patch))
     flip = (votes[0] < votes[1]) | ((votes[0] == votes[1]) & (volume < 0))
     faces = np.where(flip[patch][:, None], faces[:, [0, 2, 1]], faces)
-    fronts, hits = float(np.where(flip, votes[1], votes[0]).sum()), float(votes.sum())
+    fronts = float(np.where(flip, votes[1], votes[0]).sum())
+    hits = float(votes.sum())
     oriented = TriangleMesh(positions=mesh.positions, faces=canonical(faces))
     return oriented, fronts / hits if hits else 0.0
 
@@ -44,7 +45,8 @@ def _front_votes(mesh: TriangleMesh, patch: NDArray[np.int64]) -> NDArray[np.int
     face = first_faces(mesh, origins, directions)
     hit = face >= 0
     facing = np.einsum("ij,ij->i", mesh.double_area_vectors[face[hit]], directions[hit])
-    seen, num_patches = patch[face[hit]], int(patch.max()) + 1
+    seen = patch[face[hit]]
+    num_patches = int(patch.max()) + 1
     return np.stack(
         [
             np.bincount(seen[facing < 0], minlength=num_patches),

@@ -27,11 +27,13 @@ def smallest_passing(attempt: Callable[[int], Result], largest: int) -> Result:
     """
     budgets = _falling_budgets(largest)
     best = attempt(budgets[0])
-    passed, failed = 0, len(budgets)
+    passed = 0
+    failed = len(budgets)
     while failed - passed > 1:
         middle = (passed + failed) // 2
         try:
-            best, passed = attempt(budgets[middle]), middle
+            best = attempt(budgets[middle])
+            passed = middle
         except Rejected:
             failed = middle
     return best
@@ -39,7 +41,8 @@ def smallest_passing(attempt: Callable[[int], Result], largest: int) -> Result:
 
 def _falling_budgets(largest: int) -> list[int]:
     """Return falling budgets from `largest` down to the fewest faces."""
-    budgets, budget = [largest], float(largest)
+    budgets = [largest]
+    budget = float(largest)
     while (budget := budget / _STEP) >= _FEWEST:
         if round(budget) < budgets[-1]:
             budgets.append(round(budget))

@@ -7,7 +7,14 @@ from numpy.typing import NDArray
 
 from pipeline.assets.own.nearest import SurfaceLookup
 from pipeline.assets.own.source_surface import SourceSurface
-from pipeline.assets.own.tiles import FLAT, Atlas, pack_atlas, cells_per_side, tile_weights, longest_edge_order
+from pipeline.assets.own.tiles import (
+    FLAT,
+    Atlas,
+    cells_per_side,
+    longest_edge_order,
+    pack_atlas,
+    tile_weights,
+)
 from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.conventions import linear_from_srgb8, srgb8
@@ -20,7 +27,9 @@ centre: on the edge itself, the neighbour would be as near. At most a quarter of
 _SHRINK = 0.9
 _BLOCK = 1 << 18
 
-DIFFUSE, SPECULAR, ROUGHNESS = slice(0, 3), slice(3, 6), slice(6, 7)
+DIFFUSE = slice(0, 3)
+SPECULAR = slice(3, 6)
+ROUGHNESS = slice(6, 7)
 """Of the columns of a texel, as `source_material.columns` gives them."""
 
 
@@ -111,7 +120,8 @@ def _bake_texels(
         [weights_of[int(side)] @ corner for side, corner in zip(cells, corners, strict=True)]
     )
     normals = np.repeat(normal, counts, axis=0)
-    columns, missed = np.zeros((len(points), 7)), 0
+    columns = np.zeros((len(points), 7))
+    missed = 0
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
         places = nearest.find(points[part], normals[part], reach)
@@ -148,7 +158,8 @@ def _tiles(
 
     Triangles of one and the same colour share a tile.
     """
-    flat, count = _is_flat(texels), len(cells)
+    flat = _is_flat(texels)
+    count = len(cells)
     codes = texels.codes[texels.start[:-1]].astype(np.int64)
     number = np.where(flat, 0, 1 + np.arange(count))
     names = np.column_stack([number, np.where(flat[:, None], codes, 0)])
@@ -195,7 +206,8 @@ _PARTS = (DIFFUSE, SPECULAR, ROUGHNESS)
 
 def _constant(texels: _Texels, part: slice) -> NDArray[np.float32] | None:
     """Return what all texels say, where 8 bits could tell none of them from another."""
-    columns, codes = texels.columns[:, part], texels.codes[:, part]
+    columns = texels.columns[:, part]
+    codes = texels.codes[:, part]
     if not (codes == codes[0]).all():
         return None
     same = (columns == columns[0]).all()

@@ -41,7 +41,9 @@ def add_source_materials(
         if material_settings.if_lost == "reject":
             raise
         return levels, dict(missed), OwnMaterials(reason=lost.reason, message=lost.message)
-    return _add_skins(levels, missed, maker, materials, refuse=material_settings.if_lost == "reject")
+    return _add_skins(
+        levels, missed, maker, materials, refuse=material_settings.if_lost == "reject"
+    )
 
 
 def _add_skins(
@@ -52,7 +54,8 @@ def _add_skins(
     *,
     refuse: bool,
 ) -> tuple[tuple[Level, ...], Missed, OwnMaterials]:
-    with_skins, reasons = list[Level](), dict(missed)
+    with_skins = list[Level]()
+    reasons = dict(missed)
     for level in levels:
         try:
             with_skins.append(maker.add_skin(level))

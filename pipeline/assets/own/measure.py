@@ -36,7 +36,9 @@ def skin_quality(
     )
 
 
-def _color_errors(level: TriangleMesh, baked: BakedTextures, source: SourceSurface) -> NDArray[np.float64]:
+def _color_errors(
+    level: TriangleMesh, baked: BakedTextures, source: SourceSurface
+) -> NDArray[np.float64]:
     """Return the difference [N] at points spread evenly over the source."""
     uniform = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
     points = sample_surface(source.mesh, uniform)

@@ -44,7 +44,9 @@ class SurfaceLookup:
         self._embree = EmbreeScene(robust=True)
         EmbreeMesh(self._embree, mesh.corners.astype(np.float32))
 
-    def find(self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float) -> SurfaceLocations:
+    def find(
+        self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
+    ) -> SurfaceLocations:
         """Return the places that points [N, 3] with unit normals [N, 3] show.
 
         Args:
@@ -59,7 +61,8 @@ class SurfaceLookup:
             facing = (self._normals[face] * normals).sum(axis=1) > 0
             taken = facing & (distance <= reach) & (distance < best)
             best[taken] = distance[taken]
-            result.faces[taken], result.weights[taken] = face[taken], weights[taken]
+            result.faces[taken] = face[taken]
+            result.weights[taken] = weights[taken]
             result.is_missed[taken] = False
         return result
 
@@ -70,7 +73,8 @@ class SurfaceLookup:
         origins = (points - _BEHIND * directions).astype(np.float32)
         hit = self._embree.run(origins, directions.astype(np.float32), output=True)
         face = np.asarray(hit["primID"], np.int64)
-        u, v = np.asarray(hit["u"], np.float64), np.asarray(hit["v"], np.float64)
+        u = np.asarray(hit["u"], np.float64)
+        v = np.asarray(hit["v"], np.float64)
         distance = np.where(face < 0, np.inf, np.abs(np.asarray(hit["tfar"], np.float64) - _BEHIND))
         return np.maximum(face, 0), np.stack([1 - u - v, u, v], axis=1), distance
 
@@ -91,11 +95,14 @@ class SurfaceLookup:
 
 def barycentric(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the coordinates [N, 3] of points [N, 3] in triangles [N, 3, 3], clipped to them."""
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    first = corners[:, 1] - corners[:, 0]
+    second = corners[:, 2] - corners[:, 0]
     across = points - corners[:, 0]
     a, b, c = ((x * y).sum(axis=1) for x, y in ((first, first), (first, second), (second, second)))
-    d, e = (across * first).sum(axis=1), (across * second).sum(axis=1)
+    d = (across * first).sum(axis=1)
+    e = (across * second).sum(axis=1)
     span = np.maximum(a * c - b * b, 1e-300)
-    u, v = (c * d - b * e) / span, (a * e - b * d) / span
+    u = (c * d - b * e) / span
+    v = (a * e - b * d) / span
     weights = np.clip(np.stack([1 - u - v, u, v], axis=1), 0, 1)
     return weights / weights.sum(axis=1, keepdims=True)

@@ -37,7 +37,8 @@ class SkinBaker:
 
     def __init__(self, surface: SourceSurface, settings: OwnMaterialSettings) -> None:
         """Take a source with its colours."""
-        self._surface, self._settings = surface, settings
+        self._surface = surface
+        self._settings = settings
         self._nearest = SurfaceLookup(surface.mesh)
 
     def add_skin(self, level: Level) -> Level:

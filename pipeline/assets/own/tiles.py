@@ -102,12 +102,14 @@ def _squares(
 ) -> tuple[list[int], NDArray[np.int64], NDArray[np.bool_]]:
     """Return the widths of squares, and which one and which half each tile takes."""
     squares: list[int] = []
-    square_of, is_turned = np.zeros(len(cells), np.int64), np.zeros(len(cells), np.bool_)
+    square_of = np.zeros(len(cells), np.int64)
+    is_turned = np.zeros(len(cells), np.bool_)
     half_free = 0  # cells of the tile that would fit into the last square
     for tile in order:
         count = int(cells[tile])
         if count and count == half_free:
-            is_turned[tile], half_free = True, 0
+            is_turned[tile] = True
+            half_free = 0
         else:
             squares.append(count + _GUTTER if count else FLAT)
             half_free = count
@@ -121,7 +123,10 @@ def _rows(squares: Sequence[int], width: int) -> tuple[NDArray[np.int64], int]:
     x = y = tallest = 0
     for number, side in enumerate(squares):
         if x + side > width:
-            x, y, tallest = 0, y + tallest, 0
+            x = 0
+            y += tallest
+            tallest = 0
         corners[number] = x, y
-        x, tallest = x + side, max(tallest, side)
+        x += side
+        tallest = max(tallest, side)
     return corners, y + tallest

@@ -59,7 +59,8 @@ def _check_vertices(result: TriangleMesh, source: TriangleMesh, max_outside: flo
         raise Rejected("budget_missed", "no face is left")
     if not np.isfinite(used).all():
         raise Rejected("nonfinite_result", "a vertex of the result is not finite")
-    low, high = source.positions.min(axis=0), source.positions.max(axis=0)
+    low = source.positions.min(axis=0)
+    high = source.positions.max(axis=0)
     outside = float(np.maximum(low - used, used - high).max()) / source.diagonal
     if outside > max_outside:
         raise Rejected("bbox_escaped", f"a vertex is {outside:.2%} of the diagonal outside the box")

@@ -44,7 +44,8 @@ class Parts:
 
 def _diagonals(mesh: TriangleMesh, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
     """[P] diagonal of the bounding box of each part."""
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    low = np.full((count, 3), np.inf)
+    high = np.full((count, 3), -np.inf)
     for corner in mesh.corners.transpose(1, 0, 2):
         np.minimum.at(low, part, corner)
         np.maximum.at(high, part, corner)

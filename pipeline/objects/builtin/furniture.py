@@ -76,9 +76,11 @@ def furniture_rand(rng: np.random.Generator) -> Mesh:
 
 def _top(params: FurnitureParams) -> list[Mesh]:
     """Return the top or seat: a disc, a board, or slats on two battens."""
-    high, half = params.height, params.board / 2
+    high = params.height
+    half = params.board / 2
     if params.kind == "round":
-        radius, cut = params.width / 2, 0.3 * params.board
+        radius = params.width / 2
+        cut = 0.3 * params.board
         outline = [(radius - cut, -half), (radius, cut - half)]
         outline += [(r, -z) for r, z in reversed(outline)]
         return [scale_and_move(lathe(outline, 32), [0, 0, high - half])]
@@ -103,7 +105,8 @@ def _top(params: FurnitureParams) -> list[Mesh]:
 def _legs(params: FurnitureParams) -> list[Mesh]:
     """Return four legs, the aprons under the top, and stretchers if any."""
     inset = 1.3 * params.leg + 0.6 * params.splay
-    x, y = params.width / 2 - inset, params.depth / 2 - inset
+    x = params.width / 2 - inset
+    y = params.depth / 2 - inset
     if params.kind == "round":
         x = y = 0.62 * params.width / 2
     feet = [(-x, -y), (x, -y), (x, y), (-x, y)]
@@ -147,10 +150,14 @@ def _leg(top: NDArray[np.float64], foot: NDArray[np.float64], params: FurnitureP
 
 def _back(params: FurnitureParams) -> list[Mesh]:
     """Return two posts that lean back, and boards between them."""
-    x, y = params.width / 2 - 1.4 * params.leg, params.depth / 2 - 1.4 * params.leg
-    low, lean = params.height - 0.6 * params.board, 0.2 * params.back
-    foot, head = np.array([x, y, low]), np.array([x, y + lean, params.height + params.back])
-    mirror, post = np.array([-1, 1, 1]), (0.8 * params.leg, 0.8 * params.leg)
+    x = params.width / 2 - 1.4 * params.leg
+    y = params.depth / 2 - 1.4 * params.leg
+    low = params.height - 0.6 * params.board
+    lean = 0.2 * params.back
+    foot = np.array([x, y, low])
+    head = np.array([x, y + lean, params.height + params.back])
+    mirror = np.array([-1, 1, 1])
+    post = (0.8 * params.leg, 0.8 * params.leg)
     parts = [beam(foot * side, head * side, post, 0.12 * params.leg) for side in (mirror, 1)]
     levels = np.linspace(0.3, 0.93, params.slats) if params.level_slats else np.array([0.93])
     tall = min(0.1, 0.2 / len(levels)) * params.back
@@ -159,7 +166,8 @@ def _back(params: FurnitureParams) -> list[Mesh]:
         parts.append(beam(end * mirror, end, (0.5 * params.leg, tall), 0.003))
     if params.level_slats:
         return parts
-    bottom, rail = foot + 0.02 * (head - foot), foot + 0.93 * (head - foot)
+    bottom = foot + 0.02 * (head - foot)
+    rail = foot + 0.93 * (head - foot)
     for number in range(params.slats):
         place = np.array([(number + 1) / (params.slats + 1) * 2 - 1, 1, 1])
         wide = min(0.03, 0.6 * x / params.slats)
@@ -169,7 +177,9 @@ def _back(params: FurnitureParams) -> list[Mesh]:
 
 def _shelf(params: FurnitureParams) -> list[Mesh]:
     """Return two sides, boards between them, and books."""
-    width, depth, half = params.width / 2, params.depth / 2, params.board / 2
+    width = params.width / 2
+    depth = params.depth / 2
+    half = params.board / 2
     cut = 0.1 * params.board
     parts = [
         box([side * width, 0, params.height / 2], [half, depth, params.height / 2], cut)
@@ -179,10 +189,12 @@ def _shelf(params: FurnitureParams) -> list[Mesh]:
     plank = [width, depth - 0.006, 0.8 * half]
     parts += [box([0, 0, level], plank, 0.8 * cut) for level in levels]
     bay = levels[1] - levels[0] - 2 * half
-    place, storey = -width + half + 0.01, 0
+    place = -width + half + 0.01
+    storey = 0
     for thick, tall in params.books:
         if place + thick > width - half - 0.01:
-            place, storey = -width + half + 0.01, storey + 1
+            place = -width + half + 0.01
+            storey += 1
         if storey > params.boards:
             break
         size = [thick / 2, 0.5 * depth * (0.8 + 0.4 * tall), bay * tall / 2]

@@ -36,9 +36,12 @@ class GearParams:
 def gear(params: GearParams) -> Mesh:
     """Return the closed surface of 168 triangles per tooth."""
     root = 1 - params.tooth_depth
-    hub, rim = params.bore + params.hub_width, root - params.rim_width
-    half, cut = params.half_thickness, params.chamfer
-    hub_z, web_z = half * params.hub_height, half * params.web_height
+    hub = params.bore + params.hub_width
+    rim = root - params.rim_width
+    half = params.half_thickness
+    cut = params.chamfer
+    hub_z = half * params.hub_height
+    web_z = half * params.web_height
     upper = [(1.0, half - cut), (1 - cut, half), (rim, half), (rim, web_z)]
     upper += [(hub, web_z), (hub, hub_z), (params.bore, hub_z)]
     section = np.array(upper + [(radius, -height) for radius, height in reversed(upper)])

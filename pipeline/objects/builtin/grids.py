@@ -16,7 +16,8 @@ def torus_faces(rows: int, columns: int) -> NDArray[np.int64]:
     They face the side from which rows run upwards and columns to the left.
     """
     row, column = np.divmod(np.arange(rows * columns), columns)
-    next_row, next_column = (row + 1) % rows, (column + 1) % columns
+    next_row = (row + 1) % rows
+    next_column = (column + 1) % columns
     corners = np.stack(
         [
             row * columns + column,
@@ -38,7 +39,9 @@ def sphere_faces(rings: int, columns: int) -> NDArray[np.int64]:
     body = torus_faces(rings, columns)[: 2 * (rings - 1) * columns]
     column = np.arange(columns)
     next_column = (column + 1) % columns
-    first, last, start = rings * columns, rings * columns + 1, (rings - 1) * columns
+    first = rings * columns
+    last = rings * columns + 1
+    start = (rings - 1) * columns
     bottom = np.stack([np.full(columns, first), column, next_column], axis=1)
     top = np.stack([np.full(columns, last), start + next_column, start + column], axis=1)
     return np.concatenate([bottom, body, top])[:, ::-1]

@@ -102,7 +102,8 @@ def _surface(solid: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.in
     shape = tuple(size + 1 for size in solid.shape)
     quads = []
     for axis in range(3):
-        b, c = (axis + 1) % 3, (axis + 2) % 3
+        b = (axis + 1) % 3
+        c = (axis + 2) % 3
         change = np.diff(padded, axis=axis)
         for sign in (1, -1):
             # A cell begins where occupancy rises: its face looks down the axis.
@@ -128,11 +129,14 @@ def _warp(unit: NDArray[np.float64], params: LatticeParams) -> NDArray[np.float6
     points = (unit + params.roundness * (ball - unit)) * np.array(params.half_sizes)
     points[:, :2] *= 1 + params.taper * unit[:, 2:]
     angle = params.twist_rad * unit[:, 2]
-    x, y = points[:, 0].copy(), points[:, 1].copy()
+    x = points[:, 0].copy()
+    y = points[:, 1].copy()
     points[:, 0] = np.cos(angle) * x - np.sin(angle) * y
     points[:, 1] = np.sin(angle) * x + np.cos(angle) * y
     if params.bend_rad:
         radius = 2 * params.half_sizes[0] / params.bend_rad
-        arc_angle, x = points[:, 0] / radius, radius - points[:, 1]
-        points[:, 0], points[:, 1] = x * np.sin(arc_angle), radius - x * np.cos(arc_angle)
+        arc_angle = points[:, 0] / radius
+        x = radius - points[:, 1]
+        points[:, 0] = x * np.sin(arc_angle)
+        points[:, 1] = radius - x * np.cos(arc_angle)
     return points

@@ -156,7 +156,8 @@ def _leaf_on_stalk(
 
 def _pot(params: PlantParams) -> Mesh:
     """Return a pot with a rim, filled with earth to just below it."""
-    height, foot = params.pot_height, 0.28 * params.pot_foot
+    height = params.pot_height
+    foot = 0.28 * params.pot_foot
     outline = [(0.9 * foot, 0.0), (foot, 0.02), (0.28, height - 0.1), (0.31, height - 0.09)]
     outline += [(0.31, height), (0.28, height), (0.27, height - 0.03), (0.14, height - 0.025)]
     return lathe(outline, 20)

@@ -47,7 +47,8 @@ def rock(params: RockParams) -> Mesh:
 def rock_rand(rng: np.random.Generator) -> Mesh:
     """Return a random rock."""
     kind = rng.choice(["pebble", "broken", "layered"])
-    cuts, sizes = _rand_cuts(rng, int(rng.integers(9, 22))), rng.uniform(0.55, 1.0, 3)
+    cuts = _rand_cuts(rng, int(rng.integers(9, 22)))
+    sizes = rng.uniform(0.55, 1.0, 3)
     waves = rng.normal(size=(12, 4)) * [0.5, 0.5, 0.5, 3.0]
     return rock(
         RockParams(
@@ -82,7 +83,8 @@ def _cut_ball(direction: NDArray[np.float64], params: RockParams) -> NDArray[np.
 def _rand_cuts(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
     """Return planes [count, 4] in even but turned and shaken directions."""
     index = np.arange(count) + 0.5
-    z, azimuth = 1 - 2 * index / count, np.pi * (1 + np.sqrt(5)) * index + rng.uniform(0, 6)
+    z = 1 - 2 * index / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * index + rng.uniform(0, 6)
     ring = np.sqrt(1 - z * z)
     spread = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
     spread += rng.normal(size=spread.shape) * 0.35

@@ -46,7 +46,8 @@ def shell(params: ShellParams) -> Mesh:
     inner = _rings(back, np.broadcast_to(fade, (inside, params.columns)), params)
     poles = np.stack([outer[0].mean(axis=0), inner[-1].mean(axis=0)])
     grid = np.concatenate([outer, inner]).reshape(-1, 3)
-    cosine, sine = np.cos(params.lean_rad), np.sin(params.lean_rad)
+    cosine = np.cos(params.lean_rad)
+    sine = np.sin(params.lean_rad)
     lean = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
     faces = sphere_faces(rings + inside, params.columns)
     return np.concatenate([grid, poles]) @ lean.T, faces
@@ -103,7 +104,8 @@ def _rings(
     winding: NDArray[np.float64], radius: NDArray[np.float64], params: ShellParams
 ) -> NDArray[np.float64]:
     """Return points [rings, columns, 3] of the tube at `turn` [rings], 0 being the mouth."""
-    angle, size = 2 * np.pi * winding, params.growth**winding
+    angle = 2 * np.pi * winding
+    size = params.growth**winding
     around = 2 * np.pi * np.arange(params.columns) / params.columns
     outwards = 1 + params.tube * radius * np.cos(around)
     height = -params.drop - params.tube * params.stretch * radius * np.sin(around)

@@ -88,7 +88,8 @@ def beam(
         chamfer: as for a box.
         taper: width at the end over that at the start.
     """
-    first, last = np.asarray(start, np.float64), np.asarray(end, np.float64)
+    first = np.asarray(start, np.float64)
+    last = np.asarray(end, np.float64)
     length = float(np.linalg.norm(last - first))
     axis = (last - first) / length
     upright = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])

@@ -74,7 +74,8 @@ def _strand(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the points of the strand and the normals of its torus there, [N, 3] each."""
     around_axis, through_hole = params.windings
-    azimuth, tube = around_axis * along, through_hole * along
+    azimuth = around_axis * along
+    tube = through_hole * along
     radial = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=1)
     upright = np.array([0.0, 0.0, 1.0])
     normal = np.cos(tube)[:, None] * radial + np.sin(tube)[:, None] * upright

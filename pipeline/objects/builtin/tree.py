@@ -113,7 +113,8 @@ def _children(
     parent: _Branch, path: NDArray[np.float64], params: TreeParams, rng: np.random.Generator
 ) -> list[_Branch]:
     """Return what grows from a branch: up along the trunk, but near the ends of the others."""
-    count, trunk = params.children[parent.order], parent.order == 0
+    count = params.children[parent.order]
+    trunk = parent.order == 0
     first = rng.uniform(0, 2 * np.pi)
     branches = []
     for number in range(count):
@@ -138,7 +139,9 @@ def _children(
     return branches
 
 
-def _branch_direction(axis: NDArray[np.float64], spread: float, azimuth: float) -> NDArray[np.float64]:
+def _branch_direction(
+    axis: NDArray[np.float64], spread: float, azimuth: float
+) -> NDArray[np.float64]:
     """Return the direction at the angle `spread` from `axis`, turned about it."""
     axis = axis / np.linalg.norm(axis)
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -160,7 +163,8 @@ def _tiers(params: TreeParams, rng: np.random.Generator) -> list[Mesh]:
     """Return cones with folds whose lower rim hangs, each reaching into the next."""
     columns = 4 * params.folds
     azimuth = 2 * np.pi * np.arange(columns) / columns
-    reach, rim = _TIER[:, :1], _TIER[:, :1] > 0.9
+    reach = _TIER[:, :1]
+    rim = _TIER[:, :1] > 0.9
     parts = []
     for number in range(params.tiers):
         share = number / params.tiers

@@ -67,7 +67,8 @@ def read_catalogue(path: Path) -> list[ObjectRecord]:
 
 
 def _record(root: Path, row: dict[str, Any], place: str, name: str) -> ObjectRecord:
-    uid, path = _text(row, "uid", place), _text(row, "path", place)
+    uid = _text(row, "uid", place)
+    path = _text(row, "path", place)
     if uid != printable(uid) or not uid.strip():
         raise TrilightError(
             f"{place}: uid is {printable(uid)!r}; expected printable text that is not blank."

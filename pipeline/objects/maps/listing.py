@@ -76,14 +76,17 @@ def find_maps(
     Raises:
         TrilightError: the folder is missing or holds nothing, or its catalogue has a mistake.
     """
-    root, display_path, plural = Path(os.path.realpath(folder)), printable(folder), PLURALS[kind]
+    root = Path(os.path.realpath(folder))
+    display_path = printable(folder)
+    plural = PLURALS[kind]
     suffixes = " ".join(SUFFIXES[kind])
     if "://" in folder or not root.is_dir():
         raise TrilightError(
             f"{plural} {display_path!r}: no such folder on this machine; expected one with {suffixes} "
             "files. Download them first where they are on a server."
         )
-    stated, catalogue = stated_licence(licence), _only_catalogue(root, plural)
+    stated = stated_licence(licence)
+    catalogue = _only_catalogue(root, plural)
     failures: list[Failure] = []
     if catalogue is None:
         records = _scan_pictures(kind, root, stated, failures)
@@ -155,10 +158,8 @@ def _scan_pictures(
     bases = {name.rpartition(".")[0]: name for name in reversed(names)}
     if kind == TEXTURE:
         textures, unused_pictures = group_textures(names)
-        bases, unused = (
-            {stem: files["base"] for stem, files in textures.items()},
-            unused | unused_pictures,
-        )
+        bases = {stem: files["base"] for stem, files in textures.items()}
+        unused |= unused_pictures
     else:
         message = "another file of the same name is taken; rename one of them"
         twins = [name for name in names if bases[name.rpartition(".")[0]] != name]

@@ -148,7 +148,8 @@ def group_textures(
         message = "its name says no part, beside names that do; end it in _color, or move it away"
         unused[name] = ("unknown_map", message)
     _drop_packed(parts.values(), unused)
-    textures, used = {}, set()
+    textures = {}
+    used = set()
     for (key, kind), (stem, name) in sorted(bases.items(), key=lambda item: item[1]):
         textures[stem] = {**parts.get((key, ""), {}), **parts.get((key, kind), {}), "base": name}
         used |= {(key, ""), (key, kind)}

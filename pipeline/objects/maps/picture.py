@@ -66,7 +66,8 @@ def _plain_values(data: bytes) -> tuple[NDArray[np.float32], bool]:
             if image.mode in _MOST:
                 values = np.asarray(image, np.float32) / np.float32(_MOST[image.mode])
             elif image.mode == "F":
-                values, is_linear = _unit_values(np.asarray(image, np.float32)), True
+                values = _unit_values(np.asarray(image, np.float32))
+                is_linear = True
             else:
                 mode = "L" if image.mode in ("1", "L", "LA") else "RGB"
                 values = np.asarray(image.convert(mode), np.float32) / np.float32(255)

@@ -41,7 +41,8 @@ def usable_map(radiance: NDArray[np.float32], height: int) -> NDArray[np.float32
         "is infinite; write the map in 32 bits, or as .hdr: half floats end at 65504",
     )
     lawful = np.maximum(radiance, 0)
-    total, negative = flux(lawful), flux(lawful - radiance)
+    total = flux(lawful)
+    negative = flux(lawful - radiance)
     if (negative > MOST_NEGATIVE * total).any() and negative.any():
         raise Rejected(
             "negative_radiance",

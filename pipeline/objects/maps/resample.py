@@ -29,7 +29,8 @@ def flux(radiance: NDArray) -> NDArray[np.float64]:
 
 
 def _means(values: NDArray, rows: csr_array, width: int) -> NDArray[np.float64]:
-    height, channels = rows.shape[0], values.shape[2]
+    height = rows.shape[0]
+    channels = values.shape[2]
     columns = _overlaps(_even(values.shape[1]), _even(width))
     result = np.zeros((height, width, channels))
     for channel in range(channels):  # one at a time: the largest maps take a gigabyte

@@ -55,7 +55,8 @@ def list_objaverse(source: str, allowed: Sequence[str]) -> Listing:
         package = ObjaversePackage()
         uids = _uids_of_categories(package.categories(), names)
     else:
-        uids, count = _uids(text, source), None
+        uids = _uids(text, source)
+        count = None
         package = ObjaversePackage()
     uids = sorted(set(uids))
     known = [uid for uid in uids if uid in package]

@@ -140,7 +140,8 @@ class RemoteFiles:
     def _fill(self, name: str, temporary: Path, size: int | None, limit: "_Limit") -> None:
         """Write the bytes of a file to a temporary name, which is open for its last sync."""
         limit.value = 0  # every try begins anew
-        driver, address = self._folder.driver, self._folder.address(name)
+        driver = self._folder.driver
+        address = self._folder.address(name)
         get = driver.get_file
         if self._folder.url.is_http:  # `get_file` would take the limits for its own
             get = partial(sync, driver.loop, partial(driver._get_file, timeout=transfer_timeout()))

@@ -84,7 +84,8 @@ class RemoteFolder:
         for address, facts in listing.items():
             name = address.removeprefix(start)
             if address.startswith(start) and name:
-                self._addresses[name], self._facts[name] = address, facts
+                self._addresses[name] = address
+                self._facts[name] = facts
         return sorted(self._addresses)
 
     def _names_by_links(self) -> list[str]:
