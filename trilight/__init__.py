@@ -10,7 +10,7 @@ Everything here stands for something of the packages, and works the same there. 
 before it is used: `import trilight` takes milliseconds, and no torch, Mitsuba, USD or Prefect.
 Mistakes are `TrilightError`s, which say what was found, what was expected, and what to do.
 
-World: metres, +Z up, right-handed; networks were trained on scenes within [-0.5, 0.5]^3. Colours
+World: meters, +Z up, right-handed; networks were trained on scenes within [-0.5, 0.5]^3. Colors
 are linear with Rec.709 primaries. `trilight.extend` serves extensions: templates, builds, runs.
 """
 

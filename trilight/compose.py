@@ -78,11 +78,11 @@ class SceneBuilder:
         Args:
             mesh: a file `.glb .gltf .obj .ply .stl .off`, which `scene` reads; or vertices [V, 3]
                 and triangles [F, 3] of their rows, counter-clockwise seen from outside.
-            material: of the whole object; grey by default.
+            material: of the whole object; gray by default.
             name: unique in the scene; after the file, or `objectN`, by default.
-            at: where the origin of the mesh comes to lie, metres; with `size` the mean of its
+            at: where the origin of the mesh comes to lie, meters; with `size` the mean of its
                 vertices.
-            size: diameter in metres of the sphere around that mean that holds it; by default the
+            size: diameter in meters of the sphere around that mean that holds it; by default the
                 mesh keeps the units of its file.
             rotation_deg: angles about the world's X, then Y, then Z.
             licence: SPDX identifier, or `LicenseRef-...`.
@@ -148,9 +148,9 @@ class SceneBuilder:
         """Add a level square of 128 triangles, as the rooms of our datasets have.
 
         Args:
-            material: of the floor; grey by default.
-            size: side in metres; its middle is above the origin.
-            height: where it lies, metres; the floor of the nominal room is at -0.5.
+            material: of the floor; gray by default.
+            size: side in meters; its middle is above the origin.
+            height: where it lies, meters; the floor of the nominal room is at -0.5.
         """
         placement = PatchPlacement(
             rotation_deg=(0, 0, 0),
@@ -175,9 +175,9 @@ class SceneBuilder:
         """Add an emitter: one triangle with equal sides, hidden from the camera, bright on both.
 
         Args:
-            at: its middle, metres.
+            at: its middle, meters.
             radiance: linear red, green, blue, or one number for white.
-            size: its side in metres; the power grows with its square.
+            size: its side in meters; the power grows with its square.
             towards: the point that it faces.
 
         Raises:
@@ -211,7 +211,7 @@ class SceneBuilder:
         """Add a view.
 
         Args:
-            at: where the camera is, metres.
+            at: where the camera is, meters.
             look_at: the point in the middle of the picture.
             fov_deg: full angle of view, equal in width and height.
             up: roughly upwards in the picture; not along the view.

@@ -1,4 +1,4 @@
-"""One object: from a file to an `Asset`. It runs in a child process: native code may end it."""
+"""Prepares one object: from a file to an `Asset`, in a child process that may crash."""
 
 from pathlib import Path
 
@@ -27,18 +27,18 @@ from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, Sourc
 def prepare_asset(
     path: Path, settings: AssetSettings, method: str, root: Path | None = None
 ) -> AssetAttempt:
-    """Return the clean, outward oriented object at all budgets at which it passes the gate.
+    """Return the clean, outward oriented object at every budget that passes the quality checks.
 
     Args:
         path: the only file that is opened, with the buffers that a glTF names below its folder.
         settings: profile, budgets and limits.
-        method: a name of `recipe.methods_of`, for the levels that are not the source as it is.
-        root: folder of its pictures, as of `read_source`.
+        method: a name of `recipe.methods_of`, for levels other than the unchanged source.
+        root: folder of its pictures, as in `read_source`.
 
     Raises:
-        Rejected: the object is unusable by any method; the reason codes are those of the steps.
+        Rejected: the object is unusable by any method; each step has its reason codes.
 
-    What it does not do: close holes, or remove inner parts.
+    Holes stay open and inner components stay in.
     """
     source = read_source(path, settings.read_limits, root)
     raw = load_mesh(source)
@@ -81,7 +81,7 @@ def _facts(
 
 
 def _count_flipped(before: TriangleMesh, after: TriangleMesh) -> int:
-    """Count the faces that changed their winding: canonical rows differ in their last two."""
+    """Count the faces whose winding changed: their canonical rows differ in the last two."""
 
     def second_corners(faces: NDArray[np.int64]) -> NDArray[np.int64]:
         low = faces[:, 1:].min(axis=1)
@@ -94,9 +94,9 @@ def _count_flipped(before: TriangleMesh, after: TriangleMesh) -> int:
 def _levels(
     source: MeasuredSource, settings: AssetSettings, method: str
 ) -> tuple[tuple[Level, ...], dict[int, tuple[str, str]]]:
-    """Return the levels from the largest budget, and why others are missing.
+    """Return the levels from the largest budget, and the reasons of the missing ones.
 
-    A budget that the level before it meets as well gets no level of its own.
+    A budget that the level before it meets as well gets no level.
     """
     maker = _LevelBuilder(source, settings, method)
     levels: list[Level] = []
@@ -113,7 +113,7 @@ def _levels(
 
 
 class _LevelBuilder:
-    """Makes levels of one source by one method."""
+    """Builds the levels of one source by one method."""
 
     def __init__(self, source: MeasuredSource, settings: AssetSettings, method: str) -> None:
         self._mesh = source.mesh
@@ -122,7 +122,7 @@ class _LevelBuilder:
         self._method = method
 
     def smallest(self, budget: int) -> Level:
-        """Return the smallest level within epsilon up to `budget`, or the level of that budget."""
+        """Return the smallest level within the mesh tolerance, or else that of `budget`."""
         epsilon = self._settings.epsilon
         if epsilon is None:
             return self.level(budget)
@@ -134,12 +134,12 @@ class _LevelBuilder:
         return _level(budget, *best)
 
     def level(self, budget: int) -> Level:
-        """Return the level of a budget; raises Rejected where it fails the gate."""
+        """Return the level of a budget; raises Rejected where it fails the quality checks."""
         return _level(budget, *self._make(budget, self._settings.gate.max_error_p99))
 
     @property
     def _keeps_source(self) -> bool:
-        """Whether a source within budget is its own level: its triangles need not be even."""
+        """True where a source within budget is used unchanged: its triangles need not be even."""
         return self._settings.profile == "faithful"
 
     def _make(self, faces: int, max_error_p99: float) -> tuple[str, TriangleMesh, LevelQuality]:
@@ -152,7 +152,7 @@ class _LevelBuilder:
 
 
 def _level(budget: int, method: str, mesh: TriangleMesh, quality: LevelQuality) -> Level:
-    """Clean positions lie on a grid that float32 holds exactly."""
+    """Return a level; clean positions lie on a grid that float32 holds exactly."""
     return Level(
         record=LevelRecord(budget=budget, method=method, quality=quality),
         positions=mesh.positions.astype(np.float32),

@@ -1,8 +1,8 @@
-"""GLB: a mesh with its textures in one file that every modelling program opens.
+"""GLB: a mesh with its textures in one file that every modeling program opens.
 
 Our three columns become a dielectric of glTF whose own light is ours again when the file is read
 (pipeline.foreign.material): the specular albedo F goes back to F0 = (21 F - 1)/20, which
-KHR_materials_specular can say up to 1, and the base colour is diffuse / (1 - F).
+KHR_materials_specular can say up to 1, and the base color is diffuse / (1 - F).
 """
 
 import io

@@ -1,4 +1,4 @@
-"""Binary PLY: the plainest mesh file that every modelling program opens."""
+"""Binary PLY: the plainest mesh file that every modeling program opens."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""The fewest triangles that still pass: a search over budgets."""
+"""A search for the smallest budget that still passes."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -8,19 +8,19 @@ from storage.errors import Rejected
 Result = TypeVar("Result")
 
 _STEP = 2 ** (1 / 8)
-"""Ratio of neighbouring budgets: the result has at most 9 % more triangles than the search could
-have found, and one more trial would halve that."""
+"""Ratio of neighboring budgets: the result has at most 9 % more triangles than the smallest
+possible one, and one more trial would halve that."""
 
 _FEWEST = 4
 """Faces of the smallest closed surface."""
 
 
 def smallest_passing(attempt: Callable[[int], Result], largest: int) -> Result:
-    """Return what `attempt` makes of the smallest budget up to `largest` that it does not reject.
+    """Return the result of `attempt` at the smallest budget up to `largest` that it accepts.
 
-    Halving on a ladder of budgets: six or seven attempts. The error of a decimation falls almost,
-    not exactly, with its budget, so that a smaller budget that passes may be missed; whatever is
-    returned has passed.
+    Bisection over falling budgets: six or seven attempts. The error of a decimation is almost, not
+    exactly, monotonic in its budget, so the search may miss a smaller budget that passes; the
+    returned result always passed.
 
     Raises:
         Rejected: `largest` itself does not pass.

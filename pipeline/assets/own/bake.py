@@ -1,4 +1,4 @@
-"""The skin of a level: an atlas of its triangles, coloured by the places that they show."""
+"""The skin of a level: an atlas of its triangles, colored by the places that they show."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ from storage.records.texture import Texture
 
 _INSET = 0.02
 """How far texels on an edge show places within their own triangle, as a share of the way to its
-centre: on the edge itself, the neighbour would be as near. At most a quarter of a cell."""
+center: on the edge itself, the neighbor would be as near. At most a quarter of a cell."""
 
 _SHRINK = 0.9
 _BLOCK = 1 << 18
@@ -64,7 +64,7 @@ def bake(
     settings: OwnMaterialSettings,
     reach: float,
 ) -> BakedTextures:
-    """Return the colours of a level.
+    """Return the colors of a level.
 
     Args:
         level: in the unit box.
@@ -156,7 +156,7 @@ def _tiles(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the tile [F] of each triangle, and the first triangle [K] of each tile.
 
-    Triangles of one and the same colour share a tile.
+    Triangles of one and the same color share a tile.
     """
     flat = _is_flat(texels)
     count = len(cells)

@@ -1,4 +1,4 @@
-"""How far the colours of a level are from those of its source, and whether its seams tear."""
+"""How far the colors of a level are from those of its source, and whether its seams tear."""
 
 import igl
 import numpy as np

@@ -36,7 +36,7 @@ class SkinBaker:
     """Makes the skins of the levels of one source."""
 
     def __init__(self, surface: SourceSurface, settings: OwnMaterialSettings) -> None:
-        """Take a source with its colours."""
+        """Take a source with its colors."""
         self._surface = surface
         self._settings = settings
         self._nearest = SurfaceLookup(surface.mesh)

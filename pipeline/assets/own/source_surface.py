@@ -1,4 +1,4 @@
-"""The cleaned source with a colour at every place: its faces find themselves in the file again."""
+"""The cleaned source with a color at every place: its faces find themselves in the file again."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -193,7 +193,7 @@ def _start_at_lowest(faces: NDArray[np.int64]) -> NDArray[np.int64]:
 def _nearest_matched(
     mesh: TriangleMesh, missing: NDArray[np.bool_], source_face: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return the origin of the face whose centre is nearest, for each missing one."""
+    """Return the origin of the face whose center is nearest, for each missing one."""
     if not missing.any():
         return source_face
     centres = mesh.corners.mean(axis=1)

@@ -1,9 +1,9 @@
-"""An atlas that has a place for every triangle, whatever their number and neighbours.
+"""An atlas that has a place for every triangle, whatever their number and neighbors.
 
 A triangle of n cells a side takes one half of a square of n + 3 texels: its corners lie in the
-centres of texels, and whatever a bilinear look-up within it can touch belongs to it alone. The
-other half is another triangle's, turned by half a turn. Triangles of one colour take four texels
-that they share with all others of that colour.
+centers of texels, and whatever a bilinear look-up within it can touch belongs to it alone. The
+other half is another triangle's, turned by half a turn. Triangles of one color take four texels
+that they share with all others of that color.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ SIDES = tuple(sorted({*(1 << k for k in range(14)), *(3 << k for k in range(12))
 
 _GUTTER = 3
 FLAT = 2
-"""Width of the square of one colour."""
+"""Width of the square of one color."""
 
 
 def cells_per_side(corners: NDArray[np.float64], density: float) -> NDArray[np.int64]:
@@ -63,7 +63,7 @@ class Atlas:
     is_turned: NDArray[np.bool_]
     """[K] whether it is the half beyond the diagonal."""
     cells: NDArray[np.int64]
-    """[K] cells a side; 0 for one colour."""
+    """[K] cells a side; 0 for one color."""
 
     def texels(self, tile: int, places: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the texels [P, 2] of the atlas that a tile's own texels [P, 2] are."""

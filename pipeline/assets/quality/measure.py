@@ -1,4 +1,4 @@
-"""Everything that is known of a level: measured against the cleaned source, never assumed."""
+"""Measures of a level, all taken against the cleaned source."""
 
 import numpy as np
 
@@ -15,14 +15,14 @@ from storage.records.asset import LevelQuality
 from storage.seeds import rng_for
 
 _NUM_POINTS = 8192
-"""Points per direction: the 99th percentile is then known to within 98.7 to 99.3 (3 sigma)."""
+"""Points per direction: the measured 99th percentile lies between 98.7 and 99.3 (3 sigma)."""
 
 
 class MeasuredSource:
-    """A cleaned source with what its levels are compared with, made once."""
+    """A cleaned source with the reference values of its levels' measures."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
-        """Sample `mesh`, a clean one in the unit box."""
+        """Sample a clean mesh of the unit box."""
         self.mesh = mesh
         self.surface = Surface(mesh, rng_for(0, "asset-error").random((_NUM_POINTS, 3)))
         self.parts = Parts(self.surface)
@@ -34,16 +34,16 @@ class MeasuredSource:
         return _area(result) / self._area
 
     def silhouette_iou(self, result: TriangleMesh) -> float:
-        """Return how far the outlines agree, 0 to 1."""
+        """Return the intersection over union of the outlines, 0 to 1."""
         return intersection_over_union(self._silhouette, silhouette(result))
 
     def source_quality(self) -> LevelQuality:
-        """Return the measures of the source as a level of itself: exactly no error."""
+        """Return the measures of the unchanged source as a level: the error is exactly 0."""
         none = np.zeros(len(self.surface.points.faces))
         return self.quality(self.mesh, Deviation(to_other=none, from_other=none, angle_deg=none))
 
     def quality(self, result: TriangleMesh, deviation: Deviation | None = None) -> LevelQuality:
-        """Return all measures of a clean result; `deviation` saves the time to find it again."""
+        """Return all measures of a clean result; a known `deviation` saves its computation."""
         measured = deviation or self.surface.deviation(result)
         return LevelQuality(
             error_mean=_round_digits(max(measured.to_other.mean(), measured.from_other.mean())),
@@ -64,5 +64,5 @@ def _area(mesh: TriangleMesh) -> float:
 
 
 def _round_digits(value: float) -> float:
-    """Six digits: more than any of these measures has, and short in a file."""
+    """Round to six digits: more than these measures have, and short in a file."""
     return float(f"{value:.6g}")

@@ -1,4 +1,4 @@
-"""Furniture: tables, stools, chairs, benches and shelves, joined from bevelled boards and legs.
+"""Furniture: tables, stools, chairs, benches and shelves, joined from beveled boards and legs.
 
 Many separate closed parts with flat faces, as in most models that people make.
 """
@@ -14,7 +14,7 @@ from pipeline.objects.builtin.solids import beam, box, join, lathe, scale_and_mo
 
 @dataclass(frozen=True, kw_only=True)
 class FurnitureParams:
-    """Shape of one piece of furniture; lengths are in about metres."""
+    """Shape of one piece of furniture; lengths are in about meters."""
 
     kind: str  # `table`, `round` (a round top), `chair` (a seat with a back) or `shelf`
     width: float  # along x

@@ -1,4 +1,4 @@
-"""Gears: spur, helical and bevelled, with a hub, a thinner web and a bore.
+"""Gears: spur, helical and beveled, with a hub, a thinner web and a bore.
 
 The cross section in a half plane through the axis is a closed loop; sweeping it around the axis
 while the teeth push its outer corners in and out gives a torus. Sharp edges and flat faces are what

@@ -17,7 +17,7 @@ class RockParams:
     """Shape of one rock, about a ball of radius 1."""
 
     cuts: tuple[tuple[float, float, float, float], ...]
-    """Planes that cut the ball: a direction (of length 1) and the distance from the centre."""
+    """Planes that cut the ball: a direction (of length 1) and the distance from the center."""
     sharpness: float  # of the edges between cuts: 6 is a pebble, 30 a broken stone
     bumps: tuple[tuple[float, float, float, float], ...]
     """Waves over the surface: three numbers of waves per radius, and a phase."""

@@ -13,7 +13,7 @@ from pipeline.objects.builtin.grids import Mesh, sphere_faces
 
 @dataclass(frozen=True, kw_only=True)
 class ShellParams:
-    """Shape of one shell; lengths are in distances of the mouth's centre from the axis."""
+    """Shape of one shell; lengths are in distances of the mouth's center from the axis."""
 
     turns: float  # turns about the axis
     growth: float  # size over that one turn before; above 1

@@ -67,7 +67,7 @@ def tube(path: NDArray[np.float64], radii: NDArray[np.float64], sides: int) -> M
 
 
 def box(centre: ArrayLike, half_sizes: ArrayLike, chamfer: float) -> Mesh:
-    """Return an upright box with bevelled edges, of 44 triangles.
+    """Return an upright box with beveled edges, of 44 triangles.
 
     `chamfer` is how far edges are cut back: more than 0, less than every half size.
     """
@@ -79,7 +79,7 @@ def box(centre: ArrayLike, half_sizes: ArrayLike, chamfer: float) -> Mesh:
 def beam(
     start: ArrayLike, end: ArrayLike, sizes: tuple[float, float], chamfer: float, taper: float = 1.0
 ) -> Mesh:
-    """Return a bevelled bar of 44 triangles between two points that are not above each other in y.
+    """Return a beveled bar of 44 triangles between two points that are not above each other in y.
 
     Args:
         start: middle of one end.

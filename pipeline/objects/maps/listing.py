@@ -68,7 +68,7 @@ def find_maps(
     Args:
         kind: TEXTURE or SKY.
         folder: with a catalogue `textures.jsonl` or `.csv` (`skies.jsonl` or `.csv`), whose rows
-            are those of a catalogue of objects and name base colours; otherwise all pictures below
+            are those of a catalogue of objects and name base colors; otherwise all pictures below
             it count, each under the licence that the user states.
         licence: of files without a catalogue; by default they are the user's own.
         allowed_licences: SPDX identifiers, `LicenseRef-...`, or compound expressions.

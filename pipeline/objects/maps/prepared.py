@@ -52,7 +52,7 @@ class PreparedMap:
     """An outcome."""
 
     content_sha256: str
-    """Digest of what decides the split: the base colour, or the whole map, as it was read."""
+    """Digest of what decides the split: the base color, or the whole map, as it was read."""
     arrays: Mapping[str, NDArray[np.float32]]
     """Of a texture "diffuse", "specular" and perhaps "roughness"; of a map "radiance"."""
 

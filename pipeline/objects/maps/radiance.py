@@ -1,7 +1,7 @@
 """An environment map from outside: its laws, a stated repair, and its size.
 
 Radiance is linear. What is not a number, or infinite, stops a map: half floats end at 65,504, and a
-sun beyond was written as infinite and is gone. Small negative values, as conversions of colours
+sun beyond was written as infinite and is gone. Small negative values, as conversions of colors
 leave them, become 0, where all together are a thousandth of the light at most.
 """
 

@@ -1,8 +1,8 @@
 """The pictures of a texture as albedos and roughness that repeat.
 
-The base colour is sRGB-encoded, all else is linear. Means are of linear values, and of roughness
+The base color is sRGB-encoded, all else is linear. Means are of linear values, and of roughness
 the mean is that of the GGX width, its square. There is no Fresnel term here: a surface with a
-metallic map, or with a base colour alone, gets albedos as storage.records.fresnel has them.
+metallic map, or with a base color alone, gets albedos as storage.records.fresnel has them.
 """
 
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ class TextureSet:
     roughness: NDArray[np.float32] | None
     """[H, W, 1]; None where no picture says it: scenes draw one number."""
     content_sha256: str
-    """Digest of the base colour as it was read: copies share it, whatever is beside them."""
+    """Digest of the base color as it was read: copies share it, whatever is beside them."""
 
 
 def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> TextureSet:
