@@ -1,4 +1,4 @@
-"""Binary PLY: the plainest mesh file that every modeling program opens."""
+"""Binary PLY: a plain mesh format that every modeling program opens."""
 
 import numpy as np
 from numpy.typing import NDArray

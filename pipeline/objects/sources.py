@@ -1,7 +1,7 @@
-"""The sources of objects by the word before their colon, and the objects that one holds.
+"""Object sources by the word before their colon, and the listing of one source.
 
-Sources are folders, catalogues, servers, Objaverse and our own. Nothing is loaded here: a record
-names a file, and the mesh stage finds out whether it is usable.
+Sources are folders, catalogues, servers, Objaverse and built-in objects. Nothing is loaded here: a
+record names a file, and the mesh stage checks whether it is usable.
 """
 
 import contextlib
@@ -34,38 +34,39 @@ from storage.remote.url import PACKAGES, parse_url
 
 @dataclass(frozen=True, kw_only=True)
 class SourceQuery:
-    """What a person asks a source for."""
+    """The options of one request to an object source."""
 
     source: str
-    """The source as it was written, such as `objaverse:category/chair`."""
+    """The source as the user wrote it, such as `objaverse:category/chair`."""
     work_dir: Path
-    """Folder for files that a source makes: of the dataset, or of the user's cache."""
+    """Folder for files that a source writes: in the dataset, or in the user's cache."""
     licence: str | None
     """Licence that the user states for files without a statement of their own."""
     allowed_licences: Sequence[str]
-    """For sources that need not list what would be refused; the others are refused later."""
+    """Licences on the allow-list, for sources that skip refused objects; a later check is final."""
 
     @property
     def after_colon(self) -> str:
-        """What the source is asked for, without its name."""
+        """The part of `source` after the first colon."""
         return self.source.partition(":")[2]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectSource:
-    """A source of objects."""
+    """A source of objects, registered under the word before its colon."""
 
     list: Callable[[SourceQuery], Listing]
-    """Returns what the source holds; raises TrilightError where it is missing or malformed."""
+    """Returns the source's listing; raises TrilightError where it is missing or malformed."""
     look: Callable[[SourceQuery], object] | None = None
-    """Raises the same errors and writes nothing, where `list` would be dear."""
+    """Raises the errors of `list` without its cost, and writes nothing; None where `list` is cheap.
+    """
     states_licences: bool = True
-    """Whether the source states the licence of every object; `--licence` is then refused."""
+    """True where the source states the licence of every object; `--licence` is then refused."""
     is_place: bool = False
-    """Whether the name is the scheme of a URL, which may hold a secret."""
+    """True where the name is the scheme of a URL, which may hold a secret."""
 
     def run_query(self, query: SourceQuery, *, check_only: bool) -> Listing | None:
-        """Return what `list` does, or have a look; raises TrilightError as they do."""
+        """Return the listing, or check the source only; raises TrilightError as `list`."""
         if self.states_licences:
             require_unstated(query.licence, f"{query.source.partition(':')[0]}:")
         if check_only and self.look:
@@ -82,7 +83,7 @@ def _list_place(query: SourceQuery) -> Listing:
 
 
 PLACE = ObjectSource(list=_list_place, states_licences=False, is_place=True)
-"""A folder, here or on a server; also what has no name before a colon."""
+"""A folder, local or on a server; also every source without a known name before a colon."""
 
 SOURCES: Registry[ObjectSource] = Registry(
     "object source",
@@ -101,39 +102,39 @@ SOURCES: Registry[ObjectSource] = Registry(
     },
     decides=("data",),
 )
-"""Sources by the word before the colon."""
+"""Object sources by the word before the colon."""
 
 
 def source_of(text: str) -> ObjectSource:
-    """Return what lists a source: that of the word before its colon, or else a folder."""
+    """Return the source of the word before the colon, or else the folder source."""
     name, colon, _ = text.partition(":")
     return SOURCES.get(name, PLACE) if colon else PLACE
 
 
 ENVIRONMENT = "env:"
-"""Prefix of a source that an environment variable holds, for URLs with a secret."""
+"""Prefix of a source that stands in an environment variable, for URLs with a secret."""
 VARIABLES = "TRILIGHT_SOURCE_"
-"""Prefix of the variables that may be named: starting a run must not reveal any other."""
+"""Prefix of allowed variables, so that starting a run cannot reveal any other."""
 
 _QUOTED = re.compile(r"^objects (?:is )?(?:'[^']*'|\"[^\"]*\")")
-"""How messages about a source begin."""
+"""Beginning of messages about a source."""
 _WORD = re.compile(r"\w{3,}")
 _DOWNLOAD_REASONS = ("download_failed", "too_large_bytes", "too_many_buffers", "unsafe_name")
 
 
 @dataclass(frozen=True, kw_only=True)
 class FoundObjects:
-    """What a source has to offer."""
+    """The usable objects of a source, and the failures."""
 
     records: tuple[ObjectRecord, ...]
-    """Objects with an allowed licence whose files are on this machine, sorted by uid."""
+    """Objects with an allowed licence and their files on this machine, sorted by uid."""
     failures: tuple[Failure, ...]
-    """The other ones, of the stage `objects`, sorted by uid: licence_refused, download_failed,
+    """Failures of the stage `objects`, sorted by uid: licence_refused, download_failed,
     too_large_bytes, too_many_buffers, unsafe_name, unknown_uid, link_outside, name_clash."""
 
     @property
     def num_found(self) -> int:
-        """How many objects the source has."""
+        """Number of objects in the source."""
         return len(self.records) + len(self.failures)
 
 
@@ -147,34 +148,34 @@ def _select_all(uid: str) -> bool:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ListedObjects:
-    """What a source holds; its files are brought to this machine where they are wanted."""
+    """The listing of a source, split by licence; files are downloaded on demand."""
 
     source: str
-    """As it was asked for."""
+    """The source as the user wrote it."""
     listing: Listing
-    """What it said."""
+    """The source's own listing, before the licence check."""
     allowed: list[ObjectRecord]
-    """Objects whose licence is allowed."""
+    """Objects with an allowed licence."""
     refused: list[Failure]
-    """The others, and what cannot be used whatever its licence."""
+    """Failures: objects with a refused licence, and objects that are unusable anyway."""
 
     def found(
         self,
         wanted: Callable[[str], bool] = _select_all,
         downloaded: Callable[[int, int], None] = _ignore_progress,
     ) -> FoundObjects:
-        """Return the objects that may be used, after bringing them here.
+        """Download the selected objects and return them with the failures.
 
-        What is downloaded stays in the user's cache (`storage.cache`; Objaverse in the place of its
-        own package), and is not downloaded again.
+        Downloads stay in the user's cache (`storage.cache`; Objaverse in the folder of its own
+        package) and are not repeated.
 
         Args:
-            wanted: says of a uid whether it is asked for; the others are left where they are.
-            downloaded: called with how many downloads are done, failed ones included, and with how
-                many there are; from the calling thread.
+            wanted: returns True for the uid of a selected object.
+            downloaded: called with the number of finished downloads, failed ones included, and the
+                total; from the calling thread.
 
         Raises:
-            TrilightError: nothing of what is wanted could be downloaded.
+            TrilightError: none of the selected objects could be downloaded.
         """
         records = [record for record in self.allowed if wanted(record.uid)]
         failures = [failure for failure in self.refused if wanted(failure.item)]
@@ -191,12 +192,12 @@ class ListedObjects:
         return len(self.allowed) + len(self.refused)
 
     def fetch(self, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-        """Bring some of the allowed objects here; as `Listing.fetch`."""
+        """Download some of the allowed objects, as `Listing.fetch`."""
         with _resolve_source(self.source):
             return self.listing.fetch(records, downloaded)
 
     def require_some(self, num_here: int, failures: Sequence[Failure]) -> None:
-        """Raise TrilightError where downloads were tried and none came through."""
+        """Raise TrilightError where downloads were tried and all failed."""
         lost = [failure for failure in failures if failure.reason in _DOWNLOAD_REASONS]
         if num_here or not lost:
             return
@@ -216,17 +217,17 @@ def list_objects(
     allowed_licences: Sequence[str],
     licence: str | None = None,
 ) -> ListedObjects:
-    """Return what a source holds; the licence of an object is judged before it is downloaded.
+    """List a source; the licence check of an object comes before its download.
 
     Args:
         source: a folder; `http(s)://`, `s3://`, `gs://`, `hf://` or `file://` and a folder;
-            `builtin:` or `builtin:N`; `objaverse:` and uids, a file of uids, or categories. Of a
-            folder, `objects.jsonl` or `objects.csv` is used where it has one, and its object
-            files otherwise. `env:NAME` is what the environment variable NAME says, of which no
-            message quotes anything; NAME begins with VARIABLES.
-        work_dir: where built-in objects are written; not touched for other sources.
-        allowed_licences: SPDX identifiers, `LicenseRef-...`, or compound expressions as they stand.
-        licence: of files that come without any statement, as the user states it.
+            `builtin:` or `builtin:N`; `objaverse:` and uids, a file of uids, or categories. A
+            folder lists the rows of its `objects.jsonl` or `objects.csv`, or else its object
+            files. `env:NAME` is the content of the environment variable NAME, which no message
+            quotes; NAME begins with VARIABLES.
+        work_dir: folder for built-in objects; untouched for other sources.
+        allowed_licences: SPDX identifiers, `LicenseRef-...`, or whole compound expressions.
+        licence: the user's licence for files without a statement.
 
     Raises:
         TrilightError: the source is malformed, missing or empty; its catalogue has a mistake; a
@@ -250,7 +251,7 @@ def find_objects(
     licence: str | None = None,
     downloaded: Callable[[int, int], None] = _ignore_progress,
 ) -> FoundObjects:
-    """Return all objects of a source that may be used; as `list_objects` and what it `found`."""
+    """List a source and download all its usable objects; raises as `list_objects`."""
     listed = list_objects(
         source, work_dir=work_dir, allowed_licences=allowed_licences, licence=licence
     )
@@ -258,9 +259,9 @@ def find_objects(
 
 
 def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
-    """Find out whether a source is there and holds anything, before a dataset of it is begun.
+    """Check that a source exists and holds an object, before a dataset of it begins.
 
-    Writes nothing except into the user's cache.
+    Only the user's cache is written.
 
     Raises:
         TrilightError: as `list_objects`.
@@ -271,7 +272,7 @@ def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str
 
 @contextlib.contextmanager
 def _resolve_source(source: str) -> Iterator[str]:
-    """Yield the source, or what its environment variable holds; no message quotes that."""
+    """Yield the source, or its environment variable's content, hidden from error messages."""
     value = _read_variable(source)
     try:
         yield value
@@ -282,7 +283,7 @@ def _resolve_source(source: str) -> Iterator[str]:
 
 
 def _read_variable(source: str) -> str:
-    """Return the source, read from the environment variable where one is named."""
+    """Return the source, or the content of the environment variable that it names."""
     if not source.startswith(ENVIRONMENT):
         return source
     name = source.removeprefix(ENVIRONMENT)
@@ -301,7 +302,7 @@ def _read_variable(source: str) -> str:
 
 
 def _redact_value(message: str, source: str, value: str) -> str:
-    """Return a message about a source that a variable says, with the variable instead of it."""
+    """Return a message about a source with the variable's name instead of its content."""
     label = f"objects {printable(source)!r}"
     redacted = _QUOTED.sub(lambda _: label, message)
     rest = redacted.removeprefix(label)
@@ -309,7 +310,7 @@ def _redact_value(message: str, source: str, value: str) -> str:
         return redacted
     return (
         f"{label} cannot be used as what it says; expected a source of objects. Name that source "
-        "itself in a terminal of this machine to be told what is wrong: trilight assets SOURCE."
+        "itself in a terminal of this machine to see the error: trilight assets SOURCE."
     )
 
 
@@ -321,10 +322,10 @@ def _query_source(
     *,
     check_only: bool = False,
 ) -> Listing | None:
-    """Return what a source says that it holds, where a look does not do.
+    """Return the listing of a source, or None where a check suffices.
 
     Raises:
-        TrilightError: it holds nothing.
+        TrilightError: the source is invalid or empty.
     """
     check_allowed(allowed_licences)
     stated_licence(licence)

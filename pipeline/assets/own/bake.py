@@ -1,4 +1,4 @@
-"""The skin of a level: an atlas of its triangles, colored by the places that they show."""
+"""Bakes a level's textures: an atlas of its triangles, colored from the nearest source points."""
 
 from dataclasses import dataclass
 
@@ -21,8 +21,8 @@ from storage.conventions import linear_from_srgb8, srgb8
 from storage.records.texture import Texture
 
 _INSET = 0.02
-"""How far texels on an edge show places within their own triangle, as a share of the way to its
-center: on the edge itself, the neighbor would be as near. At most a quarter of a cell."""
+"""Inset of texels on an edge, as a fraction of the way to their triangle's center: on the edge
+itself, the neighbor would be as near. At most a quarter of a cell."""
 
 _SHRINK = 0.9
 _BLOCK = 1 << 18
@@ -30,21 +30,21 @@ _BLOCK = 1 << 18
 DIFFUSE = slice(0, 3)
 SPECULAR = slice(3, 6)
 ROUGHNESS = slice(6, 7)
-"""Of the columns of a texel, as `source_material.columns` gives them."""
+"""Slices of a texel's seven columns, in the order of `source_material.columns`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BakedTextures:
-    """What was baked, before it is measured."""
+    """The textures of a level, before their quality is measured."""
 
     uv: NDArray[np.float32]
-    """[F, 3, 2] v up."""
+    """[F, 3, 2] texture coordinates of the corners, v up."""
     textures: tuple[Texture, Texture, Texture]
-    """Diffuse, specular and roughness."""
+    """Textures for diffuse albedo, specular albedo and roughness."""
     missed: float
-    """Share of the texels that no surface nearby was found for."""
+    """Fraction of the texels without a source surface nearby."""
     density: float
-    """Texels for each unit of length."""
+    """Texels per unit of length."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,14 +64,14 @@ def bake(
     settings: OwnMaterialSettings,
     reach: float,
 ) -> BakedTextures:
-    """Return the colors of a level.
+    """Return the baked textures of a level.
 
     Args:
-        level: in the unit box.
-        source: what it was made from.
-        nearest: the places of that.
+        level: mesh in the unit box.
+        source: surface of the source.
+        nearest: lookup of points on that surface.
         settings: texels and greatest size.
-        reach: how far the source may be away, in the unit box.
+        reach: largest distance to the source, in the unit box.
     """
     order = longest_edge_order(level.corners)
     corners = np.take_along_axis(level.corners, order[..., None], axis=1)
@@ -93,7 +93,7 @@ def bake(
 def _cells(
     corners: NDArray[np.float64], settings: OwnMaterialSettings
 ) -> tuple[NDArray[np.int64], float]:
-    """Return the cells of each tile, and the density at which the atlas is within its size."""
+    """Return the cells of each tile, and the density at which the atlas fits its size."""
     density = float(settings.texels)
     while True:
         cells = cells_per_side(corners, density)
@@ -143,7 +143,7 @@ def _inset(weights: NDArray[np.float64], cells: np.integer) -> NDArray[np.float6
 
 
 def _is_flat(texels: _Texels) -> NDArray[np.bool_]:
-    """Return whether [F] all texels of a tile are stored as the same numbers."""
+    """Return [F] True where all texels of a tile have the same 8-bit codes."""
     starts = texels.start[:-1]
     low = np.minimum.reduceat(texels.codes, starts, axis=0)
     high = np.maximum.reduceat(texels.codes, starts, axis=0)
@@ -156,7 +156,7 @@ def _tiles(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the tile [F] of each triangle, and the first triangle [K] of each tile.
 
-    Triangles of one and the same color share a tile.
+    Triangles of the same flat color share a tile.
     """
     flat = _is_flat(texels)
     count = len(cells)
@@ -170,10 +170,12 @@ def _tiles(
 def _textures(
     plan: Atlas, first_of: NDArray[np.int64], texels: _Texels
 ) -> tuple[Texture, Texture, Texture]:
-    """Return the maps in 8 bits; what is the same everywhere is one texel in float32."""
+    """Return the maps in 8 bits; a constant map is one texel in float32."""
     constants = [_constant(texels, part) for part in _PARTS]
     values = np.zeros((plan.height, plan.width, 7))
-    values[:] = texels.columns[0]  # where no tile is, so that nothing there counts for a mean
+    values[:] = texels.columns[
+        0
+    ]  # texels without a tile get a color of the object, for means over the map
     for tile, face in enumerate(first_of):
         mine = slice(texels.start[face], texels.start[face + 1])
         column, row = plan.corner[tile]
@@ -205,7 +207,7 @@ _PARTS = (DIFFUSE, SPECULAR, ROUGHNESS)
 
 
 def _constant(texels: _Texels, part: slice) -> NDArray[np.float32] | None:
-    """Return what all texels say, where 8 bits could tell none of them from another."""
+    """Return the value of a map whose texels all have equal 8-bit codes, or None."""
     columns = texels.columns[:, part]
     codes = texels.codes[:, part]
     if not (codes == codes[0]).all():
@@ -215,7 +217,7 @@ def _constant(texels: _Texels, part: slice) -> NDArray[np.float32] | None:
 
 
 def _limit_diffuse(diffuse: NDArray[np.uint8], specular: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return sRGB codes that add up to at most 1 with the specular albedo after rounding."""
+    """Return diffuse sRGB codes whose sum with the specular albedo is at most 1 after rounding."""
     table = linear_from_srgb8()
     room = 1 + 1e-6 - np.broadcast_to(specular, diffuse.shape)
     highest = np.maximum(np.searchsorted(table, room, side="right") - 1, 0)

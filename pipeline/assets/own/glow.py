@@ -1,4 +1,4 @@
-"""What the triangles of a level emit: the mean over each of what its source emits there."""
+"""Emission of a level's triangles: the mean of the source's emission over each."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +9,11 @@ from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 
 _STEPS = 8
-"""Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 of them in all."""
+"""Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 points in all."""
 _LEAST = 0.05
-"""Share of the radiance of the brightest triangle below which one emits nothing."""
+"""Fraction of the brightest triangle's radiance below which a triangle emits nothing."""
 _MOST = 1e30
-"""Radiance from which on a number is no light."""
+"""Radiance from which on a number is refused."""
 
 
 def level_emission(
@@ -22,13 +22,13 @@ def level_emission(
     """Return the radiance [F, 3] of a level's triangles; None where nothing emits.
 
     Args:
-        level: in the unit box.
-        source: what it was made from.
-        nearest: the places of that.
-        reach: how far the source may be away, in the unit box.
+        level: mesh in the unit box.
+        source: surface of the source.
+        nearest: lookup of points on that surface.
+        reach: largest distance to the source, in the unit box.
 
     Raises:
-        Rejected: materials_unreadable where that is no number, or too large for single precision.
+        Rejected: materials_unreadable where the radiance is not a number, or too large for float32.
     """
     if not source.emits:
         return None

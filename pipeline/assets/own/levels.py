@@ -1,4 +1,4 @@
-"""The levels of an asset with their own materials, where settings keep those."""
+"""Adds source materials to the levels of an asset, where settings keep them."""
 
 from collections.abc import Mapping
 
@@ -20,17 +20,17 @@ def add_source_materials(
     mesh: TriangleMesh,
     settings: AssetSettings,
 ) -> tuple[tuple[Level, ...], Missed, OwnMaterials | None]:
-    """Return levels with skins, reasons of those that are missing, and what is known of materials.
+    """Return levels with skins, reasons of missing levels, and the state of the materials.
 
     Args:
-        levels: without skins.
+        levels: levels without skins.
         missed: reason and message by budget.
-        source: the file.
-        mesh: its clean, oriented mesh.
-        settings: whether materials are kept, and what becomes of an object whose own are lost.
+        source: the object's file.
+        mesh: the clean, oriented mesh of that file.
+        settings: `own_materials` keeps materials, and says what happens where they are lost.
 
     Raises:
-        Rejected: as `skin_maker`, where such objects are refused.
+        Rejected: as `open_skin_baker`, where `if_lost` is `reject`.
     """
     material_settings = settings.own_materials
     if not material_settings.keep:

@@ -1,4 +1,4 @@
-"""How far the colors of a level are from those of its source, and whether its seams tear."""
+"""Quality of a level's textures: color error, missing texels, torn seams."""
 
 import igl
 import numpy as np
@@ -39,7 +39,7 @@ def skin_quality(
 def _color_errors(
     level: TriangleMesh, baked: BakedTextures, source: SourceSurface
 ) -> NDArray[np.float64]:
-    """Return the difference [N] at points spread evenly over the source."""
+    """Return the mean color difference [N] at points spread evenly over the source."""
     uniform = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
     points = sample_surface(source.mesh, uniform)
     weights = barycentric(source.mesh.corners[points.faces], points.positions)
@@ -61,7 +61,7 @@ def _torn_seams(
     reach: float,
     texel: float,
 ) -> float:
-    """Return the share of the length of edges of two faces whose sides show distant places."""
+    """Return the fraction of inner edge length whose two sides show distant source points."""
     directed = np.stack([level.faces, np.roll(level.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
     ends = np.sort(directed, axis=1)
     edges, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)

@@ -1,7 +1,7 @@
-"""Which place of the source a place of a level shows.
+"""Lookup of the source point for each point of a level.
 
-Rays along the normal of the level, both ways, take the nearer surface that faces the same way: so a
-thin shell does not show its far side. Where they meet none within reach, the closest point counts.
+Rays along the level's normal, both ways, take the nearer surface that faces the same way, so that a
+thin shell does not show its far side. Where they hit none within reach, the closest point counts.
 """
 
 from dataclasses import dataclass
@@ -15,27 +15,27 @@ from numpy.typing import NDArray
 from pipeline.foreign.mesh import TriangleMesh
 
 _BEHIND = 1e-4
-"""Rays start so far behind the place, in the unit box: single precision would miss what is at it.
+"""Distance in the unit box by which rays start behind a point: float32 would miss a surface at it.
 """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SurfaceLocations:
-    """Places on a surface."""
+    """Points on a surface, by face and barycentric coordinates."""
 
     faces: NDArray[np.int64]
-    """[N]"""
+    """[N] face of each point."""
     weights: NDArray[np.float64]
-    """[N, 3] barycentric coordinates."""
+    """[N, 3] barycentric coordinates in that face."""
     is_missed: NDArray[np.bool_]
-    """[N] whether nothing near faced the same way."""
+    """[N] True where no surface nearby faced the same way."""
 
 
 class SurfaceLookup:
-    """The places of one source; its search trees are made once."""
+    """Finds points of one source, by search trees that are built once."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
-        """Take a clean, outward oriented mesh of the unit box."""
+        """Build the trees of a clean, outward oriented mesh of the unit box."""
         self._mesh = mesh
         vectors = mesh.double_area_vectors
         self._normals = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -47,12 +47,12 @@ class SurfaceLookup:
     def find(
         self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
     ) -> SurfaceLocations:
-        """Return the places that points [N, 3] with unit normals [N, 3] show.
+        """Return the source points that points [N, 3] with unit normals [N, 3] show.
 
         Args:
-            points: on or near the source.
-            normals: of the level there.
-            reach: farthest that a surface may be away, in the unit box.
+            points: points on or near the source.
+            normals: the level's normals there.
+            reach: largest distance to a surface, in the unit box.
         """
         result = self._closest(points, normals, reach)
         best = np.full(len(points), np.inf)
@@ -69,7 +69,7 @@ class SurfaceLookup:
     def _cast_rays(
         self, points: NDArray[np.float64], directions: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return face, weights and distance of what rays meet first; infinite where nothing."""
+        """Return face, weights and distance of each ray's first hit; infinite without one."""
         origins = (points - _BEHIND * directions).astype(np.float32)
         hit = self._embree.run(origins, directions.astype(np.float32), output=True)
         face = np.asarray(hit["primID"], np.int64)
@@ -94,7 +94,7 @@ class SurfaceLookup:
 
 
 def barycentric(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the coordinates [N, 3] of points [N, 3] in triangles [N, 3, 3], clipped to them."""
+    """Return barycentric coordinates [N, 3] of points [N, 3], clipped to triangles [N, 3, 3]."""
     first = corners[:, 1] - corners[:, 0]
     second = corners[:, 2] - corners[:, 0]
     across = points - corners[:, 0]

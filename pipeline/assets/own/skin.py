@@ -1,4 +1,4 @@
-"""`SkinMaker`: own materials of one object, from its file to the skins of its levels."""
+"""`SkinBaker`: source materials of one object, from its file to the skins of its levels."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -28,15 +28,15 @@ from storage.records.skin import LevelSkin, OwnMaterials, SkinQuality
 from storage.records.texture import TEXTURED, Texture
 
 _LEAST_REACH = 1e-3
-"""How far rays look for the source at least, in the unit box; otherwise as far as the level is off.
-"""
+"""Least distance within which rays search the source, in the unit box; beyond it, 1.5 times the
+level's largest error."""
 
 
 class SkinBaker:
-    """Makes the skins of the levels of one source."""
+    """Bakes the skins of the levels of one source."""
 
     def __init__(self, surface: SourceSurface, settings: OwnMaterialSettings) -> None:
-        """Take a source with its colors."""
+        """Build the lookup of a source surface."""
         self._surface = surface
         self._settings = settings
         self._nearest = SurfaceLookup(surface.mesh)
@@ -45,8 +45,8 @@ class SkinBaker:
         """Return a level with its skin.
 
         Raises:
-            Rejected: colours_changed or colours_missed where it is over a bound, or
-                materials_unreadable where no scene could hold it.
+            Rejected: colours_changed or colours_missed where an error is over its limit, or
+                materials_unreadable where no scene could hold the skin.
         """
         mesh = TriangleMesh(
             positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
@@ -90,12 +90,12 @@ def _require_lawful(textures: Sequence[Texture], emission: NDArray[np.float32] |
 def open_skin_baker(
     source: SourceFile, mesh: TriangleMesh, settings: OwnMaterialSettings
 ) -> tuple[SkinBaker, OwnMaterials]:
-    """Return what makes the skins of a source, and what of its materials is lost.
+    """Return the skin baker of a source, and the lost parts of its materials.
 
     Args:
-        source: the file with the pictures beside it.
-        mesh: its clean, oriented mesh.
-        settings: sizes and bounds.
+        source: the file, with the pictures next to it.
+        mesh: the clean, oriented mesh of that file.
+        settings: sizes and limits.
 
     Raises:
         Rejected: no_materials, materials_unreadable, texture_missing, texture_outside,

@@ -1,4 +1,4 @@
-"""The cleaned source with a color at every place: its faces find themselves in the file again."""
+"""The cleaned source with its materials: each clean face is matched to a face of the file."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,34 +13,35 @@ from pipeline.foreign.parts import TexturedParts
 from storage.errors import Rejected
 
 _LEAST_FOUND = 0.999
-"""Share of the cleaned faces that the file must have: all but those that rounding moved apart."""
+"""Fraction of the cleaned faces that must match one of the file: all but those that rounding split.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SourceSurface:
-    """The clean, outward oriented mesh of a source, and what it is made of."""
+    """The clean, outward oriented mesh of a source, with its materials."""
 
     mesh: TriangleMesh
-    """In the unit box."""
+    """Clean mesh in the unit box."""
     parts: TexturedParts
-    """The file's faces."""
+    """Faces of the file, with texture coordinates and materials."""
     source_face: NDArray[np.int64]
-    """[F] which of those each face is."""
+    """[F] face of the file for each clean face."""
     source_corner: NDArray[np.int64]
-    """[F, 3] which corner of that face each corner is."""
+    """[F, 3] corner of that face for each corner."""
 
     def columns(
         self, faces: NDArray[np.int64], weights: NDArray[np.float64], cell: float
     ) -> NDArray[np.float64]:
-        """Return diffuse rgb, specular rgb and roughness [N, 7] at places on faces.
+        """Return diffuse rgb, specular rgb and roughness [N, 7] at points on faces.
 
         Args:
-            faces: [N]
-            weights: [N, 3] barycentric coordinates there.
+            faces: [N] clean faces.
+            weights: [N, 3] barycentric coordinates in them.
             cell: width in the unit box over which pictures are averaged.
         """
         source_face = self.source_face[faces]
-        source_weights = np.zeros((len(faces), 3))  # the weights of the file's own corners
+        source_weights = np.zeros((len(faces), 3))  # weights of the corners in the file's order
         np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
         result = np.zeros((len(faces), 7))
         of_place = self.parts.material[source_face]
@@ -53,13 +54,13 @@ class SourceSurface:
 
     @property
     def emits(self) -> bool:
-        """Whether any of its materials says so."""
+        """True where any material emits light."""
         return any(material.emits for material in self.parts.materials)
 
     def emission(
         self, faces: NDArray[np.int64], weights: NDArray[np.float64], cell: float
     ) -> NDArray[np.float64]:
-        """Return the radiance [N, 3] at places on faces; arguments as those of `columns`."""
+        """Return the radiance [N, 3] at points on faces; arguments as in `columns`."""
         source_face = self.source_face[faces]
         source_weights = np.zeros((len(faces), 3))
         np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
@@ -120,7 +121,7 @@ class SourceSurface:
 
     @cached_property
     def _areas(self) -> NDArray[np.float64]:
-        """[R] area of each face of the file in the unit box."""
+        """Area [R] of each face of the file, in the unit box."""
         vectors = normalise(self.parts.mesh).double_area_vectors
         areas: NDArray[np.float64] = 0.5 * np.linalg.norm(vectors, axis=1)
         return areas
@@ -129,7 +130,7 @@ class SourceSurface:
 def _halvings(
     slot: Slot, corners: NDArray[np.float64], areas: NDArray[np.float64], cell: float
 ) -> NDArray[np.int64]:
-    """Return how often [N] a picture is halved so that its texels are no wider than a cell."""
+    """Return the number of halvings [N] of a picture at which texels are as wide as a cell."""
     height, width = slot.picture.values.shape[:2]
     steps = corners[:, 1:] - corners[:, :1]
     on_picture = 0.5 * np.abs(steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0])
@@ -139,14 +140,14 @@ def _halvings(
 
 
 def match_source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurface:
-    """Find the faces of a clean mesh among those of its file.
+    """Match the faces of a clean mesh to those of its file.
 
     Args:
-        mesh: as cleaning and orientation left it.
-        parts: of the same file.
+        mesh: the cleaned and oriented mesh.
+        parts: the faces of the same file.
 
     Raises:
-        Rejected: materials_unreadable where many are not found, no_texture_coordinates or
+        Rejected: materials_unreadable where many faces do not match, no_texture_coordinates or
             texture_coordinates_not_finite where a textured face has none.
     """
     raw = normalise(parts.mesh)
@@ -157,7 +158,7 @@ def match_source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurf
     vertex = np.where(known[order][place] == keys, order[place], -1)
     corners = vertex[raw.faces]
     source_face = np.full(len(mesh.faces), -1)
-    for candidate in (corners, corners[:, [0, 2, 1]]):  # those that face the same way come first
+    for candidate in (corners, corners[:, [0, 2, 1]]):  # matches of the same orientation come first
         matched = _first_matches(mesh.faces, candidate)
         source_face = np.where(source_face < 0, matched, source_face)
     missing = source_face < 0
@@ -176,7 +177,7 @@ def match_source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurf
 
 
 def _first_matches(faces: NDArray[np.int64], candidates: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the first row of `among` that is each wanted face but for its first corner, or -1."""
+    """Return the first candidate equal to each face up to rotation of its corners, or -1."""
     rows = np.concatenate([_start_at_lowest(candidates), _start_at_lowest(faces)])
     _, number = np.unique(rows, axis=0, return_inverse=True)
     first = np.full(int(number.max()) + 1, len(candidates))
@@ -193,7 +194,7 @@ def _start_at_lowest(faces: NDArray[np.int64]) -> NDArray[np.int64]:
 def _nearest_matched(
     mesh: TriangleMesh, missing: NDArray[np.bool_], source_face: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return the origin of the face whose center is nearest, for each missing one."""
+    """Fill in each missing face with the match of the face whose center is nearest."""
     if not missing.any():
         return source_face
     centres = mesh.corners.mean(axis=1)

@@ -1,9 +1,9 @@
-"""An atlas that has a place for every triangle, whatever their number and neighbors.
+"""A texture atlas with a tile for every triangle, whatever their number and neighbors.
 
 A triangle of n cells a side takes one half of a square of n + 3 texels: its corners lie in the
-centers of texels, and whatever a bilinear look-up within it can touch belongs to it alone. The
-other half is another triangle's, turned by half a turn. Triangles of one color take four texels
-that they share with all others of that color.
+centers of texels, and every texel that a bilinear lookup within it can read belongs to it alone.
+The other half holds another triangle, rotated by 180 degrees. Triangles of one flat color share
+four texels.
 """
 
 from collections.abc import Sequence
@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 SIDES = tuple(sorted({*(1 << k for k in range(14)), *(3 << k for k in range(12))}))
-"""Numbers of cells that tiles have: 1, 2, 3, 4, 6, 8, 12, ...; few, so that most find a partner."""
+"""Numbers of cells a side: 1, 2, 3, 4, 6, 8, 12, ...; few, so that most tiles find a partner."""
 
 _GUTTER = 3
 FLAT = 2
-"""Width of the square of one color."""
+"""Width in texels of the square of a flat color."""
 
 
 def cells_per_side(corners: NDArray[np.float64], density: float) -> NDArray[np.int64]:
     """Return the cells a side [F] of triangles with corners [F, 3, 3], the longest edge last.
 
     Args:
-        corners: the first corner of each lies opposite the longest edge (`turned`).
-        density: cells for each unit of length.
+        corners: the first corner of each lies opposite the longest edge (`longest_edge_order`).
+        density: cells per unit of length.
     """
     legs = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=2).max(axis=1)
     cells = np.ceil(legs * density - 1e-9).astype(np.int64)
@@ -54,19 +54,19 @@ def tile_weights(cells: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Atlas:
-    """Where tiles lie."""
+    """Positions of tiles in a texture."""
 
     width: int
     height: int
     corner: NDArray[np.int64]
     """[K, 2] first texel (column, row) of each tile's square."""
     is_turned: NDArray[np.bool_]
-    """[K] whether it is the half beyond the diagonal."""
+    """[K] True where a tile is the half beyond the diagonal."""
     cells: NDArray[np.int64]
-    """[K] cells a side; 0 for one color."""
+    """[K] cells a side of each tile; 0 for a flat color."""
 
     def texels(self, tile: int, places: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the texels [P, 2] of the atlas that a tile's own texels [P, 2] are."""
+        """Return the atlas texels [P, 2] of a tile's texels [P, 2]."""
         last = self.cells[tile] + _GUTTER - 1
         return self.corner[tile] + (last - places if self.is_turned[tile] else places)
 
@@ -82,7 +82,7 @@ class Atlas:
 
 
 def pack_atlas(cells: NDArray[np.int64]) -> Atlas:
-    """Lay out tiles of so many cells a side [K], as nearly square as rows of squares allow."""
+    """Lay out tiles with the given cells a side [K], nearly square, in rows of squares."""
     order = np.argsort(-cells, kind="stable")
     squares, square_of, is_turned = _squares(cells, order)
     area = sum(side * side for side in squares)
@@ -100,7 +100,7 @@ def pack_atlas(cells: NDArray[np.int64]) -> Atlas:
 def _squares(
     cells: NDArray[np.int64], order: NDArray[np.int64]
 ) -> tuple[list[int], NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the widths of squares, and which one and which half each tile takes."""
+    """Return the widths of squares, and the square and half of each tile."""
     squares: list[int] = []
     square_of = np.zeros(len(cells), np.int64)
     is_turned = np.zeros(len(cells), np.bool_)
@@ -118,7 +118,7 @@ def _squares(
 
 
 def _rows(squares: Sequence[int], width: int) -> tuple[NDArray[np.int64], int]:
-    """Return the first texel of each square, the largest first, in rows; and the height."""
+    """Return the first texel of each square, in rows from the largest, and the height."""
     corners = np.zeros((len(squares), 2), np.int64)
     x = y = tallest = 0
     for number, side in enumerate(squares):

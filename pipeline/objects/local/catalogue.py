@@ -1,7 +1,7 @@
 """Catalogues: `objects.jsonl` or `objects.csv`, a row per object with its file and its rights.
 
-A mistake in it stops the run, since it is the user's text; a file that it names and that is missing
-does not, since one lost download must not cost the others.
+A mistake in a catalogue stops the run, since the user wrote it. A missing file does not, since one
+lost download must not cost the others.
 """
 
 import csv
@@ -25,10 +25,10 @@ def only_catalogue(exists: Callable[[str], bool]) -> str | None:
     """Return the name of a folder's catalogue, or None where it has none.
 
     Args:
-        exists: returns whether the folder has a file of this name.
+        exists: returns True where the folder has a file of this name.
 
     Raises:
-        TrilightError: it has both.
+        TrilightError: the folder has both.
     """
     present = [name for name in CATALOGUE_NAMES if exists(name)]
     if len(present) > 1:
@@ -46,8 +46,8 @@ def read_catalogue(path: Path) -> list[ObjectRecord]:
     the name of the catalogue, `attribution` and `source_url` to nothing. Other fields are ignored.
 
     Raises:
-        TrilightError: a row is malformed, a field is missing or no text, a uid is empty, not
-            printable or used twice, or a path leads out of the folder; names file and line.
+        TrilightError: a row is malformed, a field is missing or not text, a uid is empty, not
+            printable or used twice, or a path leads out of the folder; with file and line.
     """
     root = Path(os.path.realpath(path.parent))
     records: list[ObjectRecord] = []
@@ -86,7 +86,7 @@ def _record(root: Path, row: dict[str, Any], place: str, name: str) -> ObjectRec
 
 
 def _public_field(row: dict[str, Any], field: str, place: str, default: str) -> str:
-    """Return a text that stands in the dataset's documents: printable, without passwords."""
+    """Return a field's text for the dataset's documents: printable, without passwords."""
     return printable(public_text(_text(row, field, place, default)))
 
 
@@ -99,7 +99,7 @@ def _text(row: dict[str, Any], field: str, place: str, default: str | None = Non
 
 
 def _path_below(root: Path, path: str, place: str) -> Path:
-    """Return the absolute place of a catalogue path; links are followed before it is judged."""
+    """Return the absolute path of a catalogue path; links are followed before the check."""
     display_path = printable(path)
     if not path or "\x00" in path or path != path.encode("utf-8", "ignore").decode():
         raise TrilightError(f"{place}: path is {display_path!r}; expected the name of a file.")
@@ -118,7 +118,7 @@ def jsonl_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield line numbers from 1 and JSON objects; blank lines are skipped.
 
     Raises:
-        TrilightError: the file is no UTF-8 text, or a line is no JSON object.
+        TrilightError: the file is not UTF-8 text, or a line is not a JSON object.
     """
     for number, line in enumerate(_file_text(path).split("\n"), start=1):
         if not line.strip():
@@ -139,10 +139,10 @@ def jsonl_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield line numbers from 1 and the cells that are not blank, by the names of the first row.
+    """Yield line numbers from 1 and the cells that are not blank, by column name.
 
     Raises:
-        TrilightError: the file is no UTF-8 text or breaks the rules of CSV, the first row lacks
+        TrilightError: the file is not UTF-8 text or breaks the rules of CSV, the first row lacks
             `uid` or `path` or has a name twice, or a row has another number of cells.
     """
     names: list[str] = []

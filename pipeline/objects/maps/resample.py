@@ -1,8 +1,8 @@
-"""Area means: a picture with fewer texels that sends out the same light.
+"""Area means: resampling to fewer texels that preserves the total light.
 
-A source is taken as constant within each texel. A texel of the result is the mean over the area
-that it covers, by the exact overlaps; on the sphere, area is solid angle. So the integral stays,
-and no sun is lost or doubled, whatever the two sizes are.
+A source is constant within each texel. A texel of the result is the mean over the area that it
+covers, by the exact overlaps; on the sphere, area is solid angle. So the integral stays, and no sun
+is lost or doubled, whatever the two sizes are.
 """
 
 import numpy as np
@@ -43,12 +43,12 @@ def _even(count: int) -> NDArray[np.float64]:
 
 
 def _latitudes(count: int) -> NDArray[np.float64]:
-    """Return where the rows of a map end, as shares of the height 1 - cos of the sphere."""
+    """Return the borders of a map's rows as heights 1 - cos on the sphere."""
     return 1 - np.cos(np.pi * np.arange(count + 1) / count)
 
 
 def _overlaps(source: NDArray[np.float64], target: NDArray[np.float64]) -> csr_array:
-    """Return the share [target, source] that each source interval has in each target interval."""
+    """Return the fraction [target, source] of each target interval that each source covers."""
     ends = np.union1d(source, target)
     ends = ends[np.concatenate([[True], np.diff(ends) > 1e-12])]  # rounding makes two of one
     middle = (ends[:-1] + ends[1:]) / 2

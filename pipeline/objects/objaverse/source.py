@@ -39,11 +39,11 @@ _FORMS = (
 
 
 def list_objaverse(source: str, allowed: Sequence[str]) -> Listing:
-    """Return the objects that a source names, with the rights that their annotations state.
+    """Return the objects that a source names, with the rights from their annotations.
 
     A category with `:N` gives the first N of its uids, sorted, whose licence is in `allowed`; the
-    refused ones that were passed over on the way are listed too. Whether an object is still
-    offered under the licence of then is not known: Objaverse froze its annotations.
+    refused ones before them are listed too. An object's present licence may differ: Objaverse froze
+    its annotations.
 
     Raises:
         TrilightError: the source is malformed, a category is unknown, the package is missing, or
@@ -100,7 +100,7 @@ def _records(
 
 
 def _record(uid: str, annotation: dict[str, Any]) -> ObjectRecord:
-    """Return the record of an object; its path is known once it is here."""
+    """Return the record of an object; its path is known after the download."""
     user = annotation.get("user")
     user = user if isinstance(user, dict) else {}
     title = _text(annotation, "name") or uid

@@ -1,4 +1,4 @@
-"""Objects of a remote folder: listed, then fetched to the cache that all datasets share."""
+"""Objects of a remote folder: listed, then downloaded to the cache that all datasets share."""
 
 import dataclasses
 from functools import partial
@@ -28,24 +28,23 @@ from storage.remote.tries import TransferFailed
 from storage.remote.url import RemoteUrl
 
 MAX_BYTES = 200_000_000
-"""Largest object that is fetched, with its buffers: what the mesh stage reads at most."""
+"""Largest downloaded object with its buffers, in bytes: the limit of the mesh stage."""
 THREADS = 8
 
 
 def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
-    """Return the objects of a remote folder: those of its catalogue, or else its object files.
+    """List the objects of a remote folder: its catalogue's rows, or else its object files.
 
-    Only the catalogue is fetched here. The objects go to the cache when they are fetched, where
-    they are found again: one that is there is fetched anew only when the server says that it
-    changed.
+    Only the catalogue is downloaded here. Later downloads go to the cache; a cached object is
+    downloaded again only where the server reports a change.
 
     Args:
         url: the folder.
-        licence: of files without a statement, as the user states it.
+        licence: the user's licence for files without a statement.
 
     Raises:
         TrilightError: a driver is missing, the folder cannot be read or listed or holds no object,
-            its catalogue is wrong, or has a licence stated from outside.
+            its catalogue is wrong, or there are a catalogue and a `licence`.
     """
     folder = RemoteFolder(url)
     place = cache_folder("objects") / sha256_hex(url.display_url.encode())[:32]
@@ -82,7 +81,7 @@ def _list_object_files(
 ) -> tuple[list[ObjectRecord], list[Failure]]:
     names = folder.names()
     for catalogue in set(CATALOGUE_NAMES) & set(names):
-        # it would rule, so that going on without it could use what it forbids
+        # without the catalogue, the run could use objects that it forbids
         raise TrilightError(
             f"objects {folder.url.display_url!r}: {catalogue} is listed but cannot be fetched; "
             "expected "
