@@ -173,9 +173,8 @@ def _textures(
     """Return the maps in 8 bits; a constant map is one texel in float32."""
     constants = [_constant(texels, part) for part in _PARTS]
     values = np.zeros((plan.height, plan.width, 7))
-    values[:] = texels.columns[
-        0
-    ]  # texels without a tile get a color of the object, for means over the map
+    # Texels without a tile get a color of the object, for means over the map.
+    values[:] = texels.columns[0]
     for tile, face in enumerate(first_of):
         mine = slice(texels.start[face], texels.start[face + 1])
         column, row = plan.corner[tile]

@@ -1,6 +1,6 @@
 """Furniture: tables, stools, chairs, benches and shelves, joined from beveled boards and legs.
 
-Many separate closed parts with flat faces, as in most models that people make.
+Many separate closed components with flat faces, as in most hand-made models.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from pipeline.objects.builtin.solids import beam, box, join, lathe, scale_and_mo
 
 @dataclass(frozen=True, kw_only=True)
 class FurnitureParams:
-    """Shape of one piece of furniture; lengths are in about meters."""
+    """Shape of one piece of furniture; lengths are roughly in meters."""
 
     kind: str  # `table`, `round` (a round top), `chair` (a seat with a back) or `shelf`
     width: float  # along x
@@ -30,11 +30,11 @@ class FurnitureParams:
     level_slats: bool  # whether the back's boards lie level rather than upright
     boards: int  # boards of a shelf between its top and bottom
     books: tuple[tuple[float, float], ...]
-    """Thickness and height of what stands on a shelf, from its lowest board upwards."""
+    """Thickness and height of the books on a shelf, from its lowest board upwards."""
 
 
 def furniture(params: FurnitureParams) -> Mesh:
-    """Return closed parts that reach into each other."""
+    """Return closed components that reach into each other."""
     if params.kind == "shelf":
         return join(_shelf(params))
     parts = [*_top(params), *_legs(params)]
@@ -75,7 +75,7 @@ def furniture_rand(rng: np.random.Generator) -> Mesh:
 
 
 def _top(params: FurnitureParams) -> list[Mesh]:
-    """Return the top or seat: a disc, a board, or slats on two battens."""
+    """Return the top or seat: a disk, a board, or slats on two battens."""
     high = params.height
     half = params.board / 2
     if params.kind == "round":

@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.objects.builtin.grids import Mesh, torus_faces
 
 _TOOTH = np.array([0.0, 0.0, 0.6, 1.0, 1.0, 0.6])
-"""Height of the outline at six equal steps of one tooth: gap, flank, tip, flank."""
+"""Relative height of the outline at six equal steps of one tooth: gap, flank, tip, flank."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 """Surfaces as grids of vertices: a torus, a sphere with two poles, and an open sheet.
 
-Families move the vertices of such grids, so what is closed is closed by construction.
+Families move the vertices of such grids, so closed surfaces are closed by construction.
 """
 
 import numpy as np
@@ -11,9 +11,9 @@ Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 
 
 def torus_faces(rows: int, columns: int) -> NDArray[np.int64]:
-    """Return the faces of a grid [rows, columns] that is periodic both ways: 2 rows columns.
+    """Return the 2 rows columns faces of a grid [rows, columns] that is periodic both ways.
 
-    They face the side from which rows run upwards and columns to the left.
+    The faces point to the side from which rows run upwards and columns to the left.
     """
     row, column = np.divmod(np.arange(rows * columns), columns)
     next_row = (row + 1) % rows
@@ -31,10 +31,11 @@ def torus_faces(rows: int, columns: int) -> NDArray[np.int64]:
 
 
 def sphere_faces(rings: int, columns: int) -> NDArray[np.int64]:
-    """Return the faces of rings [rings, columns] between two poles: 2 rings columns.
+    """Return the 2 rings columns faces of rings [rings, columns] between two poles.
 
-    The first pole is vertex rings * columns, the last one follows it. They face the side from which
-    rings run upwards and columns to the right: outwards, for columns counter-clockwise from above.
+    The first pole is vertex rings * columns, the last one follows it. The faces point to the side
+    from which rings run upwards and columns to the right: outwards, for columns counter-clockwise
+    from above.
     """
     body = torus_faces(rings, columns)[: 2 * (rings - 1) * columns]
     column = np.arange(columns)
@@ -48,9 +49,9 @@ def sphere_faces(rings: int, columns: int) -> NDArray[np.int64]:
 
 
 def sheet_faces(rows: int, columns: int) -> NDArray[np.int64]:
-    """Return the faces of an open grid [rows, columns]: 2 (rows - 1) (columns - 1).
+    """Return the 2 (rows - 1) (columns - 1) faces of an open grid [rows, columns].
 
-    They face the side from which rows run upwards and columns to the right.
+    The faces point to the side from which rows run upwards and columns to the right.
     """
     row, column = np.divmod(np.arange((rows - 1) * (columns - 1)), columns - 1)
     start = row * columns + column

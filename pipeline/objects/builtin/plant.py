@@ -1,7 +1,7 @@
 """Potted plants: leaves are open sheets, curved and folded, on stems in a pot.
 
-The one family that is not closed: what is thin in nature is a sheet with two sides in most models
-that people make, and a renderer has to cope with it.
+The one family that is not closed: most hand-made models have two-sided sheets for thin objects, so
+renderers must handle them.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from pipeline.objects.builtin.solids import join, lathe, tube
 
 @dataclass(frozen=True, kw_only=True)
 class LeafParams:
-    """Shape of one leaf; lengths are shares of its own length."""
+    """Shape of one leaf; lengths are fractions of the leaf's length."""
 
     length: float  # from base to tip, along the midrib
     width: float  # largest width
@@ -30,7 +30,7 @@ class LeafParams:
 
 @dataclass(frozen=True, kw_only=True)
 class PlantParams:
-    """Shape of one plant; the pot's rim has about radius 0.3."""
+    """Shape of one plant; the rim of its pot has a radius of about 0.3."""
 
     leaf: LeafParams  # the largest leaf
     leaves: int  # their number
@@ -66,7 +66,7 @@ def plant(params: PlantParams) -> Mesh:
 def leaf_sheet(leaf: LeafParams, rise_rad: float) -> Mesh:
     """Return one leaf: an open sheet of 8 (rows - 1) + 4 triangles from the origin towards x.
 
-    It faces upwards. The tip is a point.
+    The sheet faces upwards and ends in a point.
     """
     along = np.arange(leaf.rows) / leaf.rows
     across = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])

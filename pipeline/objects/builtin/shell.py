@@ -1,6 +1,6 @@
 """Sea shells (after Raup 1966): a growing tube on a spiral about an axis, open at its mouth.
 
-Smooth, with an inside that one looks into, and detail that shrinks towards the tip.
+Smooth, with a visible inside, and detail that shrinks towards the tip.
 """
 
 from dataclasses import dataclass
@@ -65,7 +65,7 @@ def shell_rand(rng: np.random.Generator) -> Mesh:
     turn_count = float(rng.uniform(*turns))
     cords = int(rng.choice([0, 0, 5, 7]))
     columns = int(rng.integers(14, 19)) if not cords else 3 * cords
-    # No more than about 5500 triangles, whatever was drawn.
+    # At most about 5500 triangles, whatever the random parameters.
     most = int(2700 / (columns * (turn_count + 0.5)))
     return shell(
         ShellParams(
@@ -103,7 +103,7 @@ def _relief(winding: NDArray[np.float64], params: ShellParams) -> NDArray[np.flo
 def _rings(
     winding: NDArray[np.float64], radius: NDArray[np.float64], params: ShellParams
 ) -> NDArray[np.float64]:
-    """Return points [rings, columns, 3] of the tube at `turn` [rings], 0 being the mouth."""
+    """Return points [rings, columns, 3] of the tube at `winding` [rings]; 0 is the mouth."""
     angle = 2 * np.pi * winding
     size = params.growth**winding
     around = 2 * np.pi * np.arange(params.columns) / params.columns

@@ -1,7 +1,7 @@
 """Superquadrics (Barr 1981): from boxes over ellipsoids to octahedra and stars, tapered, twisted.
 
-Written in polar form, so that vertices stay evenly spread whatever the exponents; the textbook form
-crowds them at the edges of boxes.
+The polar form spreads vertices evenly for all exponents; the textbook form crowds them at the edges
+of boxes.
 """
 
 from dataclasses import dataclass

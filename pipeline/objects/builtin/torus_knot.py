@@ -1,6 +1,6 @@
 """Tubes along torus knots: one closed strand, with ribs that wind around it.
 
-The tube is as thick as the knot allows: strands do not meet, bends do not fold.
+The thickness has a limit at which strands would meet or bends would fold.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class TorusKnotParams:
     """Shape of one knot."""
 
     windings: tuple[int, int]
-    """How often the strand runs around the axis, and through the hole; coprime."""
+    """Windings of the strand around the axis and through the hole; coprime."""
     minor_radius: float  # of the torus that the strand lies on, whose major radius is 1; in (0, 1)
     fill: float  # thickness as a share of the thickest tube that neither meets itself nor folds
     ribs: int  # ridges of the cross section; 0 is round

@@ -1,6 +1,6 @@
 """Lathed vases: a wall of even thickness around a smooth profile, plain, fluted or swirled.
 
-Open vessels show what closed bodies cannot: light that enters, and an inside that shades itself.
+Unlike closed bodies, open vessels let light in, and their inside shades itself.
 """
 
 from dataclasses import dataclass
@@ -65,9 +65,9 @@ def vase_rand(rng: np.random.Generator) -> Mesh:
 
 
 def _smooth(values: NDArray[np.float64], where: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a Catmull-Rom curve through `values` at equal steps, at places in [0, 1].
+    """Evaluate a Catmull-Rom curve through equally spaced `values` at positions in [0, 1].
 
-    It may swing beyond them by an eighth of their differences; callers leave room for that.
+    The curve may overshoot the values by an eighth of their differences; callers leave a margin.
     """
     padded = np.concatenate([[2 * values[0] - values[1]], values, [2 * values[-1] - values[-2]]])
     place = np.clip(where, 0, 1) * (len(values) - 1)

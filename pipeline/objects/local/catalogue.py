@@ -195,6 +195,6 @@ def _file_text(path: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise TrilightError(
-            f"{path.name}: cannot be read ({reason}); expected a file of UTF-8 text. Mend or "
+            f"{path.name}: cannot be read ({reason}); expected a file of UTF-8 text. Fix or "
             "remove it."
         ) from error

@@ -93,7 +93,7 @@ def walk_files(root: Path) -> list[str]:
     def stop(error: OSError) -> None:
         raise TrilightError(
             f"{printable(str(error.filename))}: cannot be read ({error.strerror}); expected a "
-            "readable folder. Mend its permissions or move it away."
+            "readable folder. Fix its permissions or move it away."
         )
 
     names: list[str] = []
