@@ -161,7 +161,7 @@ class ListedObjects:
 
     def found(
         self,
-        wanted: Callable[[str], bool] = _select_all,
+        is_selected: Callable[[str], bool] = _select_all,
         downloaded: Callable[[int, int], None] = _ignore_progress,
     ) -> FoundObjects:
         """Download the selected objects and return them with the failures.
@@ -170,15 +170,15 @@ class ListedObjects:
         package) and are not repeated.
 
         Args:
-            wanted: returns True for the uid of a selected object.
+            is_selected: returns True for the uid of a selected object.
             downloaded: called with the number of finished downloads, failed ones included, and the
                 total; from the calling thread.
 
         Raises:
             TrilightError: none of the selected objects could be downloaded.
         """
-        records = [record for record in self.allowed if wanted(record.uid)]
-        failures = [failure for failure in self.refused if wanted(failure.item)]
+        records = [record for record in self.allowed if is_selected(record.uid)]
+        failures = [failure for failure in self.refused if is_selected(failure.item)]
         fetched, lost = self.fetch(records, downloaded)
         self.require_some(len(fetched), [*failures, *lost])
         return FoundObjects(
