@@ -73,7 +73,7 @@ def _facts(
         num_faces_read=len(raw.faces),
         num_faces=len(source.mesh.faces),
         num_faces_turned=_count_flipped(cleaned, source.mesh),
-        num_parts=source.parts.count,
+        num_parts=source.components.count,
         open_edges=edges.open,
         nonmanifold_edges=edges.nonmanifold,
         front_share=round(front_share, 6),
@@ -98,7 +98,7 @@ def _levels(
 
     A budget that the level before it meets as well gets no level.
     """
-    maker = _LevelBuilder(source, settings, method)
+    builder = _LevelBuilder(source, settings, method)
     levels: list[Level] = []
     missed: dict[int, tuple[str, str]] = {}
     for budget in settings.budgets:
@@ -106,7 +106,7 @@ def _levels(
             continue
         try:
             finest = budget == settings.budgets[0]
-            levels.append(maker.smallest(budget) if finest else maker.level(budget))
+            levels.append(builder.smallest(budget) if finest else builder.level(budget))
         except Rejected as failure:
             missed[budget] = (failure.reason, failure.message)
     return tuple(levels), missed

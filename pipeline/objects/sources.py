@@ -75,14 +75,14 @@ class ObjectSource:
         return self.list(query)
 
 
-def _list_place(query: SourceQuery) -> Listing:
-    place = parse_url(query.source, what="objects")
-    if isinstance(place, Path):
-        return list_folder(place, query.licence)
-    return list_remote(place, query.licence)
+def _list_folder(query: SourceQuery) -> Listing:
+    location = parse_url(query.source, what="objects")
+    if isinstance(location, Path):
+        return list_folder(location, query.licence)
+    return list_remote(location, query.licence)
 
 
-PLACE = ObjectSource(list=_list_place, states_licences=False, is_place=True)
+FOLDER_SOURCE = ObjectSource(list=_list_folder, states_licences=False, is_place=True)
 """A folder, local or on a server; also every source without a known name before a colon."""
 
 SOURCES: Registry[ObjectSource] = Registry(
@@ -98,7 +98,7 @@ SOURCES: Registry[ObjectSource] = Registry(
         "objaverse": ObjectSource(
             list=lambda query: list_objaverse(query.source, query.allowed_licences)
         ),
-        **dict.fromkeys(("file", *PACKAGES, "pipe", "env"), PLACE),
+        **dict.fromkeys(("file", *PACKAGES, "pipe", "env"), FOLDER_SOURCE),
     },
     decides=("data",),
 )
@@ -108,7 +108,7 @@ SOURCES: Registry[ObjectSource] = Registry(
 def source_of(text: str) -> ObjectSource:
     """Return the source of the word before the colon, or else the folder source."""
     name, colon, _ = text.partition(":")
-    return SOURCES.get(name, PLACE) if colon else PLACE
+    return SOURCES.get(name, FOLDER_SOURCE) if colon else FOLDER_SOURCE
 
 
 ENVIRONMENT = "env:"

@@ -70,7 +70,7 @@ def _bulk_extent(points: NDArray[np.float64], weights: NDArray[np.float64]) -> f
     sides = []
     for axis in points.T:
         order = np.argsort(axis, kind="stable")
-        share = np.cumsum(weights[order])
-        low, high = np.searchsorted(share, [0.005 * share[-1], 0.995 * share[-1]])
+        cumulative = np.cumsum(weights[order])
+        low, high = np.searchsorted(cumulative, [0.005 * cumulative[-1], 0.995 * cumulative[-1]])
         sides.append(float(axis[order[min(high, len(order) - 1)]] - axis[order[low]]))
     return max(sides)

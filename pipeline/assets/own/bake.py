@@ -124,9 +124,9 @@ def _bake_texels(
     missed = 0
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
-        places = nearest.find(points[part], normals[part], reach)
-        columns[part] = source.columns(places.faces, places.weights, 1 / density)
-        missed += int(places.is_missed.sum())
+        locations = nearest.find(points[part], normals[part], reach)
+        columns[part] = source.columns(locations.faces, locations.weights, 1 / density)
+        missed += int(locations.is_missed.sum())
     codes = np.concatenate(
         [
             srgb8(columns[:, DIFFUSE]),

@@ -38,9 +38,9 @@ def level_emission(
     normal = level.double_area_vectors
     areas = 0.5 * np.linalg.norm(normal, axis=1)
     normals = np.repeat(normal / (2 * areas[:, None]), len(weights), axis=0)
-    places = nearest.find(points.reshape(-1, 3), normals, reach)
+    locations = nearest.find(points.reshape(-1, 3), normals, reach)
     cell = float(np.sqrt(np.median(areas) / len(weights)))
-    seen = source.emission(places.faces, places.weights, cell).reshape(len(corners), -1, 3)
+    seen = source.emission(locations.faces, locations.weights, cell).reshape(len(corners), -1, 3)
     mean = seen.mean(axis=1)
     if not mean.max() < _MOST:  # or not a number
         raise Rejected("materials_unreadable", f"a surface emits {mean.max():.3g}; < {_MOST:g}")

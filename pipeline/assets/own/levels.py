@@ -36,20 +36,20 @@ def add_source_materials(
     if not material_settings.keep:
         return levels, dict(missed), None
     try:
-        maker, materials = open_skin_baker(source, mesh, material_settings)
+        baker, materials = open_skin_baker(source, mesh, material_settings)
     except Rejected as lost:
         if material_settings.if_lost == "reject":
             raise
         return levels, dict(missed), OwnMaterials(reason=lost.reason, message=lost.message)
     return _add_skins(
-        levels, missed, maker, materials, refuse=material_settings.if_lost == "reject"
+        levels, missed, baker, materials, refuse=material_settings.if_lost == "reject"
     )
 
 
 def _add_skins(
     levels: tuple[Level, ...],
     missed: Mapping[int, tuple[str, str]],
-    maker: SkinBaker,
+    baker: SkinBaker,
     materials: OwnMaterials,
     *,
     refuse: bool,
@@ -58,7 +58,7 @@ def _add_skins(
     reasons = dict(missed)
     for level in levels:
         try:
-            with_skins.append(maker.add_skin(level))
+            with_skins.append(baker.add_skin(level))
         except Rejected as lost:
             if refuse:
                 reasons[level.record.budget] = (lost.reason, lost.message)

@@ -44,11 +44,11 @@ def _color_errors(
     points = sample_surface(source.mesh, uniform)
     weights = barycentric(source.mesh.corners[points.faces], points.positions)
     source_rgb = source.columns(points.faces, weights, 1 / baked.density)[:, DIFFUSE]
-    _, faces, places = igl.point_mesh_squared_distance(
+    _, faces, nearest = igl.point_mesh_squared_distance(
         points.positions, level.positions, level.faces
     )
     faces = np.asarray(faces, np.int64).ravel()
-    uv = np.einsum("nc,ncd->nd", barycentric(level.corners[faces], places), baked.uv[faces])
+    uv = np.einsum("nc,ncd->nd", barycentric(level.corners[faces], nearest), baked.uv[faces])
     level_rgb = texture_values(baked.textures[0], uv)
     error: NDArray[np.float64] = np.abs(level_rgb - source_rgb).mean(axis=1)
     return error
@@ -77,9 +77,9 @@ def _torn_seams(
     points = ((1 - along) * inner[:, 0] + along * inner[:, 1]).reshape(-1, 3)
     side_positions = []
     for side in sides.T:
-        places = nearest.find(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
-        corners = source.mesh.corners[places.faces]
-        side_positions.append(np.einsum("nc,ncd->nd", places.weights, corners))
+        locations = nearest.find(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
+        corners = source.mesh.corners[locations.faces]
+        side_positions.append(np.einsum("nc,ncd->nd", locations.weights, corners))
     gap = np.linalg.norm(side_positions[0] - side_positions[1], axis=1).reshape(len(_ALONG), -1)
     length = np.linalg.norm(inner[:, 1] - inner[:, 0], axis=1)
     torn = (gap > _TORN_TEXELS * texel).mean(axis=0)

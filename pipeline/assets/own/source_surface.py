@@ -44,9 +44,9 @@ class SourceSurface:
         source_weights = np.zeros((len(faces), 3))  # weights of the corners in the file's order
         np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
         result = np.zeros((len(faces), 7))
-        of_place = self.parts.material[source_face]
-        for row in np.unique(of_place):
-            chosen = np.flatnonzero(of_place == row)
+        material = self.parts.material[source_face]
+        for row in np.unique(material):
+            chosen = np.flatnonzero(material == row)
             result[chosen] = self._material_columns(
                 self.parts.materials[row], source_face[chosen], source_weights[chosen], cell
             )
@@ -88,10 +88,10 @@ class SourceSurface:
         def sample(slot: Slot | None) -> NDArray[np.float32] | None:
             if slot is None:
                 return None
-            place = (id(slot.picture), slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())
-            if place not in known:  # one picture often holds several numbers
-                known[place] = self._sample_picture(slot, source_face, source_weights, cell)
-            return known[place]
+            key = (id(slot.picture), slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())
+            if key not in known:  # one picture often holds several numbers
+                known[key] = self._sample_picture(slot, source_face, source_weights, cell)
+            return known[key]
 
         base = sample(material.base)
         if self.parts.colour is not None:
@@ -154,8 +154,8 @@ def match_source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurf
     known = cell_keys(mesh.positions)
     order = np.argsort(known)
     keys = cell_keys(raw.positions)
-    place = np.minimum(np.searchsorted(known[order], keys), len(known) - 1)
-    vertex = np.where(known[order][place] == keys, order[place], -1)
+    position = np.minimum(np.searchsorted(known[order], keys), len(known) - 1)
+    vertex = np.where(known[order][position] == keys, order[position], -1)
     corners = vertex[raw.faces]
     source_face = np.full(len(mesh.faces), -1)
     for candidate in (corners, corners[:, [0, 2, 1]]):  # matches of the same orientation come first

@@ -29,8 +29,8 @@ def cells_per_side(corners: NDArray[np.float64], density: float) -> NDArray[np.i
     """
     legs = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=2).max(axis=1)
     cells = np.ceil(legs * density - 1e-9).astype(np.int64)
-    place = np.searchsorted(SIDES, np.clip(cells, 1, SIDES[-1]))
-    return np.asarray(SIDES, np.int64)[place]
+    index = np.searchsorted(SIDES, np.clip(cells, 1, SIDES[-1]))
+    return np.asarray(SIDES, np.int64)[index]
 
 
 def longest_edge_order(corners: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -46,10 +46,10 @@ def tile_weights(cells: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """
     column, row = np.meshgrid(np.arange(cells + 2), np.arange(cells + 2), indexing="xy")
     mine = column + row <= cells + 1
-    places = np.stack([column[mine], row[mine]], axis=1)
-    inside = np.minimum(places, cells)
+    texels = np.stack([column[mine], row[mine]], axis=1)
+    inside = np.minimum(texels, cells)
     across = inside / np.maximum(inside.sum(axis=1, keepdims=True), cells)
-    return places, np.concatenate([1 - across.sum(axis=1, keepdims=True), across], axis=1)
+    return texels, np.concatenate([1 - across.sum(axis=1, keepdims=True), across], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,10 +65,10 @@ class Atlas:
     cells: NDArray[np.int64]
     """[K] cells a side of each tile; 0 for a flat color."""
 
-    def texels(self, tile: int, places: NDArray[np.int64]) -> NDArray[np.int64]:
+    def texels(self, tile: int, tile_texels: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the atlas texels [P, 2] of a tile's texels [P, 2]."""
         last = self.cells[tile] + _GUTTER - 1
-        return self.corner[tile] + (last - places if self.is_turned[tile] else places)
+        return self.corner[tile] + (last - tile_texels if self.is_turned[tile] else tile_texels)
 
     def uv(self, tile: int) -> NDArray[np.float64]:
         """Return the texture coordinates [3, 2] of a tile's corners, v up."""

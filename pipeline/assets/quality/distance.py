@@ -1,8 +1,8 @@
 """Two-way distance of two surfaces, by evenly spread points and exact distances.
 
 The quality check uses the 99th percentile: one vertex decides the largest value, and a mean accepts
-almost anything. A component with less than one percent of the area escapes it; `parts.py` checks
-those.
+almost anything. A component with less than one percent of the area escapes it; `Components`
+checks those.
 """
 
 from dataclasses import dataclass
@@ -55,8 +55,8 @@ def sample_surface(mesh: TriangleMesh, uniform: NDArray[np.float64]) -> SurfaceP
         uniform: [N, 3] independent numbers in [0, 1).
     """
     total = np.cumsum(np.linalg.norm(mesh.double_area_vectors, axis=1))
-    share = (np.arange(len(uniform)) + uniform[:, 0]) / len(uniform) * total[-1]
-    face = np.minimum(np.searchsorted(total, share, side="right"), len(total) - 1)
+    target = (np.arange(len(uniform)) + uniform[:, 0]) / len(uniform) * total[-1]
+    face = np.minimum(np.searchsorted(total, target, side="right"), len(total) - 1)
     root = np.sqrt(uniform[:, 1])
     weights = np.stack([1 - root, root * (1 - uniform[:, 2]), root * uniform[:, 2]], axis=1)
     return SurfacePoints(positions=np.einsum("ij,ijk->ik", weights, mesh.corners[face]), faces=face)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.assets.quality.distance import Deviation, Surface
-from pipeline.assets.quality.parts import Parts
+from pipeline.assets.quality.parts import Components
 from pipeline.assets.quality.silhouette import intersection_over_union, silhouette
 from pipeline.assets.quality.triangles import (
     area_variation,
@@ -25,7 +25,7 @@ class MeasuredSource:
         """Sample a clean mesh of the unit box."""
         self.mesh = mesh
         self.surface = Surface(mesh, rng_for(0, "asset-error").random((_NUM_POINTS, 3)))
-        self.parts = Parts(self.surface)
+        self.components = Components(self.surface)
         self._silhouette = silhouette(mesh)
         self._area = _area(mesh)
 
@@ -52,7 +52,7 @@ class MeasuredSource:
             normal_error_deg=_round_digits(measured.angle_deg.mean()),
             area_ratio=_round_digits(self.area_ratio(result)),
             silhouette_iou=_round_digits(self.silhouette_iou(result)),
-            lost_area=_round_digits(self.parts.lost_area(measured.to_other)),
+            lost_area=_round_digits(self.components.lost_area(measured.to_other)),
             area_variation=_round_digits(area_variation(result)),
             min_angle_p5_deg=_round_digits(np.percentile(smallest_angles_deg(result), 5)),
             open_edges=count_edges(result).open,

@@ -15,16 +15,16 @@ _VISIBLE = 0.005
 """Distance that never counts as lost, as a fraction of the object's diagonal: a pixel or two."""
 
 
-def label_parts(mesh: TriangleMesh) -> NDArray[np.int64]:
+def label_components(mesh: TriangleMesh) -> NDArray[np.int64]:
     """Return the component [F] of each face; faces connect over edges."""
     return np.asarray(igl.facet_components(mesh.faces)[1], np.int64)
 
 
-class Parts:
+class Components:
     """The components of a source, and the sample points on each."""
 
     def __init__(self, surface: Surface) -> None:
-        part = label_parts(surface.mesh)
+        part = label_components(surface.mesh)
         self.count = int(part.max()) + 1
         self._part_of_point = part[surface.points.faces]
         self._extent = _diagonals(surface.mesh, part, self.count) / surface.mesh.diagonal

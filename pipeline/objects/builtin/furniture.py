@@ -97,8 +97,8 @@ def _top(params: FurnitureParams) -> list[Mesh]:
         for number in range(params.slats)
     ]
     for side in (-1, 1):
-        place = [side * 0.3 * params.width, 0, high - 1.9 * half]
-        parts.append(box(place, [0.02, 0.45 * params.depth, half], 0.15 * half))
+        center = [side * 0.3 * params.width, 0, high - 1.9 * half]
+        parts.append(box(center, [0.02, 0.45 * params.depth, half], 0.15 * half))
     return parts
 
 
@@ -121,8 +121,8 @@ def _legs(params: FurnitureParams) -> list[Mesh]:
     for number in range(4):
         other = (number + 1) % 4
         for level, thick, tall in levels:
-            share = level / high
-            start, end = (ends[n] + share * (tops[n] - ends[n]) for n in (number, other))
+            fraction = level / high
+            start, end = (ends[n] + fraction * (tops[n] - ends[n]) for n in (number, other))
             # Bars of one level cross inside the legs; unequal heights keep their faces apart.
             lift = np.array([0, 0, 0.004 * (number % 2)])
             parts.append(beam(start + lift, end + lift, (thick, tall), 0.003))
@@ -161,17 +161,17 @@ def _back(params: FurnitureParams) -> list[Mesh]:
     parts = [beam(foot * side, head * side, post, 0.12 * params.leg) for side in (mirror, 1)]
     levels = np.linspace(0.3, 0.93, params.slats) if params.level_slats else np.array([0.93])
     tall = min(0.1, 0.2 / len(levels)) * params.back
-    for share in levels:
-        end = foot + share * (head - foot)
+    for fraction in levels:
+        end = foot + fraction * (head - foot)
         parts.append(beam(end * mirror, end, (0.5 * params.leg, tall), 0.003))
     if params.level_slats:
         return parts
     bottom = foot + 0.02 * (head - foot)
     rail = foot + 0.93 * (head - foot)
     for number in range(params.slats):
-        place = np.array([(number + 1) / (params.slats + 1) * 2 - 1, 1, 1])
+        scale = np.array([(number + 1) / (params.slats + 1) * 2 - 1, 1, 1])
         wide = min(0.03, 0.6 * x / params.slats)
-        parts.append(beam(bottom * place, rail * place, (wide, 0.25 * params.leg), 0.002))
+        parts.append(beam(bottom * scale, rail * scale, (wide, 0.25 * params.leg), 0.002))
     return parts
 
 
@@ -189,16 +189,16 @@ def _shelf(params: FurnitureParams) -> list[Mesh]:
     plank = [width, depth - 0.006, 0.8 * half]
     parts += [box([0, 0, level], plank, 0.8 * cut) for level in levels]
     bay = levels[1] - levels[0] - 2 * half
-    place = -width + half + 0.01
+    offset = -width + half + 0.01
     storey = 0
     for thick, tall in params.books:
-        if place + thick > width - half - 0.01:
-            place = -width + half + 0.01
+        if offset + thick > width - half - 0.01:
+            offset = -width + half + 0.01
             storey += 1
         if storey > params.boards:
             break
         size = [thick / 2, 0.5 * depth * (0.8 + 0.4 * tall), bay * tall / 2]
         floor = levels[storey] + 0.8 * half - 0.003
-        parts.append(box([place + thick / 2, 0.05 * depth, floor + size[2]], size, 0.002))
-        place += thick + 0.003
+        parts.append(box([offset + thick / 2, 0.05 * depth, floor + size[2]], size, 0.002))
+        offset += thick + 0.003
     return parts

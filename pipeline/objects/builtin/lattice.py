@@ -29,7 +29,7 @@ class LatticeParams:
 
 def lattice(params: LatticeParams) -> Mesh:
     """Return the closed surface; about 10 splits triangles per bar."""
-    places, bars = zip(*(_steps(cells, params) for cells in params.cells), strict=True)
+    planes, bars = zip(*(_steps(cells, params) for cells in params.cells), strict=True)
     x, y, z = np.meshgrid(*bars, indexing="ij")
     solid = x.astype(np.int64) + y + z >= 2
     if params.hollow:
@@ -42,7 +42,7 @@ def lattice(params: LatticeParams) -> Mesh:
         solid[:, :, 0] = True
         solid[1:-1, 1:-1, -1] = False
     corner, faces = _surface(solid)
-    unit = np.stack([np.array(places[axis])[corner[:, axis]] for axis in range(3)], axis=1)
+    unit = np.stack([np.array(planes[axis])[corner[:, axis]] for axis in range(3)], axis=1)
     return _warp(unit, params), faces
 
 
@@ -87,8 +87,8 @@ def _steps(cells: int, params: LatticeParams) -> tuple[NDArray[np.float64], NDAr
     gap = [(1 - params.bar) / params.splits] * params.splits
     widths = np.array([params.bar] + [*gap, params.bar] * cells)
     bars = np.array([True] + ([False] * params.splits + [True]) * cells)
-    places = np.concatenate([[0.0], np.cumsum(widths)])
-    return 2 * places / places[-1] - 1, bars
+    planes = np.concatenate([[0.0], np.cumsum(widths)])
+    return 2 * planes / planes[-1] - 1, bars
 
 
 def _surface(solid: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -53,12 +53,12 @@ def plant(params: PlantParams) -> Mesh:
         path[:, 2] += top - 0.02
         parts.append(tube(path, 0.045 - 0.02 * bend, 8))
     for number in range(params.leaves):
-        share = (number + 0.5) / params.leaves
+        fraction = (number + 0.5) / params.leaves
         azimuth = number * np.pi * (3 - np.sqrt(5))
-        rise = params.flattest_rad + share * (params.steepest_rad - params.flattest_rad)
-        level = (0.35 + 0.65 * share) * params.stem
+        rise = params.flattest_rad + fraction * (params.steepest_rad - params.flattest_rad)
+        level = (0.35 + 0.65 * fraction) * params.stem
         foot = np.array([0.1 * level**2 / params.stem if params.stem else 0.0, 0.0, top + level])
-        size = 1 - share * (1 - params.smallest)
+        size = 1 - fraction * (1 - params.smallest)
         parts += _leaf_on_stalk(params, foot, azimuth, rise, size)
     return join(parts)
 

@@ -90,9 +90,9 @@ def _largest_radius(params: TorusKnotParams, points: int = 512) -> float:
     change = np.linalg.norm(np.roll(step, -1, axis=0) - step, axis=1)
     bend = float((length**2 / np.maximum(change, 1e-12)).min())
     chord = np.linalg.norm(centre[:, None] - centre[None], axis=2)
-    place = np.cumsum(length)
-    arc = np.abs(place[:, None] - place[None])
-    arc = np.minimum(arc, place[-1] - arc)
+    position = np.cumsum(length)
+    arc = np.abs(position[:, None] - position[None])
+    arc = np.minimum(arc, position[-1] - arc)
     other_strand = chord < 0.5 * arc
     gap = float(chord[other_strand].min()) if other_strand.any() else np.inf
     return min(bend, 0.5 * gap)

@@ -97,10 +97,12 @@ def _branches(
     while waiting:
         branch = waiting.pop()
         order = branch.order
-        share = np.linspace(0, 1, _RINGS[order])[:, None]
+        fraction = np.linspace(0, 1, _RINGS[order])[:, None]
         bend = rng.normal(size=3) * 0.12 + params.rise * (order > 0) * up
-        path = branch.foot + branch.length * (share * branch.direction + 0.5 * share**2 * bend)
-        radii = branch.radius * (1 - _TAPER * share[:, 0])
+        path = branch.foot + branch.length * (
+            fraction * branch.direction + 0.5 * fraction**2 * bend
+        )
+        radii = branch.radius * (1 - _TAPER * fraction[:, 0])
         radii[0] *= 1.0 if order else 1.5
         parts.append(tube(path, radii, _SIDES[order]))
         if order < len(params.children):
@@ -119,8 +121,8 @@ def _children(
     first = rng.uniform(0, 2 * np.pi)
     branches = []
     for number in range(count):
-        place = 0.55 + 0.43 * number / max(count - 1, 1) if trunk else 0.98 - 0.05 * number
-        step = place * (len(path) - 1)
+        fraction = 0.55 + 0.43 * number / max(count - 1, 1) if trunk else 0.98 - 0.05 * number
+        step = fraction * (len(path) - 1)
         index = min(int(step), len(path) - 2)
         ahead = path[index + 1] - path[index]
         azimuth = (
@@ -133,7 +135,7 @@ def _children(
                 direction=_branch_direction(ahead, spread, azimuth),
                 length=params.shrink * rng.uniform(0.85, 1.1) * parent.length,
                 # Thinner than the parent there, which hides the foot.
-                radius=0.75 * parent.radius * (1 - _TAPER * place),
+                radius=0.75 * parent.radius * (1 - _TAPER * fraction),
                 order=parent.order + 1,
             )
         )
@@ -168,13 +170,13 @@ def _tiers(params: TreeParams, rng: np.random.Generator) -> list[Mesh]:
     rim = _TIER[:, :1] > 0.9
     parts = []
     for number in range(params.tiers):
-        share = number / params.tiers
-        size = (1 - share) ** 0.8 * (0.25 + params.mass)
-        height = 1.7 / params.tiers * (1.25 - 0.4 * share)
+        fraction = number / params.tiers
+        size = (1 - fraction) ** 0.8 * (0.25 + params.mass)
+        height = 1.7 / params.tiers * (1.25 - 0.4 * fraction)
         fold = 0.14 * np.cos(params.folds * azimuth + rng.uniform(0, 6))
         fold += rng.normal(size=columns) * 0.02
         radius = reach * (1 + fold * reach) * size
-        level = 0.3 + 1.4 * share
+        level = 0.3 + 1.4 * fraction
         upright = level + _TIER[:, 1:] * height - 0.12 * size * fold * rim
         grid = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), upright], axis=2)
         poles = [[0.0, 0.0, level + 0.14 * height], [0.0, 0.0, level + height]]

@@ -70,8 +70,8 @@ def _smooth(values: NDArray[np.float64], where: NDArray[np.float64]) -> NDArray[
     The curve may overshoot the values by an eighth of their differences; callers leave a margin.
     """
     padded = np.concatenate([[2 * values[0] - values[1]], values, [2 * values[-1] - values[-2]]])
-    place = np.clip(where, 0, 1) * (len(values) - 1)
-    segment = np.minimum(place.astype(np.int64), len(values) - 2)
-    step = (place - segment)[:, None] ** np.arange(4)
+    position = np.clip(where, 0, 1) * (len(values) - 1)
+    segment = np.minimum(position.astype(np.int64), len(values) - 2)
+    step = (position - segment)[:, None] ** np.arange(4)
     basis = 0.5 * np.array([[0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]])
     return np.einsum("nk,kj,nj->n", step, basis, padded[segment[:, None] + np.arange(4)])

@@ -54,11 +54,11 @@ def read_catalogue(path: Path) -> list[ObjectRecord]:
     line_of: dict[str, int] = {}
     rows = csv_rows(path) if path.suffix == ".csv" else jsonl_rows(path)
     for number, row in rows:
-        place = f"{path.name}:{number}"
-        record = _record(root, row, place, path.name)
+        location = f"{path.name}:{number}"
+        record = _record(root, row, location, path.name)
         if record.uid in line_of:
             raise TrilightError(
-                f"{place}: uid {record.uid!r} is already used in line {line_of[record.uid]}; "
+                f"{location}: uid {record.uid!r} is already used in line {line_of[record.uid]}; "
                 "expected one line per object. Rename or remove one of them."
             )
         line_of[record.uid] = number
@@ -66,49 +66,49 @@ def read_catalogue(path: Path) -> list[ObjectRecord]:
     return records
 
 
-def _record(root: Path, row: dict[str, Any], place: str, name: str) -> ObjectRecord:
-    uid = _text(row, "uid", place)
-    path = _text(row, "path", place)
+def _record(root: Path, row: dict[str, Any], location: str, name: str) -> ObjectRecord:
+    uid = _text(row, "uid", location)
+    path = _text(row, "path", location)
     if uid != printable(uid) or not uid.strip():
         raise TrilightError(
-            f"{place}: uid is {printable(uid)!r}; expected printable text that is not blank."
+            f"{location}: uid is {printable(uid)!r}; expected printable text that is not blank."
         )
     return ObjectRecord(
         uid=uid,
-        path=str(_path_below(root, path, place)),
+        path=str(_path_below(root, path, location)),
         root=str(root),
-        title=_public_field(row, "title", place, uid),
-        licence=_public_field(row, "licence", place, UNKNOWN),
-        licence_source=_public_field(row, "licence_source", place, name),
-        attribution=_public_field(row, "attribution", place, ""),
-        source_url=_public_field(row, "source_url", place, ""),
+        title=_public_field(row, "title", location, uid),
+        licence=_public_field(row, "licence", location, UNKNOWN),
+        licence_source=_public_field(row, "licence_source", location, name),
+        attribution=_public_field(row, "attribution", location, ""),
+        source_url=_public_field(row, "source_url", location, ""),
     )
 
 
-def _public_field(row: dict[str, Any], field: str, place: str, default: str) -> str:
+def _public_field(row: dict[str, Any], field: str, location: str, default: str) -> str:
     """Return a field's text for the dataset's documents: printable, without passwords."""
-    return printable(public_text(_text(row, field, place, default)))
+    return printable(public_text(_text(row, field, location, default)))
 
 
-def _text(row: dict[str, Any], field: str, place: str, default: str | None = None) -> str:
+def _text(row: dict[str, Any], field: str, location: str, default: str | None = None) -> str:
     value = row.get(field, default)
     if not isinstance(value, str):
         actual = f"a {type(value).__name__}" if field in row else "missing"
-        raise TrilightError(f"{place}: field {field!r} is {actual}; expected text.")
+        raise TrilightError(f"{location}: field {field!r} is {actual}; expected text.")
     return value
 
 
-def _path_below(root: Path, path: str, place: str) -> Path:
+def _path_below(root: Path, path: str, location: str) -> Path:
     """Return the absolute path of a catalogue path; links are followed before the check."""
     display_path = printable(path)
     if not path or "\x00" in path or path != path.encode("utf-8", "ignore").decode():
-        raise TrilightError(f"{place}: path is {display_path!r}; expected the name of a file.")
+        raise TrilightError(f"{location}: path is {display_path!r}; expected the name of a file.")
     target = Path(os.path.realpath(root / path))
     if "\\" in path and not target.exists():  # as a program on Windows writes it
         target = Path(os.path.realpath(root / path.replace("\\", "/")))
     if not target.is_relative_to(root) or target == root:
         raise TrilightError(
-            f"{place}: path {display_path!r} leads out of the folder; expected a path below it. "
+            f"{location}: path {display_path!r} leads out of the folder; expected a path below it. "
             "Copy the file into the folder."
         )
     return target
@@ -158,16 +158,16 @@ def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
         yield number, {name: cell for name, cell in zip(names, cells, strict=True) if cell.strip()}
 
 
-def _header(cells: list[str], place: str) -> list[str]:
+def _header(cells: list[str], location: str) -> list[str]:
     names = [cell.strip() for cell in cells]
     columns = printable(", ".join(names))
     if not {"uid", "path"} <= set(names):
         raise TrilightError(
-            f"{place}: the columns are {columns!r}; expected uid and path among them, with commas "
-            "between them."
+            f"{location}: the columns are {columns!r}; expected uid and path among them, with "
+            "commas between them."
         )
     if len(set(names)) < len(names):
-        raise TrilightError(f"{place}: the columns are {columns!r}; expected each name once.")
+        raise TrilightError(f"{location}: the columns are {columns!r}; expected each name once.")
     return names
 
 

@@ -97,8 +97,8 @@ def walk_files(root: Path) -> list[str]:
         )
 
     names: list[str] = []
-    for place, folders, files in os.walk(root, onerror=stop):
+    for folder, folders, files in os.walk(root, onerror=stop):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        inner = Path(place).relative_to(root)
+        inner = Path(folder).relative_to(root)
         names += [(inner / name).as_posix() for name in files]
     return names

@@ -54,5 +54,5 @@ def _overlaps(source: NDArray[np.float64], target: NDArray[np.float64]) -> csr_a
     middle = (ends[:-1] + ends[1:]) / 2
     into = np.clip(np.searchsorted(target, middle) - 1, 0, len(target) - 2)
     out_of = np.clip(np.searchsorted(source, middle) - 1, 0, len(source) - 2)
-    share = np.diff(ends) / np.diff(target)[into]
-    return csr_array((share, (into, out_of)), shape=(len(target) - 1, len(source) - 1))
+    fraction = np.diff(ends) / np.diff(target)[into]
+    return csr_array((fraction, (into, out_of)), shape=(len(target) - 1, len(source) - 1))

@@ -95,8 +95,8 @@ class RemoteFolder:
         waiting = list(folders)
         deepest = self.url.root.count("/") + _MAX_DEPTH
         while waiting:
-            place = waiting.pop()
-            for link in with_tries(partial(self.driver.ls, place, detail=False)):
+            folder = waiting.pop()
+            for link in with_tries(partial(self.driver.ls, folder, detail=False)):
                 address = html.unescape(link).replace("/./", "/")
                 inner = _below(address, self.url.root)
                 if inner is None or address in folders:
@@ -106,7 +106,7 @@ class RemoteFolder:
                     waiting.append(address)
                 else:
                     names[inner] = address
-            if len(folders) > _MAX_FOLDERS or place.count("/") > deepest:
+            if len(folders) > _MAX_FOLDERS or folder.count("/") > deepest:
                 raise TrilightError(
                     f"objects {self.url.display_url!r}: the listing has no end; expected at most "
                     f"{_MAX_FOLDERS} folders, {_MAX_DEPTH} deep. Give it objects.jsonl."

@@ -47,8 +47,8 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
             its catalogue is wrong, or there are a catalogue and a `licence`.
     """
     folder = RemoteFolder(url)
-    place = cache_folder("objects") / sha256_hex(url.display_url.encode())[:32]
-    files = RemoteFiles(folder, place, MAX_BYTES)
+    root = cache_folder("objects") / sha256_hex(url.display_url.encode())[:32]
+    files = RemoteFiles(folder, root, MAX_BYTES)
     catalogue = only_catalogue(folder.has)
     failures: list[Failure] = []
     if catalogue is not None:
