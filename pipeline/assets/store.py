@@ -25,6 +25,7 @@ _FAN_OUT = 2
 """Letters of the key that choose a sub-folder, so that no folder holds every outcome."""
 
 _OLD_S = 24 * 3600
+"""Age in seconds from which a temporary file counts as a leftover."""
 
 _LOCKS = 3
 """Letters of the key that choose a lock: 4096 files that need no cleaning up, at the price of a

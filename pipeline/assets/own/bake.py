@@ -25,7 +25,9 @@ _INSET = 0.02
 itself, the neighbor would be as near. At most a quarter of a cell."""
 
 _SHRINK = 0.9
+"""Factor on the texel density per attempt, until the atlas fits its largest size."""
 _BLOCK = 1 << 18
+"""Texels per lookup; it bounds memory."""
 
 DIFFUSE = slice(0, 3)
 SPECULAR = slice(3, 6)
@@ -147,8 +149,7 @@ def _is_flat(texels: _Texels) -> NDArray[np.bool_]:
     starts = texels.start[:-1]
     low = np.minimum.reduceat(texels.codes, starts, axis=0)
     high = np.maximum.reduceat(texels.codes, starts, axis=0)
-    flat: NDArray[np.bool_] = (low == high).all(axis=1)
-    return flat
+    return (low == high).all(axis=1)
 
 
 def _tiles(

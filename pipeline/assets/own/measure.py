@@ -14,8 +14,11 @@ from storage.records.skin import SkinQuality
 from storage.seeds import rng_for
 
 _NUM_POINTS = 4096
+"""Points on the source at which the color error is measured."""
 _ALONG = (0.2, 0.5, 0.8)
+"""Positions along an edge, as fractions, at which its two sides are compared."""
 _TORN_TEXELS = 2.0
+"""Gap in texels from which a seam counts as torn."""
 
 
 def skin_quality(
@@ -50,8 +53,7 @@ def _color_errors(
     faces = np.asarray(faces, np.int64).ravel()
     uv = np.einsum("nc,ncd->nd", barycentric(level.corners[faces], nearest), baked.uv[faces])
     level_rgb = texture_values(baked.textures[0], uv)
-    error: NDArray[np.float64] = np.abs(level_rgb - source_rgb).mean(axis=1)
-    return error
+    return np.abs(level_rgb - source_rgb).mean(axis=1)
 
 
 def _torn_seams(

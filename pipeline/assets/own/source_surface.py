@@ -123,8 +123,7 @@ class SourceSurface:
     def _areas(self) -> NDArray[np.float64]:
         """Area [R] of each face of the file, in the unit box."""
         vectors = normalise(self.parts.mesh).double_area_vectors
-        areas: NDArray[np.float64] = 0.5 * np.linalg.norm(vectors, axis=1)
-        return areas
+        return 0.5 * np.linalg.norm(vectors, axis=1)
 
 
 def _halvings(

@@ -24,8 +24,7 @@ def solid_angle_means(radiance: NDArray, height: int) -> NDArray[np.float64]:
 def flux(radiance: NDArray) -> NDArray[np.float64]:
     """Return the integral [C] over the sphere of a latitude-longitude map [H, W, C]."""
     rows = np.diff(_latitudes(len(radiance))) * 2 * np.pi
-    result: NDArray[np.float64] = rows @ radiance.mean(axis=1, dtype=np.float64)
-    return result
+    return rows @ radiance.mean(axis=1, dtype=np.float64)
 
 
 def _means(values: NDArray, rows: csr_array, width: int) -> NDArray[np.float64]:
