@@ -176,7 +176,7 @@ def test_a_texture_may_be_as_large_as_is_said_and_no_larger(tmp_path: Path) -> N
     assert side(wanted - 1) < wanted
 
 
-def test_materials_change_no_triangle_and_nothing_where_nobody_asks(tmp_path: Path) -> None:
+def test_materials_change_no_triangle_and_nothing_where_they_are_off(tmp_path: Path) -> None:
     path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS))
     own, plain = prepare(path, KEEP), prepare(path)
     assert geometry(own) == geometry(plain) and own.geometry_sha256 == plain.geometry_sha256
@@ -325,7 +325,7 @@ def test_what_is_far_darker_than_the_brightest_triangle_emits_nothing(tmp_path: 
 
 
 @pytest.mark.parametrize("kind", GLOWING)
-def test_nobody_pays_who_does_not_ask(tmp_path: Path, kind: str) -> None:
+def test_materials_that_are_off_cost_nothing(tmp_path: Path, kind: str) -> None:
     """And what is lost is named; a missing picture of it costs no material."""
     path = GLOWING[kind](tmp_path)
     plain, glows = prepare(path, KEEP), prepare(path, GLOW)
