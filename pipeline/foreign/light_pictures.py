@@ -1,4 +1,4 @@
-"""Pictures of floats, OpenEXR or Radiance, told by their first bytes."""
+"""Pictures of floats, OpenEXR or Radiance, recognized by their first bytes."""
 
 from pipeline.foreign import openexr, radiance_hdr
 from pipeline.foreign.linear_picture import LinearPicture
@@ -13,8 +13,8 @@ def read_linear_picture(
 
     Args:
         data: the file.
-        max_pixels: most pixels; known before memory is taken.
-        is_color: whether its numbers are colors, so that its primaries count.
+        max_pixels: maximum number of pixels, checked before memory is allocated.
+        is_color: whether its numbers are colors, which its primaries apply to.
 
     Raises:
         Rejected: not_hdr, load_error or too_many_pixels.

@@ -1,4 +1,4 @@
-"""Materials of files of one mesh: the MTL of an OBJ, the pictures of a PLY, or colors."""
+"""Materials of single-mesh files: the MTL of an OBJ, the pictures of a PLY, or colors."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,12 +18,13 @@ Decode = Callable[[bytes, str], NDArray]
 def read_parts(source: SourceFile, decode: Decode, *, emission: bool) -> TexturedParts:
     """Return the triangles of an OBJ, OFF, PLY or STL with their materials; colors are sRGB.
 
-    Materials and pictures stand above colors, which are named then.
+    Materials and pictures take precedence over colors, which the notes then name.
 
     Raises:
         Rejected: no_materials where it has neither, materials_unreadable, or as reading a picture.
     """
-    contents, files = source.contents, source.materials
+    contents = source.contents
+    files = source.materials
     names = contents.material_names
     if source.kind == "obj" and (names or contents.color is None):
         materials, unread = obj_materials(names, files, decode, emission=emission)

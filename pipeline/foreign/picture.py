@@ -38,16 +38,16 @@ class Decoder:
 
     def __init__(self, max_pixels: int) -> None:
         """Begin with that many."""
-        self._left = max_pixels
+        self._pixels_left = max_pixels
 
     def __call__(self, data: bytes, name: str) -> NDArray:
         """Return `decoded`, within what is left."""
-        values = decoded(data, name, self._left)
-        self._left -= values.shape[0] * values.shape[1]
+        values = decode_picture(data, name, self._pixels_left)
+        self._pixels_left -= values.shape[0] * values.shape[1]
         return values
 
 
-def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
+def decode_picture(data: bytes, name: str, max_pixels: int) -> NDArray:
     """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 of greys of 16 bits.
 
     Palettes, greys, transparency and CMYK become RGBA; colours of 16 bits are read to 8. OpenEXR
@@ -84,7 +84,7 @@ def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
         raise Rejected("texture_unreadable", f"{name!r:.80}: {UNREADABLE_PICTURE}") from error
 
 
-def has_colours(data: bytes) -> bool:
+def has_colors(data: bytes) -> bool:
     """Return whether a picture of 8 bits has colours: what USD takes as sRGB where nothing is said.
 
     False too for bytes that are no picture.
@@ -142,14 +142,14 @@ class Picture:
             return self.values
         if not self._levels:
             rows = range(0, len(self.values), _STRIP)  # a large picture in floats is too much
-            strips = [_halved(self.linear(self.values[row : row + _STRIP])) for row in rows]
+            strips = [_halve(self.linear(self.values[row : row + _STRIP])) for row in rows]
             self._levels.append(np.concatenate(strips))
         while len(self._levels) < number:
-            self._levels.append(_halved(self._levels[-1]))
+            self._levels.append(_halve(self._levels[-1]))
         return self._levels[number - 1]
 
     @property
-    def most_halvings(self) -> int:
+    def max_halvings(self) -> int:
         """Until one texel is left."""
         return max(self.values.shape[:2]).bit_length() - 1
 
@@ -163,44 +163,47 @@ class Picture:
             if self.is_srgb:
                 deep[..., :3] = linear_from_srgb(deep[..., :3])
             return deep
-        found: NDArray[np.float32] = np.divide(texels, 255, dtype=np.float32)
+        linear: NDArray[np.float32] = np.divide(texels, 255, dtype=np.float32)
         if self.is_srgb:
-            found[..., :3] = linear_from_srgb8()[texels[..., :3]]
-        return found
+            linear[..., :3] = linear_from_srgb8()[texels[..., :3]]
+        return linear
 
-    def at(self, uv: NDArray[np.float64], halvings: NDArray[np.int64]) -> NDArray[np.float32]:
+    def sample(self, uv: NDArray[np.float64], halvings: NDArray[np.int64]) -> NDArray[np.float32]:
         """Return linear values [N, 4] at coordinates [N, 2] of the picture halved so often."""
-        found = np.zeros((len(uv), 4), np.float32)
+        values = np.zeros((len(uv), 4), np.float32)
         for number in np.unique(halvings):
             chosen = halvings == number
-            found[chosen] = self._at(uv[chosen], self.level(int(number)))
-        return found
+            values[chosen] = self._sample_level(uv[chosen], self.level(int(number)))
+        return values
 
-    def _at(self, uv: NDArray[np.float64], texels: NDArray) -> NDArray[np.float32]:
+    def _sample_level(self, uv: NDArray[np.float64], texels: NDArray) -> NDArray[np.float32]:
         height, width = texels.shape[:2]
         beyond = np.zeros(len(uv), np.bool_)
-        x = _wrapped(uv[:, 0], self.wrap[0]) * width - 0.5
-        y = _wrapped(uv[:, 1], self.wrap[1]) * height - 0.5
+        x = _wrap_coordinates(uv[:, 0], self.wrap[0]) * width - 0.5
+        y = _wrap_coordinates(uv[:, 1], self.wrap[1]) * height - 0.5
         if self.is_nearest:
-            x, y = np.floor(x + 0.5), np.floor(y + 0.5)
-        column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-        along, across = (x - column)[:, None], (y - row)[:, None]
+            x = np.floor(x + 0.5)
+            y = np.floor(y + 0.5)
+        column = np.floor(x).astype(np.int64)
+        row = np.floor(y).astype(np.int64)
+        along = (x - column)[:, None]
+        across = (y - row)[:, None]
 
         def texel(up: int, right: int) -> NDArray[np.float32]:
-            rows = _within(row + up, height, self.wrap[1])
-            return self.linear(texels[rows, _within(column + right, width, self.wrap[0])])
+            rows = _wrap_index(row + up, height, self.wrap[1])
+            return self.linear(texels[rows, _wrap_index(column + right, width, self.wrap[0])])
 
         for axis in range(2):
             if self.wrap[axis] == "black":
                 beyond |= (uv[:, axis] < 0) | (uv[:, axis] > 1)
         low = (1 - along) * texel(0, 0) + along * texel(0, 1)
         high = (1 - along) * texel(1, 0) + along * texel(1, 1)
-        found: NDArray[np.float32] = ((1 - across) * low + across * high).astype(np.float32)
-        found[beyond] = 0
-        return found
+        values: NDArray[np.float32] = ((1 - across) * low + across * high).astype(np.float32)
+        values[beyond] = 0
+        return values
 
 
-def _halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def _halve(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return means of two by two texels; the last one stands alone where their number is odd."""
     for axis in (0, 1):
         count = values.shape[axis]
@@ -212,7 +215,7 @@ def _halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return values
 
 
-def _wrapped(at: NDArray[np.float64], wrap: Wrap) -> NDArray[np.float64]:
+def _wrap_coordinates(at: NDArray[np.float64], wrap: Wrap) -> NDArray[np.float64]:
     if wrap in ("clamp", "black"):
         return np.clip(at, 0, 1)
     if wrap == "mirror":
@@ -221,5 +224,5 @@ def _wrapped(at: NDArray[np.float64], wrap: Wrap) -> NDArray[np.float64]:
     return at - np.floor(at)
 
 
-def _within(index: NDArray[np.int64], count: int, wrap: Wrap) -> NDArray[np.int64]:
+def _wrap_index(index: NDArray[np.int64], count: int, wrap: Wrap) -> NDArray[np.int64]:
     return index % count if wrap == "repeat" else np.clip(index, 0, count - 1)

@@ -124,7 +124,8 @@ def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> Sou
         return _usd_file(path, limits)
     check_header(data, suffix, limits.max_faces)
     gltf: GltfDocument | None = None
-    materials, keep = MaterialFiles(), limits.with_materials
+    materials = MaterialFiles()
+    keep = limits.with_materials
     folder = SourceFolder(path.parent, root or path.parent, _read_regular)
     if suffix in (".glb", ".gltf"):
         gltf = open_gltf(data, suffix, path.parent, folder, limits, _read_regular)

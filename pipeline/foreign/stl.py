@@ -68,7 +68,10 @@ def _strip_names(text: bytes) -> tuple[bytes, bool]:
 
     The name of a solid goes to the end of its line, or to a facet on the same line.
     """
-    pieces, kept, balance, at = list[bytes](), 0, 0, text.find(b"solid")
+    pieces: list[bytes] = []
+    rest_start = 0
+    balance = 0
+    at = text.find(b"solid")
     while at >= 0:
         start = at - 3 if text[at - 3 : at] == b"end" else at
         before = text[max(start - _MOST_INDENT, 0) : start].rpartition(b"\n")[2].rstrip()
@@ -78,10 +81,10 @@ def _strip_names(text: bytes) -> tuple[bytes, bool]:
             last = text.find(b"\n", at)
             last = len(text) if last < 0 else last
             facet = _FACET_BEGINS.search(text, at, last)
-            pieces.append(text[kept:start])
-            kept = end = facet.start() if facet else last
+            pieces.append(text[rest_start:start])
+            rest_start = end = facet.start() if facet else last
         at = text.find(b"solid", end)
-    return b" ".join([*pieces, text[kept:]]), balance == 0
+    return b" ".join([*pieces, text[rest_start:]]), balance == 0
 
 
 def _read_text(text: bytes) -> FileMesh:

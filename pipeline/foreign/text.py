@@ -117,8 +117,8 @@ def parse_numbers(text: bytes, count: int, dtype: type[T]) -> NDArray[T]:
     if len(values) != count:
         kind = int if np.issubdtype(dtype, np.integer) else float
         word = next((word for word in text.split() if not _is_number(word, kind)), b"nothing")
-        wanted = "a whole number" if kind is int else "a number"
-        raise Rejected("load_error", f"{word[:40]!r} stands where {wanted} is expected")
+        expected = "a whole number" if kind is int else "a number"
+        raise Rejected("load_error", f"{word[:40]!r} stands where {expected} is expected")
     return values
 
 

@@ -18,7 +18,9 @@ _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mes
 _UNPACK = "unpack it first, for example with gltf-transform"
 _LISTS = ("scenes", "nodes", "meshes", "accessors", "bufferViews", "buffers")
 POINTS_AND_LINES = (0, 1, 2, 3)
-TRIANGLES, STRIP, FAN = 4, 5, 6
+TRIANGLES = 4
+STRIP = 5
+FAN = 6
 
 
 def check_tree(tree: dict[str, Any], limits: ReadLimits) -> None:
@@ -28,24 +30,25 @@ def check_tree(tree: dict[str, Any], limits: ReadLimits) -> None:
             raise Malformed(f"{kind} is no list")
     _check_extensions(tree)
     faces: dict[int, int] = {}
-    placed = total = 0
-    for place in placed_meshes(tree):
-        if "skin" in place.node:
+    num_placed = num_faces = 0
+    for placed in placed_meshes(tree):
+        if "skin" in placed.node:
             raise Rejected("skinned_mesh", "bones pose a mesh; apply the skin before exporting")
-        number = place.node["mesh"]
+        number = placed.node["mesh"]
         if number not in faces:
             faces[number] = sum(
                 _count_faces(tree, primitive, limits)
                 for primitive in entry(tree, "meshes", number)["primitives"]
             )
-        count = num_instances(tree, place.node)
-        placed, total = placed + count, total + count * faces[number]
-        if placed > limits.max_instances:
+        count = num_instances(tree, placed.node)
+        num_placed += count
+        num_faces += count * faces[number]
+        if num_placed > limits.max_instances:
             raise Rejected(
                 "too_many_instances", f"more than {limits.max_instances} nodes place a mesh"
             )
-    if total > limits.max_faces:
-        raise Rejected("too_many_faces", f"{total} faces; expected <= {limits.max_faces}")
+    if num_faces > limits.max_faces:
+        raise Rejected("too_many_faces", f"{num_faces} faces; expected <= {limits.max_faces}")
 
 
 def _check_extensions(tree: dict[str, Any]) -> None:

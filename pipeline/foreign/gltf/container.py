@@ -38,12 +38,12 @@ def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
     if data[:4] != b"glTF":
         raise Rejected("load_error", "the file is no GLB: it does not begin with glTF")
     if len(data) < _HEADER.size:
-        raise _cut_off(_HEADER.size, len(data))
+        raise _cut_off_error(_HEADER.size, len(data))
     _, version, length = _HEADER.unpack_from(data)
     if version != 2:
-        raise _other_version(str(version))
+        raise _version_error(str(version))
     if length > len(data):
-        raise _cut_off(length, len(data))
+        raise _cut_off_error(length, len(data))
     chunks = list(_split(memoryview(data)[:length]))
     if not chunks or chunks[0][0] != b"JSON":
         raise Rejected("load_error", "the first chunk of the GLB is no JSON")
@@ -57,13 +57,13 @@ def _split(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
         size, kind = _CHUNK.unpack_from(data, start)
         start += _CHUNK.size
         if start + size > len(data):
-            raise _cut_off(start + size, len(data))
+            raise _cut_off_error(start + size, len(data))
         yield kind, data[start : start + size]
         start += size
 
 
-def _cut_off(wanted: int, got: int) -> Rejected:
-    return Rejected("cut_off", f"the file is cut off: it states {wanted} bytes and has {got}")
+def _cut_off_error(expected: int, present: int) -> Rejected:
+    return Rejected("cut_off", f"the file is cut off: it states {expected} bytes and has {present}")
 
 
 def _parse_json(text: bytes) -> dict[str, Any]:
@@ -91,14 +91,15 @@ def _check_version(tree: dict[str, Any]) -> None:
     """Refuse a file that needs another version; a later 2.x without `minVersion` is readable."""
     asset = tree.get("asset")
     stated = asset if isinstance(asset, dict) else {}
-    least, version = stated.get("minVersion"), str(stated.get("version", "2.0"))
+    least = stated.get("minVersion")
+    version = str(stated.get("version", "2.0"))
     if least not in (None, "2.0"):
-        raise _other_version(f"{least!s:.20}")
+        raise _version_error(f"{least!s:.20}")
     if version.partition(".")[0] != "2" or isinstance(tree.get("meshes"), dict):
-        raise _other_version("1.0" if isinstance(tree.get("meshes"), dict) else f"{version:.20}")
+        raise _version_error("1.0" if isinstance(tree.get("meshes"), dict) else f"{version:.20}")
 
 
-def _other_version(version: str) -> Rejected:
+def _version_error(version: str) -> Rejected:
     message = f"the file needs glTF {version}; expected 2.0: export it as that"
     return Rejected("unsupported_format", message)
 
@@ -131,7 +132,8 @@ def local_path(uri: str, folder: Path) -> Path:
         plain = unquote_to_bytes(uri).decode("utf-8", "replace")
         parts = urlsplit(uri)
     except ValueError:
-        plain, parts = "\0", urlsplit("")
+        plain = "\0"
+        parts = urlsplit("")
     if "\0" in plain or parts.scheme or parts.netloc:
         raise Rejected("external_uri", f"{uri[:80]!r} lies elsewhere, not in the file's folder")
     targets = [(root / name).resolve() for name in (plain, uri, plain.replace("\\", "/"))]

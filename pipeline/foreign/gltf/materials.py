@@ -47,12 +47,15 @@ class GltfMaterials:
             emission: whether what emits is read too.
             notes: receives what cannot be read, which is then left out; without it that is refused.
         """
-        self._document, self._tree = document, document.tree
-        self._decode, self._emission, self._notes = decode, emission, notes
+        self._document = document
+        self._tree = document.tree
+        self._decode = decode
+        self._emission = emission
+        self._notes = notes
         self._values: dict[int, NDArray] = {}
         self._known: dict[int, SourceMaterial] = {}
 
-    def used(self) -> dict[int, SourceMaterial]:
+    def used_materials(self) -> dict[int, SourceMaterial]:
         """Return the materials that any mesh has, by number.
 
         Raises:
@@ -73,8 +76,8 @@ class GltfMaterials:
         glossy = row.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
         if "KHR_materials_unlit" in row.get("extensions", {}):
             return self._unlit(row)
-        found = self._metallic(row) if glossy is None else self._glossy(glossy)
-        return self._with_emission(dataclasses.replace(found, lost=_lost(row)), row)
+        material = self._metallic(row) if glossy is None else self._glossy(glossy)
+        return self._with_emission(dataclasses.replace(material, lost=_list_unsupported(row)), row)
 
     def _unlit(self, row: Mapping[str, Any]) -> SourceMaterial:
         """Return a diffuse surface of the base color: what shows it as it is in even light."""
@@ -83,7 +86,7 @@ class GltfMaterials:
             base_rgb=self._rgb(metal, "baseColorFactor", 4),
             base=self._slot(metal, "baseColorTexture", is_srgb=True),
             specular_strength=0.0,
-            lost=("unlit", *_lost(row)),
+            lost=("unlit", *_list_unsupported(row)),
         )
 
     def _metallic(self, row: Mapping[str, Any]) -> SourceMaterial:
@@ -116,17 +119,17 @@ class GltfMaterials:
             glossiness=self._slot(row, "specularGlossinessTexture"),
         )
 
-    def _with_emission(self, found: SourceMaterial, row: Mapping[str, Any]) -> SourceMaterial:
+    def _with_emission(self, material: SourceMaterial, row: Mapping[str, Any]) -> SourceMaterial:
         """Return a material with what it emits, where that is read."""
         if not self._emission:
-            return found
+            return material
         strength = extension(row, "KHR_materials_emissive_strength")
         times = self._number(strength, "emissiveStrength", 1, _MOST_EMISSION)
         red, green, blue = self._numbers(row, "emissiveFactor", (0.0,) * 3, _MOST_EMISSION)
         if not any((red, green, blue)) or not times:
-            return found
+            return material
         return dataclasses.replace(
-            found,
+            material,
             emission_rgb=(red * times, green * times, blue * times),
             emission=self._slot(row, "emissiveTexture", is_srgb=True),
         )
@@ -151,9 +154,9 @@ class GltfMaterials:
             raise Rejected("texture_unreadable", f"its picture is in no form read here: {forms}")
         sampler = entry(self._tree, "samplers", texture["sampler"]) if "sampler" in texture else {}
         wrap = _WRAPS[sampler.get("wrapS", 10497)], _WRAPS[sampler.get("wrapT", 10497)]
-        moved = extension(info, "KHR_texture_transform")
-        turn, shift = _moves(moved)
-        uv_set = read_count(moved, "texCoord", info.get("texCoord", 0))
+        transform = extension(info, "KHR_texture_transform")
+        uv_matrix, uv_offset = _uv_transform(transform)
+        uv_set = read_count(transform, "texCoord", info.get("texCoord", 0))
         if uv_set >= MOST_UV_SETS:
             raise Rejected("no_texture_coordinates", f"a texture lies on TEXCOORD_{uv_set}")
         values = self._picture(source)
@@ -165,8 +168,8 @@ class GltfMaterials:
                 is_nearest=sampler.get("magFilter") == _NEAREST,
             ),
             uv_set=uv_set,
-            turn=turn,
-            shift=shift,
+            uv_matrix=uv_matrix,
+            uv_offset=uv_offset,
         )
 
     def _picture(self, number: int) -> NDArray:
@@ -192,24 +195,24 @@ class GltfMaterials:
     ) -> list[float]:
         """Return factors within [0, `most`]; the default, with a note, where they are none."""
         try:
-            found = [*read_numbers(row.get(name, default), len(default), name)]
-            if most > 1 and max(found) > most and self._notes is None:
-                raise Malformed(f"{name} is {max(found):g}; expected at most {most:g}")
+            factors = [*read_numbers(row.get(name, default), len(default), name)]
+            if most > 1 and max(factors) > most and self._notes is None:
+                raise Malformed(f"{name} is {max(factors):g}; expected at most {most:g}")
         except Malformed as error:
             if self._notes is None:
                 raise
             self._notes.append(f"{error}; {[*default]} taken")
             return list(default)
-        clamped = [min(max(value, 0.0), most) for value in found]
-        if self._notes is not None and clamped != found:
+        clamped = [min(max(value, 0.0), most) for value in factors]
+        if self._notes is not None and clamped != factors:
             self._notes.append(f"{name}: clamped to [0, {most:g}]")
         return clamped
 
 
-def _lost(row: Mapping[str, Any]) -> tuple[str, ...]:
+def _list_unsupported(row: Mapping[str, Any]) -> tuple[str, ...]:
     """Return what a material says beyond what is read of it."""
     extensions = row.get("extensions", {})
-    found = {
+    unsupported = {
         "emission": any(row.get("emissiveFactor", ())),
         "normal map": "normalTexture" in row,
         "transparency": row.get("alphaMode", "OPAQUE") != "OPAQUE",
@@ -218,19 +221,20 @@ def _lost(row: Mapping[str, Any]) -> tuple[str, ...]:
             for word in ("clearcoat", "transmission", "sheen", "anisotropy", "iridescence")
         },
     }
-    return tuple(word for word, is_there in found.items() if is_there)
+    return tuple(word for word, is_there in unsupported.items() if is_there)
 
 
-def _moves(moved: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _uv_transform(transform: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the turn and shift of KHR_texture_transform for coordinates with v up.
 
     The extension says (u, w)' = shift + R S (u, w) with w down, and w = 1 - v.
     """
-    angle = read_number(moved.get("rotation", 0), "rotation")
-    scale = read_numbers(moved.get("scale", (1, 1)), 2, "scale")
-    cos, sin = np.cos(angle), np.sin(angle)
+    angle = read_number(transform.get("rotation", 0), "rotation")
+    scale = read_numbers(transform.get("scale", (1, 1)), 2, "scale")
+    cos = np.cos(angle)
+    sin = np.sin(angle)
     down = np.array([[cos, sin], [-sin, cos]]) @ np.diag(scale)
-    offset = np.array(read_numbers(moved.get("offset", (0, 0)), 2, "offset"))
+    offset = np.array(read_numbers(transform.get("offset", (0, 0)), 2, "offset"))
     flip = np.diag([1.0, -1.0])
     one = np.array([0.0, 1.0])
     return flip @ down @ flip, flip @ (offset + down @ one) + one

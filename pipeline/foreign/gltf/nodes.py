@@ -72,15 +72,15 @@ def placed_nodes(tree: Mapping[str, Any]) -> Iterator[PlacedNode]:
 
 def placed_meshes(tree: Mapping[str, Any]) -> Iterator[PlacedNode]:
     """Yield the nodes that show a mesh; raises Rejected nonfinite_vertices, or as placed nodes."""
-    for place in placed_nodes(tree):
-        if "mesh" in place.node and place.is_visible:
-            if not np.isfinite(place.to_world).all():
+    for placed in placed_nodes(tree):
+        if "mesh" in placed.node and placed.is_visible:
+            if not np.isfinite(placed.to_world).all():
                 fields = ("matrix", "translation", "rotation", "scale", "name")
-                said = {name: place.node[name] for name in fields if name in place.node}
+                stated = {name: placed.node[name] for name in fields if name in placed.node}
                 raise Rejected(
-                    "nonfinite_vertices", f"a node or one above it has a place {said!r:.120}"
+                    "nonfinite_vertices", f"a node or one above it has a place {stated!r:.120}"
                 )
-            yield place
+            yield placed
 
 
 def _roots(tree: Mapping[str, Any]) -> list[int]:
@@ -112,13 +112,13 @@ def transforms(
     x, y, z, w = rotation.T
     length = x * x + y * y + z * z + w * w
     twice = np.divide(2, length, out=np.zeros_like(length), where=length > 0)
-    turn = _rows(
+    rotations = _rows(
         [1 - twice * (y * y + z * z), twice * (x * y - z * w), twice * (x * z + y * w)],
         [twice * (x * y + z * w), 1 - twice * (x * x + z * z), twice * (y * z - x * w)],
         [twice * (x * z - y * w), twice * (y * z + x * w), 1 - twice * (x * x + y * y)],
     )
     matrices = np.tile(np.eye(4), (len(x), 1, 1))
-    matrices[:, :3, :3] = turn * scale[:, None]
+    matrices[:, :3, :3] = rotations * scale[:, None]
     matrices[:, :3, 3] = translation
     return matrices
 

@@ -21,7 +21,7 @@ def gltf_mesh(document: GltfDocument) -> TriangleMesh:
         Rejected: load_error, index_range, no_faces, cut_off, unsupported_accessor.
     """
     with refuse_malformed("load_error", "the glTF tree is"):
-        return _joined(_parts(document))
+        return _join_parts(_parts(document))
 
 
 def gltf_parts(document: GltfDocument, materials: GltfMaterials) -> TexturedParts:
@@ -35,25 +35,25 @@ def gltf_parts(document: GltfDocument, materials: GltfMaterials) -> TexturedPart
         has_colors = any(part.primitive.colors is not None for part in parts)
         if not document.tree.get("materials") and not has_colors:
             raise Rejected("no_materials", "the glTF has no materials")
-        known = materials.used()
+        known = materials.used_materials()
         rows: dict[int | None, int] = {number: row for row, number in enumerate(known)}
         numbers = [rows.get(part.primitive.material, len(rows)) for part in parts]
         counts = [len(part.faces) for part in parts]
-        colour = np.ones((sum(counts), 3, 3))
+        color = np.ones((sum(counts), 3, 3))
         uv = np.full((sum(counts), MOST_UV_SETS, 3, 2), np.nan)
         for part, last in zip(parts, np.cumsum(counts), strict=True):
-            mine = slice(last - len(part.faces), last)
+            span = slice(last - len(part.faces), last)
             if (colors := part.colors) is not None:
-                colour[mine] = colors
+                color[span] = colors
             for number in range(MOST_UV_SETS):
                 if (coordinates := part.coordinates(number)) is not None:
-                    uv[mine, number] = coordinates
+                    uv[span, number] = coordinates
         return TexturedParts(
-            mesh=_joined(parts),
+            mesh=_join_parts(parts),
             material=np.repeat(numbers, counts),
             materials=(*known.values(), DEFAULT),
             uv=uv,
-            colour=None if (colour == 1).all() else colour,
+            color=None if (color == 1).all() else color,
         )
 
 
@@ -65,7 +65,7 @@ def _parts(document: GltfDocument) -> list[PlacedPrimitive]:
     ]
 
 
-def _joined(parts: Sequence[PlacedPrimitive]) -> TriangleMesh:
+def _join_parts(parts: Sequence[PlacedPrimitive]) -> TriangleMesh:
     if not any(len(part.faces) for part in parts):
         raise Rejected("no_faces", "the file holds no triangles, or no node shows them")
     starts = np.cumsum([0, *(len(part.positions) for part in parts)])

@@ -46,15 +46,15 @@ def is_known(name: str) -> bool:
     return name in _READ or name in _CHANGES_NOTHING
 
 
-def unread_parts(tree: Mapping[str, Any]) -> tuple[str, ...]:
+def list_unread_parts(tree: Mapping[str, Any]) -> tuple[str, ...]:
     """Return what no code reads; a file that is malformed is refused elsewhere."""
     extensions: dict[str, str] = {}
-    others: dict[str, None] = {}
+    sentences: dict[str, None] = {}
     for kind, row in _rows(tree):
         for name in row.get("extensions", ()):
             if extensions.get(name, "the file") == "the file":
                 extensions[name] = kind
-        others |= dict.fromkeys(_of_row(kind, row))
+        sentences |= dict.fromkeys(_list_unread(kind, row))
     for name in tree.get("extensionsUsed", ()):
         extensions.setdefault(name, "the file")
     silent = _READ | _CHANGES_NOTHING | _NAMED_ELSEWHERE
@@ -63,7 +63,7 @@ def unread_parts(tree: Mapping[str, Any]) -> tuple[str, ...]:
         for name, kind in extensions.items()
         if name not in silent
     ]
-    return (*named, *others)
+    return (*named, *sentences)
 
 
 def _rows(tree: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -83,7 +83,7 @@ def _rows(tree: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
             waiting += [(kind, each) for each in value if isinstance(each, (dict, list))]
 
 
-def _of_row(kind: str, row: Mapping[str, Any]) -> Iterator[str]:
+def _list_unread(kind: str, row: Mapping[str, Any]) -> Iterator[str]:
     """Yield what is not read of one object of the tree, but for its extensions."""
     if "extras" in row:
         yield f"extras of {kind}"
@@ -92,8 +92,8 @@ def _of_row(kind: str, row: Mapping[str, Any]) -> Iterator[str]:
         yield from (f"key {key!r:.60} of {kind}" for key in row if key not in known)
     if kind in _ATTRIBUTES:
         names = row.get("attributes", ())
-        others = (name for name in names if not name.startswith(_ATTRIBUTES[kind]))
-        yield from (f"attribute {name!r:.60} of {kind}" for name in others)
+        unknown = (name for name in names if not name.startswith(_ATTRIBUTES[kind]))
+        yield from (f"attribute {name!r:.60} of {kind}" for name in unknown)
     if kind == "primitives":
         if row.get("mode", 4) in (0, 1, 2, 3):
             yield "points and lines"

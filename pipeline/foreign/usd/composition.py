@@ -37,17 +37,19 @@ def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
 
     cache = Pcp.Cache(Pcp.LayerStackIdentifier(root, None, context), "usd", True)
     _, errors = cache.ComputeLayerStack(cache.GetLayerStackIdentifier())
-    waiting, prototypes, made = [Sdf.Path.absoluteRootPath], set(), 0
-    begun_s = time.process_time()
+    waiting = [Sdf.Path.absoluteRootPath]
+    prototypes = set()
+    num_prims = 0
+    start_s = time.process_time()
     while waiting:
         path = waiting.pop()
-        made += 1
-        _require_bounds(name, path, made, time.process_time() - begun_s)
-        index, found = cache.ComputePrimIndex(path)
+        num_prims += 1
+        _require_bounds(name, path, num_prims, time.process_time() - start_s)
+        index, prim_errors = cache.ComputePrimIndex(path)
         if index.hasAnyPayloads:
             cache.RequestPayloads([path], [])
-            index, found = cache.ComputePrimIndex(path)
-        errors += found
+            index, prim_errors = cache.ComputePrimIndex(path)
+        errors += prim_errors
         if index.IsInstanceable():
             prototype = Pcp.InstanceKey(index)
             if prototype in prototypes:
@@ -58,15 +60,15 @@ def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
     return errors
 
 
-def _require_bounds(name: str, path: Any, made: int, took_s: float) -> None:
-    if made > MAX_PRIMS:
+def _require_bounds(name: str, path: Any, num_prims: int, elapsed_s: float) -> None:
+    if num_prims > MAX_PRIMS:
         raise TrilightError(f"{name}: composes more than {MAX_PRIMS} prims, the most that is read.")
     if path.pathElementCount > MAX_DEPTH:
         raise TrilightError(
             f"{name}: prims are nested more than {MAX_DEPTH} deep ({str(path)[:60]}...)."
         )
-    if took_s > MAX_COMPOSITION_S:
+    if elapsed_s > MAX_COMPOSITION_S:
         raise TrilightError(
-            f"{name}: {made} prims took {took_s:.0f} processor seconds to compose and more follow; "
-            f"expected all within {MAX_COMPOSITION_S:.0f}. Flatten the stage."
+            f"{name}: {num_prims} prims took {elapsed_s:.0f} processor seconds to compose and more "
+            f"follow; expected all within {MAX_COMPOSITION_S:.0f}. Flatten the stage."
         )

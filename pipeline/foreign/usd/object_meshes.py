@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.usd.object_stage import UsdStage
-from pipeline.foreign.usd.polygons import CutMesh, cut_mesh, mesh_polygons, moved
+from pipeline.foreign.usd.polygons import CutMesh, cut_mesh, mesh_polygons, place_points
 from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 from storage.errors import Rejected
 
@@ -31,12 +31,12 @@ class PlacedPart:
 
     def coordinates(self, primvars: Sequence[str], time: object) -> NDArray[np.float64]:
         """Return values [T, S, 3, 2] of primvars at corners; not a number where there are none."""
-        found = np.full((len(self.cut.corners), len(primvars), 3, 2), np.nan)
+        uv = np.full((len(self.cut.corners), len(primvars), 3, 2), np.nan)
         for row, name in enumerate(primvars):
-            values = chart_corners(UvChart(primvar=name, moves=()), self.cut, time)
+            values = chart_corners(UvChart(primvar=name, transforms=()), self.cut, time)
             if values is not None:
-                found[:, row] = values
-        return found
+                uv[:, row] = values
+        return uv
 
 
 def placed_parts(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedPart, ...]:
@@ -46,17 +46,19 @@ def placed_parts(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedPart, ...]:
         Rejected: no_faces, too_many_faces, offset_precision.
         TrilightError: arrays of a mesh contradict each other, or are not finite.
     """
-    parts, left, farthest = list[PlacedPart](), limits.max_faces, 0.0
+    parts: list[PlacedPart] = []
+    faces_left = limits.max_faces
+    farthest = 0.0
     for number, each in enumerate(stage.meshes):
-        found = mesh_polygons(each, stage.time)
-        left -= int(np.maximum(found.counts - 2, 0).sum())
-        if left < 0:
+        polygons = mesh_polygons(each, stage.time)
+        faces_left -= int(np.maximum(polygons.counts - 2, 0).sum())
+        if faces_left < 0:
             raise Rejected("too_many_faces", f"expected <= {limits.max_faces} faces")
-        cut = cut_mesh(found)
+        cut = cut_mesh(polygons)
         if len(cut.corners):
             scale = np.linalg.norm(each.to_world[:3, :3], 2)
-            farthest = max(farthest, float(scale * np.abs(found.points).max()))
-            points = moved(found.points, each.to_world)
+            farthest = max(farthest, float(scale * np.abs(polygons.points).max()))
+            points = place_points(polygons.points, each.to_world)
             parts.append(PlacedPart(number=number, points=points, cut=cut))
     if not parts:
         raise Rejected("no_faces", "the stage shows no mesh with triangles")
@@ -64,7 +66,7 @@ def placed_parts(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedPart, ...]:
     return tuple(parts)
 
 
-def joined(parts: Sequence[PlacedPart]) -> TriangleMesh:
+def join_parts(parts: Sequence[PlacedPart]) -> TriangleMesh:
     """Return all parts as one mesh, unwelded."""
     starts = np.cumsum([0, *(len(part.points) for part in parts)])
     faces = [p.cut.indices[p.cut.corners] + k for p, k in zip(parts, starts[:-1], strict=True)]

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.usd.placed import Placed, placed_prims
+from pipeline.foreign.usd.placed import PlacedPrim, placed_prims
 from pipeline.foreign.usd.skins import UnposedMesh
 from pipeline.foreign.usd.solids import SOLIDS
-from pipeline.foreign.usd.stage import OpenedUsd, OutsideFile, quietly
+from pipeline.foreign.usd.stage import OpenedUsd, OutsideFile, read_quietly
 from storage.errors import Rejected, TrilightError
 
 Read = TypeVar("Read")
@@ -28,7 +28,7 @@ class UsdStage:
     """Its files."""
     composed: Any
     """The stage itself, without which its prims expire."""
-    meshes: tuple[Placed, ...]
+    meshes: tuple[PlacedPrim, ...]
     """What is seen of it, into metres with +Z up."""
     time: Any
     """The first of a stage that moves."""
@@ -41,34 +41,36 @@ def open_stage(path: Path, limits: ReadLimits) -> UsdStage:
         Rejected: external_uri, load_error, missing_file, too_many_instances,
             unsupported_primitive, skinned_mesh.
     """
-    return refusing(path, lambda: _opened(path, limits))
+    return read_or_reject(path, lambda: _read_stage(path, limits))
 
 
-def refusing(path: Path, read: Callable[[], Read]) -> Read:
+def read_or_reject(path: Path, read: Callable[[], Read]) -> Read:
     """Return what `read` makes of a USD file; its errors become reasons.
 
     Raises:
         Rejected: external_uri, skinned_mesh, load_error, or as `read`.
     """
     try:
-        return quietly(path, read)
+        return read_quietly(path, read)
     except TrilightError as error:
         reasons = {OutsideFile: "external_uri", UnposedMesh: "skinned_mesh"}
         raise Rejected(reasons.get(type(error), "load_error"), f"{error!s:.300}") from error
 
 
-def _opened(path: Path, limits: ReadLimits) -> UsdStage:
+def _read_stage(path: Path, limits: ReadLimits) -> UsdStage:
     from pxr import Usd
 
     opened = OpenedUsd(path, max_file_bytes=limits.max_bytes)
-    stage, time = opened.compose(), Usd.TimeCode.EarliestTime()
+    stage = opened.compose()
+    time = Usd.TimeCode.EarliestTime()
     if opened.unresolved:
         raise Rejected("missing_file", f"{opened.unresolved[0]}; an object needs all of its parts")
     placed = placed_prims(stage, time, opened.lost, ("Mesh", *SOLIDS, "NurbsPatch"))
     if len(placed) > limits.max_instances:
         raise Rejected("too_many_instances", f"{len(placed)} meshes; <= {limits.max_instances}")
     for each in placed:
-        kind, where = each.prim.GetTypeName(), str(each.prim.GetPath())
+        kind = each.prim.GetTypeName()
+        where = str(each.prim.GetPath())
         if kind == "NurbsPatch":
             raise Rejected("unsupported_primitive", f"{where!r:.100} is a {kind}; make it a mesh")
         scheme = each.prim.GetAttribute("subdivisionScheme")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.polygons import triangulate
 from pipeline.foreign.usd.colors import convert_to_rec709
-from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.solids import SOLIDS, build_solid
 from storage.errors import TrilightError
 
@@ -18,7 +18,7 @@ from storage.errors import TrilightError
 class MeshPolygons:
     """The arrays of a mesh, which fit each other."""
 
-    placed: Placed
+    placed: PlacedPrim
     points: NDArray[np.float64]  # [P, 3] in the units of the mesh, finite
     counts: NDArray[np.int64]  # [F] corners of each polygon
     indices: NDArray[np.int64]  # [sum of counts] rows of `points`
@@ -40,9 +40,11 @@ class CutMesh:
     lost: list[str]
     """Receives what does not fit."""
 
-    def select(self, part: NDArray[np.bool_]) -> "CutMesh":
+    def select(self, chosen: NDArray[np.bool_]) -> "CutMesh":
         """Return some of the triangles."""
-        return dataclasses.replace(self, corners=self.corners[part], polygons=self.polygons[part])
+        return dataclasses.replace(
+            self, corners=self.corners[chosen], polygons=self.polygons[chosen]
+        )
 
     def per_corner(self, values: NDArray, interpolation: str) -> NDArray | None:
         """Return values [N, ...] at corners [T, 3, ...]; None where their number is wrong.
@@ -72,7 +74,8 @@ class CutMesh:
         primvar = UsdGeom.PrimvarsAPI(self.prim).FindPrimvarWithInheritance(name)
         if not primvar or not primvar.HasValue():
             return None
-        values, spread = np.array(primvar.ComputeFlattened(time)), str(primvar.GetInterpolation())
+        values = np.array(primvar.ComputeFlattened(time))
+        spread = str(primvar.GetInterpolation())
         if values.ndim == 0 or values.dtype.kind not in "fiu":
             return None
         if str(self.prim.GetTypeName()) in SOLIDS and spread != "constant":
@@ -83,7 +86,7 @@ class CutMesh:
         return fitting
 
 
-def mesh_polygons(placed: Placed, time: Any) -> MeshPolygons:
+def mesh_polygons(placed: PlacedPrim, time: Any) -> MeshPolygons:
     """Return the polygons of a mesh or solid at a time, posed by its bones if it has any.
 
     Raises:
@@ -123,10 +126,12 @@ def cut_mesh(mesh: MeshPolygons) -> CutMesh:
     """
     from pxr import UsdGeom
 
-    prim, to_world = mesh.placed.prim, mesh.placed.to_world
+    prim = mesh.placed.prim
+    to_world = mesh.placed.to_world
     corners, polygons = triangulate(mesh.points, mesh.counts, mesh.indices)
-    kept = ~np.isin(polygons, mesh.holes)
-    corners, polygons = corners[kept], polygons[kept]
+    is_surface = ~np.isin(polygons, mesh.holes)
+    corners = corners[is_surface]
+    polygons = polygons[is_surface]
     mirrored = np.linalg.det(to_world[:3, :3]) < 0
     if mirrored != (UsdGeom.Gprim(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded):
         corners = corners[:, ::-1]
@@ -139,7 +144,7 @@ def cut_mesh(mesh: MeshPolygons) -> CutMesh:
     )
 
 
-def moved(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:
+def place_points(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points [P, 3] in their place."""
     placed: NDArray[np.float64] = np.einsum("ij,vj->vi", to_world[:3, :3], points)
     return placed + to_world[:3, 3]
@@ -147,8 +152,8 @@ def moved(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray
 
 def as_array(values: Any, dtype: type, shape: tuple[int, ...]) -> NDArray:
     """Return values of USD as an array of a kind and shape; raises TypeError for another kind."""
-    found = np.zeros(0, dtype) if values is None else np.array(values)
-    return found.astype(dtype, casting="same_kind").reshape(shape)
+    array = np.zeros(0, dtype) if values is None else np.array(values)
+    return array.astype(dtype, casting="same_kind").reshape(shape)
 
 
 def _check(

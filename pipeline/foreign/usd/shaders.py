@@ -18,8 +18,8 @@ from pipeline.foreign.usd.texture_nodes import (
     TextureNode,
     find_sources,
     is_output,
-    texture_node,
-    value_of,
+    read_input,
+    read_texture_node,
 )
 
 PREVIEW = "UsdPreviewSurface"
@@ -195,13 +195,13 @@ def _find_material(prim: Any) -> Any:
 
 def surface_shader(material: Any) -> Any:
     """Return the shader of a material that is understood, a preview before others; else None."""
-    found = None
+    shader = None
     for context in ("", "mtlx"):
         source = material.ComputeSurfaceSource(context)[0]
         known = source and source.GetShaderId() in NAMES
-        if known and (found is None or source.GetShaderId() == PREVIEW):
-            found = source
-    return found
+        if known and (shader is None or source.GetShaderId() == PREVIEW):
+            shader = source
+    return shader
 
 
 def read_material(
@@ -221,15 +221,16 @@ def read_material(
     shader = surface_shader(material)
     if shader is None:
         return None
-    reader, notes = _Reader(shader, time, opened), len(opened.lost)
+    reader = _Reader(shader, time, opened)
+    notes = len(opened.lost)
     for name in TEXTURED:
-        reader.take(name)
+        reader.read_connection(name)
     constants = {name: reader.constant(name) for name in DEFAULTS}
     has_networks = len(opened.lost) > notes
     constants["diffuseColor"] = constants["diffuseColor"] * reader.weight()
     if material.GetDisplacementOutput().HasConnectedSource():
         opened.lost.append(f"{material.GetPath()}: its displacement has no place here")
-    lost = tuple(name for name in reader.without_place() if name not in known)
+    lost = tuple(name for name in reader.list_unsupported() if name not in known)
     opened.lost += [f"{shader.GetPath()}.{name}: has no place here" for name in lost]
     return StatedMaterial(
         name=str(material.GetPrim().GetName()),
@@ -247,7 +248,9 @@ class _Reader:
     """Reads the inputs of a shader."""
 
     def __init__(self, shader: Any, time: Any, opened: OpenedUsd) -> None:
-        self._shader, self._time, self._opened = shader, time, opened
+        self._shader = shader
+        self._time = time
+        self._opened = opened
         self._names = NAMES[shader.GetShaderId()]
         self._defaults = _DEFAULTS[shader.GetShaderId()]
         is_preview = shader.GetShaderId() == PREVIEW
@@ -260,7 +263,7 @@ class _Reader:
         """Return whether this kind of shader has the input under a name of its own."""
         return name in self._names
 
-    def take(self, name: str) -> None:
+    def read_connection(self, name: str) -> None:
         """Take the texture or the primvar that an input is connected to."""
         from pxr import UsdShade
 
@@ -270,11 +273,11 @@ class _Reader:
         node = UsdShade.Shader(sources[0].GetPrim())
         if node.GetShaderId() == "UsdUVTexture":
             output = UsdShade.Output(sources[0]).GetBaseName()
-            self.textures[name] = texture_node(node, output, self._time, self._opened)
+            self.textures[name] = read_texture_node(node, output, self._time, self._opened)
         elif node.GetShaderId() in _READERS:
             primvar, fallback = _READERS[node.GetShaderId()]
-            self.primvars[name] = str(value_of(node, primvar, self._time, ""))
-            self._fallbacks[name] = value_of(node, fallback, self._time, 0.0)
+            self.primvars[name] = str(read_input(node, primvar, self._time, ""))
+            self._fallbacks[name] = read_input(node, fallback, self._time, 0.0)
         else:
             self._lose(name, f"{node.GetShaderId() or 'a network'} that is not read")
 
@@ -299,7 +302,7 @@ class _Reader:
                 product = product * value
         return product
 
-    def without_place(self) -> list[str]:
+    def list_unsupported(self) -> list[str]:
         """Return inputs that do something, and have no place here; unknown ones too."""
         read = {*(self._names.get(name, name) for name in DEFAULTS), *_WEIGHTS}
         names = []
@@ -323,7 +326,7 @@ class _Reader:
         sources = self._sources(name)
         if sources and is_output(sources[0]):
             return None
-        return parse_color(value_of(self._shader, name, self._time, default))
+        return parse_color(read_input(self._shader, name, self._time, default))
 
     def _finite(self, name: str, stated: Any) -> NDArray[np.float32]:
         value = parse_color(stated)

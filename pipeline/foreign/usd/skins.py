@@ -39,7 +39,7 @@ class BoundSkin:
 
         points = Vt.Vec3fArray(stated)
         if self.binding.HasBlendShapes():
-            _bend(self.skeleton, self.binding, prim, points, time)
+            _blend_shapes(self.skeleton, self.binding, prim, points, time)
         if not self.binding.HasJointInfluences():
             return np.array(points, np.float64)
         is_bound = self.skeleton and self.skeleton.HasBindPose()
@@ -59,11 +59,12 @@ class BoundSkins:
         """Begin without any."""
         from pxr import UsdSkel
 
-        self._time, self._cache = time, UsdSkel.Cache()
+        self._time = time
+        self._cache = UsdSkel.Cache()
         self._bound: dict[Any, BoundSkin] = {}
         self._roots: set[Any] = set()
 
-    def take(self, prim: Any, predicate: Any) -> None:
+    def add_root(self, prim: Any, predicate: Any) -> None:
         """Take what a SkelRoot binds below it."""
         from pxr import UsdSkel
 
@@ -105,7 +106,7 @@ class BoundSkins:
         return skin
 
 
-def _bend(skeleton: Any, binding: Any, prim: Any, points: Any, time: Any) -> None:
+def _blend_shapes(skeleton: Any, binding: Any, prim: Any, points: Any, time: Any) -> None:
     """Move points by the blend shapes of an animation, which there may be."""
     from pxr import UsdSkel
 
@@ -114,10 +115,10 @@ def _bend(skeleton: Any, binding: Any, prim: Any, points: Any, time: Any) -> Non
     if not weights:
         return
     mapper = binding.GetBlendShapeMapper()
-    own = mapper.Remap(weights) if mapper else weights
+    shape_weights = mapper.Remap(weights) if mapper else weights
     shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
     shapes.ComputeDeformedPoints(
-        *shapes.ComputeSubShapeWeights(own),
+        *shapes.ComputeSubShapeWeights(shape_weights),
         shapes.ComputeBlendShapePointIndices(),
         shapes.ComputeSubShapePointOffsets(),
         points,

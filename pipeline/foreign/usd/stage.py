@@ -101,7 +101,7 @@ class OpenedUsd:
         more = len(notes) - MAX_NOTES
         return tuple(notes if more <= 0 else [*notes[:MAX_NOTES], f"and {more} more"])
 
-    def inside(self, layer: Any, asset_path: str) -> str | None:
+    def resolve(self, layer: Any, asset_path: str) -> str | None:
         """Return where USD finds a file that a layer names, or None where there is none.
 
         Raises:
@@ -119,9 +119,9 @@ class OpenedUsd:
             self._refuse(plain, ", a variable expression; expected a name. Write it out")
         with Ar.ResolverContextBinder(self._context):
             identifier = Sdf.ComputeAssetPathRelativeToLayer(layer, plain)
-            found = str(Ar.GetResolver().Resolve(identifier))
-        outer = file_and_member(found or identifier)[0]
-        if not found and not outer.is_absolute():
+            resolved = str(Ar.GetResolver().Resolve(identifier))
+        outer = file_and_member(resolved or identifier)[0]
+        if not resolved and not outer.is_absolute():
             return None  # looked for in several folders
         try:
             target = outer.resolve()
@@ -130,9 +130,9 @@ class OpenedUsd:
         member = file_and_member(plain)[1]
         if not target.is_relative_to(self.folder) or ".." in Path(member).parts:
             self._refuse(plain, ", which is outside of its folder; copy it there")
-        if found and not target.is_file():  # opening a FIFO would block forever
+        if resolved and not target.is_file():  # opening a FIFO would block forever
             self._refuse(plain, ", which is no plain file")
-        return found or None
+        return resolved or None
 
     def compose(self) -> Any:
         """Return the composed stage; all of its files have been checked.
@@ -145,7 +145,7 @@ class OpenedUsd:
 
         self._open_all()
         for error in composition_errors(self.root, self._context, self.path.name):
-            self._take(error)
+            self._note_error(error)
         stage = Usd.Stage.Open(self.root, self._context, Usd.Stage.LoadAll)
         for layer in stage.GetUsedLayers():
             real = file_and_member(layer.realPath)[0].resolve()
@@ -181,7 +181,7 @@ class OpenedUsd:
                 f"{self.path.name}: {clipped[0]} uses value clips, which are not read; bake them."
             )
 
-    def _take(self, error: Any) -> None:
+    def _note_error(self, error: Any) -> None:
         """Note what composition could not do; raises TrilightError where nothing can be read."""
         from pxr import Pcp
 
@@ -199,16 +199,16 @@ class OpenedUsd:
         """Return the layer that another one names, or None where it is missing (it is noted)."""
         from pxr import Sdf
 
-        found = self.inside(anchor, asset_path)
-        if found is None or Sdf.FileFormat.FindByExtension(found) is None:
-            why = "is missing" if found is None else "is no USD file"
+        resolved = self.resolve(anchor, asset_path)
+        if resolved is None or Sdf.FileFormat.FindByExtension(resolved) is None:
+            why = "is missing" if resolved is None else "is no USD file"
             note = f"file {asset_path!r:.100} {why}"
             if asset_path.endswith(_LOOKS):
                 self.lost.append(note)
             else:
                 self._miss(note)
             return None
-        return self._open(found)
+        return self._open(resolved)
 
     def _miss(self, note: str) -> None:
         self.lost.append(note)
@@ -275,7 +275,7 @@ def _check_package(path: Path, size: int) -> None:
 Read = TypeVar("Read")
 
 
-def quietly(path: Path, read: Callable[[], Read]) -> Read:
+def read_quietly(path: Path, read: Callable[[], Read]) -> Read:
     """Return what `read` makes of a file, without USD's own warnings on standard error.
 
     Raises:

@@ -21,7 +21,7 @@ _WRAPS = ("repeat", "mirror", "clamp", "black")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Move:
+class UvTransform:
     """A UsdTransform2d: scaled, turned counter-clockwise, and shifted, in this order."""
 
     scale: tuple[float, ...]
@@ -29,9 +29,10 @@ class Move:
     translation: tuple[float, ...]
 
     @property
-    def turn(self) -> NDArray[np.float64]:
+    def matrix(self) -> NDArray[np.float64]:
         """[2, 2] what scales and turns, for column vectors."""
-        cos, sin = np.cos(np.radians(self.rotation_deg)), np.sin(np.radians(self.rotation_deg))
+        cos = np.cos(np.radians(self.rotation_deg))
+        sin = np.sin(np.radians(self.rotation_deg))
         return np.array([[cos, -sin], [sin, cos]]) * self.scale
 
 
@@ -41,7 +42,7 @@ class UvChart:
 
     primvar: str
     """Name of the coordinates of the mesh."""
-    moves: tuple[Move, ...]
+    transforms: tuple[UvTransform, ...]
     """What moves them, the first one first."""
 
 
@@ -53,7 +54,7 @@ class TextureNode:
     """The file as the shader names it; empty where it names none."""
     resolved: str | None
     """Where that is, below the folder of the stage; None where it is missing."""
-    colour_space: str
+    color_space: str
     """`sRGB`, `raw`, or anything else for `auto`."""
     wrap: tuple[NodeWrap, NodeWrap]
     """Along s and t; `useMetadata` and what is unknown repeat."""
@@ -69,7 +70,7 @@ class TextureNode:
     """[4] what stands where there is no picture."""
 
 
-def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> TextureNode:
+def read_texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> TextureNode:
     """Return what a UsdUVTexture shader states.
 
     Args:
@@ -84,55 +85,58 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
     sources = find_sources(shader, "file")
     attribute = sources[0] if sources else None
     asset = attribute.Get(time) if attribute else None
-    named, resolved = "" if asset is None else asset.path, None
+    named = "" if asset is None else asset.path
+    resolved = None
     if attribute and named:
         specs = attribute.GetPropertyStack(time)
-        resolved = opened.inside(specs[0].layer if specs else opened.root, named)
+        resolved = opened.resolve(specs[0].layer if specs else opened.root, named)
     if "<UDIM>" in named:
         opened.lost.append(f"{shader.GetPath()}: {named!r:.100} has UDIM tiles, which are not read")
     for name in ("scale", "bias", "fallback"):
         if any(is_output(source) for source in find_sources(shader, name)):
             opened.lost.append(f"{shader.GetPath()}.{name}: a network that is not read")
-    fallback = value_of(shader, "fallback", time, None)
+    fallback = read_input(shader, "fallback", time, None)
     return TextureNode(
         named=named,
         resolved=resolved,
-        colour_space=str(value_of(shader, "sourceColorSpace", time, "auto")),
+        color_space=str(read_input(shader, "sourceColorSpace", time, "auto")),
         wrap=(_wrap(shader, "wrapS", time), _wrap(shader, "wrapT", time)),
         scale=np.array(_vector(shader, "scale", time, (1, 1, 1, 1)), np.float32),
         bias=np.array(_vector(shader, "bias", time, (0, 0, 0, 0)), np.float32),
-        chart=chart_of(shader, time, opened.lost),
+        chart=read_chart(shader, time, opened.lost),
         output=output if output in ("r", "g", "b", "a") else "rgb",
         fallback=None if fallback is None else np.array(fallback, np.float64),
     )
 
 
-def chart_of(shader: Any, time: Any, lost: list[str]) -> UvChart:
+def read_chart(shader: Any, time: Any, lost: list[str]) -> UvChart:
     """Return the coordinates of a texture's shader; `st` where it states none."""
     from pxr import UsdShade
 
-    sources, moves, primvar = find_sources(shader, "st"), list[Move](), "st"
+    sources = find_sources(shader, "st")
+    moves: list[UvTransform] = []
+    primvar = "st"
     for _ in range(_MOST_NODES):
         if not sources or not is_output(sources[0]):
             break
         node = UsdShade.Shader(sources[0].GetPrim())
         if node.GetIdAttr().Get() == "UsdTransform2d":
             moves.append(
-                Move(
+                UvTransform(
                     scale=_vector(node, "scale", time, (1, 1)),
                     rotation_deg=read_number(
-                        value_of(node, "rotation", time, 0), f"{node.GetPath()}.rotation"
+                        read_input(node, "rotation", time, 0), f"{node.GetPath()}.rotation"
                     ),
                     translation=_vector(node, "translation", time, (0, 0)),
                 )
             )
             sources = find_sources(node, "in")
             continue
-        primvar = str(value_of(node, "varname", time, primvar))
+        primvar = str(read_input(node, "varname", time, primvar))
         if node.GetIdAttr().Get() != "UsdPrimvarReader_float2":
             lost.append(f"{node.GetPath()}: not read; texture coordinates {primvar!r:.60} taken")
         break
-    return UvChart(primvar=primvar, moves=tuple(reversed(moves)))
+    return UvChart(primvar=primvar, transforms=tuple(reversed(moves)))
 
 
 def chart_corners(chart: UvChart, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
@@ -140,10 +144,10 @@ def chart_corners(chart: UvChart, cut: CutMesh, time: Any) -> NDArray[np.float64
 
     None where the mesh has none, or not for every corner.
     """
-    found = cut.read_primvar(chart.primvar, time)
-    if found is None or found.ndim != 3 or found.shape[2] < 2:
+    values = cut.read_primvar(chart.primvar, time)
+    if values is None or values.ndim != 3 or values.shape[2] < 2:
         return None
-    return np.asarray(found[..., :2], np.float64)
+    return np.asarray(values[..., :2], np.float64)
 
 
 def asset_bytes(resolved: str, max_bytes: int) -> bytes | None:
@@ -157,9 +161,9 @@ def asset_bytes(resolved: str, max_bytes: int) -> bytes | None:
     try:
         if member:
             with zipfile.ZipFile(outer) as archive:
-                found = archive.getinfo(member)
-                _require_size(found.file_size, max_bytes, name)
-                return archive.read(found)
+                info = archive.getinfo(member)
+                _require_size(info.file_size, max_bytes, name)
+                return archive.read(info)
         _require_size(outer.stat().st_size, max_bytes, name)
         return outer.read_bytes()
     except (OSError, KeyError, zipfile.BadZipFile):
@@ -186,7 +190,7 @@ def is_output(attribute: Any) -> bool:
     return bool(UsdShade.Output.IsOutput(attribute))
 
 
-def value_of(shader: Any, name: str, time: Any, default: Any) -> Any:
+def read_input(shader: Any, name: str, time: Any, default: Any) -> Any:
     """Return an input of a shader, or of its material; the default where it is not stated."""
     sources = find_sources(shader, name)
     value = sources[0].Get(time) if sources else None
@@ -194,10 +198,10 @@ def value_of(shader: Any, name: str, time: Any, default: Any) -> Any:
 
 
 def _wrap(shader: Any, name: str, time: Any) -> NodeWrap:
-    mode = str(value_of(shader, name, time, "repeat"))
+    mode = str(read_input(shader, name, time, "repeat"))
     return cast(NodeWrap, mode) if mode in _WRAPS else "repeat"
 
 
 def _vector(shader: Any, name: str, time: Any, default: tuple[float, ...]) -> tuple[float, ...]:
-    stated = value_of(shader, name, time, default)
+    stated = read_input(shader, name, time, default)
     return read_numbers(stated, len(default), f"{shader.GetPath()}.{name}")

@@ -310,11 +310,11 @@ def test_shades_of_public_reports(shared: Path) -> None:
             for face, share in enumerate(area / area.sum()):
                 material = parts.materials[parts.material[face]]
                 color = np.array(material.base_rgb)
-                if parts.colour is not None:
-                    color = color * parts.colour[face].mean(axis=0)
+                if parts.color is not None:
+                    color = color * parts.color[face].mean(axis=0)
                 if material.base is not None:
                     middle = parts.uv[face, 0].mean(axis=0)[None]
-                    color = color * material.base.picture.at(middle, np.zeros(1, int))[0, :3]
+                    color = color * material.base.picture.sample(middle, np.zeros(1, int))[0, :3]
                 found[tuple(np.round(color, 3).tolist())] += share
             assert dict(found) == pytest.approx(shades)
 
