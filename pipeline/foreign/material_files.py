@@ -84,7 +84,7 @@ class SourceFolder:
         is_uri: bool = False,
         extra_folders: Iterable[str] = (),
     ) -> MaterialFiles:
-        """Return files by name, at most `bytes_left` together; `extra_folders` are searched, too."""
+        """Return files by name, at most `bytes_left` in all; `extra_folders` are searched, too."""
         data: dict[str, bytes] = {}
         refused: dict[str, Rejected] = {}
         for name in dict.fromkeys(names):

@@ -260,7 +260,7 @@ def _read_planes(
 def _stretch(
     plane: NDArray[np.float32], first: int, count: int, sampling: int
 ) -> NDArray[np.float32]:
-    """Return rows of `count` coordinates from `first`, interpolated from multiples of `sampling`."""
+    """Return rows at `count` coordinates from `first`, interpolated between stored rows."""
     if sampling == 1:
         return plane
     at = np.arange(first, first + count) / sampling - math.ceil(first / sampling)

@@ -1,7 +1,7 @@
-"""Pictures from outside: decoded within limits, and looked up with the wrap of their format.
+"""Untrusted pictures: decoded within limits, and sampled with the wrap mode of their format.
 
-What a slot says of a picture counts, not what the picture says of itself: base colours are
-sRGB-encoded and roughness is linear, whatever profile or gamma the file names.
+The slot of a picture decides on its encoding, not the picture itself: base colors are sRGB-encoded
+and roughness is linear, whatever profile or gamma the file names.
 """
 
 import io
@@ -19,39 +19,38 @@ from storage.conventions import linear_from_srgb, linear_from_srgb8
 from storage.errors import Rejected
 
 Wrap = Literal["repeat", "clamp", "mirror", "black"]
-"""`black` is nothing beyond the picture, alpha included."""
+"""Wrap modes; `black` is 0 beyond the picture, alpha included."""
 
 FORMATS = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "TIFF")
-"""What is decoded; a file of another format is refused by its content."""
+"""Formats that are decoded; a file of another one is refused by its content."""
 
 UNREADABLE_PICTURE = (
     "it is cut off or damaged, or no PNG, JPEG, WebP, TGA, BMP, TIFF, OpenEXR or Radiance picture; "
     "write it again"
 )
-"""What records say of it, since they hold no word of a library."""
+"""Text that records hold for such a picture, since they never quote a library."""
 
-_STRIP = 256  # rows, an even number
+_STRIP = 256  # rows; an even number, since pairs of rows are averaged
 
 
 class Decoder:
-    """Decodes the pictures of one object, all together within a number of pixels."""
+    """Decodes the pictures of one object within a common bound of pixels."""
 
     def __init__(self, max_pixels: int) -> None:
-        """Begin with that many."""
         self._pixels_left = max_pixels
 
     def __call__(self, data: bytes, name: str) -> NDArray:
-        """Return `decoded`, within what is left."""
+        """Return `decode_picture` within the pixels that are left."""
         values = decode_picture(data, name, self._pixels_left)
         self._pixels_left -= values.shape[0] * values.shape[1]
         return values
 
 
 def decode_picture(data: bytes, name: str, max_pixels: int) -> NDArray:
-    """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 of greys of 16 bits.
+    """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 for grays of 16 bits.
 
-    Palettes, greys, transparency and CMYK become RGBA; colours of 16 bits are read to 8. OpenEXR
-    and Radiance are float16, cut to [0, 1].
+    Palettes, grays, transparency and CMYK become RGBA; colors of 16 bits are reduced to 8. OpenEXR
+    and Radiance are float16, clipped to [0, 1].
 
     Raises:
         Rejected: texture_too_large or texture_unreadable.
@@ -85,7 +84,7 @@ def decode_picture(data: bytes, name: str, max_pixels: int) -> NDArray:
 
 
 def has_colors(data: bytes) -> bool:
-    """Return whether a picture of 8 bits has colours: what USD takes as sRGB where nothing is said.
+    """Return whether a picture of 8 bits has colors, which USD assumes to be sRGB by default.
 
     False too for bytes that are no picture.
     """
@@ -124,24 +123,26 @@ class Picture:
     """Values in [0, 1] over texture coordinates, u to the right and v up."""
 
     values: NDArray
-    """[H, W, 4] as `decoded` returns them, or linear float32."""
+    """[H, W, 4] as `decode_picture` returns them, or linear float32."""
     is_srgb: bool
-    """Whether red, green and blue are sRGB-encoded; alpha never is."""
+    """True where red, green and blue are sRGB-encoded; alpha never is."""
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
-    """Along u and along v."""
+    """Wrap modes along u and v."""
     is_nearest: bool = False
-    """Whether texels are flat squares instead of being interpolated."""
+    """True where texels are flat squares instead of being interpolated."""
 
     @cached_property
     def _levels(self) -> list[NDArray[np.float32]]:
         return []
 
     def level(self, number: int) -> NDArray:
-        """Return the picture halved `number` times, in linear values from the first halving on."""
+        """Return the picture halved `number` times, linear from the first halving on."""
         if number == 0:
             return self.values
         if not self._levels:
-            rows = range(0, len(self.values), _STRIP)  # a large picture in floats is too much
+            rows = range(
+                0, len(self.values), _STRIP
+            )  # a whole large picture in floats takes too much memory
             strips = [_halve(self.linear(self.values[row : row + _STRIP])) for row in rows]
             self._levels.append(np.concatenate(strips))
         while len(self._levels) < number:
@@ -150,11 +151,11 @@ class Picture:
 
     @property
     def max_halvings(self) -> int:
-        """Until one texel is left."""
+        """Return the number of halvings until one texel is left."""
         return max(self.values.shape[:2]).bit_length() - 1
 
     def linear(self, texels: NDArray) -> NDArray[np.float32]:
-        """Return linear values of texels [..., 4] of the picture or of a level."""
+        """Return the linear values of texels [..., 4] of the picture or of a level."""
         if texels.dtype == np.float32:
             return texels
         if texels.dtype in (np.uint16, np.float16):
@@ -169,7 +170,7 @@ class Picture:
         return linear
 
     def sample(self, uv: NDArray[np.float64], halvings: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return linear values [N, 4] at coordinates [N, 2] of the picture halved so often."""
+        """Return linear values [N, 4] at coordinates [N, 2], each of the given halving."""
         values = np.zeros((len(uv), 4), np.float32)
         for number in np.unique(halvings):
             chosen = halvings == number
@@ -204,7 +205,7 @@ class Picture:
 
 
 def _halve(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return means of two by two texels; the last one stands alone where their number is odd."""
+    """Return means of two by two texels; the last row or column of an odd number stays alone."""
     for axis in (0, 1):
         count = values.shape[axis]
         if count > 1:

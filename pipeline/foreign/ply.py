@@ -1,4 +1,4 @@
-"""The mesh of a PLY, by its header: any elements, properties, types and lists, text or binary."""
+"""Reader of PLY meshes: any elements, properties, types and lists of a header, text or binary."""
 
 import re
 from collections import Counter
@@ -38,7 +38,7 @@ class _Property:
     name: str
     kind: np.dtype
     count: np.dtype | None = None
-    """Type of the number before a list."""
+    """Type of the count before a list; None for a single value."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,16 +51,16 @@ class _Element:
 @dataclass(frozen=True, kw_only=True)
 class _Header:
     order: Order | None
-    """Order of bytes; None of a text."""
+    """Byte order; None for text."""
     elements: Sequence[_Element]
     pictures: Sequence[str]
     size: int
-    """Bytes up to the data."""
+    """Bytes of the header, after which the data begin."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Lists:
-    """The values of a property that is a list, one list after the other."""
+    """The values of a list property, one list after the other."""
 
     values: NDArray
     counts: NDArray[np.int64]
@@ -164,7 +164,7 @@ Columns = Mapping[str, NDArray | _Lists]
 
 
 def _read_elements(data: bytes, header: _Header) -> tuple[dict[str, Columns], int]:
-    """Return the columns of each element, and how many bytes follow the last one."""
+    """Return the columns of each element, and the number of bytes or words after the last one."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     body = _Binary(data, header.order) if header.order else _Text(data[header.size :])
     columns: dict[str, Columns] = {}
@@ -178,7 +178,7 @@ def _read_elements(data: bytes, header: _Header) -> tuple[dict[str, Columns], in
 
 
 class _Text:
-    """The data of a text, by word."""
+    """The data of a text PLY, addressed by word."""
 
     def __init__(self, data: bytes) -> None:
         self.size = len(split_lines(data).words)
@@ -195,7 +195,7 @@ class _Text:
 
 
 class _Binary:
-    """Binary data, by byte."""
+    """The data of a binary PLY, addressed by byte."""
 
     def __init__(self, data: bytes, order: Order) -> None:
         self.size = len(data)
@@ -217,7 +217,7 @@ class _Binary:
 
 
 def _read_rows(body: _Text | _Binary, element: _Element, at: int) -> tuple[Columns, int]:
-    """Return the columns of an element whose rows begin at a place, and where they end."""
+    """Return the columns of an element whose rows begin at position `at`, and their end."""
     widths = [body.width(one.count or one.kind) for one in element.properties]
     if element.rows * sum(widths) > body.size - at:
         raise Rejected(
@@ -245,7 +245,7 @@ def _read_rows(body: _Text | _Binary, element: _Element, at: int) -> tuple[Colum
 def _place_rows(
     body: _Text | _Binary, element: _Element, at: int, lengths: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Return where each property [rows, P] begins, and where the last one ends."""
+    """Return the start of each property [rows, P], and the end of the last one."""
     steps = np.zeros((element.rows, len(element.properties)), np.int64)
     lists = iter(lengths.T)
     for column, one in enumerate(element.properties):
@@ -256,7 +256,7 @@ def _place_rows(
 
 
 def _list_lengths(body: _Text | _Binary, element: _Element, at: int) -> NDArray[np.int64]:
-    """Return the lengths [rows, L] of lists: those of the first row, where all rows agree."""
+    """Return the lengths [rows, L] of lists, without walking the rows where all are equal."""
     lists = [k for k, one in enumerate(element.properties) if one.count is not None]
     if not lists or not element.rows:
         return np.zeros((element.rows, len(lists)), np.int64)
@@ -272,7 +272,7 @@ def _list_lengths(body: _Text | _Binary, element: _Element, at: int) -> NDArray[
 
 
 def _walk_lists(body: _Text | _Binary, element: _Element, at: int, rows: int) -> NDArray[np.int64]:
-    """Return the lengths [rows, L] of lists, row by row."""
+    """Return the lengths [rows, L] of lists, read row by row."""
     steps: list[tuple[int, np.dtype, int]] = []
     skipped = 0
     for one in element.properties:
@@ -295,18 +295,18 @@ def _walk_lists(body: _Text | _Binary, element: _Element, at: int, rows: int) ->
 
 
 class _ColumnReader:
-    """Reads columns and notes what was read."""
+    """Reads columns and records which were read."""
 
     def __init__(self) -> None:
         self._read: set[tuple[str, str]] = set()
         self.notes = Counter[str]()
 
     def note(self, text: str) -> None:
-        """Add a sentence."""
+        """Add a sentence to the notes."""
         self.notes[text] = 1
 
     def take(self, columns: Columns, element: str, *names: str) -> list[NDArray] | None:
-        """Return single values by their names; None where one is missing."""
+        """Return columns of single values by name; None where one is missing."""
         values = [columns.get(name) for name in names]
         if not all(isinstance(value, np.ndarray) for value in values):
             return None
@@ -314,7 +314,7 @@ class _ColumnReader:
         return [value for value in values if isinstance(value, np.ndarray)]
 
     def take_lists(self, columns: Columns, element: str, *names: str) -> _Lists | None:
-        """Return the first list of these names."""
+        """Return the first list column among these names."""
         for name in names:
             if isinstance(values := columns.get(name), _Lists):
                 self._read.add((element, name))
@@ -322,7 +322,7 @@ class _ColumnReader:
         return None
 
     def unread(self, elements: Mapping[str, Columns]) -> tuple[str, ...]:
-        """Return sentences on what nothing has read."""
+        """Return sentences on elements and properties that were not read."""
         for element, columns in elements.items():
             if element not in ("vertex", "face", "tristrips"):
                 self.note(f"element {element[:24]!r}")
@@ -345,7 +345,7 @@ def _read_polygons(reader: _ColumnReader, columns: Columns, element: str) -> _Li
 
 
 def _cut_strips(strips: _Lists) -> NDArray[np.int64]:
-    """Return the triangles [T, 3] of strips; -1 begins another one, every second is turned."""
+    """Return the triangles [T, 3] of strips; -1 starts a new strip, every second one is flipped."""
     values = strips.values.astype(np.int64)
     piece = np.repeat(np.arange(len(strips.counts)), strips.counts) + np.cumsum(values == -1)
     is_vertex = values != -1

@@ -1,4 +1,4 @@
-"""Polygons as triangles: fans where they are convex, cut-off ears where they are not."""
+"""Triangulation of polygons: fans where they are convex, ear clipping where they are not."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from storage.errors import Rejected
 
 _MOST_FROM_START = 2000
-"""Corners of a polygon up to which the first ear is cut; later ones serve in larger polygons."""
+"""Corners of a polygon up to which the first ear is cut; larger ones continue after the last."""
 
 
 def check_indices(indices: NDArray[np.int64], count: int, first: int = 0) -> None:
-    """Raise Rejected for an index of none of `count` vertices; the file counts from `first`."""
+    """Raise Rejected for an index beyond `count` vertices; messages count from `first`."""
     if len(indices) and not (0 <= indices.min() and indices.max() < count):
         bad = first + (indices.min() if indices.min() < 0 else indices.max())
         raise Rejected("index_range", f"a face names vertex {bad} of {count} from {first} on")
@@ -24,16 +24,16 @@ class CutPolygons:
     """The triangles of a file's polygons."""
 
     corners: NDArray[np.int64]
-    """[T, 3] places within the indices of the polygons."""
+    """[T, 3] positions within the indices of the polygons."""
     owner: NDArray[np.int64]
-    """[T] polygon of each."""
+    """[T] polygon of each triangle."""
     vertices: NDArray[np.int64]
     """[T, 3] rows of the points."""
 
     def spread_colors(
         self, by_vertex: NDArray[np.float64] | None, by_face: NDArray[np.float64] | None
     ) -> NDArray[np.float64] | None:
-        """Return colors [T, 3, 3] of corners: of vertices [V, 3], or else of polygons [F, 3]."""
+        """Return colors [T, 3, 3] at corners: of vertices [V, 3], or else of polygons [F, 3]."""
         if by_vertex is not None:
             return by_vertex[self.vertices]
         return None if by_face is None else np.repeat(by_face[self.owner][:, None], 3, axis=1)
@@ -45,7 +45,7 @@ def cut_polygons(
     indices: NDArray[np.int64],
     unread: Counter[str],
 ) -> CutPolygons:
-    """Cut polygons into triangles; arguments as of `triangulate`, and what is not read.
+    """Cut polygons into triangles; arguments as for `triangulate`, and the counter of unread parts.
 
     Raises:
         Rejected: index_range.
@@ -103,7 +103,7 @@ def sort_by_size(
 
     Args:
         corners: [T, 3], as `triangulate` returns them.
-        owner: [T] polygon of each.
+        owner: [T] polygon of each triangle.
         counts: [F] corners of each polygon.
         group: [F]; within one, triangles come first, then the halves of four corners, each half
             together, then the others. A negative group keeps the order of its polygons.
@@ -119,16 +119,16 @@ def sort_by_size(
 
 
 def _is_folded(fans: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return for fans [F, N, 3, 3] whether a triangle faces away from its polygon."""
+    """Return whether a triangle of each fan [F, N, 3, 3] faces away from its polygon."""
     cross = np.cross(fans[:, :, 1] - fans[:, :, 0], fans[:, :, 2] - fans[:, :, 0])
     facing = np.einsum("fni,fi->fn", cross, cross.sum(axis=1))
     return np.asarray((facing < 0).any(axis=1))
 
 
 def _cut_ears(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the triangles [N - 2, 3] of one polygon [N, 3], by cutting off ears.
+    """Return the triangles [N - 2, 3] of one polygon [N, 3] by ear clipping.
 
-    A corner that touches the polygon again, as where a cut leads to a hole, blocks no ear.
+    A corner at the position of another one, as where a cut leads to a hole, blocks no ear.
     """
     flat = _project_to_plane(points)
     x = flat[:, 0].copy()
@@ -152,7 +152,7 @@ def _cut_ears(points: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _project_to_plane(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a polygon [N, 2] in the plane of its normal, counter-clockwise."""
+    """Return a polygon [N, 2] projected along an axis near its normal, counter-clockwise."""
     points = points - points[0]
     normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
     axis = int(np.argmax(np.abs(normal)))
@@ -169,7 +169,7 @@ def _is_ear(
     b: int,
     c: int,
 ) -> bool:
-    """Return whether no other corner that is left lies within the triangle of three."""
+    """Return whether no other uncut corner lies within the triangle of `a`, `b` and `c`."""
 
     def cross(i: int, j: int) -> NDArray[np.float64]:
         return (x[j] - x[i]) * (y - y[i]) - (y[j] - y[i]) * (x - x[i])

@@ -1,6 +1,6 @@
 """Radiance pictures (`.hdr`, `.pic`, RGBE) as linear radiance in Rec.709.
 
-Decoded here because the readers at hand will not do: Mitsuba's writes beyond its memory for a file
+It is decoded here because no other reader serves: Mitsuba's writes beyond its memory for a file
 whose rows are damaged, and Pillow has none. A value is mantissa / 256 x 2^(exponent - 128), divided
 by the product of all EXPOSURE and COLORCORR lines.
 """
@@ -17,35 +17,35 @@ from pipeline.foreign.numbers import Malformed, parse_number
 from storage.errors import Rejected
 
 MAGIC = b"#?"
-"""First bytes of a file."""
+"""First bytes of a Radiance file."""
 
 _MOST_HEADER = 1 << 16
 _SIZE = re.compile(rb"([-+])([XY])\s+(\d{1,6})\s+([-+])([XY])\s+(\d{1,6})\s*")
 _VARIABLE = re.compile(rb"\s*([A-Z]+)\s*=\s*(.*?)\s*")
 _SHORTEST = 8
 _LONGEST = 32767
-"""Widths between which rows may have run lengths."""
+"""Widths of rows within which they may be run-length encoded."""
 _LONG_RUN = 128
 _RADIANCE = (0.640, 0.330, 0.290, 0.600, 0.150, 0.060, 0.3333, 0.3333)
-"""Primaries of files that state none; all programs show them as Rec.709, stated or not."""
+"""Default primaries of the format; all programs show them as Rec.709, stated or not."""
 _SAYS_NOTHING = frozenset("SOFTWARE OWNER CAPDATE GMT INSTRUMENT LATLONG DATE".split())
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Header:
-    """What stands before the pixels."""
+    """The header, which precedes the pixels."""
 
     rows: int
-    """Scanlines, as they are stored."""
+    """Number of scanlines in the file."""
     columns: int
     is_column_major: bool
-    """Whether a scanline is a column."""
+    """True where a scanline is a column."""
     flips: tuple[bool, bool]
-    """Whether rows go up, and columns to the left, once scanlines are rows."""
+    """True for rows that go up, and for columns to the left, once scanlines are rows."""
     start: int
-    """Where the pixels begin."""
+    """Offset of the first pixel in bytes."""
     factors: NDArray[np.float64]
-    """[3] by which the values were multiplied."""
+    """[3] factors of the stored values, which are divided out."""
     primaries: tuple[float, ...]
     unread: tuple[str, ...]
 
@@ -55,8 +55,8 @@ def read_radiance_hdr(data: bytes, max_pixels: int, *, is_color: bool = True) ->
 
     Args:
         data: the file.
-        max_pixels: most pixels; known before memory is taken.
-        is_color: whether its numbers are colors, so that its primaries count.
+        max_pixels: maximum number of pixels, checked before memory is allocated.
+        is_color: whether its numbers are colors, which its primaries apply to.
 
     Raises:
         Rejected: not_hdr, too_many_pixels, load_error.
@@ -123,7 +123,7 @@ def _read_header(data: bytes) -> _Header:
 
 
 def _header_lines(data: bytes) -> tuple[list[bytes], bytes, int]:
-    """Return the lines before the empty one, the line of the size, and where the pixels begin."""
+    """Return the header lines, the line of the size, and the offset of the pixels."""
     if not data.startswith(MAGIC):
         raise Rejected("not_hdr", "it does not begin as a Radiance picture (#?); write it again")
     lines: list[bytes] = []
@@ -140,7 +140,7 @@ def _header_lines(data: bytes) -> tuple[list[bytes], bytes, int]:
 def _variables(lines: Sequence[bytes]) -> Iterator[tuple[str, str]]:
     for line in lines:
         match = None if line.startswith(b"#") else _VARIABLE.fullmatch(line)
-        if match is not None:  # all others are comments, or commands that made the picture
+        if match is not None:  # other lines are comments, or commands that made the picture
             yield match[1].decode(), match[2].decode("latin-1")
 
 
@@ -155,7 +155,7 @@ def _parse_numbers(text: str, count: int, name: str) -> NDArray[np.float64]:
 
 
 def _decode_texels(data: bytes, start: int, rows: int, columns: int) -> NDArray[np.uint8]:
-    """Return [H, W, 4] mantissas and exponent."""
+    """Return mantissas and exponents [H, W, 4]."""
     texels = np.zeros((rows, columns, 4), np.uint8)
     at = start
     mark = bytes([2, 2, columns >> 8 & 255, columns & 255])
@@ -174,7 +174,7 @@ def _decode_texels(data: bytes, start: int, rows: int, columns: int) -> NDArray[
 
 
 def _decode_runs(data: bytes, at: int, row: NDArray[np.uint8]) -> int:
-    """Fill a row [W, 4] from its run lengths, and return where they end."""
+    """Fill a row [W, 4] from run lengths, and return the offset of their end."""
     width = len(row)
     for channel in range(4):
         done = 0
@@ -194,7 +194,7 @@ def _decode_runs(data: bytes, at: int, row: NDArray[np.uint8]) -> int:
 
 
 def _decode_old_runs(data: bytes, at: int, row: NDArray[np.uint8]) -> int:
-    """Fill a row [W, 4] of plain texels and runs of the old kind, and return where they end.
+    """Fill a row [W, 4] from plain texels and old-style runs, and return the offset of their end.
 
     A texel (1, 1, 1, n) repeats the last one n times, and 256 n times where it follows a run.
     """

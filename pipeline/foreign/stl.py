@@ -1,4 +1,4 @@
-"""The mesh of an STL: binary of the length that it counts, or text in which white space is free."""
+"""Reader of STL meshes: binary of the stated length, or text with any white space."""
 
 import re
 from collections import Counter
@@ -18,7 +18,7 @@ _AROUND_LOOP = re.compile(rb"facet(?:\s+normal(?:\s+(?!endfacet)\S+){0,3})?\s+en
 _ENDS = re.compile(rb"(?m)^([ \t]*)end[ \t]+(?=(?:facet|loop|solid)\b)")
 _WORDS = {b"facet", b"outer", b"loop", b"vertex"}
 _MOST_INDENT = 4096
-"""Bytes that are looked at before a solid begins or ends."""
+"""Bytes that are searched before the word that begins or ends a solid."""
 
 
 def read_stl(data: bytes) -> FileMesh:
@@ -64,7 +64,7 @@ def _build_mesh(corners: np.ndarray) -> TriangleMesh:
 
 
 def _strip_names(text: bytes) -> tuple[bytes, bool]:
-    """Return a text without what begins and ends solids, and whether each of them ends.
+    """Return a text without the lines that begin and end solids, and whether all solids end.
 
     The name of a solid goes to the end of its line, or to a facet on the same line.
     """

@@ -1,4 +1,4 @@
-"""The JSON and the binary chunk of a glTF, and what its URIs name."""
+"""The JSON and the binary chunk of a glTF, and the data of its URIs."""
 
 import base64
 import json
@@ -16,7 +16,7 @@ _MAX_JSON_BYTES = 64_000_000
 _HEADER = struct.Struct("<4sII")
 _CHUNK = struct.Struct("<I4s")
 _BASE64 = bytes.maketrans(b"-_", b"+/")
-"""From the base64 of URLs to that of files."""
+"""Translation from URL-safe base64 to the standard alphabet."""
 
 
 def read_container(data: bytes, suffix: str) -> tuple[dict[str, Any], memoryview | None]:
@@ -51,7 +51,7 @@ def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
 
 
 def _split(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield kind and bytes of each chunk; kinds that nobody knows are legal."""
+    """Yield kind and bytes of each chunk; unknown kinds are legal."""
     start = _HEADER.size
     while start + _CHUNK.size <= len(data):
         size, kind = _CHUNK.unpack_from(data, start)
@@ -105,7 +105,7 @@ def _version_error(version: str) -> Rejected:
 
 
 def data_uri_bytes(uri: str) -> bytes:
-    """Return what a data: URI of any media type holds; raises Malformed where it is no base64."""
+    """Return the bytes of a data: URI of any media type; raises Malformed without a comma."""
     head, comma, body = uri.partition(",")
     if not comma:
         raise Malformed(f"the URI {uri!r:.40} has no data")
@@ -122,7 +122,7 @@ def is_data_uri(uri: str) -> bool:
 
 
 def local_path(uri: str, folder: Path) -> Path:
-    """Return the file below a folder that a relative URI names, escaped or as it is.
+    """Return the file below a folder that a relative URI names, percent-encoded or not.
 
     Raises:
         Rejected: external_uri or missing_file.

@@ -26,16 +26,16 @@ from storage.errors import Rejected, TrilightError
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _PADDING = 3
-"""Bytes by which a buffer may be shorter than stated: exporters count its padding."""
+"""Bytes by which a buffer may be shorter than stated, since exporters count its padding."""
 _MOST_REPLACED = 1 << 23
-"""Most values of a sparse accessor, which are copied."""
+"""Maximum number of values of a sparse accessor, since they are copied."""
 
 Rows = NDArray[np.int64] | slice
 
 
 @contextmanager
 def refuse_malformed(reason: str, subject: str) -> Iterator[None]:
-    """Turn what Python says of a tree that keeps no law of its format into Rejected."""
+    """Turn Python's errors about a malformed tree into Rejected."""
     try:
         yield
     except Malformed as error:
@@ -51,18 +51,18 @@ def refuse_malformed(reason: str, subject: str) -> Iterator[None]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GltfDocument:
-    """One file with its buffers."""
+    """The JSON of a glTF file with its buffers and pictures."""
 
     tree: dict[str, Any]
-    """Its JSON."""
+    """Parsed JSON of the file."""
     binary: memoryview | None
-    """The binary chunk of a GLB."""
+    """Binary chunk of a GLB; None without one."""
     buffers: Mapping[str, bytes]
-    """Files that its buffers name, by URI."""
+    """Contents of the files that buffers name, by URI."""
     pictures: MaterialFiles
-    """Files that its images name; empty where they are not kept."""
+    """Contents of the files that images name; empty where limits exclude materials."""
     unread: tuple[str, ...]
-    """What it says and no code reads, as short sentences."""
+    """Short sentences on contents of the file that are not read."""
     _embedded: dict[str, bytes] = field(default_factory=dict)
 
     def values(
@@ -71,10 +71,10 @@ class GltfDocument:
         """Return rows [N, K] of an accessor; integers as fractions where they are normalized.
 
         Args:
-            index: its number.
-            widths: how many components K may be.
-            rows: which of its values.
-            is_unit: whether integers are fractions; as the accessor says by default.
+            index: index of the accessor.
+            widths: allowed numbers of components K.
+            rows: rows to return.
+            is_unit: whether integers are fractions; as the accessor states by default.
 
         Raises:
             Rejected: cut_off, unsupported_accessor, load_error.
@@ -93,7 +93,7 @@ class GltfDocument:
         return result
 
     def indices(self, index: Any) -> NDArray[np.int64]:
-        """Return an accessor of vertices [N]."""
+        """Return an accessor of vertex indices [N]."""
         elements = self._elements(index)
         if elements.shape[1] != 1 or elements.dtype.kind != "u":
             raise Malformed(f"indices are of type {elements.dtype} x {elements.shape[1]}")
@@ -104,7 +104,7 @@ class GltfDocument:
         return read_count(self._accessor(index), "count")
 
     def instances(self, placed: PlacedNode) -> NDArray[np.float64]:
-        """Return the places [N, 4, 4] of the mesh of a node."""
+        """Return the matrices [N, 4, 4] of all instances of a node's mesh."""
         attributes = extension(placed.node, INSTANCING).get("attributes", {})
         if not attributes:
             return placed.to_world[None]
@@ -121,7 +121,7 @@ class GltfDocument:
         return np.einsum("ij,njk->nik", placed.to_world, transforms(*components))
 
     def picture_bytes(self, image: Mapping[str, Any]) -> bytes:
-        """Return the file of an image; raises Rejected where it is not there."""
+        """Return the bytes of an image; raises Rejected where its file is missing."""
         if "bufferView" in image:
             return bytes(self._view(image["bufferView"]))
         uri = image["uri"]
@@ -131,7 +131,7 @@ class GltfDocument:
         return entry(self.tree, "accessors", index)
 
     def _elements(self, index: Any) -> NDArray:
-        """Return the values [N, K] of an accessor as they are stored; zeros where nothing is."""
+        """Return the stored values [N, K] of an accessor; zeros without a buffer view."""
         accessor = self._accessor(index)
         code = accessor["componentType"]
         kind = accessor["type"]
@@ -148,7 +148,7 @@ class GltfDocument:
         return self._replace_sparse(values, accessor["sparse"]) if "sparse" in accessor else values
 
     def _replace_sparse(self, values: NDArray, sparse: Mapping[str, Any]) -> NDArray:
-        """Return values with those that a sparse accessor replaces."""
+        """Return a copy of values with those of a sparse accessor replaced."""
         count = read_count(sparse, "count")
         sparse_indices = sparse["indices"]
         sparse_values = sparse["values"]
@@ -212,15 +212,15 @@ def open_gltf(
     limits: ReadLimits,
     read: ReadFile,
 ) -> GltfDocument:
-    """Return a glTF with its buffers, and with its pictures where the limits say so.
+    """Return a glTF with its buffers, and with its pictures where the limits include materials.
 
     Args:
         data: the file.
-        suffix: of its name, `.glb` or `.gltf`.
-        folder: of the file; no buffer outside of it is read.
-        files: reads pictures.
-        limits: bound what is read.
-        read: reads a regular file of at most so many bytes.
+        suffix: suffix of its name, `.glb` or `.gltf`.
+        folder: folder of the file; no buffer outside of it is read.
+        files: reader of picture files.
+        limits: bounds of what is read.
+        read: function that reads a regular file of at most so many bytes.
 
     Raises:
         Rejected: as `read_container`, `check_tree`, and of a buffer external_uri or missing_file.

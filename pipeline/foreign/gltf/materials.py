@@ -1,6 +1,7 @@
 """Materials of a glTF as `SourceMaterial`, for objects and for scenes.
 
-A picture counts as its slot says: base and specular colors are sRGB-encoded, all else is linear.
+The slot of a picture decides on its encoding: base and specular colors are sRGB-encoded, all other
+slots are linear.
 """
 
 import dataclasses
@@ -18,18 +19,18 @@ from pipeline.foreign.picture import Picture, Wrap
 from storage.errors import Rejected
 
 DEFAULT = SourceMaterial(metallic=1.0)
-"""What glTF says of a mesh without a material."""
+"""Material that glTF defines for a mesh without one."""
 
 _WRAPS: Mapping[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
 _MOST_EMISSION = 1e9
 
 Decode = Callable[[bytes, str], NDArray]
-"""Returns the values of a picture's bytes; its name is for messages."""
+"""Function that returns the values of a picture's bytes; the name is for messages."""
 
 
 class GltfMaterials:
-    """Reads the materials of one glTF, each picture once."""
+    """Reads the materials of one glTF, decoding each picture once."""
 
     def __init__(
         self,
@@ -39,13 +40,13 @@ class GltfMaterials:
         emission: bool = False,
         notes: list[str] | None = None,
     ) -> None:
-        """Read nothing yet.
+        """Store the arguments; materials are read on demand.
 
         Args:
             document: the file.
-            decode: what makes values of the bytes of a picture.
-            emission: whether what emits is read too.
-            notes: receives what cannot be read, which is then left out; without it that is refused.
+            decode: returns the values of a picture's bytes.
+            emission: whether emission is read, too.
+            notes: receives sentences on parts that are left out; None refuses the file for these.
         """
         self._document = document
         self._tree = document.tree
@@ -56,7 +57,7 @@ class GltfMaterials:
         self._known: dict[int, SourceMaterial] = {}
 
     def used_materials(self) -> dict[int, SourceMaterial]:
-        """Return the materials that any mesh has, by number.
+        """Return the materials that meshes use, by index.
 
         Raises:
             Rejected: as reading a picture.
@@ -80,7 +81,7 @@ class GltfMaterials:
         return self._with_emission(dataclasses.replace(material, lost=_list_unsupported(row)), row)
 
     def _unlit(self, row: Mapping[str, Any]) -> SourceMaterial:
-        """Return a diffuse surface of the base color: what shows it as it is in even light."""
+        """Return a diffuse surface of the base color, which looks unlit under uniform light."""
         metal = row.get("pbrMetallicRoughness", {})
         return SourceMaterial(
             base_rgb=self._rgb(metal, "baseColorFactor", 4),
@@ -120,7 +121,7 @@ class GltfMaterials:
         )
 
     def _with_emission(self, material: SourceMaterial, row: Mapping[str, Any]) -> SourceMaterial:
-        """Return a material with what it emits, where that is read."""
+        """Return a material with its emission, where emission is read."""
         if not self._emission:
             return material
         strength = extension(row, "KHR_materials_emissive_strength")
@@ -193,7 +194,7 @@ class GltfMaterials:
     def _numbers(
         self, row: Mapping[str, Any], name: str, default: tuple[float, ...], most: float
     ) -> list[float]:
-        """Return factors within [0, `most`]; the default, with a note, where they are none."""
+        """Return factors clamped to [0, `most`]; malformed ones become the default, with a note."""
         try:
             factors = [*read_numbers(row.get(name, default), len(default), name)]
             if most > 1 and max(factors) > most and self._notes is None:
@@ -210,7 +211,7 @@ class GltfMaterials:
 
 
 def _list_unsupported(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what a material says beyond what is read of it."""
+    """Return words for stated features that are not read."""
     extensions = row.get("extensions", {})
     unsupported = {
         "emission": any(row.get("emissiveFactor", ())),
@@ -225,9 +226,9 @@ def _list_unsupported(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _uv_transform(transform: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the turn and shift of KHR_texture_transform for coordinates with v up.
+    """Return the matrix [2, 2] and offset [2] of KHR_texture_transform for coordinates with v up.
 
-    The extension says (u, w)' = shift + R S (u, w) with w down, and w = 1 - v.
+    The extension defines (u, w)' = shift + R S (u, w) with w down, and w = 1 - v.
     """
     angle = read_number(transform.get("rotation", 0), "rotation")
     scale = read_numbers(transform.get("scale", (1, 1)), 2, "scale")

@@ -1,4 +1,4 @@
-"""A glTF as an object: all triangles that its scene shows, alone or with their materials."""
+"""A glTF as an object: all triangles of its scene, alone or with their materials."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ from storage.errors import Rejected
 
 
 def gltf_mesh(document: GltfDocument) -> TriangleMesh:
-    """Return the triangles of a file in metres, +Z up.
+    """Return the triangles of a file in meters, +Z up.
 
     Raises:
         Rejected: load_error, index_range, no_faces, cut_off, unsupported_accessor.

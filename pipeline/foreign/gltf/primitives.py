@@ -1,4 +1,4 @@
-"""The triangles of a glTF primitive, in the axes of its node."""
+"""The triangles of a glTF primitive, in the space of its node or of the world."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from storage.errors import Rejected
 
 
 class GltfPrimitive:
-    """The triangles of a primitive; morph targets shape it as its weights say."""
+    """The triangles of a primitive, deformed by its weighted morph targets."""
 
     def __init__(
         self, document: GltfDocument, primitive: dict[str, Any], weights: Sequence[float]
@@ -37,15 +37,17 @@ class GltfPrimitive:
         self.faces = _faces(order, primitive.get("mode", TRIANGLES))
         """[T, 3] rows of `positions`."""
         self._rows: Rows = slice(None)
-        if count > self.faces.size:  # so that sharing a large accessor costs nothing
+        if (
+            count > self.faces.size
+        ):  # primitives that share a large accessor each read only their own rows
             self._rows, faces = np.unique(self.faces, return_inverse=True)
             self.faces = faces.reshape(-1, 3)
         self.positions = self._read_attribute("POSITION", (3,))
-        """[V, 3]"""
+        """[V, 3] in the space of the node."""
 
     @property
     def material(self) -> int | None:
-        """Row of the file's materials; None is glTF's default material."""
+        """Return the index of the material; None is glTF's default material."""
         number = self._primitive.get("material")
         if number is not None:
             entry(self._document.tree, "materials", number)
@@ -77,7 +79,7 @@ class GltfPrimitive:
     def _read_attribute(
         self, name: str, widths: tuple[int, ...], *, is_unit: bool | None = None
     ) -> NDArray[np.float64]:
-        """Return an attribute [V, K] of the vertices, with what morph targets add to it."""
+        """Return an attribute [V, K] of the vertices, with weighted morph targets added."""
         number = self._primitive["attributes"][name]
         values = self._document.values(number, widths, self._rows, is_unit=is_unit)
         targets = self._primitive.get("targets", ())
@@ -90,10 +92,10 @@ class GltfPrimitive:
 
 
 class PlacedPrimitive:
-    """A primitive in one of its places; a mirrored one has its corners in the other order."""
+    """An instance of a primitive; corners of a mirrored one have the reverse order."""
 
     def __init__(self, primitive: GltfPrimitive, to_world: NDArray[np.float64]) -> None:
-        """Place its vertices by a matrix [4, 4]."""
+        """Transform its vertices by a matrix [4, 4]."""
         self.primitive = primitive
         linear = to_world[:3, :3]
         with np.errstate(invalid="ignore", over="ignore"):
@@ -101,7 +103,7 @@ class PlacedPrimitive:
             world = np.einsum("ij,vj->vi", linear, primitive.positions) + to_world[:3, 3]
             self._cofactors = np.cross(linear[[1, 2, 0]], linear[[2, 0, 1]]) * self._winding
         self.positions: NDArray[np.float64] = world
-        """[V, 3]"""
+        """[V, 3] in world space."""
         self.faces = primitive.faces[:, :: self._winding]
         """[T, 3] rows of `positions`."""
 
@@ -127,7 +129,7 @@ class PlacedPrimitive:
 
 
 def placed_primitives(document: GltfDocument, placed: PlacedNode) -> Iterator[PlacedPrimitive]:
-    """Yield what has triangles of the mesh of a node, in each of its places."""
+    """Yield the primitives of a node's mesh that have triangles, once for each instance."""
     mesh = entry(document.tree, "meshes", placed.node["mesh"])
     weights = placed.node.get("weights", mesh.get("weights", ()))
     primitives = [

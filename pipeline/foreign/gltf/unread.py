@@ -1,4 +1,4 @@
-"""What a glTF says and no code here reads, as short sentences, each once a file."""
+"""Short sentences on contents of a glTF that no code here reads, each once a file."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -13,13 +13,13 @@ _CHANGES_NOTHING = frozenset(
     "EXT_structural_metadata FB_geometry_metadata GODOT_single_root KHR_animation_pointer "
     "KHR_node_hoverability KHR_node_selectability KHR_xmp KHR_xmp_json_ld MSFT_lod".split()
 )
-"""Metadata, ways to animate, and coarser copies of what the scene shows."""
+"""Extensions for metadata, animation, and coarser copies of meshes."""
 _NAMED_ELSEWHERE = frozenset(
     "EXT_meshopt_compression KHR_draco_mesh_compression KHR_meshopt_compression "
     "KHR_materials_anisotropy KHR_materials_clearcoat KHR_materials_iridescence "
     "KHR_materials_sheen KHR_materials_transmission".split()
 )
-"""Compression beside plain data, which is read; and what `SourceMaterial.lost` names."""
+"""Compression beside plain data, which is read, and features that `SourceMaterial.lost` names."""
 
 _KEYS: Mapping[str, str] = {
     "the file": "asset scene scenes nodes meshes accessors bufferViews buffers materials textures "
@@ -32,22 +32,22 @@ _KEYS: Mapping[str, str] = {
     "emissiveFactor alphaMode alphaCutoff doubleSided",
     "accessors": "bufferView byteOffset componentType normalized count type max min sparse name",
 }
-"""The keys of glTF 2.0 by the list that they are in."""
+"""Keys of glTF 2.0 by the list that holds them."""
 
 _ATTRIBUTES: Mapping[str, tuple[str, ...]] = {
     "primitives": ("POSITION", "NORMAL", "TANGENT", "COLOR_0", "TEXCOORD_", "JOINTS_", "WEIGHTS_"),
     "nodes, EXT_mesh_gpu_instancing": ("TRANSLATION", "ROTATION", "SCALE"),
 }
-"""How the attributes begin that are read, or that only skins have."""
+"""Prefixes of attributes that are read, or that only skins have."""
 
 
 def is_known(name: str) -> bool:
-    """Return whether an extension is read here, or changes no triangle, color or light."""
+    """Return whether an extension is read, or changes no triangle, color or light."""
     return name in _READ or name in _CHANGES_NOTHING
 
 
 def list_unread_parts(tree: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what no code reads; a file that is malformed is refused elsewhere."""
+    """Return sentences on contents that no code reads; malformed files are refused elsewhere."""
     extensions: dict[str, str] = {}
     sentences: dict[str, None] = {}
     for kind, row in _rows(tree):
@@ -67,7 +67,7 @@ def list_unread_parts(tree: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _rows(tree: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield every object of a tree but those of `extras`, with the list that it is in."""
+    """Yield every JSON object of a tree outside of `extras`, with the name of its list."""
     waiting: list[tuple[str, Any]] = [("the file", tree)]
     while waiting:
         kind, value = waiting.pop()
@@ -84,7 +84,7 @@ def _rows(tree: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _list_unread(kind: str, row: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what is not read of one object of the tree, but for its extensions."""
+    """Yield sentences on one JSON object of the tree, its extensions excluded."""
     if "extras" in row:
         yield f"extras of {kind}"
     if kind in _KEYS:

@@ -1,10 +1,10 @@
-"""How large a stage becomes: its prims are composed one by one, and counted, before it is opened.
+"""Bounds of the size of a stage: its prims are composed and counted before it is opened.
 
 References, payloads, inherits and variants multiply prims without end, in more ways than a walk
-over the arcs of single prims sees: a reference to `</A/B>` brings the arcs of `</A>` along, and a
-class is inherited again wherever its heir is referenced. So nothing is foretold here. USD's own
-composition engine makes the prims, in the order of the tree, and is left as soon as there are too
-many or they take too long. No composed prim can hold more than 32,767 sites, which is its limit.
+over the arcs of single prims sees: a reference to `</A/B>` also brings the arcs of `</A>`, and a
+class is inherited again wherever its heir is referenced. So no size is predicted here. USD's own
+composition engine makes the prims, in the order of the tree, and is stopped as soon as there are
+too many or they take too long. A composed prim holds at most 32,767 sites, which is USD's limit.
 """
 
 import time
@@ -18,8 +18,8 @@ MAX_PRIMS = 500_000
 MAX_DEPTH = 150
 """Maximum nesting of prims."""
 MAX_COMPOSITION_S = 20.0
-"""Maximum processor seconds for all prims: 500,000 of few arcs each take 4 to 10;
-chains of thousands of references or prims of thousands of sites take hours."""
+"""Maximum CPU seconds for all prims: 500,000 of few arcs each take 4 to 10; chains of thousands of
+references, or prims of thousands of sites, take hours."""
 
 
 def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
@@ -28,7 +28,7 @@ def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
     Args:
         root: the layer; every file it names must have been checked (pipeline.foreign.usd.stage).
         context: resolver context of the stage that will be opened.
-        name: of the file, for messages.
+        name: name of the file, for messages.
 
     Raises:
         TrilightError: too many prims, nested too deep, or not composed in time.

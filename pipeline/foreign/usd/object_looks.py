@@ -1,4 +1,4 @@
-"""What the materials of a USD stage state, by mesh and polygon, with the bytes of pictures."""
+"""The materials of a USD stage, by mesh and polygon, with the bytes of their pictures."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -25,11 +25,11 @@ _LOST = {
     "displacement": "displacement",
     "normal": "normal map",
 }
-"""Words for inputs without a place here, by how those begin."""
+"""Words for unsupported inputs, by the beginnings of their names."""
 
 
 Binding = tuple[int, NDArray[np.int64] | None]
-"""Row of a material, or -1 for none, and the polygons of a mesh that have it; None for all."""
+"""Index of a material, or -1 for none, and the polygons of a mesh that have it; None for all."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,19 +37,19 @@ class StageMaterials:
     """The materials of a stage."""
 
     materials: tuple[StatedMaterial, ...]
-    """Each once."""
+    """Distinct materials in the order of their first use."""
     bindings: tuple[tuple[Binding, ...], ...]
-    """Of each mesh; later ones stand before earlier ones."""
+    """Bindings of each mesh; later ones override earlier ones."""
     pictures: MaterialFiles
-    """Bytes by where they were found."""
+    """Contents of pictures by resolved path."""
 
 
 def read_stage_materials(stage: UsdStage, max_bytes: int) -> StageMaterials:
-    """Return the materials of what is seen of a stage.
+    """Return the materials of the visible meshes of a stage.
 
     Args:
         stage: the open stage.
-        max_bytes: bound of all pictures together.
+        max_bytes: maximum bytes of all pictures together.
 
     Raises:
         Rejected: texture_outside, materials_unreadable.
@@ -102,7 +102,7 @@ class _Reader:
 
 
 def name_unsupported(stated: StatedMaterial) -> tuple[str, ...]:
-    """Return the words for what a material states and has no place for."""
+    """Return words for the unsupported inputs that a material states."""
     words = {
         word for name in stated.lost for start, word in _LOST.items() if name.startswith(start)
     }

@@ -1,7 +1,7 @@
 """Materials of a USD stage: UsdPreviewSurface in both workflows, with its UsdUVTextures.
 
-A colour space counts as the shader says; without one, colours in 8 bits are sRGB-encoded, as USD
-states, and what the picture says of itself counts nothing.
+The shader decides on the color space; without one, colors in 8 bits are sRGB-encoded, as USD
+defines, and metadata of the picture are ignored.
 """
 
 import dataclasses
@@ -24,15 +24,15 @@ from storage.errors import Rejected
 _CHANNELS = {"rgb": 0, "r": 0, "g": 1, "b": 2, "a": 3}
 _STRIP = 256
 _MOST_VARIED = 256
-"""Materials that the primvars of one make; of more values the mean is taken."""
+"""Maximum number of materials made of the primvars of one; more values become their mean."""
 _UNBOUND = 0.18
-"""What USD shows of a mesh without a material and a display colour."""
+"""Gray of a mesh without material and display color, as USD shows it."""
 
 Decode = Callable[[bytes, str], NDArray]
 
 
 def usd_parts(source: UsdSource, decode: Decode, *, emission: bool = False) -> TexturedParts:
-    """Return the triangles of a USD file with their materials; what they emit only if asked.
+    """Return the triangles of a USD file with their materials; emission only on request.
 
     Raises:
         Rejected: no_materials, materials_unreadable, no_texture_coordinates, or as reading a
@@ -82,7 +82,7 @@ def _material_rows(bindings: Sequence[Binding], part: PlacedPart, plain: int) ->
 def _corner_tints(
     part: PlacedPart, is_plain: NDArray[np.bool_], time: object
 ) -> NDArray[np.float64]:
-    """Return what tints corners [T, 3, 3]: display colours, where there is no material."""
+    """Return the tints [T, 3, 3] of corners: display colors where there is no material, else 1."""
     tints = np.ones((len(is_plain), 3, 3))
     if is_plain.any():
         display_colors = read_colors(part.cut, "displayColor", time)
@@ -93,7 +93,7 @@ def _corner_tints(
 
 
 class _PrimvarMaterials:
-    """Materials whose inputs are primvars: a color tints corners, and a number makes materials."""
+    """Materials with primvar inputs: colors tint corners, and numbers become further materials."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class _PrimvarMaterials:
         self._known: dict[tuple[int, bytes], int] = {}
 
     def apply(self, part: PlacedPart, rows: NDArray[np.int64], tints: NDArray[np.float64]) -> None:
-        """Change the rows [T] and tints [T, 3, 3] of triangles of such materials."""
+        """Replace the rows [T] and tints [T, 3, 3] of triangles that have such materials."""
         for row in np.unique(rows):
             if row >= len(self._stated) or not self._stated[row].primvars:
                 continue
@@ -135,7 +135,7 @@ class _PrimvarMaterials:
     def _add_materials(
         self, row: int, means: Mapping[str, NDArray[np.float64]]
     ) -> NDArray[np.int64]:
-        """Return rows [T] of materials that have the means [T, 3] of inputs over triangles."""
+        """Return rows [T] of materials with mean inputs [T, 3] of triangles, adding new ones."""
         table = np.concatenate(list(means.values()), axis=1)
         if len(np.unique(table, axis=0)) > _MOST_VARIED:
             table = np.broadcast_to(table.mean(axis=0), table.shape)
@@ -154,7 +154,7 @@ class _PrimvarMaterials:
 def _replace_values(
     material: SourceMaterial, values: Mapping[str, NDArray[np.float64]]
 ) -> SourceMaterial:
-    """Return a material with other values [3] of inputs."""
+    """Return a material with some inputs replaced by values [3]."""
 
     def number(name: str, old: float) -> float:
         return float(values[name][0]) if name in values else old
@@ -173,7 +173,7 @@ def _replace_values(
 
 
 class _Reader:
-    """Makes materials of one stage, each picture once."""
+    """Converts the materials of one stage, decoding each picture once."""
 
     def __init__(
         self, files: MaterialFiles, primvars: Sequence[str], decode: Decode, *, emission: bool
@@ -220,7 +220,7 @@ class _Reader:
         )
 
     def _color_slot(self, stated: StatedMaterial, name: str) -> Slot | None:
-        """Return the picture of a colour; a single channel stands in all of them."""
+        """Return the slot of a color input; a single channel is copied to all three."""
         node = stated.textures.get(name)
         return None if node is None else self._slot(node, is_grey=node.output != "rgb")
 
@@ -267,7 +267,7 @@ class _Reader:
 def _scale_picture(
     picture: Picture, scale: NDArray[np.float32], bias: NDArray[np.float32]
 ) -> Picture:
-    """Return a picture of linear values in float32, scaled and moved, none below 0."""
+    """Return a picture of linear float32 values, scaled and offset, clamped to 0 from below."""
     values = np.zeros((*picture.values.shape[:2], 4), np.float32)
     for row in range(0, len(values), _STRIP):
         part = slice(row, row + _STRIP)
@@ -296,7 +296,7 @@ def _drop_negative(values: NDArray) -> RGB:
 
 
 def _glow(stated: StatedMaterial) -> RGB:
-    """Return what times the picture, if there is one, a material emits."""
+    """Return the emission factor, which a picture, if there is one, is multiplied with."""
     strength = _read_strength(stated)
     if "emissiveColor" in stated.textures:
         return (strength, strength, strength)

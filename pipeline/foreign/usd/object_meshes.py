@@ -1,4 +1,4 @@
-"""All meshes of a USD stage as one, in metres with +Z up, with what lies at its corners."""
+"""All meshes of a USD stage as one, in meters with +Z up, with their texture coordinates."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,23 +14,23 @@ from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 from storage.errors import Rejected
 
 _MAX_OFFSET = 1e5
-"""Points are float32: farther from their mesh's own origin, in sizes of the object, they are off by
-1 % of it."""
+"""Maximum distance of points from their mesh's origin, in sizes of the object: points are float32,
+and off by 1 % of the size beyond it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlacedPart:
-    """The triangles of one mesh of a stage."""
+    """The triangles of one mesh of a stage in world space."""
 
     number: int
-    """Which of the stage's meshes it is."""
+    """Index of the mesh within the stage."""
     points: NDArray[np.float64]
-    """[P, 3] metres, +Z up."""
+    """[P, 3] in meters, +Z up."""
     cut: CutMesh
-    """Its triangles."""
+    """Triangles as rows of `points`."""
 
     def coordinates(self, primvars: Sequence[str], time: object) -> NDArray[np.float64]:
-        """Return values [T, S, 3, 2] of primvars at corners; not a number where there are none."""
+        """Return the values [T, S, 3, 2] of primvars at corners; NaN where there are none."""
         uv = np.full((len(self.cut.corners), len(primvars), 3, 2), np.nan)
         for row, name in enumerate(primvars):
             values = chart_corners(UvChart(primvar=name, transforms=()), self.cut, time)

@@ -1,4 +1,4 @@
-"""`UsdSource`: a USD file of an object, its triangles and its materials; only children make one."""
+"""`UsdSource`: the triangles and materials of a USD object; only child processes make one."""
 
 import hashlib
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from storage.errors import Rejected
 
 
 class UsdSource:
-    """What a USD file holds. The materials are looked at where limits keep them."""
+    """The contents of a USD file; materials are read where limits include them."""
 
     def __init__(self, path: Path, limits: ReadLimits) -> None:
         """Open the file and those that it names.
@@ -37,7 +37,7 @@ class UsdSource:
 
     @property
     def sha256(self) -> str:
-        """Digest of all layers, the root first, and of the pictures that materials name."""
+        """Return the digest of all layers, the root first, and of the pictures of materials."""
         digest = self._digest.copy()
         if isinstance(self._materials, StageMaterials):
             pictures = self._materials.pictures.data
@@ -47,21 +47,21 @@ class UsdSource:
 
     @property
     def unread(self) -> tuple[str, ...]:
-        """What the file says and nothing reads, each once."""
+        """Return sentences on contents of the file that are not read, each once."""
         return self.stage.opened.notes
 
     @cached_property
     def parts(self) -> tuple[PlacedPart, ...]:
-        """Its meshes; raises Rejected as `placed_parts`, or load_error."""
+        """Return the meshes; raises Rejected as `placed_parts`, or load_error."""
         return read_or_reject(self._path, lambda: placed_parts(self.stage, self._limits))
 
     @cached_property
     def mesh(self) -> TriangleMesh:
-        """All of them as one, in metres, +Z up; raises Rejected as `parts`."""
+        """Return all meshes as one, in meters, +Z up; raises Rejected as `parts`."""
         return join_parts(self.parts)
 
     def materials(self) -> StageMaterials:
-        """Return its materials; raises Rejected as `stage_looks`, or where nobody keeps them."""
+        """Return the materials; raises Rejected as `read_stage_materials`, or no_materials."""
         if isinstance(self._materials, Rejected):
             raise self._materials
         if self._materials is None:
@@ -70,7 +70,7 @@ class UsdSource:
 
 
 def _digest_files(files: Sequence[Path], bytes_left: int) -> "tuple[hashlib._Hash, int]":
-    """Return the digest of files, and how many bytes are left of a bound on them."""
+    """Return the digest of files, and the bytes that are left of their bound."""
     digest = hashlib.sha256()
     for path in files:
         data = path.read_bytes()

@@ -1,8 +1,8 @@
-"""A USD file as an object: opened within bounds, with what is seen of it, and refused by name.
+"""`open_stage`: the visible meshes of a USD object, opened within bounds, or its refusal by name.
 
-USD resolves what a file names by itself, so it is given a path; every file that it may open is
-checked first (pipeline.foreign.usd.stage). What would give a plausible but wrong mesh is refused: a
-missing reference, surfaces that are no polygons, bones that nothing poses.
+USD itself resolves the names of other files, so it receives a path; every file that it may open is
+checked first (pipeline.foreign.usd.stage). Contents that would give a plausible but wrong mesh are
+refused: a missing reference, surfaces other than polygons, bones without a pose.
 """
 
 from collections.abc import Callable
@@ -22,16 +22,16 @@ Read = TypeVar("Read")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class UsdStage:
-    """An open stage."""
+    """A composed stage with its visible meshes."""
 
     opened: OpenedUsd
-    """Its files."""
+    """Opened layers of the stage, with notes on unread contents."""
     composed: Any
-    """The stage itself, without which its prims expire."""
+    """The Usd.Stage, kept because its prims expire with it."""
     meshes: tuple[PlacedPrim, ...]
-    """What is seen of it, into metres with +Z up."""
+    """Visible meshes with transforms to meters, +Z up."""
     time: Any
-    """The first of a stage that moves."""
+    """The Usd.TimeCode at which values are read: the first of an animated stage."""
 
 
 def open_stage(path: Path, limits: ReadLimits) -> UsdStage:
@@ -45,7 +45,7 @@ def open_stage(path: Path, limits: ReadLimits) -> UsdStage:
 
 
 def read_or_reject(path: Path, read: Callable[[], Read]) -> Read:
-    """Return what `read` makes of a USD file; its errors become reasons.
+    """Return the result of `read` for a USD file; its errors become reasons of Rejected.
 
     Raises:
         Rejected: external_uri, skinned_mesh, load_error, or as `read`.

@@ -1,7 +1,7 @@
-"""Every mesh, light and camera of a composed stage with its place in our world, instances too.
+"""Visible meshes, lights and cameras of a stage with their world transforms, instances included.
 
-What is seen is what UsdGeom says: visibility and purposes as they are inherited, prototypes of a
-PointInstancer wherever they stand, also below an `over` or a class.
+UsdGeom defines visibility: inherited visibility and purposes, and prototypes of a PointInstancer
+wherever they are defined, also below an `over` or a class.
 """
 
 import dataclasses
@@ -28,30 +28,30 @@ MAX_NESTED = 150
 DOMES = ("DomeLight", "DomeLight_1")
 LAMPS = ("RectLight", "DiskLight", "SphereLight", "CylinderLight")
 SCENE_KINDS = ("Mesh", *SOLIDS, "Camera", *LAMPS, *DOMES)
-"""Kinds of prims that a scene is made of."""
+"""Types of prims that scenes are read from."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlacedPrim:
-    """A prim in its place."""
+    """A prim with its world transform."""
 
-    prim: Any  # the USD prim; several places may share one
-    to_world: NDArray[np.float64]  # [4, 4], for column vectors, into metres with +Z up
-    meters_per_unit: float = 1.0  # of a unit of the stage
-    skin: BoundSkin | None = None  # what poses a mesh
-    lost: list[str] = field(default_factory=list)  # receives what is not read of it
+    prim: Any  # the Usd.Prim; several instances may share one
+    to_world: NDArray[np.float64]  # [4, 4] for column vectors, to meters with +Z up
+    meters_per_unit: float = 1.0  # length of a unit of the stage
+    skin: BoundSkin | None = None  # the skin that poses a mesh
+    lost: list[str] = field(default_factory=list)  # receives notes on contents that are not read
 
 
 def placed_prims(
     stage: Any, time: Any, lost: list[str], kinds: Collection[str] = SCENE_KINDS
 ) -> list[PlacedPrim]:
-    """Return the prims of some kinds that are seen of a stage at a time, in its own order.
+    """Return the visible prims of some kinds of a stage at a time, in the order of the stage.
 
-    Invisible prims, guides and proxies are left out; schemas that nothing reads are noted.
+    Invisible prims, guides and proxies are left out; notes name unread schemas.
 
     Raises:
         TrilightError: more than MAX_PLACED prims with all instances, prims or prototypes that are
-            nested more than MAX_NESTED deep, a place that is not finite, or UnposedMesh.
+            nested more than MAX_NESTED deep, a transform that is not finite, or UnposedMesh.
     """
     from pxr import UsdGeom
 
@@ -89,7 +89,7 @@ def placed_prims(
 
 
 def _base(stage: Any, metres: float) -> NDArray[np.float64]:
-    """Return the matrix from a stage's units and axis to metres with +Z up."""
+    """Return the matrix [4, 4] from a stage's units and up axis to meters with +Z up."""
     from pxr import UsdGeom
 
     base = np.diag([metres, metres, metres, 1.0])
@@ -100,20 +100,22 @@ def _base(stage: Any, metres: float) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Visit:
-    """A prim, and what it has from above."""
+    """A prim with the state that it inherits from its ancestors."""
 
     prim: Any
-    to_world: NDArray[np.float64]  # of what is above it until it is moved
-    origin: NDArray[np.float64]  # where `!resetXformStack!` begins: the stage, or an instance
+    to_world: NDArray[np.float64]  # of its parent until its own transform is applied
+    origin: NDArray[
+        np.float64
+    ]  # start of `!resetXformStack!`: that of the stage, or of an instance
     purpose: str = "default"
-    is_render_shown: bool = True  # what VisibilityAPI says of the purpose `render`
-    predicate: Any = None  # which children there are
+    is_render_shown: bool = True  # VisibilityAPI's answer for the purpose `render`
+    predicate: Any = None  # selects the children to visit
 
 
 def _visit_prims(
     stage: Any, base: NDArray[np.float64], time: Any, lost: list[str]
 ) -> Iterator[_Visit]:
-    """Yield what is seen of a stage with its place, in the order of the tree."""
+    """Yield the visible prims of a stage with world transforms, in the order of the tree."""
     from pxr import Usd, UsdGeom
 
     root = _Visit(
@@ -156,7 +158,7 @@ def _visit_children(above: _Visit) -> Iterator[_Visit]:
 
 
 def _inherit_purpose(above: _Visit, imageable: Any, time: Any) -> _Visit:
-    """Return a visit with the prim's own purpose, which its children have too, if it has one."""
+    """Return a visit with the prim's authored purpose, if any, which its children inherit."""
     from pxr import UsdGeom
 
     if not imageable:
@@ -188,7 +190,7 @@ def _visit_instances(above: _Visit, time: Any, lost: list[str]) -> Iterator[_Vis
     instancer = UsdGeom.PointInstancer(prim)
     targets = instancer.GetPrototypesRel().GetForwardedTargets()
     prototype_indices = instancer.GetProtoIndicesAttr().Get(time) or []
-    if len(prototype_indices) > MAX_PLACED:  # before their places are computed
+    if len(prototype_indices) > MAX_PLACED:  # before their transforms are computed
         raise TrilightError(
             f"{prim.GetPath()}: {len(prototype_indices)} instances; expected at most {MAX_PLACED}."
         )

@@ -1,6 +1,6 @@
-"""Cubes, spheres, cylinders, cones, capsules and planes of UsdGeom as polygons, tetrahedra too.
+"""Polygons of UsdGeom's cubes, spheres, cylinders, cones, capsules, planes and tetrahedra.
 
-Round ones are polygons of 48 sides whose corners lie on the surface: their area is 0.3 % too small.
+Round solids are polygons of 48 sides with corners on the surface: their area is 0.3 % too small.
 """
 
 from collections.abc import Sequence
@@ -13,18 +13,18 @@ from pipeline.foreign.numbers import read_number
 
 SOLIDS = ("Cube", "Sphere", "Cylinder", "Cylinder_1", "Cone", "Capsule", "Capsule_1", "Plane",
           "TetMesh")  # fmt: skip
-"""Kinds of prims that are read so."""
+"""Types of prims that are converted here."""
 
 _SIDES = 48
 _AXES = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
-"""From what stands along Z to what stands along another axis: both turns are rotations."""
+"""Permutations of coordinates that rotate the Z axis to another one."""
 
 Polygons = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], bool]
-"""Points [P, 3], corners of each polygon [F], their points, and whether it is meant to be round."""
+"""Points [P, 3], corner counts [F], point indices of corners, and whether the solid is round."""
 
 
 def build_solid(prim: Any, time: Any) -> Polygons:
-    """Return the polygons of a prim of SOLIDS at a time."""
+    """Return the polygons at a time of a prim whose type is in SOLIDS."""
     kind = str(prim.GetTypeName())
 
     def read_size(name: str) -> float:
@@ -40,7 +40,7 @@ def build_solid(prim: Any, time: Any) -> Polygons:
     if kind == "Plane":
         wide = read_size("width") / 2
         long = read_size("length") / 2
-        if axis != "Z":  # where Z comes from Y or Y from X
+        if axis != "Z":  # the permutation swaps the two directions for X and Y
             wide, long = long, wide
         flat = np.array([[-wide, -long, 0], [wide, -long, 0], [wide, long, 0], [-wide, long, 0]])
         return _pack(flat[:, _AXES[axis]], [[0, 1, 2, 3]], is_smooth=False)
@@ -49,13 +49,13 @@ def build_solid(prim: Any, time: Any) -> Polygons:
 
 
 def _build_profile(kind: str, read_size: Any) -> NDArray[np.float64]:
-    """Return radii and heights [N, 2] along a solid of revolution, from below."""
+    """Return radii and heights [N, 2] of a solid of revolution, from bottom to top."""
     if kind == "Sphere":
         return _build_arc(-np.pi / 2, np.pi / 2, _SIDES // 2) * read_size("radius")
     top = read_size("radiusTop" if kind.endswith("_1") else "radius")
     bottom = read_size("radiusBottom" if kind.endswith("_1") else "radius")
     half = read_size("height") / 2
-    if kind.startswith("Capsule"):  # whose ends are spheres that touch the cone between them
+    if kind.startswith("Capsule"):  # its end spheres touch the cone between them
         tilt = np.arctan2(bottom - top, 2 * half)
         ends = [(-half, bottom, -np.pi / 2, tilt), (half, top, tilt, np.pi / 2)]
         return np.concatenate([
@@ -73,7 +73,7 @@ def _build_arc(begin: float, end: float, count: int) -> NDArray[np.float64]:
 
 
 def _revolve(profile: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[list[int]]]:
-    """Return the surface that a profile makes around Z, facing out."""
+    """Return the points and polygons of a profile revolved around Z, facing out."""
     angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rings = [np.column_stack([around * radius, np.full(_SIDES, up)]) for radius, up in profile]

@@ -1,4 +1,4 @@
-"""A UsdUVTexture as its shader states it: the file, its colour space, and where it is looked up."""
+"""`TextureNode`: the file, color space and texture coordinates of a UsdUVTexture."""
 
 import zipfile
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _WRAPS = ("repeat", "mirror", "clamp", "black")
 
 @dataclass(frozen=True, kw_only=True)
 class UvTransform:
-    """A UsdTransform2d: scaled, turned counter-clockwise, and shifted, in this order."""
+    """A UsdTransform2d: scale, counter-clockwise rotation, and translation, in this order."""
 
     scale: tuple[float, ...]
     rotation_deg: float
@@ -30,7 +30,7 @@ class UvTransform:
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """[2, 2] what scales and turns, for column vectors."""
+        """Return the matrix [2, 2] of scale and rotation, for column vectors."""
         cos = np.cos(np.radians(self.rotation_deg))
         sin = np.sin(np.radians(self.rotation_deg))
         return np.array([[cos, -sin], [sin, cos]]) * self.scale
@@ -38,46 +38,46 @@ class UvTransform:
 
 @dataclass(frozen=True, kw_only=True)
 class UvChart:
-    """What a texture reads."""
+    """The texture coordinates of a texture."""
 
     primvar: str
-    """Name of the coordinates of the mesh."""
+    """Name of the mesh's primvar of coordinates."""
     transforms: tuple[UvTransform, ...]
-    """What moves them, the first one first."""
+    """Transforms of the coordinates, in the order of application."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TextureNode:
-    """A texture before its picture is opened."""
+    """The inputs of a texture, before its picture is opened."""
 
     named: str
-    """The file as the shader names it; empty where it names none."""
+    """Path of the file in the shader; empty where it states none."""
     resolved: str | None
-    """Where that is, below the folder of the stage; None where it is missing."""
+    """Resolved path below the folder of the stage; None for a missing file."""
     color_space: str
     """`sRGB`, `raw`, or anything else for `auto`."""
     wrap: tuple[NodeWrap, NodeWrap]
-    """Along s and t; `useMetadata` and what is unknown repeat."""
+    """Wrap modes along s and t; `useMetadata` and unknown ones are `repeat`."""
     scale: NDArray[np.float32]
-    """[4]"""
+    """[4] factors of the picture's RGBA values."""
     bias: NDArray[np.float32]
-    """[4]"""
+    """[4] offsets added after `scale`."""
     chart: UvChart
-    """Where it is looked up."""
+    """Texture coordinates at which it is sampled."""
     output: str
-    """rgb, r, g, b or a: what is connected."""
+    """Name of the connected output: rgb, r, g, b or a."""
     fallback: NDArray[np.float64] | None
-    """[4] what stands where there is no picture."""
+    """[4] RGBA value used without a picture; None where none is stated."""
 
 
 def read_texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> TextureNode:
-    """Return what a UsdUVTexture shader states.
+    """Return the inputs of a UsdUVTexture shader.
 
     Args:
         shader: the node.
-        output: which of its outputs is connected.
-        time: of the values.
-        opened: the file, which says where others are.
+        output: name of the connected output.
+        time: time of the values.
+        opened: the file, which resolves paths and receives notes.
 
     Raises:
         TrilightError: its picture is outside of the folder, or on the network, or Malformed.
@@ -110,7 +110,7 @@ def read_texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) ->
 
 
 def read_chart(shader: Any, time: Any, lost: list[str]) -> UvChart:
-    """Return the coordinates of a texture's shader; `st` where it states none."""
+    """Return the texture coordinates of a shader; `st` where it states none."""
     from pxr import UsdShade
 
     sources = find_sources(shader, "st")
@@ -140,7 +140,7 @@ def read_chart(shader: Any, time: Any, lost: list[str]) -> UvChart:
 
 
 def chart_corners(chart: UvChart, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
-    """Return the coordinates [T, 3, 2] of a chart, before its moves; not all need be finite.
+    """Return the coordinates [T, 3, 2] of a chart before its transforms; some may not be finite.
 
     None where the mesh has none, or not for every corner.
     """
@@ -151,7 +151,7 @@ def chart_corners(chart: UvChart, cut: CutMesh, time: Any) -> NDArray[np.float64
 
 
 def asset_bytes(resolved: str, max_bytes: int) -> bytes | None:
-    """Return the bytes of a plain file, or of a member of an archive; None where there are none.
+    """Return the bytes of a plain file, or of a member of an archive; None for a missing one.
 
     Raises:
         TrilightError: there are more than `max_bytes`.
@@ -176,7 +176,7 @@ def _require_size(size: int, max_bytes: int, name: str) -> None:
 
 
 def find_sources(shader: Any, name: str) -> Any:
-    """Return the attributes that give an input of a shader its value, its material's among them."""
+    """Return the attributes that produce the value of a shader's input, its material's included."""
     from pxr import UsdShade
 
     stated = shader.GetInput(name)
@@ -184,14 +184,14 @@ def find_sources(shader: Any, name: str) -> Any:
 
 
 def is_output(attribute: Any) -> bool:
-    """Return whether a value comes out of another node."""
+    """Return whether an attribute is the output of another node."""
     from pxr import UsdShade
 
     return bool(UsdShade.Output.IsOutput(attribute))
 
 
 def read_input(shader: Any, name: str, time: Any, default: Any) -> Any:
-    """Return an input of a shader, or of its material; the default where it is not stated."""
+    """Return an input of a shader or of its material; the default where none is stated."""
     sources = find_sources(shader, name)
     value = sources[0].Get(time) if sources else None
     return default if value is None else value
