@@ -43,7 +43,7 @@ class MaterialFiles:
     libraries: tuple[str, ...] = ()
     """Names of the MTL files of an OBJ, read or refused; the first that has a material counts."""
 
-    def of(self, name: str) -> bytes:
+    def require(self, name: str) -> bytes:
         """Return a file; raises Rejected where it is not there."""
         if name in self.data:
             return self.data[name]

@@ -41,7 +41,7 @@ Decode = Callable[[bytes, str], NDArray]
 
 
 def obj_materials(
-    used: Sequence[str], files: MaterialFiles, decode: Decode, *, emission: bool = False
+    names: Sequence[str], files: MaterialFiles, decode: Decode, *, emission: bool = False
 ) -> tuple[list[SourceMaterial], list[str]]:
     """Return materials by name, and sentences on statements that are not read.
 
@@ -54,31 +54,31 @@ def obj_materials(
     Raises:
         Rejected: no_materials where it has none, materials_unreadable, or as reading a picture.
     """
-    if not used or not files.libraries:
+    if not names or not files.libraries:
         # records hold these words, and digests hold records
-        why = "names no file of its materials (mtllib)" if used else "names no materials"
+        why = "names no file of its materials (mtllib)" if names else "names no materials"
         raise Rejected("no_materials", f"the OBJ {why}")
     known: dict[str, Fields] = {}
     for library in files.libraries:
         if library in files.data:
             known = {**read_mtl(files.data[library]), **known}
     absent = [name for name in files.libraries if name not in files.data]
-    if missing := [name for name in used if name not in known]:
+    if missing := [name for name in names if name not in known]:
         if absent:
-            files.of(absent[0])
+            files.require(absent[0])
         raise Rejected("materials_unreadable", f"no library has the material {missing[0]!r:.80}")
     reader = _Reader(files, decode)
     try:
-        materials = [reader.material(known[name]) for name in used]
+        materials = [reader.material(known[name]) for name in names]
         if emission:
             materials = [
                 reader.add_emission(one, known[name])
-                for one, name in zip(materials, used, strict=True)
+                for one, name in zip(materials, names, strict=True)
             ]
     except Malformed as error:
         raise Rejected("materials_unreadable", f"the MTL is malformed ({error!s:.200})") from error
     unread = [f"library {name[:60]!r}: it is not there" for name in absent]
-    unread += [text for name in used for text in _list_unread(known[name])]
+    unread += [text for name in names for text in _list_unread(known[name])]
     return materials, list(dict.fromkeys(unread))
 
 
@@ -132,7 +132,7 @@ class _Reader:
             return None
         options, name = split_map(text)
         if name not in self._values:
-            self._values[name] = self._decode(self._files.of(name), name)
+            self._values[name] = self._decode(self._files.require(name), name)
         clamp = options.get("-clamp") == ["on"]
         picture = Picture(
             values=self._values[name],
@@ -141,8 +141,8 @@ class _Reader:
         )
         return Slot(
             picture=picture,
-            uv_matrix=np.diag(_pair(options, "-s", 1.0)),
-            uv_offset=np.array(_pair(options, "-o", 0.0)),
+            turn=np.diag(_pair(options, "-s", 1.0)),
+            shift=np.array(_pair(options, "-o", 0.0)),
             channel=_CHANNELS.get("".join(options.get("-imfchan", ["r"])), 0),
         )
 

@@ -20,11 +20,11 @@ class TexturedParts:
     materials: Sequence[SourceMaterial]
     uv: NDArray[np.float64]
     """[F, S, 3, 2] texture coordinates of corners by set S, v up; NaN where there are none."""
-    color: NDArray[np.float64] | None = None
+    colour: NDArray[np.float64] | None = None
     """[F, 3, 3] linear tint of each corner, multiplied with the base color; None for white."""
 
 
-def build_parts(
+def build_textured_mesh(
     contents: FileMesh, materials: Sequence[SourceMaterial], default: SourceMaterial
 ) -> TexturedParts:
     """Return the triangles of a file with its materials; `default` is that of faces without one."""
@@ -36,5 +36,5 @@ def build_parts(
         material=np.where(rows < 0, len(materials), rows),
         materials=(*materials, default),
         uv=uv[:, None],
-        color=contents.color,
+        colour=contents.color,
     )

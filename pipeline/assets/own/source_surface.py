@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import cell_keys, normalise
-from pipeline.foreign.material import MaterialSamples, Slot, SourceMaterial, material_columns
+from pipeline.foreign.material import Seen, Slot, SourceMaterial, columns
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.parts import TexturedParts
 from storage.errors import Rejected
@@ -87,22 +87,17 @@ class SourceSurface:
         def shown(slot: Slot | None) -> NDArray[np.float32] | None:
             if slot is None:
                 return None
-            place = (
-                id(slot.picture),
-                slot.uv_set,
-                slot.uv_matrix.tobytes(),
-                slot.uv_offset.tobytes(),
-            )
+            place = (id(slot.picture), slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())
             if place not in known:  # one picture often holds several numbers
                 known[place] = self._shown(slot, origin, own, cell)
             return known[place]
 
         base = shown(material.base)
-        if self.parts.color is not None:
-            tint = np.einsum("nc,ncd->nd", own, self.parts.color[origin])
+        if self.parts.colour is not None:
+            tint = np.einsum("nc,ncd->nd", own, self.parts.colour[origin])
             base = np.ones((len(origin), 4), np.float32) if base is None else base
             base = np.concatenate([base[:, :3] * tint, base[:, 3:]], axis=1).astype(np.float32)
-        seen = MaterialSamples(
+        seen = Seen(
             base=base,
             metallic=shown(material.metallic_map),
             roughness=shown(material.roughness_map),
@@ -110,14 +105,14 @@ class SourceSurface:
             specular_strength=shown(material.specular_strength_map),
             glossiness=shown(material.glossiness),
         )
-        return material_columns(material, seen, len(origin))
+        return columns(material, seen, len(origin))
 
     def _shown(
         self, slot: Slot, origin: NDArray[np.int64], own: NDArray[np.float64], cell: float
     ) -> NDArray[np.float32]:
-        corners = self.parts.uv[origin, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
+        corners = self.parts.uv[origin, slot.uv_set] @ slot.turn.T + slot.shift
         uv = np.einsum("nc,ncd->nd", own, corners)
-        return slot.picture.sample(uv, _halvings(slot, corners, self._areas[origin], cell))
+        return slot.picture.at(uv, _halvings(slot, corners, self._areas[origin], cell))
 
     @cached_property
     def _areas(self) -> NDArray[np.float64]:
@@ -136,7 +131,7 @@ def _halvings(
     on_picture = 0.5 * np.abs(steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0])
     texels = on_picture * width * height * cell**2 / np.maximum(areas, 1e-30)
     halvings = np.floor(0.5 * np.log2(np.maximum(texels, 1.0))).astype(np.int64)
-    return np.minimum(halvings, slot.picture.max_halvings)
+    return np.minimum(halvings, slot.picture.most_halvings)
 
 
 def source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurface:

@@ -19,7 +19,7 @@ from pipeline.exchange.linear_maps import (
     number_texture,
     on_one_grid,
 )
-from pipeline.foreign.material import MaterialSamples, SourceMaterial, material_columns
+from pipeline.foreign.material import Seen, SourceMaterial, columns
 from storage.conventions import srgb8
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.texture import MapSource
@@ -106,8 +106,8 @@ def _columns(
         }
         colors = _places(tint, size, width)
         seen["base"] = seen["base"][:, :3] * colors if "base" in seen else colors
-        known = MaterialSamples(**{name: seen.get(name) for name in SLOTS})
-        rows = material_columns(material, known, size * width, least_roughness=0)
+        known = Seen(**{name: seen.get(name) for name in SLOTS})
+        rows = columns(material, known, size * width, least_roughness=0)
         found[first : first + size] = rows.reshape(size, width, 7)
     return found
 

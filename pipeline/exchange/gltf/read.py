@@ -37,7 +37,7 @@ from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nod
 from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material import SourceMaterial
-from pipeline.foreign.picture import decode_picture
+from pipeline.foreign.picture import decoded
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import ObjectKind, Scene, SceneObject
@@ -137,7 +137,7 @@ class _Reading:
 
     def _decode(self, data: bytes, name: str) -> NDArray:
         try:
-            return decode_picture(data, name, MAX_PIXELS)
+            return decoded(data, name, MAX_PIXELS)
         except Rejected as why:
             if why.reason != "texture_too_large":
                 raise

@@ -51,7 +51,7 @@ def sample_slots(material: SourceMaterial, coordinates: Coordinates, lost: list[
     pictures = {name: slot.picture.linear(slot.picture.values) for name, slot in slots.items()}
     first = next(iter(slots.values()), None)
     plain = None if first is None else coordinates(first.uv_set)
-    uv = None if first is None or plain is None else plain @ first.uv_matrix.T + first.uv_offset
+    uv = None if first is None or plain is None else plain @ first.turn.T + first.shift
     if slots and uv is None:
         lost.append("textures of a mesh without texture coordinates: their means were taken")
     kept = [
@@ -84,4 +84,4 @@ def sample_slots(material: SourceMaterial, coordinates: Coordinates, lost: list[
 
 def _chart(slot: Slot) -> tuple[int, bytes, bytes]:
     """Return what says where a picture lies."""
-    return (slot.uv_set, slot.uv_matrix.tobytes(), slot.uv_offset.tobytes())
+    return (slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())

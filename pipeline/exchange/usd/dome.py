@@ -92,7 +92,7 @@ def sky_attributes(sky: Environment | None) -> Attributes:
 
 def dome_as_written(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
     """Return the environment of a prim that `add_dome` wrote; raises LookupError without a file."""
-    found = opened.resolve(layer, prim.attributes[_PATH].default.path)
+    found = opened.inside(layer, prim.attributes[_PATH].default.path)
     data = None if found is None else asset_bytes(found, MAX_BYTES)
     if data is None:
         raise LookupError(_PATH)
@@ -185,7 +185,7 @@ def _picture(prim: Any, time: Any, opened: OpenedUsd) -> NDArray[np.float64] | N
         opened.lost.append(f"{place}: a picture of format {layout}; expected latlong")
         return None
     specs = attribute.GetPropertyStack(time)
-    found = opened.resolve(specs[0].layer if specs else opened.root, asset.path)
+    found = opened.inside(specs[0].layer if specs else opened.root, asset.path)
     data = None if found is None else asset_bytes(found, MAX_BYTES)
     if data is None:
         opened.lost.append(f"{place}: map {asset.path!r:.100} is missing")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd.names import FOV_DEG
 from pipeline.foreign.numbers import read_number
-from pipeline.foreign.usd.placed import PlacedPrim
+from pipeline.foreign.usd.placed import Placed
 from storage.conventions import look_at_c2w
 
 _FOV_DEG = 40.0
@@ -19,7 +19,7 @@ _SAME = 1e-5
 
 
 def cameras(
-    placed: Sequence[PlacedPrim], time: Any, lost: list[str]
+    placed: Sequence[Placed], time: Any, lost: list[str]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return poses [C, 4, 4] and full angles [C] in degrees; C is 0 where none can be used."""
     poses, angles = [], []
@@ -43,9 +43,7 @@ def camera_that_sees_all(
     return pose[None].astype(np.float32), np.array([_FOV_DEG], np.float32)
 
 
-def _camera(
-    placed: PlacedPrim, time: Any, lost: list[str]
-) -> tuple[NDArray[np.float64], float] | None:
+def _camera(placed: Placed, time: Any, lost: list[str]) -> tuple[NDArray[np.float64], float] | None:
     from pxr import UsdGeom
 
     camera, where = UsdGeom.Camera(placed.prim), placed.prim.GetPath()

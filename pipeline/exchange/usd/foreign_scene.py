@@ -22,7 +22,7 @@ from pipeline.exchange.usd.foreign_lights import light_triangles, radiance
 from pipeline.exchange.usd.foreign_materials import dressing
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup, read_mesh
 from pipeline.exchange.usd.names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
-from pipeline.foreign.usd.placed import DOMES, PlacedPrim, placed_prims
+from pipeline.foreign.usd.placed import DOMES, Placed, placed_prims
 from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.scenes.shading import flat_shaded
@@ -71,7 +71,7 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
     return _scene(pieces, placed, time, opened, sky)
 
 
-def _read_row(each: PlacedPrim) -> float:
+def _read_row(each: Placed) -> float:
     """Return the row that Trilight once wrote on an object or camera; infinity for any other."""
     prim = each.prim
     row = prim.GetAttribute(INDEX).Get()
@@ -82,7 +82,7 @@ def _read_row(each: PlacedPrim) -> float:
 
 def _scene(
     pieces: Sequence[DressedPiece],
-    placed: Sequence[PlacedPrim],
+    placed: Sequence[Placed],
     time: Any,
     opened: OpenedUsd,
     sky: Environment | None,
@@ -105,7 +105,7 @@ def _scene(
 
 
 def _environment(
-    placed: Sequence[PlacedPrim], time: Any, opened: OpenedUsd, licence: str
+    placed: Sequence[Placed], time: Any, opened: OpenedUsd, licence: str
 ) -> Environment | None:
     """Return that of the first dome that can be read; others are noted."""
     domes = [each for each in placed if each.prim.GetTypeName() in DOMES]
@@ -119,7 +119,7 @@ def _environment(
 
 
 def _pieces(
-    each: PlacedPrim, time: Any, opened: OpenedUsd, licence: str, names: set[str]
+    each: Placed, time: Any, opened: OpenedUsd, licence: str, names: set[str]
 ) -> list[DressedPiece]:
     prim = each.prim
     if prim.GetTypeName() not in ("Mesh", *SOLIDS):
@@ -153,7 +153,7 @@ def _of_light(triangles: NDArray[np.float32], light: NDArray[np.float32]) -> Dre
 
 
 def _of_mesh(
-    placed: PlacedPrim, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
+    placed: Placed, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
 ) -> DressedTriangles:
     prim = placed.prim
     found = dressing(soup, time, opened, licence)
@@ -179,7 +179,7 @@ def _of_mesh(
 
 
 def _split(
-    each: PlacedPrim, triangles: DressedTriangles, licence: str, names: set[str]
+    each: Placed, triangles: DressedTriangles, licence: str, names: set[str]
 ) -> list[DressedPiece]:
     """Return the part of a mesh that reflects, and the part that emits, where there are both."""
     return [

@@ -91,7 +91,7 @@ def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
         TrilightError: it is too large.
     """
     data = None if node.resolved is None else asset_bytes(node.resolved, MAX_BYTES)
-    name, is_color = Path(node.named).name, node.color_space != "raw"
+    name, is_color = Path(node.named).name, node.colour_space != "raw"
     pixels = decoded_pixels(data, name, opened.lost, is_color=is_color) if data else None
     if pixels is None:
         opened.lost.append(
@@ -100,7 +100,7 @@ def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
             else "a texture without a file"
         )
         return None
-    space = node.color_space
+    space = node.colour_space
     return ForeignTexture(
         pixels=pixels[::-1],
         is_srgb=is_encoded(pixels) if space not in ("sRGB", "raw") else space == "sRGB",

@@ -108,7 +108,7 @@ def _used(prim: Any, textures: dict[int, Texture], opened: OpenedUsd | None) -> 
 
 def _texture(attributes: Any, layer: Any, opened: OpenedUsd) -> Texture:
     named = attributes["inputs:file"].default.path
-    found = opened.resolve(layer, named)
+    found = opened.inside(layer, named)
     data = None if found is None else asset_bytes(found, MAX_BYTES)
     if data is None:
         raise LookupError(named)

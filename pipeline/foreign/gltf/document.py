@@ -125,7 +125,7 @@ class GltfDocument:
         if "bufferView" in image:
             return bytes(self._view(image["bufferView"]))
         uri = image["uri"]
-        return data_uri_bytes(uri) if is_data_uri(uri) else self.pictures.of(uri)
+        return data_uri_bytes(uri) if is_data_uri(uri) else self.pictures.require(uri)
 
     def _accessor(self, index: Any) -> dict[str, Any]:
         return entry(self.tree, "accessors", index)

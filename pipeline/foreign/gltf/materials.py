@@ -169,8 +169,8 @@ class GltfMaterials:
                 is_nearest=sampler.get("magFilter") == _NEAREST,
             ),
             uv_set=uv_set,
-            uv_matrix=uv_matrix,
-            uv_offset=uv_offset,
+            turn=uv_matrix,
+            shift=uv_offset,
         )
 
     def _picture(self, number: int) -> NDArray:

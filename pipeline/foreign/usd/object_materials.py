@@ -14,10 +14,10 @@ from pipeline.foreign.material import MOST_UV_SETS, RGB, WHITE, Slot, SourceMate
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.parts import TexturedParts
 from pipeline.foreign.picture import Picture, has_colors
-from pipeline.foreign.usd.object_looks import Binding, name_unsupported
-from pipeline.foreign.usd.object_meshes import PlacedPart
+from pipeline.foreign.usd.object_meshes import PlacedMesh
 from pipeline.foreign.usd.object_source import UsdSource
 from pipeline.foreign.usd.shaders import StatedMaterial, read_colors, reflect_head_on
+from pipeline.foreign.usd.stage_materials import Binding, name_unsupported
 from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart
 from storage.errors import Rejected
 
@@ -38,26 +38,28 @@ def usd_parts(source: UsdSource, decode: Decode, *, emission: bool = False) -> T
         Rejected: no_materials, materials_unreadable, no_texture_coordinates, or as reading a
             picture.
     """
-    stated = source.materials()
+    stage_materials = source.materials()
     time = source.stage.time
-    nodes = [node for stated in stated.materials for node in stated.textures.values()]
+    nodes = [node for stated in stage_materials.materials for node in stated.textures.values()]
     primvars = list(dict.fromkeys(node.chart.primvar for node in nodes))
     if len(primvars) > MOST_UV_SETS:
         raise Rejected("no_texture_coordinates", f"textures lie on {len(primvars)} sets of them")
-    reader = _Reader(stated.pictures, primvars, decode, emission=emission)
-    materials = [reader.material(stated) for stated in stated.materials]
+    reader = _Reader(stage_materials.pictures, primvars, decode, emission=emission)
+    materials = [reader.material(stated) for stated in stage_materials.materials]
     plain = len(materials)
     materials.append(SourceMaterial(roughness=0.5))
-    primvar_materials = _PrimvarMaterials(stated.materials, materials, time, emission=emission)
+    primvar_materials = _PrimvarMaterials(
+        stage_materials.materials, materials, time, emission=emission
+    )
     rows = []
     tints = []
     coordinates = []
-    for part in source.parts:
-        part_rows = _material_rows(stated.bindings[part.number], part, plain)
-        tints.append(_corner_tints(part, part_rows == plain, time))
-        primvar_materials.apply(part, part_rows, tints[-1])
-        rows.append(part_rows)
-        coordinates.append(part.coordinates(primvars or ["st"], time))
+    for placed in source.meshes:
+        mesh_rows = _material_rows(stage_materials.bindings[placed.number], placed, plain)
+        tints.append(_corner_tints(placed, mesh_rows == plain, time))
+        primvar_materials.apply(placed, mesh_rows, tints[-1])
+        rows.append(mesh_rows)
+        coordinates.append(placed.coordinates(primvars or ["st"], time))
     material = np.concatenate(rows)
     tint = np.concatenate(tints)
     if (material == plain).all() and (tint == _UNBOUND).all():
@@ -67,25 +69,27 @@ def usd_parts(source: UsdSource, decode: Decode, *, emission: bool = False) -> T
         material=material,
         materials=tuple(materials),
         uv=np.concatenate(coordinates),
-        color=None if (tint == 1).all() else tint,
+        colour=None if (tint == 1).all() else tint,
     )
 
 
-def _material_rows(bindings: Sequence[Binding], part: PlacedPart, plain: int) -> NDArray[np.int64]:
-    rows = np.full(len(part.cut.corners), plain)
+def _material_rows(
+    bindings: Sequence[Binding], placed: PlacedMesh, plain: int
+) -> NDArray[np.int64]:
+    rows = np.full(len(placed.cut.corners), plain)
     for row, polygons in bindings:
-        chosen = slice(None) if polygons is None else np.isin(part.cut.polygons, polygons)
+        chosen = slice(None) if polygons is None else np.isin(placed.cut.polygons, polygons)
         rows[chosen] = plain if row < 0 else row
     return rows
 
 
 def _corner_tints(
-    part: PlacedPart, is_plain: NDArray[np.bool_], time: object
+    placed: PlacedMesh, is_plain: NDArray[np.bool_], time: object
 ) -> NDArray[np.float64]:
     """Return the tints [T, 3, 3] of corners: display colors where there is no material, else 1."""
     tints = np.ones((len(is_plain), 3, 3))
     if is_plain.any():
-        display_colors = read_colors(part.cut, "displayColor", time)
+        display_colors = read_colors(placed.cut, "displayColor", time)
         tints[is_plain] = (
             _UNBOUND if display_colors is None else np.clip(display_colors[is_plain], 0, 1)
         )
@@ -109,20 +113,22 @@ class _PrimvarMaterials:
         self._emission = emission
         self._known: dict[tuple[int, bytes], int] = {}
 
-    def apply(self, part: PlacedPart, rows: NDArray[np.int64], tints: NDArray[np.float64]) -> None:
+    def apply(
+        self, placed: PlacedMesh, rows: NDArray[np.int64], tints: NDArray[np.float64]
+    ) -> None:
         """Replace the rows [T] and tints [T, 3, 3] of triangles that have such materials."""
         for row in np.unique(rows):
             if row >= len(self._stated) or not self._stated[row].primvars:
                 continue
             stated = self._stated[row]
-            mine = rows == row
-            base = stated.read_values("diffuseColor", part.cut, self._time)
+            mask = rows == row
+            base = stated.read_values("diffuseColor", placed.cut, self._time)
             if base is not None:
-                tints[mine] = np.clip(base, 0, 1)[mine]
+                tints[mask] = np.clip(base, 0, 1)[mask]
             elif "diffuseColor" in stated.primvars:
-                tints[mine] = np.maximum(stated.constants["diffuseColor"], 0)
+                tints[mask] = np.maximum(stated.constants["diffuseColor"], 0)
             values = {
-                name: stated.read_values(name, part.cut, self._time) for name in stated.primvars
+                name: stated.read_values(name, placed.cut, self._time) for name in stated.primvars
             }
             values["diffuseColor"] = None
             glow = values.get("emissiveColor")
@@ -130,7 +136,7 @@ class _PrimvarMaterials:
                 values["emissiveColor"] = glow * _read_strength(stated) if self._emission else None
             means = {name: each.mean(axis=1) for name, each in values.items() if each is not None}
             if means:
-                rows[mine] = self._add_materials(int(row), {k: v[mine] for k, v in means.items()})
+                rows[mask] = self._add_materials(int(row), {k: v[mask] for k, v in means.items()})
 
     def _add_materials(
         self, row: int, means: Mapping[str, NDArray[np.float64]]
@@ -145,8 +151,8 @@ class _PrimvarMaterials:
             key = (row, values.tobytes())
             if key not in self._known:
                 self._known[key] = len(self._materials)
-                parts = dict(zip(means, np.split(values, len(means)), strict=True))
-                self._materials.append(_replace_values(self._materials[row], parts))
+                inputs = dict(zip(means, np.split(values, len(means)), strict=True))
+                self._materials.append(_replace_values(self._materials[row], inputs))
             rows.append(self._known[key])
         return np.array(rows, np.int64)[index.reshape(-1)]
 
@@ -247,21 +253,21 @@ class _Reader:
         return Slot(
             picture=picture,
             uv_set=self._primvars.index(node.chart.primvar),
-            uv_matrix=uv_matrix,
-            uv_offset=uv_offset,
+            turn=uv_matrix,
+            shift=uv_offset,
             channel=channel,
         )
 
     def _picture(self, node: TextureNode) -> NDArray:
         path = node.resolved or node.named
         if path not in self._values:
-            self._values[path] = self._decode(self._files.of(path), node.named)
+            self._values[path] = self._decode(self._files.require(path), node.named)
         return self._values[path]
 
     def _is_srgb(self, node: TextureNode) -> bool:
-        if node.color_space in ("sRGB", "raw"):
-            return node.color_space == "sRGB"
-        return has_colors(self._files.of(node.resolved or node.named))
+        if node.colour_space in ("sRGB", "raw"):
+            return node.colour_space == "sRGB"
+        return has_colors(self._files.require(node.resolved or node.named))
 
 
 def _scale_picture(
@@ -270,17 +276,17 @@ def _scale_picture(
     """Return a picture of linear float32 values, scaled and offset, clamped to 0 from below."""
     values = np.zeros((*picture.values.shape[:2], 4), np.float32)
     for row in range(0, len(values), _STRIP):
-        part = slice(row, row + _STRIP)
-        values[part] = np.maximum(picture.linear(picture.values[part]) * scale + bias, 0)
+        strip = slice(row, row + _STRIP)
+        values[strip] = np.maximum(picture.linear(picture.values[strip]) * scale + bias, 0)
     return Picture(values=values, is_srgb=False, wrap=picture.wrap)
 
 
 def _chart_transform(chart: UvChart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     matrix = np.eye(2)
     offset = np.zeros(2)
-    for transform in chart.transforms:
-        matrix = transform.matrix @ matrix
-        offset = transform.matrix @ offset + transform.translation
+    for transform in chart.moves:
+        matrix = transform.turn @ matrix
+        offset = transform.turn @ offset + transform.translation
     if not (np.isfinite(matrix).all() and np.isfinite(offset).all()):
         raise Rejected("materials_unreadable", "coordinates are moved by what is no number")
     return matrix, offset

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.usd.object_stage import UsdStage
-from pipeline.foreign.usd.polygons import CutMesh, cut_mesh, mesh_polygons, place_points
+from pipeline.foreign.usd.polygons import CutMesh, cut_mesh, mesh_polygons, moved
 from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 from storage.errors import Rejected
 
@@ -19,7 +19,7 @@ and off by 1 % of the size beyond it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PlacedPart:
+class PlacedMesh:
     """The triangles of one mesh of a stage in world space."""
 
     number: int
@@ -33,20 +33,20 @@ class PlacedPart:
         """Return the values [T, S, 3, 2] of primvars at corners; NaN where there are none."""
         uv = np.full((len(self.cut.corners), len(primvars), 3, 2), np.nan)
         for row, name in enumerate(primvars):
-            values = chart_corners(UvChart(primvar=name, transforms=()), self.cut, time)
+            values = chart_corners(UvChart(primvar=name, moves=()), self.cut, time)
             if values is not None:
                 uv[:, row] = values
         return uv
 
 
-def placed_parts(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedPart, ...]:
+def place_meshes(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedMesh, ...]:
     """Return the meshes of a stage that have triangles.
 
     Raises:
         Rejected: no_faces, too_many_faces, offset_precision.
         TrilightError: arrays of a mesh contradict each other, or are not finite.
     """
-    parts: list[PlacedPart] = []
+    meshes: list[PlacedMesh] = []
     faces_left = limits.max_faces
     farthest = 0.0
     for number, each in enumerate(stage.meshes):
@@ -58,25 +58,25 @@ def placed_parts(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedPart, ...]:
         if len(cut.corners):
             scale = np.linalg.norm(each.to_world[:3, :3], 2)
             farthest = max(farthest, float(scale * np.abs(polygons.points).max()))
-            points = place_points(polygons.points, each.to_world)
-            parts.append(PlacedPart(number=number, points=points, cut=cut))
-    if not parts:
+            points = moved(polygons.points, each.to_world)
+            meshes.append(PlacedMesh(number=number, points=points, cut=cut))
+    if not meshes:
         raise Rejected("no_faces", "the stage shows no mesh with triangles")
-    _require_precision(parts, farthest)
-    return tuple(parts)
+    _require_precision(meshes, farthest)
+    return tuple(meshes)
 
 
-def join_parts(parts: Sequence[PlacedPart]) -> TriangleMesh:
+def join_meshes(meshes: Sequence[PlacedMesh]) -> TriangleMesh:
     """Return all parts as one mesh, unwelded."""
-    starts = np.cumsum([0, *(len(part.points) for part in parts)])
-    faces = [p.cut.indices[p.cut.corners] + k for p, k in zip(parts, starts[:-1], strict=True)]
+    starts = np.cumsum([0, *(len(part.points) for part in meshes)])
+    faces = [p.cut.indices[p.cut.corners] + k for p, k in zip(meshes, starts[:-1], strict=True)]
     return TriangleMesh(
-        positions=np.concatenate([part.points for part in parts]), faces=np.concatenate(faces)
+        positions=np.concatenate([part.points for part in meshes]), faces=np.concatenate(faces)
     )
 
 
-def _require_precision(parts: Sequence[PlacedPart], farthest: float) -> None:
-    used = np.concatenate([p.points[p.cut.indices[p.cut.corners.ravel()]] for p in parts])
+def _require_precision(meshes: Sequence[PlacedMesh], farthest: float) -> None:
+    used = np.concatenate([p.points[p.cut.indices[p.cut.corners.ravel()]] for p in meshes])
     extent = float(np.ptp(used, axis=0).max())
     if farthest > _MAX_OFFSET * extent > 0:
         raise Rejected(

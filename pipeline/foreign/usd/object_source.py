@@ -7,9 +7,9 @@ from pathlib import Path
 
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.usd.object_looks import StageMaterials, read_stage_materials
-from pipeline.foreign.usd.object_meshes import PlacedPart, join_parts, placed_parts
+from pipeline.foreign.usd.object_meshes import PlacedMesh, join_meshes, place_meshes
 from pipeline.foreign.usd.object_stage import UsdStage, open_stage, read_or_reject
+from pipeline.foreign.usd.stage_materials import StageMaterials, read_stage_materials
 from storage.errors import Rejected
 
 
@@ -51,14 +51,14 @@ class UsdSource:
         return self.stage.opened.notes
 
     @cached_property
-    def parts(self) -> tuple[PlacedPart, ...]:
-        """Return the meshes; raises Rejected as `placed_parts`, or load_error."""
-        return read_or_reject(self._path, lambda: placed_parts(self.stage, self._limits))
+    def meshes(self) -> tuple[PlacedMesh, ...]:
+        """Return the meshes; raises Rejected as `place_meshes`, or load_error."""
+        return read_or_reject(self._path, lambda: place_meshes(self.stage, self._limits))
 
     @cached_property
     def mesh(self) -> TriangleMesh:
-        """Return all meshes as one, in meters, +Z up; raises Rejected as `parts`."""
-        return join_parts(self.parts)
+        """Return all meshes as one, in meters, +Z up; raises Rejected as `meshes`."""
+        return join_meshes(self.meshes)
 
     def materials(self) -> StageMaterials:
         """Return the materials; raises Rejected as `read_stage_materials`, or no_materials."""

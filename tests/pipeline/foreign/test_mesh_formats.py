@@ -14,6 +14,7 @@ from pipeline.exchange.scene_files import build_scene
 from pipeline.foreign.gltf.container import data_uri_bytes, local_path
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.load import load_mesh
+from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.mesh_materials import read_parts
 from pipeline.foreign.picture import Decoder
@@ -308,13 +309,13 @@ def test_shades_of_public_reports(shared: Path) -> None:
             area = np.linalg.norm(parts.mesh.double_area_vectors, axis=1) / 2
             found = Counter[tuple[float, ...]]()
             for face, share in enumerate(area / area.sum()):
-                material = parts.materials[parts.material[face]]
+                material: SourceMaterial = parts.materials[parts.material[face]]
                 color = np.array(material.base_rgb)
-                if parts.color is not None:
-                    color = color * parts.color[face].mean(axis=0)
+                if parts.colour is not None:
+                    color = color * parts.colour[face].mean(axis=0)
                 if material.base is not None:
                     middle = parts.uv[face, 0].mean(axis=0)[None]
-                    color = color * material.base.picture.sample(middle, np.zeros(1, int))[0, :3]
+                    color = color * material.base.picture.at(middle, np.zeros(1, int))[0, :3]
                 found[tuple(np.round(color, 3).tolist())] += share
             assert dict(found) == pytest.approx(shades)
 

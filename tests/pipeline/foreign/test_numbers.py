@@ -30,7 +30,7 @@ def look_at_parts(path: Path) -> str:
     for material in _parts(source, Decoder(1 << 20), emission=True).materials:
         colors = (*material.base_rgb, *material.specular_rgb, *material.emission_rgb)
         numbers = (material.metallic, material.roughness, material.f0, material.specular_strength)
-        moves = [[*slot.uv_matrix.flat, *slot.uv_offset] for slot in material.slots]
+        moves = [[*slot.turn.flat, *slot.shift] for slot in material.slots]
         assert np.isfinite([*colors, *numbers, *itertools.chain(*moves)]).all()
     return "; ".join(source.unread)
 

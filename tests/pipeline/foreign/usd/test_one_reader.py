@@ -53,7 +53,7 @@ def of_object(path: Path) -> Looks:
     assert usd is not None
     parts = usd_parts(usd, lambda data, name: np.zeros((1, 1, 4), np.uint8))
     base = np.array([material.base_rgb for material in parts.materials])[parts.material]
-    tint = 1.0 if parts.color is None else parts.color.mean(axis=1)
+    tint = 1.0 if parts.colour is None else parts.colour.mean(axis=1)
     rough = np.array([material.roughness for material in parts.materials])[parts.material]
     return looks_of(parts.mesh.positions[parts.mesh.faces], base * tint, rough)
 
