@@ -24,6 +24,6 @@ def read_linear_picture(
             return openexr.read_openexr(data, max_pixels, is_color=is_color)
         if data.startswith(radiance_hdr.MAGIC):
             return radiance_hdr.read_radiance_hdr(data, max_pixels, is_color=is_color)
-    except (ValueError, LookupError, ArithmeticError) as error:  # names that are no UTF-8, ...
+    except (ValueError, LookupError, ArithmeticError) as error:  # such as names that are not UTF-8
         raise Rejected("load_error", "it is damaged; write it again") from error
     return None

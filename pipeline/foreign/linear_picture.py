@@ -65,8 +65,8 @@ def as_rec709(rgb: NDArray[np.float32], primaries: Sequence[float]) -> NDArray[n
         Rejected: as `rec709_from`.
     """
     matrix = rec709_from(primaries).astype(np.float32)
-    moved: NDArray[np.float32] = rgb @ matrix.T
-    return np.where((rgb >= 0).all(axis=-1, keepdims=True), np.maximum(moved, 0), moved)
+    converted: NDArray[np.float32] = rgb @ matrix.T
+    return np.where((rgb >= 0).all(axis=-1, keepdims=True), np.maximum(converted, 0), converted)
 
 
 def _to_xyz(primaries: Sequence[float]) -> NDArray[np.float64]:

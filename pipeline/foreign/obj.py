@@ -47,7 +47,7 @@ def read_obj(data: bytes) -> FileMesh:
     lines, kinds = _read_statements(join_continued(text))
     numbers = _Numbers(lines, kinds)
     points, width = numbers.read_rows(_V, 3)
-    unread = _name_others(lines, np.flatnonzero(kinds == _OTHER))
+    unread = _count_unread(lines, np.flatnonzero(kinds == _OTHER))
     faces = np.flatnonzero(kinds == _F)
     counts = lines.counts[faces] - 1
     if few := int((counts < 3).sum()):
@@ -65,17 +65,17 @@ def read_obj(data: bytes) -> FileMesh:
     triangles, polygon = sort_by_size(triangles, polygon, counts, group)
     chosen = corners[triangles.ravel()]
     first, vertex = _unmerge(chosen, np.repeat(material[polygon], 3))
-    places, _ = numbers.read_rows(_VT, 1)
+    coordinates, _ = numbers.read_rows(_VT, 1)
     used = chosen[:, 1]
-    if (used >= len(places)).any() or (used < -1).any():
+    if (used >= len(coordinates)).any() or (used < -1).any():
         unread["texture coordinates that the file does not hold"] = 1
-        used = np.where((used < 0) | (used >= len(places)), -1, used)
+        used = np.where((used < 0) | (used >= len(coordinates)), -1, used)
     colors = _decode_colors(text, points, width, unread)
     return FileMesh(
         mesh=TriangleMesh(positions=points[chosen[first, 0], :3], faces=vertex.reshape(-1, 3)),
         material=material[polygon],
         material_names=names,
-        uv=_pick(places[:, :2], used).reshape(-1, 3, 2) if len(places) else None,
+        uv=_pick(coordinates[:, :2], used).reshape(-1, 3, 2) if len(coordinates) else None,
         color=None if colors is None else colors[chosen[:, 0]].reshape(-1, 3, 3),
         unread=list_some(unread),
     )
@@ -138,7 +138,7 @@ class _Numbers:
         codes[keys[is_long] + 1] = _SPACE
         self._text = codes.tobytes()
 
-    def take_text(self, kind: int) -> bytes:
+    def join_text(self, kind: int) -> bytes:
         """Return the lines of a kind without their key words."""
         return self._lines.take_rows(self._by_kind[kind], self._text)
 
@@ -155,7 +155,7 @@ class _Numbers:
             self.require_complete(short, f"expected {least} numbers or more")
             line = self._lines.line(int(short[0]))
             raise Rejected("load_error", f"{line[:60]!r}: expected {least} numbers or more")
-        flat = parse_numbers(self.take_text(kind), int(counts.sum()), np.float64)
+        flat = parse_numbers(self.join_text(kind), int(counts.sum()), np.float64)
         width = max(int(counts.max(initial=0)), max(least, 2))
         if len(flat) == width * len(rows):
             return flat.reshape(-1, width), counts
@@ -177,21 +177,21 @@ def _read_corners(
 ) -> NDArray[np.int64]:
     """Return rows [C, 3] of vertex, texture coordinate and normal of corners; -1 for none."""
     counts = lines.counts[faces] - 1
-    text = re.sub(rb"/(?![-+0-9])", b"/0", numbers.take_text(_F))
+    text = re.sub(rb"/(?![-+0-9])", b"/0", numbers.join_text(_F))
     words = split_lines(text)
     if len(words.words) != counts.sum():
         raise Rejected("load_error", "a corner of a face is malformed")
     slashes = np.flatnonzero(words.codes == ord("/"))
     owner = np.searchsorted(words.words, slashes, side="right") - 1
-    parts = 1 + np.bincount(owner, minlength=len(words.words))
-    if parts.max(initial=0) > 3:
+    num_indices = 1 + np.bincount(owner, minlength=len(words.words))
+    if num_indices.max(initial=0) > 3:
         raise Rejected("load_error", "a corner of a face has more than three indices")
-    flat = parse_numbers(text.replace(b"/", b" "), int(parts.sum()), np.int64)
-    start = np.cumsum(parts) - parts
+    flat = parse_numbers(text.replace(b"/", b" "), int(num_indices.sum()), np.int64)
+    start = np.cumsum(num_indices) - num_indices
     row = np.repeat(faces, counts)
-    corners = np.full((len(parts), 3), -1)
+    corners = np.full((len(num_indices), 3), -1)
     for column, kind in enumerate((_V, _VT, _VN)):
-        has = parts > column
+        has = num_indices > column
         index = flat[start[has] + column]
         before = numbers.count_before(kind, row[has])
         index = np.where(index > 0, index - 1, np.where(index < 0, before + index, -1))
@@ -210,8 +210,8 @@ def _read_materials(
     ]
     rows: dict[str, int] = {}
     known = [-1, *(rows.setdefault(name, len(rows)) if name else -1 for _, name in named)]
-    places = np.array([row for row, _ in named], np.int64)
-    material = np.array(known)[np.searchsorted(places, faces)]
+    statement_rows = np.array([row for row, _ in named], np.int64)
+    material = np.array(known)[np.searchsorted(statement_rows, faces)]
     used, flat = np.unique(material, return_inverse=True)
     names = list(rows)
     return flat - int(used[0] < 0), tuple(names[row] for row in used if row >= 0)
@@ -257,7 +257,7 @@ def _read_value(line: bytes, key: bytes) -> str | None:
     return unquote_name(decode_name(line[len(word) :]))
 
 
-def _name_others(lines: TextLines, rows: NDArray[np.int64]) -> Counter[str]:
+def _count_unread(lines: TextLines, rows: NDArray[np.int64]) -> Counter[str]:
     """Count the statements that no code reads, by name."""
     unread = Counter[str]()
     for row in rows.tolist():

@@ -181,7 +181,7 @@ def _list_choices(headers: Sequence[Mapping[str, Any]]) -> Iterator[_Choice]:
             layers[part, layer][letter] = str(channel.name)
     for color_letters in (_COLOR, _CHROMA, _GREY, None):
         for (part, layer), names in layers.items():
-            letters = color_letters or tuple(set(names) - {"A"})  # one channel of any name is grey
+            letters = color_letters or tuple(set(names) - {"A"})  # one channel of any name is gray
             is_depth = letters == ("Z",) or layer.lower().endswith(("depth", "mist"))
             if is_depth or (letters == _GREY and "X" in names):
                 continue  # or CIE XYZ

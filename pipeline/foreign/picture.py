@@ -67,7 +67,7 @@ def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
                         f"{image.width} x {image.height}; at most {max_pixels} "
                         "pixels are left. Make it smaller, or raise own_materials.max_pixels",
                     )
-                return np.ascontiguousarray(_values(image)[::-1])
+                return np.ascontiguousarray(_decode_values(image)[::-1])
     except MemoryError:
         raise
     except Rejected as error:
@@ -86,7 +86,7 @@ def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
 def has_colors(data: bytes) -> bool:
     """Return whether a picture of 8 bits has colors, which USD assumes to be sRGB by default.
 
-    False too for bytes that are no picture.
+    False for bytes that no decoder reads, too.
     """
     try:
         with warnings.catch_warnings():
@@ -109,12 +109,12 @@ def _unit_values(values: NDArray[np.float32]) -> NDArray[np.float16]:
     return rgba
 
 
-def _values(image: Image.Image) -> NDArray:
+def _decode_values(image: Image.Image) -> NDArray:
     if image.mode == "F":
         return _unit_values(np.asarray(image, np.float32)[..., None])
     if image.mode.startswith("I"):
-        grey = np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
-        return np.stack([grey, grey, grey, np.full_like(grey, 65535)], axis=-1)
+        gray = np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
+        return np.stack([gray, gray, gray, np.full_like(gray, 65535)], axis=-1)
     return np.asarray(image.convert("RGBA"))
 
 

@@ -61,8 +61,8 @@ def placed_prims(
     skins = BoundSkins(time)
     visits = 0
     above_zero = Within(0, FINITE.high, low_open=True)
-    metres = read_number(UsdGeom.GetStageMetersPerUnit(stage), "metersPerUnit", above_zero)
-    for visit in _visit_prims(stage, _base(stage, metres), time, lost):
+    meters_per_unit = read_number(UsdGeom.GetStageMetersPerUnit(stage), "metersPerUnit", above_zero)
+    for visit in _visit_prims(stage, _stage_to_world(stage, meters_per_unit), time, lost):
         visits += 1
         if visits > MAX_PLACED:
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
@@ -79,18 +79,20 @@ def placed_prims(
             if not np.isfinite(to_world).all():
                 raise TrilightError(f"{prim.GetPath()}: its place is not finite.")
             skin = skins.find(prim)
-            placed.append(Placed(prim=prim, to_world=to_world, metres=metres, skin=skin, lost=lost))
+            placed.append(
+                Placed(prim=prim, to_world=to_world, metres=meters_per_unit, skin=skin, lost=lost)
+            )
     lost += [f"{count} x {kind}: not read" for kind, count in sorted(unread.items())]
     return placed
 
 
-def _base(stage: Any, metres: float) -> NDArray[np.float64]:
+def _stage_to_world(stage: Any, meters_per_unit: float) -> NDArray[np.float64]:
     """Return the matrix [4, 4] from a stage's units and up axis to meters with +Z up."""
     from pxr import UsdGeom
 
-    base = np.diag([metres, metres, metres, 1.0])
+    base = np.diag([meters_per_unit, meters_per_unit, meters_per_unit, 1.0])
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
-        base[:3, :3] = metres * np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+        base[:3, :3] = meters_per_unit * np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     return base
 
 

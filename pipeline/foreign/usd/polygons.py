@@ -146,8 +146,8 @@ def cut_mesh(mesh: MeshPolygons) -> CutMesh:
 
 def moved(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points [P, 3] transformed by a matrix [4, 4]."""
-    placed: NDArray[np.float64] = np.einsum("ij,vj->vi", to_world[:3, :3], points)
-    return placed + to_world[:3, 3]
+    rotated: NDArray[np.float64] = np.einsum("ij,vj->vi", to_world[:3, :3], points)
+    return rotated + to_world[:3, 3]
 
 
 def as_array(values: Any, dtype: type, shape: tuple[int, ...]) -> NDArray:
