@@ -46,7 +46,7 @@ def obj_materials(
     """Return materials by name, and sentences on statements that are not read.
 
     Args:
-        used: names, in the order of the result.
+        names: material names, in the order of the result.
         files: contents of the libraries and pictures that the OBJ names.
         decode: returns the values of a picture's bytes.
         emission: whether emission is read, too.
