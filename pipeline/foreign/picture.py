@@ -40,7 +40,7 @@ class Decoder:
         self._pixels_left = max_pixels
 
     def __call__(self, data: bytes, name: str) -> NDArray:
-        """Return `decode_picture` within the pixels that are left."""
+        """Return `decode_image` within the pixels that are left."""
         values = decoded(data, name, self._pixels_left)
         self._pixels_left -= values.shape[0] * values.shape[1]
         return values
@@ -123,7 +123,7 @@ class Picture:
     """Values in [0, 1] over texture coordinates, u to the right and v up."""
 
     values: NDArray
-    """[H, W, 4] as `decode_picture` returns them, or linear float32."""
+    """[H, W, 4] as `decode_image` returns them, or linear float32."""
     is_srgb: bool
     """True where red, green and blue are sRGB-encoded; alpha never is."""
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
