@@ -206,7 +206,7 @@ def _middle(seconds: Sequence[float]) -> float:
 
 def tracing_child(variant: Variant) -> IsolatedChild:
     """Return a child that traces on one thread; the caller closes it."""
-    return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(variant,))
+    return IsolatedChild(limits=_LIMITS, factory=set_up_child, args=(variant,))
 
 
 def set_up_child(variant: Variant) -> None:

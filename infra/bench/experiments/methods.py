@@ -66,7 +66,7 @@ def _measure(
     context: BenchContext, points: Sequence[Point], trial: str
 ) -> Iterator[tuple[str, Figures]]:
     methods, child = context.get_or_make("methods", lambda: _set_up(context))
-    scene = child.call(held_out_scene, int(trial.split()[-1]))
+    scene = held_out_scene(child, int(trial.split()[-1]))
     for px in WIDTHS:
         camera = first_camera(scene, px)
         reference = kept_reference(child, scene, camera, 2 * context.scale.max_spp)

@@ -1,8 +1,8 @@
-"""Objects' own materials: baked onto each level of an asset.
+"""Source materials of objects, baked onto each level of an asset.
 
-- `source_surface`: the cleaned source with a colour at every place.
-- `nearest`: which place of the source a place of a level shows.
-- `tiles`: an atlas with a place for every triangle.
-- `glow`: what the triangles of a level emit.
-- `bake`, `measure`: the skin of a level, and how far it is off.
+- `source_surface`: the cleaned source with its materials at every point.
+- `nearest`: the point of the source for each point of a level.
+- `tiles`: an atlas with a tile for every triangle.
+- `glow`: the emission of a level's triangles.
+- `bake`, `measure`: the textures of a level, and their error.
 """

@@ -1,4 +1,4 @@
-"""The cleaned source with a colour at every place: its faces find themselves in the file again."""
+"""The cleaned source with its materials: each clean face is matched to a face of the file."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,119 +13,123 @@ from pipeline.foreign.parts import TexturedParts
 from storage.errors import Rejected
 
 _LEAST_FOUND = 0.999
-"""Share of the cleaned faces that the file must have: all but those that rounding moved apart."""
+"""Fraction of the cleaned faces that must match one of the file: all but those that rounding split.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SourceSurface:
-    """The clean, outward oriented mesh of a source, and what it is made of."""
+    """The clean, outward oriented mesh of a source, with its materials."""
 
     mesh: TriangleMesh
-    """In the unit box."""
+    """Clean mesh in the unit box."""
     parts: TexturedParts
-    """The file's faces."""
-    origin: NDArray[np.int64]
-    """[F] which of those each face is."""
-    turn: NDArray[np.int64]
-    """[F, 3] which corner of that face each corner is."""
+    """Faces of the file, with texture coordinates and materials."""
+    source_face: NDArray[np.int64]
+    """[F] face of the file for each clean face."""
+    source_corner: NDArray[np.int64]
+    """[F, 3] corner of that face for each corner."""
 
     def columns(
         self, faces: NDArray[np.int64], weights: NDArray[np.float64], cell: float
     ) -> NDArray[np.float64]:
-        """Return diffuse rgb, specular rgb and roughness [N, 7] at places on faces.
+        """Return diffuse rgb, specular rgb and roughness [N, 7] at points on faces.
 
         Args:
-            faces: [N]
-            weights: [N, 3] barycentric coordinates there.
+            faces: [N] clean faces.
+            weights: [N, 3] barycentric coordinates in them.
             cell: width in the unit box over which pictures are averaged.
         """
-        origin = self.origin[faces]
-        own = np.zeros((len(faces), 3))  # the weights of the file's own corners
-        np.put_along_axis(own, self.turn[faces], weights, axis=1)
-        found = np.zeros((len(faces), 7))
-        of_place = self.parts.material[origin]
-        for row in np.unique(of_place):
-            chosen = np.flatnonzero(of_place == row)
-            found[chosen] = self._of_material(
-                self.parts.materials[row], origin[chosen], own[chosen], cell
+        source_face = self.source_face[faces]
+        source_weights = np.zeros((len(faces), 3))  # weights of the corners in the file's order
+        np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
+        result = np.zeros((len(faces), 7))
+        material = self.parts.material[source_face]
+        for row in np.unique(material):
+            chosen = np.flatnonzero(material == row)
+            result[chosen] = self._material_columns(
+                self.parts.materials[row], source_face[chosen], source_weights[chosen], cell
             )
-        return found
+        return result
 
     @property
     def emits(self) -> bool:
-        """Whether any of its materials says so."""
+        """True where any material emits light."""
         return any(material.emits for material in self.parts.materials)
 
     def emission(
         self, faces: NDArray[np.int64], weights: NDArray[np.float64], cell: float
     ) -> NDArray[np.float64]:
-        """Return the radiance [N, 3] at places on faces; arguments as those of `columns`."""
-        origin = self.origin[faces]
-        own = np.zeros((len(faces), 3))
-        np.put_along_axis(own, self.turn[faces], weights, axis=1)
-        found = np.zeros((len(faces), 3))
+        """Return the radiance [N, 3] at points on faces; arguments as in `columns`."""
+        source_face = self.source_face[faces]
+        source_weights = np.zeros((len(faces), 3))
+        np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
+        result = np.zeros((len(faces), 3))
         for row, material in enumerate(self.parts.materials):
-            chosen = np.flatnonzero(self.parts.material[origin] == row)
+            chosen = np.flatnonzero(self.parts.material[source_face] == row)
             if not material.emits or not len(chosen):
                 continue
-            found[chosen] = material.emission_rgb
+            result[chosen] = material.emission_rgb
             if material.emission is not None:
-                found[chosen] *= self._shown(material.emission, origin[chosen], own[chosen], cell)[
-                    :, :3
-                ]
-        return found
+                result[chosen] *= self._sample_picture(
+                    material.emission, source_face[chosen], source_weights[chosen], cell
+                )[:, :3]
+        return result
 
-    def _of_material(
+    def _material_columns(
         self,
         material: SourceMaterial,
-        origin: NDArray[np.int64],
-        own: NDArray[np.float64],
+        source_face: NDArray[np.int64],
+        source_weights: NDArray[np.float64],
         cell: float,
     ) -> NDArray[np.float64]:
         known: dict[tuple[object, ...], NDArray[np.float32]] = {}
 
-        def shown(slot: Slot | None) -> NDArray[np.float32] | None:
+        def sample(slot: Slot | None) -> NDArray[np.float32] | None:
             if slot is None:
                 return None
-            place = (id(slot.picture), slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())
-            if place not in known:  # one picture often holds several numbers
-                known[place] = self._shown(slot, origin, own, cell)
-            return known[place]
+            key = (id(slot.picture), slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())
+            if key not in known:  # one picture often holds several numbers
+                known[key] = self._sample_picture(slot, source_face, source_weights, cell)
+            return known[key]
 
-        base = shown(material.base)
+        base = sample(material.base)
         if self.parts.colour is not None:
-            tint = np.einsum("nc,ncd->nd", own, self.parts.colour[origin])
-            base = np.ones((len(origin), 4), np.float32) if base is None else base
+            tint = np.einsum("nc,ncd->nd", source_weights, self.parts.colour[source_face])
+            base = np.ones((len(source_face), 4), np.float32) if base is None else base
             base = np.concatenate([base[:, :3] * tint, base[:, 3:]], axis=1).astype(np.float32)
         seen = Seen(
             base=base,
-            metallic=shown(material.metallic_map),
-            roughness=shown(material.roughness_map),
-            specular_colour=shown(material.specular_colour),
-            specular_strength=shown(material.specular_strength_map),
-            glossiness=shown(material.glossiness),
+            metallic=sample(material.metallic_map),
+            roughness=sample(material.roughness_map),
+            specular_colour=sample(material.specular_colour),
+            specular_strength=sample(material.specular_strength_map),
+            glossiness=sample(material.glossiness),
         )
-        return columns(material, seen, len(origin))
+        return columns(material, seen, len(source_face))
 
-    def _shown(
-        self, slot: Slot, origin: NDArray[np.int64], own: NDArray[np.float64], cell: float
+    def _sample_picture(
+        self,
+        slot: Slot,
+        source_face: NDArray[np.int64],
+        source_weights: NDArray[np.float64],
+        cell: float,
     ) -> NDArray[np.float32]:
-        corners = self.parts.uv[origin, slot.uv_set] @ slot.turn.T + slot.shift
-        uv = np.einsum("nc,ncd->nd", own, corners)
-        return slot.picture.at(uv, _halvings(slot, corners, self._areas[origin], cell))
+        corners = self.parts.uv[source_face, slot.uv_set] @ slot.turn.T + slot.shift
+        uv = np.einsum("nc,ncd->nd", source_weights, corners)
+        return slot.picture.at(uv, _halvings(slot, corners, self._areas[source_face], cell))
 
     @cached_property
     def _areas(self) -> NDArray[np.float64]:
-        """[R] area of each face of the file in the unit box."""
+        """Area [R] of each face of the file, in the unit box."""
         vectors = normalise(self.parts.mesh).double_area_vectors
-        areas: NDArray[np.float64] = 0.5 * np.linalg.norm(vectors, axis=1)
-        return areas
+        return 0.5 * np.linalg.norm(vectors, axis=1)
 
 
 def _halvings(
     slot: Slot, corners: NDArray[np.float64], areas: NDArray[np.float64], cell: float
 ) -> NDArray[np.int64]:
-    """Return how often [N] a picture is halved so that its texels are no wider than a cell."""
+    """Return the number of halvings [N] of a picture at which texels are as wide as a cell."""
     height, width = slot.picture.values.shape[:2]
     steps = corners[:, 1:] - corners[:, :1]
     on_picture = 0.5 * np.abs(steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0])
@@ -134,73 +138,75 @@ def _halvings(
     return np.minimum(halvings, slot.picture.most_halvings)
 
 
-def source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurface:
-    """Find the faces of a clean mesh among those of its file.
+def match_source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurface:
+    """Match the faces of a clean mesh to those of its file.
 
     Args:
-        mesh: as cleaning and orientation left it.
-        parts: of the same file.
+        mesh: the cleaned and oriented mesh.
+        parts: the faces of the same file.
 
     Raises:
-        Rejected: materials_unreadable where many are not found, no_texture_coordinates or
+        Rejected: materials_unreadable where many faces do not match, no_texture_coordinates or
             texture_coordinates_not_finite where a textured face has none.
     """
     raw = normalise(parts.mesh)
     known = cell_keys(mesh.positions)
     order = np.argsort(known)
     keys = cell_keys(raw.positions)
-    place = np.minimum(np.searchsorted(known[order], keys), len(known) - 1)
-    vertex = np.where(known[order][place] == keys, order[place], -1)
+    position = np.minimum(np.searchsorted(known[order], keys), len(known) - 1)
+    vertex = np.where(known[order][position] == keys, order[position], -1)
     corners = vertex[raw.faces]
-    origin = np.full(len(mesh.faces), -1)
-    for candidate in (corners, corners[:, [0, 2, 1]]):  # those that face the same way come first
-        found = _matching(mesh.faces, candidate)
-        origin = np.where(origin < 0, found, origin)
-    missing = origin < 0
+    source_face = np.full(len(mesh.faces), -1)
+    for candidate in (corners, corners[:, [0, 2, 1]]):  # matches of the same orientation come first
+        matched = _first_matches(mesh.faces, candidate)
+        source_face = np.where(source_face < 0, matched, source_face)
+    missing = source_face < 0
     if missing.mean() > 1 - _LEAST_FOUND:
         raise Rejected(
             "materials_unreadable",
             f"{missing.mean():.1%} of the faces are not found again beside their materials",
         )
-    origin = np.where(missing, _any_neighbour(mesh, missing, origin), origin)
-    turn = (corners[origin][:, None, :] == mesh.faces[:, :, None]).argmax(axis=2)
-    turn[missing] = np.arange(3)
-    _require_coordinates(parts, origin)
-    return SourceSurface(mesh=mesh, parts=parts, origin=origin, turn=turn)
+    source_face = np.where(missing, _nearest_matched(mesh, missing, source_face), source_face)
+    source_corner = (corners[source_face][:, None, :] == mesh.faces[:, :, None]).argmax(axis=2)
+    source_corner[missing] = np.arange(3)
+    _require_coordinates(parts, source_face)
+    return SourceSurface(
+        mesh=mesh, parts=parts, source_face=source_face, source_corner=source_corner
+    )
 
 
-def _matching(wanted: NDArray[np.int64], among: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the first row of `among` that is each wanted face but for its first corner, or -1."""
-    rows = np.concatenate([_rolled(among), _rolled(wanted)])
+def _first_matches(faces: NDArray[np.int64], candidates: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the first candidate equal to each face up to rotation of its corners, or -1."""
+    rows = np.concatenate([_start_at_lowest(candidates), _start_at_lowest(faces)])
     _, number = np.unique(rows, axis=0, return_inverse=True)
-    first = np.full(int(number.max()) + 1, len(among))
-    np.minimum.at(first, number.ravel()[: len(among)], np.arange(len(among)))
-    found = first[number.ravel()[len(among) :]]
-    return np.where(found < len(among), found, -1)
+    first = np.full(int(number.max()) + 1, len(candidates))
+    np.minimum.at(first, number.ravel()[: len(candidates)], np.arange(len(candidates)))
+    first_match = first[number.ravel()[len(candidates) :]]
+    return np.where(first_match < len(candidates), first_match, -1)
 
 
-def _rolled(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    return np.take_along_axis(faces, turn, axis=1)
+def _start_at_lowest(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    corner_order = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    return np.take_along_axis(faces, corner_order, axis=1)
 
 
-def _any_neighbour(
-    mesh: TriangleMesh, missing: NDArray[np.bool_], origin: NDArray[np.int64]
+def _nearest_matched(
+    mesh: TriangleMesh, missing: NDArray[np.bool_], source_face: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return the origin of the face whose centre is nearest, for each missing one."""
+    """Fill in each missing face with the match of the face whose center is nearest."""
     if not missing.any():
-        return origin
+        return source_face
     centres = mesh.corners.mean(axis=1)
     known = np.flatnonzero(~missing)
-    filled = origin.copy()
+    filled = source_face.copy()
     for row in np.flatnonzero(missing):
-        away = np.square(centres[known] - centres[row]).sum(axis=1)
-        filled[row] = origin[known[away.argmin()]]
+        squared = np.square(centres[known] - centres[row]).sum(axis=1)
+        filled[row] = source_face[known[squared.argmin()]]
     return filled
 
 
-def _require_coordinates(parts: TexturedParts, origin: NDArray[np.int64]) -> None:
-    used = np.unique(origin)
+def _require_coordinates(parts: TexturedParts, source_face: NDArray[np.int64]) -> None:
+    used = np.unique(source_face)
     for row in np.unique(parts.material[used]):
         mine = used[parts.material[used] == row]
         for slot in parts.materials[row].slots:

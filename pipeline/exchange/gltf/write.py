@@ -78,7 +78,7 @@ def encode_scene_glb(scene: Scene) -> bytes:
         "materials": [_material(file, scene, row) for row in range(len(scene.materials))],
         "extensionsUsed": _USED,
     }
-    return file.encoded()
+    return file.encode()
 
 
 def _parts(scene: Scene) -> Iterator[tuple[int, int, NDArray[np.int64]]]:

@@ -14,6 +14,7 @@ from pipeline.exchange.scene_files import build_scene
 from pipeline.foreign.gltf.container import data_uri_bytes, local_path
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.load import load_mesh
+from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.mesh_materials import read_parts
 from pipeline.foreign.picture import Decoder
@@ -308,7 +309,7 @@ def test_shades_of_public_reports(shared: Path) -> None:
             area = np.linalg.norm(parts.mesh.double_area_vectors, axis=1) / 2
             found = Counter[tuple[float, ...]]()
             for face, share in enumerate(area / area.sum()):
-                material = parts.materials[parts.material[face]]
+                material: SourceMaterial = parts.materials[parts.material[face]]
                 color = np.array(material.base_rgb)
                 if parts.colour is not None:
                     color = color * parts.colour[face].mean(axis=0)

@@ -18,12 +18,12 @@ from pipeline.generation import frozen_pool, pipeline, restore_object
 from pipeline.generation import object_options as asked_objects
 from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
 from pipeline.generation.accept_objects import accept_objects, load_trusted_objects
-from pipeline.generation.attempt_scene import SceneAttempt
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, require_same
 from pipeline.generation.frozen_pool import AssetMissing, SplitPool
 from pipeline.generation.prepare_isolated import asset_store
+from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.generation.user_maps import user_maps
 from pipeline.objects.maps.prepared import MapFiles, prepare_map
 from pipeline.scenes.compose import compose_scene
@@ -202,7 +202,7 @@ def test_an_object_that_is_away_is_brought_back_for_the_same_attempt(
     calls: list[tuple[object, ...]] = []
     away = [("a", "1"), ("b", "2")]
 
-    def call(child: object, function: object, *args: object) -> SceneAttempt:
+    def attempt(child: object, args: tuple[object, ...]) -> SceneAttempt:
         calls.append(args)
         return SceneAttempt(sample=None, failures=[], missing_asset=away[0] if away else None)
 
@@ -210,7 +210,7 @@ def test_an_object_that_is_away_is_brought_back_for_the_same_attempt(
         calls.append((uid, name))
         away.pop(0)
 
-    monkeypatch.setattr(pipeline, "call_with_retries", call)
+    monkeypatch.setattr(pipeline, "_attempt_with_retries", attempt)
     child: object = None
     pipeline.make_scene("train", 7, 1, child, restore)  # type: ignore[arg-type]
     assert calls == [("train", 7, 0), ("a", "1"), ("train", 7, 0), ("b", "2"), ("train", 7, 0)]

@@ -15,7 +15,7 @@ from pipeline.assets.own.skin import _parts
 from pipeline.exchange.gltf.read import GltfScene, read_gltf
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.load import load_mesh
-from pipeline.foreign.material import Seen, columns
+from pipeline.foreign.material import Seen, SourceMaterial, columns
 from pipeline.foreign.picture import Decoder
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
@@ -41,7 +41,8 @@ def surface(path: Path) -> NDArray[np.float64]:
     assert np.array_equal(load_mesh(source).corners, corners)
     colors = np.zeros((len(corners), 3))
     for row in np.unique(parts.material):
-        chosen, material = np.flatnonzero(parts.material == row), parts.materials[row]
+        chosen = np.flatnonzero(parts.material == row)
+        material: SourceMaterial = parts.materials[row]
         base = np.ones((len(chosen), 4), np.float32)
         if (slot := material.base) is not None:
             uv = parts.uv[chosen, slot.uv_set].mean(axis=1) @ slot.turn.T + slot.shift
