@@ -176,7 +176,9 @@ class NeuralRenderer:
         views = prepared.views
         if resolution not in views:
             decode = functools.partial(_picture, self._model, prepared.groups, resolution)
-            on_card = any(scene.lit.place for each, _ in prepared.groups for scene in each.traced)
+            on_card = self.device.type == "cuda" and any(
+                scene.lit.place for each, _ in prepared.groups for scene in each.traced
+            )
             views[resolution] = Replayed(decode) if on_card else decode
         picture: NDArray[np.float32] = views[resolution](c2w_44, angle).cpu().numpy()
         return picture
