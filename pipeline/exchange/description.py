@@ -8,7 +8,7 @@ from typing import Literal
 
 Vector = tuple[float, float, float]
 
-ColourGroups = Literal["per-triangle", "per-shading-group"]
+ColorGroups = Literal["per-triangle", "per-shading-group"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,7 @@ class DescribedMaterial:
     smooth_shading: bool
     """Whether normals are interpolated across edges of up to 30 degrees; flat otherwise."""
     random_diffuse_max: float  # bound of the random colours
-    random_diffuse_type: ColourGroups  # what shares one random colour
+    random_diffuse_type: ColorGroups  # what shares one random colour
     rand_tri_diffuse_seed: int | None
     """Seed of random colours that replace `diffuse`; None for none."""
 

@@ -25,11 +25,11 @@ from pipeline.exchange.gltf.read import read_gltf
 from pipeline.exchange.renderformer_cells import textured_triangles
 from pipeline.exchange.renderformer_h5 import (
     read_renderformer_h5,
-    reflecting_emitters,
+    note_reflecting_emitters,
     write_renderformer_h5,
 )
-from pipeline.exchange.renderformer_json import described_files
-from pipeline.exchange.scene_files import build_scene, cameras_by, described_by
+from pipeline.exchange.renderformer_json import describe_scene
+from pipeline.exchange.scene_files import build_scene, read_scene_cameras, read_scene_description
 from pipeline.exchange.usd import write as usd
 from pipeline.exchange.usd.read import read_usd, usd_keys
 from pipeline.exchange.usd.write import write_usd, write_usd_shard
@@ -116,20 +116,20 @@ class SceneFormat:
     """Whether `write` makes use of pictures."""
 
 
-def readable() -> list[str]:
+def readable_suffixes() -> list[str]:
     """Return the suffixes of files that are scenes."""
     return [suffix for suffix, form in FORMATS.items() if form.read and not form.always_many]
 
 
-def writable() -> list[str]:
+def writable_suffixes() -> list[str]:
     """Return the suffixes of files that can be written."""
     return [suffix for suffix, form in FORMATS.items() if form.write]
 
 
 def _read_usd(source: SceneSource, pictures: bool) -> LoadedScene:
-    found = read_usd(source.path, source.key, source.usd_folder, USER_PROVIDED)
+    loaded = read_usd(source.path, source.key, source.usd_folder, USER_PROVIDED)
     return LoadedScene(
-        scene=found.scene, notes=tuple(f"{source.name}: {text}" for text in found.lost)
+        scene=loaded.scene, notes=tuple(f"{source.name}: {text}" for text in loaded.lost)
     )
 
 
@@ -159,9 +159,9 @@ def _write_many_usd(target: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
 
 
 def _read_gltf(source: SceneSource, pictures: bool) -> LoadedScene:
-    found = read_gltf(source.path, USER_PROVIDED)
+    loaded = read_gltf(source.path, USER_PROVIDED)
     return LoadedScene(
-        scene=found.scene, notes=tuple(f"{source.name}: {text}" for text in found.lost)
+        scene=loaded.scene, notes=tuple(f"{source.name}: {text}" for text in loaded.lost)
     )
 
 
@@ -171,7 +171,7 @@ def _write_glb(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...
 
 def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
     root, name = source.path.parent.resolve(), source.path.name
-    unknown = described_by(root, name).unknown_fields
+    unknown = read_scene_description(root, name).unknown_fields
     unread: list[str] = []
     scene, _ = build_scene(
         root,
@@ -189,11 +189,11 @@ def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
 
 
 def _json_cameras(source: SceneSource) -> Cameras:
-    return cameras_by(source.path.parent.resolve(), source.path.name)
+    return read_scene_cameras(source.path.parent.resolve(), source.path.name)
 
 
 def _write_json(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
-    described = described_files(scene, target.stem)
+    described = describe_scene(scene, target.stem)
     for path, data in described.meshes.items():
         write_atomically(target.parent / path, data)
     write_atomically(target, described.json)  # last: what it names is there
@@ -201,11 +201,11 @@ def _write_json(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ..
 
 
 def _read_h5(source: SceneSource, pictures: bool) -> LoadedScene:
-    found = read_renderformer_h5(source.path)
+    loaded = read_renderformer_h5(source.path)
     return LoadedScene(
-        scene=found.scene,
-        notes=tuple(f"{source.path.name}: {text}" for text in found.lost),
-        radiance_rgb=found.radiance_rgb if pictures else None,
+        scene=loaded.scene,
+        notes=tuple(f"{source.path.name}: {text}" for text in loaded.lost),
+        radiance_rgb=loaded.radiance_rgb if pictures else None,
     )
 
 
@@ -213,7 +213,7 @@ def _write_h5(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]
     write_renderformer_h5(target, scene, pictures)
     count = int(textured_triangles(scene).sum())
     cells = (f"more of {count} textured triangles than the means of 32 x 32 cells each",)
-    return (*reflecting_emitters(scene), *(cells if count else ()))
+    return (*note_reflecting_emitters(scene), *(cells if count else ()))
 
 
 def _read_scene_file(source: SceneSource, pictures: bool) -> LoadedScene:
@@ -281,7 +281,7 @@ FORMATS: Registry[SceneFormat] = Registry(
 """Formats by suffix, in lower case with the point."""
 
 
-def lost_members(scene: Scene, carried: Collection[str]) -> tuple[str, ...]:
+def list_lost_members(scene: Scene, carried: Collection[str]) -> tuple[str, ...]:
     """Return what a form that carries these members loses of a scene: one text, or none."""
     lost = [
         member
@@ -297,16 +297,18 @@ def _members_in_use(scene: Scene) -> Iterator[str]:
         if field.name == "materials":
             yield from (f"materials.{name}" for name in columns_in_use(scene.materials))
         elif field.name == "objects":
-            for part in dataclasses.fields(SceneObject):
-                if any(getattr(entry, part.name) != part.default for entry in scene.objects):
-                    yield f"objects.{part.name}"
+            for part_field in dataclasses.fields(SceneObject):
+                if any(
+                    getattr(entry, part_field.name) != part_field.default for entry in scene.objects
+                ):
+                    yield f"objects.{part_field.name}"
         elif field.name == "environment":
             yield from ("environment",) if scene.environment is not None else ()
         elif field.name not in MAP_ARRAYS and len(getattr(scene, field.name)):
             yield field.name  # texture coordinates and the like come and go with `textures`
 
 
-def carried_scene(scene: Scene, carried: Collection[str]) -> Scene:
+def drop_uncarried_maps(scene: Scene, carried: Collection[str]) -> Scene:
     """Return what a form that carries these members shows of a scene: it, or it without its maps.
 
     Raises:

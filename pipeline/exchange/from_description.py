@@ -91,15 +91,15 @@ def scene_from_description(
     scales: dict[str, float] = {}
     for described, mesh in zip(description.objects, meshes, strict=True):
         try:
-            found, scale = _pieces(described, mesh, albedo_over_one)
-            pieces += found
+            object_pieces, scale = _pieces(described, mesh, albedo_over_one)
+            pieces += object_pieces
             if scale < 1:
                 scales[described.name] = round(scale, 6)
         except TrilightError as error:
             raise TrilightError(f"{description.file}: objects.{described.name}: {error}") from error
     try:
         _check_counts(pieces)
-        c2w, fov_deg = described_cameras(description.cameras[:num_views])
+        c2w, fov_deg = build_cameras(description.cameras[:num_views])
         scene = Scene(
             **concatenate_pieces(pieces),
             c2w=c2w,
@@ -113,14 +113,14 @@ def scene_from_description(
     return scene
 
 
-def placed(mesh: LoadedMesh, described: DescribedObject) -> NDArray[np.float32]:
+def place_mesh(mesh: LoadedMesh, described: DescribedObject) -> NDArray[np.float32]:
     """Return the vertices [V, 3] of a mesh in world space."""
     transform = described.transform
     points = mesh.positions
     if transform.normalize:
         points = (points - mesh.centre) / (2 * mesh.reach)
-    turned = rotate_points(points, rotation_xyz(transform.rotation_deg))
-    world = turned * np.array(transform.scale) + np.array(transform.translation)
+    rotated = rotate_points(points, rotation_xyz(transform.rotation_deg))
+    world = rotated * np.array(transform.scale) + np.array(transform.translation)
     return world.astype(np.float32)
 
 
@@ -137,7 +137,7 @@ def _pieces(
     described: DescribedObject, mesh: LoadedMesh, over_one: AlbedoOverOne
 ) -> tuple[list[ScenePiece], float]:
     """Return the pieces of an object, and by what the darkest of its materials was multiplied."""
-    positions = placed(mesh, described)
+    positions = place_mesh(mesh, described)
     mirrored = np.prod(described.transform.scale) < 0
     faces = (mesh.faces[:, ::-1] if mirrored else mesh.faces).astype(np.uint32)
     faces = without_slivers(positions, faces)
@@ -164,20 +164,20 @@ def _surface(
     rows = np.zeros(len(shaded.faces), np.int64)
     diffuse = np.array([material.diffuse])
     if material.rand_tri_diffuse_seed is not None:
-        rows = colour_groups(shaded, material)
+        rows = color_groups(shaded, material)
         count = int(rows.max()) + 1
         diffuse = random_diffuse(material.rand_tri_diffuse_seed, material.random_diffuse_max, count)
-    materials, scale = _reflecting(diffuse, material, over_one)
+    materials, scale = _build_materials(diffuse, material, over_one)
     kind: ObjectKind = "shell" if mesh.uid.startswith(SHELL_FOLDER) else "object"
     entry = _entry(described.name, kind, mesh)
     return ScenePiece(entry=entry, mesh=shaded, materials=materials, material_index=rows), scale
 
 
-def _reflecting(
+def _build_materials(
     diffuse: NDArray[np.float64], material: DescribedMaterial, over_one: AlbedoOverOne
 ) -> tuple[NDArray[np.float32], float]:
     """Return rows that do not emit, for diffuse albedos [M, 3], and the least factor."""
-    diffuse, specular, scale = lawful_albedos(diffuse, np.array(material.specular), over_one)
+    diffuse, specular, scale = limit_albedos(diffuse, np.array(material.specular), over_one)
     materials = default_rows(len(diffuse))
     materials[:, DIFFUSE] = diffuse
     materials[:, SPECULAR] = specular
@@ -193,9 +193,9 @@ def _emitters(
     over_one: AlbedoOverOne,
 ) -> tuple[list[ScenePiece], float]:
     if len(faces) > MAX_EMITTERS:
-        _too_many("emitting triangles", len(faces), MAX_EMITTERS)
+        _refuse_count("emitting triangles", len(faces), MAX_EMITTERS)
     diffuse = np.array([described.material.diffuse])
-    materials, scale = _reflecting(diffuse, described.material, over_one)
+    materials, scale = _build_materials(diffuse, described.material, over_one)
     materials[:, EMISSION] = described.material.emissive
     single = len(faces) == 1
     pieces = [
@@ -215,7 +215,7 @@ def _entry(name: str, kind: ObjectKind, mesh: LoadedMesh) -> SceneObject:
     return SceneObject(name=name, kind=kind, uid=uid, licence=mesh.licence)
 
 
-def described_cameras(
+def build_cameras(
     cameras: Sequence[DescribedCamera],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return poses [C, 4, 4] and full angles [C] in degrees; raises TrilightError."""
@@ -243,14 +243,14 @@ def _check_counts(pieces: Sequence[ScenePiece]) -> None:
         ("materials", sum(len(piece.materials) for piece in pieces), MAX_MATERIALS),
     ):
         if count > most:
-            _too_many(what, count, most)
+            _refuse_count(what, count, most)
 
 
-def _too_many(what: str, count: int, most: int) -> NoReturn:
+def _refuse_count(what: str, count: int, most: int) -> NoReturn:
     raise TrilightError(f"{count} {what}; expected at most {most} in a scene.")
 
 
-def lawful_albedos(
+def limit_albedos(
     diffuse: NDArray[np.float64], specular: NDArray[np.float64], over_one: AlbedoOverOne
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Return albedos that add up to at most 1, and by what the darkened ones were multiplied.
@@ -286,7 +286,7 @@ def lawful_albedos(
     return diffuse * factors[:, None], both * factors[:, None], float(factors.min())
 
 
-def colour_groups(mesh: ShadedMesh, material: DescribedMaterial) -> NDArray[np.int64]:
+def color_groups(mesh: ShadedMesh, material: DescribedMaterial) -> NDArray[np.int64]:
     """Return the number of the draw that colours each triangle, [T].
 
     As published, a flat mesh shares no vertices, so that each of its triangles is a group of its

@@ -11,7 +11,7 @@ from pipeline.foreign.numbers import Malformed, read_number
 from storage.errors import TrilightError
 from storage.settings.ranges import Within
 
-_SHOWN = 120
+_MAX_SHOWN = 120
 """Most characters of a value in a message."""
 
 _MAX_TEXT = 200
@@ -37,12 +37,12 @@ class Fields:
         if not isinstance(value, dict):
             self._refuse(where or "the file", value, "a JSON object")
         self._values: dict[str, Any] = value
-        self._asked: set[str] = set()
+        self._read_keys: set[str] = set()
 
     def end(self) -> None:
         """Collect the fields that were not asked for."""
-        unasked = [key for key in self._values if key not in self._asked]
-        self._unknown += [shown(self._name(key)) for key in unasked]
+        unread = [key for key in self._values if key not in self._read_keys]
+        self._unknown += [to_text(self._name(key)) for key in unread]
 
     def keys(self) -> Iterator[str]:
         """Yield the names of all fields, which must be short printable text."""
@@ -83,17 +83,17 @@ class Fields:
             self._refuse(self._name(key), value, "true or false")
         return value
 
-    def whole(self, key: str, low: int, high: int, default: int) -> int:
+    def integer(self, key: str, low: int, high: int, default: int) -> int:
         """Return a field that is a whole number from `low` to `high`."""
         value = self._get(key, default)
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             self._refuse(self._name(key), value, f"a whole number from {low} to {high}")
         return value
 
-    def optional_whole(self, key: str, low: int, high: int) -> int | None:
+    def optional_integer(self, key: str, low: int, high: int) -> int | None:
         """Return the same, or None where the field is missing or null."""
-        self._asked.add(key)
-        return None if self._values.get(key) is None else self.whole(key, low, high, low)
+        self._read_keys.add(key)
+        return None if self._values.get(key) is None else self.integer(key, low, high, low)
 
     def number(self, key: str, low: float, high: float, default: float | None = None) -> float:
         """Return a field that is a finite number from `low` to `high`."""
@@ -112,13 +112,13 @@ class Fields:
 
     def _number(self, name: str, value: Any, low: float, high: float) -> float:
         try:
-            return read_number(value, shown(name), Within(low, high))
+            return read_number(value, to_text(name), Within(low, high))
         except Malformed as error:
             raise TrilightError(f"{self._file}: {error}.") from error
 
     def _get(self, key: str, default: Any = None) -> Any:
         """Return a value; a field without default must be there."""
-        self._asked.add(key)
+        self._read_keys.add(key)
         if key in self._values:
             return self._values[key]
         if default is None:
@@ -129,10 +129,12 @@ class Fields:
         return f"{self._where}.{key}" if self._where else key
 
     def _refuse(self, name: str, value: Any, expected: str) -> NoReturn:
-        raise TrilightError(f"{self._file}: {shown(name)} is {shown(value)}; expected {expected}.")
+        raise TrilightError(
+            f"{self._file}: {to_text(name)} is {to_text(value)}; expected {expected}."
+        )
 
 
-def shown(value: Any) -> str:
+def to_text(value: Any) -> str:
     """Return a value for a message: short, in one line, without control characters."""
     text = value if isinstance(value, str) and value.isprintable() else repr(value)
-    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
+    return text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 3]}..."

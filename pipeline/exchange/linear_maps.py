@@ -35,28 +35,28 @@ def is_constant(values: Map) -> bool:
     return values.shape[:2] == (1, 1)
 
 
-def on_one_grid(*maps: Map) -> tuple[Map, ...]:
+def resample_to_largest(*maps: Map) -> tuple[Map, ...]:
     """Return maps of which all but constants have equally many texels: the most that any has."""
     sizes = [values.shape[:2] for values in maps if not is_constant(values)]
     if len(set(sizes)) < 2:
         return maps
     height, width = (max(size[axis] for size in sizes) for axis in range(2))
     return tuple(
-        values if is_constant(values) else interpolated(values, height, width) for values in maps
+        values if is_constant(values) else resample_map(values, height, width) for values in maps
     )
 
 
-def interpolated(values: Map, height: int, width: int) -> Map:
+def resample_map(values: Map, height: int, width: int) -> Map:
     """Return a map at the centres of other texels, as it is looked up."""
     if values.shape[:2] == (height, width):
         return values
     texture = Texture(texels=values)
     u, v = ((np.arange(count) + 0.5) / count for count in (width, height))
-    found = np.zeros((height, width, values.shape[2]), np.float32)
+    resampled = np.zeros((height, width, values.shape[2]), np.float32)
     for first in range(0, height, _ROWS):
         uv = np.stack(np.meshgrid(u, v[first : first + _ROWS]), axis=-1)
-        found[first : first + _ROWS] = texture_values(texture, uv)
-    return found
+        resampled[first : first + _ROWS] = texture_values(texture, uv)
+    return resampled
 
 
 def number_texture(values: Map, source: MapSource) -> Texture:
@@ -66,13 +66,13 @@ def number_texture(values: Map, source: MapSource) -> Texture:
     return Texture(texels=np.round(values * 255).astype(np.uint8), source=source)
 
 
-def colour_textures(diffuse: Map, specular: Map, source: MapSource) -> tuple[Texture, Texture]:
+def color_textures(diffuse: Map, specular: Map, source: MapSource) -> tuple[Texture, Texture]:
     """Return textures of two albedos, whose sum is at most 1 wherever they are looked up.
 
     The diffuse one gives way where they would add up to more.
     """
-    diffuse, specular = on_one_grid(diffuse, specular)
-    glossy = _coded(specular, source)
+    diffuse, specular = resample_to_largest(diffuse, specular)
+    glossy = _encode_color(specular, source)
     room = 1 - linear_map(glossy)
     if is_constant(diffuse) and (diffuse <= room.min(axis=(0, 1)) + _EXCESS).all():
         return Texture(texels=diffuse, source=source), glossy
@@ -84,12 +84,12 @@ def colour_textures(diffuse: Map, specular: Map, source: MapSource) -> tuple[Tex
     return Texture(texels=codes - over.astype(np.uint8), is_srgb=True, source=source), glossy
 
 
-def over_one(diffuse: Texture, specular: Texture) -> bool:
+def may_exceed_one(diffuse: Texture, specular: Texture) -> bool:
     """Return whether two albedos may add up to more than 1 somewhere."""
     return bool((diffuse.greatest + specular.greatest > 1 + _EXCESS).any())
 
 
-def _coded(values: Map, source: MapSource) -> Texture:
+def _encode_color(values: Map, source: MapSource) -> Texture:
     if is_constant(values):
         return Texture(texels=values, source=source)
     return Texture(texels=srgb8(values), is_srgb=True, source=source)

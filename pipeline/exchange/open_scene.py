@@ -22,7 +22,7 @@ from pipeline.exchange.formats import (
     LoadedScene,
     SceneFormat,
     SceneSource,
-    readable,
+    readable_suffixes,
 )
 from pipeline.exchange.from_description import AlbedoOverOne
 from storage.errors import TrilightError
@@ -48,7 +48,7 @@ def scene_source(
     Raises:
         TrilightError: a URL, no such file, or a name that is none of the forms.
     """
-    expected = f"expected a scene {' '.join(readable())}, or SHARD.tar{SEPARATOR}KEY"
+    expected = f"expected a scene {' '.join(readable_suffixes())}, or SHARD.tar{SEPARATOR}KEY"
     if "://" in text:
         raise TrilightError(f"{safe_url(text)}: only files of this machine are read; {expected}.")
     name, separator, key = text.rpartition(SEPARATOR)

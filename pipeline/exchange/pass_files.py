@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.exchange.chosen import chosen_samples, is_dataset
+from pipeline.exchange.select_samples import select_samples, is_dataset
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
 from storage.atomic import write_atomically
@@ -18,7 +18,7 @@ _RESOLUTION = 256
 
 
 @dataclass(frozen=True, kw_only=True)
-class WantedPasses:
+class PassOptions:
     """Which pictures to write."""
 
     names: Sequence[str]
@@ -34,7 +34,7 @@ class WantedPasses:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Found:
+class _NamedScene:
     """One scene of a source."""
 
     name: str
@@ -44,7 +44,7 @@ class _Found:
 
 
 def write_passes(
-    source: str, out: Path, wanted: WantedPasses, *, done: Callable[[Path], None]
+    source: str, out: Path, options: PassOptions, *, done: Callable[[Path], None]
 ) -> tuple[str, ...]:
     """Write `SCENE.VIEW.passes.exr` into a folder for each wanted view; return notes for people.
 
@@ -62,33 +62,35 @@ def write_passes(
             cannot be written.
     """
     notes: list[str] = []
-    for found in _scenes(source, wanted.scene):
-        notes += found.notes
-        views = range(found.scene.num_views) if wanted.view is None else [wanted.view]
+    for named in _scenes(source, options.scene):
+        notes += named.notes
+        views = range(named.scene.num_views) if options.view is None else [options.view]
         for view in views:
-            require_row("view", view, found.scene.num_views)
-            path = out / f"{found.name}.{view}.passes.exr"
+            require_row("view", view, named.scene.num_views)
+            path = out / f"{named.name}.{view}.passes.exr"
             data = passes_exr(
-                found.scene,
-                wanted.names,
+                named.scene,
+                options.names,
                 view=view,
-                resolution=wanted.resolution or found.resolution,
-                rays_a_side=wanted.rays_a_side,
+                resolution=options.resolution or named.resolution,
+                rays_a_side=options.rays_a_side,
             )
             write_atomically(path, data)
             done(path)
     return tuple(dict.fromkeys(notes))
 
 
-def _scenes(source: str, key: str | None) -> Iterator[_Found]:
+def _scenes(source: str, key: str | None) -> Iterator[_NamedScene]:
     if is_dataset(source):
-        for _, sample in chosen_samples(open_dataset(source), scene=key):
+        for _, sample in select_samples(open_dataset(source), scene=key):
             resolution = sample.radiance_rgb.shape[2]
-            yield _Found(name=sample.key, scene=sample.scene, resolution=resolution)
+            yield _NamedScene(name=sample.key, scene=sample.scene, resolution=resolution)
         return
     with SceneReader() as reader:
-        wanted = scene_source(source if key is None else f"{source}::{key}", many=True)
-        for each in reader.scenes_of(wanted):
+        whole_source = scene_source(source if key is None else f"{source}::{key}", many=True)
+        for each in reader.scenes_of(whole_source):
             loaded = reader.load(each)
             name = each.path.stem if each.key is None else each.key
-            yield _Found(name=name, scene=loaded.scene, resolution=_RESOLUTION, notes=loaded.notes)
+            yield _NamedScene(
+                name=name, scene=loaded.scene, resolution=_RESOLUTION, notes=loaded.notes
+            )

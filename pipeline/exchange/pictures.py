@@ -20,7 +20,7 @@ Pixels = NDArray[np.uint8] | NDArray[np.float32]
 """[H, W, C] encoded as the file has them, the top row first; uint8 and C of 1 to 4, or float32."""
 
 
-def decoded_pixels(
+def decode_pixels(
     data: bytes, name: str, lost: list[str] | None = None, *, is_color: bool = True
 ) -> Pixels | None:
     """Return a picture, or None where the bytes are none.
@@ -45,7 +45,7 @@ def decoded_pixels(
             lost.append(f"{name!r:.100}: {error.message}")
         return None
     if picture is None:
-        return _plain(data, name)
+        return _decode_with_pillow(data, name)
     if lost is not None:
         lost += [f"{name!r:.100}: {sentence}" for sentence in picture.unread]
     return picture.values
@@ -65,7 +65,7 @@ def is_encoded(pixels: Pixels) -> bool:
     return bool(pixels.dtype == np.uint8 and pixels.shape[2] >= 3)
 
 
-def _plain(data: bytes, name: str) -> Pixels | None:
+def _decode_with_pillow(data: bytes, name: str) -> Pixels | None:
     from PIL import Image
 
     try:

@@ -69,8 +69,8 @@ class SceneReader:
         What of the file nothing reads is logged.
         """
         self._child.allow_files(reach(files=[path]))
-        wanted = (path, path.name, path.name, AssetSettings(), licence)
-        mesh, _ = self._call(path.name, load_mesh_file, *wanted)
+        arguments = (path, path.name, path.name, AssetSettings(), licence)
+        mesh, _ = self._call(path.name, load_mesh_file, *arguments)
         if mesh.unread:
             log.warning("%s: not read: %s", path.name, "; ".join(mesh.unread))
         return mesh
@@ -120,12 +120,12 @@ def file_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
 
     It may use these files, and what it is let by `may`.
     """
-    return IsolatedChild(limits=_LIMITS, setup=_no_set_up, confined_to=confined_to)
+    return IsolatedChild(limits=_LIMITS, setup=_set_up_nothing, confined_to=confined_to)
 
 
 def unconfined_child() -> IsolatedChild:
     """Return the same for what is read already, such as to render it; close it."""
-    return IsolatedChild(limits=_LIMITS, setup=_no_set_up)
+    return IsolatedChild(limits=_LIMITS, setup=_set_up_nothing)
 
 
 def reach_of(source: SceneSource, *, writes: Iterable[Path] = ()) -> Reach:
@@ -134,5 +134,5 @@ def reach_of(source: SceneSource, *, writes: Iterable[Path] = ()) -> Reach:
     return reach(files=[source.path, *folders], writes=writes)
 
 
-def _no_set_up() -> None:
+def _set_up_nothing() -> None:
     pass

@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.renderformer_cells import (
     CELLS,
-    cells_of,
-    filled_cells,
+    compute_cells,
+    filled_cell_mask,
     textured_triangles,
 )
 from pipeline.exchange.renderformer_stored import (
@@ -46,13 +46,13 @@ from pipeline.exchange.renderformer_stored import (
     MAX_TRIANGLES,
     TEXTURE_EMISSION,
     TEXTURE_NORMAL,
-    stored_textures,
+    read_textures,
     with_cells,
 )
-from pipeline.exchange.renderformer_v2 import KNOWN, grey_textures, is_second_version, sky_of
+from pipeline.exchange.renderformer_v2 import KNOWN, read_grey_textures, is_second_version, read_sky
 from pipeline.exchange.safe_h5 import (
-    names_in,
-    opened_h5,
+    list_names,
+    open_h5,
     plain_array,
     read_whole,
 )
@@ -150,7 +150,7 @@ def texture_rows(scene: Scene, texture_type: TextureType) -> NDArray[np.floating
     return half[scene.material_index]
 
 
-def reflecting_emitters(scene: Scene) -> tuple[str, ...]:
+def note_reflecting_emitters(scene: Scene) -> tuple[str, ...]:
     """Return what a file says otherwise, for people: what emitters reflect, where they do."""
     emits = (scene.materials[:, EMISSION] > 0).any(axis=1)
     reflects = (scene.materials[emits][:, : SPECULAR.stop] > 0).any(axis=1)
@@ -168,12 +168,12 @@ def _write_texture(file: Any, rows: NDArray[np.floating], scene: Scene) -> None:
     texture = file.create_dataset(
         "texture", shape, rows.dtype, compression="gzip", compression_opts=GZIP_LEVEL
     )
-    filled, step = filled_cells(), texture.chunks[0]
+    filled, step = filled_cell_mask(), texture.chunks[0]
     for start in range(0, len(rows), step):
         block = rows[start : start + step, :, None, None]
         cells = np.where(filled, block, rows.dtype.type(0))
         for triangle in start + np.flatnonzero(textured[start : start + step]):
-            for part, values in cells_of(scene, int(triangle)):
+            for part, values in compute_cells(scene, int(triangle)):
                 cells[triangle - start, part] = values
         texture[start : start + step] = cells
 
@@ -231,18 +231,18 @@ def read_renderformer_h5(path: Path) -> RenderFormerFile:
             not finite (pipeline.exchange.safe_h5); or a scene that breaks a law (`Scene.check`).
     """
     lost: list[str] = []
-    with opened_h5(path) as file:
-        lost += _unknown(file)
+    with open_h5(path) as file:
+        lost += _list_unknown(file)
         triangles = read_whole(plain_array(file, "triangles", (None, 3, 3), MAX_TRIANGLES))
         count = len(triangles)
         normals = read_whole(plain_array(file, "vn", (count, 3, 3), MAX_TRIANGLES))
         second = is_second_version(file)
-        stored = (grey_textures if second else stored_textures)(file, count, lost)
-        sky = sky_of(file, UNKNOWN_LICENCE, lost) if second else None
+        stored = (read_grey_textures if second else read_textures)(file, count, lost)
+        sky = read_sky(file, UNKNOWN_LICENCE, lost) if second else None
         c2w = read_whole(plain_array(file, "c2w", (None, 4, 4), MAX_VIEWS))
         fov_deg = read_whole(plain_array(file, "fov", (len(c2w),), MAX_VIEWS))
-        pictures = _pictures(file, len(c2w), lost) if "img" in names_in(file) else None
-        positions, normals, faces = _indexed(triangles, _unit(triangles, normals, lost))
+        pictures = _pictures(file, len(c2w), lost) if "img" in list_names(file) else None
+        positions, normals, faces = _index_vertices(triangles, _normalize(triangles, normals, lost))
         scene = Scene(
             vertex_positions=positions,
             vertex_normals=normals,
@@ -258,9 +258,9 @@ def read_renderformer_h5(path: Path) -> RenderFormerFile:
     return RenderFormerFile(scene=scene, radiance_rgb=pictures, lost=tuple(lost))
 
 
-def _unknown(file: Any) -> list[str]:
+def _list_unknown(file: Any) -> list[str]:
     known = (*_KNOWN, *KNOWN) if is_second_version(file) else _KNOWN
-    names = [f"array or group {name!r:.60}" for name in names_in(file) if name not in known]
+    names = [f"array or group {name!r:.60}" for name in list_names(file) if name not in known]
     names += [f"attribute {name!r:.60}" for name in sorted(file.attrs)]
     return names if len(names) <= 10 else [*names[:10], f"and {len(names) - 10} more"]
 
@@ -273,7 +273,7 @@ def _pictures(file: Any, num_views: int, lost: list[str]) -> NDArray[np.float32]
     return rgba[..., :3].copy()
 
 
-def _unit(
+def _normalize(
     triangles: NDArray[np.float32], normals: NDArray[np.float32], lost: list[str]
 ) -> NDArray[np.float32]:
     """Return normals [T, 3, 3] of unit length; the face's own where there is none."""
@@ -292,15 +292,15 @@ def _unit(
     return np.where(off, chosen / size, normals).astype(np.float32)
 
 
-def _indexed(
+def _index_vertices(
     triangles: NDArray[np.float32], normals: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
     """Return vertices and faces; vertices are in the order in which they are first used."""
     corners = np.concatenate([triangles, normals], axis=2).reshape(-1, 6)
     first, rows = distinct_rows(corners)
-    kept = corners[first]
+    vertices = corners[first]
     faces = rows.astype(np.uint32).reshape(-1, 3)
-    return kept[:, :3].copy(), kept[:, 3:].copy(), faces
+    return vertices[:, :3].copy(), vertices[:, 3:].copy(), faces
 
 
 def _palette(
@@ -314,7 +314,7 @@ def _palette(
         lost.append("what emitters reflect: ours reflect nothing")
     materials[emits, REFLECTING] = [0, 0, 0, 0, 0, 0, 1]
     materials[varies, REFLECTING] = 0  # one row for all of them: their cells say the rest
-    _within_one(materials, lost)
+    _limit_rounded_albedos(materials, lost)
     order = np.where(emits, np.cumsum(emits), -1.0 * varies)  # emitters stay apart, even if equal
     first, index = distinct_rows(np.column_stack([materials, order.astype(np.float32)]))
     if len(first) > MAX_PALETTE or emits.sum() >= MAX_PALETTE:
@@ -324,7 +324,7 @@ def _palette(
         )
     surface = () if emits.all() else (SceneObject(name="surfaces", kind="object"),)
     emitters = tuple(SceneObject(name=f"emitter{i}", kind="emitter") for i in range(emits.sum()))
-    entries = [_of_unknown_rights(entry) for entry in (*surface, *emitters)]
+    entries = [_with_unknown_licence(entry) for entry in (*surface, *emitters)]
     return {
         "materials": materials[first],
         "material_index": index.astype(np.uint16),
@@ -333,11 +333,11 @@ def _palette(
     }
 
 
-def _of_unknown_rights(entry: SceneObject) -> SceneObject:
+def _with_unknown_licence(entry: SceneObject) -> SceneObject:
     return SceneObject(name=entry.name, kind=entry.kind, licence=UNKNOWN_LICENCE)
 
 
-def _within_one(materials: NDArray[np.float32], lost: list[str]) -> None:
+def _limit_rounded_albedos(materials: NDArray[np.float32], lost: list[str]) -> None:
     """Lower specular albedos where rounding took the sum over 1; `Scene.check` refuses more."""
     excess = materials[:, DIFFUSE] + materials[:, SPECULAR] - 1
     rounded = (excess > ALBEDO_SUM_TOLERANCE) & (excess <= _ROUNDING)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.description import (
-    ColourGroups,
+    ColorGroups,
     DescribedCamera,
     DescribedMaterial,
     DescribedObject,
@@ -72,7 +72,7 @@ def read_description(data: bytes, name: str) -> SceneDescription:
     if len(data) > MAX_BYTES:
         raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
     unknown: list[str] = []
-    fields = Fields(_parsed(data, name), file=name, where="", unknown=unknown)
+    fields = Fields(_parse_json(data, name), file=name, where="", unknown=unknown)
     scene_name, version = fields.text("scene_name"), fields.text("version")
     if version != _VERSION:
         raise TrilightError(f"{name}: version is {version!r}; expected {_VERSION!r}.")
@@ -81,13 +81,13 @@ def read_description(data: bytes, name: str) -> SceneDescription:
     if not 1 <= len(names) <= MAX_OBJECTS:
         raise TrilightError(f"{name}: {len(names)} objects; expected 1 to {MAX_OBJECTS}.")
     described = tuple(_object(key, objects.group(key)) for key in names)
-    seen = tuple(_camera(camera) for camera in cameras)
+    described_cameras = tuple(_camera(camera) for camera in cameras)
     fields.end()
     return SceneDescription(
         file=name,
         scene_name=scene_name,
         objects=described,
-        cameras=seen,
+        cameras=described_cameras,
         unknown_fields=tuple(unknown),
     )
 
@@ -100,16 +100,16 @@ def read_cameras(data: bytes, name: str) -> tuple[DescribedCamera, ...]:
     """
     if len(data) > MAX_BYTES:
         raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
-    fields = Fields(_parsed(data, name), file=name, where="", unknown=[])
+    fields = Fields(_parse_json(data, name), file=name, where="", unknown=[])
     return tuple(_camera(camera) for camera in fields.groups("cameras", MAX_CAMERAS))
 
 
-def _parsed(data: bytes, name: str) -> Any:
+def _parse_json(data: bytes, name: str) -> Any:
     try:
         return json.loads(
             data.decode("utf-8-sig"),
-            object_pairs_hook=_without_repeats,
-            parse_constant=_refused_constant,
+            object_pairs_hook=_refuse_repeats,
+            parse_constant=_refuse_constant,
         )
     except RecursionError as error:
         raise TrilightError(f"{name}: nested too deeply for a scene; expected JSON.") from error
@@ -122,15 +122,15 @@ def _parsed(data: bytes, name: str) -> Any:
         raise TrilightError(f"{name}: not readable as JSON in UTF-8.") from error
 
 
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+def _refuse_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) < len(pairs):
         (repeated, _), *_ = Counter(key for key, _ in pairs).most_common(1)
         raise Malformed(f"the name {repeated!r:.60} stands twice in one object")
-    return found
+    return members
 
 
-def _refused_constant(text: str) -> float:
+def _refuse_constant(text: str) -> float:
     raise Malformed(f"{text} is no JSON number")
 
 
@@ -141,7 +141,7 @@ def _object(name: str, fields: Fields) -> DescribedObject:
         transform=_transform(fields.group("transform")),
         material=_material(fields.group("material")),
         remesh=fields.flag("remesh", default=False),
-        remesh_target_face_num=fields.whole("remesh_target_face_num", 4, _MAX_REMESH_FACES, 2048),
+        remesh_target_face_num=fields.integer("remesh_target_face_num", 4, _MAX_REMESH_FACES, 2048),
     )
     fields.end()
     return described
@@ -167,8 +167,8 @@ def _material(fields: Fields) -> DescribedMaterial:
         emissive=fields.vector("emissive", 0, _MAX_EMISSION),
         smooth_shading=fields.flag("smooth_shading"),
         random_diffuse_max=fields.number("random_diffuse_max", 0, 1, default=1.0),
-        random_diffuse_type=cast(ColourGroups, groups),
-        rand_tri_diffuse_seed=fields.optional_whole("rand_tri_diffuse_seed", 0, _MAX_SEED),
+        random_diffuse_type=cast(ColorGroups, groups),
+        rand_tri_diffuse_seed=fields.optional_integer("rand_tri_diffuse_seed", 0, _MAX_SEED),
     )
     fields.end()
     return material
@@ -210,7 +210,7 @@ class DescribedFiles:
     lost: tuple[str, ...]  # what of the members in CARRIED does not come back, for people
 
 
-def described_files(scene: Scene, stem: str) -> DescribedFiles:
+def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
     """Return a scene as the files that the published tools read.
 
     Args:
@@ -226,7 +226,7 @@ def described_files(scene: Scene, stem: str) -> DescribedFiles:
     meshes: dict[str, bytes] = {}
     objects: dict[str, Any] = {}
     taken: set[str] = set()
-    for row, material, faces in _parts(scene):
+    for row, material, faces in _group_triangles(scene):
         if len(without_slivers(scene.vertex_positions, scene.faces[faces])) == 0:
             continue  # readers refuse a mesh of which nothing is left
         name = _unique(_name(scene, row, material), taken)
@@ -235,7 +235,7 @@ def described_files(scene: Scene, stem: str) -> DescribedFiles:
         meshes[path] = _obj(scene, faces)
         smooth = _is_smooth(scene, faces, normals)
         objects[name] = _object_entry(path, scene.materials[material], smooth)
-        if smooth and not _comes_back(scene, faces, normals):
+        if smooth and not _is_reproduced(scene, faces, normals):
             lost.append(f"{name}: shading normals; readers make their own")
     if not any(max(entry["material"]["emissive"]) > 0 for entry in objects.values()):
         raise TrilightError("scene: no emitter has an area; a scene file needs at least one.")
@@ -252,21 +252,21 @@ def described_files(scene: Scene, stem: str) -> DescribedFiles:
     return DescribedFiles(json=data, meshes=meshes, lost=(*_losses(scene), *lost))
 
 
-def _parts(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
+def _group_triangles(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
     """Return (object, material, its triangles) in the order of objects and then of materials."""
     keys = scene.object_index.astype(np.int64) * len(scene.materials) + scene.material_index
     order = np.argsort(keys, kind="stable")
-    found, starts = np.unique(keys[order], return_index=True)
+    distinct, starts = np.unique(keys[order], return_index=True)
     return [
         (*divmod(int(key), len(scene.materials)), faces)
-        for key, faces in zip(found, np.split(order, starts[1:]), strict=True)
+        for key, faces in zip(distinct, np.split(order, starts[1:]), strict=True)
     ]
 
 
 def _name(scene: Scene, row: int, material: int) -> str:
-    own = scene.material_index[scene.object_index == row]
+    materials = scene.material_index[scene.object_index == row]
     name = _printable(scene.objects[row].name).lstrip(".") or f"object{row}"
-    return name if (own == material).all() else f"{name}.material{material}"
+    return name if (materials == material).all() else f"{name}.material{material}"
 
 
 def _printable(text: str) -> str:
@@ -276,12 +276,12 @@ def _printable(text: str) -> str:
 
 def _unique(name: str, taken: set[str]) -> str:
     """Return a name that no other has, capitals or not, since it becomes that of a file."""
-    chosen, count = name, 1
-    while chosen.casefold() in taken:
+    candidate, count = name, 1
+    while candidate.casefold() in taken:
         count += 1
-        chosen = f"{name}.{count}"
-    taken.add(chosen.casefold())
-    return chosen
+        candidate = f"{name}.{count}"
+    taken.add(candidate.casefold())
+    return candidate
 
 
 def _mesh_path(scene: Scene, row: int, material: int, stem: str) -> str:
@@ -334,12 +334,12 @@ def camera_entry(c2w: NDArray[np.float32], fov_deg: float) -> dict[str, Any]:
 
 def _is_smooth(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float32]) -> bool:
     with np.errstate(invalid="ignore", divide="ignore"):
-        own = face_normals(scene.vertex_positions, scene.faces[faces])
-    off = np.abs(normals - own[:, None])
+        flat = face_normals(scene.vertex_positions, scene.faces[faces])
+    off = np.abs(normals - flat[:, None])
     return bool((off[np.isfinite(off)] > _FLAT).any())
 
 
-def _comes_back(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float32]) -> bool:
+def _is_reproduced(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float32]) -> bool:
     """Return whether a reader that smooths makes the same normals."""
     rows, corners = np.unique(scene.faces[faces], return_inverse=True)
     positions, triangles = scene.vertex_positions[rows], corners.reshape(-1, 3).astype(np.uint32)
@@ -350,17 +350,19 @@ def _comes_back(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float
 
 
 def _losses(scene: Scene) -> list[str]:
-    found: list[str] = []
-    parts = np.bincount([row for row, _, _ in _parts(scene)])
-    whole, split = int((parts > 1).sum()), int(parts[parts > 1].sum())
-    if whole:
-        found.append(f"that {split} of its objects were {whole}, of several materials")
+    losses: list[str] = []
+    parts = np.bincount([row for row, _, _ in _group_triangles(scene)])
+    num_objects, num_parts = int((parts > 1).sum()), int(parts[parts > 1].sum())
+    if num_objects:
+        losses.append(f"that {num_parts} of its objects were {num_objects}, of several materials")
     solid = len(without_slivers(scene.vertex_positions, scene.faces))
     if solid < scene.num_triangles:
-        found.append(f"{scene.num_triangles - solid} triangles without an area, which readers drop")
+        losses.append(
+            f"{scene.num_triangles - solid} triangles without an area, which readers drop"
+        )
     if (scene.materials[:, EMISSION] > HALF_FLOAT_MAX).any():
-        found.append(f"emission over {HALF_FLOAT_MAX:.0f}, which the published converter cuts off")
-    return found
+        losses.append(f"emission over {HALF_FLOAT_MAX:.0f}, which the published converter cuts off")
+    return losses
 
 
 def _require_size(scene: Scene, data: bytes, objects: int) -> None:

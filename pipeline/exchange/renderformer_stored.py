@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.renderformer_cells import CELLS, MAX_VARYING, atlas_of, filled_cells
+from pipeline.exchange.renderformer_cells import CELLS, MAX_VARYING, build_atlas, filled_cell_mask
 from pipeline.exchange.safe_h5 import iterate_blocks, plain_array, require_finite
 from storage.records.material import REFLECTING
 from storage.records.retextured import with_textures, without_constant_textures
@@ -35,7 +35,7 @@ class StoredTextures:
     """[N, 7, 32, 32] what those reflect, cell by cell; None where none varies."""
 
 
-def stored_textures(file: Any, count: int, lost: list[str]) -> StoredTextures:
+def read_textures(file: Any, count: int, lost: list[str]) -> StoredTextures:
     """Return the textures of an open file.
 
     Args:
@@ -56,7 +56,7 @@ def with_cells(scene: Scene, stored: StoredTextures, licence: str) -> Scene:
     varies = stored.varies
     if stored.cells is None:
         return scene
-    atlas = atlas_of(stored.cells, MapSource(name="cells of triangles", licence=licence))
+    atlas = build_atlas(stored.cells, MapSource(name="cells of triangles", licence=licence))
     uv = np.zeros((scene.num_triangles, 3, 2), np.float32)
     uv[varies] = atlas.uv
     index = np.full((len(scene.materials), len(TEXTURED)), CONSTANT, np.int32)
@@ -65,8 +65,8 @@ def with_cells(scene: Scene, stored: StoredTextures, licence: str) -> Scene:
     index[np.unique(scene.material_index[varies])] = [
         order.index(texture.sha256) for texture in atlas.textures
     ]
-    kept = tuple(next(t for t in atlas.textures if t.sha256 == key) for key in order)
-    return without_constant_textures(with_textures(scene, uv.reshape(-1, 2), kept, index))
+    textures = tuple(next(t for t in atlas.textures if t.sha256 == key) for key in order)
+    return without_constant_textures(with_textures(scene, uv.reshape(-1, 2), textures, index))
 
 
 def _texture_rows(
@@ -77,7 +77,7 @@ def _texture_rows(
     One block of cells is held at a time.
     """
     texture = plain_array(file, "texture", (count, CHANNELS, CELLS, CELLS), MAX_TRIANGLES)
-    filled = filled_cells()
+    filled = filled_cell_mask()
     low = np.full((count, CHANNELS), np.inf, np.float32)
     high, total = -low, np.zeros((count, CHANNELS))
     for where, block in iterate_blocks(texture):

@@ -19,7 +19,7 @@ from pipeline.exchange.renderformer_stored import (
     TEXTURE_NORMAL,
     StoredTextures,
 )
-from pipeline.exchange.safe_h5 import names_in, plain_array, read_whole
+from pipeline.exchange.safe_h5 import list_names, plain_array, read_whole
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.exr import MAX_RESOLUTION
@@ -34,10 +34,10 @@ _GREY = 0.5
 
 def is_second_version(file: Any) -> bool:
     """Return whether an open file is of the successor: its lights are apart."""
-    return "light_strength" in names_in(file)
+    return "light_strength" in list_names(file)
 
 
-def grey_textures(file: Any, count: int, lost: list[str]) -> StoredTextures:
+def read_grey_textures(file: Any, count: int, lost: list[str]) -> StoredTextures:
     """Return grey surfaces with the lights of a file.
 
     Args:
@@ -60,7 +60,7 @@ def grey_textures(file: Any, count: int, lost: list[str]) -> StoredTextures:
     return StoredTextures(rows=rows, varies=np.zeros(count, np.bool_), cells=None)
 
 
-def sky_of(file: Any, licence: str, lost: list[str]) -> Environment | None:
+def read_sky(file: Any, licence: str, lost: list[str]) -> Environment | None:
     """Return the environment of a file, which cameras do not see; None where it has none.
 
     Its axes are ours: the middle is +X, a quarter from the left +Y, the top +Z.
@@ -68,7 +68,7 @@ def sky_of(file: Any, licence: str, lost: list[str]) -> Environment | None:
     Raises:
         TrilightError: a map of another shape, or as `plain_array`.
     """
-    if "env_map" not in names_in(file):
+    if "env_map" not in list_names(file):
         return None
     values = read_whole(plain_array(file, "env_map", (None, None, None), MAX_RESOLUTION))
     if 3 not in (values.shape[0], values.shape[2]):
@@ -78,8 +78,8 @@ def sky_of(file: Any, licence: str, lost: list[str]) -> Environment | None:
     is_processed = values.shape[0] == 3  # it is turned and scaled already
     radiance = np.moveaxis(values, 0, -1) if is_processed else values
     if not is_processed:
-        radiance = radiance * _number(file, "env_map_strength", 1.0)
-        if np.any(_numbers(file, "env_map_rotation")):
+        radiance = radiance * _read_number(file, "env_map_strength", 1.0)
+        if np.any(_read_numbers(file, "env_map_rotation")):
             lost.append("rotation of the environment: three angles whose order it does not state")
     if not radiance.any():
         return None  # how it says that there is none
@@ -89,14 +89,14 @@ def sky_of(file: Any, licence: str, lost: list[str]) -> Environment | None:
     )
 
 
-def _number(file: Any, name: str, default: float) -> np.float32:
-    found = _numbers(file, name)
-    return np.float32(found.ravel()[0]) if found.size == 1 else np.float32(default)
+def _read_number(file: Any, name: str, default: float) -> np.float32:
+    values = _read_numbers(file, name)
+    return np.float32(values.ravel()[0]) if values.size == 1 else np.float32(default)
 
 
-def _numbers(file: Any, name: str) -> NDArray[np.float32]:
+def _read_numbers(file: Any, name: str) -> NDArray[np.float32]:
     """Return a small array of a file; none where it has not got it."""
-    if name not in names_in(file):
+    if name not in list_names(file):
         return np.zeros(0, np.float32)
     try:
         return read_whole(plain_array(file, name, (), 1))

@@ -44,7 +44,7 @@ class H5Array:
 
 
 @contextlib.contextmanager
-def opened_h5(path: Path) -> Iterator[Any]:
+def open_h5(path: Path) -> Iterator[Any]:
     """Open a file for reading and yield its root group.
 
     Raises:
@@ -66,7 +66,7 @@ def opened_h5(path: Path) -> Iterator[Any]:
         raise TrilightError(f"{path.name}: not a readable HDF5 file.") from error
 
 
-def names_in(group: Any) -> list[str]:
+def list_names(group: Any) -> list[str]:
     """Return what a group holds, by name; no link is followed."""
     return sorted(group)
 
@@ -85,21 +85,21 @@ def plain_array(group: Any, name: str, shape: Sequence[int | None], longest: int
     """
     import h5py
 
-    if name not in names_in(group):
-        raise TrilightError(f"{name}: missing; expected an array {_shown(shape)}.")
+    if name not in list_names(group):
+        raise TrilightError(f"{name}: missing; expected an array {_format_shape(shape)}.")
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise TrilightError(f"{name}: is a link; expected an array in the file itself.")
     dataset = group[name]
     if not isinstance(dataset, h5py.Dataset):
-        raise TrilightError(f"{name}: is no array; expected one {_shown(shape)}.")
+        raise TrilightError(f"{name}: is no array; expected one {_format_shape(shape)}.")
     claimed = dataset.shape or ()
     fits = len(claimed) == len(shape) and all(
-        1 <= got <= longest if wanted is None else got == wanted
-        for got, wanted in zip(claimed, shape, strict=True)
+        1 <= got <= longest if expected is None else got == expected
+        for got, expected in zip(claimed, shape, strict=True)
     )
     if not fits:
         raise TrilightError(
-            f"{name}: has shape {list(claimed)}; expected {_shown(shape)} with lengths of at most "
+            f"{name}: has shape {list(claimed)}; expected {_format_shape(shape)} with lengths of at most "
             f"{longest}."
         )
     dtype = _float_type(dataset, name)
@@ -119,7 +119,7 @@ def iterate_blocks(array: H5Array) -> Iterator[tuple[tuple[slice, ...], NDArray]
     if plan.get_external_count() or plan.get_layout() == h5d.VIRTUAL:
         raise TrilightError(f"{array.name}: its bytes are elsewhere; expected them in the file.")
     if plan.get_layout() == h5d.CHUNKED:
-        yield from _chunks(array, plan)
+        yield from _iterate_chunks(array, plan)
         return
     num_bytes = math.prod(array.shape) * array.dtype.itemsize
     if array.dataset.id.get_storage_size() != num_bytes:
@@ -157,7 +157,7 @@ def require_finite(array: H5Array, values: NDArray) -> None:
         raise TrilightError(f"{array.name}: holds {values[~finite][0]}; expected finite values.")
 
 
-def _chunks(array: H5Array, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
+def _iterate_chunks(array: H5Array, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
     size = array.dataset.chunks
     filters = [plan.get_filter(at)[0] for at in range(plan.get_nfilters())]
     if filters not in ([], [_DEFLATE], [_SHUFFLE], [_SHUFFLE, _DEFLATE]):
@@ -170,13 +170,13 @@ def _chunks(array: H5Array, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDAr
         raise TrilightError(
             f"{array.name}: has {math.prod(counts)} chunks; expected up to {MAX_CHUNKS}."
         )
-    stored = _stored(array)
+    stored_offsets = _list_chunk_offsets(array)
     for at in itertools.product(*(range(count) for count in counts)):
         offset = tuple(i * chunk for i, chunk in zip(at, size, strict=True))
-        if offset not in stored:
+        if offset not in stored_offsets:
             raise TrilightError(f"{array.name}: the chunk at {list(offset)} is missing.")
         _, packed = array.dataset.id.read_direct_chunk(offset)
-        values = np.frombuffer(_unpacked(array, packed, filters), array.dtype).reshape(size)
+        values = np.frombuffer(_unpack(array, packed, filters), array.dtype).reshape(size)
         where = tuple(
             slice(start, min(start + chunk, length))
             for start, chunk, length in zip(offset, size, array.shape, strict=True)
@@ -184,22 +184,22 @@ def _chunks(array: H5Array, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDAr
         yield where, values[tuple(slice(0, part.stop - part.start) for part in where)]
 
 
-def _stored(array: H5Array) -> set[tuple[int, ...]]:
+def _list_chunk_offsets(array: H5Array) -> set[tuple[int, ...]]:
     """Return the offsets of the chunks that the file has, none larger than a block or the file."""
     most = min(MAX_BLOCK_BYTES, array.dataset.file.id.get_filesize())
-    found: set[tuple[int, ...]] = set()
+    offsets: set[tuple[int, ...]] = set()
 
-    def look(chunk: Any) -> bool | None:
-        if chunk.filter_mask or chunk.size > most or len(found) >= MAX_CHUNKS:
+    def add_offset(chunk: Any) -> bool | None:
+        if chunk.filter_mask or chunk.size > most or len(offsets) >= MAX_CHUNKS:
             return True  # ends the walk; the chunk then counts as missing
-        found.add(chunk.chunk_offset)
+        offsets.add(chunk.chunk_offset)
         return None
 
-    array.dataset.id.chunk_iter(look)
-    return found
+    array.dataset.id.chunk_iter(add_offset)
+    return offsets
 
 
-def _unpacked(array: H5Array, packed: bytes, filters: list[int]) -> bytes:
+def _unpack(array: H5Array, packed: bytes, filters: list[int]) -> bytes:
     num_bytes = math.prod(array.dataset.chunks) * array.dtype.itemsize
     if _DEFLATE in filters:
         inflater = zlib.decompressobj()
@@ -237,5 +237,5 @@ def _require_memory(array: H5Array, num_bytes: int, most: int) -> None:
         )
 
 
-def _shown(shape: Sequence[int | None]) -> str:
+def _format_shape(shape: Sequence[int | None]) -> str:
     return "[" + ", ".join("any" if length is None else str(length) for length in shape) + "]"

@@ -39,12 +39,12 @@ def within_budget(scene: Scene, budget: int) -> tuple[Scene, tuple[str, ...]]:
     room = budget - int(counts[emits].sum())
     least = np.where(emits, 0, np.minimum(counts, LEAST))
     more = np.where(emits, 0, counts) - least
-    share = max(room - int(least.sum()), 0) / max(int(more.sum()), 1)
+    fraction = max(room - int(least.sum()), 0) / max(int(more.sum()), 1)
     pieces = []
     for row in np.flatnonzero(counts):
-        piece = _piece_of(scene, int(row))
+        piece = _build_piece(scene, int(row))
         if not emits[row]:
-            piece = _reduced(piece, int(least[row] + more[row] * share))
+            piece = _reduce_piece(piece, int(least[row] + more[row] * fraction))
         pieces.append(piece)
     total = sum(len(piece.mesh.faces) for piece in pieces)
     if total > budget:
@@ -64,10 +64,10 @@ def within_budget(scene: Scene, budget: int) -> tuple[Scene, tuple[str, ...]]:
     return reduced, (f"{scene.num_triangles} triangles reduced to {total}", *lost)
 
 
-def _piece_of(scene: Scene, row: int) -> ScenePiece:
-    own = scene.object_index == row
-    rows, corners = np.unique(scene.faces[own], return_inverse=True)
-    palette, index = np.unique(scene.material_index[own], return_inverse=True)
+def _build_piece(scene: Scene, row: int) -> ScenePiece:
+    in_object = scene.object_index == row
+    rows, corners = np.unique(scene.faces[in_object], return_inverse=True)
+    palette, index = np.unique(scene.material_index[in_object], return_inverse=True)
     faces = corners.reshape(-1, 3).astype(np.uint32)
     return ScenePiece(
         entry=scene.objects[row],
@@ -82,16 +82,16 @@ def _piece_of(scene: Scene, row: int) -> ScenePiece:
     )
 
 
-def _reduced(piece: ScenePiece, count: int) -> ScenePiece:
+def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
     from scipy.spatial import cKDTree
 
     old = piece.mesh
     if len(old.faces) <= count:
         return piece
-    positions, faces = _simpler(piece, count)
+    positions, faces = _decimate_mesh(piece, count)
     faces = without_slivers(positions, faces)
-    own = face_normals(old.positions, old.faces)[:, None]
-    smooth = bool((np.abs(old.normals[old.faces] - own) > _FLAT).any())
+    flat = face_normals(old.positions, old.faces)[:, None]
+    smooth = bool((np.abs(old.normals[old.faces] - flat) > _FLAT).any())
     mesh = (
         smooth_shaded(positions, faces, _SMOOTH_ANGLE_DEG)
         if smooth
@@ -107,7 +107,7 @@ def _reduced(piece: ScenePiece, count: int) -> ScenePiece:
     )
 
 
-def _simpler(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+def _decimate_mesh(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     raw = TriangleMesh(
         positions=piece.mesh.positions.astype(np.float64), faces=piece.mesh.faces.astype(np.int64)
     )
@@ -115,12 +115,12 @@ def _simpler(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], NDArra
     unit = clean(normalise(raw))
     for method in methods_of("faithful"):
         try:
-            found = decimate(unit, count, safe_method(unit, method))
+            decimated = decimate(unit, count, safe_method(unit, method))
         except Rejected:
             continue
-        if 0 < len(found.faces) <= count:
-            positions = found.positions * (high - low).max() + (low + high) / 2
-            return positions.astype(np.float32), found.faces.astype(np.uint32)
+        if 0 < len(decimated.faces) <= count:
+            positions = decimated.positions * (high - low).max() + (low + high) / 2
+            return positions.astype(np.float32), decimated.faces.astype(np.uint32)
     raise TrilightError(
         f"{piece.entry.name}: no method gives at most {count} of its {len(raw.faces)} triangles; "
         "choose a larger --budget."

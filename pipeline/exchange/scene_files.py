@@ -18,7 +18,7 @@ from pipeline.exchange.description import DescribedObject, SceneDescription
 from pipeline.exchange.from_description import (
     AlbedoOverOne,
     LoadedMesh,
-    described_cameras,
+    build_cameras,
     scene_from_description,
 )
 from pipeline.exchange.renderformer_json import MAX_BYTES, read_cameras, read_description
@@ -79,12 +79,12 @@ class SceneFiles:
         return scene
 
 
-def described_by(root: Path, name: str) -> SceneDescription:
+def read_scene_description(root: Path, name: str) -> SceneDescription:
     """Return what a scene file in the folder `root` describes; raises TrilightError."""
     return read_description(_read_scene_file(root, name), name)
 
 
-def cameras_by(root: Path, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def read_scene_cameras(root: Path, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the poses [C, 4, 4] and angles [C] of a scene file or a list of cameras.
 
     Raises:
@@ -92,7 +92,7 @@ def cameras_by(root: Path, name: str) -> tuple[NDArray[np.float32], NDArray[np.f
     """
     cameras = read_cameras(_read_scene_file(root, name), name)
     try:
-        return described_cameras(cameras)
+        return build_cameras(cameras)
     except TrilightError as error:
         raise TrilightError(f"{name}: {error}") from error
 
@@ -136,7 +136,7 @@ def build_scene(
     for described in description.objects:
         key = (described.mesh_path, described.remesh_faces)
         if key not in meshes:
-            meshes[key], digest = _load(root, described, name, settings, licence)
+            meshes[key], digest = _load_mesh(root, described, name, settings, licence)
             digests[meshes[key].uid] = digest
             if notes is not None:
                 notes += (f"{meshes[key].uid}: {text}" for text in meshes[key].unread)
@@ -162,21 +162,21 @@ def build_scene(
     return scene, digests
 
 
-def _load(
+def _load_mesh(
     root: Path, described: DescribedObject, name: str, settings: AssetSettings, licence: str
 ) -> tuple[LoadedMesh, str]:
     """Return the mesh of an object, and the digest of its file."""
     where = f"{name}: objects.{described.name}.mesh_path"
     path = _below(root, described.mesh_path, where)
     uid = path.relative_to(root).as_posix()
-    shown = f"{where} is {described.mesh_path}"
-    return load_mesh_file(path, uid, shown, settings, licence, described.remesh_faces)
+    display_name = f"{where} is {described.mesh_path}"
+    return load_mesh_file(path, uid, display_name, settings, licence, described.remesh_faces)
 
 
 def load_mesh_file(
     path: Path,
     uid: str,
-    shown: str,
+    display_name: str,
     settings: AssetSettings,
     licence: str,
     remesh_faces: int | None = None,
@@ -202,9 +202,9 @@ def load_mesh_file(
     try:
         loaded = load_scene_mesh(path, settings, remesh_faces)
     except Rejected as rejection:
-        raise TrilightError(f"{shown}: {rejection}; expected a usable mesh.") from rejection
+        raise TrilightError(f"{display_name}: {rejection}; expected a usable mesh.") from rejection
     except OSError as error:
-        raise TrilightError(f"{shown}: cannot be read ({error.strerror}).") from error
+        raise TrilightError(f"{display_name}: cannot be read ({error.strerror}).") from error
     mesh = LoadedMesh(
         uid=uid,
         licence=licence,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pipeline.exchange.description import SceneDescription
 from pipeline.exchange.from_description import AlbedoOverOne
-from pipeline.exchange.scene_files import described_by
+from pipeline.exchange.scene_files import read_scene_description
 from storage.errors import EnvironmentFailure, TrilightError
 
 MAX_SCENES = 100_000
@@ -28,7 +28,7 @@ class SceneFolder:
     unusable: Mapping[str, str]  # what is wrong with each of the others, by its name
     albedo_over_one: AlbedoOverOne  # what to do where albedos add up to more than 1
 
-    def views(self, wanted: int | None) -> int:
+    def views(self, num_views: int | None) -> int:
         """Return how many views every scene gets: `wanted`, or the fewest cameras of any file.
 
         No camera is ever invented: the pictures show what the files say.
@@ -37,28 +37,28 @@ class SceneFolder:
             TrilightError: a file has fewer cameras than wanted.
         """
         fewest = min(self.descriptions, key=lambda description: len(description.cameras))
-        if wanted is None:
+        if num_views is None:
             return len(fewest.cameras)
-        if not 1 <= wanted <= len(fewest.cameras):
+        if not 1 <= num_views <= len(fewest.cameras):
             raise TrilightError(
-                f"--views is {wanted}; expected 1 to {len(fewest.cameras)}, the number of cameras "
+                f"--views is {num_views}; expected 1 to {len(fewest.cameras)}, the number of cameras "
                 f"in {fewest.file}: choose fewer views, or add cameras to the file."
             )
-        return wanted
+        return num_views
 
     def notes(self, num_views: int) -> tuple[str, ...]:
         """Return what a person should know: fields without meaning, and cameras not used."""
-        found = []
+        notes = []
         for description in self.descriptions:
-            found += [
+            notes += [
                 f"{description.file}: unknown field {name}" for name in description.unknown_fields
             ]
             if (unused := len(description.cameras) - num_views) > 0:
-                found.append(
+                notes.append(
                     f"{description.file}: {unused} of {len(description.cameras)} cameras not used, "
                     f"from cameras[{num_views}] on"
                 )
-        return tuple(found)
+        return tuple(notes)
 
 
 def find_scene_files(folder: str, albedo_over_one: AlbedoOverOne = "scale") -> SceneFolder:
@@ -84,7 +84,7 @@ def find_scene_files(folder: str, albedo_over_one: AlbedoOverOne = "scale") -> S
     descriptions, unusable = [], {}
     for name in names:
         try:
-            descriptions.append(described_by(root, name))
+            descriptions.append(read_scene_description(root, name))
         except EnvironmentFailure:
             raise
         except TrilightError as mistake:

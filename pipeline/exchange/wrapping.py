@@ -34,7 +34,7 @@ class Tiles:
     """How many there are."""
 
 
-def tiles_of(
+def choose_tiles(
     wraps: Sequence[Wrap], at: NDArray[np.floating], most_texels: int
 ) -> tuple[Tiles, bool]:
     """Return the tiles that textures of one material need along an axis, and whether they suffice.
@@ -46,33 +46,33 @@ def tiles_of(
         at: coordinates of all corners along the axis.
         most_texels: of any of them along the axis.
     """
-    wanted = _wanted(wraps, at)
-    if wanted.count <= MAX_TILES and wanted.count * most_texels <= MAX_RESOLUTION:
-        return wanted, True
-    return Tiles(first=0, count=1), wanted.count == 1
+    needed_tiles = _needed_tiles(wraps, at)
+    if needed_tiles.count <= MAX_TILES and needed_tiles.count * most_texels <= MAX_RESOLUTION:
+        return needed_tiles, True
+    return Tiles(first=0, count=1), needed_tiles.count == 1
 
 
-def _wanted(wraps: Sequence[Wrap], at: NDArray[np.floating]) -> Tiles:
+def _needed_tiles(wraps: Sequence[Wrap], at: NDArray[np.floating]) -> Tiles:
     low, high = (float(at.min()), float(at.max())) if at.size else (0.0, 1.0)
-    others = {wrap for wrap in wraps if wrap != "repeat"}
-    if not others or (low >= -_INSIDE and high <= 1 + _INSIDE):
+    modes = {wrap for wrap in wraps if wrap != "repeat"}
+    if not modes or (low >= -_INSIDE and high <= 1 + _INSIDE):
         return Tiles(first=0, count=1)
-    if others == {"mirror"}:
+    if modes == {"mirror"}:
         return Tiles(first=0, count=2)
     first, last = int(np.floor(low)), int(np.ceil(high))
     return Tiles(first=first, count=last - first)
 
 
-def tiled(values: NDArray, wrap: Wrap, tiles: Tiles, axis: int) -> NDArray:
+def expand_tiles(values: NDArray, wrap: Wrap, tiles: Tiles, axis: int) -> NDArray:
     """Return a picture [H, W, C] side by side along an axis, 0 for v and 1 for u."""
-    parts = [
+    tile_values = [
         _tile(values, wrap, number, axis)
         for number in range(tiles.first, tiles.first + tiles.count)
     ]
-    return np.concatenate(parts, axis=axis) if len(parts) > 1 else parts[0]
+    return np.concatenate(tile_values, axis=axis) if len(tile_values) > 1 else tile_values[0]
 
 
-def repeated_near_zero(uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+def shift_near_zero(uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
     """Return coordinates [T, 3, 2] within the law of scenes, and whether they show the same.
 
     A triangle far out is moved by whole pictures, which repeat.

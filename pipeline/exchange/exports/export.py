@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
-from pipeline.exchange.chosen import chosen_samples
+from pipeline.exchange.select_samples import select_samples
 from pipeline.exchange.exports.coco import write_coco
 from pipeline.exchange.exports.huggingface import write_huggingface
 from pipeline.exchange.exports.hypersim import write_hypersim
 from pipeline.exchange.exports.nerfstudio import write_nerfstudio
-from pipeline.exchange.exports.scenes import PARTS, write_benchmark, write_scenes
+from pipeline.exchange.exports.scenes import WRITERS, write_benchmark, write_scenes
 from storage.atomic import write_atomically
 from storage.dataset.dataset import open_dataset
 from storage.errors import TrilightError
@@ -28,7 +28,7 @@ FORMS: dict[str, Callable[[Samples, Path], Sequence[str] | None]] = {
     "coco": write_coco,
     "huggingface": write_huggingface,
     "hypersim": write_hypersim,
-    **{form: functools.partial(write_scenes, form=form) for form in PARTS},
+    **{form: functools.partial(write_scenes, form=form) for form in WRITERS},
     "benchmark": write_benchmark,
 }
 """Writers by form; each writes into a folder, the file that names all others last, and returns what
@@ -68,9 +68,9 @@ def export_dataset(
     dataset = open_dataset(source)
 
     def samples() -> Samples:
-        for found in chosen_samples(dataset, split=split, scene=scene):
-            yield found
-            done(found[1])
+        for split_sample in select_samples(dataset, split=split, scene=scene):
+            yield split_sample
+            done(split_sample[1])
 
     lost = FORMS[form](samples(), out)
     for name in _RIGHTS:

@@ -28,16 +28,18 @@ def write_huggingface(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
         for view in range(sample.scene.num_views):
             row = _row(out / split, sample, view)
             lines.setdefault(split, []).append(json.dumps(row, allow_nan=False))
-    for split, found in lines.items():
-        write_atomically(out / split / "metadata.jsonl", "".join(f"{x}\n" for x in found).encode())
+    for split, split_lines in lines.items():
+        write_atomically(
+            out / split / "metadata.jsonl", "".join(f"{x}\n" for x in split_lines).encode()
+        )
 
 
 def _row(folder: Path, sample: Sample, view: int) -> dict[str, Any]:
     scene, name = sample.scene, f"{sample.key}.{view}"
     write_png(folder / f"{name}.png", sample, view)
-    found = sample.view_passes(list(_PASSES.values()), view=view)
-    for column, wanted in _PASSES.items():
-        write_tiff(folder / f"{name}.{column}.tiff", found[wanted])
+    passes = sample.view_passes(list(_PASSES.values()), view=view)
+    for column, pass_name in _PASSES.items():
+        write_tiff(folder / f"{name}.{column}.tiff", passes[pass_name])
     return {
         "file_name": f"{name}.png",
         **{f"{column}_file_name": f"{name}.{column}.tiff" for column in _PASSES},

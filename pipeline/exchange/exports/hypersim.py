@@ -50,21 +50,23 @@ def write_hypersim(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
 
 def _diffuse_light(sample: Sample) -> NDArray[np.float32]:
     """Return the light [C, R, R, 3] of diffuse lobes."""
-    parts = sample.parts_rgb or {}
-    found = [part for name, part in parts.items() if name.startswith("diffuse")]
-    if not found:
+    components = sample.parts_rgb or {}
+    diffuse_components = [
+        component for name, component in components.items() if name.startswith("diffuse")
+    ]
+    if not diffuse_components:
         raise TrilightError(
-            f"sample {sample.key}: keeps {', '.join(parts) or 'all light together'}; expected "
+            f"sample {sample.key}: keeps {', '.join(components) or 'all light together'}; expected "
             "diffuse and specular light apart. Make the dataset with "
             "--set renders.split_lobes=true."
         )
-    light: NDArray[np.float32] = np.stack(found).sum(axis=0, dtype=np.float32)
+    light: NDArray[np.float32] = np.stack(diffuse_components).sum(axis=0, dtype=np.float32)
     return light if sample.lights_rgb is None else np.stack([view.sum(axis=0) for view in light])
 
 
 def _write_view(images: Path, sample: Sample, view: int, diffuse_rgb: NDArray[np.float32]) -> None:
-    seen = sample.view_passes([_REFLECTANCE, *_GEOMETRY.values()], view=view)
-    reflectance = np.nan_to_num(seen[_REFLECTANCE])
+    passes = sample.view_passes([_REFLECTANCE, *_GEOMETRY.values()], view=view)
+    reflectance = np.nan_to_num(passes[_REFLECTANCE])
     reflects = reflectance > 0
     illumination = np.where(reflects, diffuse_rgb / np.where(reflects, reflectance, 1), 0)
     color = sample.radiance_rgb[view]
@@ -74,7 +76,7 @@ def _write_view(images: Path, sample: Sample, view: int, diffuse_rgb: NDArray[np
         "diffuse_reflectance": reflectance,
         "residual": color - reflectance * illumination,
     }
-    geometry = {name: seen[wanted] for name, wanted in _GEOMETRY.items()}
+    geometry = {name: passes[pass_name] for name, pass_name in _GEOMETRY.items()}
     depth = geometry["depth_meters"]
     geometry["depth_meters"] = np.where(np.isfinite(depth), depth, np.nan)
     for kind, pictures in (("final", shading), ("geometry", geometry)):

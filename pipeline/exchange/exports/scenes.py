@@ -47,7 +47,7 @@ def write_targets(sample: Sample, folder: Path) -> Sequence[str]:
     return ()
 
 
-def scene_writer(form: str) -> WriteSample:
+def make_scene_writer(form: str) -> WriteSample:
     """Return what writes a sample's scene in a form of SCENE_SUFFIXES."""
 
     def write(sample: Sample, folder: Path) -> Sequence[str]:
@@ -58,8 +58,8 @@ def scene_writer(form: str) -> WriteSample:
     return write
 
 
-PARTS: dict[str, WriteSample] = {
-    **{form: scene_writer(form) for form in SCENE_SUFFIXES},
+WRITERS: dict[str, WriteSample] = {
+    **{form: make_scene_writer(form) for form in SCENE_SUFFIXES},
     TARGETS: write_targets,
 }
 """Writers by form."""
@@ -69,18 +69,18 @@ def write_scenes(samples: Iterator[tuple[str, Sample]], out: Path, form: str) ->
     """Write one form of every sample into a folder; return what it cannot hold, for people."""
     lost: dict[str, None] = {}
     for _, sample in samples:
-        lost |= dict.fromkeys(PARTS[form](sample, out))
-    return _told(form, list(lost))
+        lost |= dict.fromkeys(WRITERS[form](sample, out))
+    return _limit_notes(form, list(lost))
 
 
 def write_benchmark(samples: Iterator[tuple[str, Sample]], out: Path) -> Sequence[str]:
     """Write all forms and the table of views; see the top of this file."""
-    lost: dict[str, dict[str, None]] = {form: {} for form in PARTS}
+    lost: dict[str, dict[str, None]] = {form: {} for form in WRITERS}
     stream = io.StringIO(newline="")
     table = csv.writer(stream, lineterminator="\n")
     table.writerow(_COLUMNS)
     for split, sample in samples:
-        for form, write in PARTS.items():
+        for form, write in WRITERS.items():
             lost[form] |= dict.fromkeys(write(sample, out / form))
         scenes = [f"{form}/{sample.key}{suffix}" for form, suffix in SCENE_SUFFIXES.items()]
         for view, record in enumerate(sample.views):
@@ -88,10 +88,10 @@ def write_benchmark(samples: Iterator[tuple[str, Sample]], out: Path) -> Sequenc
             floor = f"{record.noise_floor_db:.3f}"
             table.writerow([sample.key, view, split, *scenes, target, floor])
     write_atomically(out / "views.csv", stream.getvalue().encode())
-    return [note for form, texts in lost.items() for note in _told(form, list(texts))]
+    return [note for form, texts in lost.items() for note in _limit_notes(form, list(texts))]
 
 
-def _told(form: str, lost: Sequence[str]) -> list[str]:
-    found = [f"{form} cannot hold {text}" for text in lost[:MOST_NOTES]]
+def _limit_notes(form: str, lost: Sequence[str]) -> list[str]:
+    notes = [f"{form} cannot hold {text}" for text in lost[:MOST_NOTES]]
     more = len(lost) - MOST_NOTES
-    return [*found, f"{form} loses {more} more things of this kind"] if more > 0 else found
+    return [*notes, f"{form} loses {more} more things of this kind"] if more > 0 else notes

@@ -9,15 +9,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.dressed import PLAIN, DressedTriangles, Worn
+from pipeline.exchange.textured_pieces import NO_TEXTURES, TexturedTriangles, TextureSet
 from pipeline.exchange.gltf.meshes import WorldTriangles
-from pipeline.exchange.gltf.textures import SLOTS, Sampled, sample_slots
+from pipeline.exchange.gltf.textures import SLOTS, SampledMaps, sample_slots
 from pipeline.exchange.linear_maps import (
     Map,
-    colour_textures,
+    color_textures,
     constant_map,
     number_texture,
-    on_one_grid,
+    resample_to_largest,
 )
 from pipeline.foreign.material import Seen, SourceMaterial, columns
 from storage.conventions import srgb8
@@ -36,9 +36,9 @@ _MOST_TINTED = 1 << 25
 _ROUGH = ("roughness", "glossiness")
 
 
-def dress_triangles(
-    material: SourceMaterial, found: WorldTriangles, source: MapSource, lost: list[str]
-) -> DressedTriangles:
+def apply_material(
+    material: SourceMaterial, triangles: WorldTriangles, source: MapSource, lost: list[str]
+) -> TexturedTriangles:
     """Return triangles with what a material comes to on them.
 
     Args:
@@ -47,45 +47,45 @@ def dress_triangles(
         source: name and rights of the textures.
         lost: receives what cannot be carried over.
     """
-    count, most = len(found.positions), _MOST_TINTED
-    shown = sample_slots(material, found.coordinates, lost)
-    if shown.uv is not None:
-        texels = max(values[..., 0].size for values in shown.maps.values())
+    count, most = len(triangles.positions), _MOST_TINTED
+    sampled = sample_slots(material, triangles.coordinates, lost)
+    if sampled.uv is not None:
+        texels = max(values[..., 0].size for values in sampled.maps.values())
         most = min(max(_MOST_TINTED // texels, 1), _MOST_TINTS)
-    tints, worn = _tints(found.colors, count, most, lost)
-    if shown.uv is None and len(tints) > _MOST_TINTS:
-        shown, tints, worn = _with_palette(shown, tints, worn)
+    tints, tint_index = _tints(triangles.colors, count, most, lost)
+    if sampled.uv is None and len(tints) > _MOST_TINTS:
+        sampled, tints, tint_index = _with_palette(sampled, tints, tint_index)
     rows = default_rows(count)
     rows[:, EMISSION] = _emission(material, lost)
-    wardrobe: Sequence[Worn] = (PLAIN,)
-    if shown.uv is not None:
-        wardrobe = [_textures(material, shown.maps, tint, source) for tint in tints]
+    texture_sets: Sequence[TextureSet] = (NO_TEXTURES,)
+    if sampled.uv is not None:
+        texture_sets = [_textures(material, sampled.maps, tint, source) for tint in tints]
     else:
-        values = _columns(material, shown.maps, np.asarray(tints)[None])[0, worn]
+        values = _columns(material, sampled.maps, np.asarray(tints)[None])[0, tint_index]
         rows[:, DIFFUSE], rows[:, SPECULAR] = values[:, :3], values[:, 3:6]
         rows[:, ROUGHNESS] = values[:, 6]
-    return DressedTriangles(
-        positions=found.positions,
-        normals=found.normals,
+    return TexturedTriangles(
+        positions=triangles.positions,
+        normals=triangles.normals,
         rows=rows,
-        uv=np.zeros((count, 3, 2), np.float32) if shown.uv is None else shown.uv,
-        worn=worn % len(wardrobe),
-        wardrobe=wardrobe,
+        uv=np.zeros((count, 3, 2), np.float32) if sampled.uv is None else sampled.uv,
+        texture_set_index=tint_index % len(texture_sets),
+        texture_sets=texture_sets,
     )
 
 
 def _textures(
     material: SourceMaterial, maps: Mapping[str, Map], tint: NDArray[np.float64], source: MapSource
-) -> Worn:
+) -> TextureSet:
     """Return the textures of a material whose base color is multiplied by a tint [3]."""
     colored = {name: values for name, values in maps.items() if name not in _ROUGH}
     rough = {name: values for name, values in maps.items() if name in _ROUGH}
     values = _columns(material, colored, tint[None, None])
     roughness = _columns(material, rough, np.ones((1, 1, 3)))[..., 6:]
-    diffuse, specular = colour_textures(
-        _reduced(values[..., :3]), _reduced(values[..., 3:6]), source
+    diffuse, specular = color_textures(
+        _collapse_constant(values[..., :3]), _collapse_constant(values[..., 3:6]), source
     )
-    return diffuse, specular, number_texture(_reduced(roughness), source)
+    return diffuse, specular, number_texture(_collapse_constant(roughness), source)
 
 
 def _columns(
@@ -93,31 +93,33 @@ def _columns(
 ) -> NDArray[np.float32]:
     """Return the columns [H, W, 7] of a material whose base is multiplied by a tint [., ., 3]."""
     names = list(maps)
-    shown = dict(zip(names, on_one_grid(*maps.values()), strict=True)) if names else {}
+    resampled = dict(zip(names, resample_to_largest(*maps.values()), strict=True)) if names else {}
     height, width = np.broadcast_shapes(
-        tint.shape[:2], *(map_.shape[:2] for map_ in shown.values())
+        tint.shape[:2], *(map_.shape[:2] for map_ in resampled.values())
     )
-    found = np.zeros((height, width, 7), np.float32)
+    values = np.zeros((height, width, 7), np.float32)
     for first in range(0, height, _STRIP):
         size = min(_STRIP, height - first)
         seen = {
-            name: _places(map_[first : first + size] if len(map_) > 1 else map_, size, width)
-            for name, map_ in shown.items()
+            name: _flatten_on_grid(
+                map_[first : first + size] if len(map_) > 1 else map_, size, width
+            )
+            for name, map_ in resampled.items()
         }
-        colors = _places(tint, size, width)
+        colors = _flatten_on_grid(tint, size, width)
         seen["base"] = seen["base"][:, :3] * colors if "base" in seen else colors
         known = Seen(**{name: seen.get(name) for name in SLOTS})
         rows = columns(material, known, size * width, least_roughness=0)
-        found[first : first + size] = rows.reshape(size, width, 7)
-    return found
+        values[first : first + size] = rows.reshape(size, width, 7)
+    return values
 
 
-def _places(values: NDArray, height: int, width: int) -> NDArray:
+def _flatten_on_grid(values: NDArray, height: int, width: int) -> NDArray:
     """Return the values [N, C] of a map at each texel of a grid."""
     return np.broadcast_to(values, (height, width, values.shape[2])).reshape(-1, values.shape[2])
 
 
-def _reduced(values: NDArray[np.float32]) -> Map:
+def _collapse_constant(values: NDArray[np.float32]) -> Map:
     """Return a map of one texel where all are equal."""
     return values[:1, :1] if (values == values[0, 0]).all() else values
 
@@ -131,39 +133,39 @@ def _tints(
     if np.ptp(colors, axis=1).max() > 1 / 255:
         lost.append("colors of vertices: the mean of each triangle")
     plain = np.clip(np.nan_to_num(colors.mean(axis=1)), 0, 1)
-    tints, worn = _grouped(plain, np.round(plain * 1e6).astype(np.int64))
+    tints, tint_index = _group_colors(plain, np.round(plain * 1e6).astype(np.int64))
     coded = srgb8(plain).astype(np.int64)
     shift = 0
     while len(tints) > most:
-        tints, worn = _grouped(plain, coded >> shift)
+        tints, tint_index = _group_colors(plain, coded >> shift)
         shift += 1
     if shift:
         lost.append("colors of vertices over textures: rounded to a few")
-    return tints, worn
+    return tints, tint_index
 
 
-def _grouped(
+def _group_colors(
     colors: NDArray[np.float64], codes: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the mean color [K, 3] of equal codes [T, 3], and the group [T] of each."""
     keys = codes @ np.array([1 << 42, 1 << 21, 1])
-    _, worn, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    sums = [np.bincount(worn, colors[:, channel]) for channel in range(3)]
-    return np.stack(sums, axis=1) / counts[:, None], worn.astype(np.int64)
+    _, group_index, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    sums = [np.bincount(group_index, colors[:, channel]) for channel in range(3)]
+    return np.stack(sums, axis=1) / counts[:, None], group_index.astype(np.int64)
 
 
 def _with_palette(
-    found: Sampled, tints: NDArray[np.float64], worn: NDArray[np.int64]
-) -> tuple[Sampled, NDArray[np.float64], NDArray[np.int64]]:
+    sampled: SampledMaps, tints: NDArray[np.float64], tint_index: NDArray[np.int64]
+) -> tuple[SampledMaps, NDArray[np.float64], NDArray[np.int64]]:
     """Return many colors as a texture of a texel each, looked up in the middles of texels."""
     side = int(np.ceil(np.sqrt(len(tints))))
     texels = np.ones((side * side, 4), np.float32)
     texels[: len(tints), :3] = tints
-    base = found.maps.get("base", constant_map([1, 1, 1, 1])) * texels.reshape(side, side, 4)
-    centers = (np.stack([worn % side, worn // side], axis=1) + 0.5) / side
+    base = sampled.maps.get("base", constant_map([1, 1, 1, 1])) * texels.reshape(side, side, 4)
+    centers = (np.stack([tint_index % side, tint_index // side], axis=1) + 0.5) / side
     uv = np.repeat(centers[:, None], 3, axis=1).astype(np.float32)
-    sampled = Sampled(maps={**found.maps, "base": base}, uv=uv)
-    return sampled, np.ones((1, 3)), np.zeros(len(worn), np.int64)
+    with_palette = SampledMaps(maps={**sampled.maps, "base": base}, uv=uv)
+    return with_palette, np.ones((1, 3)), np.zeros(len(tint_index), np.int64)
 
 
 def _emission(material: SourceMaterial, lost: list[str]) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.linear_maps import Map, constant_map
-from pipeline.exchange.wrapping import repeated_near_zero, tiled, tiles_of
+from pipeline.exchange.wrapping import shift_near_zero, expand_tiles, choose_tiles
 from pipeline.foreign.material import Slot, SourceMaterial
 
 SLOTS: Mapping[str, str] = {
@@ -29,7 +29,7 @@ Coordinates = Callable[[int], NDArray[np.float64] | None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sampled:
+class SampledMaps:
     """What the pictures of a material show over a mesh."""
 
     maps: Mapping[str, Map]
@@ -38,7 +38,9 @@ class Sampled:
     """[T, 3, 2] where the maps are looked up; None where all are constants."""
 
 
-def sample_slots(material: SourceMaterial, coordinates: Coordinates, lost: list[str]) -> Sampled:
+def sample_slots(
+    material: SourceMaterial, coordinates: Coordinates, lost: list[str]
+) -> SampledMaps:
     """Return the maps of a material.
 
     Args:
@@ -54,32 +56,35 @@ def sample_slots(material: SourceMaterial, coordinates: Coordinates, lost: list[
     uv = None if first is None or plain is None else plain @ first.turn.T + first.shift
     if slots and uv is None:
         lost.append("textures of a mesh without texture coordinates: their means were taken")
-    kept = [
+    same_chart = [
         name
         for name, slot in slots.items()
         if first and uv is not None and _chart(slot) == _chart(first)
     ]
-    if uv is not None and len(kept) < len(slots):
+    if uv is not None and len(same_chart) < len(slots):
         lost.append("textures with coordinates unlike the first of their material: their means")
     maps = {name: constant_map(picture.mean(axis=(0, 1))) for name, picture in pictures.items()}
     if uv is None:
-        return Sampled(maps=maps, uv=None)
-    axes, same = [], True
+        return SampledMaps(maps=maps, uv=None)
+    tiles_by_axis, is_exact = [], True
     for axis in range(2):
-        texels = max(pictures[name].shape[1 - axis] for name in kept)
-        wraps = [slots[name].picture.wrap[axis] for name in kept]
-        tiles, fits = tiles_of(wraps, uv[..., axis], texels)
-        axes.append(tiles)
-        same &= fits
-    for name in kept:
+        texels = max(pictures[name].shape[1 - axis] for name in same_chart)
+        wraps = [slots[name].picture.wrap[axis] for name in same_chart]
+        tiles, fits = choose_tiles(wraps, uv[..., axis], texels)
+        tiles_by_axis.append(tiles)
+        is_exact &= fits
+    for name in same_chart:
         wrap = slots[name].picture.wrap
-        across = tiled(pictures[name], wrap[0], axes[0], 1)
-        maps[name] = tiled(across, wrap[1], axes[1], 0)
-    moved = (uv - [axes[0].first, axes[1].first]) / [axes[0].count, axes[1].count]
-    near, all_near = repeated_near_zero(moved)
-    if not (same and all_near):
+        across = expand_tiles(pictures[name], wrap[0], tiles_by_axis[0], 1)
+        maps[name] = expand_tiles(across, wrap[1], tiles_by_axis[1], 0)
+    moved = (uv - [tiles_by_axis[0].first, tiles_by_axis[1].first]) / [
+        tiles_by_axis[0].count,
+        tiles_by_axis[1].count,
+    ]
+    near, all_near = shift_near_zero(moved)
+    if not (is_exact and all_near):
         lost.append("textures far outside of [0, 1]: some look otherwise there")
-    return Sampled(maps=maps, uv=near.astype(np.float32))
+    return SampledMaps(maps=maps, uv=near.astype(np.float32))
 
 
 def _chart(slot: Slot) -> tuple[int, bytes, bytes]:

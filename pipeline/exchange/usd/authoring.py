@@ -67,13 +67,13 @@ def add_link(prim: Any, name: str, kind: str, source: str | None = None) -> None
         link.connectionPathList.explicitItems = [_target(source)]
 
 
-def as_expected(prim: Any, attributes: Attributes) -> bool:
+def has_attributes(prim: Any, attributes: Attributes) -> bool:
     """Return whether a prim holds these attributes with these values and no other time."""
     for name, (kind, value) in attributes.items():
-        found = prim.attributes.get(name)
-        if found is None or found.HasInfo("timeSamples"):
+        attribute = prim.attributes.get(name)
+        if attribute is None or attribute.HasInfo("timeSamples"):
             return False
-        if found.typeName != _value_type(kind) or found.default != usd_value(kind, value):
+        if attribute.typeName != _value_type(kind) or attribute.default != usd_value(kind, value):
             return False
     return True
 
@@ -116,7 +116,7 @@ def _converter(kind: str) -> Callable[[Any], Any]:
         "double3": lambda value: Gf.Vec3d(*value),
     }
     plain = kind.removeprefix(UNIFORM)
-    return known.get(plain, _vectors if plain.endswith("[]") else _as_it_is)
+    return known.get(plain, _vectors if plain.endswith("[]") else _identity)
 
 
 def _vectors(values: NDArray[np.float32]) -> Any:
@@ -125,5 +125,5 @@ def _vectors(values: NDArray[np.float32]) -> Any:
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values))
 
 
-def _as_it_is(value: Any) -> Any:
+def _identity(value: Any) -> Any:
     return value

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.pictures import MAX_BYTES, decoded_pixels, linear_rgb
+from pipeline.exchange.pictures import MAX_BYTES, decode_pixels, linear_rgb
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
 from pipeline.exchange.usd.foreign_lights import read_light_color
 from pipeline.exchange.usd.held_materials import parse_map_text
@@ -36,7 +36,7 @@ TO_OUR_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 _PATH = "inputs:texture:file"
 
-_SAME_TURN = 1e-5
+_SAME_ROTATION = 1e-5
 """Difference up to which a rotation is the one that Trilight wrote: angles have float32 there."""
 
 
@@ -90,10 +90,10 @@ def sky_attributes(sky: Environment | None) -> Attributes:
     }
 
 
-def dome_as_written(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
+def read_exact_dome(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
     """Return the environment of a prim that `add_dome` wrote; raises LookupError without a file."""
-    found = opened.inside(layer, prim.attributes[_PATH].default.path)
-    data = None if found is None else asset_bytes(found, MAX_BYTES)
+    resolved = opened.inside(layer, prim.attributes[_PATH].default.path)
+    data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
     if data is None:
         raise LookupError(_PATH)
     matrix = np.array(prim.attributes["xformOp:transform"].default).T
@@ -106,7 +106,7 @@ def dome_as_written(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
     )
 
 
-def foreign_dome(
+def read_foreign_dome(
     prim: Any, to_world: NDArray[np.float64], time: Any, opened: OpenedUsd, licence: str
 ) -> Environment | None:
     """Return the environment of any DomeLight, or None, with a note, where it cannot be read.
@@ -121,27 +121,27 @@ def foreign_dome(
     Raises:
         TrilightError: its file is outside of the folder or on the network.
     """
-    place = str(prim.GetPath())
-    radiance = _picture(prim, time, opened)
+    prim_path = str(prim.GetPath())
+    radiance = _read_map(prim, time, opened)
     if radiance is None:
         return None
     tinted = radiance * read_light_color(prim, time, opened.lost)
-    left, _, right = np.linalg.svd(to_world[:3, :3] @ _turn_pole(prim))
-    turn = left @ right
-    if np.linalg.det(turn) < 0:
-        opened.lost.append(f"{place}: a mirrored dome; its light was left out")
+    left_basis, _, right_basis = np.linalg.svd(to_world[:3, :3] @ _pole_rotation(prim))
+    rotation = left_basis @ right_basis
+    if np.linalg.det(rotation) < 0:
+        opened.lost.append(f"{prim_path}: a mirrored dome; its light was left out")
         return None
     seen = prim.GetAttribute(VISIBLE_TO_CAMERA)
     sky = Environment(
         radiance_rgb=tinted.astype(np.float32),
-        rotation=(turn @ TO_OUR_AXES.T).astype(np.float32),
+        rotation=(rotation @ TO_OUR_AXES.T).astype(np.float32),
         is_seen=bool(seen and seen.Get(time)),
         source=MapSource(name=prim.GetName(), licence=licence),
     )
     try:
         sky.check()
     except TrilightError as error:
-        opened.lost.append(f"{place}: {error}; its light was left out")
+        opened.lost.append(f"{prim_path}: {error}; its light was left out")
         return None
     return _take_held(sky, prim, time)
 
@@ -157,12 +157,12 @@ def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
     if not dome.HasAttribute(VISIBLE_TO_CAMERA):
         sky = dataclasses.replace(sky, is_seen=bool(holder.GetAttribute(SKY_VISIBLE).Get(time)))
     rows = [holder.GetAttribute(name).Get(time) for name in SKY_ROWS]
-    if None in rows or not np.allclose(rows, sky.rotation, atol=_SAME_TURN):
+    if None in rows or not np.allclose(rows, sky.rotation, atol=_SAME_ROTATION):
         return sky
     return dataclasses.replace(sky, rotation=np.array(rows, np.float32))
 
 
-def _turn_pole(prim: Any) -> NDArray[np.float64]:
+def _pole_rotation(prim: Any) -> NDArray[np.float64]:
     """Return what turns a dome, whose pole is +Y, to the axis that a DomeLight_1 states."""
     from pxr import UsdGeom
 
@@ -174,24 +174,26 @@ def _turn_pole(prim: Any) -> NDArray[np.float64]:
     return np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) if is_turned else np.eye(3)
 
 
-def _picture(prim: Any, time: Any, opened: OpenedUsd) -> NDArray[np.float64] | None:
+def _read_map(prim: Any, time: Any, opened: OpenedUsd) -> NDArray[np.float64] | None:
     """Return the map [H, 2 H, 3] of a dome: even where it names no file."""
-    place, attribute = str(prim.GetPath()), prim.GetAttribute(_PATH)
+    prim_path, attribute = str(prim.GetPath()), prim.GetAttribute(_PATH)
     asset = attribute.Get(time) if attribute else None
     if asset is None or not asset.path:
         return np.ones((1, 2, 3))
     layout = prim.GetAttribute("inputs:texture:format").Get(time)
     if layout not in (None, "automatic", "latlong"):
-        opened.lost.append(f"{place}: a picture of format {layout}; expected latlong")
+        opened.lost.append(f"{prim_path}: a picture of format {layout}; expected latlong")
         return None
     specs = attribute.GetPropertyStack(time)
-    found = opened.inside(specs[0].layer if specs else opened.root, asset.path)
-    data = None if found is None else asset_bytes(found, MAX_BYTES)
+    resolved = opened.inside(specs[0].layer if specs else opened.root, asset.path)
+    data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
     if data is None:
-        opened.lost.append(f"{place}: map {asset.path!r:.100} is missing")
+        opened.lost.append(f"{prim_path}: map {asset.path!r:.100} is missing")
         return None
-    pixels = decoded_pixels(data, asset.path, opened.lost)
+    pixels = decode_pixels(data, asset.path, opened.lost)
     if pixels is None:
-        opened.lost.append(f"{place}: map {asset.path!r:.100} is not read; its light was left out")
+        opened.lost.append(
+            f"{prim_path}: map {asset.path!r:.100} is not read; its light was left out"
+        )
         return None
     return linear_rgb(pixels).astype(np.float64)

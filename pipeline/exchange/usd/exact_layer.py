@@ -29,13 +29,13 @@ def drop_absent(prim: Any, properties: Mapping[str, T], added: set[str]) -> dict
     }
 
 
-def numbered(folder: Any, name: Callable[[int], str]) -> list[Any]:
+def children_by_row(folder: Any, name: Callable[[int], str]) -> list[Any]:
     """Return the children of a folder by their rows; asking it for each by name is quadratic."""
     prims = {prim.name: prim for prim in folder.nameChildren}
     return [prims[name(row)] for row in range(len(prims))]
 
 
-def children_of(prim: Any, expected: set[str]) -> Any:
+def require_children(prim: Any, expected: set[str]) -> Any:
     require(set(prim.nameChildren.keys()) == expected)
     return prim.nameChildren
 
@@ -46,20 +46,20 @@ def require_plain(prim: Any, properties: set[str]) -> None:
     require(set(prim.ListInfoKeys()) <= _PLAIN_INFO)
 
 
-def whole_numbers(prim: Any, name: str) -> NDArray[np.int64]:
+def read_integers(prim: Any, name: str) -> NDArray[np.int64]:
     attribute = prim.attributes[name]
     values = np.array(attribute.default, np.int64)
     require(values.ndim == 1 and not attribute.HasInfo("timeSamples"))
     return values
 
 
-def vectors(prim: Any, name: str) -> NDArray[np.float32]:
+def read_vectors(prim: Any, name: str) -> NDArray[np.float32]:
     attribute = prim.attributes[name]
     values = np.array(attribute.default, np.float32).reshape(-1, 3)
     require(not attribute.HasInfo("timeSamples"))
     return values
 
 
-def require(law: Any) -> None:
-    if not law:
+def require(condition: Any) -> None:
+    if not condition:
         raise Changed

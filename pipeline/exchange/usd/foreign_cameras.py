@@ -14,36 +14,38 @@ from storage.conventions import look_at_c2w
 
 _FOV_DEG = 40.0
 """Field of view of the camera that is added to a stage without cameras."""
-_SAME = 1e-5
+_SAME_LENS = 1e-5
 """Relative difference up to which a lens is the one that Trilight wrote."""
 
 
-def cameras(
+def read_stage_cameras(
     placed: Sequence[Placed], time: Any, lost: list[str]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return poses [C, 4, 4] and full angles [C] in degrees; C is 0 where none can be used."""
     poses, angles = [], []
     for each in placed:
-        found = _camera(each, time, lost)
-        if found is not None:
-            poses.append(found[0])
-            angles.append(found[1])
+        pose_and_angle = _read_camera(each, time, lost)
+        if pose_and_angle is not None:
+            poses.append(pose_and_angle[0])
+            angles.append(pose_and_angle[1])
     return np.array(poses, np.float32).reshape(-1, 4, 4), np.array(angles, np.float32)
 
 
-def camera_that_sees_all(
+def fit_camera(
     points: NDArray[np.float32],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return one camera that sees all points [N, 3], from above and from the side."""
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
-    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
-    away = np.array([0.6, -1.0, 0.6]) / np.linalg.norm([0.6, -1.0, 0.6])
-    eye = middle + away * reach / math.sin(math.radians(_FOV_DEG) / 2)
-    pose = look_at_c2w(eye=eye, target=middle, up=[0, 0, 1])
+    center, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    direction = np.array([0.6, -1.0, 0.6]) / np.linalg.norm([0.6, -1.0, 0.6])
+    eye = center + direction * radius / math.sin(math.radians(_FOV_DEG) / 2)
+    pose = look_at_c2w(eye=eye, target=center, up=[0, 0, 1])
     return pose[None].astype(np.float32), np.array([_FOV_DEG], np.float32)
 
 
-def _camera(placed: Placed, time: Any, lost: list[str]) -> tuple[NDArray[np.float64], float] | None:
+def _read_camera(
+    placed: Placed, time: Any, lost: list[str]
+) -> tuple[NDArray[np.float64], float] | None:
     from pxr import UsdGeom
 
     camera, where = UsdGeom.Camera(placed.prim), placed.prim.GetPath()
@@ -59,7 +61,7 @@ def _camera(placed: Placed, time: Any, lost: list[str]) -> tuple[NDArray[np.floa
         return None
     angle = math.degrees(2 * math.atan(wide / (2 * focal)))
     held = placed.prim.GetAttribute(FOV_DEG).Get(time)
-    is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=_SAME)
+    is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=_SAME_LENS)
     if not is_held and not math.isclose(wide, high, rel_tol=1e-4):
         lost.append(f"{where}: pictures are square here; its horizontal angle was taken")
     if any(a.Get(time) for a in (camera.GetHorizontalApertureOffsetAttr(),

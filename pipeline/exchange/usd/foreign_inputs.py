@@ -7,15 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.linear_maps import (
-    colour_textures,
+    color_textures,
     constant_map,
     is_constant,
     linear_map,
-    on_one_grid,
-    over_one,
+    resample_to_largest,
+    may_exceed_one,
 )
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup
-from pipeline.exchange.usd.foreign_skins import CHANNELS
+from pipeline.exchange.usd.foreign_uv_textures import CHANNELS
 from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
 from pipeline.foreign.usd.shaders import StatedMaterial, parse_color, reflect_head_on
 from pipeline.foreign.usd.stage import OpenedUsd
@@ -41,8 +41,8 @@ class ShaderInputs:
 
     def textures(self, names: Collection[str]) -> dict[str, ForeignTexture]:
         """Return the textures that inputs are connected to, by their names."""
-        found = {name: self._texture(name) for name in names}
-        return {name: each for name, each in found.items() if each is not None}
+        textures = {name: self._texture(name) for name in names}
+        return {name: each for name, each in textures.items() if each is not None}
 
     def constant(self, name: str) -> NDArray[np.float32]:
         """Return the value [3] of an input without a texture; a number stands in every channel."""
@@ -88,7 +88,7 @@ class ShaderInputs:
         return self._read[name]
 
 
-def compute_varied(
+def compute_varying_columns(
     inputs: ShaderInputs, textures: Mapping[str, Texture]
 ) -> dict[str, NDArray[np.float32]]:
     """Return the columns [T, 3] or [T, 1] of triangles that primvars of the mesh change.
@@ -119,7 +119,7 @@ def compute_varied(
     return columns
 
 
-def worn_textures(
+def build_textures(
     inputs: ShaderInputs,
     textures: Mapping[str, Texture],
     source: MapSource,
@@ -143,8 +143,8 @@ def worn_textures(
     if inputs.stated.is_specular:
         diffuse, specular = base, of("specularColor", 3)
     else:
-        diffuse, specular = _metallic(base, of("metallic", 1), inputs, textures, source)
-    if over_one(diffuse, specular) and not (_one_texel(diffuse) and _one_texel(specular)):
+        diffuse, specular = _build_metallic(base, of("metallic", 1), inputs, textures, source)
+    if may_exceed_one(diffuse, specular) and not (_one_texel(diffuse) and _one_texel(specular)):
         diffuse, specular = lower_diffuse(diffuse, specular, source, where, lost)
     return diffuse, specular, roughness
 
@@ -154,10 +154,10 @@ def lower_diffuse(
 ) -> tuple[Texture, Texture]:
     """Return two albedos that add up to at most 1, and say so; arguments of `worn_textures`."""
     lost.append(f"{where}: textured diffuse lowered where it would reflect more than it gets")
-    return colour_textures(linear_map(diffuse), linear_map(specular), source)
+    return color_textures(linear_map(diffuse), linear_map(specular), source)
 
 
-def _metallic(
+def _build_metallic(
     base: Texture,
     metal: Texture,
     inputs: ShaderInputs,
@@ -171,12 +171,12 @@ def _metallic(
     dielectric = reflect_head_on(ior).astype(np.float32)
     if not metal.greatest.any():
         return base, Texture(texels=constant_map(np.clip(dielectric, 0, 1)), source=source)
-    colour, share = on_one_grid(linear_map(base), linear_map(metal))
-    diffuse, specular = _split_albedos(colour, share, dielectric)
+    color, metalness = resample_to_largest(linear_map(base), linear_map(metal))
+    diffuse, specular = _split_albedos(color, metalness, dielectric)
     specular = np.clip(specular, 0, 1)
     if is_constant(diffuse):
         return tuple(Texture(texels=each, source=source) for each in (diffuse, specular))  # type: ignore[return-value]
-    return colour_textures(diffuse, specular, source)
+    return color_textures(diffuse, specular, source)
 
 
 def _split_albedos(

@@ -61,7 +61,7 @@ def light_triangles(placed: Placed, time: Any, lost: list[str]) -> NDArray[np.fl
     return world.astype(np.float32)
 
 
-def radiance(
+def compute_radiance(
     placed: Placed, triangles: NDArray[np.float32], time: Any, lost: list[str]
 ) -> NDArray[np.float32]:
     """Return the radiance [3] that the light API of a prim states.
@@ -72,14 +72,14 @@ def radiance(
         time: of the values.
         lost: receives what cannot be carried over.
     """
-    found = read_light_color(placed.prim, time, lost)
+    emitted = read_light_color(placed.prim, time, lost)
     if placed.prim.GetAttribute("inputs:normalize").Get(time):
         area = _area(triangles.astype(np.float64)) / placed.metres**2
-        found = found / max(area, 1e-30)
-    if (found < 0).any():
+        emitted = emitted / max(area, 1e-30)
+    if (emitted < 0).any():
         lost.append(f"{placed.prim.GetPath()}: a light below zero; it emits nothing")
-    found = np.maximum(found, 0)
-    return np.where(np.isfinite(found), found, 0).astype(np.float32)
+    emitted = np.maximum(emitted, 0)
+    return np.where(np.isfinite(emitted), emitted, 0).astype(np.float32)
 
 
 def read_light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float64]:
@@ -145,16 +145,16 @@ def _square() -> NDArray[np.float64]:
 
 def _disk() -> NDArray[np.float64]:
     """Return a polygon of the area of the unit disk, facing -Z."""
-    turn = -2 * math.pi * np.arange(_DISK_CORNERS) / _DISK_CORNERS
-    rim = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
+    angle = -2 * math.pi * np.arange(_DISK_CORNERS) / _DISK_CORNERS
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
     fan = np.stack([np.zeros_like(rim), rim, np.roll(rim, -1, axis=0)], axis=1)
     return fan * math.sqrt(math.pi / _area(fan))
 
 
 def _build_tube() -> NDArray[np.float64]:
     """Return a tube of length 1 along X, of the area of a cylinder of radius 1 without its ends."""
-    turn = 2 * math.pi * np.arange(_DISK_CORNERS) / _DISK_CORNERS
-    low = np.stack([np.full_like(turn, -0.5), np.cos(turn), np.sin(turn)], axis=1)
+    angle = 2 * math.pi * np.arange(_DISK_CORNERS) / _DISK_CORNERS
+    low = np.stack([np.full_like(angle, -0.5), np.cos(angle), np.sin(angle)], axis=1)
     low[:, 1:] *= math.pi / _DISK_CORNERS / math.sin(math.pi / _DISK_CORNERS)
     along = np.array([1.0, 0.0, 0.0])
     high, ahead = low + along, np.roll(low, -1, axis=0)
@@ -168,8 +168,8 @@ def _sphere() -> NDArray[np.float64]:
         [[[x, 0, 0], [0, y, 0], [0, 0, z]] for x in (1, -1) for y in (1, -1) for z in (1, -1)],
         float,
     )
-    turned = np.prod(octahedron.sum(axis=1), axis=1) < 0
-    octahedron[turned] = octahedron[turned][:, ::-1]
+    faces_inward = np.prod(octahedron.sum(axis=1), axis=1) < 0
+    octahedron[faces_inward] = octahedron[faces_inward][:, ::-1]
     faces = octahedron
     for _ in range(2):
         middle = (faces + np.roll(faces, -1, axis=1)) / 2

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.dressed import PLAIN, Worn
-from pipeline.exchange.usd.foreign_inputs import ShaderInputs, compute_varied
+from pipeline.exchange.textured_pieces import NO_TEXTURES, TextureSet
+from pipeline.exchange.usd.foreign_inputs import ShaderInputs, compute_varying_columns
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup
-from pipeline.exchange.usd.foreign_skins import CHANNELS, skinned
+from pipeline.exchange.usd.foreign_uv_textures import CHANNELS, build_uv_textures
 from pipeline.exchange.usd.held_materials import (
     HeldMaterial,
     choose_emission,
@@ -52,20 +52,22 @@ _COLUMNS = {
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Dressing:
+class SurfaceMaterials:
     """The materials and textures of the triangles of a mesh."""
 
     rows: NDArray[np.float32]
     """[T, 10 or more]"""
     uv: NDArray[np.float32]
     """[T, 3, 2] where textures are looked up."""
-    worn: NDArray[np.int64]
+    texture_set_index: NDArray[np.int64]
     """[T] rows of `wardrobe`."""
-    wardrobe: tuple[Worn, ...]
+    texture_sets: tuple[TextureSet, ...]
     """Textures by material."""
 
 
-def dressing(surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str) -> Dressing:
+def read_surface_materials(
+    surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
+) -> SurfaceMaterials:
     """Return materials and textures of the triangles of a mesh.
 
     Args:
@@ -79,25 +81,33 @@ def dressing(surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str) 
     """
     count = len(surface.positions)
     rows, uv = default_rows(count), np.zeros((count, 3, 2), np.float32)
-    wardrobe, worn = list[Worn](), np.zeros(count, np.int64)
+    texture_sets, texture_set_index = list[TextureSet](), np.zeros(count, np.int64)
     for bound, polygons in read_bindings(surface.prim, time):
         chosen = np.isin(surface.cut.polygons, polygons) if polygons is not None else slice(None)
-        part = _shaded(bound, surface, time, opened, licence)
-        rows[chosen], uv[chosen], worn[chosen] = part.rows[chosen], part.uv[chosen], len(wardrobe)
-        wardrobe.append(part.worn)
-    _limit(rows, worn, wardrobe, surface, opened.lost)
-    return Dressing(rows=rows, uv=uv, worn=worn, wardrobe=tuple(wardrobe))
+        part = _read_material_on_surface(bound, surface, time, opened, licence)
+        rows[chosen], uv[chosen], texture_set_index[chosen] = (
+            part.rows[chosen],
+            part.uv[chosen],
+            len(texture_sets),
+        )
+        texture_sets.append(part.texture_set)
+    _limit_diffuse(rows, texture_set_index, texture_sets, surface, opened.lost)
+    return SurfaceMaterials(
+        rows=rows, uv=uv, texture_set_index=texture_set_index, texture_sets=tuple(texture_sets)
+    )
 
 
-def _limit(
+def _limit_diffuse(
     rows: NDArray[np.float32],
-    worn: NDArray[np.int64],
-    wardrobe: Sequence[Worn],
+    texture_set_index: NDArray[np.int64],
+    texture_sets: Sequence[TextureSet],
     surface: TriangleSoup,
     lost: list[str],
 ) -> None:
     """Lower diffuse albedos that, with the specular ones, would reflect more than they get."""
-    is_plain = np.array([textures[:2] == (None, None) for textures in wardrobe])[worn]
+    is_plain = np.array([textures[:2] == (None, None) for textures in texture_sets])[
+        texture_set_index
+    ]
     excess = (rows[:, DIFFUSE] + rows[:, SPECULAR]).max(axis=1, initial=0) > 1 + 1e-6
     excess &= is_plain
     if excess.any():
@@ -109,17 +119,17 @@ def _limit(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Shaded:
+class _MaterialOnSurface:
     """One material over a whole mesh."""
 
     rows: NDArray[np.float32]  # [T, 10 or more]
     uv: NDArray[np.float32]  # [T, 3, 2]
-    worn: Worn  # its textures
+    texture_set: TextureSet  # its textures
 
 
-def _shaded(
+def _read_material_on_surface(
     material: Any, surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
-) -> _Shaded:
+) -> _MaterialOnSurface:
     """Return a material over the whole mesh; its display colour without one."""
     held = read_held_material(material, time) if material else None
     known = () if held is None else ("specular",)  # Blender's level of it
@@ -127,32 +137,32 @@ def _shaded(
     if held is not None:
         opened.lost.append(_HELD)
     count = len(surface.positions)
-    rows, nowhere = default_rows(count), np.zeros((count, 3, 2), np.float32)
+    rows, no_uv = default_rows(count), np.zeros((count, 3, 2), np.float32)
     if stated is None:
         rows[:] = _build_plain_rows(material, held, surface, time, opened.lost)
-        return _Shaded(rows=rows, uv=nowhere, worn=PLAIN)
+        return _MaterialOnSurface(rows=rows, uv=no_uv, texture_set=NO_TEXTURES)
     inputs = ShaderInputs(stated, surface, time, opened)
     source = MapSource(name=stated.name, licence=licence)
     textures = {**read_held_textures(held, material, time, opened), **inputs.textures(CHANNELS)}
-    skin = skinned(textures, surface, time, source, opened.lost)
+    mapped = build_uv_textures(textures, surface, time, source, opened.lost)
     where = f"{surface.prim.GetPath()}"
-    worn = choose_textures(held, inputs, skin.textures, source, where, opened.lost)
-    for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), worn, strict=True):
+    resolved_textures = choose_textures(held, inputs, mapped.textures, source, where, opened.lost)
+    for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), resolved_textures, strict=True):
         rows[:, part] = texture.mean if part != ROUGHNESS else texture.mean[0]
     rows[:, EMISSION] = choose_emission(held, inputs.emission(), opened.lost)
-    kept = {
+    varying = {
         name: texture if texture.constant is None else None
-        for name, texture in zip(TEXTURED, worn, strict=True)
+        for name, texture in zip(TEXTURED, resolved_textures, strict=True)
     }
-    for name, column in compute_varied(inputs, skin.textures).items():
-        rows[:, _COLUMNS[name]], kept[name] = column, None
+    for name, column in compute_varying_columns(inputs, mapped.textures).items():
+        rows[:, _COLUMNS[name]], varying[name] = column, None
     _take_added_columns(rows, material, time, opened.lost)
     if held is not None:
         opened.lost += name_lost_columns(material)
-    return _Shaded(
+    return _MaterialOnSurface(
         rows=rows,
-        uv=nowhere if skin.uv is None else skin.uv,
-        worn=(kept["diffuse"], kept["specular"], kept["roughness"]),
+        uv=no_uv if mapped.uv is None else mapped.uv,
+        texture_set=(varying["diffuse"], varying["specular"], varying["roughness"]),
     )
 
 
@@ -167,7 +177,7 @@ def _build_plain_rows(
         return rows
     if material:
         lost.append(f"{material.GetPath()}: no shader that is understood; display colour taken")
-    rows[:, DIFFUSE] = _display_colour(surface, time)
+    rows[:, DIFFUSE] = _display_color(surface, time)
     rows[:, SPECULAR], rows[:, ROUGHNESS] = 0.04, 0.5
     return rows
 
@@ -176,15 +186,15 @@ def _take_added_columns(
     rows: NDArray[np.float32], material: Any, time: Any, lost: list[str]
 ) -> None:
     """Take the columns beyond the published ones from the attributes that Trilight writes."""
-    places = {column.name: (column, part) for column, part in laid_out()}
+    columns = {column.name: (column, part) for column, part in laid_out()}
     for attribute in material.GetPrim().GetAttributes():
         name = added_column(attribute.GetName())
         if name is None:
             continue
-        if name not in places:
+        if name not in columns:
             lost.append(f"{attribute.GetPath()}: this material column is not declared here")
             continue
-        column, part = places[name]
+        column, part = columns[name]
         value = parse_numbers(attribute.Get(time))
         if len(value) == column.width and np.all(column.within.holds(value)):
             rows[:, part] = value
@@ -195,7 +205,7 @@ def _take_added_columns(
             )
 
 
-def _display_colour(surface: TriangleSoup, time: Any) -> NDArray[np.float32]:
+def _display_color(surface: TriangleSoup, time: Any) -> NDArray[np.float32]:
     rows = np.full((len(surface.positions), 3), _DEFAULT_DIFFUSE, np.float32)
     colors = read_colors(surface.cut, "displayColor", time)
     if colors is not None:

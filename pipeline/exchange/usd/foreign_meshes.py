@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.dressed import have_areas
+from pipeline.exchange.textured_pieces import have_areas
 from pipeline.foreign.usd.placed import Placed
 from pipeline.foreign.usd.polygons import (
     CutMesh,
@@ -52,32 +52,32 @@ def read_mesh(placed: Placed, time: Any, lost: list[str]) -> TriangleSoup:
     Raises:
         TrilightError: its arrays contradict each other, or are not finite.
     """
-    found = mesh_polygons(placed, time)
-    cut = cut_mesh(found)
+    polygons = mesh_polygons(placed, time)
+    cut = cut_mesh(polygons)
     rows = cut.indices[cut.corners]
-    positions = moved(found.points, placed.to_world)[rows].astype(np.float32)
+    positions = moved(polygons.points, placed.to_world)[rows].astype(np.float32)
     cross = _cross(positions)
     solid = have_areas(positions, cross)
     if not solid.all():
         lost.append(f"{cut.prim.GetPath()}: {int((~solid).sum())} triangles without an area")
     cut, positions = cut.select(solid), positions[solid]
-    normals = _normals(found, cut, time, positions, lost)
+    normals = _normals(polygons, cut, time, positions, lost)
     return TriangleSoup(positions=positions, normals=normals, cut=cut)
 
 
 def _normals(
-    found: MeshPolygons,
+    polygons: MeshPolygons,
     cut: CutMesh,
     time: Any,
     positions: NDArray[np.float32],
     lost: list[str],
 ) -> NDArray[np.float32]:
-    placed, where = found.placed, cut.prim.GetPath()
+    placed, where = polygons.placed, cut.prim.GetPath()
     cross = _cross(positions)
     flat = cross / np.linalg.norm(cross, axis=1, keepdims=True)
     stated = None if placed.skin is not None else _stated_normals(cut.prim, time)
     if stated is None:
-        if not (found.is_smooth or placed.skin is not None) or not len(positions):
+        if not (polygons.is_smooth or placed.skin is not None) or not len(positions):
             return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
         if placed.skin is not None:
             lost.append(f"{where}: posed by bones; its normals are those of its faces")
@@ -88,11 +88,11 @@ def _normals(
     if normals is None:
         lost.append(f"{where}: normals whose number does not fit")
         return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
-    turn = np.linalg.inv(placed.to_world[:3, :3]).T
-    turned = np.einsum("ij,tcj->tci", turn, normals)
-    length = np.linalg.norm(turned, axis=2, keepdims=True)
+    normal_matrix = np.linalg.inv(placed.to_world[:3, :3]).T
+    world_normals = np.einsum("ij,tcj->tci", normal_matrix, normals)
+    length = np.linalg.norm(world_normals, axis=2, keepdims=True)
     usable = np.isfinite(length) & (length > 0)
-    unit = np.where(usable, turned / np.where(usable, length, 1), flat[:, None])
+    unit = np.where(usable, world_normals / np.where(usable, length, 1), flat[:, None])
     return np.asarray(unit, np.float32)
 
 

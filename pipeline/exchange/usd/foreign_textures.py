@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.pictures import MAX_BYTES, Pixels, decoded_pixels, is_encoded
+from pipeline.exchange.pictures import MAX_BYTES, Pixels, decode_pixels, is_encoded
 from pipeline.exchange.wrapping import Wrap
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart, asset_bytes
@@ -49,7 +49,7 @@ class ForeignTexture:
             chosen = _channels(self.pixels, self.output, channels, 255)
             is_srgb = self.is_srgb and not self._is_alpha
             return Texture(texels=np.ascontiguousarray(chosen), is_srgb=is_srgb, source=source)
-        values = _channels(self._scaled(), self.output, channels, 1)
+        values = _channels(self._scale_texels(), self.output, channels, 1)
         if not (values.min() >= 0 and values.max() <= 1):  # or NaN
             lost.append("texels that are no number from 0 to 1: they were clamped, NaN to 0")
             values = np.clip(np.nan_to_num(values, nan=0.0), 0, 1)
@@ -59,9 +59,9 @@ class ForeignTexture:
         """Return the means [T, 3] over triangles with coordinates [T, 3, 2], at 36 points each."""
         points = np.einsum("pk,tkc->tpc", _grid(), uv)
         height, width = self.pixels.shape[:2]
-        columns = _wrapped(points[..., 0], width, self.wrap[0])
-        rows = _wrapped(points[..., 1], height, self.wrap[1])
-        values = _channels(self._scaled(), self.output, 3, 1)
+        columns = _wrap_texels(points[..., 0], width, self.wrap[0])
+        rows = _wrap_texels(points[..., 1], height, self.wrap[1])
+        values = _channels(self._scale_texels(), self.output, 3, 1)
         means: NDArray[np.float32] = np.nan_to_num(values[rows, columns].mean(axis=1), nan=0.0)
         return means.astype(np.float32)
 
@@ -69,19 +69,19 @@ class ForeignTexture:
     def _is_alpha(self) -> bool:
         return self.output == "a"
 
-    def _scaled(self) -> NDArray[np.float32]:
+    def _scale_texels(self) -> NDArray[np.float32]:
         """Return linear values [H, W, 4], scaled and moved."""
         values = self.pixels.astype(np.float32)
         if self.pixels.dtype == np.uint8:
             values = values / np.float32(255)
         count = values.shape[2]
-        whole = np.ones((*values.shape[:2], 4), np.float32)
-        whole[..., :3] = values[..., :3] if count >= 3 else values[..., :1]
+        rgba = np.ones((*values.shape[:2], 4), np.float32)
+        rgba[..., :3] = values[..., :3] if count >= 3 else values[..., :1]
         if self.is_srgb:
-            whole[..., :3] = _linear(whole[..., :3])
+            rgba[..., :3] = _linear(rgba[..., :3])
         if count in (2, 4):
-            whole[..., 3] = values[..., -1]
-        return whole * self.scale + self.bias
+            rgba[..., 3] = values[..., -1]
+        return rgba * self.scale + self.bias
 
 
 def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
@@ -92,7 +92,7 @@ def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
     """
     data = None if node.resolved is None else asset_bytes(node.resolved, MAX_BYTES)
     name, is_color = Path(node.named).name, node.colour_space != "raw"
-    pixels = decoded_pixels(data, name, opened.lost, is_color=is_color) if data else None
+    pixels = decode_pixels(data, name, opened.lost, is_color=is_color) if data else None
     if pixels is None:
         opened.lost.append(
             f"texture {node.named!r:.100}: missing or not readable as a picture"
@@ -129,7 +129,7 @@ def _linear(encoded: NDArray[np.float32]) -> NDArray[np.float32]:
     return linear.astype(np.float32)
 
 
-def _wrapped(at: NDArray[np.float64], size: int, mode: str) -> NDArray[np.int64]:
+def _wrap_texels(at: NDArray[np.float64], size: int, mode: str) -> NDArray[np.int64]:
     """Return the texel of coordinates; `black` is treated as `clamp`."""
     if mode == "mirror":
         at = 1 - np.abs(np.mod(at, 2) - 1)

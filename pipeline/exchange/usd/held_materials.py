@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.linear_maps import constant_map, over_one
-from pipeline.exchange.usd.foreign_inputs import ShaderInputs, lower_diffuse, worn_textures
+from pipeline.exchange.linear_maps import constant_map, may_exceed_one
+from pipeline.exchange.usd.foreign_inputs import ShaderInputs, lower_diffuse, build_textures
 from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
 from pipeline.exchange.usd.names import (
     ADDED_COLUMNS,
@@ -37,7 +37,7 @@ _STATED = {
 }
 """Of each column that may be textured: the input of a preview, and its channels."""
 
-_SAME = 1e-5
+_SAME_VALUE = 1e-5
 """Relative difference up to which a value is what was written: programs count in float32."""
 
 
@@ -105,8 +105,8 @@ def read_held_textures(
     node = UsdShade.Shader(sources[0].GetPrim())
     if node.GetShaderId() != "UsdUVTexture":
         return {}
-    found = read_texture(texture_node(node, "rgb", time, opened), opened)
-    return {} if found is None else {"specularColor": found}
+    texture = read_texture(texture_node(node, "rgb", time, opened), opened)
+    return {} if texture is None else {"specularColor": texture}
 
 
 def choose_textures(
@@ -128,14 +128,14 @@ def choose_textures(
         lost: receives what was changed.
     """
     if held is None:
-        return worn_textures(inputs, textures, source, where, lost)
+        return build_textures(inputs, textures, source, where, lost)
     is_specular = inputs.stated.is_specular
     if not is_specular and ("metallic" in textures or inputs.constant("metallic").any()):
         lost.append(
             f"{held.where}: became a metal since Trilight wrote it; read as any other material"
         )
-        return worn_textures(inputs, textures, source, where, lost)
-    worn, is_changed = dict[str, Texture](), False
+        return build_textures(inputs, textures, source, where, lost)
+    chosen, is_changed = dict[str, Texture](), False
     for column, (name, channels) in _STATED.items():
         stated = textures.get(name)
         if stated is None and (column != "specular" or is_specular):
@@ -151,12 +151,12 @@ def choose_textures(
             is_changed = True
         texture = stated if exact is None else exact
         assert texture is not None
-        worn[column] = texture
-    diffuse, specular = worn["diffuse"], worn["specular"]
+        chosen[column] = texture
+    diffuse, specular = chosen["diffuse"], chosen["specular"]
     is_textured = any(texture.constant is None for texture in (diffuse, specular))
-    if is_changed and is_textured and over_one(diffuse, specular):
+    if is_changed and is_textured and may_exceed_one(diffuse, specular):
         diffuse, specular = lower_diffuse(diffuse, specular, source, where, lost)
-    return diffuse, specular, worn["roughness"]
+    return diffuse, specular, chosen["roughness"]
 
 
 def choose_emission(
@@ -186,7 +186,7 @@ def _find_exact(held: HeldMaterial, column: str, stated: Texture | None) -> Text
 
 
 def _agree(stated: NDArray[np.float32], exact: NDArray[np.float32]) -> bool:
-    return bool(np.allclose(stated, exact, rtol=_SAME, atol=0))
+    return bool(np.allclose(stated, exact, rtol=_SAME_VALUE, atol=0))
 
 
 def name_lost_columns(material: Any) -> list[str]:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.exchange.usd.foreign_scene import scene_of_stage
-from pipeline.exchange.usd.read_ours import is_marked, read_exact, scene_keys
+from pipeline.exchange.usd.foreign_scene import build_stage_scene
+from pipeline.exchange.usd.read_exact_scene import is_marked, read_exact, scene_keys
 from pipeline.foreign.usd.stage import OpenedUsd, quietly
 from storage.errors import TrilightError
 from storage.records.scene import Scene
@@ -58,7 +58,7 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Usd
     opened = OpenedUsd(path, folder)
     shard = scene_keys(opened.root)
     if shard is not None:
-        return _of_shard(opened, shard, key or shard[0])
+        return _read_shard_scene(opened, shard, key or shard[0])
     if key is None:
         scene = read_exact(opened.root, opened=opened)
         if scene is not None:
@@ -68,20 +68,20 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Usd
     if is_marked(opened.root):
         opened.lost.append("changed since Trilight wrote it: read as any other file")
     if key is not None and key not in frames:
-        shown = f"{frames[0]} to {frames[-1]}" if frames else "none: it does not move"
-        raise TrilightError(f"{path.name}: no time code {key}; expected one of {shown}.")
+        expected = f"{frames[0]} to {frames[-1]}" if frames else "none: it does not move"
+        raise TrilightError(f"{path.name}: no time code {key}; expected one of {expected}.")
     chosen = key or (frames[0] if frames else "")
     if frames and key is None:
         opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
     try:
-        scene = scene_of_stage(stage, _time(chosen), opened, licence)
+        scene = build_stage_scene(stage, _time(chosen), opened, licence)
     except TrilightError as error:
         text = str(error).removeprefix(f"{path.name}: ")
         raise TrilightError(f"{path.name}: {text}") from error
     return UsdScene(key=chosen, scene=scene, lost=opened.notes, exact=False)
 
 
-def _of_shard(opened: OpenedUsd, keys: list[str], key: str) -> UsdScene:
+def _read_shard_scene(opened: OpenedUsd, keys: list[str], key: str) -> UsdScene:
     name = opened.path.name
     if key not in keys:
         raise TrilightError(f"{name}: no scene {key}; expected one of {keys[0]} to {keys[-1]}.")

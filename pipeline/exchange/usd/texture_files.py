@@ -24,7 +24,7 @@ def texture_file(texture: Texture) -> str:
     return f"texture-{texture.sha256[:16]}.{suffix}"
 
 
-def encoded_texture(texture: Texture) -> bytes:
+def encode_texture(texture: Texture) -> bytes:
     """Return the file of a texture; no clock is in it.
 
     Raises:
@@ -47,7 +47,7 @@ def encoded_texture(texture: Texture) -> bytes:
     return stream.getvalue()
 
 
-def decoded_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSource) -> Texture:
+def decode_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSource) -> Texture:
     """Return the texture of a file that `encoded_texture` made.
 
     Raises:

@@ -2,7 +2,7 @@
 
 Z up, metres, a default prim; textures and an environment map are files beside it, or in the
 archive. Equal scenes give equal bytes.
-`pipeline.exchange.usd.names` lists the paths; `pipeline.exchange.usd.read_ours` reads it back. A
+`pipeline.exchange.usd.names` lists the paths; `pipeline.exchange.usd.read_exact_scene` reads it back. A
 camera has a pose and a lens, in tenths of a metre, on a square film of 36 mm. A `.usdz` file is a
 zip archive of plainly stored members that begin at multiples of 64 bytes.
 """
@@ -157,7 +157,7 @@ def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
         else:
             raise TrilightError(f"{path.name}: USD could not write the scene.")
     if path.suffix.lower() == ".usdz":
-        write_atomically(path, packaged(data, files))
+        write_atomically(path, encode_usdz(data, files))
         return
     for name, content in files.items():
         write_atomically(path.parent / name, content)
@@ -202,7 +202,7 @@ _PADDING_ID = 0x1986
 """Identifier of the extra field that aligns a member's bytes; readers skip it."""
 
 
-def packaged(layer: bytes, files: Mapping[str, bytes] | None = None) -> bytes:
+def encode_usdz(layer: bytes, files: Mapping[str, bytes] | None = None) -> bytes:
     """Return the `.usdz` of one `.usdc` layer and files that it names; no clock is in it."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:

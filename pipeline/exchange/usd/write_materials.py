@@ -50,7 +50,7 @@ from storage.records.material import (
 )
 from storage.records.scene import Scene
 
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
 INDEX_OF_REFRACTION = 1000.0
 """Of the preview; 1000 is the most that Blender takes, and reflects 0.996 head-on."""
@@ -97,7 +97,7 @@ def material_tables(
     diffuse, specular, emission = (_rgb(values[part]) for part in (DIFFUSE, SPECULAR, EMISSION))
     roughness = float(values[ROUGHNESS])
     tables: dict[str, Attributes] = {
-        "": _exact(values, columns),
+        "": _exact_attributes(values, columns),
         f"/{PREVIEW}": {
             "info:id": ("uniform token", "UsdPreviewSurface"),
             "inputs:useSpecularWorkflow": ("int", 1),
@@ -114,37 +114,37 @@ def material_tables(
     return {**tables, f"/{OPENPBR}": _openpbr(diffuse, specular, roughness, emission)}
 
 
-def _openpbr(diffuse: Colour, specular: Colour, roughness: float, emission: Colour) -> Attributes:
-    head_on, luminance = max(specular), max(emission)
-    root = math.sqrt(min(head_on, _MOST_REFLECTING))
+def _openpbr(diffuse: Color, specular: Color, roughness: float, emission: Color) -> Attributes:
+    max_specular, max_emission = max(specular), max(emission)
+    root = math.sqrt(min(max_specular, _MOST_REFLECTING))
     return {
         "info:id": ("uniform token", "ND_open_pbr_surface_surfaceshader"),
         "inputs:base_color": ("color3f", diffuse),
         "inputs:base_weight": ("float", 1.0),
         "inputs:base_diffuse_roughness": ("float", 0.0),
-        "inputs:specular_weight": ("float", 1.0 if head_on > 0 else 0.0),
-        "inputs:specular_color": ("color3f", _share(specular, head_on)),
+        "inputs:specular_weight": ("float", 1.0 if max_specular > 0 else 0.0),
+        "inputs:specular_color": ("color3f", _divide_by_largest(specular, max_specular)),
         "inputs:specular_roughness": ("float", roughness),
-        "inputs:specular_ior": ("float", _single((1 + root) / (1 - root))),
-        "inputs:emission_luminance": ("float", luminance),
-        "inputs:emission_color": ("color3f", _share(emission, luminance)),
+        "inputs:specular_ior": ("float", _round_to_float32((1 + root) / (1 - root))),
+        "inputs:emission_luminance": ("float", max_emission),
+        "inputs:emission_color": ("color3f", _divide_by_largest(emission, max_emission)),
     }
 
 
-def _exact(values: NDArray[np.float32], columns: Sequence[str]) -> Attributes:
+def _exact_attributes(values: NDArray[np.float32], columns: Sequence[str]) -> Attributes:
     """Return the attributes that hold the columns exactly."""
-    found: dict[str, tuple[str, Any]] = {}
+    attributes: dict[str, tuple[str, Any]] = {}
     for column, part in laid_out():
         if column.name in columns:
             kind = "color3f" if column.is_colour else "float" if column.width == 1 else "float[]"
             value = _rgb(values[part]) if column.is_colour else values[part]
-            found[column_attribute(column.name)] = (
+            attributes[column_attribute(column.name)] = (
                 kind,
                 float(value[0]) if kind == "float" else value,
             )
     if added := [name for name in columns if name not in MATERIAL_ATTRIBUTES]:
-        found[ADDED_COLUMNS] = ("string", " ".join(added))
-    return found
+        attributes[ADDED_COLUMNS] = ("string", " ".join(added))
+    return attributes
 
 
 def _add_material(
@@ -158,18 +158,18 @@ def _add_material(
             add_link(prim, name, kind, None if source is None else f"{path}/{source}")
 
 
-def _rgb(values: NDArray[np.float32]) -> Colour:
+def _rgb(values: NDArray[np.float32]) -> Color:
     red, green, blue = (float(value) for value in values)
     return red, green, blue
 
 
-def _share(rgb: Colour, largest: float) -> Colour:
+def _divide_by_largest(rgb: Color, largest: float) -> Color:
     """Return a colour divided by its largest channel; white for black."""
     if largest <= 0:
         return 1.0, 1.0, 1.0
-    red, green, blue = (_single(value / largest) for value in rgb)
+    red, green, blue = (_round_to_float32(value / largest) for value in rgb)
     return red, green, blue
 
 
-def _single(value: float) -> float:
+def _round_to_float32(value: float) -> float:
     return float(np.float32(value))

@@ -130,7 +130,7 @@ def sum_positions(center: NDArray[np.float64], points: NDArray[np.float32]) -> N
     return (points.astype(np.float64) + center).astype(np.float32)
 
 
-def place_attributes(
+def position_attributes(
     center: NDArray[np.float64], points: NDArray[np.float32], positions: NDArray[np.float32]
 ) -> Attributes:
     """Return the attributes that place a mesh, with the positions that its sums do not give."""
@@ -151,7 +151,7 @@ def _add_arrays(prim: Any, scene: Scene, faces: NDArray[np.intp]) -> None:
     add_attributes(
         prim,
         {
-            **place_attributes(center, points, scene.vertex_positions[rows]),
+            **position_attributes(center, points, scene.vertex_positions[rows]),
             "faceVertexCounts": ("int[]", np.full(len(faces), 3, np.int32)),
             "faceVertexIndices": ("int[]", corners.ravel().astype(np.int32)),
             "points": ("point3f[]", points),
@@ -163,6 +163,6 @@ def _add_arrays(prim: Any, scene: Scene, faces: NDArray[np.intp]) -> None:
     )
     prim.attributes["normals"].SetInfo("interpolation", "vertex")
     if scene.uv is not None:
-        own = np.ascontiguousarray(scene.uv.reshape(-1, 3, 2)[faces].reshape(-1, 2))
-        add_attributes(prim, {ST: ("texCoord2f[]", own)})
+        corner_uv = np.ascontiguousarray(scene.uv.reshape(-1, 3, 2)[faces].reshape(-1, 2))
+        add_attributes(prim, {ST: ("texCoord2f[]", corner_uv)})
         prim.attributes[ST].SetInfo("interpolation", "faceVarying")

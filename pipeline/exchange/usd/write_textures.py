@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.exchange.usd.authoring import Attributes
 from pipeline.exchange.usd.names import MAP_TEXTS, TEXTURE_ROW, format_map, texture_attribute
-from pipeline.exchange.usd.texture_files import encoded_texture, texture_file
+from pipeline.exchange.usd.texture_files import encode_texture, texture_file
 from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
@@ -64,7 +64,7 @@ def used_textures(scene: Scene, row: int) -> Used:
 
 def texture_files(scene: Scene) -> dict[str, bytes]:
     """Return the files of the textures of a scene by their names; raises TrilightError."""
-    return {texture_file(texture): encoded_texture(texture) for texture in scene.textures}
+    return {texture_file(texture): encode_texture(texture) for texture in scene.textures}
 
 
 def build_source_table(used: Used) -> Attributes:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.exchange.renderformer_json import MAX_BYTES, described_files, read_description
+from pipeline.exchange.renderformer_json import MAX_BYTES, describe_scene, read_description
 from storage.errors import TrilightError
 from storage.records.scene import SceneObject
 from tests.for_each import for_each
@@ -164,4 +164,4 @@ def test_normals_that_no_reader_makes_are_said_to_be_lost(tmp_path: Path) -> Non
 def test_too_many_objects(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.exchange.renderformer_json.MAX_OBJECTS", 1)
     with pytest.raises(TrilightError, match="2 objects of one material; a scene file holds at"):
-        described_files(tiny_scene(), "a")
+        describe_scene(tiny_scene(), "a")

@@ -14,7 +14,7 @@ def is_dataset(source: str) -> bool:
     return "://" in source or os.path.isdir(source)
 
 
-def chosen_samples(
+def select_samples(
     dataset: Dataset, *, split: str | None = None, scene: str | None = None
 ) -> Iterator[tuple[str, Sample]]:
     """Yield (split, sample) of a dataset in its order, with pictures.
@@ -29,17 +29,17 @@ def chosen_samples(
     """
     if split is not None and split not in SPLITS:
         raise TrilightError(f"split is {split!r}; expected one of {', '.join(SPLITS)}.")
-    wanted = sample_key(int(scene)) if scene is not None and scene.isdecimal() else scene
-    found = False
+    scene_key = sample_key(int(scene)) if scene is not None and scene.isdecimal() else scene
+    has_samples = False
     for shard in dataset.manifest.shards:
         if split not in (None, shard.split):
             continue
-        keys = [key for key in dataset.keys(shard) if wanted in (None, key)]
-        found = found or bool(keys)
+        keys = [key for key in dataset.keys(shard) if scene_key in (None, key)]
+        has_samples = has_samples or bool(keys)
         for sample in dataset.read_samples(shard, keys):
             yield shard.split, sample
-    if not found:
-        which = f"scene {wanted}" if wanted else "scene"
+    if not has_samples:
+        which = f"scene {scene_key}" if scene_key else "scene"
         where = "" if split is None else f" in split {split}"
         raise TrilightError(
             f"{dataset.display_name}: no {which}{where}; expected one of its "

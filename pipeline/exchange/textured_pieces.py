@@ -18,17 +18,17 @@ from storage.records.retextured import AnyScene, with_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
-Worn = tuple[Texture | None, Texture | None, Texture | None]
+TextureSet = tuple[Texture | None, Texture | None, Texture | None]
 """Textures in the order of TEXTURED; None where the column of the row stands."""
 
-PLAIN: Worn = (None, None, None)
+NO_TEXTURES: TextureSet = (None, None, None)
 
 _SMALLEST_DOUBLE_AREA = 1e-12
 """In square metres."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DressedTriangles:
+class TexturedTriangles:
     """Triangles with a material each."""
 
     positions: NDArray[np.float32]
@@ -39,32 +39,32 @@ class DressedTriangles:
     """[T, 10 or more] material columns; what they say of textured columns counts for nothing."""
     uv: NDArray[np.float32]
     """[T, 3, 2] texture coordinates of the corners; any where nothing is textured."""
-    worn: NDArray[np.int64]
+    texture_set_index: NDArray[np.int64]
     """[T] row of `wardrobe`."""
-    wardrobe: Sequence[Worn]
+    texture_sets: Sequence[TextureSet]
     """Textures that a triangle may have."""
 
-    def chosen(self, part: NDArray[np.bool_]) -> "DressedTriangles":
+    def select(self, mask: NDArray[np.bool_]) -> "TexturedTriangles":
         """Return some of them."""
-        return DressedTriangles(
-            positions=self.positions[part],
-            normals=self.normals[part],
-            rows=self.rows[part],
-            uv=self.uv[part],
-            worn=self.worn[part],
-            wardrobe=self.wardrobe,
+        return TexturedTriangles(
+            positions=self.positions[mask],
+            normals=self.normals[mask],
+            rows=self.rows[mask],
+            uv=self.uv[mask],
+            texture_set_index=self.texture_set_index[mask],
+            texture_sets=self.texture_sets,
         )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DressedPiece:
+class TexturedPiece:
     """One object of a scene with its textures."""
 
     piece: ScenePiece
     """Without them."""
     uv: NDArray[np.float32]
     """[T, 3, 2]"""
-    worn: tuple[Worn, ...]
+    texture_sets: tuple[TextureSet, ...]
     """Textures of each of its material rows."""
 
 
@@ -77,55 +77,60 @@ def have_areas(corners: NDArray[np.floating], cross: NDArray[np.float64]) -> NDA
     return np.asarray(np.linalg.norm(cross, axis=1) > _SMALLEST_DOUBLE_AREA * size**2)
 
 
-def by_kind(triangles: DressedTriangles) -> list[tuple[ObjectKind, DressedTriangles]]:
+def split_by_kind(triangles: TexturedTriangles) -> list[tuple[ObjectKind, TexturedTriangles]]:
     """Return the part that reflects, and the part that emits, where there are both."""
     emits = (triangles.rows[:, EMISSION] > 0).any(axis=1)
     kinds: list[tuple[ObjectKind, NDArray[np.bool_]]] = [
         ("object", np.logical_not(emits)),
         ("emitter", np.asarray(emits)),
     ]
-    return [(kind, triangles.chosen(part)) for kind, part in kinds if part.any()]
+    return [(kind, triangles.select(mask)) for kind, mask in kinds if mask.any()]
 
 
-def dressed(entry: SceneObject, triangles: DressedTriangles) -> DressedPiece:
+def build_piece(entry: SceneObject, triangles: TexturedTriangles) -> TexturedPiece:
     """Return triangles as an object of a scene."""
     corners = np.concatenate([triangles.positions, triangles.normals], axis=2).reshape(-1, 6)
     first, index = distinct_rows(corners)
-    kept, faces = corners[first], index.reshape(-1, 3).astype(np.uint32)
+    vertices, faces = corners[first], index.reshape(-1, 3).astype(np.uint32)
     rows = _with_means(triangles)
-    looks = np.column_stack([rows, triangles.worn.astype(np.float32)])
-    palette, material_index = distinct_rows(looks)
+    appearance = np.column_stack([rows, triangles.texture_set_index.astype(np.float32)])
+    palette, material_index = distinct_rows(appearance)
     mesh = ShadedMesh(
-        positions=kept[:, :3].copy(),
-        normals=kept[:, 3:].copy(),
+        positions=vertices[:, :3].copy(),
+        normals=vertices[:, 3:].copy(),
         faces=faces,
         groups=np.zeros(len(faces), np.int64),
     )
-    return DressedPiece(
+    return TexturedPiece(
         piece=ScenePiece(
             entry=entry, mesh=mesh, materials=rows[palette], material_index=material_index
         ),
         uv=triangles.uv,
-        worn=tuple(_varying(triangles.wardrobe[row]) for row in triangles.worn[palette]),
+        texture_sets=tuple(
+            _drop_constant_textures(triangles.texture_sets[row])
+            for row in triangles.texture_set_index[palette]
+        ),
     )
 
 
-def joined_arrays(pieces: Sequence[DressedPiece]) -> dict[str, Any]:
+def join_arrays(pieces: Sequence[TexturedPiece]) -> dict[str, Any]:
     """Return geometry and materials of a Scene, without the textures."""
     return concatenate_pieces([each.piece for each in pieces])
 
 
-def with_worn_textures(scene: AnyScene, pieces: Sequence[DressedPiece]) -> AnyScene:
+def with_texture_sets(scene: AnyScene, pieces: Sequence[TexturedPiece]) -> AnyScene:
     """Return a scene of these pieces, in their order, with their textures."""
     textures: dict[str, Texture] = {}
     index: list[list[int]] = []
     order: dict[str, int] = {}
-    for worn in (worn for each in pieces for worn in each.worn):
-        for texture in worn:
+    for texture_set in (worn for each in pieces for worn in each.texture_sets):
+        for texture in texture_set:
             if texture is not None and texture.sha256 not in textures:
                 order[texture.sha256] = len(textures)
                 textures[texture.sha256] = texture
-        index.append([CONSTANT if texture is None else order[texture.sha256] for texture in worn])
+        index.append(
+            [CONSTANT if texture is None else order[texture.sha256] for texture in texture_set]
+        )
     if not textures:
         return scene
     uv = np.concatenate([each.uv.reshape(-1, 2) for each in pieces]).astype(np.float32)
@@ -133,29 +138,31 @@ def with_worn_textures(scene: AnyScene, pieces: Sequence[DressedPiece]) -> AnySc
     return with_textures(scene, uv, tuple(textures.values()), rows)
 
 
-def _with_means(triangles: DressedTriangles) -> NDArray[np.float32]:
+def _with_means(triangles: TexturedTriangles) -> NDArray[np.float32]:
     """Return the rows with the means of textures, so that equal looks are equal."""
-    rows, places = triangles.rows.copy(), {column.name: part for column, part in laid_out()}
-    for number, worn in enumerate(triangles.wardrobe):
-        chosen = np.flatnonzero(triangles.worn == number)
-        for name, texture in zip(TEXTURED, worn, strict=True):
+    rows, column_slices = triangles.rows.copy(), {column.name: part for column, part in laid_out()}
+    for number, texture_set in enumerate(triangles.texture_sets):
+        chosen = np.flatnonzero(triangles.texture_set_index == number)
+        for name, texture in zip(TEXTURED, texture_set, strict=True):
             if texture is not None and len(chosen):
                 same = texture.constant
-                rows[chosen, places[name]] = texture.mean if same is None else same
+                rows[chosen, column_slices[name]] = texture.mean if same is None else same
     return rows
 
 
-def _varying(worn: Worn) -> Worn:
+def _drop_constant_textures(textures: TextureSet) -> TextureSet:
     """Return textures without those of one colour, which stand in the columns."""
     one, two, three = (
-        None if texture is None or texture.constant is not None else texture for texture in worn
+        None if texture is None or texture.constant is not None else texture for texture in textures
     )
     return one, two, three
 
 
-def scene_with_worn(arrays: dict[str, Any], pieces: Sequence[DressedPiece], **more: Any) -> Scene:
+def build_textured_scene(
+    arrays: dict[str, Any], pieces: Sequence[TexturedPiece], **more: Any
+) -> Scene:
     """Return the checked scene of joined arrays, its textures, and the other members."""
     scene = Scene(**arrays, objects=tuple(each.piece.entry for each in pieces), **more)
-    scene = with_worn_textures(scene, pieces)
+    scene = with_texture_sets(scene, pieces)
     scene.check()
     return scene

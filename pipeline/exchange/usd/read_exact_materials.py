@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.usd import names
-from pipeline.exchange.usd.authoring import as_expected
+from pipeline.exchange.usd.authoring import has_attributes
 from pipeline.exchange.usd.exact_layer import (
-    children_of,
+    require_children,
     drop_absent,
-    numbered,
+    children_by_row,
     require,
     require_plain,
 )
-from pipeline.exchange.usd.texture_files import decoded_texture
+from pipeline.exchange.usd.texture_files import decode_texture
 from pipeline.exchange.usd.write_materials import material_tables
 from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, SHADERS, Used, material_links
 from pipeline.foreign.usd.stage import OpenedUsd
@@ -29,7 +29,7 @@ _ADDED = {"inputs:ior", COAT_ROUGHNESS, "outputs:r", *map(names.texture_attribut
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class WrittenMaterials:
+class ExactMaterials:
     """What the prims of all materials say."""
 
     rows: NDArray[np.float32]
@@ -40,7 +40,7 @@ class WrittenMaterials:
     """[M, 3] as `Scene.material_textures`."""
 
 
-def materials_as_written(folder: Any, opened: OpenedUsd | None) -> WrittenMaterials:
+def read_exact_materials(folder: Any, opened: OpenedUsd | None) -> ExactMaterials:
     """Return the materials below a prim.
 
     Args:
@@ -51,20 +51,20 @@ def materials_as_written(folder: Any, opened: OpenedUsd | None) -> WrittenMateri
         UndeclaredColumn: a material has a column that is not declared here.
         Changed, LookupError, TypeError, ValueError: not as export writes them.
     """
-    prims = numbered(folder, names.material_name)
+    prims = children_by_row(folder, names.material_name)
     rows = default_rows(len(prims))
-    columns = _columns(prims[0])
+    columns = _list_columns(prims[0])
     index = np.full((len(prims), len(TEXTURED)), CONSTANT, np.int32)
     textures: dict[int, Texture] = {}
     for row, prim in enumerate(prims):
         for column, part in laid_out():
             if column.name in columns:
                 rows[row, part] = prim.attributes[names.column_attribute(column.name)].default
-        used = _used(prim, textures, opened)
+        used = _read_textures(prim, textures, opened)
         for name, (texture, _) in used.items():
             index[row, TEXTURED.index(name)] = texture
         _require_prims(prim, rows[row], columns, used)
-    return WrittenMaterials(
+    return ExactMaterials(
         rows=rows,
         textures=tuple(textures[row] for row in range(len(textures))),
         material_textures=index if textures else None,
@@ -76,21 +76,23 @@ def _require_prims(
 ) -> None:
     """Require that a material's prims are what export writes for such a row, and no more."""
     tables, links = material_tables(values, columns, used), material_links(list(used))
-    children_of(prim, {place.removeprefix("/") for place in tables if place})
-    own = prim.path.StripAllVariantSelections()
+    require_children(
+        prim, {relative_path.removeprefix("/") for relative_path in tables if relative_path}
+    )
+    root_path = prim.path.StripAllVariantSelections()
     for place in tables:
         part = prim.nameChildren[place.removeprefix("/")] if place else prim
         table = drop_absent(part, tables[place], _ADDED)
         linked = drop_absent(part, links[place], _ADDED)
-        require(as_expected(part, table))
+        require(has_attributes(part, table))
         require_plain(part, {*table, *linked})
         for attribute in part.attributes:
             source = linked.get(attribute.name, ("", None))[1]
-            found = [str(path) for path in attribute.connectionPathList.explicitItems]
-            require(found == ([] if source is None else [f"{own}/{source}"]))
+            connections = [str(path) for path in attribute.connectionPathList.explicitItems]
+            require(connections == ([] if source is None else [f"{root_path}/{source}"]))
 
 
-def _used(prim: Any, textures: dict[int, Texture], opened: OpenedUsd | None) -> Used:
+def _read_textures(prim: Any, textures: dict[int, Texture], opened: OpenedUsd | None) -> Used:
     """Return the textures of a material, and add those that are new to `textures`."""
     used = {}
     for name, shader in SHADERS.items():
@@ -101,19 +103,19 @@ def _used(prim: Any, textures: dict[int, Texture], opened: OpenedUsd | None) -> 
         attributes = prim.nameChildren[shader].attributes
         row = attributes[names.TEXTURE_ROW].default
         if row not in textures:
-            textures[row] = _texture(attributes, prim.layer, opened)
+            textures[row] = _read_texture(attributes, prim.layer, opened)
         used[name] = (row, textures[row])
     return used
 
 
-def _texture(attributes: Any, layer: Any, opened: OpenedUsd) -> Texture:
+def _read_texture(attributes: Any, layer: Any, opened: OpenedUsd) -> Texture:
     named = attributes["inputs:file"].default.path
-    found = opened.inside(layer, named)
-    data = None if found is None else asset_bytes(found, MAX_BYTES)
+    resolved = opened.inside(layer, named)
+    data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
     if data is None:
         raise LookupError(named)
     texts = {field: attributes[name].default for field, name in names.MAP_TEXTS.items()}
-    return decoded_texture(
+    return decode_texture(
         data,
         is_exr=named.endswith(".exr"),
         is_srgb=attributes["inputs:sourceColorSpace"].default == "sRGB",
@@ -121,8 +123,8 @@ def _texture(attributes: Any, layer: Any, opened: OpenedUsd) -> Texture:
     )
 
 
-def _columns(prim: Any) -> tuple[str, ...]:
+def _list_columns(prim: Any) -> tuple[str, ...]:
     """Return the columns that a material has; raises UndeclaredColumn."""
-    found = (names.added_column(attribute.name) for attribute in prim.attributes)
-    added = [name for name in found if name is not None]
+    added_or_none = (names.added_column(attribute.name) for attribute in prim.attributes)
+    added = [name for name in added_or_none if name is not None]
     return (*PUBLISHED_COLUMNS, *(declared_column(name).name for name in added))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.dressed import PLAIN, DressedTriangles
+from pipeline.exchange.textured_pieces import NO_TEXTURES, TexturedTriangles
 from pipeline.exchange.usd.foreign_cameras import rigid_pose
 from pipeline.foreign.gltf.nodes import PlacedNode
 from pipeline.foreign.numbers import read_number, read_numbers
@@ -31,7 +31,7 @@ _SIZE = 0.01
 """Radius of a light as a share of the diagonal of the scene."""
 
 
-def camera_of(
+def read_camera(
     tree: dict[str, Any], placed: PlacedNode, lost: list[str]
 ) -> tuple[NDArray[np.float64], float] | None:
     """Return pose [4, 4] and full angle in degrees of a camera; None where it has neither."""
@@ -48,7 +48,7 @@ def camera_of(
 
 def light_triangles(
     light: dict[str, Any], placed: PlacedNode, reach: float, lost: list[str]
-) -> DressedTriangles | None:
+) -> TexturedTriangles | None:
     """Return what stands for a punctual light; None where nothing can.
 
     Args:
@@ -70,20 +70,22 @@ def light_triangles(
     positions = (placed.to_world[:3, 3] + radius * _octahedron()).astype(np.float32)
     cross = np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0])
     length = np.linalg.norm(cross, axis=1, keepdims=True)
-    shown = float(length.sum()) / 8  # half of the cross products are areas, a quarter is seen
+    visible_area = (
+        float(length.sum()) / 8
+    )  # half of the cross products are areas, a quarter is seen
     rows = default_rows(len(positions))
     rows[:, ROUGHNESS] = 1
-    rows[:, EMISSION] = np.clip(_read_light(light) / shown, 0, 1e9)
+    rows[:, EMISSION] = np.clip(_read_light(light) / visible_area, 0, 1e9)
     if not rows[:, EMISSION].any() or not np.isfinite(positions).all():
         lost.append("lights that shine no light")
         return None
-    return DressedTriangles(
+    return TexturedTriangles(
         positions=positions,
         normals=np.repeat((cross / length)[:, None], 3, axis=1).astype(np.float32),
         rows=rows,
         uv=np.zeros((len(positions), 3, 2), np.float32),
-        worn=np.zeros(len(positions), np.int64),
-        wardrobe=(PLAIN,),
+        texture_set_index=np.zeros(len(positions), np.int64),
+        texture_sets=(NO_TEXTURES,),
     )
 
 
@@ -93,7 +95,7 @@ def _read_light(light: dict[str, Any]) -> NDArray[np.float64]:
     return color * read_number(light.get("intensity", 1), "intensity of a light")
 
 
-def sky_with_suns(
+def build_sun_sky(
     suns: Sequence[tuple[dict[str, Any], NDArray[np.float64]]], lost: list[str]
 ) -> Environment | None:
     """Return a sky that is black but for directional lights; None where none of them shines.
@@ -103,14 +105,14 @@ def sky_with_suns(
         lost: receives what cannot be carried over.
     """
     radiance = np.zeros((_SUN_ROWS, 2 * _SUN_ROWS, 3), np.float64)
-    turn = np.eye(3)
+    rotation = np.eye(3)
     for number, (light, to_world) in enumerate(suns):
         towards = to_world[:3, 2]
         if not np.linalg.norm(towards) > 0:
             continue
         if number == 0:  # it lies in the middle of a texel at the map's equator
-            turn = _frame(towards) @ _frame(latlong_direction(0.5 + _HALF_TEXEL)).T
-        u, v = latlong_uv(towards @ turn)
+            rotation = _frame(towards) @ _frame(latlong_direction(0.5 + _HALF_TEXEL)).T
+        u, v = latlong_uv(towards @ rotation)
         row = min(int((1 - v) * _SUN_ROWS), _SUN_ROWS - 1)
         angle = np.square(np.pi / _SUN_ROWS) * np.sin(np.pi * (row + 0.5) / _SUN_ROWS)
         radiance[row, int(u * 2 * _SUN_ROWS) % (2 * _SUN_ROWS)] += _read_light(light) / angle
@@ -120,7 +122,7 @@ def sky_with_suns(
     lost.append("directional lights: suns of 0.7 degrees with their lux, in units of radiance")
     return Environment(
         radiance_rgb=np.clip(radiance, 0, 1e9).astype(np.float32),
-        rotation=turn.astype(np.float32),
+        rotation=rotation.astype(np.float32),
         source=MapSource(name="directional lights"),
     )
 
@@ -143,8 +145,8 @@ def even_sky() -> Environment:
 def _octahedron() -> NDArray[np.float64]:
     """Return the triangles [8, 3, 3] of an octahedron of radius 1, counter-clockwise."""
     axes = np.eye(3)
-    found = []
+    triangles = []
     for x, y, z in np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T:
         corners = axes * np.array([x, y, z])
-        found.append(corners if x * y * z > 0 else corners[::-1])
-    return np.stack(found)
+        triangles.append(corners if x * y * z > 0 else corners[::-1])
+    return np.stack(triangles)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup
 from pipeline.exchange.usd.foreign_textures import ForeignTexture
-from pipeline.exchange.wrapping import repeated_near_zero, tiled, tiles_of
+from pipeline.exchange.wrapping import shift_near_zero, expand_tiles, choose_tiles
 from storage.records.texture import MapSource, Texture
 
 CHANNELS = {"diffuseColor": 3, "specularColor": 3, "metallic": 1, "roughness": 1, "ior": 1}
@@ -21,7 +21,7 @@ CHANNELS = {"diffuseColor": 3, "specularColor": 3, "metallic": 1, "roughness": 1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Skinned:
+class UvTextures:
     """What is looked up, and where."""
 
     textures: Mapping[str, Texture]
@@ -30,13 +30,13 @@ class Skinned:
     """[T, 3, 2]; None where nothing is looked up."""
 
 
-def skinned(
-    found: Mapping[str, ForeignTexture],
+def build_uv_textures(
+    foreign_textures: Mapping[str, ForeignTexture],
     surface: TriangleSoup,
     time: Any,
     source: MapSource,
     lost: list[str],
-) -> Skinned:
+) -> UvTextures:
     """Return the textures of a material.
 
     Args:
@@ -46,36 +46,43 @@ def skinned(
         source: names and rights of the textures.
         lost: receives what cannot be carried over.
     """
-    names = [name for name in CHANNELS if name in found]
+    names = [name for name in CHANNELS if name in foreign_textures]
     where = surface.prim.GetPath()
-    plain = {name: found[name].texture(CHANNELS[name], source, lost) for name in names}
+    plain = {name: foreign_textures[name].texture(CHANNELS[name], source, lost) for name in names}
     if not names:
-        return Skinned(textures={}, uv=None)
-    chart = found[names[0]].chart
+        return UvTextures(textures={}, uv=None)
+    chart = foreign_textures[names[0]].chart
     uv = surface.read_coordinates(chart, time)
     if uv is None:
         lost.append(f"{where}: no coordinates {chart.primvar!r:.60}; means of textures taken")
-        return Skinned(textures=_means(plain), uv=None)
-    kept = [name for name in names if found[name].chart == chart]
-    if len(kept) < len(names):
+        return UvTextures(textures=_means(plain), uv=None)
+    same_chart = [name for name in names if foreign_textures[name].chart == chart]
+    if len(same_chart) < len(names):
         lost.append(f"{where}: textures of one material with several coordinates; means taken")
-    axes, same = [], True
+    tiles_by_axis, is_exact = [], True
     for axis in range(2):
-        wraps = [found[name].wrap[axis] for name in kept]
-        texels = max(plain[name].texels.shape[1 - axis] for name in kept)
-        tiles, fits = tiles_of(wraps, uv[..., axis], texels)
-        axes.append(tiles)
-        same &= fits
-    textures = _means({name: plain[name] for name in names if name not in kept})
-    for name in kept:
-        across = tiled(plain[name].texels, found[name].wrap[0], axes[0], 1)
-        whole = np.ascontiguousarray(tiled(across, found[name].wrap[1], axes[1], 0))
-        textures[name] = Texture(texels=whole, is_srgb=plain[name].is_srgb, source=source)
-    moved = (uv - [axes[0].first, axes[1].first]) / [axes[0].count, axes[1].count]
-    near, all_near = repeated_near_zero(moved)
-    if not (same and all_near):
+        wraps = [foreign_textures[name].wrap[axis] for name in same_chart]
+        most_texels = max(plain[name].texels.shape[1 - axis] for name in same_chart)
+        tiles, fits = choose_tiles(wraps, uv[..., axis], most_texels)
+        tiles_by_axis.append(tiles)
+        is_exact &= fits
+    textures = _means({name: plain[name] for name in names if name not in same_chart})
+    for name in same_chart:
+        across = expand_tiles(
+            plain[name].texels, foreign_textures[name].wrap[0], tiles_by_axis[0], 1
+        )
+        texels = np.ascontiguousarray(
+            expand_tiles(across, foreign_textures[name].wrap[1], tiles_by_axis[1], 0)
+        )
+        textures[name] = Texture(texels=texels, is_srgb=plain[name].is_srgb, source=source)
+    moved = (uv - [tiles_by_axis[0].first, tiles_by_axis[1].first]) / [
+        tiles_by_axis[0].count,
+        tiles_by_axis[1].count,
+    ]
+    near, all_near = shift_near_zero(moved)
+    if not (is_exact and all_near):
         lost.append(f"{where}: textures far outside of [0, 1]; some look otherwise there")
-    return Skinned(textures=textures, uv=near.astype(np.float32))
+    return UvTextures(textures=textures, uv=near.astype(np.float32))
 
 
 def _means(textures: Mapping[str, Texture]) -> dict[str, Texture]:
