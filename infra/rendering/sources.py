@@ -33,7 +33,8 @@ def _scene_files(folder: Path) -> list[Path]:
     paths = [path for path in folder.iterdir() if path.suffix.lower() in readable_suffixes()]
     if not paths:
         raise TrilightError(
-            f"{folder}: holds no scene file; expected files that end in {' '.join(readable_suffixes())}."
+            f"{folder}: holds no scene file; expected files that end in "
+            f"{' '.join(readable_suffixes())}."
         )
     return sorted(paths, key=lambda path: _by_number(path.name))
 

@@ -1,6 +1,6 @@
-"""One scene, or all that a file holds, from one form to another; in a child process with limits.
+"""Converts the scenes of a file to another format, in a child process with limits.
 
-USD holds many scenes in one file. Forms that hold one: many become `NAME.KEY.SUFFIX`.
+A USD file holds many scenes. In formats that hold one, each scene becomes `NAME.KEY.SUFFIX`.
 """
 
 import dataclasses
@@ -30,17 +30,17 @@ from storage.records.scene import Scene
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertResult:
-    """What came of a conversion."""
+    """Result of a conversion."""
 
-    files: tuple[Path, ...]  # what was written, without the meshes beside a scene JSON
-    triangles: int  # triangles of all scenes
-    notes: tuple[str, ...]  # what could not be carried over, for people
+    files: tuple[Path, ...]  # written files, without the meshes of a scene JSON
+    triangles: int  # sum over all scenes
+    notes: tuple[str, ...]  # sentences about what was lost
 
 
 def convert_scene(
     source: SceneSource, target: Path, *, budget: int | None, done: Callable[[int, int], None]
 ) -> ConvertResult:
-    """Read a source and write it in the form that the target's name says.
+    """Read a source and write it in the format of the target's suffix.
 
     Args:
         source: one scene, or a file of many.
@@ -49,8 +49,8 @@ def convert_scene(
         done: called with (finished, all) files.
 
     Raises:
-        TrilightError: the source is unusable, the target's form cannot hold it, or it cannot be
-            written.
+        TrilightError: the source is unusable, the target's format cannot hold it, or it cannot
+            be written.
     """
     form = _form_of(target)
     child = file_child(reach_of(source, writes=[_make_folder(target)]))
@@ -82,15 +82,15 @@ def convert_scene(
 def write_scene(
     target: Path, scene: Scene, radiance_rgb: NDArray[np.float32] | None = None
 ) -> tuple[str, ...]:
-    """Write a scene in the form that the target's name says; return what that cannot hold.
+    """Write a scene in the format of the target's suffix; return what that cannot hold.
 
     Args:
         target: the file to write.
-        scene: that passes `Scene.check`.
+        scene: passes `Scene.check`.
         radiance_rgb: [V, R, R, 3] pictures of its views, which HDF5 alone holds.
 
     Raises:
-        TrilightError: the form cannot hold it, or it cannot be written.
+        TrilightError: the format cannot hold it, or it cannot be written.
     """
     form = _form_of(target)
     assert form.write is not None
@@ -99,7 +99,7 @@ def write_scene(
 
 
 def _make_folder(target: Path) -> Path:
-    """Make the folder of a file, for a child that may write there and nowhere else."""
+    """Make the folder of a file; the child may write there and nowhere else."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -135,7 +135,8 @@ def _convert_many(
 ) -> ConvertResult:
     form = _form_of(target)
     assert form.write_many is not None
-    triangles, notes = 0, list[str]()
+    triangles = 0
+    notes = list[str]()
 
     def scenes() -> Iterator[tuple[str, Scene]]:
         nonlocal triangles

@@ -1,7 +1,7 @@
-"""Strict access to the fields of a JSON object: every complaint names file, field, got, expected.
+"""Strict access to the fields of a JSON object.
 
-What was never asked for is an unknown field; those are collected, so that a misspelt option is
-named instead of silently having no effect.
+Every error names the file, the field, its value and what was expected. Fields that the reader never
+asks for are collected as unknown, so that a misspelt option is reported instead of ignored.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,35 +12,37 @@ from storage.errors import TrilightError
 from storage.settings.ranges import Within
 
 _MAX_SHOWN = 120
-"""Most characters of a value in a message."""
+"""Maximum number of characters of a value in a message."""
 
 _MAX_TEXT = 200
-"""Longest text that a field may hold."""
+"""Maximum number of characters of a text field."""
 
 
 class Fields:
     """One JSON object of a file, read field by field."""
 
     def __init__(self, value: Any, *, file: str, where: str, unknown: list[str]) -> None:
-        """Begin to read.
+        """Wrap a value of the JSON tree.
 
         Args:
-            value: what the JSON holds there.
+            value: the parsed value.
             file: name of the file, for messages.
-            where: dotted name of this object inside of the file; empty for the whole.
-            unknown: collects the names of fields that nobody asks for (`end`).
+            where: dotted name of this object inside the file; empty for the root.
+            unknown: receives the names of fields that are never read (`end`).
 
         Raises:
-            TrilightError: `value` is no JSON object.
+            TrilightError: `value` is not a JSON object.
         """
-        self._file, self._where, self._unknown = file, where, unknown
+        self._file = file
+        self._where = where
+        self._unknown = unknown
         if not isinstance(value, dict):
             self._refuse(where or "the file", value, "a JSON object")
         self._values: dict[str, Any] = value
         self._read_keys: set[str] = set()
 
     def end(self) -> None:
-        """Collect the fields that were not asked for."""
+        """Add the names of fields that were not read to `unknown`."""
         unread = [key for key in self._values if key not in self._read_keys]
         self._unknown += [to_text(self._name(key)) for key in unread]
 
@@ -84,14 +86,14 @@ class Fields:
         return value
 
     def integer(self, key: str, low: int, high: int, default: int) -> int:
-        """Return a field that is a whole number from `low` to `high`."""
+        """Return a field that is an integer from `low` to `high`."""
         value = self._get(key, default)
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             self._refuse(self._name(key), value, f"a whole number from {low} to {high}")
         return value
 
     def optional_integer(self, key: str, low: int, high: int) -> int | None:
-        """Return the same, or None where the field is missing or null."""
+        """Return an integer field, or None where it is missing or null."""
         self._read_keys.add(key)
         return None if self._values.get(key) is None else self.integer(key, low, high, low)
 
@@ -101,7 +103,8 @@ class Fields:
 
     def vector(self, key: str, low: float, high: float) -> tuple[float, float, float]:
         """Return a field that is a list of three finite numbers from `low` to `high`."""
-        values, name = self._get(key), self._name(key)
+        values = self._get(key)
+        name = self._name(key)
         if not isinstance(values, list) or len(values) != 3:
             self._refuse(name, values, "a list of three numbers")
         x, y, z = (self._number(f"{name}[{at}]", v, low, high) for at, v in enumerate(values))
@@ -117,7 +120,7 @@ class Fields:
             raise TrilightError(f"{self._file}: {error}.") from error
 
     def _get(self, key: str, default: Any = None) -> Any:
-        """Return a value; a field without default must be there."""
+        """Return a value, or its default; a field without a default must exist."""
         self._read_keys.add(key)
         if key in self._values:
             return self._values[key]
@@ -135,6 +138,6 @@ class Fields:
 
 
 def to_text(value: Any) -> str:
-    """Return a value for a message: short, in one line, without control characters."""
+    """Return a value as short text for a message, on one line without control characters."""
     text = value if isinstance(value, str) and value.isprintable() else repr(value)
     return text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 3]}..."

@@ -1,12 +1,12 @@
-"""Passes of stored scenes as OpenEXR files, one a view, as datasets that store them hold them."""
+"""Writes passes of scenes as OpenEXR files, one for each view, as datasets store them."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.exchange.select_samples import select_samples, is_dataset
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.select_samples import is_dataset, select_samples
 from storage.atomic import write_atomically
 from storage.dataset.dataset import open_dataset
 from storage.records.first_hits import require_row
@@ -14,15 +14,15 @@ from storage.records.passes.stored import passes_exr
 from storage.records.scene import Scene
 
 _RESOLUTION = 256
-"""Of scenes that have no pictures."""
+"""Width and height in pixels for scenes without pictures."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PassOptions:
-    """Which pictures to write."""
+    """Options of `write_passes`: the passes and views to write."""
 
     names: Sequence[str]
-    """Passes by name."""
+    """Names of the passes to write."""
     scene: str | None
     """Key of the only scene, with or without zeros before it; None for all."""
     view: int | None
@@ -30,12 +30,12 @@ class PassOptions:
     resolution: int | None
     """Width and height in pixels; None for that of the dataset's pictures, or 256."""
     rays_a_side: int
-    """As `view_passes`."""
+    """Rays along each side of a pixel."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _NamedScene:
-    """One scene of a source."""
+    """A scene of a source with its file name."""
 
     name: str
     scene: Scene
@@ -46,16 +46,16 @@ class _NamedScene:
 def write_passes(
     source: str, out: Path, options: PassOptions, *, done: Callable[[Path], None]
 ) -> tuple[str, ...]:
-    """Write `SCENE.VIEW.passes.exr` into a folder for each wanted view; return notes for people.
+    """Write `SCENE.VIEW.passes.exr` into a folder for each chosen view; return notes.
 
-    With the resolution and the single ray of a dataset that stores the same passes, the files are
-    the same to the last byte.
+    With the resolution and the single ray of a dataset that stores the same passes, the files equal
+    the stored ones byte for byte.
 
     Args:
         source: a dataset (folder or URL), or a scene in any form that `trilight convert` reads.
-        out: the folder; it is made.
-        wanted: which.
-        done: called with each file.
+        out: the folder, which is created.
+        options: the passes and views.
+        done: called with each written file.
 
     Raises:
         TrilightError: the source is unusable, there is no such scene, view or pass, or the folder

@@ -1,11 +1,11 @@
-"""Textures as the cells of RenderFormer's triangles, and cells as textures.
+"""Converts textures to the cells of RenderFormer's triangles, and cells to textures.
 
 The layout is a right triangle in a square of 32 x 32 cells: the column x of a cell is the weight of
-the first vertex and its row y that of the second, in 32nds, so that the third is at the corner of
-x = y = 0. V1 wrote constants only; this is the layout of its successor, which fills the same cells.
-A cell holds the mean of a texture over its area inside the triangle; cells that lie beyond go on as
-the texture does. Read back, every triangle becomes a square of an atlas, with a border of one cell
-so that no look-up meets a neighbour.
+the first vertex and its row y that of the second, in 32nds, so that the third vertex is at the
+corner x = y = 0. Version 1 wrote constants only; this is the layout of its successor, which fills
+the same cells. A cell holds the mean of a texture over its area inside the triangle; cells beyond
+the triangle continue the texture. When read, every triangle becomes a square of an atlas, with a
+border of one cell so that no look-up touches a neighbor.
 """
 
 from dataclasses import dataclass
@@ -21,24 +21,24 @@ from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
 
 CELLS = 32
 REFLECTED = 7
-"""Channels of a texture that a material here may have textured: two colours and a roughness."""
+"""Number of channels that a material may have textured: two colors and a roughness."""
 
 MAX_VARYING = 8192
-"""Most triangles whose cells become an atlas; they take 28 kB each on the way."""
+"""Maximum number of triangles whose cells become an atlas; each takes 28 kB meanwhile."""
 
 _BORDER = 1
 _TILE = CELLS + 2 * _BORDER
-_MOST_STEPS = 16  # samples along the side of a cell
+_MOST_STEPS = 16  # maximum number of samples along the side of a cell
 
 
 def filled_cell_mask() -> NDArray[np.bool_]:
-    """Return which cells [32, 32] of a texture hold its value: those with x + y <= 32."""
+    """Return a mask [32, 32] of the cells that hold a texture: those with x + y <= 32."""
     x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
     return x + y <= CELLS
 
 
 def textured_triangles(scene: Scene) -> NDArray[np.bool_]:
-    """Return which triangles [T] have a texture and emit nothing."""
+    """Return a mask [T] of the triangles that have a texture and emit nothing."""
     if scene.material_textures is None:
         return np.zeros(scene.num_triangles, np.bool_)
     textured = (scene.material_textures != CONSTANT).any(axis=1)
@@ -46,11 +46,11 @@ def textured_triangles(scene: Scene) -> NDArray[np.bool_]:
 
 
 def compute_cells(scene: Scene, triangle: int) -> list[tuple[slice, NDArray[np.float32]]]:
-    """Return the channels of the textured columns of a triangle, and their cells [C, 32, 32].
+    """Return the channels and cells [C, 32, 32] of each textured column of a triangle.
 
     Args:
-        scene: with textures.
-        triangle: row of its triangles.
+        scene: a scene with textures.
+        triangle: row of the triangle.
     """
     assert scene.material_textures is not None and scene.uv is not None
     index = scene.material_textures[scene.material_index[triangle]]
@@ -66,7 +66,7 @@ def compute_cells(scene: Scene, triangle: int) -> list[tuple[slice, NDArray[np.f
 def _compute_means(texture: Texture, uv: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return the means [C, 32, 32] of a texture over the cells of a triangle with corners [3, 2].
 
-    Samples lie as close as the texels, up to 16 each way in a cell.
+    Samples are as dense as the texels, up to 16 x 16 in a cell.
     """
     height, width = texture.texels.shape[:2]
     edges = (uv[:2] - uv[2]) * [width, height] / CELLS  # in texels, along a cell
@@ -89,19 +89,19 @@ def _compute_means(texture: Texture, uv: NDArray[np.float64]) -> NDArray[np.floa
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CellAtlas:
-    """Cells of many triangles side by side."""
+    """Textures that hold the cells of many triangles, one square tile for each."""
 
     textures: tuple[Texture, Texture, Texture]
-    """Diffuse, specular and roughness."""
+    """Diffuse, specular and roughness texture of all tiles."""
     uv: NDArray[np.float32]
-    """[N, 3, 2] of the corners of each triangle."""
+    """[N, 3, 2] texture coordinates of the corners of each triangle."""
 
 
 def build_atlas(cells: NDArray[np.float32], source: MapSource) -> CellAtlas:
     """Return cells [N, 7, 32, 32] as textures of 8 bits, in the order of their triangles.
 
-    The diffuse albedo gives way where both add up to more than 1. Cells that no look-up meets have
-    the mean of the others, so that a texture's mean is that of its triangles.
+    The diffuse albedo is lowered where both add up to more than 1. Cells that no look-up reaches
+    get the mean of the others, so that a texture's mean is that of its triangles.
     """
     count = len(cells)
     across = int(np.ceil(np.sqrt(count)))

@@ -1,4 +1,4 @@
-"""RenderFormer's published HDF5 file of one scene, written and read: every array with its quirks.
+"""Reads and writes the published RenderFormer HDF5 file of one scene.
 
 | array | dtype, shape | meaning |
 |---|---|---|
@@ -11,19 +11,19 @@
 | `mvp` | f32 [V, 4, 4] | world to clip space, near 0.05, far 5; where there are pictures |
 
 - A texture fills its cells (x, y) with x + y <= 32, which are 559 of 1024; the others are zero.
-  Published files hold one value in all of them: 1024 times the bytes of what it says. Textures of
-  a scene become cells, and cells that vary textures (pipeline.exchange.renderformer_cells).
-- Normals of a texture are (.5, .5, 1): no bump, in the file's tangent space.
-- An emitter's texture says diffuse (1, 1, 1) and roughness 1, as published, though our emitters
-  reflect nothing (as do the published ones when rendered).
-- Half floats end at 65504 and keep 11 bits: albedos move by up to 2^-11, and brighter lights are
+  Published files hold one value in all of them. Textures of a scene become cells, and varying cells
+  become textures (pipeline.exchange.renderformer_cells).
+- The normal channels are (.5, .5, 1): no bump, in the file's tangent space.
+- The texture of an emitter states diffuse (1, 1, 1) and roughness 1, as published, though emitters
+  reflect nothing here (nor do the published ones when rendered).
+- Half floats end at 65504 and keep 11 bits: albedos change by up to 2^-11, and brighter lights are
   refused.
-- Every array is packed by gzip at level 9, in chunks of h5py's choosing.
-- Our pictures have no alpha: it is written as 1, and the empty background is radiance zero.
+- Every array is compressed by gzip at level 9, in chunks that h5py chooses.
+- Pictures have no alpha here: it is written as 1, and the empty background is radiance zero.
 - `mvp` is OpenGL's, for column vectors; the published training multiplies it by zero.
 
-What a file cannot say: which triangles are one object, names and rights, provenance, shared
-vertices. The reader does not trust the file (pipeline.exchange.safe_h5).
+The file has no place for objects (which triangles belong together), names and rights, provenance,
+or shared vertices. The reader does not trust the file (pipeline.exchange.safe_h5).
 """
 
 import io
@@ -49,7 +49,7 @@ from pipeline.exchange.renderformer_stored import (
     read_textures,
     with_cells,
 )
-from pipeline.exchange.renderformer_v2 import KNOWN, read_grey_textures, is_second_version, read_sky
+from pipeline.exchange.renderformer_v2 import KNOWN, is_second_version, read_grey_textures, read_sky
 from pipeline.exchange.safe_h5 import (
     list_names,
     open_h5,
@@ -77,8 +77,9 @@ CARRIED = frozenset(
 )
 """Members of a scene that the file holds (pipeline.exchange.formats)."""
 
-NEAR, FAR = 0.05, 5.0
-"""Clip distances of `mvp`, in metres."""
+NEAR = 0.05
+FAR = 5.0
+"""Clip distances of `mvp`, in meters."""
 GZIP_LEVEL = 9
 
 TextureType = Literal["float16", "float32"]
@@ -93,11 +94,11 @@ def write_renderformer_h5(
 ) -> None:
     """Write a scene, and its pictures [V, R, R, 3] if given; equal scenes give equal bytes.
 
-    `float16` is what the public converter writes, `float32` what the authors' later tools do. The
-    file appears whole or not at all; in memory it takes its packed size and one block of textures.
+    The public converter writes `float16`, the authors' later tools `float32`. The file appears
+    whole or not at all; memory is its compressed size and one block of textures.
 
     Raises:
-        TrilightError: a value that half floats do not hold, or the file cannot be written.
+        TrilightError: a value exceeds half floats, or the file cannot be written.
     """
     import h5py
 
@@ -122,7 +123,7 @@ def texture_rows(scene: Scene, texture_type: TextureType) -> NDArray[np.floating
     Where rounding to half floats would make albedos add up to more than 1, they are rounded down.
 
     Raises:
-        TrilightError: an emission that half floats turn into infinity or nothing.
+        TrilightError: an emission becomes infinite or zero as half floats.
     """
     emits = np.any(scene.materials[:, EMISSION] > 0, axis=1)
     rows = np.zeros((len(scene.materials), CHANNELS), np.float32)
@@ -151,7 +152,7 @@ def texture_rows(scene: Scene, texture_type: TextureType) -> NDArray[np.floating
 
 
 def note_reflecting_emitters(scene: Scene) -> tuple[str, ...]:
-    """Return what a file says otherwise, for people: what emitters reflect, where they do."""
+    """Return a note that a written file changes the albedos of emitters, where they reflect."""
     emits = (scene.materials[:, EMISSION] > 0).any(axis=1)
     reflects = (scene.materials[emits][:, : SPECULAR.stop] > 0).any(axis=1)
     return (f"what {int(reflects.sum())} emitting materials reflect",) if reflects.any() else ()
@@ -162,13 +163,14 @@ def _write(file: Any, name: str, values: NDArray) -> None:
 
 
 def _write_texture(file: Any, rows: NDArray[np.floating], scene: Scene) -> None:
-    """Write textures a block of triangles at a time: whole, they take 53 kB a triangle."""
+    """Write textures in blocks of triangles; in memory each triangle takes 53 kB."""
     textured = textured_triangles(scene)
     shape = (len(rows), CHANNELS, CELLS, CELLS)
     texture = file.create_dataset(
         "texture", shape, rows.dtype, compression="gzip", compression_opts=GZIP_LEVEL
     )
-    filled, step = filled_cell_mask(), texture.chunks[0]
+    filled = filled_cell_mask()
+    step = texture.chunks[0]
     for start in range(0, len(rows), step):
         block = rows[start : start + step, :, None, None]
         cells = np.where(filled, block, rows.dtype.type(0))
@@ -187,7 +189,8 @@ def _mvp(scene: Scene) -> NDArray[np.float32]:
     focal = 1 / np.tan(np.radians(scene.fov_deg.astype(np.float64)) / 2)
     clip = np.zeros((len(focal), 4, 4))
     clip[:, 0, 0] = clip[:, 1, 1] = focal
-    clip[:, 2, 2], clip[:, 2, 3] = (FAR + NEAR) / (NEAR - FAR), 2 * FAR * NEAR / (NEAR - FAR)
+    clip[:, 2, 2] = (FAR + NEAR) / (NEAR - FAR)
+    clip[:, 2, 3] = 2 * FAR * NEAR / (NEAR - FAR)
     clip[:, 3, 2] = -1
     view = np.linalg.inv(scene.c2w.astype(np.float64))
     return np.einsum("vij,vjk->vik", clip, view).astype(np.float32)
@@ -195,40 +198,40 @@ def _mvp(scene: Scene) -> NDArray[np.float32]:
 
 MAX_VIEWS = 1000
 MAX_PICTURE_BYTES = 1 << 30
-"""Maximum size of all pictures of a file as float32."""
+"""Maximum bytes of all pictures of a file as float32."""
 MAX_PALETTE = 1 << 16
 """Maximum number of material rows and of objects: `Scene` counts them in 16 bits."""
 
 UNKNOWN_LICENCE = "LicenseRef-unknown"
-"""A file names no rights."""
+"""Licence of everything that is read, since the file states no rights."""
 
 _KNOWN = ("c2w", "fov", "img", "mvp", "texture", "triangles", "vn")
 _ROUNDING = 2.0**-10
-"""Albedos that are meant to add up to 1 may exceed it by this as half floats."""
+"""Tolerance for the half-float rounding of albedos that add up to 1."""
 _PUBLISHED_EMITTER = np.array([1, 1, 1, 0, 0, 0, 1], np.float32)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RenderFormerFile:
-    """What a file says."""
+    """A scene that was read, with its pictures and losses."""
 
     scene: Scene
     """A checked scene: one object of everything that reflects, one for each emitting triangle."""
     radiance_rgb: NDArray[np.float32] | None
     """[V, H, W, 3] linear radiance; None where the file has no pictures."""
     lost: tuple[str, ...]
-    """What could not be carried over, for people."""
+    """Sentences about parts of the file that were lost."""
 
 
 def read_renderformer_h5(path: Path) -> RenderFormerFile:
     """Read a file of the published layout.
 
     Corners with equal position and normal become one vertex, so that flat and smooth shading stay
-    as they are; equal materials become one row, but each emitting triangle has its own.
+    as they are. Equal materials become one row, but each emitting triangle has a separate row.
 
     Raises:
-        TrilightError: not such a file; behind links, outside of the file, larger than it may be,
-            not finite (pipeline.exchange.safe_h5); or a scene that breaks a law (`Scene.check`).
+        TrilightError: the file has another layout; an array is a link, outside the file, too large
+            or not finite (pipeline.exchange.safe_h5); or the scene breaks a law (`Scene.check`).
     """
     lost: list[str] = []
     with open_h5(path) as file:
@@ -276,7 +279,7 @@ def _pictures(file: Any, num_views: int, lost: list[str]) -> NDArray[np.float32]
 def _normalize(
     triangles: NDArray[np.float32], normals: NDArray[np.float32], lost: list[str]
 ) -> NDArray[np.float32]:
-    """Return normals [T, 3, 3] of unit length; the face's own where there is none."""
+    """Return unit normals [T, 3, 3]; the normal of the face replaces zero normals."""
     length = np.linalg.norm(normals.astype(np.float64), axis=2, keepdims=True)
     off = np.abs(length - 1) > UNIT_NORMAL_TOLERANCE
     if not off.any():
@@ -295,7 +298,7 @@ def _normalize(
 def _index_vertices(
     triangles: NDArray[np.float32], normals: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
-    """Return vertices and faces; vertices are in the order in which they are first used."""
+    """Return positions, normals and faces, with vertices in the order of first use."""
     corners = np.concatenate([triangles, normals], axis=2).reshape(-1, 6)
     first, rows = distinct_rows(corners)
     vertices = corners[first]
@@ -313,9 +316,9 @@ def _palette(
     if (materials[emits, REFLECTING] != _PUBLISHED_EMITTER).any():
         lost.append("what emitters reflect: ours reflect nothing")
     materials[emits, REFLECTING] = [0, 0, 0, 0, 0, 0, 1]
-    materials[varies, REFLECTING] = 0  # one row for all of them: their cells say the rest
+    materials[varies, REFLECTING] = 0  # one row for all of them, since their cells hold the values
     _limit_rounded_albedos(materials, lost)
-    order = np.where(emits, np.cumsum(emits), -1.0 * varies)  # emitters stay apart, even if equal
+    order = np.where(emits, np.cumsum(emits), -1.0 * varies)  # equal emitters keep separate rows
     first, index = distinct_rows(np.column_stack([materials, order.astype(np.float32)]))
     if len(first) > MAX_PALETTE or emits.sum() >= MAX_PALETTE:
         raise TrilightError(
@@ -338,7 +341,7 @@ def _with_unknown_licence(entry: SceneObject) -> SceneObject:
 
 
 def _limit_rounded_albedos(materials: NDArray[np.float32], lost: list[str]) -> None:
-    """Lower specular albedos where rounding took the sum over 1; `Scene.check` refuses more."""
+    """Lower specular albedos whose sum rounding raised above 1, as `Scene.check` demands."""
     excess = materials[:, DIFFUSE] + materials[:, SPECULAR] - 1
     rounded = (excess > ALBEDO_SUM_TOLERANCE) & (excess <= _ROUNDING)
     if rounded.any():

@@ -1,14 +1,14 @@
-"""RenderFormer's scene JSON (version 1.0), read as a `SceneDescription`, written from a `Scene`.
+"""Reads RenderFormer's scene JSON (version 1.0) as a `SceneDescription`; writes it from a `Scene`.
 
-Which fields may be missing, and their defaults, follow the published reader. Unlike it, unknown
-fields are named and left out. Only the fields of the published example scenes are known: no
-templates, whose values would have to be halved, no textures, no environment.
+Optional fields and their defaults follow the published reader. Unlike it, this reader reports and
+ignores unknown fields. It knows the fields of the published example scenes only: no templates
+(whose values would have to be halved), no textures, no environment.
 
-A written file names one OBJ file per mesh, in world space and not normalised. An object of the file
-has one material, so an object of ours becomes one for each of its materials. `CARRIED` lists what
-the format holds; of that, `DescribedFiles.lost` lists what does not come back whole: which
-triangles of several colours were one object; shading normals other than flat ones and those that
-its readers make (smooth across edges of up to 30 degrees).
+A written file names one OBJ file per mesh, in world space and not normalized. An object of the file
+has one material, so an object of a scene becomes one object for each of its materials. `CARRIED`
+lists the members that the format holds. `DescribedFiles.lost` lists what of these a reader cannot
+restore: objects of several materials; shading normals other than flat ones and those that readers
+compute (smooth across edges of up to 30 degrees).
 """
 
 import json
@@ -39,17 +39,17 @@ from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGH
 from storage.records.scene import ARRAY_FIELDS, Scene
 
 MAX_BYTES = 4 << 20
-"""Largest accepted file; an object takes about 1 KiB."""
+"""Maximum size of a file; an object takes about 1 KiB."""
 
 MAX_OBJECTS = 8192
-"""Maximum number of objects in a file; a triangle with its own colour counts as an object."""
+"""Maximum number of objects in a file; a triangle with a separate color counts as an object."""
 
 MAX_CAMERAS = 1000
 """Maximum number of cameras in a file."""
 
 _VERSION = "1.0"
 _MAX_LENGTH = 1e6
-"""Greatest coordinate or factor: beyond it float32 positions are off by centimetres."""
+"""Maximum coordinate or factor; beyond it float32 positions are off by centimeters."""
 _MAX_ANGLE_DEG = 1e6
 _MAX_EMISSION = 1e9
 _MAX_SEED = 2**32 - 1
@@ -58,25 +58,27 @@ _COLOUR_GROUPS = ("per-triangle", "per-shading-group")
 
 
 def read_description(data: bytes, name: str) -> SceneDescription:
-    """Return what a scene file describes.
+    """Parse a scene file.
 
     Args:
         data: the bytes of the file.
-        name: of the file, for messages.
+        name: name of the file, for messages.
 
     Raises:
-        TrilightError: larger than MAX_BYTES, not JSON, a name twice in one JSON object, or a field
-            that is missing, of the wrong type, not finite or out of range; the message names file,
-            field (with the object's name), value got and value expected.
+        TrilightError: the file exceeds MAX_BYTES or is not JSON; a JSON object repeats a name; or a
+            field is missing, of the wrong type, not finite or out of range. The message names file,
+            field (with the object's name), value and expected value.
     """
     if len(data) > MAX_BYTES:
         raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
     unknown: list[str] = []
     fields = Fields(_parse_json(data, name), file=name, where="", unknown=unknown)
-    scene_name, version = fields.text("scene_name"), fields.text("version")
+    scene_name = fields.text("scene_name")
+    version = fields.text("version")
     if version != _VERSION:
         raise TrilightError(f"{name}: version is {version!r}; expected {_VERSION!r}.")
-    objects, cameras = fields.group("objects"), fields.groups("cameras", MAX_CAMERAS)
+    objects = fields.group("objects")
+    cameras = fields.groups("cameras", MAX_CAMERAS)
     names = list(objects.keys())
     if not 1 <= len(names) <= MAX_OBJECTS:
         raise TrilightError(f"{name}: {len(names)} objects; expected 1 to {MAX_OBJECTS}.")
@@ -96,7 +98,7 @@ def read_cameras(data: bytes, name: str) -> tuple[DescribedCamera, ...]:
     """Return the cameras of a scene file, or of a JSON file that has nothing but `cameras`.
 
     Raises:
-        TrilightError: as `read_description`, for what of it is read.
+        TrilightError: as `read_description`, for the cameras alone.
     """
     if len(data) > MAX_BYTES:
         raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
@@ -194,32 +196,32 @@ CARRIED = frozenset(
 _FLAT = 1e-5
 """Largest difference between a flat face's float32 normal and its geometric normal."""
 _CLOSE = 1e-2
-"""How far a normal may lie from the one that a reader makes before it counts as lost: 0.6 deg."""
+"""Maximum difference between a normal and the one that a reader computes: 0.6 degrees."""
 _NAME_LETTERS = 48
-"""Length limit of object names; the published converter makes files of them (255 bytes)."""
+"""Maximum length of object names; the published converter uses them as file names (255 bytes)."""
 _NO_FILE_LETTERS = '/\\:*?"<>|'
-"""Letters that a name of a file must not have, on some system."""
+"""Characters that some operating system forbids in file names."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DescribedFiles:
-    """The files of one scene."""
+    """The scene file and mesh files of one scene."""
 
     json: bytes  # the scene file
-    meshes: dict[str, bytes]  # OBJ files by path relative to it
-    lost: tuple[str, ...]  # what of the members in CARRIED does not come back, for people
+    meshes: dict[str, bytes]  # OBJ files by path relative to the scene file
+    lost: tuple[str, ...]  # sentences about members in CARRIED that readers cannot restore
 
 
 def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
     """Return a scene as the files that the published tools read.
 
     Args:
-        scene: that passes `Scene.check`.
-        stem: of the scene file; its meshes stand in folders of that name.
+        scene: passes `Scene.check`.
+        stem: stem of the scene file and name of its mesh folders.
 
     Raises:
-        TrilightError: more objects or cameras than a file may have, a number beyond its range, or
-            no emitter with an area.
+        TrilightError: more objects or cameras than a file may have, a number out of range, or no
+            emitter with an area.
     """
     scene.check()
     lost: list[str] = []
@@ -228,7 +230,7 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
     taken: set[str] = set()
     for row, material, faces in _group_triangles(scene):
         if len(without_slivers(scene.vertex_positions, scene.faces[faces])) == 0:
-            continue  # readers refuse a mesh of which nothing is left
+            continue  # readers refuse a mesh without an area
         name = _unique(_name(scene, row, material), taken)
         normals = scene.vertex_normals[scene.faces[faces]]
         path = _mesh_path(scene, row, material, stem)
@@ -248,12 +250,12 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
         }
     ).encode()
     _require_size(scene, data, len(objects))
-    read_description(data, f"{stem}.json")  # nothing is written that its readers would refuse
+    read_description(data, f"{stem}.json")  # raises for anything that readers would refuse
     return DescribedFiles(json=data, meshes=meshes, lost=(*_losses(scene), *lost))
 
 
 def _group_triangles(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
-    """Return (object, material, its triangles) in the order of objects and then of materials."""
+    """Return (object, material, triangles), sorted by object and then by material."""
     keys = scene.object_index.astype(np.int64) * len(scene.materials) + scene.material_index
     order = np.argsort(keys, kind="stable")
     distinct, starts = np.unique(keys[order], return_index=True)
@@ -275,8 +277,9 @@ def _printable(text: str) -> str:
 
 
 def _unique(name: str, taken: set[str]) -> str:
-    """Return a name that no other has, capitals or not, since it becomes that of a file."""
-    candidate, count = name, 1
+    """Return an unused name, ignoring case, since it becomes the name of a file."""
+    candidate = name
+    count = 1
     while candidate.casefold() in taken:
         count += 1
         candidate = f"{name}.{count}"
@@ -292,7 +295,7 @@ def _mesh_path(scene: Scene, row: int, material: int, stem: str) -> str:
 
 
 def _obj(scene: Scene, faces: NDArray[np.intp]) -> bytes:
-    """Return triangles as an OBJ file whose numbers come back as the same single floats."""
+    """Return triangles as an OBJ file whose numbers round-trip to the same float32."""
     rows, corners = np.unique(scene.faces[faces], return_inverse=True)
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in scene.vertex_positions[rows].tolist()]
     lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in scene.vertex_normals[rows].tolist()]
@@ -340,9 +343,10 @@ def _is_smooth(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float3
 
 
 def _is_reproduced(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float32]) -> bool:
-    """Return whether a reader that smooths makes the same normals."""
+    """Return whether the smoothing of a reader computes the same normals."""
     rows, corners = np.unique(scene.faces[faces], return_inverse=True)
-    positions, triangles = scene.vertex_positions[rows], corners.reshape(-1, 3).astype(np.uint32)
+    positions = scene.vertex_positions[rows]
+    triangles = corners.reshape(-1, 3).astype(np.uint32)
     if len(without_slivers(positions, triangles)) < len(triangles):
         return False
     made = smooth_shaded(positions, triangles, SMOOTH_ANGLE_DEG)
@@ -352,7 +356,8 @@ def _is_reproduced(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.fl
 def _losses(scene: Scene) -> list[str]:
     losses: list[str] = []
     parts = np.bincount([row for row, _, _ in _group_triangles(scene)])
-    num_objects, num_parts = int((parts > 1).sum()), int(parts[parts > 1].sum())
+    num_objects = int((parts > 1).sum())
+    num_parts = int(parts[parts > 1].sum())
     if num_objects:
         losses.append(f"that {num_parts} of its objects were {num_objects}, of several materials")
     solid = len(without_slivers(scene.vertex_positions, scene.faces))

@@ -1,7 +1,7 @@
-"""Reduces the triangles of a user's scene: each object gives up the same share.
+"""Reduces the triangles of a user's scene, by the same fraction in each object.
 
-Emitters stay as they are. What becomes of an object is what the mesh stage makes of it; a triangle
-takes the material of the nearest old one, and normals are made anew where they were smooth.
+Emitters stay unchanged. The mesh stage's decimation reduces an object; each new triangle takes the
+material of the nearest old one, and smooth normals are computed again.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ from storage.records.retextured import without_maps
 from storage.records.scene import Scene
 
 LEAST = 4
-"""Fewest triangles that an object is brought down to."""
+"""Minimum number of triangles of a reduced object."""
 
 _LOST = "textures became their means: reduced triangles have no texture coordinates"
 _SMOOTH_ANGLE_DEG = 30.0
@@ -27,10 +27,10 @@ _FLAT = 1e-3
 
 
 def within_budget(scene: Scene, budget: int) -> tuple[Scene, tuple[str, ...]]:
-    """Return the scene with at most `budget` triangles, and what that cost, for people.
+    """Return the scene with at most `budget` triangles, and notes on what that cost.
 
     Raises:
-        TrilightError: emitters alone are more, or an object cannot be reduced that far.
+        TrilightError: emitters alone exceed the budget, or an object cannot be reduced that far.
     """
     lost = [_LOST] if scene.textures else []
     scene = without_maps(scene, environment=False)
@@ -97,8 +97,8 @@ def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
         if smooth
         else flat_shaded(positions, faces)
     )
-    centres = old.positions[old.faces].mean(axis=1)
-    _, nearest = cKDTree(centres).query(mesh.positions[mesh.faces].mean(axis=1))
+    centers = old.positions[old.faces].mean(axis=1)
+    _, nearest = cKDTree(centers).query(mesh.positions[mesh.faces].mean(axis=1))
     return ScenePiece(
         entry=piece.entry,
         mesh=mesh,
@@ -111,7 +111,8 @@ def _decimate_mesh(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], 
     raw = TriangleMesh(
         positions=piece.mesh.positions.astype(np.float64), faces=piece.mesh.faces.astype(np.int64)
     )
-    low, high = raw.positions.min(axis=0), raw.positions.max(axis=0)
+    low = raw.positions.min(axis=0)
+    high = raw.positions.max(axis=0)
     unit = clean(normalise(raw))
     for method in methods_of("faithful"):
         try:

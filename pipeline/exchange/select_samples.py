@@ -1,4 +1,4 @@
-"""The samples of a dataset that a user chooses, by split and by key."""
+"""Selects samples of a dataset by split and by key."""
 
 import os
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ from storage.records.sample import Sample, sample_key
 
 
 def is_dataset(source: str) -> bool:
-    """Return whether what a user names is a dataset, rather than the file of a scene."""
+    """Return whether a source is a dataset (URL or folder) rather than a scene file."""
     return "://" in source or os.path.isdir(source)
 
 
@@ -20,12 +20,12 @@ def select_samples(
     """Yield (split, sample) of a dataset in its order, with pictures.
 
     Args:
-        dataset: where they are.
+        dataset: the dataset to read.
         split: the only split; None for all.
         scene: key of the only scene, with or without the zeros before it; None for all.
 
     Raises:
-        TrilightError: there is no such split or scene, the dataset is empty, or as `read_samples`.
+        TrilightError: the split or scene does not exist, or the dataset is empty or damaged.
     """
     if split is not None and split not in SPLITS:
         raise TrilightError(f"split is {split!r}; expected one of {', '.join(SPLITS)}.")

@@ -1,7 +1,7 @@
-"""Pieces of a stranger's scene with their materials and textures, and how they join into a Scene.
+"""Joins triangles with materials and textures into the objects of a Scene.
 
-Triangles come with three corners of their own; corners of equal position and normal become one
-vertex, and equal materials one row. Textures of one colour become constants.
+Each triangle has three separate corners. Corners of equal position and normal become one vertex,
+and equal materials one row. Textures of one color become constants.
 """
 
 from collections.abc import Sequence
@@ -19,33 +19,33 @@ from storage.records.scene import ObjectKind, Scene, SceneObject
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
 TextureSet = tuple[Texture | None, Texture | None, Texture | None]
-"""Textures in the order of TEXTURED; None where the column of the row stands."""
+"""Textures in the order of TEXTURED; None where the material column is the value."""
 
 NO_TEXTURES: TextureSet = (None, None, None)
 
 _SMALLEST_DOUBLE_AREA = 1e-12
-"""In square metres."""
+"""Twice the area of a triangle, in square meters, below which it counts as empty."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TexturedTriangles:
-    """Triangles with a material each."""
+    """Triangles, each with a material and texture coordinates."""
 
     positions: NDArray[np.float32]
-    """[T, 3, 3] world."""
+    """[T, 3, 3] corners in world space, in meters."""
     normals: NDArray[np.float32]
-    """[T, 3, 3] unit."""
+    """[T, 3, 3] unit normals at the corners."""
     rows: NDArray[np.float32]
-    """[T, 10 or more] material columns; what they say of textured columns counts for nothing."""
+    """[T, 10 or more] material columns; values of textured columns are ignored."""
     uv: NDArray[np.float32]
-    """[T, 3, 2] texture coordinates of the corners; any where nothing is textured."""
+    """[T, 3, 2] texture coordinates of the corners; unused where nothing is textured."""
     texture_set_index: NDArray[np.int64]
-    """[T] row of `wardrobe`."""
+    """[T] index of each triangle into `texture_sets`."""
     texture_sets: Sequence[TextureSet]
-    """Textures that a triangle may have."""
+    """Distinct texture sets of the triangles."""
 
     def select(self, mask: NDArray[np.bool_]) -> "TexturedTriangles":
-        """Return some of them."""
+        """Return the triangles that a mask [T] selects."""
         return TexturedTriangles(
             positions=self.positions[mask],
             normals=self.normals[mask],
@@ -58,27 +58,28 @@ class TexturedTriangles:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TexturedPiece:
-    """One object of a scene with its textures."""
+    """An object of a scene with its textures."""
 
     piece: ScenePiece
-    """Without them."""
+    """Geometry and material rows of the object."""
     uv: NDArray[np.float32]
-    """[T, 3, 2]"""
+    """[T, 3, 2] texture coordinates of the corners."""
     texture_sets: tuple[TextureSet, ...]
-    """Textures of each of its material rows."""
+    """Texture set of each material row of `piece`."""
 
 
 def have_areas(corners: NDArray[np.floating], cross: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether triangles [T, 3, 3] have an area; `cross` [T, 3] are as long as twice theirs.
+    """Return a mask [T] of the triangles [T, 3, 3] with an area.
 
-    In a mesh below a metre that is measured by its size: triangles of a watch are small.
+    `cross` [T, 3] are the cross products of their edges. In a mesh smaller than a meter the limit
+    shrinks with its size: triangles of a watch are small.
     """
     size = min(float(np.ptp(corners.reshape(-1, 3), axis=0).max()), 1.0) if corners.size else 1.0
     return np.asarray(np.linalg.norm(cross, axis=1) > _SMALLEST_DOUBLE_AREA * size**2)
 
 
 def split_by_kind(triangles: TexturedTriangles) -> list[tuple[ObjectKind, TexturedTriangles]]:
-    """Return the part that reflects, and the part that emits, where there are both."""
+    """Split triangles into those that reflect and those that emit; empty kinds are left out."""
     emits = (triangles.rows[:, EMISSION] > 0).any(axis=1)
     kinds: list[tuple[ObjectKind, NDArray[np.bool_]]] = [
         ("object", np.logical_not(emits)),
@@ -88,10 +89,11 @@ def split_by_kind(triangles: TexturedTriangles) -> list[tuple[ObjectKind, Textur
 
 
 def build_piece(entry: SceneObject, triangles: TexturedTriangles) -> TexturedPiece:
-    """Return triangles as an object of a scene."""
+    """Build an object of a scene from its triangles."""
     corners = np.concatenate([triangles.positions, triangles.normals], axis=2).reshape(-1, 6)
     first, index = distinct_rows(corners)
-    vertices, faces = corners[first], index.reshape(-1, 3).astype(np.uint32)
+    vertices = corners[first]
+    faces = index.reshape(-1, 3).astype(np.uint32)
     rows = _with_means(triangles)
     appearance = np.column_stack([rows, triangles.texture_set_index.astype(np.float32)])
     palette, material_index = distinct_rows(appearance)
@@ -114,12 +116,12 @@ def build_piece(entry: SceneObject, triangles: TexturedTriangles) -> TexturedPie
 
 
 def join_arrays(pieces: Sequence[TexturedPiece]) -> dict[str, Any]:
-    """Return geometry and materials of a Scene, without the textures."""
+    """Return the geometry and material arrays of a Scene, without textures."""
     return concatenate_pieces([each.piece for each in pieces])
 
 
 def with_texture_sets(scene: AnyScene, pieces: Sequence[TexturedPiece]) -> AnyScene:
-    """Return a scene of these pieces, in their order, with their textures."""
+    """Return the scene of these pieces, in their order, with their textures."""
     textures: dict[str, Texture] = {}
     index: list[list[int]] = []
     order: dict[str, int] = {}
@@ -139,8 +141,9 @@ def with_texture_sets(scene: AnyScene, pieces: Sequence[TexturedPiece]) -> AnySc
 
 
 def _with_means(triangles: TexturedTriangles) -> NDArray[np.float32]:
-    """Return the rows with the means of textures, so that equal looks are equal."""
-    rows, column_slices = triangles.rows.copy(), {column.name: part for column, part in laid_out()}
+    """Return the rows with the means of textures, so that equal materials have equal rows."""
+    rows = triangles.rows.copy()
+    column_slices = {column.name: part for column, part in laid_out()}
     for number, texture_set in enumerate(triangles.texture_sets):
         chosen = np.flatnonzero(triangles.texture_set_index == number)
         for name, texture in zip(TEXTURED, texture_set, strict=True):
@@ -151,7 +154,7 @@ def _with_means(triangles: TexturedTriangles) -> NDArray[np.float32]:
 
 
 def _drop_constant_textures(textures: TextureSet) -> TextureSet:
-    """Return textures without those of one colour, which stand in the columns."""
+    """Replace textures of one color by None; the material columns hold their values."""
     one, two, three = (
         None if texture is None or texture.constant is not None else texture for texture in textures
     )
@@ -161,7 +164,7 @@ def _drop_constant_textures(textures: TextureSet) -> TextureSet:
 def build_textured_scene(
     arrays: dict[str, Any], pieces: Sequence[TexturedPiece], **more: Any
 ) -> Scene:
-    """Return the checked scene of joined arrays, its textures, and the other members."""
+    """Build and check the scene of joined arrays, textures and further members."""
     scene = Scene(**arrays, objects=tuple(each.piece.entry for each in pieces), **more)
     scene = with_texture_sets(scene, pieces)
     scene.check()

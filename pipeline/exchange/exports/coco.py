@@ -1,8 +1,8 @@
-"""COCO: masks and boxes of the objects and shell parts that each picture shows.
+"""COCO export: masks and boxes of the visible objects and shells of each picture.
 
     SPLIT/KEY.VIEW.png, annotations/instances_SPLIT.json
 
-Masks are exact: the pixels whose centre shows the object, run-length encoded column by column.
+Masks are exact: pixels whose center shows the object, run-length encoded column by column.
 https://cocodataset.org/#format-data
 """
 
@@ -18,11 +18,11 @@ from storage.records.sample import Sample
 from storage.records.scene import SceneObject
 
 _CATEGORIES = {"object": 1, "shell": 2}
-"""Ids of categories by kind; emitters are hidden from cameras."""
+"""Category ids by kind of object; emitters are hidden from cameras."""
 
 
 def write_coco(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
-    """Write the pictures, and one file of annotations for each split; see the top of this file."""
+    """Write pictures and one annotation file for each split, in the layout of this module."""
     splits: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for split, sample in samples:
         tables = splits.setdefault(split, {"images": [], "annotations": []})
@@ -49,9 +49,11 @@ def _annotations(
 ) -> Iterator[dict[str, Any]]:
     """Yield an annotation for each row of `objects` among the ids [R, R] of a picture."""
     for row in np.unique(ids[ids >= 0]).tolist():
-        entry, mask = objects[row], ids == row
+        entry = objects[row]
+        mask = ids == row
         rows, columns = np.nonzero(mask)
-        min_column, min_row = int(columns.min()), int(rows.min())
+        min_column = int(columns.min())
+        min_row = int(rows.min())
         yield {
             "category_id": _CATEGORIES[entry.kind],
             "segmentation": {"size": list(mask.shape), "counts": _runs(mask)},

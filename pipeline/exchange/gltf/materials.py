@@ -1,7 +1,7 @@
-"""Materials of a glTF over a mesh of a scene: textures and rows, by the law that objects follow.
+"""Converts glTF materials on a mesh to textures and material rows, as for objects.
 
-glTF reflects more at grazing angles, by Schlick's curve; ours reflects its mean everywhere
-(pipeline.foreign.material).
+glTF reflects more at grazing angles, by Schlick's curve; a scene's material reflects the mean of
+that curve at all angles (pipeline.foreign.material).
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.textured_pieces import NO_TEXTURES, TexturedTriangles, TextureSet
 from pipeline.exchange.gltf.meshes import WorldTriangles
 from pipeline.exchange.gltf.textures import SLOTS, SampledMaps, sample_slots
 from pipeline.exchange.linear_maps import (
@@ -19,19 +18,20 @@ from pipeline.exchange.linear_maps import (
     number_texture,
     resample_to_largest,
 )
+from pipeline.exchange.textured_pieces import NO_TEXTURES, TexturedTriangles, TextureSet
 from pipeline.foreign.material import Seen, SourceMaterial, columns
 from storage.conventions import srgb8
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.texture import MapSource
 
 _STRIP = 256
-"""Rows of a map whose columns are computed at a time."""
+"""Number of texel rows whose material columns are computed at a time."""
 
 _MOST_TINTS = 256
-"""Most colors of vertices that are materials of their own; more become a texture."""
+"""Maximum number of vertex colors that become separate materials; more become a texture."""
 
 _MOST_TINTED = 1 << 25
-"""Most texels of all textures of a mesh that differ in the color of its vertices alone."""
+"""Maximum texels of all textures of a mesh that differ in vertex color alone."""
 
 _ROUGH = ("roughness", "glossiness")
 
@@ -39,15 +39,16 @@ _ROUGH = ("roughness", "glossiness")
 def apply_material(
     material: SourceMaterial, triangles: WorldTriangles, source: MapSource, lost: list[str]
 ) -> TexturedTriangles:
-    """Return triangles with what a material comes to on them.
+    """Return triangles with the textures and rows of a material.
 
     Args:
-        material: as the file says.
-        found: the triangles, with coordinates and colors.
+        material: the material as the file states it.
+        triangles: the triangles, with coordinates and colors.
         source: name and rights of the textures.
-        lost: receives what cannot be carried over.
+        lost: receives a sentence for each loss.
     """
-    count, most = len(triangles.positions), _MOST_TINTED
+    count = len(triangles.positions)
+    most = _MOST_TINTED
     sampled = sample_slots(material, triangles.coordinates, lost)
     if sampled.uv is not None:
         texels = max(values[..., 0].size for values in sampled.maps.values())
@@ -62,7 +63,8 @@ def apply_material(
         texture_sets = [_textures(material, sampled.maps, tint, source) for tint in tints]
     else:
         values = _columns(material, sampled.maps, np.asarray(tints)[None])[0, tint_index]
-        rows[:, DIFFUSE], rows[:, SPECULAR] = values[:, :3], values[:, 3:6]
+        rows[:, DIFFUSE] = values[:, :3]
+        rows[:, SPECULAR] = values[:, 3:6]
         rows[:, ROUGHNESS] = values[:, 6]
     return TexturedTriangles(
         positions=triangles.positions,
@@ -120,14 +122,14 @@ def _flatten_on_grid(values: NDArray, height: int, width: int) -> NDArray:
 
 
 def _collapse_constant(values: NDArray[np.float32]) -> Map:
-    """Return a map of one texel where all are equal."""
+    """Return a map of one texel where all texels are equal."""
     return values[:1, :1] if (values == values[0, 0]).all() else values
 
 
 def _tints(
     colors: NDArray[np.float64] | None, count: int, most: int, lost: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return at most `most` colors [K, 3] of triangles, and the one [T] of each."""
+    """Return at most `most` colors [K, 3], and the index [T] of the color of each triangle."""
     if colors is None or not count:
         return np.ones((1, 3)), np.zeros(count, np.int64)
     if np.ptp(colors, axis=1).max() > 1 / 255:
@@ -147,7 +149,7 @@ def _tints(
 def _group_colors(
     colors: NDArray[np.float64], codes: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the mean color [K, 3] of equal codes [T, 3], and the group [T] of each."""
+    """Group colors by equal codes [T, 3]; return group means [K, 3] and indices [T]."""
     keys = codes @ np.array([1 << 42, 1 << 21, 1])
     _, group_index, counts = np.unique(keys, return_inverse=True, return_counts=True)
     sums = [np.bincount(group_index, colors[:, channel]) for channel in range(3)]
@@ -157,7 +159,7 @@ def _group_colors(
 def _with_palette(
     sampled: SampledMaps, tints: NDArray[np.float64], tint_index: NDArray[np.int64]
 ) -> tuple[SampledMaps, NDArray[np.float64], NDArray[np.int64]]:
-    """Return many colors as a texture of a texel each, looked up in the middles of texels."""
+    """Return many colors as a texture with one texel each, looked up at texel centers."""
     side = int(np.ceil(np.sqrt(len(tints))))
     texels = np.ones((side * side, 4), np.float32)
     texels[: len(tints), :3] = tints
@@ -169,7 +171,7 @@ def _with_palette(
 
 
 def _emission(material: SourceMaterial, lost: list[str]) -> NDArray[np.float64]:
-    """Return the radiance [3] of a material; of a texture its mean."""
+    """Return the radiance [3] of a material; a texture counts by its mean."""
     radiance: NDArray[np.float64] = np.array(material.emission_rgb)
     if material.emission is not None:
         picture = material.emission.picture

@@ -1,4 +1,4 @@
-"""The triangles of a glTF primitive that have an area, with its normals, or flat ones."""
+"""Triangles of a glTF primitive in world space, without those of zero area."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,10 +9,10 @@ from storage.errors import Rejected
 
 
 class WorldTriangles:
-    """The triangles of a primitive in one place."""
+    """World-space triangles of a placed primitive."""
 
     def __init__(self, primitive: PlacedPrimitive) -> None:
-        """Keep those that have an area; raises Rejected where positions are not finite."""
+        """Drop triangles without an area; raise Rejected where positions are not finite."""
         self._primitive = primitive
         corners = primitive.positions[primitive.faces]
         if not np.isfinite(corners).all():
@@ -22,13 +22,13 @@ class WorldTriangles:
         self._has_area = have_areas(wide, cross)
         self.num_without_area = int((~self._has_area).sum())
         self.positions = wide[self._has_area].astype(np.float32)
-        """[T, 3, 3]"""
+        """[T, 3, 3] corners in world space, in meters."""
         length = np.linalg.norm(cross[self._has_area], axis=1, keepdims=True)
         self._flat = np.repeat((cross[self._has_area] / length)[:, None], 3, axis=1)
 
     @property
     def colors(self) -> NDArray[np.float64] | None:
-        """Linear colors [T, 3, 3] of the corners; None where there are none."""
+        """Linear colors [T, 3, 3] of the corners; None where the file has none."""
         return self._select(self._primitive.colors)
 
     @property
@@ -43,10 +43,10 @@ class WorldTriangles:
         )
 
     def coordinates(self, number: int) -> NDArray[np.float64] | None:
-        """Return a set of texture coordinates [T, 3, 2], v up; None where there is none.
+        """Return a set of texture coordinates [T, 3, 2], v up; None where it is missing.
 
         Raises:
-            Rejected: they are not finite.
+            Rejected: a coordinate is not finite.
         """
         uv = self._select(self._primitive.coordinates(number))
         if uv is not None and not np.isfinite(uv).all():

@@ -1,6 +1,6 @@
-"""A glTF file as a scene: meshes in their places, materials with textures, cameras and lights.
+"""Reads a glTF file as a scene: placed meshes, materials with textures, cameras and lights.
 
-Only children with limits come here (pipeline.isolation): a stranger's file is read.
+Only child processes with limits import this (pipeline.isolation), since the file is untrusted.
 """
 
 from collections.abc import Iterator
@@ -12,24 +12,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.textured_pieces import (
-    TexturedPiece,
-    TexturedTriangles,
-    split_by_kind,
-    build_piece,
-    join_arrays,
-    build_textured_scene,
+from pipeline.exchange.gltf.cameras_and_lights import (
+    DIRECTIONAL,
+    build_sun_sky,
+    even_sky,
+    light_triangles,
+    read_camera,
 )
 from pipeline.exchange.gltf.materials import apply_material
 from pipeline.exchange.gltf.meshes import WorldTriangles
-from pipeline.exchange.gltf.cameras_and_lights import (
-    DIRECTIONAL,
-    read_camera,
-    even_sky,
-    light_triangles,
-    build_sun_sky,
-)
 from pipeline.exchange.pictures import MAX_PIXELS
+from pipeline.exchange.textured_pieces import (
+    TexturedPiece,
+    TexturedTriangles,
+    build_piece,
+    build_textured_scene,
+    join_arrays,
+    split_by_kind,
+)
 from pipeline.exchange.usd.foreign_cameras import fit_camera
 from pipeline.foreign.gltf.document import GltfDocument, refuse_malformed
 from pipeline.foreign.gltf.materials import DEFAULT, GltfMaterials
@@ -50,23 +50,23 @@ _LIMITS = ReadLimits(max_bytes=1 << 30, with_materials=True)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GltfScene:
-    """A scene and what could not be carried over."""
+    """A scene that was read, with its losses."""
 
     scene: Scene
-    """It passes `Scene.check`."""
+    """The scene, which passes `Scene.check`."""
     lost: tuple[str, ...]
-    """For people."""
+    """Sentences about parts of the file that were lost."""
 
 
 def read_gltf(path: Path, licence: str) -> GltfScene:
     """Read the default scene of a file.
 
     Args:
-        path: the file; buffers and pictures lie in its folder or in the file.
-        licence: of its objects and textures, which glTF has no word for.
+        path: the file; buffers and pictures are in its folder or in the file.
+        licence: licence of its objects and textures, which glTF cannot state.
 
     Raises:
-        TrilightError: the file is unusable, holds too much, or is none that a `Scene` can hold.
+        TrilightError: the file is unusable or too large, or a `Scene` cannot hold it.
     """
     try:
         with refuse_malformed("load_error", "the glTF tree is"):
@@ -79,7 +79,7 @@ def read_gltf(path: Path, licence: str) -> GltfScene:
 
 @dataclass(kw_only=True, eq=False)
 class _GltfReader:
-    """One file on its way to a scene."""
+    """State of reading one file: the document, names in use and losses."""
 
     document: GltfDocument
     name: str
@@ -88,7 +88,7 @@ class _GltfReader:
     names: dict[str, int] = field(default_factory=dict)
 
     def scene(self) -> GltfScene:
-        """Return what the file shows."""
+        """Build the scene of the file."""
         tree = self.document.tree
         nodes = list(placed_nodes(tree))
         visible = [placed for placed in nodes if placed.is_visible]
@@ -166,7 +166,7 @@ class _GltfReader:
         return apply_material(self._material(number), triangles, source, self.lost)
 
     def _light(self, placed: PlacedNode) -> dict[str, Any] | None:
-        """Return the JSON of the light of a node; None where it has none."""
+        """Return the JSON of a node's light; None where it has none."""
         reference = extension(placed.node, "KHR_lights_punctual")
         if "light" not in reference:
             return None

@@ -1,7 +1,7 @@
-"""The pictures of a source's material, as maps of linear values over the coordinates of a mesh.
+"""Samples the pictures of a material as linear maps over the coordinates of a mesh.
 
-A material has one set of coordinates here: that of its first picture. A picture with others becomes
-its mean.
+A material has one set of coordinates here: that of its first picture. A picture with another set
+becomes its mean.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.linear_maps import Map, constant_map
-from pipeline.exchange.wrapping import shift_near_zero, expand_tiles, choose_tiles
+from pipeline.exchange.wrapping import choose_tiles, expand_tiles, shift_near_zero
 from pipeline.foreign.material import Slot, SourceMaterial
 
 SLOTS: Mapping[str, str] = {
@@ -22,20 +22,20 @@ SLOTS: Mapping[str, str] = {
     "specular_strength": "specular_strength_map",
     "glossiness": "glossiness",
 }
-"""Fields of `Seen`, and the slot of `SourceMaterial` that shows each."""
+"""Slot of `SourceMaterial` for each field of `Seen`."""
 
 Coordinates = Callable[[int], NDArray[np.float64] | None]
-"""Gives a set of texture coordinates [T, 3, 2] of a mesh by its number, v up."""
+"""Function from the number of a set to its texture coordinates [T, 3, 2], v up."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampledMaps:
-    """What the pictures of a material show over a mesh."""
+    """Linear maps of a material's pictures, and the coordinates of a mesh in them."""
 
     maps: Mapping[str, Map]
-    """By the field of `Seen`: [H, W, 4] linear, the bottom row first."""
+    """[H, W, 4] linear values by the field of `Seen`, the bottom row first."""
     uv: NDArray[np.float32] | None
-    """[T, 3, 2] where the maps are looked up; None where all are constants."""
+    """[T, 3, 2] coordinates in the maps; None where all maps are constants."""
 
 
 def sample_slots(
@@ -44,9 +44,9 @@ def sample_slots(
     """Return the maps of a material.
 
     Args:
-        material: whose first slot decides on coordinates.
-        coordinates: of the mesh.
-        lost: receives what cannot be carried over.
+        material: the material; its first slot decides on the coordinates.
+        coordinates: function that returns a set of coordinates of the mesh.
+        lost: receives a sentence for each loss.
     """
     stated = {name: getattr(material, field) for name, field in SLOTS.items()}
     slots: dict[str, Slot] = {name: slot for name, slot in stated.items() if slot is not None}
@@ -66,7 +66,8 @@ def sample_slots(
     maps = {name: constant_map(picture.mean(axis=(0, 1))) for name, picture in pictures.items()}
     if uv is None:
         return SampledMaps(maps=maps, uv=None)
-    tiles_by_axis, is_exact = [], True
+    tiles_by_axis = []
+    is_exact = True
     for axis in range(2):
         texels = max(pictures[name].shape[1 - axis] for name in same_chart)
         wraps = [slots[name].picture.wrap[axis] for name in same_chart]
@@ -88,5 +89,5 @@ def sample_slots(
 
 
 def _chart(slot: Slot) -> tuple[int, bytes, bytes]:
-    """Return what says where a picture lies."""
+    """Return a key that is equal for pictures with the same coordinates."""
     return (slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())

@@ -1,9 +1,9 @@
-"""A scene as GLB: one file that every modelling program, browser and game engine opens.
+"""Writes a scene as GLB, a single file for modeling programs, browsers and game engines.
 
-Our materials become dielectrics of glTF whose reading (pipeline.exchange.gltf.materials) gives ours
-again. The specular albedo F is the mean of Schlick's term, F0 + (F90 - F0)/21. The strength of
-KHR_materials_specular is F90: it is chosen as the strongest channel of F, which then reflects the
-same at every angle, as ours does; the tint gives the other channels. The base colour is
+Materials become glTF dielectrics that reading (pipeline.exchange.gltf.materials) converts back. The
+specular albedo F is the mean of Schlick's term, F0 + (F90 - F0)/21. The strength of
+KHR_materials_specular is F90. It is set to the strongest channel of F, which then reflects the same
+at every angle, as in Trilight; the tint gives the other channels. The base color is
 diffuse / (1 - F). Lamps are surfaces that emit (KHR_materials_emissive_strength).
 """
 
@@ -35,13 +35,13 @@ CARRIED = frozenset(
 """Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 _TO_Y_UP = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)
-"""Quaternion of the node below which all stands as it does in our world."""
+"""Quaternion of the root node, which rotates +Z up to the +Y up of glTF."""
 
 _USED = ["KHR_materials_specular", "KHR_materials_emissive_strength"]
 
 
 def write_gltf(path: Path, scene: Scene) -> tuple[str, ...]:
-    """Write a scene, and return what of CARRIED does not come back whole.
+    """Write a scene, and return sentences about members in CARRIED that lose something.
 
     Args:
         path: ends in `.glb`.
@@ -103,7 +103,8 @@ def _primitive(
     if scene.uv is None:
         vertices, indices = np.unique(corners, return_inverse=True)
     else:
-        vertices, indices = corners, np.arange(len(corners))
+        vertices = corners
+        indices = np.arange(len(corners))
     points = scene.vertex_positions[vertices].astype("<f4")
     bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
     normals = scene.vertex_normals[vertices].astype("<f4")
@@ -123,7 +124,8 @@ def _primitive(
 
 
 def _material(file: GlbFile, scene: Scene, row: int) -> dict[str, Any]:
-    values, maps = scene.materials[row], _maps(scene, row)
+    values = scene.materials[row]
+    maps = _maps(scene, row)
     diffuse, specular = resample_to_largest(maps["diffuse"], maps["specular"])
     strength = float(specular.max())
     base: Map = np.clip(diffuse / np.maximum(1 - specular, 1e-6), 0, 1).astype(np.float32)
@@ -156,7 +158,7 @@ def _material(file: GlbFile, scene: Scene, row: int) -> dict[str, Any]:
 
 
 def _maps(scene: Scene, row: int) -> Mapping[str, Map]:
-    """Return what a material says of each column that a texture may stand for."""
+    """Return the map of each column of a material that may be textured."""
     column_slices = {"diffuse": DIFFUSE, "specular": SPECULAR, "roughness": ROUGHNESS}
     maps = {name: constant_map(scene.materials[row, part]) for name, part in column_slices.items()}
     if scene.material_textures is not None:

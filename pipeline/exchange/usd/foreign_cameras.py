@@ -1,4 +1,4 @@
-"""Cameras of a USD stage as poses and angles of square pictures."""
+"""Reads the cameras of a USD stage as poses and angles of square pictures."""
 
 import math
 from collections.abc import Sequence
@@ -15,14 +15,15 @@ from storage.conventions import look_at_c2w
 _FOV_DEG = 40.0
 """Field of view of the camera that is added to a stage without cameras."""
 _SAME_LENS = 1e-5
-"""Relative difference up to which a lens is the one that Trilight wrote."""
+"""Relative tolerance for a lens that Trilight wrote."""
 
 
 def read_stage_cameras(
     placed: Sequence[Placed], time: Any, lost: list[str]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return poses [C, 4, 4] and full angles [C] in degrees; C is 0 where none can be used."""
-    poses, angles = [], []
+    """Return poses [C, 4, 4] and full angles [C] in degrees of the usable cameras."""
+    poses = []
+    angles = []
     for each in placed:
         pose_and_angle = _read_camera(each, time, lost)
         if pose_and_angle is not None:
@@ -34,9 +35,11 @@ def read_stage_cameras(
 def fit_camera(
     points: NDArray[np.float32],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return one camera that sees all points [N, 3], from above and from the side."""
-    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
-    center, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    """Return the pose and angle of a camera that sees all points [N, 3], obliquely from above."""
+    low = points.min(axis=0).astype(np.float64)
+    high = points.max(axis=0).astype(np.float64)
+    center = (low + high) / 2
+    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
     direction = np.array([0.6, -1.0, 0.6]) / np.linalg.norm([0.6, -1.0, 0.6])
     eye = center + direction * radius / math.sin(math.radians(_FOV_DEG) / 2)
     pose = look_at_c2w(eye=eye, target=center, up=[0, 0, 1])
@@ -48,7 +51,8 @@ def _read_camera(
 ) -> tuple[NDArray[np.float64], float] | None:
     from pxr import UsdGeom
 
-    camera, where = UsdGeom.Camera(placed.prim), placed.prim.GetPath()
+    camera = UsdGeom.Camera(placed.prim)
+    where = placed.prim.GetPath()
     lens = (
         camera.GetFocalLengthAttr(),
         camera.GetHorizontalApertureAttr(),
@@ -74,8 +78,9 @@ def _read_camera(
 
 
 def rigid_pose(matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return a place without its scale; None where it has no direction."""
-    backward, right = matrix[:3, 2], matrix[:3, 0]
+    """Return a transform [4, 4] without its scale; None where it has no direction."""
+    backward = matrix[:3, 2]
+    right = matrix[:3, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         backward = backward / np.linalg.norm(backward)
         right = right - backward * np.einsum("i,i->", right, backward)

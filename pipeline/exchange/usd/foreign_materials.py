@@ -1,9 +1,9 @@
-"""What a USD material comes to here: one row of material columns a triangle.
+"""Converts USD materials to one row of material columns for each triangle.
 
-UsdPreviewSurface in both workflows, and the constants of OpenPBR and Standard Surface where a
-material has no preview. Our BRDF has no Fresnel term: the specular albedo is what such a material
-reflects head-on, metals have no diffuse part, and the diffuse albedo gives way where both together
-would reflect more than they get. Coats, transparency and bumps are lost, and named.
+Supported are UsdPreviewSurface in both workflows, and the constants of OpenPBR and Standard Surface
+where a material has no preview. The BRDF of a scene has no Fresnel term: the specular albedo is the
+head-on reflectance of the material, metals have no diffuse albedo, and the diffuse albedo is
+lowered where both add up to more than 1. Coats, transparency and bumps are lost, with notes.
 """
 
 from collections.abc import Sequence
@@ -56,40 +56,40 @@ class SurfaceMaterials:
     """The materials and textures of the triangles of a mesh."""
 
     rows: NDArray[np.float32]
-    """[T, 10 or more]"""
+    """[T, 10 or more] material columns."""
     uv: NDArray[np.float32]
-    """[T, 3, 2] where textures are looked up."""
+    """[T, 3, 2] texture coordinates of the corners."""
     texture_set_index: NDArray[np.int64]
-    """[T] rows of `wardrobe`."""
+    """[T] index of each triangle into `texture_sets`."""
     texture_sets: tuple[TextureSet, ...]
-    """Textures by material."""
+    """Texture set of each material bound to the mesh."""
 
 
 def read_surface_materials(
     surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
 ) -> SurfaceMaterials:
-    """Return materials and textures of the triangles of a mesh.
+    """Read the materials and textures of the triangles of a mesh.
 
     Args:
         surface: the mesh.
-        time: of the values.
-        opened: the file; what is lost is noted there.
-        licence: of its textures.
+        time: time code of the values.
+        opened: the open file, which collects notes on losses.
+        licence: licence of its textures.
 
     Raises:
-        TrilightError: a texture is outside of the folder, on the network, or too large.
+        TrilightError: a texture is outside the folder, on the network, or too large.
     """
     count = len(surface.positions)
-    rows, uv = default_rows(count), np.zeros((count, 3, 2), np.float32)
-    texture_sets, texture_set_index = list[TextureSet](), np.zeros(count, np.int64)
+    rows = default_rows(count)
+    uv = np.zeros((count, 3, 2), np.float32)
+    texture_sets = list[TextureSet]()
+    texture_set_index = np.zeros(count, np.int64)
     for bound, polygons in read_bindings(surface.prim, time):
         chosen = np.isin(surface.cut.polygons, polygons) if polygons is not None else slice(None)
         part = _read_material_on_surface(bound, surface, time, opened, licence)
-        rows[chosen], uv[chosen], texture_set_index[chosen] = (
-            part.rows[chosen],
-            part.uv[chosen],
-            len(texture_sets),
-        )
+        rows[chosen] = part.rows[chosen]
+        uv[chosen] = part.uv[chosen]
+        texture_set_index[chosen] = len(texture_sets)
         texture_sets.append(part.texture_set)
     _limit_diffuse(rows, texture_set_index, texture_sets, surface, opened.lost)
     return SurfaceMaterials(
@@ -104,7 +104,7 @@ def _limit_diffuse(
     surface: TriangleSoup,
     lost: list[str],
 ) -> None:
-    """Lower diffuse albedos that, with the specular ones, would reflect more than they get."""
+    """Lower constant diffuse albedos where diffuse + specular is over 1."""
     is_plain = np.array([textures[:2] == (None, None) for textures in texture_sets])[
         texture_set_index
     ]
@@ -120,24 +120,25 @@ def _limit_diffuse(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _MaterialOnSurface:
-    """One material over a whole mesh."""
+    """One material evaluated on a whole mesh."""
 
     rows: NDArray[np.float32]  # [T, 10 or more]
     uv: NDArray[np.float32]  # [T, 3, 2]
-    texture_set: TextureSet  # its textures
+    texture_set: TextureSet  # textures of the material
 
 
 def _read_material_on_surface(
     material: Any, surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
 ) -> _MaterialOnSurface:
-    """Return a material over the whole mesh; its display colour without one."""
+    """Evaluate a material on the whole mesh; the display color replaces a missing one."""
     held = read_held_material(material, time) if material else None
-    known = () if held is None else ("specular",)  # Blender's level of it
+    known = () if held is None else ("specular",)  # Blender writes its specular level there
     stated = read_material(material, time, opened, known) if material else None
     if held is not None:
         opened.lost.append(_HELD)
     count = len(surface.positions)
-    rows, no_uv = default_rows(count), np.zeros((count, 3, 2), np.float32)
+    rows = default_rows(count)
+    no_uv = np.zeros((count, 3, 2), np.float32)
     if stated is None:
         rows[:] = _build_plain_rows(material, held, surface, time, opened.lost)
         return _MaterialOnSurface(rows=rows, uv=no_uv, texture_set=NO_TEXTURES)
@@ -155,7 +156,8 @@ def _read_material_on_surface(
         for name, texture in zip(TEXTURED, resolved_textures, strict=True)
     }
     for name, column in compute_varying_columns(inputs, mapped.textures).items():
-        rows[:, _COLUMNS[name]], varying[name] = column, None
+        rows[:, _COLUMNS[name]] = column
+        varying[name] = None
     _take_added_columns(rows, material, time, opened.lost)
     if held is not None:
         opened.lost += name_lost_columns(material)
@@ -169,7 +171,7 @@ def _read_material_on_surface(
 def _build_plain_rows(
     material: Any, held: HeldMaterial | None, surface: TriangleSoup, time: Any, lost: list[str]
 ) -> NDArray[np.float32]:
-    """Return rows [T, 10 or more] of a material without a shader: as held, or display colours."""
+    """Return rows [T, 10 or more] of a material without a shader: held values or display colors."""
     rows = default_rows(len(surface.positions))
     if held is not None:
         lost.append(f"{material.GetPath()}: no shader; what Trilight wrote on it taken")
@@ -178,14 +180,15 @@ def _build_plain_rows(
     if material:
         lost.append(f"{material.GetPath()}: no shader that is understood; display colour taken")
     rows[:, DIFFUSE] = _display_color(surface, time)
-    rows[:, SPECULAR], rows[:, ROUGHNESS] = 0.04, 0.5
+    rows[:, SPECULAR] = 0.04
+    rows[:, ROUGHNESS] = 0.5
     return rows
 
 
 def _take_added_columns(
     rows: NDArray[np.float32], material: Any, time: Any, lost: list[str]
 ) -> None:
-    """Take the columns beyond the published ones from the attributes that Trilight writes."""
+    """Fill the columns beyond the published ones from the attributes that Trilight writes."""
     columns = {column.name: (column, part) for column, part in laid_out()}
     for attribute in material.GetPrim().GetAttributes():
         name = added_column(attribute.GetName())

@@ -1,4 +1,4 @@
-"""Makes a `Scene` of the placed prims of a stage."""
+"""Builds a `Scene` from the placed prims of a USD stage."""
 
 import math
 from collections.abc import Sequence
@@ -11,14 +11,14 @@ from pipeline.exchange.textured_pieces import (
     NO_TEXTURES,
     TexturedPiece,
     TexturedTriangles,
-    split_by_kind,
     build_piece,
-    join_arrays,
     build_textured_scene,
+    join_arrays,
+    split_by_kind,
 )
 from pipeline.exchange.usd.dome import read_foreign_dome
 from pipeline.exchange.usd.foreign_cameras import fit_camera, read_stage_cameras
-from pipeline.exchange.usd.foreign_lights import light_triangles, compute_radiance
+from pipeline.exchange.usd.foreign_lights import compute_radiance, light_triangles
 from pipeline.exchange.usd.foreign_materials import read_surface_materials
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup, read_mesh
 from pipeline.exchange.usd.names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
@@ -33,15 +33,15 @@ from storage.records.scene import ObjectKind, Scene, SceneObject
 
 MAX_TRIANGLES = 1_000_000
 MAX_ROWS = 1 << 16
-"""Maximum number of objects and of materials in a scene."""
+"""Maximum number of objects, and of materials, in a scene."""
 
 
 def build_stage_scene(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Scene:
-    """Return the scene that a stage shows at a time; what is lost goes to `opened.lost`.
+    """Build the scene of a stage at a time; `opened.lost` receives notes on losses.
 
     Raises:
-        TrilightError: too much of something, arrays that contradict each other, or no triangle or
-            no light at all.
+        TrilightError: a count exceeds its maximum, arrays contradict each other, or the stage lacks
+            triangles or light.
     """
     placed = sorted(placed_prims(stage, time, opened.lost), key=_read_row)
     pieces: list[TexturedPiece] = []
@@ -72,7 +72,7 @@ def build_stage_scene(stage: Any, time: Any, opened: OpenedUsd, licence: str) ->
 
 
 def _read_row(each: Placed) -> float:
-    """Return the row that Trilight once wrote on an object or camera; infinity for any other."""
+    """Return the row that Trilight wrote on an object or camera; infinity for other prims."""
     prim = each.prim
     row = prim.GetAttribute(INDEX).Get()
     if prim.HasAttribute(FOV_DEG):
@@ -107,7 +107,7 @@ def _build_scene(
 def _read_environment(
     placed: Sequence[Placed], time: Any, opened: OpenedUsd, licence: str
 ) -> Environment | None:
-    """Return that of the first dome that can be read; others are noted."""
+    """Return the environment of the first readable dome; note the others."""
     domes = [each for each in placed if each.prim.GetTypeName() in DOMES]
     sky = None
     for each in domes:
@@ -181,7 +181,7 @@ def _build_mesh(
 def _split(
     each: Placed, triangles: TexturedTriangles, licence: str, names: set[str]
 ) -> list[TexturedPiece]:
-    """Return the part of a mesh that reflects, and the part that emits, where there are both."""
+    """Build an object of the triangles that reflect, and one of those that emit."""
     return [
         build_piece(_entry(each.prim, kind, licence, names), part)
         for kind, part in split_by_kind(triangles)
@@ -189,11 +189,12 @@ def _split(
 
 
 def _entry(prim: Any, kind: ObjectKind, licence: str, names: set[str]) -> SceneObject:
-    """Return what is known of a prim: what Trilight once wrote on it, or its name."""
+    """Return the object entry of a prim: values that Trilight wrote on it, or its name."""
     texts = {field: prim.GetAttribute(name).Get() for field, name in OBJECT_TEXTS.items()}
     known = {field: text for field, text in texts.items() if isinstance(text, str)}
     base = known.get("name") or prim.GetName()
-    name, count = base, 1
+    name = base
+    count = 1
     while name in names:
         count += 1
         name = f"{base}.{count}"

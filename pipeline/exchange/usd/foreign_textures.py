@@ -1,7 +1,7 @@
-"""Textures of a USD material: pictures with their colour space, channel, scale and wrapping.
+"""Reads textures of a USD material: pictures with color space, channel, scale and wrap modes.
 
-Where nothing is scaled, the bytes of a picture stay as they are. What a colour space says is taken
-as said; without one, colours in 8 bits are sRGB-encoded, as USD states.
+Without a scale, the bytes of a picture stay unchanged. A stated color space is used; without one,
+colors in 8 bits are sRGB-encoded, as USD specifies.
 """
 
 from dataclasses import dataclass
@@ -17,32 +17,32 @@ from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart, asset_bytes
 from storage.records.texture import MapSource, Texture
 
 _STEPS = 8
-"""Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 of them in all."""
+"""Number of points along an edge of the grid over a triangle; (8 + 1) 8 / 2 in all."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ForeignTexture:
-    """A picture as a material uses it."""
+    """A picture with the settings of its texture node."""
 
     pixels: Pixels
     """[H, W, 1 to 4] as stored, the bottom row first."""
     is_srgb: bool
-    """Whether its colours are sRGB-encoded; alpha is not."""
+    """True where colors are sRGB-encoded; alpha is always linear."""
     wrap: tuple[Wrap, Wrap]
     """Wrap modes along s and t."""
     scale: NDArray[np.float32]
-    """[4]"""
+    """[4] factors of the linear RGBA values."""
     bias: NDArray[np.float32]
-    """[4]"""
+    """[4] offsets that are added after `scale`."""
     chart: UvChart
-    """Where it is looked up."""
+    """Texture coordinates at which the picture is looked up."""
     output: str
-    """rgb, r, g, b or a: what is connected."""
+    """Connected output of the node: rgb, r, g, b or a."""
 
     def texture(self, channels: int, source: MapSource, lost: list[str]) -> Texture:
-        """Return what is connected, as a texture of one or of three channels.
+        """Return the connected output as a texture of one or three channels.
 
-        It does not repeat yet as the picture wraps.
+        The wrap modes of the picture are not applied yet.
         """
         is_plain = (self.scale == 1).all() and (self.bias == 0).all()
         if self.pixels.dtype == np.uint8 and is_plain:
@@ -70,7 +70,7 @@ class ForeignTexture:
         return self.output == "a"
 
     def _scale_texels(self) -> NDArray[np.float32]:
-        """Return linear values [H, W, 4], scaled and moved."""
+        """Return linear RGBA values [H, W, 4] with scale and bias applied."""
         values = self.pixels.astype(np.float32)
         if self.pixels.dtype == np.uint8:
             values = values / np.float32(255)
@@ -85,13 +85,14 @@ class ForeignTexture:
 
 
 def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
-    """Return the texture of a node, or None with a note where its picture is not readable.
+    """Read the texture of a node; return None, with a note, where its picture is unreadable.
 
     Raises:
-        TrilightError: it is too large.
+        TrilightError: the picture is too large.
     """
     data = None if node.resolved is None else asset_bytes(node.resolved, MAX_BYTES)
-    name, is_color = Path(node.named).name, node.colour_space != "raw"
+    name = Path(node.named).name
+    is_color = node.colour_space != "raw"
     pixels = decode_pixels(data, name, opened.lost, is_color=is_color) if data else None
     if pixels is None:
         opened.lost.append(
@@ -113,7 +114,7 @@ def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
 
 
 def _channels(values: NDArray, output: str, channels: int, opaque: int) -> NDArray:
-    """Return one or three channels [H, W, 1 or 3] of a picture for what is connected."""
+    """Return one or three channels [H, W, 1 or 3] of a picture for the connected output."""
     count = values.shape[2]
     if output == "a":
         alpha = values[..., -1:] if count in (2, 4) else np.full_like(values[..., :1], opaque)
@@ -130,7 +131,7 @@ def _linear(encoded: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _wrap_texels(at: NDArray[np.float64], size: int, mode: str) -> NDArray[np.int64]:
-    """Return the texel of coordinates; `black` is treated as `clamp`."""
+    """Return the texel index at coordinates; `black` is treated as `clamp`."""
     if mode == "mirror":
         at = 1 - np.abs(np.mod(at, 2) - 1)
     elif mode in ("clamp", "black"):

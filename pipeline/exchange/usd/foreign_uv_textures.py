@@ -1,7 +1,7 @@
-"""The textures of one USD material over one mesh, as textures that repeat over one set of uv.
+"""Converts the textures of a USD material to repeating textures over one set of coordinates.
 
 A material has the coordinates of its first texture. A texture with other coordinates becomes its
-mean, and so do all where the mesh has no coordinates.
+mean, and so do all textures where the mesh has no coordinates.
 """
 
 from collections.abc import Mapping
@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup
 from pipeline.exchange.usd.foreign_textures import ForeignTexture
-from pipeline.exchange.wrapping import shift_near_zero, expand_tiles, choose_tiles
+from pipeline.exchange.wrapping import choose_tiles, expand_tiles, shift_near_zero
 from storage.records.texture import MapSource, Texture
 
 CHANNELS = {"diffuseColor": 3, "specularColor": 3, "metallic": 1, "roughness": 1, "ior": 1}
-"""Inputs that may be textured, in the order in which they decide on coordinates."""
+"""Channel count of each input that may be textured; the first textured one decides on uv."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class UvTextures:
-    """What is looked up, and where."""
+    """Textures of a material, and the coordinates at which a mesh looks them up."""
 
     textures: Mapping[str, Texture]
-    """By the names of inputs; of one texel where the mean stands."""
+    """Textures by name of the input; one texel where the mean replaces a texture."""
     uv: NDArray[np.float32] | None
-    """[T, 3, 2]; None where nothing is looked up."""
+    """[T, 3, 2] texture coordinates; None where no texture varies."""
 
 
 def build_uv_textures(
@@ -37,14 +37,14 @@ def build_uv_textures(
     source: MapSource,
     lost: list[str],
 ) -> UvTextures:
-    """Return the textures of a material.
+    """Build the textures of a material on a mesh.
 
     Args:
-        found: pictures by the names of inputs, as in CHANNELS.
+        foreign_textures: pictures by name of the input, as in CHANNELS.
         surface: the mesh.
-        time: of its coordinates.
-        source: names and rights of the textures.
-        lost: receives what cannot be carried over.
+        time: time code of its coordinates.
+        source: name and rights of the textures.
+        lost: receives a sentence for each loss.
     """
     names = [name for name in CHANNELS if name in foreign_textures]
     where = surface.prim.GetPath()
@@ -59,7 +59,8 @@ def build_uv_textures(
     same_chart = [name for name in names if foreign_textures[name].chart == chart]
     if len(same_chart) < len(names):
         lost.append(f"{where}: textures of one material with several coordinates; means taken")
-    tiles_by_axis, is_exact = [], True
+    tiles_by_axis = []
+    is_exact = True
     for axis in range(2):
         wraps = [foreign_textures[name].wrap[axis] for name in same_chart]
         most_texels = max(plain[name].texels.shape[1 - axis] for name in same_chart)

@@ -1,4 +1,4 @@
-"""The materials and textures of a scene that Trilight wrote, from the prims of a layer."""
+"""Reads the materials and textures of a scene that Trilight wrote, from the prims of a layer."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,10 +10,10 @@ from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.authoring import has_attributes
 from pipeline.exchange.usd.exact_layer import (
-    require_children,
-    drop_absent,
     children_by_row,
+    drop_absent,
     require,
+    require_children,
     require_plain,
 )
 from pipeline.exchange.usd.texture_files import decode_texture
@@ -25,31 +25,31 @@ from storage.records.material import PUBLISHED_COLUMNS, declared_column, default
 from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
 
 _ADDED = {"inputs:ior", COAT_ROUGHNESS, "outputs:r", *map(names.texture_attribute, TEXTURED)}
-"""Properties that files of an older Trilight have not; its roughness textures have `outputs:r`."""
+"""Properties that older Trilights did not write; their roughness textures have `outputs:r`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ExactMaterials:
-    """What the prims of all materials say."""
+    """Material arrays of a scene, as the prims of all materials hold them."""
 
     rows: NDArray[np.float32]
-    """[M, 10 or more] as `Scene.materials`."""
+    """[M, 10 or more] rows of `Scene.materials`."""
     textures: tuple[Texture, ...]
-    """As `Scene.textures`."""
+    """Distinct textures, the value of `Scene.textures`."""
     material_textures: NDArray[np.int32] | None
-    """[M, 3] as `Scene.material_textures`."""
+    """[M, 3] the value of `Scene.material_textures`; None without textures."""
 
 
 def read_exact_materials(folder: Any, opened: OpenedUsd | None) -> ExactMaterials:
-    """Return the materials below a prim.
+    """Read the materials below a prim.
 
     Args:
         folder: the prim.
-        opened: the way to the files of textures; without it, textured materials are not read.
+        opened: the open file, which resolves texture files; None refuses textured materials.
 
     Raises:
         UndeclaredColumn: a material has a column that is not declared here.
-        Changed, LookupError, TypeError, ValueError: not as export writes them.
+        Changed, LookupError, TypeError, ValueError: the materials are not as export writes them.
     """
     prims = children_by_row(folder, names.material_name)
     rows = default_rows(len(prims))
@@ -74,8 +74,9 @@ def read_exact_materials(folder: Any, opened: OpenedUsd | None) -> ExactMaterial
 def _require_prims(
     prim: Any, values: NDArray[np.float32], columns: tuple[str, ...], used: Used
 ) -> None:
-    """Require that a material's prims are what export writes for such a row, and no more."""
-    tables, links = material_tables(values, columns, used), material_links(list(used))
+    """Require that a material's prims are exactly those that export writes for its row."""
+    tables = material_tables(values, columns, used)
+    links = material_links(list(used))
     require_children(
         prim, {relative_path.removeprefix("/") for relative_path in tables if relative_path}
     )
@@ -93,7 +94,7 @@ def _require_prims(
 
 
 def _read_textures(prim: Any, textures: dict[int, Texture], opened: OpenedUsd | None) -> Used:
-    """Return the textures of a material, and add those that are new to `textures`."""
+    """Return the textures of a material, and add new ones to `textures`."""
     used = {}
     for name, shader in SHADERS.items():
         if shader not in prim.nameChildren:
@@ -124,7 +125,7 @@ def _read_texture(attributes: Any, layer: Any, opened: OpenedUsd) -> Texture:
 
 
 def _list_columns(prim: Any) -> tuple[str, ...]:
-    """Return the columns that a material has; raises UndeclaredColumn."""
+    """Return the column names of a material; raises UndeclaredColumn."""
     added_or_none = (names.added_column(attribute.name) for attribute in prim.attributes)
     added = [name for name in added_or_none if name is not None]
     return (*PUBLISHED_COLUMNS, *(declared_column(name).name for name in added))

@@ -1,8 +1,8 @@
-"""A scene that Trilight wrote, read back from its layer bit for bit, without composing a stage.
+"""Reads a scene that Trilight wrote from its layer, bit for bit, without composing a stage.
 
-After an edit - a mesh moved, a colour picked, a light added - the exact attributes of a file are
-stale. So everything that export writes is compared with the file, and the geometry with its digest;
-where anything differs, this reader returns None and the file is read as a foreign one
+After an edit (a mesh moved, a color changed, a light added) the exact attributes of a file are
+stale. So this reader compares the file with everything that export writes, and the geometry with
+its digest. Where anything differs, it returns None and the file is read as a foreign one
 (pipeline.exchange.usd.foreign_scene).
 """
 
@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.authoring import has_attributes
-from pipeline.exchange.usd.dome import read_exact_dome, dome_attributes, sky_attributes
+from pipeline.exchange.usd.dome import dome_attributes, read_exact_dome, sky_attributes
 from pipeline.exchange.usd.exact_layer import (
     Changed,
-    require_children,
-    drop_absent,
     children_by_row,
-    require,
-    require_plain,
-    read_vectors,
+    drop_absent,
     read_integers,
+    read_vectors,
+    require,
+    require_children,
+    require_plain,
 )
 from pipeline.exchange.usd.read_exact_materials import read_exact_materials
 from pipeline.exchange.usd.write import ENVIRONMENT, camera_attributes
@@ -57,26 +57,26 @@ def scene_keys(layer: Any) -> list[str] | None:
     if names.VARIANT_SET not in root.variantSets or len(root.nameChildren):
         return None
     keys: list[str] = list(root.variantSets[names.VARIANT_SET].variants.keys())
-    ours = all(_find_root(layer, key) is not None for key in keys)
-    return keys if ours and keys else None
+    all_marked = all(_find_root(layer, key) is not None for key in keys)
+    return keys if all_marked and keys else None
 
 
 def is_marked(layer: Any, key: str | None = None) -> bool:
-    """Return whether a layer claims to be of Trilight's making."""
+    """Return whether a layer has the marks of a scene that Trilight wrote."""
     return _find_root(layer, key) is not None
 
 
 def read_exact(layer: Any, key: str | None = None, opened: OpenedUsd | None = None) -> Scene | None:
-    """Return the scene of a layer, or that under `key` of a shard; None where it is not as written.
+    """Read the scene of a layer or of a shard's key; return None where it was changed.
 
     Args:
-        layer: of one scene, or of a shard.
-        key: which of a shard.
-        opened: the way to files of maps; without it, a scene that has any is not read.
+        layer: the layer of one scene or of a shard.
+        key: key of the scene in a shard.
+        opened: the open file, which resolves map files; None refuses scenes with maps.
 
     Raises:
-        TrilightError: it was written by a Trilight that this one cannot read, has a material column
-            that is not declared here, or the scene breaks a law.
+        TrilightError: the file has an unsupported version or an undeclared material column, or the
+            scene breaks a law (`Scene.check`).
     """
     root = _find_root(layer, key)
     if root is None or len(layer.subLayerPaths) or len(layer.rootPrims) != 1:
@@ -170,7 +170,7 @@ def _read_object(prim: Any) -> SceneObject:
 def _read_vertices(
     root: Any, meshes: list[Any], sky: Environment | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return positions and normals [V, 3] from the rows that meshes and root say are theirs."""
+    """Return positions and normals [V, 3], placed by the vertex rows of meshes and root."""
     expected = {names.VERSION, names.DIGEST, names.PROVENANCE}
     expected |= {names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS}
     attributes = drop_absent(root, sky_attributes(sky), {names.SKY_SOURCE})
@@ -182,7 +182,8 @@ def _read_vertices(
     require(len(rows) > 0 and rows.min() >= 0)
     count = int(rows.max()) + 1
     require(count <= len(rows) and len(np.unique(rows)) == count)
-    positions, normals = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
+    positions = np.zeros((count, 3), np.float32)
+    normals = np.zeros((count, 3), np.float32)
     unused = read_vectors(root, names.UNUSED_POSITIONS)
     positions[rows] = np.concatenate([unused, *(_read_positions(mesh) for mesh in meshes)])
     normals[rows] = np.concatenate([read_vectors(prim, name) for prim, _, name in kinds])
@@ -190,7 +191,7 @@ def _read_vertices(
 
 
 def _read_positions(mesh: Any) -> NDArray[np.float32]:
-    """Return where the vertices [V, 3] of a mesh are; meshes of old files stand at the origin."""
+    """Return the positions [V, 3] of a mesh's vertices; meshes of old files have no center."""
     points = read_vectors(mesh, "points")
     if CENTER not in mesh.attributes:
         return points
@@ -211,12 +212,11 @@ def _read_faces(
     count = len(rows)
     require(np.array_equal(np.sort(rows), np.arange(count)))
     faces = np.zeros((count, 3), np.uint32)
-    material_index, object_index = np.zeros(count, np.uint16), np.zeros(count, np.uint16)
+    material_index = np.zeros(count, np.uint16)
+    object_index = np.zeros(count, np.uint16)
     for mesh in meshes:
-        face_rows, vertex_rows = (
-            read_integers(mesh, names.FACE_ROWS),
-            read_integers(mesh, names.VERTEX_ROWS),
-        )
+        face_rows = read_integers(mesh, names.FACE_ROWS)
+        vertex_rows = read_integers(mesh, names.VERTEX_ROWS)
         require(np.array_equal(read_integers(mesh, "faceVertexCounts"), np.full(len(face_rows), 3)))
         faces[face_rows] = vertex_rows[read_integers(mesh, "faceVertexIndices").reshape(-1, 3)]
         object_index[face_rows] = mesh.attributes[names.INDEX].default
@@ -245,7 +245,7 @@ def _read_coordinates(meshes: list[Any], count: int) -> NDArray[np.float32]:
 
 
 def _bound_material_row(prim: Any) -> int:
-    """Return the row of the material that is bound to a prim, if it is one of the same scene."""
+    """Return the row of the material that is bound to a prim; require the same scene."""
     (target,) = prim.relationships["material:binding"].targetPathList.explicitItems
     scene_path = str(prim.path.StripAllVariantSelections()).partition("/Objects/")[0]
     row = int(target.name.rpartition("_")[2])
@@ -255,7 +255,8 @@ def _bound_material_row(prim: Any) -> int:
 
 def _read_cameras(folder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     prims = children_by_row(folder, names.camera_name)
-    c2w, fov_deg = np.zeros((len(prims), 4, 4), np.float32), np.zeros(len(prims), np.float32)
+    c2w = np.zeros((len(prims), 4, 4), np.float32)
+    fov_deg = np.zeros(len(prims), np.float32)
     for row, prim in enumerate(prims):
         c2w[row] = np.array(prim.attributes["xformOp:transform"].default).T
         fov_deg[row] = prim.attributes[names.FOV_DEG].default

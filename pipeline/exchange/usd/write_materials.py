@@ -1,14 +1,14 @@
-"""A material row as USD: exact attributes, UsdPreviewSurface, and OpenPBR for MaterialX renderers.
+"""Writes material rows to USD: exact attributes, UsdPreviewSurface, and OpenPBR for MaterialX.
 
-Our BRDF is Lambert + specular x GGX without a Fresnel term. UsdPreviewSurface in its specular
-workflow takes the same albedos and roughness, but lets its specular albedo rise to 1 at grazing
-angles. Blender multiplies that albedo by what the index of refraction reflects head-on, which
-nothing else reads here: the index is one that reflects almost all. OpenPBR's base has one index of
-refraction: it is chosen so that the strongest channel reflects our specular albedo head-on, and the
-tint gives the others. So both look alike and neither is equal; the exact values are in the
-attributes. Textures are connected to the preview (pipeline.exchange.usd.write_textures).
+The BRDF of a scene is Lambert + specular x GGX without a Fresnel term. UsdPreviewSurface in its
+specular workflow has the same albedos and roughness, but its specular albedo rises to 1 at grazing
+angles. Blender multiplies that albedo by the head-on reflectance of the index of refraction, which
+other programs ignore; so the written index reflects almost everything. OpenPBR's base has one index
+of refraction: it is set so that the strongest channel reflects the specular albedo head-on, and the
+tint gives the other channels. Both shaders look similar and neither is equal; the attributes hold
+the exact values. Textures are connected to the preview (pipeline.exchange.usd.write_textures).
 
-OpenPBR counts emission in nits and UsdPreviewSurface as a plain colour: both get our radiance.
+OpenPBR counts emission in nits and UsdPreviewSurface as a plain color: both get the radiance.
 """
 
 import math
@@ -53,17 +53,17 @@ from storage.records.scene import Scene
 Color = tuple[float, float, float]
 
 INDEX_OF_REFRACTION = 1000.0
-"""Of the preview; 1000 is the most that Blender takes, and reflects 0.996 head-on."""
+"""Index of refraction of the preview; 1000 is Blender's maximum and reflects 0.996 head-on."""
 
 _MOST_REFLECTING = 0.98
-"""Head-on reflectance beyond which no index of refraction is sought: 0.98 needs 199."""
+"""Maximum head-on reflectance that sets the index of refraction: 0.98 needs 199."""
 
 
 def add_materials(layer: Any, folder: str, scene: Scene) -> None:
     """Write a prim for each material row below `folder`.
 
-    Copies of the first prim without textures get their values: that takes half the time of writing
-    each anew.
+    Rows without textures are copies of the first such prim with other values, which takes half the
+    time of writing each prim.
     """
     from pxr import Sdf
 
@@ -71,7 +71,8 @@ def add_materials(layer: Any, folder: str, scene: Scene) -> None:
     first = None
     names = stored_columns(scene.materials)
     for row, values in enumerate(scene.materials):
-        path, used = f"{folder}/{material_name(row)}", used_textures(scene, row)
+        path = f"{folder}/{material_name(row)}"
+        used = used_textures(scene, row)
         if used or first is None:
             _add_material(layer, path, material_tables(values, names, used), list(used))
             first = first if used else path
@@ -87,12 +88,12 @@ def add_materials(layer: Any, folder: str, scene: Scene) -> None:
 def material_tables(
     values: NDArray[np.float32], columns: Sequence[str], used: Used | None = None
 ) -> dict[str, Attributes]:
-    """Return the attributes of the prims of a material row, by their place below it.
+    """Return the attributes of a material row's prims, by their path below the material.
 
     Args:
         values: the row, with all declared columns.
-        columns: names of those that the file holds (storage.records.material.stored_columns).
-        used: its textures; none by default.
+        columns: names of the stored columns (storage.records.material.stored_columns).
+        used: textures of the row; none by default.
     """
     diffuse, specular, emission = (_rgb(values[part]) for part in (DIFFUSE, SPECULAR, EMISSION))
     roughness = float(values[ROUGHNESS])
@@ -115,7 +116,8 @@ def material_tables(
 
 
 def _openpbr(diffuse: Color, specular: Color, roughness: float, emission: Color) -> Attributes:
-    max_specular, max_emission = max(specular), max(emission)
+    max_specular = max(specular)
+    max_emission = max(emission)
     root = math.sqrt(min(max_specular, _MOST_REFLECTING))
     return {
         "info:id": ("uniform token", "ND_open_pbr_surface_surfaceshader"),
@@ -164,7 +166,7 @@ def _rgb(values: NDArray[np.float32]) -> Color:
 
 
 def _divide_by_largest(rgb: Color, largest: float) -> Color:
-    """Return a colour divided by its largest channel; white for black."""
+    """Return a color divided by its largest channel; white for black."""
     if largest <= 0:
         return 1.0, 1.0, 1.0
     red, green, blue = (_round_to_float32(value / largest) for value in rgb)
