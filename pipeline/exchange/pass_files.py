@@ -18,7 +18,7 @@ _RESOLUTION = 256
 
 
 @dataclass(frozen=True, kw_only=True)
-class PassOptions:
+class PassFileOptions:
     """Options of `write_passes`: the passes and views to write."""
 
     names: Sequence[str]
@@ -44,7 +44,7 @@ class _NamedScene:
 
 
 def write_passes(
-    source: str, out: Path, options: PassOptions, *, done: Callable[[Path], None]
+    source: str, out: Path, options: PassFileOptions, *, done: Callable[[Path], None]
 ) -> tuple[str, ...]:
     """Write `SCENE.VIEW.passes.exr` into a folder for each chosen view; return notes.
 

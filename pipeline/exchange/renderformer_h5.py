@@ -155,7 +155,7 @@ def note_reflecting_emitters(scene: Scene) -> tuple[str, ...]:
     """Return a note that a written file changes the albedos of emitters, where they reflect."""
     emits = (scene.materials[:, EMISSION] > 0).any(axis=1)
     reflects = (scene.materials[emits][:, : SPECULAR.stop] > 0).any(axis=1)
-    return (f"what {int(reflects.sum())} emitting materials reflect",) if reflects.any() else ()
+    return (f"albedos of {int(reflects.sum())} emitting materials",) if reflects.any() else ()
 
 
 def _write(file: Any, name: str, values: NDArray) -> None:
@@ -272,7 +272,7 @@ def _pictures(file: Any, num_views: int, lost: list[str]) -> NDArray[np.float32]
     array = plain_array(file, "img", (num_views, None, None, 4), MAX_RESOLUTION)
     rgba = read_whole(array, MAX_PICTURE_BYTES)
     if (rgba[..., 3] != 1).any():
-        lost.append("alpha of pictures: they stand before black")
+        lost.append("alpha of pictures: composited over black")
     return rgba[..., :3].copy()
 
 
@@ -314,7 +314,7 @@ def _palette(
     materials[:, REFLECTING] = rows[:, REFLECTING]
     materials[:, EMISSION] = rows[:, TEXTURE_EMISSION]
     if (materials[emits, REFLECTING] != _PUBLISHED_EMITTER).any():
-        lost.append("what emitters reflect: ours reflect nothing")
+        lost.append("albedos of emitters: emitters of a scene reflect nothing")
     materials[emits, REFLECTING] = [0, 0, 0, 0, 0, 0, 1]
     materials[varies, REFLECTING] = 0  # one row for all of them, since their cells hold the values
     _limit_rounded_albedos(materials, lost)

@@ -238,7 +238,7 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
         smooth = _is_smooth(scene, faces, normals)
         objects[name] = _object_entry(path, scene.materials[material], smooth)
         if smooth and not _is_reproduced(scene, faces, normals):
-            lost.append(f"{name}: shading normals; readers make their own")
+            lost.append(f"{name}: shading normals, which readers compute again")
     if not any(max(entry["material"]["emissive"]) > 0 for entry in objects.values()):
         raise TrilightError("scene: no emitter has an area; a scene file needs at least one.")
     data = json.dumps(
@@ -359,7 +359,9 @@ def _losses(scene: Scene) -> list[str]:
     num_objects = int((parts > 1).sum())
     num_parts = int(parts[parts > 1].sum())
     if num_objects:
-        losses.append(f"that {num_parts} of its objects were {num_objects}, of several materials")
+        losses.append(
+            f"the grouping of {num_parts} objects that were {num_objects}, of several materials"
+        )
     solid = len(without_slivers(scene.vertex_positions, scene.faces))
     if solid < scene.num_triangles:
         losses.append(

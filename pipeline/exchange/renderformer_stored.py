@@ -95,10 +95,10 @@ def _texture_rows(
     varies = differs[:, REFLECTING].any(axis=1) & ~emits
     glows = differs[:, TEXTURE_EMISSION].any(axis=1)
     if varies.sum() > MAX_VARYING:
-        lost.append(f"textures that vary, of {varies.sum()} triangles: their mean was taken")
+        lost.append(f"varying textures of {varies.sum()} triangles: replaced by their means")
         varies[:] = False
     if glows.any():
-        lost.append(f"emission that varies, of {glows.sum()} triangles: its mean was taken")
+        lost.append(f"varying emission of {glows.sum()} triangles: replaced by its mean")
     bumpy = (low[:, TEXTURE_NORMAL] != np.array(FLAT_NORMAL, np.float32)).any(axis=1)
     if bumpy.any():
         lost.append(f"normal textures of {bumpy.sum()} triangles")

@@ -56,7 +56,7 @@ def read_grey_textures(file: Any, count: int, lost: list[str]) -> StoredTextures
     rows[:, TEXTURE_EMISSION] = light
     lost.append(
         f"materials: nine channels of a learned code for a BRDF, which no formula turns into "
-        f"albedos; a diffuse grey of {_GREY} was taken for all {count} triangles"
+        f"albedos; all {count} triangles are a diffuse grey of {_GREY}"
     )
     return StoredTextures(rows=rows, varies=np.zeros(count, np.bool_), cells=None)
 

@@ -43,7 +43,7 @@ def read_camera(
         lost.append("a camera without perspective")
         return None
     if not math.isclose(read_number(lens.get("aspectRatio", 1), "aspectRatio"), 1, rel_tol=1e-3):
-        lost.append("pictures are square here: the vertical angle of a camera was taken")
+        lost.append("pictures are square: the vertical angle of a camera was used")
     return pose, angle
 
 
@@ -78,7 +78,7 @@ def light_triangles(
     rows[:, ROUGHNESS] = 1
     rows[:, EMISSION] = np.clip(_read_light(light) / visible_area, 0, 1e9)
     if not rows[:, EMISSION].any() or not np.isfinite(positions).all():
-        lost.append("lights that shine no light")
+        lost.append("lights without emission")
         return None
     return TexturedTriangles(
         positions=positions,
@@ -118,7 +118,7 @@ def build_sun_sky(
         angle = np.square(np.pi / _SUN_ROWS) * np.sin(np.pi * (row + 0.5) / _SUN_ROWS)
         radiance[row, int(u * 2 * _SUN_ROWS) % (2 * _SUN_ROWS)] += _read_light(light) / angle
     if not np.isfinite(radiance).all() or not (radiance > 0).any():
-        lost.extend(["lights that shine no light"] if suns else [])
+        lost.extend(["lights without emission"] if suns else [])
         return None
     lost.append("directional lights: suns of 0.7 degrees with their lux, in units of radiance")
     return Environment(

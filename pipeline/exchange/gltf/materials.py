@@ -133,7 +133,7 @@ def _tints(
     if colors is None or not count:
         return np.ones((1, 3)), np.zeros(count, np.int64)
     if np.ptp(colors, axis=1).max() > 1 / 255:
-        lost.append("colors of vertices: the mean of each triangle")
+        lost.append("colors of vertices: replaced by the mean of each triangle")
     plain = np.clip(np.nan_to_num(colors.mean(axis=1)), 0, 1)
     tints, tint_index = _group_colors(plain, np.round(plain * 1e6).astype(np.int64))
     coded = srgb8(plain).astype(np.int64)
@@ -175,6 +175,6 @@ def _emission(material: SourceMaterial, lost: list[str]) -> NDArray[np.float64]:
     radiance: NDArray[np.float64] = np.array(material.emission_rgb)
     if material.emission is not None:
         picture = material.emission.picture
-        lost.append("textures of emission: their means were taken")
+        lost.append("textures of emission: replaced by their means")
         radiance = radiance * picture.linear(picture.values).mean(axis=(0, 1))[:3]
     return radiance

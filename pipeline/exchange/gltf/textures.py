@@ -55,14 +55,16 @@ def sample_slots(
     plain = None if first is None else coordinates(first.uv_set)
     uv = None if first is None or plain is None else plain @ first.turn.T + first.shift
     if slots and uv is None:
-        lost.append("textures of a mesh without texture coordinates: their means were taken")
+        lost.append("textures of a mesh without texture coordinates: replaced by their means")
     same_chart = [
         name
         for name, slot in slots.items()
         if first and uv is not None and _chart(slot) == _chart(first)
     ]
     if uv is not None and len(same_chart) < len(slots):
-        lost.append("textures with coordinates unlike the first of their material: their means")
+        lost.append(
+            "textures with other coordinates than the first of a material: replaced by means"
+        )
     maps = {name: constant_map(picture.mean(axis=(0, 1))) for name, picture in pictures.items()}
     if uv is None:
         return SampledMaps(maps=maps, uv=None)
@@ -84,7 +86,7 @@ def sample_slots(
     ]
     near, all_near = shift_near_zero(moved)
     if not (is_exact and all_near):
-        lost.append("textures far outside of [0, 1]: some look otherwise there")
+        lost.append("coordinates far outside [0, 1]: some textures look different there")
     return SampledMaps(maps=maps, uv=near.astype(np.float32))
 
 

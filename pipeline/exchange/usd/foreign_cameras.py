@@ -67,7 +67,7 @@ def _read_camera(
     held = placed.prim.GetAttribute(FOV_DEG).Get(time)
     is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=_SAME_LENS)
     if not is_held and not math.isclose(wide, high, rel_tol=1e-4):
-        lost.append(f"{where}: pictures are square here; its horizontal angle was taken")
+        lost.append(f"{where}: pictures are square; its horizontal angle was used")
     if any(a.Get(time) for a in (camera.GetHorizontalApertureOffsetAttr(),
                                  camera.GetVerticalApertureOffsetAttr())):  # fmt: skip
         lost.append(f"{where}: its shift has no place here")

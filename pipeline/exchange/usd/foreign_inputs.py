@@ -77,8 +77,8 @@ class ShaderInputs:
                 uv = np.broadcast_to(np.float64(0.5), (count, 3, 2))
             glow = texture.means(uv)
             self._opened.lost.append(
-                f"{self._surface.prim.GetPath()}: texture of emissiveColor became one value a "
-                "triangle"
+                f"{self._surface.prim.GetPath()}: texture of emissiveColor became one value "
+                "for each triangle"
             )
         elif glow is None:
             glow = np.broadcast_to(self.constant("emissiveColor"), (count, 3))
@@ -159,7 +159,7 @@ def lower_diffuse(
     diffuse: Texture, specular: Texture, source: MapSource, where: str, lost: list[str]
 ) -> tuple[Texture, Texture]:
     """Return two albedos that add up to at most 1, and note it; see `build_textures`."""
-    lost.append(f"{where}: textured diffuse lowered where it would reflect more than it gets")
+    lost.append(f"{where}: textured diffuse lowered where diffuse + specular is over 1")
     return color_textures(linear_map(diffuse), linear_map(specular), source)
 
 

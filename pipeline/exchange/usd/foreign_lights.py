@@ -57,7 +57,7 @@ def light_triangles(placed: Placed, time: Any, lost: list[str]) -> NDArray[np.fl
         lost.append(f"{prim.GetPath()}: a light without an area")
         return None
     if kind in ("RectLight", "DiskLight"):
-        lost.append(f"{prim.GetPath()}: emits to one side there, and to both sides here")
+        lost.append(f"{prim.GetPath()}: emits to one side in USD, and to both sides in a scene")
     return world.astype(np.float32)
 
 
@@ -77,7 +77,7 @@ def compute_radiance(
         area = _area(triangles.astype(np.float64)) / placed.metres**2
         emitted = emitted / max(area, 1e-30)
     if (emitted < 0).any():
-        lost.append(f"{placed.prim.GetPath()}: a light below zero; it emits nothing")
+        lost.append(f"{placed.prim.GetPath()}: negative radiance; the light emits nothing")
     emitted = np.maximum(emitted, 0)
     return np.where(np.isfinite(emitted), emitted, 0).astype(np.float32)
 

@@ -112,8 +112,8 @@ def _limit_diffuse(
     excess &= is_plain
     if excess.any():
         lost.append(
-            f"{surface.prim.GetPath()}: diffuse lowered on {int(excess.sum())} triangles that "
-            "would reflect more than they get"
+            f"{surface.prim.GetPath()}: diffuse lowered on {int(excess.sum())} triangles where "
+            "diffuse + specular is over 1"
         )
         rows[excess, DIFFUSE] = np.minimum(rows[excess, DIFFUSE], 1 - rows[excess, SPECULAR])
 
@@ -174,11 +174,11 @@ def _build_plain_rows(
     """Return rows [T, 10 or more] of a material without a shader: held values or display colors."""
     rows = default_rows(len(surface.positions))
     if held is not None:
-        lost.append(f"{material.GetPath()}: no shader; what Trilight wrote on it taken")
+        lost.append(f"{material.GetPath()}: no shader; the values that Trilight wrote are used")
         rows[:] = held.row
         return rows
     if material:
-        lost.append(f"{material.GetPath()}: no shader that is understood; display colour taken")
+        lost.append(f"{material.GetPath()}: no supported shader; its display color is used")
     rows[:, DIFFUSE] = _display_color(surface, time)
     rows[:, SPECULAR] = 0.04
     rows[:, ROUGHNESS] = 0.5
@@ -204,7 +204,7 @@ def _take_added_columns(
         else:
             lost.append(
                 f"{attribute.GetPath()}: expected {column.width} numbers {column.within}; "
-                "the default taken"
+                "the default is used"
             )
 
 

@@ -88,7 +88,7 @@ def _normals(
         return _smooth(positions, cut)
     normals = cut.per_corner(*stated)
     if normals is None:
-        lost.append(f"{where}: normals whose number does not fit")
+        lost.append(f"{where}: the number of normals does not match")
         return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
     normal_matrix = np.linalg.inv(placed.to_world[:3, :3]).T
     world_normals = np.einsum("ij,tcj->tci", normal_matrix, normals)

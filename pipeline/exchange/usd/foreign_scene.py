@@ -112,7 +112,7 @@ def _read_environment(
     sky = None
     for each in domes:
         if sky is not None:
-            opened.lost.append(f"{each.prim.GetPath()}: a second dome; one lights a scene here")
+            opened.lost.append(f"{each.prim.GetPath()}: a second dome; a scene has one environment")
             continue
         sky = read_foreign_dome(each.prim, each.to_world, time, opened, licence)
     return sky
@@ -166,7 +166,7 @@ def _build_mesh(
         rows[:, EMISSION] = rows[:, EMISSION] * light if tints else light
         if mode == "materialGlowTintsLight" and not glows:
             opened.lost.append(
-                f"{prim.GetPath()}: its material does not glow; the light's own taken"
+                f"{prim.GetPath()}: its material emits nothing; the radiance of the light is used"
             )
     return TexturedTriangles(
         positions=soup.positions,

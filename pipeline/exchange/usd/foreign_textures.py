@@ -51,7 +51,7 @@ class ForeignTexture:
             return Texture(texels=np.ascontiguousarray(chosen), is_srgb=is_srgb, source=source)
         values = _channels(self._scale_texels(), self.output, channels, 1)
         if not (values.min() >= 0 and values.max() <= 1):  # or NaN
-            lost.append("texels that are no number from 0 to 1: they were clamped, NaN to 0")
+            lost.append("texels outside [0, 1]: clamped, and NaN replaced by 0")
             values = np.clip(np.nan_to_num(values, nan=0.0), 0, 1)
         return Texture(texels=np.ascontiguousarray(values, np.float32), source=source)
 

@@ -54,11 +54,13 @@ def build_uv_textures(
     chart = foreign_textures[names[0]].chart
     uv = surface.read_coordinates(chart, time)
     if uv is None:
-        lost.append(f"{where}: no coordinates {chart.primvar!r:.60}; means of textures taken")
+        lost.append(f"{where}: no coordinates {chart.primvar!r:.60}; textures replaced by means")
         return UvTextures(textures=_means(plain), uv=None)
     same_chart = [name for name in names if foreign_textures[name].chart == chart]
     if len(same_chart) < len(names):
-        lost.append(f"{where}: textures of one material with several coordinates; means taken")
+        lost.append(
+            f"{where}: textures of one material with several coordinates; replaced by means"
+        )
     tiles_by_axis = []
     is_exact = True
     for axis in range(2):
@@ -82,7 +84,7 @@ def build_uv_textures(
     ]
     near, all_near = shift_near_zero(moved)
     if not (is_exact and all_near):
-        lost.append(f"{where}: textures far outside of [0, 1]; some look otherwise there")
+        lost.append(f"{where}: coordinates far outside [0, 1]; some textures look different there")
     return UvTextures(textures=textures, uv=near.astype(np.float32))
 
 

@@ -146,11 +146,13 @@ def choose_textures(
             stated = inputs.build_constant(name, channels, source)
         exact = _find_exact(held, column, stated)
         if exact is None and stated is None:
-            lost.append(f"{held.where}: the texture of {column} is not in the file; its mean taken")
+            lost.append(
+                f"{held.where}: the texture of {column} is not in the file; its mean is used"
+            )
             stated = Texture(texels=constant_map(held.columns[column]), source=source)
         elif exact is None:
             lost.append(
-                f"{held.where}: {column} was changed since Trilight wrote it; taken as it is now"
+                f"{held.where}: {column} was changed since Trilight wrote it; the new value is used"
             )
             is_changed = True
         texture = stated if exact is None else exact
@@ -173,7 +175,9 @@ def choose_emission(
     exact = held.row[EMISSION]
     if _agree(stated, exact):
         return np.broadcast_to(exact, stated.shape).astype(np.float32)
-    lost.append(f"{held.where}: emission was changed since Trilight wrote it; taken as it is now")
+    lost.append(
+        f"{held.where}: emission was changed since Trilight wrote it; the new value is used"
+    )
     return stated
 
 
@@ -198,7 +202,7 @@ def name_lost_columns(material: Any) -> list[str]:
     """Return a note for each added column that the file has lost."""
     prim = material.GetPrim()
     return [
-        f"{prim.GetPath()}: material column {name!r} is not in the file any more; its default taken"
+        f"{prim.GetPath()}: material column {name!r} is not in the file any more; default used"
         for name in str(prim.GetAttribute(ADDED_COLUMNS).Get() or "").split()
         if not prim.HasAttribute(column_attribute(name))
     ]

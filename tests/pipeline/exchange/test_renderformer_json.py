@@ -148,7 +148,7 @@ def test_an_object_of_many_colours_and_odd_names(tmp_path: Path) -> None:
     assert [entry.name for entry in back.objects] == [
         "a_..__ü.material0", "a_..__ü.material2", "light",
     ]  # fmt: skip
-    assert lost == ("that 2 of its objects were 1, of several materials",)
+    assert lost == ("the grouping of 2 objects that were 1, of several materials",)
     written = [path.relative_to(tmp_path).parts[0] for path in tmp_path.rglob("*.obj")]
     assert set(written) == {"objects"}
 
@@ -158,7 +158,7 @@ def test_normals_that_no_reader_makes_are_said_to_be_lost(tmp_path: Path) -> Non
     normals = base.vertex_normals.copy()
     normals[0] = [0.6, 0, 0.8]
     _, lost = json_and_back(dataclasses.replace(base, vertex_normals=normals), tmp_path)
-    assert "floor: shading normals; readers make their own" in lost
+    assert "floor: shading normals, which readers compute again" in lost
 
 
 def test_too_many_objects(monkeypatch: pytest.MonkeyPatch) -> None:
