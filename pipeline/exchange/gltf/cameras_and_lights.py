@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.textured_pieces import NO_TEXTURES, TexturedTriangles
+from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
 from pipeline.exchange.usd.foreign_cameras import rigid_pose
 from pipeline.foreign.gltf.nodes import PlacedNode
 from pipeline.foreign.numbers import read_number, read_numbers

@@ -18,7 +18,7 @@ from pipeline.exchange.linear_maps import (
     number_texture,
     resample_to_largest,
 )
-from pipeline.exchange.textured_pieces import NO_TEXTURES, TexturedTriangles, TextureSet
+from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles, TextureSet
 from pipeline.foreign.material import Seen, SourceMaterial, columns
 from storage.conventions import srgb8
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows

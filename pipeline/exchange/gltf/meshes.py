@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.textured_pieces import have_areas
+from pipeline.exchange.textured_triangles import have_areas
 from pipeline.foreign.gltf.primitives import PlacedPrimitive
 from storage.errors import Rejected
 

@@ -22,7 +22,7 @@ from pipeline.exchange.gltf.cameras_and_lights import (
 from pipeline.exchange.gltf.materials import apply_material
 from pipeline.exchange.gltf.meshes import WorldTriangles
 from pipeline.exchange.pictures import MAX_PIXELS
-from pipeline.exchange.textured_pieces import (
+from pipeline.exchange.textured_triangles import (
     TexturedPiece,
     TexturedTriangles,
     build_piece,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.textured_pieces import NO_TEXTURES, TextureSet
+from pipeline.exchange.textured_triangles import NO_TEXTURES, TextureSet
 from pipeline.exchange.usd.foreign_inputs import ShaderInputs, compute_varying_columns
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup
 from pipeline.exchange.usd.foreign_uv_textures import CHANNELS, build_uv_textures

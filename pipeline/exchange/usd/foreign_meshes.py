@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.textured_pieces import have_areas
+from pipeline.exchange.textured_triangles import have_areas
 from pipeline.foreign.usd.placed import Placed
 from pipeline.foreign.usd.polygons import (
     CutMesh,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.textured_pieces import (
+from pipeline.exchange.textured_triangles import (
     NO_TEXTURES,
     TexturedPiece,
     TexturedTriangles,
