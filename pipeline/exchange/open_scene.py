@@ -4,7 +4,7 @@
     scene.safetensors          storage.records.scene_file
     scene.h5                   the published layout (pipeline.exchange.renderformer_h5)
     scene.glb .gltf            glTF 2.0 (pipeline.exchange.gltf)
-    scene.usda .usdc .usdz .usd   a USD stage (pipeline.scenes.usd)
+    scene.usda .usdc .usdz .usd   a USD stage (pipeline.exchange.usd)
     train-000000.tar::KEY      the sample KEY of a shard
     scenes.usdc::KEY           a scene of a USD shard, or a time code of an animated stage
 
