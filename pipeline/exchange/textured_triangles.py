@@ -125,7 +125,7 @@ def with_texture_sets(scene: AnyScene, pieces: Sequence[TexturedPiece]) -> AnySc
     textures: dict[str, Texture] = {}
     index: list[list[int]] = []
     order: dict[str, int] = {}
-    for texture_set in (worn for each in pieces for worn in each.texture_sets):
+    for texture_set in (row for each in pieces for row in each.texture_sets):
         for texture in texture_set:
             if texture is not None and texture.sha256 not in textures:
                 order[texture.sha256] = len(textures)

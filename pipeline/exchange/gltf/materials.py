@@ -102,15 +102,17 @@ def _columns(
     values = np.zeros((height, width, 7), np.float32)
     for first in range(0, height, _STRIP):
         size = min(_STRIP, height - first)
-        seen = {
+        texel_values = {
             name: _flatten_on_grid(
                 map_[first : first + size] if len(map_) > 1 else map_, size, width
             )
             for name, map_ in resampled.items()
         }
         colors = _flatten_on_grid(tint, size, width)
-        seen["base"] = seen["base"][:, :3] * colors if "base" in seen else colors
-        known = Seen(**{name: seen.get(name) for name in SLOTS})
+        texel_values["base"] = (
+            texel_values["base"][:, :3] * colors if "base" in texel_values else colors
+        )
+        known = Seen(**{name: texel_values.get(name) for name in SLOTS})
         rows = columns(material, known, size * width, least_roughness=0)
         values[first : first + size] = rows.reshape(size, width, 7)
     return values

@@ -132,11 +132,11 @@ def read_foreign_dome(
     if np.linalg.det(rotation) < 0:
         opened.lost.append(f"{prim_path}: a mirrored dome; its light was left out")
         return None
-    seen = prim.GetAttribute(VISIBLE_TO_CAMERA)
+    visibility = prim.GetAttribute(VISIBLE_TO_CAMERA)
     sky = Environment(
         radiance_rgb=tinted.astype(np.float32),
         rotation=(rotation @ TO_OUR_AXES.T).astype(np.float32),
-        is_seen=bool(seen and seen.Get(time)),
+        is_seen=bool(visibility and visibility.Get(time)),
         source=MapSource(name=prim.GetName(), licence=licence),
     )
     try:

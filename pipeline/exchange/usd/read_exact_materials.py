@@ -81,13 +81,13 @@ def _require_prims(
         prim, {relative_path.removeprefix("/") for relative_path in tables if relative_path}
     )
     root_path = prim.path.StripAllVariantSelections()
-    for place in tables:
-        part = prim.nameChildren[place.removeprefix("/")] if place else prim
-        table = drop_absent(part, tables[place], _ADDED)
-        linked = drop_absent(part, links[place], _ADDED)
-        require(has_attributes(part, table))
-        require_plain(part, {*table, *linked})
-        for attribute in part.attributes:
+    for relative_path in tables:
+        child = prim.nameChildren[relative_path.removeprefix("/")] if relative_path else prim
+        table = drop_absent(child, tables[relative_path], _ADDED)
+        linked = drop_absent(child, links[relative_path], _ADDED)
+        require(has_attributes(child, table))
+        require_plain(child, {*table, *linked})
+        for attribute in child.attributes:
             source = linked.get(attribute.name, ("", None))[1]
             connections = [str(path) for path in attribute.connectionPathList.explicitItems]
             require(connections == ([] if source is None else [f"{root_path}/{source}"]))

@@ -78,8 +78,8 @@ def add_materials(layer: Any, folder: str, scene: Scene) -> None:
             first = first if used else path
             continue
         Sdf.CopySpec(layer, first, layer, path)
-        for place, attributes in material_tables(values, names).items():
-            prim = layer.GetPrimAtPath(path + place)
+        for relative_path, attributes in material_tables(values, names).items():
+            prim = layer.GetPrimAtPath(path + relative_path)
             for name, (kind, value) in attributes.items():
                 if kind in ("color3f", "float", "float[]"):
                     prim.attributes[name].default = usd_value(kind, value)
@@ -153,10 +153,10 @@ def _add_material(
     layer: Any, path: str, tables: Mapping[str, Attributes], textured: Sequence[str]
 ) -> None:
     links = material_links(textured)
-    for place, attributes in tables.items():
-        prim = add_prim(layer, path + place, "Shader" if place else "Material")
+    for relative_path, attributes in tables.items():
+        prim = add_prim(layer, path + relative_path, "Shader" if relative_path else "Material")
         add_attributes(prim, attributes)
-        for name, (kind, source) in links[place].items():
+        for name, (kind, source) in links[relative_path].items():
             add_link(prim, name, kind, None if source is None else f"{path}/{source}")
 
 

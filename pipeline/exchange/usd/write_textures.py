@@ -99,10 +99,10 @@ def material_links(textured: Sequence[str]) -> dict[str, Links]:
         "outputs:surface": ("token", f"{PREVIEW}.outputs:surface")
     }
     preview: dict[str, tuple[str, str | None]] = {"outputs:surface": ("token", None)}
-    places: dict[str, dict[str, tuple[str, str | None]]] = {"": surface, f"/{PREVIEW}": preview}
+    links: dict[str, dict[str, tuple[str, str | None]]] = {"": surface, f"/{PREVIEW}": preview}
     if not textured:
         surface["outputs:mtlx:surface"] = ("token", f"{OPENPBR}.outputs:out")
-        return {**places, f"/{OPENPBR}": {"outputs:out": ("token", None)}}
+        return {**links, f"/{OPENPBR}": {"outputs:out": ("token", None)}}
     for name in textured:
         kind, socket, output, output_kind = _INPUTS[name]
         preview[socket] = (kind, f"{SHADERS[name]}.{output}")
@@ -113,8 +113,8 @@ def material_links(textured: Sequence[str]) -> dict[str, Links]:
         if name == "specular":
             preview[COAT_ROUGHNESS] = ("float", f"{SHADERS[name]}.outputs:r")
             shader["outputs:r"] = ("float", None)
-        places[f"/{SHADERS[name]}"] = shader
-    return {**places, f"/{COORDINATES}": {"outputs:result": ("float2", None)}}
+        links[f"/{SHADERS[name]}"] = shader
+    return {**links, f"/{COORDINATES}": {"outputs:result": ("float2", None)}}
 
 
 def _texture_table(row: int, texture: Texture) -> Attributes:
