@@ -7,7 +7,7 @@ material of the nearest old one, and smooth normals are computed again.
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.cleaning.clean import clean, normalise
+from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.recipe import methods_of
 from pipeline.foreign.mesh import TriangleMesh
@@ -113,7 +113,7 @@ def _decimate_mesh(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], 
     )
     low = raw.positions.min(axis=0)
     high = raw.positions.max(axis=0)
-    unit = clean(normalise(raw))
+    unit = clean(normalize(raw))
     for method in methods_of("faithful"):
         try:
             decimated = decimate(unit, count, safe_method(unit, method))

@@ -19,7 +19,7 @@ from pipeline.exchange.linear_maps import (
     resample_to_largest,
 )
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles, TextureSet
-from pipeline.foreign.material import Seen, SourceMaterial, columns
+from pipeline.foreign.material import MaterialSamples, SourceMaterial, source_columns
 from storage.conventions import srgb8
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.texture import MapSource
@@ -112,8 +112,8 @@ def _columns(
         texel_values["base"] = (
             texel_values["base"][:, :3] * colors if "base" in texel_values else colors
         )
-        known = Seen(**{name: texel_values.get(name) for name in SLOTS})
-        rows = columns(material, known, size * width, least_roughness=0)
+        known = MaterialSamples(**{name: texel_values.get(name) for name in SLOTS})
+        rows = source_columns(material, known, size * width, least_roughness=0)
         values[first : first + size] = rows.reshape(size, width, 7)
     return values
 

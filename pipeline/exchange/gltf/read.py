@@ -37,7 +37,7 @@ from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nod
 from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material import SourceMaterial
-from pipeline.foreign.picture import decoded
+from pipeline.foreign.picture import decode_image
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import ObjectKind, Scene, SceneObject
@@ -139,7 +139,7 @@ class _GltfReader:
 
     def _decode(self, data: bytes, name: str) -> NDArray:
         try:
-            return decoded(data, name, MAX_PIXELS)
+            return decode_image(data, name, MAX_PIXELS)
         except Rejected as why:
             if why.reason != "texture_too_large":
                 raise

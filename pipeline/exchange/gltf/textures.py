@@ -22,7 +22,7 @@ SLOTS: Mapping[str, str] = {
     "specular_strength": "specular_strength_map",
     "glossiness": "glossiness",
 }
-"""Slot of `SourceMaterial` for each field of `Seen`."""
+"""Slot of `SourceMaterial` for each field of `MaterialSamples`."""
 
 Coordinates = Callable[[int], NDArray[np.float64] | None]
 """Function from the number of a set to its texture coordinates [T, 3, 2], v up."""
@@ -33,7 +33,7 @@ class SampledMaps:
     """Linear maps of a material's pictures, and the coordinates of a mesh in them."""
 
     maps: Mapping[str, Map]
-    """[H, W, 4] linear values by the field of `Seen`, the bottom row first."""
+    """[H, W, 4] linear values by the field of `MaterialSamples`, the bottom row first."""
     uv: NDArray[np.float32] | None
     """[T, 3, 2] coordinates in the maps; None where all maps are constants."""
 
@@ -53,7 +53,7 @@ def sample_slots(
     pictures = {name: slot.picture.linear(slot.picture.values) for name, slot in slots.items()}
     first = next(iter(slots.values()), None)
     plain = None if first is None else coordinates(first.uv_set)
-    uv = None if first is None or plain is None else plain @ first.turn.T + first.shift
+    uv = None if first is None or plain is None else plain @ first.uv_matrix.T + first.uv_offset
     if slots and uv is None:
         lost.append("textures of a mesh without texture coordinates: replaced by their means")
     same_chart = [
@@ -92,4 +92,4 @@ def sample_slots(
 
 def _chart(slot: Slot) -> tuple[int, bytes, bytes]:
     """Return a key that is equal for pictures with the same coordinates."""
-    return (slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())
+    return (slot.uv_set, slot.uv_matrix.tobytes(), slot.uv_offset.tobytes())

@@ -93,7 +93,7 @@ def sky_attributes(sky: Environment | None) -> Attributes:
 
 def read_exact_dome(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
     """Read the environment that `add_dome` wrote; raises LookupError without its file."""
-    resolved = opened.inside(layer, prim.attributes[_PATH].default.path)
+    resolved = opened.resolve(layer, prim.attributes[_PATH].default.path)
     data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
     if data is None:
         raise LookupError(_PATH)
@@ -187,7 +187,7 @@ def _read_map(prim: Any, time: Any, opened: OpenedUsd) -> NDArray[np.float64] | 
         opened.lost.append(f"{prim_path}: a picture of format {layout}; expected latlong")
         return None
     specs = attribute.GetPropertyStack(time)
-    resolved = opened.inside(specs[0].layer if specs else opened.root, asset.path)
+    resolved = opened.resolve(specs[0].layer if specs else opened.root, asset.path)
     data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
     if data is None:
         opened.lost.append(f"{prim_path}: map {asset.path!r:.100} is missing")

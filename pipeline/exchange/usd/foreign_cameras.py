@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd.names import FOV_DEG
 from pipeline.foreign.numbers import read_number
-from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.placed import PlacedPrim
 from storage.conventions import look_at_c2w
 
 _FOV_DEG = 40.0
@@ -19,7 +19,7 @@ _SAME_LENS = 1e-5
 
 
 def read_stage_cameras(
-    placed: Sequence[Placed], time: Any, lost: list[str]
+    placed: Sequence[PlacedPrim], time: Any, lost: list[str]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return poses [C, 4, 4] and full angles [C] in degrees of the usable cameras."""
     poses = []
@@ -47,7 +47,7 @@ def fit_camera(
 
 
 def _read_camera(
-    placed: Placed, time: Any, lost: list[str]
+    placed: PlacedPrim, time: Any, lost: list[str]
 ) -> tuple[NDArray[np.float64], float] | None:
     from pxr import UsdGeom
 

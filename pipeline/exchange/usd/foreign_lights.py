@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.numbers import FINITE, read_number, read_numbers
 from pipeline.foreign.usd.colors import convert_to_rec709
-from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.placed import PlacedPrim
 from storage.settings.ranges import Within
 
 _DISK_CORNERS = 24
@@ -36,7 +36,7 @@ _NEUTRAL: Mapping[str, Any] = {
 _EXPOSURES = Within(-1000, 1000, unit="stops")
 
 
-def light_triangles(placed: Placed, time: Any, lost: list[str]) -> NDArray[np.float32] | None:
+def light_triangles(placed: PlacedPrim, time: Any, lost: list[str]) -> NDArray[np.float32] | None:
     """Return the world-space triangles [T, 3, 3] of a light; None where it has no area."""
     prim = placed.prim
     kind = str(prim.GetTypeName())
@@ -62,7 +62,7 @@ def light_triangles(placed: Placed, time: Any, lost: list[str]) -> NDArray[np.fl
 
 
 def compute_radiance(
-    placed: Placed, triangles: NDArray[np.float32], time: Any, lost: list[str]
+    placed: PlacedPrim, triangles: NDArray[np.float32], time: Any, lost: list[str]
 ) -> NDArray[np.float32]:
     """Return the radiance [3] that the light API of a prim states.
 
@@ -74,7 +74,7 @@ def compute_radiance(
     """
     emitted = read_light_color(placed.prim, time, lost)
     if placed.prim.GetAttribute("inputs:normalize").Get(time):
-        area = _area(triangles.astype(np.float64)) / placed.metres**2
+        area = _area(triangles.astype(np.float64)) / placed.meters_per_unit**2
         emitted = emitted / max(area, 1e-30)
     if (emitted < 0).any():
         lost.append(f"{placed.prim.GetPath()}: negative radiance; the light emits nothing")

@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.textured_triangles import have_areas
-from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.polygons import (
     CutMesh,
     MeshPolygons,
     as_array,
     cut_mesh,
     mesh_polygons,
-    moved,
+    place_points,
 )
 from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 from pipeline.scenes.shading import smooth_shaded
@@ -41,12 +41,12 @@ class TriangleSoup:
         uv = chart_corners(chart, self.cut, time)
         if uv is None or not np.isfinite(uv).all():
             return None
-        for move in chart.moves:
-            uv = np.einsum("ij,tcj->tci", move.turn, uv) + move.translation
+        for move in chart.transforms:
+            uv = np.einsum("ij,tcj->tci", move.matrix, uv) + move.translation
         return uv
 
 
-def read_mesh(placed: Placed, time: Any, lost: list[str]) -> TriangleSoup:
+def read_mesh(placed: PlacedPrim, time: Any, lost: list[str]) -> TriangleSoup:
     """Return the triangles of a mesh that have an area.
 
     Raises:
@@ -55,7 +55,7 @@ def read_mesh(placed: Placed, time: Any, lost: list[str]) -> TriangleSoup:
     polygons = mesh_polygons(placed, time)
     cut = cut_mesh(polygons)
     rows = cut.indices[cut.corners]
-    positions = moved(polygons.points, placed.to_world)[rows].astype(np.float32)
+    positions = place_points(polygons.points, placed.to_world)[rows].astype(np.float32)
     cross = _cross(positions)
     solid = have_areas(positions, cross)
     if not solid.all():

@@ -22,7 +22,7 @@ from pipeline.exchange.usd.foreign_lights import compute_radiance, light_triangl
 from pipeline.exchange.usd.foreign_materials import read_surface_materials
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup, read_mesh
 from pipeline.exchange.usd.names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
-from pipeline.foreign.usd.placed import DOMES, Placed, placed_prims
+from pipeline.foreign.usd.placed import DOMES, PlacedPrim, placed_prims
 from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.scenes.shading import flat_shaded
@@ -71,7 +71,7 @@ def build_stage_scene(stage: Any, time: Any, opened: OpenedUsd, licence: str) ->
     return _build_scene(pieces, placed, time, opened, sky)
 
 
-def _read_row(each: Placed) -> float:
+def _read_row(each: PlacedPrim) -> float:
     """Return the row that Trilight wrote on an object or camera; infinity for other prims."""
     prim = each.prim
     row = prim.GetAttribute(INDEX).Get()
@@ -82,7 +82,7 @@ def _read_row(each: Placed) -> float:
 
 def _build_scene(
     pieces: Sequence[TexturedPiece],
-    placed: Sequence[Placed],
+    placed: Sequence[PlacedPrim],
     time: Any,
     opened: OpenedUsd,
     sky: Environment | None,
@@ -105,7 +105,7 @@ def _build_scene(
 
 
 def _read_environment(
-    placed: Sequence[Placed], time: Any, opened: OpenedUsd, licence: str
+    placed: Sequence[PlacedPrim], time: Any, opened: OpenedUsd, licence: str
 ) -> Environment | None:
     """Return the environment of the first readable dome; note the others."""
     domes = [each for each in placed if each.prim.GetTypeName() in DOMES]
@@ -119,7 +119,7 @@ def _read_environment(
 
 
 def _pieces(
-    each: Placed, time: Any, opened: OpenedUsd, licence: str, names: set[str]
+    each: PlacedPrim, time: Any, opened: OpenedUsd, licence: str, names: set[str]
 ) -> list[TexturedPiece]:
     prim = each.prim
     if prim.GetTypeName() not in ("Mesh", *SOLIDS):
@@ -153,7 +153,7 @@ def _build_light(triangles: NDArray[np.float32], light: NDArray[np.float32]) -> 
 
 
 def _build_mesh(
-    placed: Placed, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
+    placed: PlacedPrim, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
 ) -> TexturedTriangles:
     prim = placed.prim
     materials = read_surface_materials(soup, time, opened, licence)
@@ -179,7 +179,7 @@ def _build_mesh(
 
 
 def _split(
-    each: Placed, triangles: TexturedTriangles, licence: str, names: set[str]
+    each: PlacedPrim, triangles: TexturedTriangles, licence: str, names: set[str]
 ) -> list[TexturedPiece]:
     """Build an object of the triangles that reflect, and one of those that emit."""
     return [

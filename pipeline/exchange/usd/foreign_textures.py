@@ -92,7 +92,7 @@ def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
     """
     data = None if node.resolved is None else asset_bytes(node.resolved, MAX_BYTES)
     name = Path(node.named).name
-    is_color = node.colour_space != "raw"
+    is_color = node.color_space != "raw"
     pixels = decode_pixels(data, name, opened.lost, is_color=is_color) if data else None
     if pixels is None:
         opened.lost.append(
@@ -101,7 +101,7 @@ def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
             else "a texture without a file"
         )
         return None
-    space = node.colour_space
+    space = node.color_space
     return ForeignTexture(
         pixels=pixels[::-1],
         is_srgb=is_encoded(pixels) if space not in ("sRGB", "raw") else space == "sRGB",

@@ -26,7 +26,7 @@ from pipeline.exchange.usd.names import (
 from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS
 from pipeline.foreign.usd.shaders import surface_shader
 from pipeline.foreign.usd.stage import OpenedUsd
-from pipeline.foreign.usd.texture_nodes import find_sources, is_output, texture_node
+from pipeline.foreign.usd.texture_nodes import find_sources, is_output, read_texture_node
 from storage.records.material import EMISSION, declared_column, default_rows, laid_out
 from storage.records.texture import TEXTURED, MapSource, Texture
 
@@ -108,7 +108,7 @@ def read_held_textures(
     node = UsdShade.Shader(sources[0].GetPrim())
     if node.GetShaderId() != "UsdUVTexture":
         return {}
-    texture = read_texture(texture_node(node, "rgb", time, opened), opened)
+    texture = read_texture(read_texture_node(node, "rgb", time, opened), opened)
     return {} if texture is None else {"specularColor": texture}
 
 

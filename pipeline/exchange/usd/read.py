@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.exchange.usd.foreign_scene import build_stage_scene
 from pipeline.exchange.usd.read_exact_scene import is_marked, read_exact, scene_keys
-from pipeline.foreign.usd.stage import OpenedUsd, quietly
+from pipeline.foreign.usd.stage import OpenedUsd, read_quietly
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 
@@ -36,7 +36,7 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
     Raises:
         TrilightError: the file is unusable (pipeline.foreign.usd.stage).
     """
-    return quietly(path, lambda: _keys(OpenedUsd(path, folder)))
+    return read_quietly(path, lambda: _keys(OpenedUsd(path, folder)))
 
 
 def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:
@@ -51,7 +51,7 @@ def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> 
     Raises:
         TrilightError: the file is unusable, lacks the scene, or a `Scene` cannot hold it.
     """
-    return quietly(path, lambda: _read(path, key, folder, licence))
+    return read_quietly(path, lambda: _read(path, key, folder, licence))
 
 
 def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:

@@ -111,7 +111,7 @@ def _read_textures(prim: Any, textures: dict[int, Texture], opened: OpenedUsd | 
 
 def _read_texture(attributes: Any, layer: Any, opened: OpenedUsd) -> Texture:
     named = attributes["inputs:file"].default.path
-    resolved = opened.inside(layer, named)
+    resolved = opened.resolve(layer, named)
     data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
     if data is None:
         raise LookupError(named)
