@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.attempt import AssetAttempt
-from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalise
+from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalize
 from pipeline.assets.cleaning.guards import check_clean, check_raw
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.decimation.smallest import smallest_passing
-from pipeline.assets.own.levels import add_source_materials
-from pipeline.assets.quality.gate import check_level
+from pipeline.assets.quality.level_checks import check_level
 from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.quality.triangles import count_edges
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
+from pipeline.assets.source_materials.levels import add_source_materials
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
@@ -43,7 +43,7 @@ def prepare_asset(
     source = read_source(path, settings.read_limits, root)
     raw = load_mesh(source)
     check_raw(raw, settings, is_single=source.is_single)
-    cleaned = clean(normalise(raw))
+    cleaned = clean(normalize(raw))
     check_clean(cleaned)
     mesh, front_share = orient_outward(cleaned)
     measured = MeasuredSource(mesh)

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.cleaning.clean import clean, normalise
+from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.outside_rays import first_faces
-from pipeline.assets.own.nearest import barycentric
 from pipeline.assets.settings import AssetSettings
+from pipeline.assets.source_materials.nearest import barycentric
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
@@ -27,7 +27,7 @@ picture, and full lines above the second."""
 _SUPERSAMPLE = 2
 
 
-def preview_both(
+def preview_source_and_level(
     path: str, settings: AssetSettings, level: Level, width_px: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return gray pictures [W, W] of a cleaned source file and of one of its levels.
@@ -35,7 +35,7 @@ def preview_both(
     Raises Rejected as `prepare_asset`.
     """
     data = read_source(Path(path), settings.read_limits)
-    mesh, _ = orient_outward(clean(normalise(load_mesh(data))))
+    mesh, _ = orient_outward(clean(normalize(load_mesh(data))))
     return preview(mesh, width_px), preview_level(level, width_px)
 
 

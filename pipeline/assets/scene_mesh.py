@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.cleaning.clean import clean, normalise
+from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.guards import check_raw
 from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.recipe import methods_of
@@ -78,7 +78,7 @@ def remesh(raw: TriangleMesh, num_faces: int) -> TriangleMesh:
     used = raw.positions[np.unique(raw.faces)]
     low = used.min(axis=0)
     high = used.max(axis=0)
-    unit = clean(normalise(raw))
+    unit = clean(normalize(raw))
     if len(unit.faces):
         for method in methods_of("uniform"):
             try:

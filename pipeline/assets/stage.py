@@ -36,7 +36,7 @@ class PreparedAsset:
     """SHA-256 digest of the asset file, in hex."""
     geometry_sha256: str
     """Digest of the cleaned geometry, in hex."""
-    without_own: str = ""
+    missing_materials_reason: str = ""
     """Reason code of missing source materials, where settings keep them; otherwise empty."""
     unread: tuple[str, ...] = ()
     """Short sentences, one for each part of the file that no reader handled."""
@@ -111,7 +111,7 @@ def _prepare_once(
         path=path,
         asset_sha256=sha256_hex(data),
         geometry_sha256=asset.geometry_sha256,
-        without_own="" if asset.materials is None else asset.materials.reason,
+        missing_materials_reason="" if asset.materials is None else asset.materials.reason,
         unread=store.unread(key),
     )
 

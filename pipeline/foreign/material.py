@@ -29,9 +29,9 @@ class Slot:
     picture: Picture
     uv_set: int = 0
     """Index of the mesh's texture coordinate set."""
-    turn: NDArray[np.float64] = field(default_factory=lambda: np.eye(2))
+    uv_matrix: NDArray[np.float64] = field(default_factory=lambda: np.eye(2))
     """[2, 2] matrix that those coordinates, v up, are multiplied with first."""
-    shift: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    uv_offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     """[2] offset added after the matrix, v up."""
     channel: int = 0
     """Index of the channel that holds a single number."""
@@ -86,7 +86,7 @@ class SourceMaterial:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Seen:
+class MaterialSamples:
     """Values [N, 4] of the pictures of a material at N places; None without such a picture."""
 
     base: NDArray[np.float32] | None
@@ -97,9 +97,9 @@ class Seen:
     glossiness: NDArray[np.float32] | None
 
 
-def columns(
+def source_columns(
     material: SourceMaterial,
-    samples: Seen,
+    samples: MaterialSamples,
     count: int,
     *,
     least_roughness: float = LEAST_ROUGHNESS,

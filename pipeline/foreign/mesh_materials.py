@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.material import Slot, SourceMaterial
 from pipeline.foreign.obj_materials import obj_materials
-from pipeline.foreign.parts import TexturedParts, build_textured_mesh
 from pipeline.foreign.picture import Picture
 from pipeline.foreign.source_file import SourceFile
+from pipeline.foreign.textured_mesh import TexturedMesh, build_textured_mesh
 from storage.errors import Rejected
 
 Decode = Callable[[bytes, str], NDArray]
 
 
-def read_parts(source: SourceFile, decode: Decode, *, emission: bool) -> TexturedParts:
+def read_textured_mesh(source: SourceFile, decode: Decode, *, emission: bool) -> TexturedMesh:
     """Return the triangles of an OBJ, OFF, PLY or STL with their materials; colors are sRGB.
 
     Materials and pictures take precedence over colors, which the notes then name.

@@ -141,8 +141,8 @@ class _Reader:
         )
         return Slot(
             picture=picture,
-            turn=np.diag(_pair(options, "-s", 1.0)),
-            shift=np.array(_pair(options, "-o", 0.0)),
+            uv_matrix=np.diag(_pair(options, "-s", 1.0)),
+            uv_offset=np.array(_pair(options, "-o", 0.0)),
             channel=_CHANNELS.get("".join(options.get("-imfchan", ["r"])), 0),
         )
 

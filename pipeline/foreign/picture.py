@@ -41,12 +41,12 @@ class Decoder:
 
     def __call__(self, data: bytes, name: str) -> NDArray:
         """Return `decode_image` within the pixels that are left."""
-        values = decoded(data, name, self._pixels_left)
+        values = decode_image(data, name, self._pixels_left)
         self._pixels_left -= values.shape[0] * values.shape[1]
         return values
 
 
-def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
+def decode_image(data: bytes, name: str, max_pixels: int) -> NDArray:
     """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 for grays of 16 bits.
 
     Palettes, grays, transparency and CMYK become RGBA; colors of 16 bits are reduced to 8. OpenEXR
@@ -150,7 +150,7 @@ class Picture:
         return self._levels[number - 1]
 
     @property
-    def most_halvings(self) -> int:
+    def max_halvings(self) -> int:
         """Return the number of halvings until one texel is left."""
         return max(self.values.shape[:2]).bit_length() - 1
 
@@ -169,7 +169,7 @@ class Picture:
             linear[..., :3] = linear_from_srgb8()[texels[..., :3]]
         return linear
 
-    def at(self, uv: NDArray[np.float64], halvings: NDArray[np.int64]) -> NDArray[np.float32]:
+    def sample(self, uv: NDArray[np.float64], halvings: NDArray[np.int64]) -> NDArray[np.float32]:
         """Return linear values [N, 4] at coordinates [N, 2], each of the given halving."""
         values = np.zeros((len(uv), 4), np.float32)
         for number in np.unique(halvings):

@@ -30,7 +30,7 @@ class Listing:
     fetched. Files of this machine stay in place."""
 
     @property
-    def is_here(self) -> bool:
+    def is_local(self) -> bool:
         """True where the files of all objects are on this machine already."""
         return self.fetch is _already_local
 

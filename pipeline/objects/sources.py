@@ -159,7 +159,7 @@ class ListedObjects:
     refused: list[Failure]
     """Failures: objects with a refused licence, and objects that are unusable anyway."""
 
-    def found(
+    def fetch_selected(
         self,
         is_selected: Callable[[str], bool] = _select_all,
         downloaded: Callable[[int, int], None] = _ignore_progress,
@@ -255,10 +255,10 @@ def find_objects(
     listed = list_objects(
         source, work_dir=work_dir, allowed_licences=allowed_licences, licence=licence
     )
-    return listed.found(downloaded=downloaded)
+    return listed.fetch_selected(downloaded=downloaded)
 
 
-def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
+def check_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
     """Check that a source exists and holds an object, before a dataset of it begins.
 
     Only the user's cache is written.

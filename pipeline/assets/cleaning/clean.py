@@ -26,7 +26,7 @@ _DIGEST_SHIFT = 3
 number format still share it."""
 
 
-def normalise(mesh: TriangleMesh) -> TriangleMesh:
+def normalize(mesh: TriangleMesh) -> TriangleMesh:
     """Return the mesh with its bounding box centered on the origin, the longest side being 1.
 
     Vertices that no face uses are dropped. The mesh must be finite and have an extent.

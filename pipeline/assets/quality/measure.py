@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from pipeline.assets.quality.components import Components
 from pipeline.assets.quality.distance import Deviation, Surface
-from pipeline.assets.quality.parts import Components
 from pipeline.assets.quality.silhouette import intersection_over_union, silhouette
 from pipeline.assets.quality.triangles import (
     area_variation,

@@ -169,8 +169,8 @@ class GltfMaterials:
                 is_nearest=sampler.get("magFilter") == _NEAREST,
             ),
             uv_set=uv_set,
-            turn=uv_matrix,
-            shift=uv_offset,
+            uv_matrix=uv_matrix,
+            uv_offset=uv_offset,
         )
 
     def _picture(self, number: int) -> NDArray:

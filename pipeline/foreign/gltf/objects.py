@@ -10,7 +10,7 @@ from pipeline.foreign.gltf.nodes import placed_meshes
 from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.material import MOST_UV_SETS
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.parts import TexturedParts
+from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
 
 
@@ -24,7 +24,7 @@ def gltf_mesh(document: GltfDocument) -> TriangleMesh:
         return _join_primitives(_list_primitives(document))
 
 
-def gltf_parts(document: GltfDocument, materials: GltfMaterials) -> TexturedParts:
+def gltf_textured_mesh(document: GltfDocument, materials: GltfMaterials) -> TexturedMesh:
     """Return the same triangles with their materials.
 
     Raises:
@@ -48,12 +48,12 @@ def gltf_parts(document: GltfDocument, materials: GltfMaterials) -> TexturedPart
             for number in range(MOST_UV_SETS):
                 if (coordinates := instance.coordinates(number)) is not None:
                     uv[span, number] = coordinates
-        return TexturedParts(
+        return TexturedMesh(
             mesh=_join_primitives(primitives),
             material=np.repeat(numbers, counts),
             materials=(*known.values(), DEFAULT),
             uv=uv,
-            colour=None if (color == 1).all() else color,
+            color=None if (color == 1).all() else color,
         )
 
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.material import MOST_UV_SETS, RGB, WHITE, Slot, SourceMaterial
 from pipeline.foreign.material_files import MaterialFiles
-from pipeline.foreign.parts import TexturedParts
 from pipeline.foreign.picture import Picture, has_colors
+from pipeline.foreign.textured_mesh import TexturedMesh
 from pipeline.foreign.usd.object_meshes import PlacedMesh
 from pipeline.foreign.usd.object_source import UsdSource
 from pipeline.foreign.usd.shaders import StatedMaterial, read_colors, reflect_head_on
@@ -31,7 +31,7 @@ _UNBOUND = 0.18
 Decode = Callable[[bytes, str], NDArray]
 
 
-def usd_parts(source: UsdSource, decode: Decode, *, emission: bool = False) -> TexturedParts:
+def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = False) -> TexturedMesh:
     """Return the triangles of a USD file with their materials; emission only on request.
 
     Raises:
@@ -64,12 +64,12 @@ def usd_parts(source: UsdSource, decode: Decode, *, emission: bool = False) -> T
     tint = np.concatenate(tints)
     if (material == plain).all() and (tint == _UNBOUND).all():
         raise Rejected("no_materials", "the stage has no materials and no display colours")
-    return TexturedParts(
+    return TexturedMesh(
         mesh=source.mesh,
         material=material,
         materials=tuple(materials),
         uv=np.concatenate(coordinates),
-        colour=None if (tint == 1).all() else tint,
+        color=None if (tint == 1).all() else tint,
     )
 
 
@@ -253,8 +253,8 @@ class _Reader:
         return Slot(
             picture=picture,
             uv_set=self._primvars.index(node.chart.primvar),
-            turn=uv_matrix,
-            shift=uv_offset,
+            uv_matrix=uv_matrix,
+            uv_offset=uv_offset,
             channel=channel,
         )
 
@@ -265,8 +265,8 @@ class _Reader:
         return self._values[path]
 
     def _is_srgb(self, node: TextureNode) -> bool:
-        if node.colour_space in ("sRGB", "raw"):
-            return node.colour_space == "sRGB"
+        if node.color_space in ("sRGB", "raw"):
+            return node.color_space == "sRGB"
         return has_colors(self._files.require(node.resolved or node.named))
 
 
@@ -284,9 +284,9 @@ def _scale_picture(
 def _chart_transform(chart: UvChart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     matrix = np.eye(2)
     offset = np.zeros(2)
-    for transform in chart.moves:
-        matrix = transform.turn @ matrix
-        offset = transform.turn @ offset + transform.translation
+    for transform in chart.transforms:
+        matrix = transform.matrix @ matrix
+        offset = transform.matrix @ offset + transform.translation
     if not (np.isfinite(matrix).all() and np.isfinite(offset).all()):
         raise Rejected("materials_unreadable", "coordinates are moved by what is no number")
     return matrix, offset

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.usd.object_stage import UsdStage
-from pipeline.foreign.usd.polygons import CutMesh, cut_mesh, mesh_polygons, moved
+from pipeline.foreign.usd.polygons import CutMesh, cut_mesh, mesh_polygons, place_points
 from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 from storage.errors import Rejected
 
@@ -33,7 +33,7 @@ class PlacedMesh:
         """Return the values [T, S, 3, 2] of primvars at corners; NaN where there are none."""
         uv = np.full((len(self.cut.corners), len(primvars), 3, 2), np.nan)
         for row, name in enumerate(primvars):
-            values = chart_corners(UvChart(primvar=name, moves=()), self.cut, time)
+            values = chart_corners(UvChart(primvar=name, transforms=()), self.cut, time)
             if values is not None:
                 uv[:, row] = values
         return uv
@@ -58,7 +58,7 @@ def place_meshes(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedMesh, ...]:
         if len(cut.corners):
             scale = np.linalg.norm(each.to_world[:3, :3], 2)
             farthest = max(farthest, float(scale * np.abs(polygons.points).max()))
-            points = moved(polygons.points, each.to_world)
+            points = place_points(polygons.points, each.to_world)
             meshes.append(PlacedMesh(number=number, points=points, cut=cut))
     if not meshes:
         raise Rejected("no_faces", "the stage shows no mesh with triangles")

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.usd.placed import Placed, placed_prims
+from pipeline.foreign.usd.placed import PlacedPrim, placed_prims
 from pipeline.foreign.usd.skins import UnposedMesh
 from pipeline.foreign.usd.solids import SOLIDS
-from pipeline.foreign.usd.stage import OpenedUsd, OutsideFile, quietly
+from pipeline.foreign.usd.stage import OpenedUsd, OutsideFile, read_quietly
 from storage.errors import Rejected, TrilightError
 
 Read = TypeVar("Read")
@@ -28,7 +28,7 @@ class UsdStage:
     """Opened layers of the stage, with notes on unread contents."""
     composed: Any
     """The Usd.Stage, kept because its prims expire with it."""
-    meshes: tuple[Placed, ...]
+    meshes: tuple[PlacedPrim, ...]
     """Visible meshes with transforms to meters, +Z up."""
     time: Any
     """The Usd.TimeCode at which values are read: the first of an animated stage."""
@@ -51,7 +51,7 @@ def read_or_reject(path: Path, read: Callable[[], Read]) -> Read:
         Rejected: external_uri, skinned_mesh, load_error, or as `read`.
     """
     try:
-        return quietly(path, read)
+        return read_quietly(path, read)
     except TrilightError as error:
         reasons = {OutsideFile: "external_uri", UnposedMesh: "skinned_mesh"}
         raise Rejected(reasons.get(type(error), "load_error"), f"{error!s:.300}") from error

@@ -32,19 +32,19 @@ SCENE_KINDS = ("Mesh", *SOLIDS, "Camera", *LAMPS, *DOMES)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Placed:
+class PlacedPrim:
     """A prim with its world transform."""
 
     prim: Any  # the Usd.Prim; several instances may share one
     to_world: NDArray[np.float64]  # [4, 4] for column vectors, to meters with +Z up
-    metres: float = 1.0  # length of a unit of the stage
+    meters_per_unit: float = 1.0  # length of a unit of the stage
     skin: BoundSkin | None = None  # the skin that poses a mesh
     lost: list[str] = field(default_factory=list)  # receives notes on contents that are not read
 
 
 def placed_prims(
     stage: Any, time: Any, lost: list[str], kinds: Collection[str] = SCENE_KINDS
-) -> list[Placed]:
+) -> list[PlacedPrim]:
     """Return the visible prims of some kinds of a stage at a time, in the order of the stage.
 
     Invisible prims, guides and proxies are left out; notes name unread schemas.
@@ -55,7 +55,7 @@ def placed_prims(
     """
     from pxr import UsdGeom
 
-    placed: list[Placed] = []
+    placed: list[PlacedPrim] = []
     unread = Counter[str]()
     known: dict[Any, list[str]] = {}
     skins = BoundSkins(time)
@@ -80,7 +80,13 @@ def placed_prims(
                 raise TrilightError(f"{prim.GetPath()}: its place is not finite.")
             skin = skins.find(prim)
             placed.append(
-                Placed(prim=prim, to_world=to_world, metres=meters_per_unit, skin=skin, lost=lost)
+                PlacedPrim(
+                    prim=prim,
+                    to_world=to_world,
+                    meters_per_unit=meters_per_unit,
+                    skin=skin,
+                    lost=lost,
+                )
             )
     lost += [f"{count} x {kind}: not read" for kind, count in sorted(unread.items())]
     return placed

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.polygons import triangulate
 from pipeline.foreign.usd.colors import convert_to_rec709
-from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.solids import SOLIDS, build_solid
 from storage.errors import TrilightError
 
@@ -18,7 +18,7 @@ from storage.errors import TrilightError
 class MeshPolygons:
     """The arrays of a mesh, checked to be consistent."""
 
-    placed: Placed
+    placed: PlacedPrim
     points: NDArray[np.float64]  # [P, 3] in the units of the mesh, finite
     counts: NDArray[np.int64]  # [F] corners of each polygon
     indices: NDArray[np.int64]  # [sum of counts] rows of `points`
@@ -86,7 +86,7 @@ class CutMesh:
         return fitting
 
 
-def mesh_polygons(placed: Placed, time: Any) -> MeshPolygons:
+def mesh_polygons(placed: PlacedPrim, time: Any) -> MeshPolygons:
     """Return the polygons of a mesh or solid at a time, posed by its skeleton if it has one.
 
     Raises:
@@ -144,7 +144,7 @@ def cut_mesh(mesh: MeshPolygons) -> CutMesh:
     )
 
 
-def moved(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:
+def place_points(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points [P, 3] transformed by a matrix [4, 4]."""
     rotated: NDArray[np.float64] = np.einsum("ij,vj->vi", to_world[:3, :3], points)
     return rotated + to_world[:3, 3]

@@ -19,7 +19,7 @@ from pipeline.foreign.usd.texture_nodes import (
     find_sources,
     is_output,
     read_input,
-    texture_node,
+    read_texture_node,
 )
 
 PREVIEW = "UsdPreviewSurface"
@@ -273,7 +273,7 @@ class _Reader:
         node = UsdShade.Shader(sources[0].GetPrim())
         if node.GetShaderId() == "UsdUVTexture":
             output = UsdShade.Output(sources[0]).GetBaseName()
-            self.textures[name] = texture_node(node, output, self._time, self._opened)
+            self.textures[name] = read_texture_node(node, output, self._time, self._opened)
         elif node.GetShaderId() in _READERS:
             primvar, fallback = _READERS[node.GetShaderId()]
             self.primvars[name] = str(read_input(node, primvar, self._time, ""))

@@ -101,7 +101,7 @@ class OpenedUsd:
         more = len(notes) - MAX_NOTES
         return tuple(notes if more <= 0 else [*notes[:MAX_NOTES], f"and {more} more"])
 
-    def inside(self, layer: Any, asset_path: str) -> str | None:
+    def resolve(self, layer: Any, asset_path: str) -> str | None:
         """Return the resolved path of a file that a layer names, or None for a missing file.
 
         Raises:
@@ -199,7 +199,7 @@ class OpenedUsd:
         """Return the layer that another one names, or None with a note where it is missing."""
         from pxr import Sdf
 
-        resolved = self.inside(anchor, asset_path)
+        resolved = self.resolve(anchor, asset_path)
         if resolved is None or Sdf.FileFormat.FindByExtension(resolved) is None:
             why = "is missing" if resolved is None else "is no USD file"
             note = f"file {asset_path!r:.100} {why}"
@@ -275,7 +275,7 @@ def _check_package(path: Path, size: int) -> None:
 Read = TypeVar("Read")
 
 
-def quietly(path: Path, read: Callable[[], Read]) -> Read:
+def read_quietly(path: Path, read: Callable[[], Read]) -> Read:
     """Return the result of `read` for a file, without USD's own warnings on standard error.
 
     Raises:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.usd.object_stage import UsdStage
-from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
 from pipeline.foreign.usd.stage import OutsideFile
 from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes
@@ -76,7 +76,7 @@ class _Reader:
         self._rows: dict[str, int] = {}
         self.materials: list[StatedMaterial] = []
 
-    def bindings(self, placed: Placed) -> Iterator[Binding]:
+    def bindings(self, placed: PlacedPrim) -> Iterator[Binding]:
         for material, polygons in read_bindings(placed.prim, self._stage.time):
             yield self._row(material), polygons
 

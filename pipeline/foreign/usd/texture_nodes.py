@@ -21,7 +21,7 @@ _WRAPS = ("repeat", "mirror", "clamp", "black")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Move:
+class UvTransform:
     """A UsdTransform2d: scale, counter-clockwise rotation, and translation, in this order."""
 
     scale: tuple[float, ...]
@@ -29,7 +29,7 @@ class Move:
     translation: tuple[float, ...]
 
     @property
-    def turn(self) -> NDArray[np.float64]:
+    def matrix(self) -> NDArray[np.float64]:
         """Return the matrix [2, 2] of scale and rotation, for column vectors."""
         cos = np.cos(np.radians(self.rotation_deg))
         sin = np.sin(np.radians(self.rotation_deg))
@@ -42,7 +42,7 @@ class UvChart:
 
     primvar: str
     """Name of the mesh's primvar of coordinates."""
-    moves: tuple[Move, ...]
+    transforms: tuple[UvTransform, ...]
     """Transforms of the coordinates, in the order of application."""
 
 
@@ -54,7 +54,7 @@ class TextureNode:
     """Path of the file in the shader; empty where it states none."""
     resolved: str | None
     """Resolved path below the folder of the stage; None for a missing file."""
-    colour_space: str
+    color_space: str
     """`sRGB`, `raw`, or anything else for `auto`."""
     wrap: tuple[NodeWrap, NodeWrap]
     """Wrap modes along s and t; `useMetadata` and unknown ones are `repeat`."""
@@ -70,7 +70,7 @@ class TextureNode:
     """[4] RGBA value used without a picture; None where none is stated."""
 
 
-def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> TextureNode:
+def read_texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> TextureNode:
     """Return the inputs of a UsdUVTexture shader.
 
     Args:
@@ -89,7 +89,7 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
     resolved = None
     if attribute and named:
         specs = attribute.GetPropertyStack(time)
-        resolved = opened.inside(specs[0].layer if specs else opened.root, named)
+        resolved = opened.resolve(specs[0].layer if specs else opened.root, named)
     if "<UDIM>" in named:
         opened.lost.append(f"{shader.GetPath()}: {named!r:.100} has UDIM tiles, which are not read")
     for name in ("scale", "bias", "fallback"):
@@ -99,7 +99,7 @@ def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
     return TextureNode(
         named=named,
         resolved=resolved,
-        colour_space=str(read_input(shader, "sourceColorSpace", time, "auto")),
+        color_space=str(read_input(shader, "sourceColorSpace", time, "auto")),
         wrap=(_wrap(shader, "wrapS", time), _wrap(shader, "wrapT", time)),
         scale=np.array(_vector(shader, "scale", time, (1, 1, 1, 1)), np.float32),
         bias=np.array(_vector(shader, "bias", time, (0, 0, 0, 0)), np.float32),
@@ -114,7 +114,7 @@ def read_chart(shader: Any, time: Any, lost: list[str]) -> UvChart:
     from pxr import UsdShade
 
     sources = find_sources(shader, "st")
-    moves: list[Move] = []
+    moves: list[UvTransform] = []
     primvar = "st"
     for _ in range(_MOST_NODES):
         if not sources or not is_output(sources[0]):
@@ -122,7 +122,7 @@ def read_chart(shader: Any, time: Any, lost: list[str]) -> UvChart:
         node = UsdShade.Shader(sources[0].GetPrim())
         if node.GetIdAttr().Get() == "UsdTransform2d":
             moves.append(
-                Move(
+                UvTransform(
                     scale=_vector(node, "scale", time, (1, 1)),
                     rotation_deg=read_number(
                         read_input(node, "rotation", time, 0), f"{node.GetPath()}.rotation"
@@ -136,7 +136,7 @@ def read_chart(shader: Any, time: Any, lost: list[str]) -> UvChart:
         if node.GetIdAttr().Get() != "UsdPrimvarReader_float2":
             lost.append(f"{node.GetPath()}: not read; texture coordinates {primvar!r:.60} taken")
         break
-    return UvChart(primvar=primvar, moves=tuple(reversed(moves)))
+    return UvChart(primvar=primvar, transforms=tuple(reversed(moves)))
 
 
 def chart_corners(chart: UvChart, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:

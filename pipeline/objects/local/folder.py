@@ -4,10 +4,15 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+from pipeline.objects.file_filters import (
+    drop_copies,
+    drop_outputs,
+    drop_scenes,
+    warn_unread_formats,
+)
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
 from pipeline.objects.listing import SUFFIXES, Listing, assign_uids, failure, is_object_file
 from pipeline.objects.local.catalogue import only_catalogue, read_catalogue
-from pipeline.objects.selection import drop_copies, drop_outputs, drop_scenes, warn_unread_formats
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
 from storage.remote.safe_url import printable

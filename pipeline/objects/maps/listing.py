@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
 
+from pipeline.objects.file_filters import drop_outputs
 from pipeline.objects.licences import (
     StatedLicence,
     refuse_licences,
@@ -21,7 +22,6 @@ from pipeline.objects.listing import failure
 from pipeline.objects.local.catalogue import read_catalogue
 from pipeline.objects.local.folder import walk_files
 from pipeline.objects.maps.names import PICTURES, group_textures
-from pipeline.objects.selection import drop_outputs
 from storage.errors import TrilightError
 from storage.records.objects import SKY, TEXTURE, Failure, ObjectRecord
 from storage.remote.safe_url import printable

@@ -68,7 +68,7 @@ def decode_prepared(data: bytes, name: str) -> PreparedMap:
     return PreparedMap(content_sha256=metadata["content"], arrays=arrays)
 
 
-def outcome_name(map_files: MapFiles) -> str:
+def map_cache_key(map_files: MapFiles) -> str:
     """Return the cache key of the outcome: a digest of the files, the size and the recipe.
 
     Raises:

@@ -4,6 +4,7 @@ import dataclasses
 from functools import partial
 from pathlib import Path
 
+from pipeline.objects.file_filters import drop_copies, drop_outputs, warn_unread_formats
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
 from pipeline.objects.listing import (
     CountDone,
@@ -18,7 +19,6 @@ from pipeline.objects.local.catalogue import CATALOGUE_NAMES, only_catalogue, re
 from pipeline.objects.local.folder import file_record
 from pipeline.objects.remote.files import RemoteFiles
 from pipeline.objects.remote.folder import RemoteFolder
-from pipeline.objects.selection import drop_copies, drop_outputs, warn_unread_formats
 from storage.cache import cache_folder
 from storage.digests import sha256_hex
 from storage.errors import TrilightError

@@ -30,7 +30,7 @@ from tests.pipeline.assets.meshes_by_hand import (
     write_glb,
     write_obj,
 )
-from tests.pipeline.assets.own.test_bad_pictures import OUTSIDE
+from tests.pipeline.assets.source_materials.test_bad_pictures import OUTSIDE
 
 BALL = sphere(rings=5, columns=8)
 

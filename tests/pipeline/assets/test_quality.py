@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from pipeline.assets.quality.components import Components, label_components
 from pipeline.assets.quality.distance import Surface, sample_surface
-from pipeline.assets.quality.gate import check_level
+from pipeline.assets.quality.level_checks import check_level
 from pipeline.assets.quality.measure import MeasuredSource
-from pipeline.assets.quality.parts import Components, label_components
 from pipeline.assets.quality.silhouette import intersection_over_union, silhouette
 from pipeline.assets.quality.triangles import area_variation, count_edges, smallest_angles_deg
 from pipeline.assets.settings import GateSettings

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.nearest import SurfaceLookup
-from pipeline.assets.own.source_surface import SourceSurface
+from pipeline.assets.source_materials.nearest import SurfaceLookup
+from pipeline.assets.source_materials.source_surface import SourceSurface
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 

@@ -6,10 +6,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.cleaning.clean import cell_keys, normalise
-from pipeline.foreign.material import Seen, Slot, SourceMaterial, columns
+from pipeline.assets.cleaning.clean import cell_keys, normalize
+from pipeline.foreign.material import MaterialSamples, Slot, SourceMaterial, source_columns
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.parts import TexturedParts
+from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
 
 _LEAST_FOUND = 0.999
@@ -23,7 +23,7 @@ class SourceSurface:
 
     mesh: TriangleMesh
     """Clean mesh in the unit box."""
-    parts: TexturedParts
+    parts: TexturedMesh
     """Faces of the file, with texture coordinates and materials."""
     source_face: NDArray[np.int64]
     """[F] face of the file for each clean face."""
@@ -88,17 +88,22 @@ class SourceSurface:
         def sample(slot: Slot | None) -> NDArray[np.float32] | None:
             if slot is None:
                 return None
-            key = (id(slot.picture), slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())
+            key = (
+                id(slot.picture),
+                slot.uv_set,
+                slot.uv_matrix.tobytes(),
+                slot.uv_offset.tobytes(),
+            )
             if key not in known:  # one picture often holds several numbers
                 known[key] = self._sample_picture(slot, source_face, source_weights, cell)
             return known[key]
 
         base = sample(material.base)
-        if self.parts.colour is not None:
-            tint = np.einsum("nc,ncd->nd", source_weights, self.parts.colour[source_face])
+        if self.parts.color is not None:
+            tint = np.einsum("nc,ncd->nd", source_weights, self.parts.color[source_face])
             base = np.ones((len(source_face), 4), np.float32) if base is None else base
             base = np.concatenate([base[:, :3] * tint, base[:, 3:]], axis=1).astype(np.float32)
-        seen = Seen(
+        seen = MaterialSamples(
             base=base,
             metallic=sample(material.metallic_map),
             roughness=sample(material.roughness_map),
@@ -106,7 +111,7 @@ class SourceSurface:
             specular_strength=sample(material.specular_strength_map),
             glossiness=sample(material.glossiness),
         )
-        return columns(material, seen, len(source_face))
+        return source_columns(material, seen, len(source_face))
 
     def _sample_picture(
         self,
@@ -115,14 +120,14 @@ class SourceSurface:
         source_weights: NDArray[np.float64],
         cell: float,
     ) -> NDArray[np.float32]:
-        corners = self.parts.uv[source_face, slot.uv_set] @ slot.turn.T + slot.shift
+        corners = self.parts.uv[source_face, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
         uv = np.einsum("nc,ncd->nd", source_weights, corners)
-        return slot.picture.at(uv, _halvings(slot, corners, self._areas[source_face], cell))
+        return slot.picture.sample(uv, _halvings(slot, corners, self._areas[source_face], cell))
 
     @cached_property
     def _areas(self) -> NDArray[np.float64]:
         """Area [R] of each face of the file, in the unit box."""
-        vectors = normalise(self.parts.mesh).double_area_vectors
+        vectors = normalize(self.parts.mesh).double_area_vectors
         return 0.5 * np.linalg.norm(vectors, axis=1)
 
 
@@ -135,10 +140,10 @@ def _halvings(
     on_picture = 0.5 * np.abs(steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0])
     texels = on_picture * width * height * cell**2 / np.maximum(areas, 1e-30)
     halvings = np.floor(0.5 * np.log2(np.maximum(texels, 1.0))).astype(np.int64)
-    return np.minimum(halvings, slot.picture.most_halvings)
+    return np.minimum(halvings, slot.picture.max_halvings)
 
 
-def match_source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurface:
+def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurface:
     """Match the faces of a clean mesh to those of its file.
 
     Args:
@@ -149,7 +154,7 @@ def match_source_surface(mesh: TriangleMesh, parts: TexturedParts) -> SourceSurf
         Rejected: materials_unreadable where many faces do not match, no_texture_coordinates or
             texture_coordinates_not_finite where a textured face has none.
     """
-    raw = normalise(parts.mesh)
+    raw = normalize(parts.mesh)
     known = cell_keys(mesh.positions)
     order = np.argsort(known)
     keys = cell_keys(raw.positions)
@@ -205,7 +210,7 @@ def _nearest_matched(
     return filled
 
 
-def _require_coordinates(parts: TexturedParts, source_face: NDArray[np.int64]) -> None:
+def _require_coordinates(parts: TexturedMesh, source_face: NDArray[np.int64]) -> None:
     used = np.unique(source_face)
     for row in np.unique(parts.material[used]):
         mine = used[parts.material[used] == row]

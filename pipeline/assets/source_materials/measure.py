@@ -4,10 +4,10 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.bake import DIFFUSE, BakedTextures
-from pipeline.assets.own.nearest import SurfaceLookup, barycentric
-from pipeline.assets.own.source_surface import SourceSurface
 from pipeline.assets.quality.distance import sample_surface
+from pipeline.assets.source_materials.bake import DIFFUSE, BakedTextures
+from pipeline.assets.source_materials.nearest import SurfaceLookup, barycentric
+from pipeline.assets.source_materials.source_surface import SourceSurface
 from pipeline.foreign.mesh import TriangleMesh
 from storage.records.lookup import texture_values
 from storage.records.skin import SkinQuality

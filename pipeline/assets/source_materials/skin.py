@@ -6,21 +6,21 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.bake import bake
-from pipeline.assets.own.glow import level_emission
-from pipeline.assets.own.measure import skin_quality
-from pipeline.assets.own.nearest import SurfaceLookup
-from pipeline.assets.own.source_surface import SourceSurface, match_source_surface
 from pipeline.assets.settings import OwnMaterialSettings
+from pipeline.assets.source_materials.bake import bake
+from pipeline.assets.source_materials.emission import level_emission
+from pipeline.assets.source_materials.measure import skin_quality
+from pipeline.assets.source_materials.nearest import SurfaceLookup
+from pipeline.assets.source_materials.source_surface import SourceSurface, match_source_surface
 from pipeline.foreign.gltf.materials import GltfMaterials
-from pipeline.foreign.gltf.objects import gltf_parts
+from pipeline.foreign.gltf.objects import gltf_textured_mesh
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.mesh_materials import read_parts
+from pipeline.foreign.mesh_materials import read_textured_mesh
 from pipeline.foreign.numbers import FINITE
-from pipeline.foreign.parts import TexturedParts
 from pipeline.foreign.picture import Decoder
 from pipeline.foreign.source_file import SourceFile
-from pipeline.foreign.usd.object_materials import usd_parts
+from pipeline.foreign.textured_mesh import TexturedMesh
+from pipeline.foreign.usd.object_materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level
 from storage.records.packed_maps import pack_texture
@@ -111,9 +111,11 @@ def open_skin_baker(
 
 def _parts(
     source: SourceFile, decode: Callable[[bytes, str], NDArray], *, emission: bool
-) -> TexturedParts:
+) -> TexturedMesh:
     if source.usd is not None:
-        return usd_parts(source.usd, decode, emission=emission)
+        return usd_textured_mesh(source.usd, decode, emission=emission)
     if source.gltf is not None:
-        return gltf_parts(source.gltf, GltfMaterials(source.gltf, decode, emission=emission))
-    return read_parts(source, decode, emission=emission)
+        return gltf_textured_mesh(
+            source.gltf, GltfMaterials(source.gltf, decode, emission=emission)
+        )
+    return read_textured_mesh(source, decode, emission=emission)

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.nearest import SurfaceLookup
-from pipeline.assets.own.source_surface import SourceSurface
-from pipeline.assets.own.tiles import (
+from pipeline.assets.settings import OwnMaterialSettings
+from pipeline.assets.source_materials.nearest import SurfaceLookup
+from pipeline.assets.source_materials.source_surface import SourceSurface
+from pipeline.assets.source_materials.tiles import (
     FLAT,
     Atlas,
     cells_per_side,
@@ -15,7 +16,6 @@ from pipeline.assets.own.tiles import (
     pack_atlas,
     tile_weights,
 )
-from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.records.texture import Texture
@@ -32,7 +32,7 @@ _BLOCK = 1 << 18
 DIFFUSE = slice(0, 3)
 SPECULAR = slice(3, 6)
 ROUGHNESS = slice(6, 7)
-"""Slices of a texel's seven columns, in the order of `source_material.columns`."""
+"""Slices of a texel's seven columns, in the order of `material.source_columns`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

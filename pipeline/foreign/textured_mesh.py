@@ -11,7 +11,7 @@ from pipeline.foreign.mesh import FileMesh, TriangleMesh
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TexturedParts:
+class TexturedMesh:
     """The triangles of a source, unwelded, in its own units, +Z up."""
 
     mesh: TriangleMesh
@@ -20,21 +20,21 @@ class TexturedParts:
     materials: Sequence[SourceMaterial]
     uv: NDArray[np.float64]
     """[F, S, 3, 2] texture coordinates of corners by set S, v up; NaN where there are none."""
-    colour: NDArray[np.float64] | None = None
+    color: NDArray[np.float64] | None = None
     """[F, 3, 3] linear tint of each corner, multiplied with the base color; None for white."""
 
 
 def build_textured_mesh(
     contents: FileMesh, materials: Sequence[SourceMaterial], default: SourceMaterial
-) -> TexturedParts:
+) -> TexturedMesh:
     """Return the triangles of a file with its materials; `default` is that of faces without one."""
     count = len(contents.mesh.faces)
     rows = np.full(count, -1) if contents.material is None else contents.material
     uv = np.full((count, 3, 2), np.nan) if contents.uv is None else contents.uv
-    return TexturedParts(
+    return TexturedMesh(
         mesh=contents.mesh,
         material=np.where(rows < 0, len(materials), rows),
         materials=(*materials, default),
         uv=uv[:, None],
-        colour=contents.color,
+        color=contents.color,
     )

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdShade
 
-from pipeline.assets.cleaning.clean import clean, normalise
+from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.own.skin import open_skin_baker
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
+from pipeline.assets.source_materials.skin import open_skin_baker
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
@@ -27,7 +27,7 @@ from tests.pipeline.assets.meshes_by_hand import (
     write_glb,
     write_obj,
 )
-from tests.pipeline.assets.own.textured_kit import (
+from tests.pipeline.assets.source_materials.textured_kit import (
     CORNERS,
     KEEP,
     OWN,
@@ -45,7 +45,7 @@ from tests.pipeline.assets.own.textured_kit import (
     textured_obj,
     textured_tree,
 )
-from tests.pipeline.assets.own.usd_kit import SHADER, TEXTURE, textured_usd
+from tests.pipeline.assets.source_materials.usd_kit import SHADER, TEXTURE, textured_usd
 
 FILES: dict[str, Callable[[Path], Path]] = {
     "glb": lambda folder: textured_glb(folder / "a.glb", picture_bytes(CORNERS)),
@@ -236,7 +236,7 @@ def test_a_level_that_lies_nowhere_near_its_source_is_told(tmp_path: Path) -> No
     uv = ball.positions[:, [0, 2]]
     path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS), uv, ball)
     source = read_source(path, KEEP.read_limits)
-    mesh, _ = orient_outward(clean(normalise(load_mesh(source))))
+    mesh, _ = orient_outward(clean(normalize(load_mesh(source))))
     maker, _ = open_skin_baker(source, mesh, dataclasses.replace(OWN, max_colour_error=1.0))
     level = prepare(path, KEEP).levels[0]
     assert maker.add_skin(level).skin is not None

@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping
 
-from pipeline.assets.own.skin import SkinBaker, open_skin_baker
 from pipeline.assets.settings import AssetSettings
+from pipeline.assets.source_materials.skin import SkinBaker, open_skin_baker
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import SourceFile
 from storage.errors import Rejected

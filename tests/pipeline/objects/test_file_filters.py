@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.objects.file_filters import drop_copies, drop_outputs, drop_scenes, warn_once
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.local.folder import list_folder
 from pipeline.objects.maps.listing import find_maps
-from pipeline.objects.selection import drop_copies, drop_outputs, drop_scenes, warn_once
 from storage.records.objects import TEXTURE
 from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_scene
