@@ -25,7 +25,7 @@ _SMALLEST_EXPONENT = -90
 
 
 class SplatUnit:
-    """The radiance of one unit. Not a dataclass: Dr.Jit would take its arrays for loop variables."""
+    """The radiance of one unit, as kernels read it."""
 
     def __init__(self, radiance: float) -> None:
         self.radiance = dr.opaque(mi.Float64, radiance)

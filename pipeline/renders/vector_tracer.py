@@ -133,7 +133,9 @@ class VectorTracer:
         """
         return int(LIGHT_PATHS * camera.resolution**2 * spp)
 
-    def _pass(self, camera: Camera, film: Film, pixels: Any, seed: int, spp: int) -> tuple[Any, ...]:
+    def _pass(
+        self, camera: Camera, film: Film, pixels: Any, seed: int, spp: int
+    ) -> tuple[Any, ...]:
         """Return the arguments of `_means` and `_sums` for a pass."""
         count = self._num_light_paths(camera, spp)
         numbers = _PassNumbers(seed, self._light_paths * camera.resolution**2, count)
@@ -223,7 +225,9 @@ def _sums(
     objects: Any, pixels: Any, traced: Any, resolution: int, spp: int, count: int, sums: list[Any]
 ) -> list[Any]:
     """Return the sums with those of a pass."""
-    means: list[Any] = [mi.Color3d(part) for part in traced(objects, pixels, resolution, spp, count)]
+    means: list[Any] = [
+        mi.Color3d(part) for part in traced(objects, pixels, resolution, spp, count)
+    ]
     mean: Any = sum(means)
     square = dr.square((mean.x + mean.y + mean.z) / 3)
     new = [*(part * spp for part in means), square * spp, mi.Float64(spp), mi.Float64(1)]
@@ -247,9 +251,7 @@ def _features(objects: Any, resolution: int, spp: int) -> dict[str, Any]:
     named = {"albedo": lobes.diffuse + lobes.specular, "normal": normal}
     if parts.num_lobes == 2:
         named |= {"diffuse": lobes.diffuse, "specular": lobes.specular}
-    return {
-        name: _pixel_means(spp, dr.select(active, values, 0)) for name, values in named.items()
-    }
+    return {name: _pixel_means(spp, dr.select(active, values, 0)) for name, values in named.items()}
 
 
 @recorded
