@@ -161,7 +161,7 @@ def _guides(_: Any, arrays: dict[str, Any], hits: Any, names: Sequence[str]) -> 
         albedo = mi.Color3f(arrays.get(name.partition("_")[0], arrays["albedo"]))
         seen = normal if name.partition("_")[0] not in arrays else _where_any(albedo, normal)
         guides[name] = dr.ravel(albedo), dr.ravel(seen)
-    shown = dr.any(normal != 0)
+    shown: Any = dr.any(normal != 0)
     return guides, mi.UInt8(dr.select(hits, 1, 0) + dr.select(shown, 2, 0))
 
 
@@ -198,7 +198,8 @@ def _measure(
     kept = denoised
     if is_filtered and len(sums[0]) == 1:
         picture = [[(a + b) / 2 for a, b in zip(*each, strict=True)] for each in (denoised, raws)]
-        right = _converged(*picture, _squared_error_of_means(sums), resolution)
+        error = _squared_error_of_means(sums)
+        right = _converged(picture[0], picture[1], error, resolution)
         kept = [_chosen(right, *each) for each in zip(raws, denoised, strict=True)]
     hit = (masks & 1) > 0
     rows, every = [], max(1, len(names))
@@ -233,7 +234,8 @@ def _finish(
             pictures = _with_means_of(pairs, resolution)
     else:
         (pictures,) = raws
-    return dr.concat([dr.ravel(picture) for picture in pictures])
+    flat: list[Any] = [dr.ravel(picture) for picture in pictures]
+    return dr.concat(flat)
 
 
 def _half_means(sums: Sums) -> list[list[Any]]:

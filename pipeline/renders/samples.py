@@ -41,7 +41,8 @@ class HalfSamples:
 
     def count_over(self, counted: NDArray[np.bool_]) -> None:
         """Let `spp` be a mean over some pixels, [R, R], from now on; before, it is over all."""
-        self._counted, self._mean_spp = counted, None
+        self._counted = counted
+        self._mean_spp: int | None = None
 
     @property
     def spp(self) -> int:

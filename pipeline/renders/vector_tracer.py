@@ -256,7 +256,8 @@ def _features(objects: Any, resolution: int, spp: int) -> dict[str, Any]:
 
 @recorded
 def _hits(objects: Any, resolution: int) -> Any:
-    return _first_hit(*objects, resolution, 1).is_valid()
+    scene, film = objects
+    return _first_hit(scene, film, resolution, 1).is_valid()
 
 
 def _first_hit(scene: Any, film: Film, resolution: int, spp: int) -> Any:
@@ -277,7 +278,7 @@ class DeviceSum:
     def __init__(self, tracer: VectorTracer, camera: Camera) -> None:
         self._tracer, self._camera, self._film = tracer, camera, tracer._film(camera)
         kinds = [*[mi.Color3d] * tracer._parts.count, *[mi.Float64] * 3]
-        self.sums = [dr.opaque(kind, 0, camera.resolution**2) for kind in kinds]
+        self.sums: list[Any] = [dr.opaque(kind, 0, camera.resolution**2) for kind in kinds]
         """Of each part (Color3d); the squares of `read_squares`; samples; passes (Float64)."""
 
     def add(self, *, seed: int, spp: int, chosen: Chosen = None) -> None:

@@ -46,14 +46,16 @@ class HostPictures:
         means = HostMeans(self._samples)
         pairs = [(raw, self._denoised(raw, quality)) for raw in means.half_means()]
         error = means.standard_error()
-        converges = error is not None and self._settings.denoiser != "off"
-        kept = keep_in_halves(pairs, error) if converges else pairs
-        floors = [measure_floor(*map(_half, kept), self.hits)]
+        kept = pairs
+        if error is not None and self._settings.denoiser != "off":
+            kept = keep_in_halves(pairs, error)
+        first, second = map(_half, kept)
+        floors = [measure_floor(first, second, self.hits)]
         for part in range(len(names)):
             parts = [
                 _half((raw[part :: len(names)], rest[part :: len(names)])) for raw, rest in kept
             ]
-            floors.append(measure_floor(*parts, self.hits))
+            floors.append(measure_floor(parts[0], parts[1], self.hits))
         return Look(
             floor=floors[0],
             part_floors=dict(zip(names, floors[1:], strict=True)),
@@ -156,9 +158,10 @@ def _with_means_of(pairs: Sequence[tuple[Pictures, Pictures]]) -> list[Pictures]
     return [with_mean_of(*pair) for pair in pairs]
 
 
-def _shares_of(parts: Sequence[Pictures]) -> Pictures:
+def _shares_of(parts: Sequence[Pictures]) -> Sequence[Pictures]:
     """Return what share of their sum each of P parts [R, R, 3] is: equal ones where all are 0."""
     parts_rgb = np.stack(parts)
     total = parts_rgb.sum(axis=0, dtype=np.float64)
     equal = np.full(parts_rgb.shape, 1 / len(parts_rgb))
-    return np.divide(parts_rgb, total, out=equal, where=total > 0).astype(np.float32)
+    shares = np.divide(parts_rgb, total, out=equal, where=total > 0).astype(np.float32)
+    return list(shares)

@@ -44,7 +44,7 @@ class CameraPathsOnly(VectorTracer):
     """The path tracer as it is without light paths."""
 
     _light_paths = 0.0
-    _traced = staticmethod(trace_camera_paths)  # type: ignore[assignment]
+    _traced = staticmethod(trace_camera_paths)
 
 
 class CameraPathsLeft(CameraPathsOnly):
@@ -57,7 +57,7 @@ class LightPathsOnly(VectorTracer):
     """All light but the direct one from light paths alone, with a weight of 1."""
 
     _light_paths = _ALMOST_ALL
-    _traced = staticmethod(trace_light_paths)  # type: ignore[assignment]
+    _traced = staticmethod(trace_light_paths)
 
     def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
         super().__init__(scene, max_depth=max_depth, rr_depth=rr_depth)
