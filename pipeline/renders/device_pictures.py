@@ -6,6 +6,7 @@ of 64 pixels, then over rows of tiles: in an order of their own, but always the 
 """
 
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -86,7 +87,9 @@ class DevicePictures:
         self._names, self._quality = settings.part_names, settings.denoiser
         arrays = tracer.feature_arrays(camera, spp=settings.aux_spp)
         names = self._names or ("",)
-        self._guides, masks = _guides(KernelInputs(), arrays, tracer.hit_array(camera), names)
+        self._guides, masks = _guides(
+            KernelInputs(), arrays, tracer.hit_array(camera), names, camera.resolution
+        )
         self._logs = [dr.opaque(mi.Color3d, 0, camera.resolution**2) for _ in range(2)]
         self._masks = masks
         bits = read_numbers(masks).reshape(camera.resolution, camera.resolution)
@@ -135,7 +138,7 @@ class DevicePictures:
         """Return what the denoiser makes of each half, or of the mean of both."""
         if quality == "off":
             return []
-        raws = _raws(KernelInputs(), sums, self._names, of_both)
+        raws = _raws(KernelInputs(), sums, self._names, of_both, self._resolution)
         pictures = range(sum(len(tracer) - 3 for tracer in sums[0]))
         names = [name for _, name in to_filter(pictures, self._names)]
         guides = [self._guides[name] for name in names]
@@ -154,19 +157,24 @@ def _brightness(_: Any, sums: Sums, resolution: int) -> Any:
 
 
 @recorded
-def _guides(_: Any, arrays: dict[str, Any], hits: Any, names: Sequence[str]) -> tuple[Any, Any]:
+def _guides(
+    _: Any, arrays: dict[str, Any], hits: Any, names: Sequence[str], resolution: int
+) -> tuple[Any, Any]:
     """Return albedo and normal by the name of a part, as `Features.of_part`, and hits and shown."""
-    normal, guides = mi.Color3f(arrays["normal"]), {}
+    normal: Any = mi.Color3f(arrays["normal"])
+    guides = dict[str, Any]()
     for name in names:
         albedo = mi.Color3f(arrays.get(name.partition("_")[0], arrays["albedo"]))
         seen = normal if name.partition("_")[0] not in arrays else _where_any(albedo, normal)
         guides[name] = dr.ravel(albedo), dr.ravel(seen)
-    shown: Any = dr.any(normal != 0)
+    shown: Any = functools.reduce(operator.or_, normal != 0)
     return guides, mi.UInt8(dr.select(hits, 1, 0) + dr.select(shown, 2, 0))
 
 
 @recorded
-def _raws(_: Any, sums: Sums, names: Sequence[str], of_both: bool) -> list[list[Any]]:
+def _raws(
+    _: Any, sums: Sums, names: Sequence[str], of_both: bool, resolution: int
+) -> list[list[Any]]:
     """Return what the denoiser is asked for, of each half or of both (Float, pixel by pixel)."""
     return [
         [dr.ravel(picture) for picture, _ in to_filter(means, names)]

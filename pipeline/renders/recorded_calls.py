@@ -62,8 +62,8 @@ def recorded(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that takes `KernelInputs` where `function` takes their objects, first.
 
     What differs from call to call comes in arrays. Numbers of Python among the arguments tell
-    recordings apart, and so they must where they are the size of a launch: Dr.Jit reads other sizes
-    off the largest array of which each lane of the launch has one element.
+    recordings apart, and so must all sizes: a replay reads that of a launch off the largest array
+    of which each lane has one element, but other memory is as large as when it was recorded.
     """
 
     def call(kind: _Kind, _: list[Any], *arguments: Any) -> Any:

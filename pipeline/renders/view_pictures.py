@@ -51,7 +51,7 @@ class ViewPictures(Protocol):
         """
 
     def finish(self) -> NDArray[np.float32]:
-        """Return the pictures that all samples make, [P, R, R, 3]; raises as `look`."""
+        """Return the pictures of all samples of the last look, [P, R, R, 3]."""
 
 
 def require_finite(num_broken: int) -> None:

@@ -1,5 +1,6 @@
 """`HostPictures`: the arithmetic of a view in numpy, on sums that are read back."""
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -43,7 +44,7 @@ class HostPictures:
 
     def look(self, quality: Filtered) -> Look:
         names = self._settings.part_names
-        means = HostMeans(self._samples)
+        self._means = means = HostMeans(self._samples)
         pairs = [(raw, self._denoised(raw, quality)) for raw in means.half_means()]
         error = means.standard_error()
         kept = pairs
@@ -63,8 +64,7 @@ class HostPictures:
         )
 
     def finish(self) -> NDArray[np.float32]:
-        means = HostMeans(self._samples)
-        raw, error = means.mean(), means.standard_error()
+        raw, error = self._means.mean(), self._means.standard_error()
         parts = self._denoised(raw, self._settings.denoiser)
         if error is None or self._settings.denoiser == "off":
             return parts
@@ -113,15 +113,18 @@ class HostMeans:
         samples = self._samples
         if len(samples.sums[0]) > 1:
             return None
-        squares = np.stack([tracers[0].read_squares() for tracers in samples.sums])
         greys = np.stack([mean.sum(axis=0).mean(axis=-1) for mean in self._means()])
         spp = np.stack([samples.spp_of(half) for half in range(2)])
         mean, count = greys.mean(axis=0), samples.count_of(0) + samples.count_of(1)
         # Passes of n samples have the variance v / n, and the mean of a half of N has v / N.
-        spread = (squares - spp * mean * (2 * greys - mean)).sum(axis=0)
+        spread = (self._squares - spp * mean * (2 * greys - mean)).sum(axis=0)
         variance = np.maximum(spread, 0) / (count - 1)
         error = np.sqrt(variance * (1 / spp).sum(axis=0) / 4)
         return np.where(count < LEAST_PASSES, np.inf, error)
+
+    @functools.cached_property
+    def _squares(self) -> NDArray[np.float64]:
+        return np.stack([tracers[0].read_squares() for tracers in self._samples.sums])
 
     def _means(self) -> list[NDArray[np.float64]]:
         spp = [self._samples.spp_of(half)[..., None] for half in range(2)]
