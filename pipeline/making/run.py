@@ -13,7 +13,7 @@ from pipeline.making.bucket_publication import begin_dataset
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.environment import environment
 from pipeline.making.freeze_objects import AcceptedObjects
-from pipeline.making.machine import visible_gpus
+from pipeline.making.machine import children_of_gpu, gpu_memory_bytes, visible_gpus
 from pipeline.making.publication import Publication
 from pipeline.objects.sources import look_at_source
 from pipeline.renders.variant import choose_variant
@@ -48,7 +48,10 @@ class Run:
         """Return how many tasks run at a time in one process, where the executor does not say."""
         if self.order.workers is not None:
             return self.order.workers
-        return max(1, len(visible_gpus())) if choose_variant().name == "cuda_ad_rgb" else 1
+        if choose_variant().name != "cuda_ad_rgb":
+            return 1
+        num_gpus = max(1, len(visible_gpus()))
+        return num_gpus * children_of_gpu(self.settings.renders.resolution, gpu_memory_bytes())
 
     def job(self, num_at_once: int) -> "ShardJob":
         """Return what the tasks of this run share, `num_at_once` of them in one process."""

@@ -168,7 +168,8 @@ def _guides(
         seen = normal if name.partition("_")[0] not in arrays else _where_any(albedo, normal)
         guides[name] = dr.ravel(albedo), dr.ravel(seen)
     shown: Any = functools.reduce(operator.or_, normal != 0)
-    return guides, mi.UInt8(dr.select(hits, 1, 0) + dr.select(shown, 2, 0))
+    byte: Any = mi.UInt8
+    return guides, byte(dr.select(hits, 1, 0) + dr.select(shown, 2, 0))
 
 
 @recorded

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from infra.cli.changes import parse_changes
 from pipeline.making.dataset_order import DatasetOrder, generate_words
-from pipeline.making.machine import cores_owned, visible_gpus
+from pipeline.making.machine import children_of_gpu, cores_owned, visible_gpus
 from pipeline.making.runner import in_window
 from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece, TaskSizes, TasksLeft, cut_tasks
 from storage.dataset.settings import SplitSettings
@@ -196,3 +196,13 @@ def test_cards_are_those_that_are_visible(
 ) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", value)
     assert visible_gpus() == cards
+
+
+@for_each(
+    ("resolution", "memory_gib", "children"),
+    [(256, 80, 4), (512, 8, 4), (512, 4, 2), (2048, 24, 2), (2048, 141, 4), (256, 0, 1)],
+)
+def test_a_card_has_as_many_children_as_keep_it_busy_and_fit(
+    resolution: int, memory_gib: int, children: int
+) -> None:
+    assert children_of_gpu(resolution, memory_gib << 30) == children
