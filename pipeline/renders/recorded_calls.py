@@ -5,6 +5,7 @@ arguments for good. So the objects that kernels read come as `KernelInputs`: all
 inputs, all else that they hold tells recordings apart, and no recording keeps a scene.
 """
 
+import gc
 from collections.abc import Callable
 from typing import Any
 
@@ -72,9 +73,13 @@ def recorded(function: Callable[..., Any]) -> Callable[..., Any]:
     frozen = dr.freeze(call, limit=_MOST_RECORDINGS, warn_after=1 << 30)
 
     def replay(inputs: KernelInputs, *arguments: Any) -> Any:
+        collects = gc.isenabled()
+        gc.disable()  # to free an old scene cannot be recorded, and would end the process
         try:
             return frozen(inputs.kind, inputs.arrays, *arguments)
         finally:
+            if collects:
+                gc.enable()
             inputs.kind.objects = ()  # a recording keeps the kind that it was made with
 
     return replay

@@ -1,15 +1,19 @@
 """Passes that are replayed are those that are traced each time, in every bit."""
 
+import gc
 import itertools
 import weakref
+from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import read_back
 from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.recorded_calls import KernelInputs, recorded
 from pipeline.renders.tracer import Tracer
 from pipeline.renders.vector_tracer import VectorTracer
 from storage.records.scene import Scene
@@ -57,3 +61,18 @@ def test_a_scene_that_was_recorded_is_not_kept() -> None:
     table = weakref.ref(vars(vars(tracer)["_scene"])["table"])
     del tracer
     assert table() is None
+
+
+def test_old_scenes_are_not_freed_while_a_call_is_recorded() -> None:
+    """Dr.Jit would end the process."""
+    old = load_tracer(mirrors(), max_depth=4, rr_depth=2)
+    vars(old)["itself"] = old
+    del old
+
+    def double(_: Any, values: Any) -> Any:
+        if gc.isenabled():
+            gc.collect()
+        return 2 * values
+
+    doubled = recorded(double)(KernelInputs(), dr.opaque(mi.Float, 1, 3))
+    np.testing.assert_array_equal(doubled, 2)
