@@ -30,7 +30,7 @@ from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
 from pipeline.renders.tiles import TileChoice
 from pipeline.renders.tracer import Tracer
-from pipeline.renders.view_pictures import Look, ViewPictures
+from pipeline.renders.view_pictures import MeasuredLook, ViewPictures
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected, TrilightError
 from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
@@ -188,7 +188,7 @@ class SceneRenderer:
 
     def _sample_to_targets(
         self, samples: HalfSamples, pictures: ViewPictures
-    ) -> Generator[Sampling, None, Look]:
+    ) -> Generator[Sampling, None, MeasuredLook]:
         targets_db, max_spp = self._settings.targets_db, self._settings.max_spp
         measured: list[tuple[int, Floors]] = []
         shown = np.ones_like(pictures.shown) if self._sees_sky else pictures.shown

@@ -55,9 +55,6 @@ _GOLDEN = 1.1673039782614187
 class VectorTracer:
     """A scene on the LLVM or CUDA backend; see `Tracer` for the meaning of its methods."""
 
-    _light_paths = LIGHT_PATHS
-    """For each camera path, as weights have it."""
-
     def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int, scale: float = 1) -> None:
         """Load a scene that is `scale` times as large as cameras take it for."""
         surfaces, emitters = split_triangles(scene)
@@ -118,6 +115,11 @@ class VectorTracer:
 
     def _film(self, camera: Camera) -> Film:
         return Film(camera.scaled(self._scale))
+
+    @property
+    def _light_paths(self) -> float:
+        """Light paths for each camera path, as weights have it."""
+        return LIGHT_PATHS
 
     @property
     def _traced(self) -> Any:

@@ -20,7 +20,7 @@ which would hide the overflow."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Look:
+class MeasuredLook:
     """What is measured on the samples of a view at one time."""
 
     floor: MeasuredFloor
@@ -43,7 +43,7 @@ class ViewPictures(Protocol):
     shown: NDArray[np.bool_]
     """[R, R] pixels with a first surface, anywhere within the pixel; all of them if none has."""
 
-    def look(self, quality: Filtered) -> Look:
+    def look(self, quality: Filtered) -> MeasuredLook:
         """Return what is measured now, with halves denoised by a filter of this quality.
 
         Raises:

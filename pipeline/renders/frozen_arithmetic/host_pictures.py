@@ -21,7 +21,7 @@ from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tiles import tile_means
 from pipeline.renders.tracer import Features, Tracer
 from pipeline.renders.view_pictures import (
-    Look,
+    MeasuredLook,
     put_together,
     require_bounded,
     require_finite,
@@ -42,7 +42,7 @@ class HostPictures:
         self.shown = _shown(self._features)
         self._changes = LogChanges()
 
-    def look(self, quality: Filtered) -> Look:
+    def look(self, quality: Filtered) -> MeasuredLook:
         names = self._settings.part_names
         self._means = means = HostMeans(self._samples)
         pairs = [(raw, self._denoised(raw, quality)) for raw in means.half_means()]
@@ -57,7 +57,7 @@ class HostPictures:
                 _half((raw[part :: len(names)], rest[part :: len(names)])) for raw, rest in kept
             ]
             floors.append(measure_floor(parts[0], parts[1], self.hits))
-        return Look(
+        return MeasuredLook(
             floor=floors[0],
             part_floors=dict(zip(names, floors[1:], strict=True)),
             changes=self._changes.since([_half(pair) for pair in pairs]),
@@ -132,7 +132,7 @@ class HostMeans:
 
 
 class LogChanges:
-    """How much the halves change from look to look, as `Look.changes`."""
+    """How much the halves change from look to look, as `MeasuredLook.changes`."""
 
     def __init__(self) -> None:
         self._before: Sequence[NDArray[np.float64]] = []

@@ -10,7 +10,7 @@ import pytest
 from pipeline.renders.device_pictures import DevicePictures
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import Filtered, RenderSettings
-from pipeline.renders.view_pictures import Look
+from pipeline.renders.view_pictures import MeasuredLook
 from tests.for_each import for_each
 from tests.pipeline.renders.sampling import render_view
 from tests.pipeline.renders.scene_kit import sampled_like_scene
@@ -66,7 +66,7 @@ def test_little_is_read_back(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(dr.ArrayBase, way, counted)
     look = DevicePictures.look
 
-    def counted_look(self: DevicePictures, quality: Filtered) -> Look:
+    def counted_look(self: DevicePictures, quality: Filtered) -> MeasuredLook:
         nonlocal num_looks
         num_looks += 1
         return look(self, quality)

@@ -223,6 +223,7 @@ def test_the_right_picture_passes() -> None:
     assert wrong_picture() == ""
 
 
+@pytest.mark.usefixtures("unrecorded")
 @pytest.mark.parametrize("blind", ["surfaces", "everything"])
 @pytest.mark.parametrize("kernel", ["trace", "trace_light"])
 def test_a_kernel_that_misses_one_scene_is_found(
