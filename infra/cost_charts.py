@@ -1,6 +1,6 @@
-"""Charts of errors against costs: each cost a mark, each kind of point a color, names beside them.
+"""Charts of errors against costs: a marker for each cost, a color for each kind, and names.
 
-A point stands at its first cost and at each further one, both at its error, with a line between.
+A point is drawn at each of its costs, always at the height of its error, with a line between.
 """
 
 from collections.abc import Mapping, Sequence
@@ -8,27 +8,27 @@ from dataclasses import dataclass
 from typing import Any
 
 _COLORS = ("#c0392b", "#2e7d32", "#1f5fa8", "#7d5a00", "#6a3d9a")
-"""Of kinds, in the order in which they come; dark enough for small marks on white."""
+"""Colors of kinds in order of appearance; dark enough for small markers on white."""
 
 _FONT = 9
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeriesPoint:
-    """One point with several costs."""
+    """Point with several costs."""
 
     name: str
-    """Written beside it."""
+    """Label beside the point."""
     kind: str
-    """What it is one of: its color."""
+    """Group of the point, which decides its color."""
     costs: Sequence[float]
-    """Above 0, one for each series."""
+    """Costs above 0, one for each series."""
     error: float
-    """Its height."""
+    """Error on the vertical axis."""
 
 
 def colors_of(points: Sequence[SeriesPoint]) -> dict[str, str]:
-    """Return the color of each kind, in the order in which they come."""
+    """Return the color of each kind, in order of appearance."""
     kinds = list(dict.fromkeys(one.kind for one in points))
     return {name: _COLORS[row % len(_COLORS)] for row, name in enumerate(kinds)}
 
@@ -50,14 +50,14 @@ def draw_points(axes: Any, points: Sequence[SeriesPoint], colors: Mapping[str, s
 
 
 def name_points(axes: Any, points: Sequence[SeriesPoint]) -> None:
-    """Write each name beside the point's first cost; the figure was drawn once."""
+    """Write each name beside the point's first cost; the figure must have been drawn."""
     names = [(one.name, (one.costs[0], one.error)) for one in points]
-    others = [(cost, one.error) for one in points for cost in one.costs[1:]]
-    _place_labels(axes, names, others)
+    further_costs = [(cost, one.error) for one in points for cost in one.costs[1:]]
+    _place_labels(axes, names, further_costs)
 
 
 def draw_legend(figure: Any, costs: Sequence[str], colors: Mapping[str, str]) -> None:
-    """Say below the axes which mark is which cost, and which color which kind."""
+    """Draw the legend of markers (costs) and colors (kinds) below the axes."""
     from matplotlib.lines import Line2D
 
     grey = [
@@ -84,9 +84,9 @@ _PLACES = (
     (0, 9, "left", "bottom"),
     (0, -9, "left", "top"),
 )
-"""Offsets in printer's points, with the alignment of the name; the first free one is taken."""
+"""Offsets of names in points, with their alignment; the first free one is used."""
 _CLEAR_PX = 7
-"""Kept free around each point, so that no name covers it or its ring."""
+"""Free distance in pixels around each point."""
 
 
 def _place_labels(
@@ -94,14 +94,14 @@ def _place_labels(
     names: Sequence[tuple[str, tuple[float, float]]],
     also_clear: Sequence[tuple[float, float]],
 ) -> None:
-    """Write names beside their points, where they cover neither a point nor a name.
+    """Write names beside their points, so that they cover neither a point nor another name.
 
-    A name also stands clear of lines where possible, and is left out where there is no room.
+    A name avoids lines where possible, and is left out where there is no room.
 
     Args:
-        axes: of matplotlib, drawn once, so that places are known.
-        names: with the point of each, in the order in which they matter.
-        also_clear: other points that no name covers.
+        axes: axes of matplotlib that have been drawn, so that positions are known.
+        names: pairs of name and point, the most important first.
+        also_clear: further points that no name may cover.
     """
     from matplotlib.transforms import Bbox
 
@@ -139,7 +139,7 @@ def _label(
         name, at, xytext=(right, up), textcoords="offset points", fontsize=_FONT,
         horizontalalignment=across, verticalalignment=along,
     )  # fmt: skip
-    label.set_in_layout(False)  # else the axes would make room for it, and places would move
+    label.set_in_layout(False)  # else the axes would make room for it, and positions would change
     return label
 
 

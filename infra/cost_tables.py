@@ -1,13 +1,13 @@
-"""Tables of costs and errors: numbers as text, and the rows that no other row dominates."""
+"""Tables of costs and errors: numbers as text, and the Pareto front of rows."""
 
 from collections.abc import Sequence
 
 COST_NOISE = 0.03
-"""Costs that differ by less than this fraction count as equal: core-seconds vary by that much."""
+"""Relative difference below which costs count as equal: CPU seconds vary by that much."""
 
 
 def number_text(value: float) -> str:
-    """Return a number with three digits or a little more, without powers of ten where it can."""
+    """Return a number with two or three significant digits, mostly without powers of ten."""
     size = abs(value)
     if value == 0 or size >= 100:
         return f"{value:.0f}"
@@ -17,14 +17,14 @@ def number_text(value: float) -> str:
 
 
 def on_front(figures: Sequence[tuple[float, Sequence[float]]]) -> list[bool]:
-    """Return which of some points no other one dominates.
+    """Return for each point whether it is on the Pareto front: no other point dominates it.
 
-    One with less error dominates where none of its costs is more than COST_NOISE higher; one with
-    the same error where none is higher and one is more than COST_NOISE lower. Some point always
-    remains, since a dominating point has less error, or the same error and less cost.
+    A point with less error dominates if none of its costs is more than COST_NOISE higher; one with
+    the same error, if none of its costs is higher and one is more than COST_NOISE lower. The front
+    is never empty, since a dominating point has less error, or the same error and less cost.
 
     Args:
-        figures: error (smaller is better) and costs above 0 of each point, equally many.
+        figures: error (smaller is better) and costs above 0 of each point, equally many costs.
     """
     return [not any(_dominates(other, mine) for other in figures) for mine in figures]
 

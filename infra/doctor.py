@@ -1,4 +1,4 @@
-"""What this machine has and lacks, what that slows down, and the one command that fixes it."""
+"""Checks of this machine: what is missing, its consequence, and the command that fixes it."""
 
 import contextlib
 import importlib.util
@@ -15,7 +15,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
-from pipeline.isolation.confinement import VARIABLE, missing_parts, wanted_confinement
+from pipeline.isolation.confinement import VARIABLE, confinement_mode, missing_features
 from pipeline.isolation.landlock import landlock_version
 from pipeline.isolation.seccomp import seccomp_works
 from pipeline.renders.facts import render_facts
@@ -35,36 +35,36 @@ _LEAST_LIMITS = {
     "KiB of address space (ulimit -v)": (resource.RLIMIT_AS, 1024, 2 << 30),
     "KiB of a file (ulimit -f)": (resource.RLIMIT_FSIZE, 1024, 1 << 30),
 }
-"""Kind, unit and least value of what a run needs, by name."""
+"""Resource, unit and least value of each limit that a run needs, by name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One line of the report."""
+    """Result of one check."""
 
     name: str
-    """What was looked at."""
+    """Name of the check, a key of CHECKS."""
     state: State
-    """`ok`; `slower` where work goes on without it; `missing` where some work cannot be done."""
+    """`ok`; `slower` if work goes on without it; `missing` if some work cannot be done."""
     found: str
-    """What is there."""
+    """Detected version, size or problem."""
     consequence: str = ""
-    """What is slower or impossible; empty when all is well."""
+    """Slower or impossible work; empty if the state is ok."""
     mend: str = ""
-    """The one command that fixes it."""
+    """Command or action that fixes it; empty if none is known."""
 
 
 def examine(looking_at: Callable[[str], None] = lambda name: None) -> Iterator[Finding]:
-    """Look at one thing after another; probes that may crash run in processes of their own.
+    """Yield the result of each check; probes that may crash run in child processes.
 
     Args:
-        looking_at: called with the name of what is looked at next, which may take seconds.
+        looking_at: callback with the name of the next check, which may take seconds.
     """
     for name, check in CHECKS.items():
         looking_at(name)
         try:
             yield check()
-        except TrilightError as error:  # of what it asked, which says the next step itself
+        except TrilightError as error:  # its message names the next step
             yield Finding(name=name, state="missing", found=str(error), consequence="", mend="")
         except (metadata.PackageNotFoundError, ModuleNotFoundError) as error:
             yield Finding(
@@ -87,20 +87,20 @@ def _machine() -> Finding:
 
 def _disk() -> Finding:
     free = shutil.disk_usage(Path.cwd()).free
-    found = f"{free / 2**30:.0f} GiB free here"
+    text = f"{free / 2**30:.0f} GiB free here"
     if free >= _MIN_FREE_BYTES:
-        return Finding(name="disk", state="ok", found=found)
+        return Finding(name="disk", state="ok", found=text)
     return Finding(
         name="disk",
         state="slower",
-        found=found,
+        found=text,
         consequence="a dataset of ten thousand scenes takes more",
         mend="choose another disk with --out",
     )
 
 
 def _limits() -> Finding:
-    """Look at what a shell, a scheduler or a service sets for what it starts."""
+    """Check the resource limits that a shell, a scheduler or a service sets."""
     problems = [f"no temporary folder ({error})" for error in _temporary_problem()]
     for name, (kind, unit, least) in _LEAST_LIMITS.items():
         soft = resource.getrlimit(kind)[0]
@@ -126,11 +126,11 @@ def _temporary_problem() -> list[str]:
 
 
 def _renderer() -> Finding:
-    found = f"mitsuba {metadata.version('mitsuba')}"
+    text = f"mitsuba {metadata.version('mitsuba')}"
     finding = _probe(
         "renderer",
         "import mitsuba; mitsuba.set_variant('scalar_rgb')",
-        found=found,
+        found=text,
         consequence="nothing can be rendered",
         mend=f"{_APT} libatomic1",
     )
@@ -148,8 +148,8 @@ def _renderer() -> Finding:
             consequence="nothing can be rendered",
             mend=f"{_APT} libllvm19",
         )
-    found = ", ".join(part for part in (found, variant.name, variant.libllvm) if part)
-    return Finding(name="renderer", state="ok", found=found)
+    text = ", ".join(part for part in (text, variant.name, variant.libllvm) if part)
+    return Finding(name="renderer", state="ok", found=text)
 
 
 def _denoiser() -> Finding:
@@ -163,16 +163,16 @@ def _denoiser() -> Finding:
             consequence="pictures cannot be denoised",
             mend="make setup",
         )
-    found = f"OIDN {facts['denoiser']}, {facts['denoiser_device']}, {facts['threads']} threads"
+    text = f"OIDN {facts['denoiser']}, {facts['denoiser_device']}, {facts['threads']} threads"
     if variant.note:
         return Finding(
             name="denoiser",
             state="slower",
-            found=found,
+            found=text,
             consequence=variant.note,
             mend="a newer driver, or a card from compute capability 7.5 on",
         )
-    return Finding(name="denoiser", state="ok", found=found)
+    return Finding(name="denoiser", state="ok", found=text)
 
 
 def _mesh_decimation() -> Finding:
@@ -209,20 +209,22 @@ def _mesh_filters() -> Finding:
 
 
 def _confinement() -> Finding:
-    wanted, missing = wanted_confinement(), missing_parts()
+    mode = confinement_mode()
+    missing = missing_features()
     version = landlock_version()
     has = [f"Landlock {version}"] if version else []
-    found = ", ".join([*has, *(["seccomp"] if seccomp_works() else [])]) or "nothing to confine by"
-    if wanted != "off" and not missing:
-        return Finding(name="confinement", state="ok", found=found)
-    if wanted == "off":
-        found, mend = f"{found}; {VARIABLE}=off", f"unset {VARIABLE}"
+    text = ", ".join([*has, *(["seccomp"] if seccomp_works() else [])]) or "nothing to confine by"
+    if mode != "off" and not missing:
+        return Finding(name="confinement", state="ok", found=text)
+    if mode == "off":
+        text = f"{text}; {VARIABLE}=off"
+        mend = f"unset {VARIABLE}"
     else:
         mend = "run on Linux 5.13 or later, or read strangers' files in a container"
     return Finding(
         name="confinement",
-        state="missing" if wanted == "required" else "slower",
-        found=found,
+        state="missing" if mode == "required" else "slower",
+        found=text,
         consequence="a file that takes over its parser can do all that you can",
         mend=mend,
     )
@@ -234,7 +236,7 @@ def _orchestrator() -> Finding:
         "import prefect.server.api.server",
         found=f"prefect {metadata.version('prefect')}, fastapi {metadata.version('fastapi')}",
         consequence="no flow can run",
-        mend="make setup",
+        mend="make setup" if _has_home() else "export HOME=/a/folder/of/your/own",
     )
 
 
@@ -285,8 +287,17 @@ def _cache() -> Finding:
     )
 
 
+def _has_home() -> bool:
+    """Return whether this user has a home, which Prefect looks for when it is imported."""
+    try:
+        Path.home()
+    except RuntimeError:
+        return False
+    return True
+
+
 def _probe(name: str, code: str, *, found: str, consequence: str, mend: str) -> Finding:
-    """Run code in a process of its own; a non-zero end, a crash or a hang is `missing`."""
+    """Run code in a child process; a non-zero status, a crash or a hang is `missing`."""
     try:
         result = subprocess.run(
             [sys.executable, "-c", code],
@@ -300,6 +311,8 @@ def _probe(name: str, code: str, *, found: str, consequence: str, mend: str) -> 
         problem = "" if result.returncode == 0 else _last_line(result.stderr, result.returncode)
     except subprocess.TimeoutExpired:
         problem = f"no answer within {_PROBE_S} s"
+    except OSError as error:
+        problem = f"{sys.executable} cannot be started ({error.strerror})"
     if not problem:
         return Finding(name=name, state="ok", found=found)
     found = f"{found}: {problem}"
@@ -324,4 +337,4 @@ CHECKS: Mapping[str, Callable[[], Finding]] = {
     "learning": _learning,
     "GPU": _accelerator,
 }
-"""What `examine` looks at by the name of its finding, in the order of the report."""
+"""Checks of `examine` by name, in the order of the report."""

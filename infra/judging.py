@@ -1,9 +1,8 @@
-"""A trained network judged on a dataset: the figures, and the files that show them."""
+"""Evaluation of a trained network on a dataset: its figures, and the report's files."""
 
 import contextlib
 import dataclasses
 import itertools
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +15,12 @@ from model.open import find_network
 from model.weights import network_digest
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
+from storage.errors import TrilightError
+from storage.typed_json import read_json
 from train.evaluation.evaluate import (
-    Contest,
-    judged_views,
-    make_rivals,
+    EvalConfig,
+    judge_views,
+    make_baselines,
     sheet_views,
     stored_resolution,
     worst_and_median,
@@ -28,26 +29,26 @@ from train.evaluation.evaluate import (
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.report import markdown, record
 from train.evaluation.same_time import same_time
-from train.evaluation.sheet import drawn_sheet, write_picture
+from train.evaluation.sheet import draw_sheet, write_picture
 from train.loop.checkpoints import network_of_run
-from train.loop.crew import choose_device
+from train.loop.distributed import choose_device
 from train.loss.lpips import load_lpips
 from train.result import pretty_json
 
-Told = Callable[[Sequence[JudgedView]], dict[str, Any]]
-"""Says of the judged views what the same time buys elsewhere."""
+EqualTimeReport = Callable[[Sequence[JudgedView]], dict[str, Any]]
+"""Function that compares the evaluated views with the path tracer in equal time."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judgement:
-    """The result of an evaluation."""
+    """Result of an evaluation."""
 
     record: dict[str, Any]
-    """All that was measured, as JSON values (train.evaluation.report)."""
+    """All figures as JSON values (train.evaluation.report)."""
     views: tuple[JudgedView, ...]
-    """View by view."""
-    contest: Contest
-    """Who was judged on what."""
+    """Scores of each view, in the order of the dataset."""
+    contest: EvalConfig
+    """Network, data and baselines of the evaluation."""
 
 
 def judge_network(
@@ -63,42 +64,46 @@ def judge_network(
     device: str | None = None,
     done: Callable[[int, int], None] = lambda now, total: None,
 ) -> Judgement:
-    """Judge a network view by view, beside each view's own noise floor and simple baselines.
+    """Evaluate a network on each view, with the view's noise floor and simple baselines.
 
     Args:
         checkpoint: folder of a run, its model.safetensors, a checkpoint, or `builtin:`.
         data: root of a dataset, or shards by name or pattern.
-        split: which of its splits.
+        split: split of the dataset.
         train_data: data of the baselines' training pictures; by default `data`, if it has any.
-        resolution: pixels across; by default what the network was trained at, else the data's.
-        most_scenes: the first so many scenes are judged.
-        tracer_views: on so many views at most the path tracer is judged in the network's own time
-            (infra.tracer_rival); 0: nothing is traced. Where it cannot be, the record says why.
+        resolution: width in pixels; by default the network's training width, else the data's.
+        most_scenes: maximum number of scenes, from the start of the split.
+        tracer_views: maximum number of views on which the path tracer is evaluated in the network's
+            time (infra.tracer_rival); 0 for none. Where it fails, the record says why.
         lpips: folder of LPIPS' weights, or `hub`; without them LPIPS is n/a.
-        device: cpu or cuda; by default cuda where there is one.
+        device: cpu or cuda; by default cuda if there is a GPU.
         done: called with (finished, all) scenes.
 
     Raises:
-        TrilightError: no such network or data, or a split that holds no scene.
+        TrilightError: the network or the data does not exist, or the split is empty.
     """
     opened = open_training_data(data)
     rivals = opened if train_data is None else open_training_data(train_data)
-    found, shards = find_network(checkpoint, network_of_run), opened.split(split)
+    network_file = find_network(checkpoint, network_of_run)
+    shards = opened.split(split)
     if resolution is None:
         stored = stored_resolution(shards)
-        resolution = min(found.trained.resolution or stored, stored)
-    place, distance = choose_device(device), load_lpips(lpips)
-    contest = Contest(
-        network=found.open().to(place),
+        resolution = min(network_file.trained.resolution or stored, stored)
+    torch_device = choose_device(device)
+    distance = load_lpips(lpips)
+    contest = EvalConfig(
+        network=network_file.open().to(torch_device),
         shards=shards,
         resolution=resolution,
-        rivals=make_rivals(rivals.split("train"), resolution) if "train" in rivals.splits else None,
-        lpips=None if distance is None else distance.to(place),
+        baselines=make_baselines(rivals.split("train"), resolution)
+        if "train" in rivals.splits
+        else None,
+        lpips=None if distance is None else distance.to(torch_device),
         most_scenes=most_scenes,
     )
-    counted = _Counted(done, _num_scenes(contest))
+    counted = _SceneCounter(done, _num_scenes(contest))
     with _tracing(contest, tracer_views) as (contest, traced):
-        views = judged_views(contest, counted.one_more)
+        views = judge_views(contest, counted.one_more)
     about = _about(checkpoint, opened, contest, split, views)
     return Judgement(
         record=record(views, about, traced(views)), views=tuple(views), contest=contest
@@ -106,8 +111,8 @@ def judge_network(
 
 
 @contextlib.contextmanager
-def _tracing(contest: Contest, most_views: int) -> Iterator[tuple[Contest, Told]]:
-    """Enter a contest with the path tracer in the network's own time, if one can be had."""
+def _tracing(contest: EvalConfig, most_views: int) -> Iterator[tuple[EvalConfig, EqualTimeReport]]:
+    """Add the path tracer in the network's time to the evaluation, if it can trace the scenes."""
     rival = TracerRival(contest.resolution, most_views=most_views, num_scenes=_num_scenes(contest))
     with contextlib.closing(rival):
         samples = list(itertools.islice(contest.samples(), TIMED_SCENES))
@@ -126,23 +131,24 @@ def write_judgement(judgement: Judgement, out: str | Path) -> Path:
     Raises:
         TrilightError: the folder cannot be written.
     """
-    found = judgement.record
-    own = (None, found["about"]["network sha256"])
+    evaluation = judgement.record
+    replaceable = (None, evaluation["about"]["network sha256"])
     numbered = (f"{out}-{number}" if number > 1 else out for number in itertools.count(1))
-    folder = next(place for place in map(Path, numbered) if _network_of(place) in own)
-    write_atomically(folder / "evaluation.json", pretty_json(found))
-    write_atomically(folder / "evaluation.md", markdown(found).encode())
-    contest, views = judgement.contest, list(judgement.views)
+    folder = next(place for place in map(Path, numbered) if _network_of(place) in replaceable)
+    write_atomically(folder / "evaluation.json", pretty_json(evaluation))
+    write_atomically(folder / "evaluation.md", markdown(evaluation).encode())
+    contest = judgement.contest
+    views = list(judgement.views)
     chosen = worst_and_median(views)
     if excursions := worst_of_each_excursion(views):
         chosen["worst of each axis"] = excursions
         plot_excursions(folder / "excursions.png", views)
     with contextlib.closing(contest.traced) if contest.traced else contextlib.nullcontext():
         pictures = sheet_views(contest, [row for rows in chosen.values() for row in rows])
-    shown = iter(pictures)
+    remaining = iter(pictures)
     for name, rows in chosen.items():
         title = (f"{name}, of {len(views)} views at {contest.resolution} pixels, by psnr_log_db",)
-        sheet = drawn_sheet([next(shown) for _ in rows], title)
+        sheet = draw_sheet([next(remaining) for _ in rows], title)
         write_picture(folder / f"{name.replace(' ', '_')}.png", sheet)
     return folder
 
@@ -150,19 +156,22 @@ def write_judgement(judgement: Judgement, out: str | Path) -> Path:
 def _network_of(folder: Path) -> str | None:
     """Return the digest of the network whose report a folder holds; None where it holds none."""
     try:
-        digest = json.loads((folder / "evaluation.json").read_bytes())["about"]["network sha256"]
+        data = (folder / "evaluation.json").read_bytes()
+        report = read_json(data, dict[str, Any], str(folder))
+        return str(report["about"]["network sha256"])
     except OSError:
         return None
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (TrilightError, KeyError, TypeError):
         return "unknown"
-    return str(digest)
 
 
-class _Counted:
-    """Reports the number of judged scenes and of all."""
+class _SceneCounter:
+    """Counter that reports the evaluated scenes and all scenes."""
 
     def __init__(self, done: Callable[[int, int], None], total: int) -> None:
-        self._done, self._total, self._now = done, total, 0
+        self._done = done
+        self._total = total
+        self._now = 0
         done(0, total)
 
     def one_more(self) -> None:
@@ -173,15 +182,15 @@ class _Counted:
 def _about(
     checkpoint: str,
     opened: TrainingData,
-    contest: Contest,
+    contest: EvalConfig,
     split: str,
     views: Sequence[JudgedView],
 ) -> dict[str, str | int]:
-    """Return what the report says of itself; no path of this machine."""
+    """Return the report's facts about itself, without paths of this machine."""
     return {
         "network": Path(checkpoint).name,
         "network sha256": network_digest(contest.network),
-        "data": opened.shown.rstrip("/").rsplit("/", 1)[-1],
+        "data": opened.display_name.rstrip("/").rsplit("/", 1)[-1],
         "build": opened.build or "unknown",
         "data digest": opened.digest,
         "split": split,
@@ -190,8 +199,8 @@ def _about(
     }
 
 
-def _num_scenes(contest: Contest) -> int:
-    """Return how many scenes will be judged; opens no shard that is not judged anyway."""
+def _num_scenes(contest: EvalConfig) -> int:
+    """Return the number of scenes to evaluate; opens only shards that are evaluated anyway."""
     count = 0
     for number in range(len(contest.shards.names)):
         if count < contest.most_scenes:
@@ -200,14 +209,14 @@ def _num_scenes(contest: Contest) -> int:
 
 
 COLUMNS = 3
-"""Plots in a row."""
+"""Number of plots in a row."""
 
 
 def plot_excursions(path: Path, views: Sequence[JudgedView]) -> int:
-    """Draw how psnr_log_db falls off beyond the usual range; return how many axes there are.
+    """Plot psnr_log_db beyond the usual range of scenes; return the number of axes.
 
-    One plot for each axis: a dot is a view, the line the median at each value, the dashed line
-    that of the noise floors. Nothing is written where no view leaves the usual range.
+    Each axis has a plot: a dot is a view, the line the median at each value, the dashed line the
+    median of the noise floors. Nothing is written if no view leaves the usual range.
     """
     import matplotlib
 

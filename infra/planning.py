@@ -1,8 +1,8 @@
-"""Predicts what a dataset will take from a few scenes measured on this machine.
+"""Predicts time, bytes and cost of a dataset from a few scenes measured on this machine.
 
 Scenes differ in cost by orders of magnitude (a hard view takes a hundred times the samples of an
-easy one), so a mean of few has a wide interval: it is the bootstrap's, from the measured scenes.
-The scenes are the first ones of the dataset itself, in its own shards and splits.
+easy one), so that a mean of few scenes has a wide interval, which is computed by the bootstrap. The
+measured scenes are the first ones of the dataset, in its shards and splits.
 """
 
 import dataclasses
@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.settings import BuildSettings
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.machine import cores_owned
-from pipeline.making.pipeline import make_task, prepare_dataset
-from pipeline.making.render_children import close_children
-from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.machine import available_cores
+from pipeline.generation.pipeline import make_task, prepare_dataset
+from pipeline.generation.render_children import close_children
+from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.dataset.progress import read_progress
-from storage.dataset.scene_logs import look_at_logs
+from storage.dataset.scene_logs import sample_logs
 from storage.dataset.shard import contents_of
 from storage.dataset.splits import lacks_validation, planned_scenes, shard_name, shards_for
 from storage.dataset.staging import read_staged_scene
@@ -36,68 +36,66 @@ _DRAWS = 2000
 _BYTES_PER_TASK_RUN = 19_400
 """Bytes in Prefect's database: states, events and indices (study S58)."""
 _BYTES_PER_SHARD = 180
-"""Bytes of a row of the manifest: 172 of train-000123.tar, 178 of one in a part of the folder."""
+"""Bytes of a row of the manifest: 172 for train-000123.tar, 178 for one in a subfolder."""
 _LONG_TASK_MINUTES = 10
 
 
 @dataclass(frozen=True, kw_only=True)
 class Interval:
-    """A figure with its 90 % interval, as far as few scenes can tell."""
+    """Predicted figure with its 90 % interval."""
 
     value: float
-    """What to expect."""
+    """Expected value of the figure."""
     low: float
-    """5th percentile."""
+    """5th percentile of the bootstrap."""
     high: float
-    """95th percentile."""
+    """95th percentile of the bootstrap."""
 
-    def shown(self, form: Callable[[float], str]) -> str:
-        """Return the figure and its interval, each as `form` writes it."""
+    def to_text(self, form: Callable[[float], str]) -> str:
+        """Return the figure and its interval, each formatted by `form`."""
         return f"{form(self.value)} ({form(self.low)} to {form(self.high)})"
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredScenes:
-    """What some scenes took."""
+    """Measured costs of some scenes."""
 
     core_s: tuple[float, ...]
-    """Core-seconds of each, in the order in which they were made."""
+    """CPU seconds of each scene, in the order of rendering."""
     num_bytes: tuple[int, ...]
-    """Bytes of each, in the same order."""
+    """Bytes of each scene in its shard, in the same order."""
     num_views: int
-    """Views of a scene."""
+    """Number of views of a scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """What a dataset will take."""
+    """Predicted size and cost of a dataset."""
 
     num_scenes: int
-    """Scenes."""
     num_shards: int
-    """Shards."""
     scenes_per_shard: int
-    """Scenes in each but the last, which may have fewer."""
+    """Number of scenes in each shard but the last, which may have fewer."""
     core_hours: Interval
-    """Cores times hours."""
+    """CPU hours of all scenes."""
     hours: Interval
-    """On the whole fleet, all of whose cores are busy."""
+    """Wall-clock hours with all cores busy."""
     usd: Interval
-    """What the cores cost."""
+    """Price of the CPU hours in US dollars."""
     gigabytes: Interval
-    """All shards."""
+    """Size of all shards in 10^9 bytes."""
     shard_hours: Interval
-    """Core-hours of one shard."""
+    """CPU hours of one average shard."""
     num_tasks: int
-    """Task runs of one flow run that makes everything."""
+    """Number of task runs in one flow run that makes the whole dataset."""
     task_minutes: float
-    """How long one takes on one of the machines' render processes."""
+    """Wall-clock minutes of a task on this machine's cores."""
     database_mb: float
-    """Rows of those task runs in Prefect's database."""
+    """Size of the task runs in Prefect's database in 10^6 bytes."""
     manifest_mb: float
-    """Size of manifest.json when all is done."""
+    """Size of the finished manifest.json in 10^6 bytes."""
     notes: tuple[str, ...]
-    """Warnings before the dataset is begun."""
+    """Warnings about the predicted run."""
 
 
 def measure_scenes(
@@ -106,20 +104,21 @@ def measure_scenes(
     """Make the first scenes of a dataset in another folder.
 
     Args:
-        order: the dataset; its folder is not touched.
-        count: scenes to make.
-        place: an empty folder, which may be deleted then.
-        scene_done: called after each.
+        order: options of the dataset, whose folder is not touched.
+        count: number of scenes to make.
+        place: empty folder, which may be deleted afterwards.
+        scene_done: called after each scene.
 
     Raises:
         TrilightError: as `prepare_dataset`.
     """
-    # begun as large as it will be, so that a lack of objects is reported now and not by `generate`
+    # prepared at its full size, so that a lack of objects is reported now and not by `generate`
     scenes = max(count, _num_scenes(order))
     run = prepare_dataset(dataclasses.replace(order, out=str(place), scenes=scenes))
     job = run.job(1)
     splits = run.settings.splits
-    core_s, sizes = [], []
+    core_s = []
+    sizes = []
     try:
         for scene in range(count):
             shard = scene // splits.scenes_per_shard
@@ -137,75 +136,79 @@ def measure_scenes(
 def predict(
     measured: MeasuredScenes, order: DatasetOrder, *, cores: int, usd_per_core_hour: float
 ) -> Prediction:
-    """Return what the whole dataset will take, by the means of the measured scenes.
+    """Return the predicted cost of the whole dataset from the means of measured scenes.
 
     The first scene of a process also compiles kernels, which a long run does once per 200 scenes;
-    it is left out where there are others. Means are resampled 2000 times (Efron's bootstrap), which
-    is too narrow for very few scenes and cannot know what none of them shows.
+    it is left out if there are others. Means are resampled 2000 times (Efron's bootstrap), which is
+    too narrow for very few scenes and cannot predict costs that none of them shows.
     """
     splits = _settings(order).splits
     num_scenes = planned_scenes(_num_scenes(order), splits)
     num_shards = shards_for(num_scenes, splits)
     core_hours = _total(measured.core_s[1:] or measured.core_s, num_scenes / 3600)
-    scene_s = core_hours.value * 3600 / num_scenes / cores_owned()
-    num_tasks = min(MOST_TASKS, max(1, math.ceil(num_scenes * scene_s / TASK_S)))
-    found = Prediction(
+    scene_s = core_hours.value * 3600 / num_scenes / available_cores()
+    num_tasks = min(MAX_TASKS, max(1, math.ceil(num_scenes * scene_s / TASK_S)))
+    prediction = Prediction(
         num_scenes=num_scenes,
         num_shards=num_shards,
         scenes_per_shard=splits.scenes_per_shard,
         core_hours=core_hours,
-        hours=_scaled(core_hours, 1 / cores),
-        usd=_scaled(core_hours, usd_per_core_hour),
+        hours=_scale(core_hours, 1 / cores),
+        usd=_scale(core_hours, usd_per_core_hour),
         gigabytes=_total(measured.num_bytes, num_scenes / 1e9),
-        shard_hours=_scaled(core_hours, 1 / num_shards),
+        shard_hours=_scale(core_hours, 1 / num_shards),
         num_tasks=num_tasks,
         task_minutes=num_scenes * scene_s / num_tasks / 60,
         database_mb=num_tasks * _BYTES_PER_TASK_RUN / 1e6,
         manifest_mb=num_shards * _BYTES_PER_SHARD / 1e6,
         notes=(),
     )
-    return dataclasses.replace(found, notes=tuple(_notes(found)))
+    return dataclasses.replace(prediction, notes=tuple(_notes(prediction)))
 
 
 def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
-    """Return what a run is going to make, and how long it takes as far as earlier scenes tell.
+    """Return a line on the scenes that a run will make, and its time by earlier scenes.
 
-    Empty where files or another dataset say which scenes there are.
+    It is empty if files or another dataset define the scenes.
     """
     settings = _settings(order)
     if order.scenes_from or order.revisits or settings.revisit:
         return ""
-    scenes, said = _num_scenes(order), "; how long that takes is known after the first scenes"
+    scenes = _num_scenes(order)
+    said = "; how long that takes is known after the first scenes"
     if folder.manifest.exists():
-        manifest, last = read_manifest(folder.manifest), look_at_logs(folder).last
+        manifest = read_manifest(folder.manifest)
+        last = sample_logs(folder).last
         scenes = max(scenes, manifest.num_scenes)
-        left, cores = max(scenes - read_progress(folder).scenes_done, 0), cores_owned()
+        remaining = max(scenes - read_progress(folder).scenes_done, 0)
+        cores = available_cores()
         if last:
             core_s = [row.seconds * row.cores for row in last]
-            minutes = _total(core_s, left / cores / 60).shown("{:,.1f}".format)
-            said = f"; {left} of them are still to make: {minutes} minutes on {cores} cores"
+            minutes = _total(core_s, remaining / cores / 60).to_text("{:,.1f}".format)
+            said = f"; {remaining} of them are still to make: {minutes} minutes on {cores} cores"
         if sizes := [
             each.num_bytes / each.num_samples for each in manifest.shards if each.num_samples
         ]:
             said = f", about {_total(sizes, scenes / 1e6).value:,.1f} MB{said}"
-    shards, lacking = shards_for(scenes, settings.splits), lacks_validation(scenes, settings.splits)
+    shards = shards_for(scenes, settings.splits)
+    lacking = lacks_validation(scenes, settings.splits)
     lacking = f" ({lacking})" if lacking else ""
     part = f", of which this run makes {order.shards}" if order.shards else ""
     views = f"{settings.scenes.num_views} views each"
-    counts = f"{_counted(scenes, 'scene')} of {views} in {_counted(shards, 'shard')}"
+    counts = f"{_count_text(scenes, 'scene')} of {views} in {_count_text(shards, 'shard')}"
     return f"{counts}{lacking}{part}{said}"
 
 
-def _counted(count: int, noun: str) -> str:
+def _count_text(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
-def _notes(found: Prediction) -> Iterator[str]:
-    if found.task_minutes > _LONG_TASK_MINUTES:
-        parts = math.ceil(found.task_minutes / _LONG_TASK_MINUTES)
+def _notes(prediction: Prediction) -> Iterator[str]:
+    if prediction.task_minutes > _LONG_TASK_MINUTES:
+        parts = math.ceil(prediction.task_minutes / _LONG_TASK_MINUTES)
         yield (
-            f"one flow run would have tasks of {found.task_minutes:.0f} minutes: let build-dataset "
-            f"make it in at least {parts} flow runs, on as many workers"
+            f"one flow run would have tasks of {prediction.task_minutes:.0f} minutes: let "
+            f"build-dataset make it in at least {parts} flow runs, on as many workers"
         )
 
 
@@ -225,9 +228,9 @@ def _settings(order: DatasetOrder) -> BuildSettings:
 
 
 def _scene_bytes(folder: DatasetFolder, shard: str, scene: int) -> int:
-    """Return what a scene adds to its shard: a header for each member, its bytes in blocks of 512.
+    """Return the bytes of a scene in its shard: a header for each member, and blocks of 512 bytes.
 
-    The last scene of a shard is packed already, and the others wait for it.
+    The last scene of a shard is packed already; the others are still staged.
     """
     if folder.shard(shard).exists():
         with open_plain(folder.shard(shard)) as stream:
@@ -240,7 +243,7 @@ def _scene_bytes(folder: DatasetFolder, shard: str, scene: int) -> int:
 
 
 def _total(each: Sequence[float], times: float) -> Interval:
-    """Return the mean of some scenes times a number, with a bootstrap interval."""
+    """Return the mean of some scenes times a factor, with a bootstrap interval."""
     values = np.asarray(each, np.float64)
     rows = rng_for(0, "plan").integers(0, len(values), (_DRAWS, len(values)))
     means: NDArray[np.float64] = values[rows].mean(axis=1) * times
@@ -248,5 +251,5 @@ def _total(each: Sequence[float], times: float) -> Interval:
     return Interval(value=float(values.mean()) * times, low=float(low), high=float(high))
 
 
-def _scaled(interval: Interval, by: float) -> Interval:
+def _scale(interval: Interval, by: float) -> Interval:
     return Interval(value=interval.value * by, low=interval.low * by, high=interval.high * by)

@@ -1,11 +1,11 @@
-"""The name of this machine's processor, which stands beside every measured time."""
+"""Name of this machine's processor, which accompanies every measured time."""
 
 import platform
 from pathlib import Path
 
 
 def processor() -> str:
-    """Return the name of the processor; empty where the system does not say it."""
+    """Return the name of the processor; empty if the system does not state it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""How far a training run is, from its folder and without torch."""
+"""Progress of a training run, from its folder and without torch."""
 
 import math
 import shlex
@@ -10,7 +10,7 @@ from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
 from storage.typed_json import read_json
 from train.folder import RunFolder
-from train.watching.rows import read_rows
+from train.monitoring.rows import read_rows
 
 FIGURES = {
     "training_loss": ("loss",),
@@ -18,11 +18,11 @@ FIGURES = {
     "validation_psnr_log_db_median": ("validation", "psnr_log_db_median"),
     "views_per_s": ("views_per_s",),
 }
-"""Figures of which the last is told, and where they stand in a row of the log."""
+"""Keys in a row of metrics.jsonl of each figure whose last value is reported."""
 
 
 def is_run(root: Path) -> bool:
-    """Return whether a folder is one that a training wrote."""
+    """Return whether a folder is that of a training run."""
     folder = RunFolder(root)
     return folder.settings.is_file() and folder.metrics.is_file()
 
@@ -33,10 +33,10 @@ def tensorboard_command(root: Path) -> str:
 
 
 def run_facts(root: Path) -> dict[str, Any]:
-    """Return how far a run is, as JSON values; what is not known yet is left out.
+    """Return the progress of a run as JSON values, without figures that are not known yet.
 
     Raises:
-        TrilightError: the folder holds no run, or a file that is damaged.
+        TrilightError: the folder holds no run, or a file is damaged.
     """
     if not is_run(root):
         raise TrilightError(f"{root}: no run here; expected a folder that `trilight train` wrote.")
@@ -45,7 +45,8 @@ def run_facts(root: Path) -> dict[str, Any]:
         place = str(folder.settings)
         settings = read_json(read_plain(folder.settings), dict[str, Any], place)["settings"]
         rows = read_rows(folder.metrics)
-        step, planned = max((row["step"] for row in rows), default=0), settings["num_steps"]
+        step = max((row["step"] for row in rows), default=0)
+        planned = settings["num_steps"]
         facts = {
             "run": settings.get("run"),
             "steps": step,

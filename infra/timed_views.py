@@ -1,4 +1,4 @@
-"""What the first view of a scene takes, and a further one: core-seconds once everything is warm."""
+"""Times of the first and of a further view of a scene: CPU seconds after a warm-up."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -8,45 +8,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 REPEATS = 3
-"""Counted times that a scene is loaded and shown; the median counts."""
+"""Number of measured repetitions after the warm-up; the result is their median."""
 
 Show = Callable[[], NDArray[np.float32]]
-"""Makes the picture [R, R, 3] of a loaded scene."""
+"""Function that renders the picture [R, R, 3] of a loaded scene."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TimedViews:
-    """A picture, and what it takes."""
+    """Picture and its costs."""
 
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance."""
     first_s: float
-    """Core-seconds of loading the scene and showing it."""
+    """CPU seconds of loading the scene and rendering a view."""
     further_s: float
-    """Core-seconds of showing it once more."""
+    """CPU seconds of rendering one more view."""
 
 
 def timed_views(load: Callable[[], Show], repeats: int = REPEATS) -> TimedViews:
-    """Load a scene and show it twice, once to warm up and then `repeats` times that count.
+    """Load a scene and render it twice, once to warm up and then in `repeats` measured repetitions.
 
-    Core-seconds are those of this process with all of its threads.
+    CPU seconds are those of this process with all of its threads.
     """
-    found = [_once(load) for _ in range(1 + repeats)][1:]
+    repetitions = [_once(load) for _ in range(1 + repeats)][1:]
     return TimedViews(
-        radiance_rgb=found[-1].radiance_rgb,
-        first_s=_median([one.first_s for one in found]),
-        further_s=_median([one.further_s for one in found]),
+        radiance_rgb=repetitions[-1].radiance_rgb,
+        first_s=_median([one.first_s for one in repetitions]),
+        further_s=_median([one.further_s for one in repetitions]),
     )
 
 
 def _once(load: Callable[[], Show]) -> TimedViews:
-    began = time.process_time()
+    start = time.process_time()
     show = load()
     show()
-    shown = time.process_time()
+    first_end = time.process_time()
     picture = show()
-    again = time.process_time()
-    return TimedViews(radiance_rgb=picture, first_s=shown - began, further_s=again - shown)
+    second_end = time.process_time()
+    return TimedViews(
+        radiance_rgb=picture, first_s=first_end - start, further_s=second_end - first_end
+    )
 
 
 def _median(seconds: Sequence[float]) -> float:

@@ -1,4 +1,4 @@
-"""PyTorch, which making data does not need: refused in one line where it is missing."""
+"""Check for PyTorch, which only training and networks need."""
 
 import importlib.util
 import os
@@ -9,9 +9,8 @@ from storage.errors import TrilightError
 def require_torch(what: str) -> None:
     """Prepare this process for the first import of torch.
 
-    torch's threads would wait for each other in busy loops, which beside other work made training
-    twelve times slower. OpenMP reads when torch is imported how it should wait; a setting of the
-    user's own wins.
+    torch's threads would spin while they wait, which made training beside other work twelve times
+    slower. OpenMP reads the variable when torch is imported; a value that the user set wins.
 
     Raises:
         TrilightError: `what` needs torch, and it is not installed.

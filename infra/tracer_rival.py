@@ -1,8 +1,8 @@
-"""The path tracer in a network's own time: what the same core-seconds buy elsewhere.
+"""Equal-time baseline: the path tracer with as many CPU seconds as a network.
 
-A network is timed on a few scenes of what it is judged on, and so are previews of 1, 2, 4, ...
-samples a pixel with either filter. The rival is the preview of the most samples whose further view
-takes no longer than the network's; where even one sample takes longer, it is that one.
+A network is timed on a few scenes of its evaluation, and so are previews of 1, 2, 4, ... samples
+per pixel with either filter. The baseline is the preview of the most samples whose further view
+takes no longer than the network's; if even one sample takes longer, it is that one.
 """
 
 import copy
@@ -26,53 +26,53 @@ from pipeline.renders.variant import Variant, activate, choose_variant
 from storage.errors import Rejected, TrilightError
 from storage.records.sample import Sample
 from storage.records.scene import Scene
-from train.evaluation.same_time import Times, TracerTimes
+from train.evaluation.same_time import SameTimeResult, TracerTimes
 
 TIMED_SCENES = 4
-"""Scenes on which both are timed."""
+"""Number of scenes on which both are timed."""
 
 TIMED_S = 60.0
-"""After so many core-seconds of the network no further scene is timed."""
+"""CPU seconds of the network after which no further scene is timed."""
 
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=10_000)
 
 _SEED = 0
-"""Of the samples: the default of `trilight render`."""
+"""Seed of the samples: the default of `trilight render`."""
 
 LADDER = tuple(1 << step for step in range(MOST_SPP.bit_length()))
-"""Samples a pixel that may fit."""
+"""Candidate numbers of samples per pixel."""
 
 Level = tuple[int, Literal["fast", "high"]]
-"""Samples a pixel, and the filter."""
+"""Samples per pixel, and the filter."""
 
 LEAST: Level = (1, "fast")
-"""What is cheapest."""
+"""Cheapest level."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Price:
-    """Core-seconds of one thread."""
+    """CPU seconds of one thread."""
 
     first_s: float
-    """Of the first view of a scene, its loading included."""
+    """CPU seconds of the first view of a scene, loading included."""
     further_s: float
-    """Of a further one."""
+    """CPU seconds of a further view."""
 
 
 DEARER = Price(first_s=math.inf, further_s=math.inf)
-"""What was not tried, since fewer samples took too long."""
+"""Price of a level that was not tried, since fewer samples took too long."""
 
 
 class TracerRival:
-    """Traces pictures of stored scenes in a child of its own, on one thread."""
+    """Equal-time path tracer of stored scenes, in a child with one thread."""
 
     def __init__(self, resolution: int, *, most_views: int, num_scenes: int) -> None:
-        """Remember what is asked; a child is started when it is first needed.
+        """Store the limits; a child is started when it is first needed.
 
         Args:
-            resolution: pixels across.
-            most_views: how many views it is judged on at most; with 0 nothing is traced.
-            num_scenes: how many are judged.
+            resolution: width in pixels.
+            most_views: maximum number of views to trace; 0 for none.
+            num_scenes: number of evaluated scenes.
         """
         self._resolution = resolution
         self._most_views = most_views
@@ -86,23 +86,23 @@ class TracerRival:
 
     @property
     def which(self) -> str:
-        """Which views it was judged on, in words."""
+        """Text on the views that were traced."""
         views = f"the first {self._views} views" if self._views > 1 else "the first view"
         if self._asked_views <= self._views:
             views = "all views"
         return f"{views} of {'each scene' if self._every == 1 else f'one scene in {self._every}'}"
 
-    def measure(self, network: RenderFormer, samples: Sequence[Sample]) -> Times:
-        """Time both on some scenes, in turns, and remember the samples that fit.
+    def measure(self, network: RenderFormer, samples: Sequence[Sample]) -> SameTimeResult:
+        """Time both on some scenes, and choose the samples that fit.
 
-        The network comes first, then the path tracer, then the network once more.
+        The network is timed first, then the path tracer, then the network once more.
 
         Args:
-            network: wherever it is; it is timed on the processor.
-            samples: one at least.
+            network: network on any device; it is timed on the processor.
+            samples: scenes, at least one.
 
         Raises:
-            TrilightError: the network cannot show such pictures.
+            TrilightError: the network cannot render such pictures.
         """
         renderer = NeuralRenderer(copy.deepcopy(network).cpu())
         scenes: list[Scene] = []
@@ -115,32 +115,32 @@ class TracerRival:
         theirs, missing = self._prices(scenes, _middle([each.further_s for each in ours]))
         ours += [_network_price(renderer, scene, self._resolution) for scene in scenes]
         further_s = _middle([each.further_s for each in ours])
-        return Times(
+        return SameTimeResult(
             network_first_s=_middle([each.first_s for each in ours]),
             network_further_s=further_s,
             scenes=len(scenes),
-            preview=self._chosen(theirs, further_s) if theirs else None,
+            preview=self._choose(theirs, further_s) if theirs else None,
             missing=missing,
         )
 
     def _prices(
         self, scenes: Sequence[Scene], most_s: float
     ) -> tuple[list[Mapping[Level, Price]], str]:
-        """Return the prices of each scene that can be traced, or none and why."""
+        """Return the prices of each scene that can be traced, or an empty list and the reason."""
         if not self._most_views:
-            return [], "nobody asked for its views"
-        found: list[Mapping[Level, Price]] = []
+            return [], "no views of it were requested"
+        by_scene: list[Mapping[Level, Price]] = []
         for scene in scenes:
             try:
                 prices = self._open().call(preview_prices, scene, self._resolution, most_s)
-                found.append(dict(prices))
+                by_scene.append(dict(prices))
             except (Rejected, ChildFailed):
                 continue
             except TrilightError as error:
                 return [], str(error).rstrip(".")
-        return found, "" if found else "the scenes that were timed cannot be traced"
+        return by_scene, "" if by_scene else "the scenes that were timed cannot be traced"
 
-    def _chosen(self, prices: Sequence[Mapping[Level, Price]], most_s: float) -> TracerTimes:
+    def _choose(self, prices: Sequence[Mapping[Level, Price]], most_s: float) -> TracerTimes:
         level = self._level = chosen_level(prices, most_s)
         return TracerTimes(
             samples=level[0],
@@ -151,7 +151,7 @@ class TracerRival:
         )
 
     def judged(self, sample: Sample, view: int) -> NDArray[np.float32] | None:
-        """Return linear radiance [R, R, 3], or None of a view that it is not judged on."""
+        """Return linear radiance [R, R, 3]; None for a view that is not traced."""
         number = self._number.setdefault(sample.key, len(self._number))
         self._asked_views = max(self._asked_views, view + 1)
         if number % self._every or view >= self._views:
@@ -159,8 +159,10 @@ class TracerRival:
         return self.shown(sample, view)
 
     def shown(self, sample: Sample, view: int) -> NDArray[np.float32] | None:
-        """Return the same of any view; None where it cannot be traced."""
-        scene, child, (spp, denoiser) = sample.scene, self._open(), self._level
+        """Return linear radiance [R, R, 3] of any view; None if it cannot be traced."""
+        scene = sample.scene
+        child = self._open()
+        (spp, denoiser) = self._level
         settings = PreviewSettings(resolution=self._resolution, spp=spp, denoiser=denoiser)
         try:
             return with_retries(lambda: child.call(traced_view, scene, view, settings))
@@ -168,7 +170,7 @@ class TracerRival:
             return None
 
     def close(self) -> None:
-        """End the child; a later picture starts another one."""
+        """End the child; a later picture starts a new one."""
         if self._child is not None:
             self._child.close()
             self._child = None
@@ -182,13 +184,13 @@ class TracerRival:
 
 
 def chosen_level(prices: Sequence[Mapping[Level, Price]], most_s: float) -> Level:
-    """Return the most samples whose median further view fits, of equal ones the better filter.
+    """Return the most samples whose median further view fits, and of equals the better filter.
 
-    Where none fits it is LEAST.
+    If none fits, return LEAST.
 
     Args:
-        prices: of each scene; what is not among them takes longer than `most_s`.
-        most_s: core-seconds of a further view.
+        prices: prices of each scene by level; a missing level takes longer than `most_s`.
+        most_s: maximum CPU seconds of a further view.
     """
     fits = [
         level
@@ -203,7 +205,7 @@ def _middle(seconds: Sequence[float]) -> float:
 
 
 def tracing_child(variant: Variant) -> IsolatedChild:
-    """Return a child that traces on one thread; close it when nothing more is asked."""
+    """Return a child that traces on one thread; the caller closes it."""
     return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(variant,))
 
 
@@ -219,27 +221,27 @@ def traced_view(scene: Scene, view: int, settings: PreviewSettings) -> NDArray[n
 
 
 def preview_prices(scene: Scene, resolution: int, most_s: float) -> Sequence[tuple[Level, Price]]:
-    """Return what previews of a scene's first view take, once warm; runs in the child.
+    """Return the prices of previews of a scene's first view, after a warm-up; runs in the child.
 
-    Samples are doubled until the fast filter takes longer than `most_s` core-seconds; the last of
-    these is among what is returned.
+    Samples are doubled until the fast filter takes longer than `most_s` CPU seconds; that level is
+    returned, too.
     """
-    found: dict[Level, Price] = {}
+    by_level: dict[Level, Price] = {}
     for spp in LADDER:
         levels: tuple[Level, ...] = ((spp, "fast"), (spp, "high"))
         for level in levels:
             settings = PreviewSettings(resolution=resolution, spp=spp, denoiser=level[1])
-            found[level] = min((_priced(scene, settings) for _ in range(2)), key=_further)
-        if found[spp, "fast"].further_s > most_s:
+            by_level[level] = min((_price_preview(scene, settings) for _ in range(2)), key=_further)
+        if by_level[spp, "fast"].further_s > most_s:
             break
-    return tuple(found.items())
+    return tuple(by_level.items())
 
 
 def _further(price: Price) -> float:
     return price.further_s
 
 
-def _priced(scene: Scene, settings: PreviewSettings) -> Price:
+def _price_preview(scene: Scene, settings: PreviewSettings) -> Price:
     began = time.process_time()
     renderer = PreviewRenderer(scene, settings)
     loaded = time.process_time()
@@ -254,7 +256,7 @@ def _show(renderer: PreviewRenderer, scene: Scene, view: int) -> NDArray[np.floa
 
 
 def _network_price(renderer: NeuralRenderer, scene: Scene, resolution: int) -> Price:
-    """Return what the network takes for a scene's first view, on one thread of the processor."""
+    """Return the network's price of a scene's first view, on one thread of the processor."""
 
     def load() -> Show:
         prepared = renderer.prepare(scene)
@@ -263,7 +265,7 @@ def _network_price(renderer: NeuralRenderer, scene: Scene, resolution: int) -> P
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # core-seconds of waiting threads are not the network's
     try:
-        found = timed_views(load, repeats=1)
+        times = timed_views(load, repeats=1)
     finally:
         torch.set_num_threads(threads)
-    return Price(first_s=found.first_s, further_s=found.further_s)
+    return Price(first_s=times.first_s, further_s=times.further_s)

@@ -1,7 +1,7 @@
-"""The widths at which learning rates and initial weights are stated. Without torch.
+"""Base widths of the maximal update parametrization. Imports no torch.
 
-At other widths they follow the rules of model.width_scales. A width of 0 states them for none: they
-are then the same at every width, as in the paper's recipe.
+Learning rates and initial weights are stated at these widths; at other widths they follow the rules
+of model.width_scales. With a width of 0 they are the same at every width, as in the paper's recipe.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from storage.settings.ranges import Within
 
 @checked("base widths")
 class BaseWidths:
-    """Widths of the network whose learning rates and initial weights are stated."""
+    """Widths of the network at which learning rates and initial weights are stated."""
 
     width: Annotated[int, Within(0, 16_384)] = 0
     """Width of tokens at which the rates were measured; at other widths they and the initial
@@ -35,13 +35,13 @@ class BaseWidths:
             )
 
     def of(self, config: ModelConfig) -> ModelConfig:
-        """Return a network at these widths that is otherwise as `config`.
+        """Return the configuration `config` at these widths.
 
-        Widths that have no field here keep their share of the tokens' width. Frequencies, which no
-        weight's shape depends on, are fewest, so that they fit any head.
+        Widths without a field here keep their ratio to the tokens' width. The number of
+        frequencies, on which no weight's shape depends, is 1, so that it fits any head.
 
         Args:
-            config: the network that is trained; `width` of this is above 0.
+            config: network that is trained; `self.width` is above 0.
         """
 
         def in_proportion(wide: int) -> int:

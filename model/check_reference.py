@@ -1,9 +1,9 @@
 """`python -m model.check_reference FILE`: compares this network with the published one's outputs.
 
-Reads a file with a configuration, weights under published names, scenes, and what the published
-code made of them; runs this network on it, padded as the file is and each scene alone without its
-padding. Prints the largest differences of the log10 output and exits with 1 above 5e-7, which is
-eight times float32's own rounding: a tolerance of 1e-5 would accept ten real mistakes.
+Reads a file with a configuration, weights under published names, scenes, and the published code's
+outputs; runs this network on it, padded as in the file and each scene alone without padding. Prints
+the largest differences of the log10 output and exits with 1 above 5e-7, which is eight times
+float32's rounding: a tolerance of 1e-5 would accept ten real mistakes.
 """
 
 import json
@@ -23,7 +23,7 @@ from model.weights import read_tensors
 from storage.errors import TrilightError
 
 TOLERANCE = 5e-7
-"""Largest accepted difference."""
+"""Maximum absolute difference of log10 outputs."""
 
 _PARAMETER = "param."
 _INPUTS = ("triangles", "vertex_normals", "material13", "valid_mask", "c2w", "fov_deg")
@@ -32,16 +32,16 @@ _OUTPUT = "output.log10_radiance_bvchw"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reference:
-    """One file: a network, scenes, and the pictures that are expected of it."""
+    """Network, scenes and expected pictures of one file."""
 
     model: RenderFormer
-    """Float32."""
+    """Network in float32 with the file's weights."""
     batch: SceneBatch
-    """Padded as in the file."""
+    """Scenes, padded as in the file."""
     resolution: int
-    """Pixels across."""
+    """Width of the pictures in pixels."""
     expected_BVRR3: Tensor
-    """The published network's own output, behind its ELU."""
+    """Output of the published network, after its ELU."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +56,8 @@ class Differences:
     """Standard deviation of the expected output, the scale of a difference."""
 
     @property
-    def accepted(self) -> bool:
-        """Whether both are within TOLERANCE; NaN is not."""
+    def is_accepted(self) -> bool:
+        """True if both are within TOLERANCE; NaN is not."""
         return self.padded <= TOLERANCE and self.unpadded <= TOLERANCE
 
 
@@ -65,7 +65,7 @@ def read_reference(path: Path) -> Reference:
     """Return the content of a reference file.
 
     Raises:
-        TrilightError: the file is not of this form; what is missing is named.
+        TrilightError: the file lacks entries; the message names them.
     """
     tensors, metadata = read_tensors(path)
     inputs = [f"input.{name}" for name in _INPUTS]
@@ -89,8 +89,9 @@ def read_reference(path: Path) -> Reference:
 
 
 def differences(reference: Reference) -> Differences:
-    """Return how far this network is from the published one."""
-    batch, expected = reference.batch, reference.expected_BVRR3
+    """Return the largest differences between this network and the published one."""
+    batch = reference.batch
+    expected = reference.expected_BVRR3
     alone = [
         _difference(reference, _scene_alone(batch, scene), expected[[scene]])
         for scene in range(len(expected))
@@ -105,7 +106,7 @@ def differences(reference: Reference) -> Differences:
 def _batch(
     triangles: Tensor, normals: Tensor, material13: Tensor, mask: Tensor, c2w: Tensor, fov: Tensor
 ) -> SceneBatch:
-    """Return the batch; padding is zeroed, the tangent normal left out, emission encoded."""
+    """Return the batch with zero padding, encoded emission and no tangent normal."""
     exists = mask.bool()
     material = material13.float()
     ten = torch.cat(
@@ -146,17 +147,19 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write("usage: python -m model.check_reference FILE.safetensors\n")
         return 2
     try:
-        found = differences(read_reference(Path(arguments[0])))
+        result = differences(read_reference(Path(arguments[0])))
     except TrilightError as mistake:
         sys.stderr.write(f"check_reference: {mistake}\n")
         return 1
-    for name, value in (("padded", found.padded), ("unpadded", found.unpadded)):
-        share = value / found.output_std
+    for name, value in (("padded", result.padded), ("unpadded", result.unpadded)):
+        share = value / result.output_std
         sys.stdout.write(
             f"{name:<9} max difference {value:.3g} ({share:.3g} of the output's std)\n"
         )
-    sys.stdout.write(f"{'passes' if found.accepted else 'FAILS'}: expected at most {TOLERANCE:g}\n")
-    return 0 if found.accepted else 1
+    sys.stdout.write(
+        f"{'passes' if result.is_accepted else 'FAILS'}: expected at most {TOLERANCE:g}\n"
+    )
+    return 0 if result.is_accepted else 1
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Sizes of the network: one frozen description, from which every part builds itself.
+"""Configuration of the network: all sizes, from which every module is built.
 
-The architecture is written once; a size is only numbers. `SIZES` names those that are used. What a
-size cannot change: two stages, QK-norm over the full width, SwiGLU, RMSNorm before each block.
+The architecture is fixed: two stages, QK-norm over the full width, SwiGLU, RMSNorm before each
+block. `SIZES` has the named configurations.
 """
 
 import dataclasses
@@ -17,19 +17,19 @@ from storage.settings.ranges import Within
 Head = Literal["dpt", "linear"]
 
 ViewStage = Literal["bundles", "hits"]
-"""`bundles`: RenderFormer as published; `hits`: what rays find is traced (model.hits.decoder)."""
+"""`bundles`: RenderFormer as published; `hits`: traced visible surfaces (model.hits.decoder)."""
 
 VERTEX_COORDINATES = 9
-"""Three vertices of three coordinates: what a triangle's rotary position is made of."""
+"""Number of coordinates of a triangle's rotary position: three vertices of three each."""
 
 NUM_TAPS = 4
-"""Decoder layers that a DPT head reads (Ranftl et al. 2021)."""
+"""Number of decoder layers that a DPT head reads (Ranftl et al. 2021)."""
 
 REMOVED: Mapping[str, Any] = {"projected_freqs": 0, "texture_cells": 0, "sky_cells": 0}
-"""Settings of earlier versions that files of networks may name, at the values that meant none."""
+"""Removed settings that files of networks may hold, with the values that switched them off."""
 
 HITS_PX = 8
-"""Pictures of the view stage `hits` are a multiple of so many pixels wide."""
+"""Pixels whose multiple is the width of pictures of the view stage `hits`."""
 
 LAYERS = 256
 """Maximum number of layers of a stage: twenty times the largest published network's."""
@@ -37,14 +37,14 @@ LAYERS = 256
 
 @checked("model config")
 class ModelConfig:
-    """Sizes of one network."""
+    """Configuration of one network."""
 
     PRESETS: ClassVar[Mapping[str, Callable[[], "ModelConfig"]]] = {}
-    """The named sizes, by which a setting of this kind may be given (storage.settings.changes)."""
+    """Named sizes, which a setting of this type accepts (storage.settings.changes)."""
     REMOVED: ClassVar = tuple(REMOVED)
-    """Settings of earlier versions."""
+    """Names of settings of earlier versions, which old files may hold."""
     width: Annotated[int, Within(2 * VERTEX_COORDINATES, 16_384)]
-    """Width of every token."""
+    """Width of every token, a multiple of num_heads."""
     num_heads: Annotated[int, Within(1, 512)]
     """Attention heads; each is width / num_heads wide."""
     encoder_layers: Annotated[int, Within(1, LAYERS)]
@@ -52,7 +52,7 @@ class ModelConfig:
     decoder_layers: Annotated[int, Within(1, LAYERS)]
     """Layers of the view stage."""
     hidden_width: Annotated[int, Within(1, 65_536)]
-    """Width inside the SwiGLU."""
+    """Width of the hidden layer of each SwiGLU."""
     num_registers: Annotated[int, Within(0, 4096)]
     """Number of register tokens: learned tokens that belong to no triangle."""
     rope_num_freqs: Annotated[int, Within(1, 64)]
@@ -70,7 +70,7 @@ class ModelConfig:
     """Width in ray bundles of the Swin windows of the view stage; with 0, every bundle attends to
     all others."""
     head: Head
-    """`dpt` mixes neighbouring bundles by convolution, `linear` reads each bundle alone."""
+    """`dpt` mixes neighboring bundles by convolution, `linear` reads each bundle alone."""
     dpt_features: Annotated[int, Within(0, 4096)] = 0
     """Width of the DPT's fusion path; 0 with a linear head."""
     dpt_channels: Annotated[tuple[int, ...], Within(1, 8192)] = ()
@@ -78,30 +78,31 @@ class ModelConfig:
     dpt_taps: Annotated[tuple[int, ...], Within(0, LAYERS - 1)] = ()
     """Decoder layers that feed the DPT's four grids, finest first; empty with a linear head."""
     view_stage: ViewStage = "bundles"
-    """What a view begins with: `bundles` of rays, as published, or traced `hits`, after which the
-    network learns only what is not traced. `hits` needs a linear head."""
+    """Input of a view: `bundles` of rays, as published, or traced `hits`, so that the network
+    learns only the light that is not traced. `hits` needs a linear head."""
     demodulated: bool = False
-    """bundles: whether the network predicts the light that arrives, diffuse and specular apart, by
-    which the traced albedo of what each pixel sees first is multiplied."""
+    """bundles: predict diffuse and specular light, which is multiplied by the traced albedo of each
+    pixel's visible surface."""
     hit_rays: Annotated[int, Within(0, 8, unit="rays")] = 0
     """hits, and demodulated bundles: rays along a side of each pixel, its square in all; else 0."""
     hit_anchors: Annotated[int, Within(0, 256, unit="anchors")] = 0
-    """hits: anchors along a side of the picture, which ask the scene's tokens; 0 with bundles."""
+    """hits: anchors along a side of the picture, which attend to the scene's tokens; 0 with
+    bundles."""
     gather_rays: Annotated[int, Within(0, 4096, unit="rays")] = 0
-    """hits: rays with which each anchor gathers the light of other surfaces; with 0, no light but
-    that of lamps is traced. 0 with bundles."""
+    """hits: rays with which each anchor gathers the light of other surfaces; with 0, only the light
+    of lamps is traced. 0 with bundles."""
     pixel_width: Annotated[int, Within(0, 4096)] = 0
-    """hits: width of the network that each pixel passes; 0 with bundles."""
+    """hits: width of the network that runs per pixel; 0 with bundles."""
     filter_width: Annotated[int, Within(0, 1024)] = 0
-    """hits: width of the network that says which pixels share what their mirrored rays found; 0
-    leaves each pixel its own. 0 with bundles."""
+    """hits: width of the network that filters reflections over neighboring pixels; 0 filters none.
+    0 with bundles."""
     scene_tokens: bool = True
-    """hits: whether anchors ask the scene's tokens; false leaves out the view-independent stage."""
+    """hits: anchors attend to the scene's tokens; false leaves out the view-independent stage."""
     material_columns: tuple[str, ...] = PUBLISHED_COLUMNS
     """Material columns that the network reads, in the order of its input."""
     sky_rays: Annotated[int, Within(0, 64, unit="rays")] = 0
-    """hits: rays towards the sky from each point that is shaded; with 0, the network knows no sky.
-    0 with bundles."""
+    """hits: rays towards the sky from each shaded point; with 0, the network supports no sky. 0
+    with bundles."""
 
     def __post_init__(self) -> None:
         if self.width % self.num_heads or self.head_width % 2:
@@ -129,9 +130,9 @@ class ModelConfig:
             _wrong(f"patch_px {self.patch_px} with a dpt head", "8, which its grids multiply up to")
 
     def _check_hits(self) -> None:
-        needed = {"hit_anchors": self.hit_anchors, "pixel_width": self.pixel_width}
+        required = {"hit_anchors": self.hit_anchors, "pixel_width": self.pixel_width}
         if self.view_stage == "hits":
-            for name, value in {"hit_rays": self.hit_rays, **needed}.items():
+            for name, value in {"hit_rays": self.hit_rays, **required}.items():
                 if value < 1:
                     _wrong(f"{name} {value} with view_stage hits", "1 or more")
             if self.hit_anchors % HITS_PX:
@@ -144,7 +145,7 @@ class ModelConfig:
                 )
             if self.demodulated:
                 _wrong("demodulated with view_stage hits", "false")
-        elif any([*needed.values(), self.gather_rays, self.filter_width, not self.scene_tokens]):
+        elif any([*required.values(), self.gather_rays, self.filter_width, not self.scene_tokens]):
             _wrong("fields of hits beside view_stage bundles", "0, and scene_tokens true")
         elif self.sky_rays:
             _wrong(f"sky_rays {self.sky_rays} with view_stage bundles", "0")
@@ -159,12 +160,12 @@ class ModelConfig:
 
     @property
     def picture_px(self) -> int:
-        """Width of a ray bundle or window in pixels; pictures are a multiple of it wide."""
+        """Width of a ray bundle or window in pixels, of which pictures are a multiple."""
         return self.patch_px * max(1, self.window_bundles)
 
 
 def smoke() -> ModelConfig:
-    """Return the size that two CPU cores train in minutes."""
+    """Return the size that two CPU cores train in minutes (128 wide, linear head)."""
     return ModelConfig(
         width=128,
         num_heads=2,
@@ -179,7 +180,7 @@ def smoke() -> ModelConfig:
 
 
 def hits_smoke() -> ModelConfig:
-    """Return the size with traced hits that two CPU cores train: what is traced does most."""
+    """Return the small size with traced hits, which two CPU cores train."""
     return dataclasses.replace(
         smoke(),
         decoder_layers=3,
@@ -194,7 +195,7 @@ def hits_smoke() -> ModelConfig:
 
 
 def hits_base() -> ModelConfig:
-    """Return V1-Base with the view stage `hits`: for a graphics card."""
+    """Return V1-Base with the view stage `hits`, for a GPU."""
     return dataclasses.replace(
         hits_smoke(),
         width=768,
@@ -298,8 +299,8 @@ SIZES: Registry[Callable[[], ModelConfig]] = Registry(
     },
     decides=("weights",),
 )
-"""Every named size, ours first and smallest first. A checkpoint holds all numbers of its network,
-and no name, so that it opens where its size is not registered."""
+"""Named sizes, ours first and smallest first. A checkpoint stores all numbers of its configuration
+and no name, so that it opens without its size being registered."""
 
 ModelConfig.PRESETS = SIZES
 

@@ -1,8 +1,8 @@
-"""Costs of a network from its configuration alone: parameters, FLOPs, bytes.
+"""Costs of a network from its configuration: parameters, FLOPs, bytes.
 
-A multiplication and an addition count as two. Counted are matrix products, attention and
-convolutions, as torch's FlopCounterMode counts them, against which this is tested; norms,
-rotations and activations are left out (1 % of the time at 205 M parameters).
+A multiplication and an addition count as two. Matrix products, attention and convolutions are
+counted as by torch's FlopCounterMode, against which this is tested; norms, rotations and
+activations are left out (1 % of the time at 205 M parameters).
 
     d width   f hidden width   n registers + triangles   q ray bundles of a view
 """
@@ -23,28 +23,28 @@ from model.windows import cut_windows
 from storage.records.material import material_width
 
 TRAINING_BYTES = 16
-"""Per parameter while training in float32: weight, gradient, and AdamW's two memories."""
+"""Bytes per parameter while training in float32: weight, gradient, and AdamW's two moments."""
 
 
 TRAINING_PASSES = 3
-"""Forward, and twice as much backward: one product for each operand."""
+"""Forward passes of equal cost in a training step: backward has a product for each operand."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Workload:
-    """What is to be rendered."""
+    """Size of a scene and its views."""
 
     triangles: int
-    """Triangles in the scene."""
+    """Number of triangles in the scene."""
     views: int
-    """Views of that scene."""
+    """Number of views of that scene."""
     resolution: int
-    """Pixels across each view."""
+    """Width of each view in pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Costs:
-    """What a network costs, and a workload with it."""
+    """Costs of a network and of a workload."""
 
     parameters: dict[str, int]
     """Numbers in the weights, by part of the network."""
@@ -53,20 +53,20 @@ class Costs:
     weight_bytes: dict[str, int]
     """Bytes of the weights, by precision."""
     scene_bytes: dict[str, int]
-    """Keys and values that are kept of an encoded scene, by precision."""
+    """Bytes of the cached keys and values of an encoded scene, by precision."""
     training_bytes: int
-    """Weights, gradients and AdamW's memories in float32, without activations."""
+    """Bytes of weights, gradients and AdamW's moments in float32, without activations."""
 
 
 def costs(config: ModelConfig, workload: Workload) -> Costs:
-    """Return the costs of a configuration; no weight is made."""
+    """Return the costs of a configuration without allocating weights."""
     with torch.device("meta"):
         model = RenderFormer(config)
     rounded = sum(count_parameters(part) for part in rounded_parts(model))
     total = count_parameters(model)
     head = count_parameters(model.decoder.head)
     tokens = config.num_registers + workload.triangles
-    kept = 2 * config.decoder_layers * tokens * config.width
+    cached_numbers = 2 * config.decoder_layers * tokens * config.width
     sizes = {name: precision.dtype.itemsize for name, precision in PRECISIONS.items()}
     return Costs(
         parameters={
@@ -76,17 +76,19 @@ def costs(config: ModelConfig, workload: Workload) -> Costs:
         },
         flops=flops(config, workload),
         weight_bytes={name: size * rounded + 4 * (total - rounded) for name, size in sizes.items()},
-        scene_bytes={name: size * kept for name, size in sizes.items()},
+        scene_bytes={name: size * cached_numbers for name, size in sizes.items()},
         training_bytes=TRAINING_BYTES * total,
     )
 
 
 def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
     """Return the FLOPs of each part of a forward pass."""
-    d, f = config.width, config.hidden_width
+    d = config.width
+    f = config.hidden_width
     n = config.num_registers + workload.triangles
     per_side = workload.resolution // config.patch_px
-    q, views = per_side**2, workload.views
+    q = per_side**2
+    views = workload.views
     token_inputs = material_width(config.material_columns) + encoded_normal_width(
         config.normal_octaves
     )
@@ -100,8 +102,8 @@ def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
     }
     if config.view_stage == "hits":
         view = view_flops(config, n, workload.resolution)
-        whole = stage if config.scene_tokens else {}
-        return whole | {name: views * count for name, count in view.items()}
+        scene_stage = stage if config.scene_tokens else {}
+        return scene_stage | {name: views * count for name, count in view.items()}
     layers = {
         "cross-attention": 4 * q * d * d + 4 * q * n * d,
         "bundle self-attention": 8 * q * d * d + 4 * d * _pairs(config, per_side),
@@ -123,7 +125,7 @@ def training_flops(config: ModelConfig, workload: Workload) -> int:
 
 @functools.lru_cache
 def _pairs(config: ModelConfig, per_side: int) -> int:
-    """Return how many (query, key) pairs of bundles there are, as the mean over the layers."""
+    """Return the number of (query, key) pairs of bundles, as a mean over the layers."""
     if not config.window_bundles:
         return per_side**4
     pairs = []
@@ -138,7 +140,8 @@ def _pairs(config: ModelConfig, per_side: int) -> int:
 def _head(config: ModelConfig, per_side: int) -> int:
     if config.head == "linear":
         return 2 * per_side**2 * config.width * picture_channels(config) * config.patch_px**2
-    features, half = config.dpt_features, (per_side + 1) // 2
+    features = config.dpt_features
+    half = (per_side + 1) // 2
     grids = (4 * per_side, 2 * per_side, per_side, half)
     total = 0
     for level, (wide, side) in enumerate(zip(config.dpt_channels, grids, strict=True)):

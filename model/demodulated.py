@@ -1,12 +1,12 @@
-"""Demodulated pictures: the network says which light arrives, first hits say what reflects it.
+"""Demodulated pictures: the network predicts light, and traced visible surfaces reflect it.
 
     radiance = diffuse albedo * diffuse light + specular albedo * specular light
 
-The albedo of what a pixel sees first is known exactly, for milliseconds: its rays are followed to
-the first triangle that is no lamp, and the two material columns averaged over them, 0 where nothing
-is met. So textures of colour, silhouettes and the black background need not be learned. Diffuse
-light is irradiance over pi; neither light is ever negative, and both are log10(1 + x) to the
-network. What is glossy has no exact factor: its light is what is left of a mirror image.
+The albedo of a pixel's visible surface is computed exactly in milliseconds: its rays are traced to
+the first triangle that is no lamp, and two material columns are averaged over them, 0 for misses.
+So color textures, silhouettes and the black background need not be learned. Diffuse light is
+irradiance over pi; neither light is ever negative, and the network predicts both as log10(1 + x).
+Glossy reflection has no exact factor: its light contains a blurred mirror image.
 """
 
 import dataclasses
@@ -21,31 +21,31 @@ from torch.nn.functional import softplus
 from model.hits.camera import Rays
 from model.hits.lit_scene import LitScene
 from model.hits.tracing import like, lit_scene_of
-from model.precision import as_given
+from model.precision import without_autocast
 from model.scene_tensors import Cameras, SceneTensors
 
 _START = -1.5
-"""Before softplus: the light at the start, 0.6 in every pixel, is about that of the scenes."""
+"""Offset before softplus: the initial light of 0.6 in every pixel is about that of the scenes."""
 
 _BRIGHTEST = 8.0
-"""Most log10(1 + light): far above any lamp, and small enough for float32."""
+"""Maximum log10(1 + light): far above any lamp, and small enough for float32."""
 
 
-def composed(light_BVRR6: Tensor, albedo_BVRR6: Tensor) -> Tensor:
-    """Return log10(1 + radiance) [B, V, R, R, 3] of what a head says; each number is at least 0.
+def compose_radiance(light_BVRR6: Tensor, albedo_BVRR6: Tensor) -> Tensor:
+    """Return log10(1 + radiance) [B, V, R, R, 3], at least 0, from predicted light and albedo.
 
     Args:
-        light_BVRR6: of a head; diffuse, then specular.
-        albedo_BVRR6: likewise.
+        light_BVRR6: output of a head; diffuse, then specular.
+        albedo_BVRR6: albedo in the same order.
     """
-    with as_given(light_BVRR6.device):
+    with without_autocast(light_BVRR6.device):
         log10_BVRR6 = softplus(light_BVRR6 + _START).clamp(max=_BRIGHTEST)
         reflected = albedo_BVRR6 * torch.expm1(log10_BVRR6 * math.log(10))
         return torch.log1p(reflected[..., :3] + reflected[..., 3:]) / math.log(10)
 
 
 def with_albedo(scene: SceneTensors, resolution: int, rays_a_side: int) -> SceneTensors:
-    """Return a scene with the albedo that its views see: what a trainer's threads do ahead."""
+    """Return a scene with the albedo of its views, which a trainer's threads compute ahead."""
     albedo = _of_views(lit_scene_of(scene), scene.c2w_V44, scene.fov_deg_V, resolution, rays_a_side)
     return dataclasses.replace(scene, albedo_VRR6=like(albedo, scene.c2w_V44))
 
@@ -53,17 +53,14 @@ def with_albedo(scene: SceneTensors, resolution: int, rays_a_side: int) -> Scene
 def albedo_of_cameras(
     scenes: tuple[LitScene, ...], cameras: Cameras, resolution: int, rays_a_side: int
 ) -> Tensor:
-    """Return the albedo [B, V, R, R, 6] that any cameras of the scenes of a batch see.
-
-    It is where the cameras are, and of their type.
-    """
-    found = [
+    """Return the albedo [B, V, R, R, 6] that cameras of a batch see, with their device and type."""
+    albedo = [
         _of_views(scene, c2w_V44, fov_deg_V, resolution, rays_a_side)
         for scene, c2w_V44, fov_deg_V in zip(
             scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
         )
     ]
-    return like(torch.stack(found), cameras.fov_deg_BV)
+    return like(torch.stack(albedo), cameras.fov_deg_BV)
 
 
 def _of_views(
@@ -83,15 +80,15 @@ def first_albedo(
     resolution: int,
     rays_a_side: int,
 ) -> NDArray[np.float32]:
-    """Return [R, R, 6]: diffuse, then specular albedo of what pixels see first.
+    """Return the diffuse and specular albedo [R, R, 6] of visible surfaces.
 
-    Means over the rays_a_side^2 rays of each pixel; those that meet nothing count as black.
+    Each pixel is the mean over its rays_a_side^2 rays; a miss counts as black.
     """
     rays = Rays(c2w, fov_deg, resolution, rays_a_side)
     nothing = np.zeros((6, 1), np.float32)  # the last column, which a miss picks
     table = np.concatenate([np.concatenate([scene.diffuse, scene.specular]), nothing], axis=1)
     total = np.zeros((6, resolution**2), np.float32)
-    for turn in range(rays.turns):
-        total += table[:, scene.first_hits(rays.origin, rays.direction(turn)).triangle]
+    for jitter in range(rays.turns):
+        total += table[:, scene.first_hits(rays.origin, rays.direction(jitter)).triangle]
     mean: NDArray[np.float32] = total.T / np.float32(rays.turns)
     return mean.reshape(resolution, resolution, 6)

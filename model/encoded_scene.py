@@ -1,4 +1,4 @@
-"""What remains of a scene after the view-independent stage: all that any view of it needs."""
+"""Encoded scenes: the output of the view-independent stage, which any view reads."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from model.attention import Keys
-from model.packing import Packing, pack_lengths, takes_packed
+from model.packing import Packing, pack_lengths, supports_packed
 
 if TYPE_CHECKING:
     from model.hits.lit_scene import LitScene
@@ -17,53 +17,51 @@ KeysValues = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TokenPlaces:
-    """Where the tokens of scenes stand: registers first, then triangles."""
+class TokenPositions:
+    """Positions of the tokens of scenes: registers first, then triangles."""
 
     positions_BN33: Tensor
     """Three vertices each, world space; a register stands at the mean vertex, three times over."""
     scale_BN11: Tensor
-    """Factor of the positions in whatever frame they are asked for: 1 but for published registers,
-    whose mean divides by a little more than the number of triangles."""
+    """Factor of the positions in any frame: 1 except for published registers, whose mean divides by
+    slightly more than the number of triangles."""
     is_key_BN: Tensor | None
     """bool, False in the padding; None where nothing is padded."""
     lengths: tuple[int, ...] | None = None
-    """Tokens of each scene, where they are the first of each and `is_key_BN` says so too. The host
-    knows them without waiting for the device."""
+    """Number of tokens of each padded scene, as in `is_key_BN`, but known to the host without a
+    wait for the device; None if unknown."""
 
     def packing(self, x: Tensor, head_width: int) -> Packing | None:
-        """Return where the tokens of scenes are when packed; None where masks are meant.
+        """Return the packing of the tokens, or None if attention uses masks.
 
         Args:
-            x: what attention is computed with.
-            head_width: of that attention.
+            x: tensor with the device and type of the attention.
+            head_width: width of the attention's heads.
         """
-        if self.lengths is None or not takes_packed(x, head_width):
+        if self.lengths is None or not supports_packed(x, head_width):
             return None
         return pack_lengths(self.lengths, self.positions_BN33.shape[1], x.device)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EncodedScene:
-    """A batch of scenes, ready to be seen from anywhere.
+    """A batch of encoded scenes, for any number of views.
 
-    Keys are kept before their rotation, since that carries the camera: rotated ones would be wrong
-    for the next view.
+    Keys are stored before their rotation, since that depends on the camera.
     """
 
-    places: TokenPlaces
-    """Positions of the tokens."""
+    places: TokenPositions
+    """Positions of all tokens, registers included."""
     keys_values: tuple[KeysValues, ...]
-    """Keys and values for each layer of the view stage; for that of hits, keys are rotated into the
-    world."""
+    """Keys and values for each layer of the view stage; for `hits`, keys are rotated into world
+    space."""
     packing: Packing | None = None
-    """Where their tokens are: scene after scene in one row [1, H, P, D]; None where scenes are
-    padded."""
+    """Packing of the tokens, scene after scene in one row [1, H, P, D]; None for padded scenes."""
     traced: "tuple[TracedScene, ...]" = ()
-    """Of the view stage of hits: each scene, ready for rays; none where its views come traced."""
+    """Scenes ready for ray casting, for `hits`; empty if the views are traced already."""
     surfaces: "tuple[LitScene, ...]" = ()
-    """Of demodulated bundles: each scene, whose albedo rays ask; none where it is known."""
+    """Scenes ready for albedo rays, for demodulated bundles; empty if the albedo is known."""
 
     def keys(self, views: int = 1) -> Keys:
-        """Return which keys exist; packed ones for each view, all scenes of a view together."""
+        """Return the valid keys; packed ones are repeated for each view, view after view."""
         return self.places.is_key_BN if self.packing is None else self.packing.of_views(views)

@@ -1,7 +1,7 @@
-"""Bundle tokens -> pixels: a linear map of each bundle, or a dense prediction transformer (DPT).
+"""Heads from bundle tokens to pixels: linear, or a dense prediction transformer (DPT).
 
 The linear head is smaller and as good for minutes of training; the DPT (Ranftl et al. 2021) mixes
-neighbouring bundles, so that their borders do not show. Both start at a black picture, or,
+neighboring bundles, so that their borders do not show. Both start at a black picture, or,
 where they predict light (model.demodulated), at equal dim light everywhere.
 """
 
@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate, silu
 
 from model.config import NUM_TAPS, ModelConfig
 from model.layers import LAYER_NORM_EPS, Norm
-from model.precision import as_given
+from model.precision import without_autocast
 from model.rays import unbundle
 
 LAST_CHANNELS = 32
@@ -22,12 +22,12 @@ LAST_CHANNELS = 32
 
 
 def picture_channels(config: ModelConfig) -> int:
-    """Return how many numbers a head gives each pixel: a colour, or two kinds of light."""
+    """Return the number of channels of a head: a color, or two kinds of light."""
     return 6 if config.demodulated else 3
 
 
 class LinearHead(nn.Module):
-    """Last layer's tokens -> P P colours each."""
+    """Linear map of the last layer's tokens to P x P pixels each."""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
@@ -39,11 +39,11 @@ class LinearHead(nn.Module):
     def forward(self, taps_MQW: Sequence[Tensor]) -> Tensor:
         """Return pictures [M, channels, R, R]."""
         tokens_MQW = taps_MQW[0].to(self.last.weight.dtype)
-        with as_given(tokens_MQW.device):
+        with without_autocast(tokens_MQW.device):
             return unbundle(self.last(self.norm(tokens_MQW)), self.patch_px)
 
     def rounded_parts(self) -> list[nn.Module]:
-        """Return no part: what the last layer rounds is seen as it is."""
+        """Return no module, since rounding of the last layer would be visible."""
         return []
 
 
@@ -60,11 +60,11 @@ class ResidualConv(nn.Module):
         return x_MCHW + self.second(silu(self.first(silu(x_MCHW))))
 
 
-class Enlarged(torch.autograd.Function):
-    """Bilinear interpolation, corners on corners, whose way back is two products.
+class BilinearUpsample(torch.autograd.Function):
+    """Bilinear upsampling with aligned corners, whose backward pass is two matrix products.
 
-    Torch's own way back adds with atomics: compiled, 17 of 195 ms of a step of Base on an H100, and
-    a sum in any order (study S87).
+    Torch's own backward pass adds with atomics: compiled, it takes 17 of 195 ms of a step of Base
+    on an H100, and sums in a random order (study S87).
     """
 
     @staticmethod
@@ -74,12 +74,12 @@ class Enlarged(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, tuple[int, int]], output: Tensor) -> None:
-        """Keep the size that is enlarged: the map is linear, and needs no numbers."""
+        """Save the input's size: the map is linear, so backward needs no values."""
         ctx.small = inputs[0].shape[-2:]
 
     @staticmethod
     def backward(ctx: Any, gradient_MCHW: Tensor) -> tuple[Tensor, None]:
-        """Return the gradient of x, in the type of the result's, and none of the size."""
+        """Return the gradient of x, in the type of the output's gradient."""
         height, width = ctx.small
         rows = _line_weights(height, gradient_MCHW.shape[-2], gradient_MCHW)
         columns = _line_weights(width, gradient_MCHW.shape[-1], gradient_MCHW)
@@ -87,15 +87,15 @@ class Enlarged(torch.autograd.Function):
 
 
 def _line_weights(short: int, long: int, like: Tensor) -> Tensor:
-    """Return by how much each of `short` points counts for each of `long`: [short, long]."""
-    dtype = torch.promote_types(like.dtype, torch.float32)  # in which the way forth weighs
+    """Return the interpolation weights [short, long] between points on a line."""
+    dtype = torch.promote_types(like.dtype, torch.float32)  # as in the forward pass
     points = torch.eye(short, dtype=dtype, device=like.device)[None]
     weights = interpolate(points, size=long, mode="linear", align_corners=True)[0]
     return weights.to(like.dtype)
 
 
 class Fusion(nn.Module):
-    """Adds one grid to the coarser sum so far and brings it to the size of the next finer one."""
+    """Adds a grid to the coarser sum, and upsamples the result to the next finer grid."""
 
     def __init__(self, features: int, *, deepest: bool) -> None:
         super().__init__()
@@ -114,17 +114,17 @@ class Fusion(nn.Module):
         if self.skip is not None and coarse_MCHW is not None:
             grid_MCHW = coarse_MCHW + self.skip(grid_MCHW)
         fused = self.project(self.refine(grid_MCHW))
-        enlarged: Tensor = Enlarged.apply(fused, size)
-        return enlarged
+        return BilinearUpsample.apply(fused, size)
 
 
 class DptHead(nn.Module):
-    """Four decoder layers -> four grids (4x, 2x, 1x, 1/2 of the bundles) -> one picture."""
+    """DPT from four decoder layers over grids (4x, 2x, 1x, 1/2 of the bundles) to a picture."""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         self.taps = config.dpt_taps
-        features, channels = config.dpt_features, config.dpt_channels
+        features = config.dpt_features
+        channels = config.dpt_channels
         self.project = nn.ModuleList(nn.Conv2d(config.width, wide, 1) for wide in channels)
         self.resize = nn.ModuleList(
             [
@@ -151,14 +151,15 @@ class DptHead(nn.Module):
         for level in reversed(range(NUM_TAPS)):
             height, width = grids[level - 1].shape[-2:]
             if level == 0:
-                height, width = 2 * grids[0].shape[-2], 2 * grids[0].shape[-1]
+                height = 2 * grids[0].shape[-2]
+                width = 2 * grids[0].shape[-1]
             fused = self.fuse[level](fused, grids[level], (height, width))
         halved = self.halve(fused).to(self.last.weight.dtype)
-        with as_given(halved.device):
+        with without_autocast(halved.device):
             return self.last(silu(self.widen(halved)))
 
     def rounded_parts(self) -> list[nn.Module]:
-        """Return all but the last two layers: what those round is seen as it is."""
+        """Return all modules but the last two layers, whose rounding would be visible."""
         return [self.project, self.resize, self.reassemble, self.fuse, self.halve]
 
     def _grid(self, level: int, tokens_MQW: Tensor) -> Tensor:
@@ -172,11 +173,11 @@ def build_head(config: ModelConfig) -> LinearHead | DptHead:
     return DptHead(config) if config.head == "dpt" else LinearHead(config)
 
 
-def blacken(head: Any) -> None:
+def zero_last_layer(head: Any) -> None:
     """Zero the last layer, so that training starts at a black picture.
 
-    Safe only because the loss is taken before the ELU: after it, a start at 0 has a thousandth of
-    the gradient on one side, and most runs stay black.
+    This is safe only because the loss is taken before the ELU: after it, a start at 0 has a
+    thousandth of the gradient on one side, and most runs stay black.
     """
     nn.init.zeros_(head.last.weight)
     assert head.last.bias is not None

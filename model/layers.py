@@ -1,7 +1,7 @@
-"""The blocks of both stages: self-attention, cross-attention and SwiGLU, each behind an RMSNorm.
+"""Transformer blocks of both stages: self-attention, cross-attention and SwiGLU after RMSNorms.
 
-No biases. Queries and keys are normalised over the full width, before the split into heads and
-before the rotation, which keeps their products bounded while training.
+There are no biases. Queries and keys are normalized over the full width, before the split into
+heads and before the rotation, which keeps their products bounded while training.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 from model.attention import Keys, attend
 from model.encoded_scene import KeysValues
 from model.positions import Rotation, rotate
-from model.precision import as_given
+from model.precision import without_autocast
 from model.rounding import rounded_call, rounded_weights
 from model.windows import Windows, attend_in_windows
 
@@ -25,30 +25,30 @@ TOKEN_NORM_EPS = 1.1920929e-07
 
 
 class Norm(nn.RMSNorm):
-    """RMSNorm whose result has the type of its input, whatever the type of its weight.
+    """RMSNorm whose result has the type of its input, independent of the type of its weight.
 
-    Under autocast the two differ, and torch then leaves its fused kernel. On CUDA, autocast would
-    also have it return float32, and all that follows compute in it.
+    Under autocast the two differ, and torch would not use its fused kernel. On CUDA, autocast would
+    also return float32, and all later operations would compute in it.
     """
 
     def forward(self, x: Tensor) -> Tensor:
         """[..., W] -> [..., W]."""
         assert self.weight is not None
         weight = self.weight.to(x.dtype)
-        with as_given(x.device):
+        with without_autocast(x.device):
             return nn.functional.rms_norm(x, self.normalized_shape, weight, self.eps)
 
 
 def dtype_of(layers: nn.ModuleList) -> torch.dtype:
-    """Return the type that layers compute in."""
+    """Return the type of the layers' weights, in which they compute."""
     return next(layers.parameters()).dtype
 
 
 def run_layer(layer: nn.Module, *inputs: object, recompute: bool) -> Any:
-    """Return layer(*inputs); with `recompute`, nothing inside it is kept for the way back.
+    """Return layer(*inputs); `recompute` keeps no activations for the backward pass.
 
-    It is then computed a second time there (Chen et al. 2016): the same gradients, for less memory
-    and about a third more time.
+    They are then computed a second time (Chen et al. 2016): the same gradients, for less memory and
+    about a third more time.
     """
     (device,) = {each.device for each in inputs if isinstance(each, Tensor)}
     weights = rounded_weights(layer, device)
@@ -79,7 +79,7 @@ class SwiGLU(nn.Module):
     def forward(self, x_BNW: Tensor) -> Tensor:
         """[B, N, W] -> [B, N, W].
 
-        On a card gate and up are one product, which reads x once, and once more on the way back.
+        On a GPU gate and up are one product, which reads x only once in each pass.
         """
         if x_BNW.device.type != "cuda":
             return self.down(nn.functional.silu(self.gate(x_BNW)) * self.up(x_BNW))
@@ -89,7 +89,7 @@ class SwiGLU(nn.Module):
 
 
 class SelfAttention(nn.Module):
-    """Attention of a sequence to itself, with or without rotary positions."""
+    """Self-attention of a sequence, with or without rotary positions."""
 
     def __init__(self, width: int, num_heads: int) -> None:
         super().__init__()
@@ -109,8 +109,8 @@ class SelfAttention(nn.Module):
     ) -> Tensor:
         """[B, N, W] -> [B, N, W].
 
-        `rotation` is None where all positions are the origin; `windows` cuts the sequence into
-        parts that do not see each other, and goes with neither of the other two.
+        `rotation` is None if all positions are the origin; `windows` splits the sequence into
+        windows without attention between them, and excludes the other two.
         """
         if windows is not None:
             x_BNW = x_BNW[:, windows.order_Q]
@@ -119,7 +119,8 @@ class SelfAttention(nn.Module):
         k_BHND = split_heads(self.k_norm(k_BNW), self.num_heads)
         v_BHND = split_heads(v_BNW, self.num_heads)
         if rotation is not None:
-            q_BHND, k_BHND = rotate(q_BHND, *rotation), rotate(k_BHND, *rotation)
+            q_BHND = rotate(q_BHND, *rotation)
+            k_BHND = rotate(k_BHND, *rotation)
         if windows is None:
             return self.out(merge_heads(attend(q_BHND, k_BHND, v_BHND, keys)))
         attended_BNW = merge_heads(attend_in_windows(q_BHND, k_BHND, v_BHND, windows))
@@ -127,10 +128,10 @@ class SelfAttention(nn.Module):
 
 
 class CrossAttention(nn.Module):
-    """Attention of ray bundles to the tokens of their scene.
+    """Cross-attention of ray bundles to the tokens of their scene.
 
-    Keys and values are projected once per scene and rotated once per view: the rotation is what
-    carries the camera. Queries stand at the camera's origin, where the rotation is the identity.
+    Keys and values are projected once per scene, and keys are rotated once per view, which encodes
+    the camera. Queries are at the camera's origin, where the rotation is the identity.
     """
 
     def __init__(self, width: int, num_heads: int) -> None:
@@ -145,7 +146,7 @@ class CrossAttention(nn.Module):
         self.out = nn.Linear(width, width, bias=False)
 
     def keys_values(self, context_BNW: Tensor) -> KeysValues:
-        """Return keys, not yet rotated, and values of a context: once per scene."""
+        """Return unrotated keys, and values, of a context: once per scene."""
         normed_BNW = self.context_norm(context_BNW)
         k_BHND = split_heads(self.k_norm(self.k(normed_BNW)), self.num_heads)
         return k_BHND, split_heads(self.v(normed_BNW), self.num_heads)
@@ -168,8 +169,8 @@ class CrossAttention(nn.Module):
 class EncoderLayer(nn.Module):
     """Self-attention of all tokens of a scene, then SwiGLU, each added to the residual stream.
 
-    The last addition is left to the next layer: it adds and normalises in one kernel where it is
-    compiled, and reads the stream once instead of twice.
+    The last addition is left to the next layer: compiled, it adds and normalizes in one kernel, and
+    reads the stream once instead of twice.
     """
 
     def __init__(self, width: int, num_heads: int, hidden_width: int) -> None:
@@ -182,9 +183,9 @@ class EncoderLayer(nn.Module):
     def forward(
         self, x_BNW: Tensor, due_BNW: Tensor | None, rotation: Rotation, keys: Keys
     ) -> tuple[Tensor, Tensor]:
-        """Return the stream [B, N, W], and what is due to be added to it.
+        """Return the stream [B, N, W], and the pending term that the next layer adds.
 
-        `due_BNW` is what the layer before left; None in the first layer.
+        `due_BNW` is the pending term of the previous layer; None in the first layer.
         """
         if due_BNW is not None:
             x_BNW = x_BNW + due_BNW
@@ -193,7 +194,7 @@ class EncoderLayer(nn.Module):
 
 
 class DecoderLayer(nn.Module):
-    """Bundles read the scene, then each other within their view, then SwiGLU."""
+    """Cross-attention to the scene, self-attention within the view, then SwiGLU."""
 
     def __init__(self, width: int, num_heads: int, hidden_width: int) -> None:
         super().__init__()

@@ -23,7 +23,7 @@ from model.light_groups import LightGroup, light_groups
 from model.open import Finder, find_network
 from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
-from model.scene_tensors import Cameras, batch_scenes, converted, scene_tensors
+from model.scene_tensors import Cameras, batch_scenes, map_tensors, scene_tensors
 from model.weights import MAX_LIGHTS, TrainedRange, network_digest
 from storage.errors import TrilightError
 from storage.records.material import unread_columns
@@ -143,9 +143,9 @@ class NeuralRenderer:
         self._require_memory(scene.num_triangles)
         below_sky, scene = scene, self._with_known_sky(scene)
         by_hits = self._model.config.view_stage == "hits"
-        all_lights = [LightGroup(scene=scene, share=1.0)]
+        all_lights = [LightGroup(scene=scene, fraction=1.0)]
         groups = [
-            (_encode(self._model, group.scene, self.device), group.share)
+            (_encode(self._model, group.scene, self.device), group.fraction)
             for group in (all_lights if by_hits else light_groups(scene, lights_per_pass))
         ]
         return PreparedScene(groups=tuple(groups), notes=self._notes(below_sky, len(groups)))
@@ -250,7 +250,7 @@ class NeuralRenderer:
 def _encode(model: RenderFormer, scene: Scene, device: torch.device) -> EncodedScene:
     """Return one scene after the view-independent stage."""
     batch = batch_scenes([scene_tensors(scene, model.config.material_columns)])
-    return model.encode(converted(batch, lambda tensor: tensor.to(device)))
+    return model.encode(map_tensors(batch, lambda tensor: tensor.to(device)))
 
 
 def _decode(

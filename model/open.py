@@ -1,4 +1,4 @@
-"""Opens a network from any source; the only place that does, and without pickle.
+"""Loads a network from any source, without pickle.
 
 ours, shipped      builtin:hits (builtin: for short), builtin:tokens
 our own            model.safetensors of `trilight train`, or the folder that holds one
@@ -34,58 +34,59 @@ from storage.atomic import write_atomically
 from storage.errors import TrilightError, expected_one_of
 from storage.records.safe_read import open_plain
 
-WEIGHTS_NAME, CONFIG_NAME = "model.safetensors", "config.json"
-"""What a checkpoint's folder holds; only published ones have the second."""
+WEIGHTS_NAME = "model.safetensors"
+CONFIG_NAME = "config.json"
+"""File name of the configuration in the folder of a published checkpoint."""
 
 PUBLISHED = ("microsoft/renderformer-v1-base", "microsoft/renderformer-v1.1-swin-large")
-"""The published checkpoints' names on the Hugging Face hub."""
+"""Names of the published checkpoints on the Hugging Face hub."""
 
 _SHIPPED = Path(__file__).parent / "builtin"
 
 BUILTIN = "builtin:"
-"""Name of the better of the small networks that come with Trilight."""
+"""Name of the better of the small networks that Trilight ships."""
 
 BUILTIN_TOKENS = "builtin:tokens"
-"""Name of the one whose view stage is RenderFormer's: nothing is traced."""
+"""Name of the shipped network with RenderFormer's view stage, without traced inputs."""
 
 BUILTIN_NETWORKS = {
     BUILTIN: _SHIPPED / "hits" / WEIGHTS_NAME,
     "builtin:hits": _SHIPPED / "hits" / WEIGHTS_NAME,
     BUILTIN_TOKENS: _SHIPPED / "tokens" / WEIGHTS_NAME,
 }
-"""File of each network that comes along, by its name; its card, README.md, is beside it."""
+"""File of each shipped network by name; its model card, README.md, is in the same folder."""
 
 MAX_CONFIG_BYTES = 1 << 16
-"""A published config.json has about 1 KiB."""
+"""Maximum size of a config.json; published ones have about 1 KiB."""
 
 _ANSWER_S = 5.0
-"""Time limit for the hub's first answer; without one, files fetched before are used."""
+"""Timeout of the hub's first response in seconds; afterwards cached files are used."""
 
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 _PICKLES = (".pt", ".pth", ".bin", ".ckpt", ".pkl")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FoundNetwork:
-    """A network that is there; its weights are read when it is opened."""
+class NetworkFile:
+    """File of a network, whose weights are read when it is opened."""
 
     path: Path
-    """The file that holds them."""
+    """Path of the file with the weights."""
     trained: TrainedRange
-    """What it was trained on, as far as the file says."""
+    """Range of the training data, as far as the file states it."""
     any_width: bool
-    """Whether pictures of other widths than that are as good."""
+    """True if pictures of other widths than in training are as good."""
     open: Callable[[], RenderFormer]
-    """Returns the network, float32, in evaluation mode on the CPU; raises TrilightError where the
-    file is damaged, or its tensors are not those of its configuration."""
+    """Returns the network, float32, in evaluation mode on the CPU; raises TrilightError if the file
+    is damaged, or its tensors do not match its configuration."""
 
 
-Finder = Callable[[Path], FoundNetwork | None]
-"""Finds the network of a place in a form that this package does not know, such as a training
-checkpoint (train.loop.checkpoints); returns None for any other place."""
+Finder = Callable[[Path], NetworkFile | None]
+"""Finds the network at a path in a format that this package does not know, such as a training
+checkpoint (train.loop.checkpoints); returns None for any other path."""
 
 
-def open_network(place: str | Path, *finders: Finder) -> RenderFormer:
+def open_network(source: str | Path, *finders: Finder) -> RenderFormer:
     """Return a network, float32, in evaluation mode on the CPU.
 
     Args:
@@ -93,22 +94,22 @@ def open_network(place: str | Path, *finders: Finder) -> RenderFormer:
         finders: as there.
 
     Raises:
-        TrilightError: there is none, it holds pickled code, it is damaged, or its tensors are not
-            those of its configuration; names are listed.
+        TrilightError: no such file, pickled code, a damaged file, or tensors that do not match the
+            configuration; the message lists their names.
     """
-    return find_network(place, *finders).open()
+    return find_network(source, *finders).open()
 
 
-def find_network(place: str | Path, *finders: Finder) -> FoundNetwork:
-    """Return a network before its weights are read; of a published name, after it is fetched.
+def find_network(place: str | Path, *finders: Finder) -> NetworkFile:
+    """Return the file of a network without reading its weights; published names are downloaded.
 
     Args:
         place: one of BUILTIN_NETWORKS, a file, a folder, or the name of a repository on the
             Hugging Face hub.
-        finders: are asked first, such as `train.loop.checkpoints.network_of_run`.
+        finders: functions that are tried first, such as `train.loop.checkpoints.network_of_run`.
 
     Raises:
-        TrilightError: there is none, or it holds pickled code.
+        TrilightError: no such file, or pickled code.
     """
     source = str(place)
     if source.startswith(BUILTIN) and source not in BUILTIN_NETWORKS:
@@ -118,27 +119,27 @@ def find_network(place: str | Path, *finders: Finder) -> FoundNetwork:
         )
     path = BUILTIN_NETWORKS.get(source, Path(source))
     for finder in finders:
-        if found := finder(path):
-            return found
+        if network := finder(path):
+            return network
     weights = _weights_file(source, path)
     metadata = read_metadata(weights)
     if CONFIG_KEY in metadata:
-        return FoundNetwork(
+        return NetworkFile(
             path=weights,
             trained=trained_range(metadata) or TrainedRange(),
             any_width=decode_config(metadata[CONFIG_KEY], str(weights)).view_stage == "hits",
             open=lambda: from_tensors(*read_tensors(weights), str(weights)),
         )
-    return FoundNetwork(
+    return NetworkFile(
         path=weights,
         trained=PUBLISHED_RANGE,
         any_width=False,
-        open=lambda: _published(weights),
+        open=lambda: _open_published(weights),
     )
 
 
 def _weights_file(source: str, path: Path) -> Path:
-    """Return the safetensors file that is meant; raises as `find_network`."""
+    """Return the safetensors file of a source; raises as `find_network`."""
     if not path.exists():
         is_path = path.suffix in (*_PICKLES, ".safetensors") or source.startswith("runs/")
         if is_path or not _HUB_NAME.fullmatch(source):
@@ -161,7 +162,7 @@ def _weights_file(source: str, path: Path) -> Path:
     return weights
 
 
-def _published(weights: Path) -> RenderFormer:
+def _open_published(weights: Path) -> RenderFormer:
     tensors, _ = read_tensors(weights)
     return from_published(tensors, _read_config(weights.parent / CONFIG_NAME))
 
@@ -173,9 +174,9 @@ def _has_pickles(folder: Path) -> bool:
 def save_published(model: RenderFormer, folder: Path) -> None:
     """Write a network as a published checkpoint: config.json and model.safetensors.
 
-    Its texture input is as wide as that of its family, so that their loader feeds it as it does
-    theirs. A network that was trained here has its registers at the exact mean of the triangles;
-    their code puts them 1e-5 / T nearer to the origin.
+    Its texture input is as wide as that of its family, as the published loader expects. A network
+    that was trained here has its registers at the exact mean of the triangles; the published code
+    puts them 1e-5 / T nearer to the origin.
 
     Raises:
         TrilightError: the network is of neither published family, or the folder cannot be written.
@@ -206,7 +207,7 @@ def _read_config(path: Path) -> PublishedConfig:
 
 
 def _download(name: str) -> Path:
-    """Return the local folder of a repository on the hub, fetched if it is not there yet."""
+    """Return the local folder of a repository on the hub, after a download if necessary."""
     try:
         from huggingface_hub import hf_hub_download, model_info
     except ModuleNotFoundError as error:
@@ -215,9 +216,9 @@ def _download(name: str) -> Path:
             "it, is not installed. Run `make setup-all`, or name a local folder."
         ) from error
     reason = ""
-    try:  # one short question: the downloads would ask again and again, for half a minute
+    try:  # one short request first: downloads would retry for half a minute
         model_info(name, timeout=_ANSWER_S)
-    except Exception as error:  # of whatever library asks
+    except Exception as error:  # the hub's HTTP library is not known
         reason = _first_line(error)
     try:
         hf_hub_download(name, CONFIG_NAME, local_files_only=bool(reason))

@@ -1,9 +1,8 @@
-"""Sequences of several lengths, one after the other and without padding, for flash attention.
+"""Packing of sequences of several lengths without padding, for flash attention.
 
-With a mask, torch takes its memory-efficient kernel, which reaches half of what flash attention
-does on a card. Flash attention takes no mask, but it takes sequences that follow each other, with
-the places where they start. Packing and unpacking read memory once, both on the way and back, and
-add nothing up: they are exact, and the same in every run.
+With a mask, torch uses its memory-efficient kernel, which is half as fast as flash attention on a
+GPU. Flash attention takes no mask, but packed sequences with their start offsets. Packing and
+unpacking read memory once in each direction and sum nothing: they are exact and deterministic.
 """
 
 import itertools
@@ -17,47 +16,49 @@ from torch.nn.functional import scaled_dot_product_attention
 from model.precision import REDUCED
 
 LONGEST_STEP = 512
-"""The longest sequence is said in multiples of this, so that compiled code meets few values."""
+"""Multiple to which the longest length is rounded up, so that compiled code sees few values."""
 
 MOST_HEAD_WIDTH = 256
-"""Widest head that flash attention takes; widths are multiples of 8."""
+"""Maximum head width of flash attention; widths are multiples of 8."""
 
 
 class Sequences(NamedTuple):
-    """Where S sequences start that follow each other.
+    """Start offsets of S packed sequences.
 
-    A named tuple, since compiled code takes its parts as inputs.
+    It is a named tuple, since compiled code takes its fields as inputs.
     """
 
     starts_S1: Tensor
-    """int32 [S + 1] where sequences start, and where the last one ends."""
+    """int32 [S + 1] start offsets, and the end of the last sequence."""
     longest: int
-    """At least the length of each."""
+    """Upper bound of the sequence lengths."""
 
 
 class Packing(NamedTuple):
-    """Where the tokens of S padded sequences [S, N] are when P of them that exist are packed."""
+    """Index maps between S padded sequences [S, N] and their P packed tokens."""
 
     index_P: Tensor
-    """int64 place of each token among the S N padded ones."""
+    """int64 index of each packed token among the S N padded ones."""
     back_M: Tensor
-    """int64 [S N] place of each padded one among the packed; 0 where it does not exist."""
+    """int64 [S N] index of each padded token among the packed ones; 0 for padding."""
     exists_M: Tensor
-    """bool [S N]."""
+    """bool [S N], False for padding."""
     sequences: Sequences
-    """Where they lie then."""
+    """Offsets of the packed sequences."""
 
     def of_views(self, views: int) -> Sequences:
-        """Return where the sequences lie when all of them come again for each of several views."""
-        (starts_S1, longest), total = self.sequences, len(self.index_P)
+        """Return the offsets of all sequences repeated for each of several views."""
+        starts_S1, longest = self.sequences
+        total = len(self.index_P)
         first_V1 = total * torch.arange(views, dtype=torch.int32, device=starts_S1.device)[:, None]
         ends_VS = first_V1 + starts_S1[1:]
         return Sequences(torch.nn.functional.pad(ends_VS.flatten(), (1, 0)), longest)
 
 
 def pack_lengths(lengths: Sequence[int], longest: int, device: torch.device) -> Packing:
-    """Return where tokens go: the first `lengths[s]` of the `longest` of each sequence exist."""
-    total, count = sum(lengths), len(lengths)
+    """Return the packing of sequences whose first `lengths[s]` of `longest` tokens are valid."""
+    total = sum(lengths)
+    count = len(lengths)
     lengths_S = torch.tensor(lengths, device=device)
     starts_S1 = torch.nn.functional.pad(lengths_S.cumsum(0), (1, 0))
     row_P = torch.repeat_interleave(
@@ -77,10 +78,10 @@ def pack_lengths(lengths: Sequence[int], longest: int, device: torch.device) -> 
     )
 
 
-def takes_packed(x: Tensor, head_width: int) -> bool:
-    """Return whether there is a kernel for packed sequences where a tensor is computed with.
+def supports_packed(x: Tensor, head_width: int) -> bool:
+    """Return whether packed attention is faster for a tensor's device and type.
 
-    The one that torch has is for cards and half precision; elsewhere masks are as quick.
+    Torch's kernel is for GPUs and half precision; elsewhere masks are as fast.
     """
     device = x.device.type
     reduced = x.dtype in REDUCED or (device == "cuda" and torch.is_autocast_enabled("cuda"))
@@ -116,31 +117,30 @@ class _Unpack(torch.autograd.Function):
         return _Pack.apply(grads[0], index_P, back_M, exists_M), None, None, None
 
 
-def packed(x_SNK: Tensor, packing: Packing) -> Tensor:
-    """Return the tokens that exist: [S, N, ...] -> [P, ...]."""
-    found: Tensor = _Pack.apply(x_SNK.flatten(0, 1), *packing[:3])
-    return found
+def pack_tokens(x_SNK: Tensor, packing: Packing) -> Tensor:
+    """Return the valid tokens: [S, N, ...] -> [P, ...]."""
+    return _Pack.apply(x_SNK.flatten(0, 1), *packing[:3])
 
 
 def attend_packed(
-    q_QHD: Tensor, k_PHD: Tensor, v_PHD: Tensor, asks: Sequences, keys: Sequences
+    q_QHD: Tensor, k_PHD: Tensor, v_PHD: Tensor, queries: Sequences, keys: Sequences
 ) -> Tensor:
     """Return softmax(q k^T / sqrt(D)) v, [Q, H, D], of each sequence to its own keys.
 
     Args:
-        q_QHD: queries, half precision on a card.
+        q_QHD: queries, half precision on a GPU.
         k_PHD, v_PHD: keys and values.
-        asks: where the queries lie.
-        keys: where the keys of the same sequences lie.
+        queries: offsets of the queries.
+        keys: offsets of the keys of the same sequences.
     """
     if q_QHD.device.type == "cuda":
         from torch.nn.attention.varlen import varlen_attn
 
-        starts = asks.starts_S1, keys.starts_S1
-        found: Any = varlen_attn(q_QHD, k_PHD, v_PHD, *starts, asks.longest, keys.longest)
-        return found  # one tensor, where nothing else is asked for
+        starts = queries.starts_S1, keys.starts_S1
+        attended: Any = varlen_attn(q_QHD, k_PHD, v_PHD, *starts, queries.longest, keys.longest)
+        return attended  # one tensor, where nothing else is asked for
     parts = []
-    spans = zip(_spans(asks.starts_S1), _spans(keys.starts_S1), strict=True)
+    spans = zip(_spans(queries.starts_S1), _spans(keys.starts_S1), strict=True)
     for (first, end), (low, high) in spans:
         q, k, v = (x.transpose(0, 1) for x in (q_QHD[first:end], k_PHD[low:high], v_PHD[low:high]))
         parts.append(scaled_dot_product_attention(q[None], k[None], v[None])[0].transpose(0, 1))

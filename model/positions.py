@@ -1,8 +1,8 @@
-"""Where a triangle is: rotary angles of its vertices, and the sines that encode its normals.
+"""Position encodings: rotary angles of triangles, and sines of their normals.
 
 Queries and keys are rotated by angles proportional to the nine vertex coordinates, so that their
-product depends on differences of positions only: the network cannot tell where in the world a
-scene stands (Zeng et al. 2025, section 3.1). It can tell which way the scene is turned.
+product depends only on differences of positions: the network is invariant to translation (Zeng et
+al. 2025, section 3.1), but not to rotation.
 """
 
 import math
@@ -10,33 +10,35 @@ import math
 import torch
 from torch import Tensor, nn
 
-from model.encoded_scene import TokenPlaces
-from model.packing import Packing, packed
+from model.encoded_scene import TokenPositions
+from model.packing import Packing, pack_tokens
 
 Rotation = tuple[Tensor, Tensor]
 """cos and sin [..., N, D / 2]."""
 
 
 class TriangleRotary(nn.Module):
-    """Angles of triangles: coordinate x frequency, coordinate-major, no factor of 2 pi.
+    """Rotary angles of triangles: coordinate x frequency, coordinate-major, without a factor 2 pi.
 
-    The frequencies stay outside the state dict, since the configuration determines them, and
-    positions must reach this module in float32 or better: rounding them costs 60 dB and more.
+    The frequencies are not in the state dict, since the configuration determines them. Positions
+    must be float32 or better: rounding them costs 60 dB and more.
     """
 
     freqs_F: Tensor
 
     def __init__(self, *, num_freqs: int, max_freq: float, head_width: int) -> None:
         super().__init__()
-        self.num_freqs, self.max_freq = num_freqs, max_freq
-        self.head_width, self.half_width = head_width, head_width // 2
+        self.num_freqs = num_freqs
+        self.max_freq = max_freq
+        self.head_width = head_width
+        self.half_width = head_width // 2
         self.register_buffer("freqs_F", None, persistent=False)
         self.reset()
 
     def reset(self) -> None:
-        """Compute the frequencies, float32: they survive neither the meta device nor a cast.
+        """Compute the frequencies again in float32, after a cast or the meta device.
 
-        Log2-spaced as in the published code, so that they are its own bit by bit.
+        They are log2-spaced as in the published code, and exactly equal to its own.
         """
         octaves_F = torch.linspace(0, math.log2(self.max_freq), self.num_freqs)
         self.freqs_F = 2**octaves_F
@@ -44,7 +46,7 @@ class TriangleRotary(nn.Module):
     def forward(self, triangles_N33: Tensor) -> Rotation:
         """Return (cos, sin) [..., N, D / 2] of vertex positions [..., N, 3, 3].
 
-        Angles beyond the 9 x num_freqs that positions fill are 0: those pairs do not turn.
+        Angles beyond the first 9 x num_freqs are 0: those pairs are not rotated.
         """
         coordinates_N9 = triangles_N33.flatten(-2)
         angles_NA = (coordinates_N9[..., None] * self.freqs_F).flatten(-2)
@@ -53,20 +55,21 @@ class TriangleRotary(nn.Module):
 
 
 def rotate(x_HND: Tensor, cos_NA: Tensor, sin_NA: Tensor) -> Tensor:
-    """Turn each pair (channel i, channel i + D / 2) of x [..., H, N, D] by its angle.
+    """Rotate each pair (channel i, channel i + D / 2) of x [..., H, N, D] by its angle.
 
-    cos and sin are [..., N, D / 2]; all heads turn alike. A half-precision x is turned in the
+    cos and sin are [..., N, D / 2], equal for all heads. A half-precision x is rotated in the
     table's precision and rounded once, at the end. In memory the heads of a token stay together, as
-    the layers before have them and those after attention read them: nothing is copied on the way.
+    layers before and after attention have them, so that nothing is copied.
     """
-    cos_N1A, sin_N1A = cos_NA.unsqueeze(-2), sin_NA.unsqueeze(-2)
+    cos_N1A = cos_NA.unsqueeze(-2)
+    sin_N1A = sin_NA.unsqueeze(-2)
     a, b = x_HND.transpose(-2, -3).chunk(2, dim=-1)
-    turned = torch.cat([a * cos_N1A - b * sin_N1A, b * cos_N1A + a * sin_N1A], dim=-1)
-    return turned.to(x_HND.dtype).transpose(-2, -3)
+    rotated = torch.cat([a * cos_N1A - b * sin_N1A, b * cos_N1A + a * sin_N1A], dim=-1)
+    return rotated.to(x_HND.dtype).transpose(-2, -3)
 
 
 def encode_normals(normals_N33: Tensor, octaves: int) -> Tensor:
-    """Return [..., N, 9 + 18 octaves]: the components, their sines, their cosines.
+    """Return components, their sines and their cosines, [..., N, 9 + 18 octaves].
 
     Sines are of component x 2^k, component-major (NeRF, Mildenhall et al. 2020, equation 4,
     without its factor pi).
@@ -79,7 +82,7 @@ def encode_normals(normals_N33: Tensor, octaves: int) -> Tensor:
 
 
 def encoded_normal_width(octaves: int) -> int:
-    """Return the last dimension of `encode_normals`."""
+    """Return the last dimension of the result of `encode_normals`."""
     return 9 + 18 * octaves
 
 
@@ -96,30 +99,29 @@ def to_camera(points_BT33: Tensor, c2w_BV44: Tensor) -> Tensor:
 
 
 def register_position(triangles_BT33: Tensor, is_triangle_BT: Tensor | None) -> Tensor:
-    """Return [B, 1, 3, 3]: the mean vertex of the scene, three times over."""
-    centre_BT3 = triangles_BT33.mean(dim=-2)
+    """Return the mean vertex of each scene, repeated three times, [B, 1, 3, 3]."""
+    center_BT3 = triangles_BT33.mean(dim=-2)
     if is_triangle_BT is None:
-        mean_B3 = centre_BT3.mean(dim=1)
+        mean_B3 = center_BT3.mean(dim=1)
     else:
-        weight_BT1 = is_triangle_BT[..., None].to(centre_BT3.dtype)
-        mean_B3 = (centre_BT3 * weight_BT1).sum(dim=1) / weight_BT1.sum(dim=1)
+        weight_BT1 = is_triangle_BT[..., None].to(center_BT3.dtype)
+        mean_B3 = (center_BT3 * weight_BT1).sum(dim=1) / weight_BT1.sum(dim=1)
     return mean_B3[:, None, None, :].expand(-1, 1, 3, 3)
 
 
-def token_places(
+def token_positions(
     triangles_BT33: Tensor,
     is_triangle_BT: Tensor | None,
     *,
     num_registers: int,
     eps: float,
     num_triangles: tuple[int, ...] | None = None,
-) -> TokenPlaces:
-    """Return where registers and triangles stand; `num_triangles` says what the mask says.
+) -> TokenPositions:
+    """Return the positions of registers and triangles; `num_triangles` agrees with the mask.
 
-    The published code divides the registers' sum of positions by T + 1e-5, in the world and again
-    in each camera's frame, which pulls them towards that frame's origin by 1e-5 / T of their
-    distance. `eps` repeats this for published weights; at 0 the network is exactly invariant under
-    translation, which those are not.
+    The published code divides the registers' sum of positions by T + 1e-5, in world space and again
+    in each camera's space, which moves them towards the origin by 1e-5 / T of their distance. `eps`
+    reproduces this for published weights; with 0 the network is exactly invariant to translation.
     """
     batch, longest = triangles_BT33.shape[:2]
     register_B133 = register_position(triangles_BT33, is_triangle_BT)
@@ -132,7 +134,7 @@ def token_places(
         count_B = is_triangle_BT.sum(dim=1).to(scale_BN11.dtype)
         is_key_BN = nn.functional.pad(is_triangle_BT, (num_registers, 0), value=True)
     scale_BN11[:, :num_registers] = (count_B / (count_B + eps))[:, None, None, None]
-    return TokenPlaces(
+    return TokenPositions(
         positions_BN33=torch.cat([registers_BR33, triangles_BT33], dim=1),
         scale_BN11=scale_BN11,
         is_key_BN=is_key_BN,
@@ -141,24 +143,24 @@ def token_places(
 
 
 def packed_rotation(rotation_BNA: Rotation, packing: Packing) -> Rotation:
-    """Return the rotation [1, P, A] of tokens that are packed."""
+    """Return the rotation [1, P, A] of packed tokens."""
     cos_BNA, sin_BNA = rotation_BNA
-    return packed(cos_BNA, packing)[None], packed(sin_BNA, packing)[None]
+    return pack_tokens(cos_BNA, packing)[None], pack_tokens(sin_BNA, packing)[None]
 
 
 def packed_camera_rotation(rotation_BVNA: Rotation, packing: Packing) -> Rotation:
-    """Return the rotation [1, V, P, A] of tokens that are packed, in the space of each camera."""
+    """Return the rotation [1, V, P, A] of packed tokens, in the space of each camera."""
     cos_BVNA, sin_BVNA = rotation_BVNA
-    found = packed_rotation((cos_BVNA.transpose(1, 2), sin_BVNA.transpose(1, 2)), packing)
-    return found[0].transpose(1, 2), found[1].transpose(1, 2)
+    rotation = packed_rotation((cos_BVNA.transpose(1, 2), sin_BVNA.transpose(1, 2)), packing)
+    return rotation[0].transpose(1, 2), rotation[1].transpose(1, 2)
 
 
-def world_rotation(rotary: TriangleRotary, places: TokenPlaces) -> Rotation:
-    """Return the rotation [B, N, D / 2] of all tokens in the world."""
+def world_rotation(rotary: TriangleRotary, places: TokenPositions) -> Rotation:
+    """Return the rotation [B, N, D / 2] of all tokens in world space."""
     return rotary(places.positions_BN33 * places.scale_BN11)
 
 
-def camera_rotation(rotary: TriangleRotary, places: TokenPlaces, c2w_BV44: Tensor) -> Rotation:
+def camera_rotation(rotary: TriangleRotary, places: TokenPositions, c2w_BV44: Tensor) -> Rotation:
     """Return the rotation [B, V, N, D / 2] of all tokens in the space of each camera."""
     positions_BVN33 = to_camera(places.positions_BN33, c2w_BV44)
     return rotary(positions_BVN33 * places.scale_BN11[:, None])

@@ -1,14 +1,14 @@
-"""The number format of the network's products: chosen at run time, not part of a checkpoint.
+"""Precision of the network's matrix products, chosen at run time and not stored in checkpoints.
 
-The layers of both stages and the head may be rounded. Always float32, whatever is chosen:
-positions and rotary angles with their sines, the rotation itself, ray directions and their layer,
-normals and their octaves, materials, the learned tokens, and a head's last layers, whose rounding
-would be seen as bands. All of that is a hundredth of the work; rounding it too cost 7 dB on a
-trained network (study S68).
+The layers of both stages and the head may be rounded. Always float32 are positions and rotary
+angles with their sines, the rotation itself, ray directions and their layer, normals and their
+octaves, materials, the learned tokens, and a head's last layers, whose rounding would be visible as
+banding. These are a hundredth of the work; rounding them too cost 7 dB on a trained network (study
+S68).
 
-Weights are rounded once, when the network is made ready, and not at every use (autocast): equally
-fast, half the memory. Training in few bits needs float32 weights and therefore uses autocast;
-`as_given` switches autocast off for what is always float32.
+Weights are rounded once before inference, and not at every use (autocast): equally fast, half the
+memory. Training in reduced precision needs float32 weights and therefore uses autocast; `as_given`
+disables autocast for operations that are always float32.
 """
 
 from collections.abc import Iterator
@@ -32,9 +32,9 @@ class PrecisionChoice:
     dtype: torch.dtype
     """Type of the weights and activations of the layers and the head."""
     tf32: bool = False
-    """Whether a GPU may multiply float32 matrices with 10 bits of mantissa."""
+    """True if a GPU may multiply float32 matrices with 10 bits of mantissa."""
     needs_cuda: bool = False
-    """Whether it is refused on a CPU, which has no fast path for it."""
+    """True if a CPU has no fast path for it, so that it is refused there."""
 
 
 PRECISIONS = {
@@ -43,8 +43,8 @@ PRECISIONS = {
     "tf32": PrecisionChoice(dtype=torch.float32, tf32=True, needs_cuda=True),
     "float16": PrecisionChoice(dtype=torch.float16, needs_cuda=True),
 }
-"""Every choice by name. Studies S67 and S68 have speeds and errors of bfloat16, and
-the errors that float16's numbers make; float16's speed and all of tf32 were not measured."""
+"""Precisions by name. Studies S67 and S68 have speeds and errors of bfloat16, and errors of
+float16; the speed of float16 and all of tf32 were not measured."""
 
 
 REDUCED = (torch.bfloat16, torch.float16)
@@ -52,7 +52,7 @@ REDUCED = (torch.bfloat16, torch.float16)
 
 
 def rounded_parts(model: "RenderFormer") -> list[nn.Module]:
-    """Return the parts of a network that a precision rounds; the others stay float32."""
+    """Return the modules that a precision rounds; the others stay float32."""
     scene = [] if model.encoder is None else [model.encoder.layers]
     return [*scene, model.decoder.layers, *model.decoder.head.rounded_parts()]
 
@@ -60,10 +60,10 @@ def rounded_parts(model: "RenderFormer") -> list[nn.Module]:
 def set_precision(model: "RenderFormer", name: str) -> "RenderFormer":
     """Round a network for inference, in place, and return it.
 
-    Going back to float32 does not bring back what rounding took; open the checkpoint again.
+    Rounding cannot be undone: to return to float32, open the checkpoint again.
 
     Raises:
-        TrilightError: there is no such precision, or not on the network's device.
+        TrilightError: no such precision, or the network's device does not support it.
     """
     if name not in PRECISIONS:
         raise TrilightError(f"precision {name!r}: expected one of {', '.join(PRECISIONS)}.")
@@ -80,22 +80,22 @@ def set_precision(model: "RenderFormer", name: str) -> "RenderFormer":
     return model
 
 
-def as_given(device: torch.device) -> AbstractContextManager[None]:
-    """Return a context whose operations keep the types they are given, whatever autocast says."""
-    if device.type == "meta":  # on which operations are only counted: it has no autocast
-        return nullcontext()  # torch 2.11 cannot compile a question whether it has
-    context: AbstractContextManager[None] = torch.autocast(device.type, enabled=False)
-    return context
+def without_autocast(device: torch.device) -> AbstractContextManager[None]:
+    """Return a context without autocast, in which operations keep the types of their inputs."""
+    if device.type == "meta":  # it has no autocast, and operations are only counted there
+        return nullcontext()  # torch 2.11 cannot compile a check whether a device has it
+    return torch.autocast(device.type, enabled=False)
 
 
 @contextmanager
-def quick_products(device: torch.device, *, wanted: bool) -> Iterator[None]:
-    """Have a card multiply float32 matrices with 10 bits of mantissa, eight times as fast.
+def fast_float32_products(device: torch.device, *, enabled: bool) -> Iterator[None]:
+    """Let a GPU multiply float32 matrices with 10 bits of mantissa, eight times as fast.
 
-    While a network trains in few bits: on the way back, whose other products have 7 bits, and in
-    the pixels of `hits`. On an H200 float32 there was a sixth of the step of `hits-256`.
+    Used while a network trains in reduced precision: in the backward pass, whose other products
+    have 7 bits, and in the pixel network of `hits`. On an H200 float32 there took a sixth of the
+    step of `hits-256`.
     """
-    if device.type != "cuda" or not wanted:
+    if device.type != "cuda" or not enabled:
         yield
         return
     before = torch.get_float32_matmul_precision()
@@ -111,9 +111,9 @@ def tf32(allowed: bool) -> Iterator[None]:
     """Allow or forbid TF32 in CUDA's float32 products and convolutions; no effect on a CPU.
 
     Torch allows TF32 in convolutions by default, so plain float32 has to be requested too. Within
-    autocast, where a network trains in few bits, convolutions keep torch's default: a head's last
-    layers are rounded to 10 bits of mantissa then, as the way back has them anyway, and not to 7.
-    Products stay as they are asked for: rays and materials are not rounded at all.
+    autocast, in training, convolutions keep torch's default: a head's last layers are then rounded
+    to 10 bits of mantissa, as in the backward pass anyway, and not to 7. Products follow the
+    request: rays and materials are not rounded at all.
     """
     convolution = torch.backends.cudnn.conv  # type: ignore[attr-defined]
     switches = (torch.backends.cuda.matmul, convolution)

@@ -1,7 +1,7 @@
-"""Pictures as ray bundles: directions through pixel centres, in camera space, patch by patch.
+"""Ray bundles: directions through pixel centers, in camera space, patch by patch.
 
-Camera space has no pose: all that distinguishes two views here is their field of view. Tested
-against storage.conventions.camera_rays, which is the definition.
+In camera space two views differ only in their field of view. Tested against
+storage.conventions.camera_rays, which is the definition.
 """
 
 import torch

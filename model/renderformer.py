@@ -1,4 +1,4 @@
-"""The whole network (RenderFormer, Zeng et al. 2025): assembles the two stages, nothing else."""
+"""The whole network (RenderFormer, Zeng et al. 2025), assembled from its two stages."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from model.config import ModelConfig
-from model.demodulated import albedo_of_cameras, composed
+from model.demodulated import albedo_of_cameras, compose_radiance
 from model.encoded_scene import EncodedScene, KeysValues
 from model.hits.decoder import HitDecoder
 from model.hits.lit_scene import LitScene
@@ -19,27 +19,27 @@ from model.hits.tracing import (
     traced_batch,
     traced_cameras,
 )
-from model.image_head import blacken
-from model.positions import TriangleRotary, token_places
+from model.image_head import zero_last_layer
+from model.positions import TriangleRotary, token_positions
 from model.precision import tf32
-from model.scene_tensors import Cameras, SceneBatch, in_units
-from model.sky.known import require_known
+from model.scene_tensors import Cameras, SceneBatch, in_light_units
+from model.sky.known import require_known_sky
 from model.triangle_encoder import TriangleEncoder
 from model.view_decoder import ViewDecoder
 from storage.errors import TrilightError
 
 ELU_ALPHA = 1e-3
-"""How far below 0 the published output may go: a picture's radiance stays above -0.0023."""
+"""Slope of the output's ELU, as published: a picture's radiance stays above -0.0023."""
 
 TOKEN_STD = 0.02
-"""Spread of the learned tokens at the start; their neighbours in the sum have unit size."""
+"""Standard deviation of the initial learned tokens, which are added to terms of unit size."""
 
 
 class RenderFormer(nn.Module):
-    """Triangles, materials and cameras -> pictures.
+    """Network from triangles, materials and cameras to pictures.
 
-    It is exact under translation of the world and permutation of triangles, and has to learn
-    everything else: rotation, mirroring and the order of a triangle's vertices.
+    It is exactly invariant to translation of the world and permutation of triangles, and has to
+    learn all other symmetries: rotation, mirroring and the order of a triangle's vertices.
     """
 
     def __init__(self, config: ModelConfig) -> None:
@@ -56,45 +56,45 @@ class RenderFormer(nn.Module):
         self.decoder: Any = stage(config, rotary)
 
     def forward(self, batch: SceneBatch, resolution: int) -> Tensor:
-        """Return log10(1 + radiance) [B, V, R, R, 3], before the ELU: what training compares.
+        """Return log10(1 + radiance) [B, V, R, R, 3] before the ELU, as the loss uses it.
 
         Raises:
-            TrilightError: the resolution is not a multiple of `config.picture_px`, or a scene has a
-                sky whose light the network is not told.
+            TrilightError: the resolution is not a multiple of `config.picture_px`, or the network
+                does not support the sky of a scene.
         """
         if batch.albedo_BVRR6 is None and self.config.view_stage == "bundles":
             return self.decode(self.encode(batch), batch.cameras, resolution)
-        self._require(resolution)
+        self._require_resolution(resolution)
         if self.config.view_stage == "bundles":
             return self._bundles(
-                self._encoded(batch), batch.cameras, resolution, batch.albedo_BVRR6
+                self._encode_scenes(batch), batch.cameras, resolution, batch.albedo_BVRR6
             )
         scenes: tuple[TracedScene, ...] = ()
         traced = batch.traced
         if traced is None:
             scenes = traced_batch(batch)
             traced = traced_cameras(scenes, batch.cameras, resolution, self.config)
-        encoded = self._encoded(batch, scenes, traced.sides_T12, traced.unit_3)
+        encoded = self._encode_scenes(batch, scenes, traced.sides_T12, traced.unit_3)
         with tf32(self.tf32):
             pictures: Tensor = self.decoder(encoded, traced)
         return pictures
 
     def encode(self, batch: SceneBatch) -> EncodedScene:
-        """Return the scenes of a batch ready to be seen; their cameras are not looked at."""
+        """Return the encoded scenes of a batch; its cameras are ignored."""
         if self.config.view_stage == "bundles":
             surfaces = lit_scenes(batch) if self.config.demodulated else ()
-            return self._encoded(batch, surfaces=surfaces)
+            return self._encode_scenes(batch, surfaces=surfaces)
         scenes = traced_batch(batch)
         lights = [scene.light for scene in scenes]
         longest = batch.triangles_BT33.shape[1]
         sides = [pad(sides_of(light), (0, 0, 0, longest - light.num_triangles)) for light in lights]
         units = [torch.from_numpy(light.mean_3) for light in lights]
         sides_BT12 = like(torch.stack(sides), batch.triangles_BT33)
-        return self._encoded(
+        return self._encode_scenes(
             batch, scenes, sides_BT12, like(torch.stack(units), batch.triangles_BT33)
         )
 
-    def _encoded(
+    def _encode_scenes(
         self,
         batch: SceneBatch,
         traced: tuple[TracedScene, ...] = (),
@@ -102,10 +102,10 @@ class RenderFormer(nn.Module):
         unit_B3: Tensor | None = None,
         surfaces: tuple[LitScene, ...] = (),
     ) -> EncodedScene:
-        """Return the scenes after the view-independent stage, if there is one."""
+        """Encode scenes by the view-independent stage, if there is one."""
         for sky in batch.skies or ():
-            require_known(sky, self.config)
-        places = token_places(
+            require_known_sky(sky, self.config)
+        places = token_positions(
             batch.triangles_BT33,
             batch.is_triangle_BT,
             num_registers=self.config.num_registers,
@@ -118,7 +118,7 @@ class RenderFormer(nn.Module):
             packing = self.encoder.packing(places)
             if sides_BT12 is not None and unit_B3 is not None:
                 sides_BT12 = sides_BT12 / unit_B3.repeat(1, 4)[:, None]
-                batch = in_units(batch, unit_B3)
+                batch = in_light_units(batch, unit_B3)
             with tf32(self.tf32):
                 context_BNW = self.encoder(batch, places, sides_BT12, packing)
                 keys_values = self.decoder.keys_values(context_BNW, places, packing)
@@ -133,17 +133,17 @@ class RenderFormer(nn.Module):
     def decode(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
         """Return the pictures [B, V, R, R, 3] of any views of encoded scenes.
 
-        On a CPU, views asked for one by one are as fast as together, in half the memory.
+        On a CPU, decoding views one by one is as fast as together, in half the memory.
 
         Args:
-            scene: of `encode`.
-            cameras: B scenes by V views.
+            scene: result of `encode`.
+            cameras: cameras of B scenes by V views.
             resolution: a multiple of `config.picture_px`.
 
         Raises:
-            TrilightError: the resolution is another.
+            TrilightError: the resolution is no such multiple.
         """
-        self._require(resolution)
+        self._require_resolution(resolution)
         if isinstance(self.decoder, HitDecoder):
             with tf32(self.tf32):
                 traced = traced_cameras(scene.traced, cameras, resolution, self.config)
@@ -161,14 +161,14 @@ class RenderFormer(nn.Module):
         resolution: int,
         albedo_BVRR6: Tensor | None,
     ) -> Tensor:
-        """Return the pictures of ray bundles; `albedo` is that of a demodulated network."""
+        """Return the pictures of ray bundles; a demodulated network needs an albedo."""
         with tf32(self.tf32):
             picture_BVRRC: Tensor = self.decoder(scene, cameras, resolution)
         if not self.config.demodulated or albedo_BVRR6 is None:
             return picture_BVRRC
-        return composed(picture_BVRRC, albedo_BVRR6)
+        return compose_radiance(picture_BVRRC, albedo_BVRR6)
 
-    def _require(self, resolution: int) -> None:
+    def _require_resolution(self, resolution: int) -> None:
         picture_px = self.config.picture_px
         if resolution < picture_px or resolution % picture_px:
             unit = "a window of ray bundles" if self.config.window_bundles else "a ray bundle"
@@ -177,14 +177,14 @@ class RenderFormer(nn.Module):
                 f"{unit}. Choose the next one."
             )
 
-    def recompute_activations(self, wanted: bool) -> None:
-        """Keep only each layer's input for the way back, or all that is in it (the default)."""
-        self.decoder.recompute = wanted
+    def recompute_activations(self, enabled: bool) -> None:
+        """Set whether activations are recomputed in the backward pass; by default they are kept."""
+        self.decoder.recompute = enabled
         if self.encoder is not None:
-            self.encoder.recompute = wanted
+            self.encoder.recompute = enabled
 
-    def initialise(self, generator: torch.Generator) -> None:
-        """Draw all weights: Xavier for matrices, small tokens, a black picture."""
+    def initialize(self, generator: torch.Generator) -> None:
+        """Initialize all weights: Xavier for matrices, small tokens, a black picture."""
         for module in self.modules():
             if isinstance(module, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
                 nn.init.xavier_uniform_(module.weight, generator=generator)
@@ -195,18 +195,18 @@ class RenderFormer(nn.Module):
             tokens.append(self.decoder.token_W)
         for token in tokens:
             nn.init.normal_(token, std=TOKEN_STD, generator=generator)
-        blacken(self.decoder.head)
+        zero_last_layer(self.decoder.head)
 
 
 def radiance(log10_rgb: Tensor) -> Tensor:
     """Return the linear radiance of the network's output: ELU, then 10^x - 1.
 
-    For pictures only. The ELU's slope is a thousandth below 0, so a loss behind it lets a network
-    die that once went dark.
+    For pictures only. The ELU's slope is a thousandth below 0, so that with a loss after it a dark
+    network hardly recovers.
     """
     return torch.pow(10.0, nn.functional.elu(log10_rgb, alpha=ELU_ALPHA)) - 1.0
 
 
 def count_parameters(model: nn.Module) -> int:
-    """Return how many numbers training changes."""
+    """Return the number of trainable parameters."""
     return sum(weight.numel() for weight in model.parameters())

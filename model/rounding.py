@@ -1,8 +1,8 @@
-"""Weights rounded once a pass, all of a layer in one kernel, where training computes in few bits.
+"""Rounding of all weights of a layer in one kernel, for training in reduced precision.
 
-Autocast rounds every matrix in a kernel of its own, and its gradient in another on the way back:
-hundreds of launches that do next to nothing. Here a layer's are rounded together. Every number is
-what it would be with autocast alone, to the bit.
+Autocast rounds every matrix in a separate kernel, and its gradient in another one: hundreds of
+launches with little work. Here a layer's weights are rounded together. Every number is exactly that
+of autocast.
 """
 
 from collections.abc import Iterable
@@ -14,49 +14,53 @@ from torch.func import functional_call
 
 
 def rounded_call(module: nn.Module, weights: dict[str, Tensor], *inputs: Any) -> Any:
-    """Return module(*inputs), with some of its weights replaced by name."""
+    """Return module(*inputs) with some of its weights replaced by name."""
     if not weights:
         return module(*inputs)
     return functional_call(module, weights, inputs)
 
 
 def rounded_weights(module: nn.Module, device: torch.device) -> dict[str, Tensor]:
-    """Return a module's matrices rounded as autocast would; empty where it is off."""
-    return _rounded(device, ((name, w) for name, w in module.named_parameters() if w.ndim > 1))
+    """Return a module's matrices rounded as by autocast; empty without autocast."""
+    return _round_weights(
+        device, ((name, w) for name, w in module.named_parameters() if w.ndim > 1)
+    )
 
 
 def rounded_parts_of(
     module: nn.Module, parts: Iterable[nn.Module], device: torch.device
 ) -> dict[str, Tensor]:
-    """Return the same of all weights of some parts, by their names in `module`."""
+    """Return all weights of some submodules rounded as by autocast, by their names in `module`."""
     inside = {id(weight) for part in parts for weight in part.parameters()}
     named = module.named_parameters()
-    return _rounded(device, ((name, weight) for name, weight in named if id(weight) in inside))
+    return _round_weights(
+        device, ((name, weight) for name, weight in named if id(weight) in inside)
+    )
 
 
-def _rounded(device: torch.device, named: Iterable[tuple[str, Tensor]]) -> dict[str, Tensor]:
+def _round_weights(device: torch.device, named: Iterable[tuple[str, Tensor]]) -> dict[str, Tensor]:
     kind = device.type
     if kind == "meta" or not torch.is_autocast_enabled(kind):
         return {}
     to = torch.get_autocast_dtype(kind)
-    found = {name: weight for name, weight in named if weight.dtype == torch.float32}
-    if not found:
+    rounded = {name: weight for name, weight in named if weight.dtype == torch.float32}
+    if not rounded:
         return {}
-    return dict(zip(found, _Together.apply(to, *found.values()), strict=True))
+    return dict(zip(rounded, _RoundTogether.apply(to, *rounded.values()), strict=True))
 
 
-class _Together(torch.autograd.Function):
+class _RoundTogether(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, to: torch.dtype, *weights: Tensor) -> tuple[Tensor, ...]:
-        return _copies(weights, to)
+        return _copy_as(weights, to)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        return None, *_copies(grads, torch.float32)
+        return None, *_copy_as(grads, torch.float32)
 
 
-def _copies(tensors: Iterable[Tensor], to: torch.dtype) -> tuple[Tensor, ...]:
-    given = list(tensors)
-    copies = [torch.empty_like(tensor, dtype=to) for tensor in given]
-    torch._foreach_copy_(copies, given)
+def _copy_as(tensors: Iterable[Tensor], to: torch.dtype) -> tuple[Tensor, ...]:
+    sources = list(tensors)
+    copies = [torch.empty_like(tensor, dtype=to) for tensor in sources]
+    torch._foreach_copy_(copies, sources)
     return tuple(copies)

@@ -1,4 +1,4 @@
-"""`Scene` -> tensors: the one way in, for training and inference alike.
+"""Conversion of scenes to tensors, for training and inference.
 
 Shape suffixes here and in all of `model`:
     B scenes of a batch      V views of a scene      T triangles (padded to the longest of a batch)
@@ -7,8 +7,8 @@ Shape suffixes here and in all of `model`:
     A rotary angles of a position                    3 x, y, z or r, g, b
     M numbers of a material, of the columns that the network reads: 10 of the published ones
 
-A batch holds scenes of about one length and is padded to the longest of them, never to a constant;
-the padding is zero, because a mask hides finite garbage but not NaN (0 * NaN is NaN).
+A batch holds scenes of similar length and is padded to the longest of them, never to a constant;
+the padding is zero, because a mask hides finite values but not NaN (0 * NaN is NaN).
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from model.hits.textures import SurfaceTextures, surface_textures
 from model.hits.traced import Traced, stack_traced
-from model.sky.known import shining
+from model.sky.known import lit_sky
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -32,31 +32,30 @@ from storage.records.scene import MAX_POSITION_M, Scene
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneTensors:
-    """One scene as the network reads it; float32 unless converted."""
+    """Input of the network for one scene; float32 unless converted."""
 
     triangles_T33: Tensor
-    """Vertices of each triangle, world space, metres."""
+    """Vertices of each triangle, world space, meters."""
     normals_T33: Tensor
     """Unit shading normals at those vertices, world space."""
     material_TM: Tensor
-    """What the columns hold; of those that are log-encoded, log10(1 + x)."""
+    """Values of the material columns, log10(1 + x) in log-encoded ones."""
     c2w_V44: Tensor
-    """Camera to world."""
+    """Camera-to-world matrix of each view."""
     fov_deg_V: Tensor
     """Full field of view in degrees."""
     columns: tuple[str, ...] = PUBLISHED_COLUMNS
     """Names of the columns of `material_TM`, in order (storage.records.material)."""
     traced: Traced | None = None
-    """What was traced of these views, for a network with the view stage `hits`; where it is None,
-    such a network traces them itself."""
+    """Traced inputs of these views, for the view stage `hits`; if None, the network traces them."""
     albedo_VRR6: Tensor | None = None
-    """Albedo of what their pixels see first, for a demodulated network; where it is None, such a
-    network asks for it itself (model.demodulated)."""
+    """Albedo of visible surfaces, for a demodulated network; if None, the network computes it
+    (model.demodulated)."""
     textures: SurfaceTextures | None = None
-    """What such a network reads at each hit in the place of material columns; `material_TM` holds
-    the means. None where nothing is textured."""
+    """Textures that replace material columns at each hit; `material_TM` holds their means. None
+    without textures."""
     sky: Environment | None = None
-    """Light from far away; None where there is none, or none but black."""
+    """Environment light; None if there is none or it is black."""
 
     @property
     def num_triangles(self) -> int:
@@ -69,62 +68,56 @@ class SceneTensors:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Cameras:
-    """Views of a batch of scenes, as many of each."""
+    """Cameras of a batch of scenes, with equal numbers of views; fields as in SceneTensors."""
 
     c2w_BV44: Tensor
-    """As in SceneTensors."""
     fov_deg_BV: Tensor
-    """As in SceneTensors."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneBatch:
-    """Scenes of equal view count, padded with zeros to the longest."""
+    """Scenes of equal view count, padded with zeros to the longest; fields as in SceneTensors."""
 
     triangles_BT33: Tensor
-    """As in SceneTensors."""
     normals_BT33: Tensor
-    """As in SceneTensors."""
     material_BTM: Tensor
-    """As in SceneTensors."""
     c2w_BV44: Tensor
-    """As in SceneTensors."""
     fov_deg_BV: Tensor
-    """As in SceneTensors."""
     is_triangle_BT: Tensor | None
-    """bool, False in the padding; None where nothing is padded, which spares the mask."""
+    """bool, False in the padding; None without padding, so that attention needs no mask."""
     columns: tuple[str, ...] = PUBLISHED_COLUMNS
-    """As in SceneTensors."""
     num_triangles: tuple[int, ...] | None = None
-    """Of each scene, where something is padded; None: `is_triangle_BT` alone says it."""
+    """Number of triangles of each padded scene; None without padding or if unknown."""
     traced: Traced | None = None
-    """As in SceneTensors; None where a scene has None."""
+    """Traced inputs; None if any scene has none."""
     albedo_BVRR6: Tensor | None = None
-    """As in SceneTensors; None where a scene has None."""
+    """Albedo of visible surfaces; None if any scene has none."""
     textures: tuple[SurfaceTextures | None, ...] | None = None
-    """Those of each scene; None where no scene has any."""
+    """Textures of each scene; None if no scene has any."""
     skies: tuple[Environment | None, ...] | None = None
-    """That of each scene; None where no scene has any."""
+    """Environment light of each scene; None if no scene has any."""
 
     @property
     def cameras(self) -> Cameras:
         return Cameras(c2w_BV44=self.c2w_BV44, fov_deg_BV=self.fov_deg_BV)
 
     def material_of(self, columns: tuple[str, ...]) -> Tensor:
-        """Return [B, T, M] of these columns alone, in this order.
+        """Return the material [B, T, M] with only these columns, in this order.
 
         Raises:
             TrilightError: the batch has no such column.
         """
         if columns == self.columns:
             return self.material_BTM
-        places = {column.name: part for column, part in laid_out(self.columns)}
-        if missing := [name for name in columns if name not in places]:
+        columns_by_name = {column.name: part for column, part in laid_out(self.columns)}
+        if missing := [name for name in columns if name not in columns_by_name]:
             raise TrilightError(
                 f"scene: the network reads the material columns {', '.join(missing)}; the scene "
                 f"has only {', '.join(self.columns)}."
             )
-        return torch.cat([self.material_BTM[..., places[name]] for name in columns], dim=-1)
+        return torch.cat(
+            [self.material_BTM[..., columns_by_name[name]] for name in columns], dim=-1
+        )
 
 
 Scenes = TypeVar("Scenes", SceneTensors, SceneBatch)
@@ -134,16 +127,16 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
     """Return the tensors of a scene that passes `Scene.check`; its arrays stay unchanged.
 
     Args:
-        scene: what to show.
-        columns: of the material, such as those that one network reads
-            (`ModelConfig.material_columns`); None: all that are declared, for any network.
+        scene: scene to convert.
+        columns: material columns, such as those of one network (`ModelConfig.material_columns`);
+            None for all declared columns.
 
     Raises:
         TrilightError: a vertex is farther than MAX_POSITION_M from the origin along an axis, or a
             column is not declared.
     """
     farthest = np.abs(scene.vertex_positions).max()
-    if not farthest <= MAX_POSITION_M:  # not a number is no place either
+    if not farthest <= MAX_POSITION_M:  # also true for NaN
         raise TrilightError(
             f"scene: a vertex stands {farthest:g} m from the origin; the network reads up to "
             f"{MAX_POSITION_M:g} m. Move the scene, with its cameras, towards the origin."
@@ -163,16 +156,16 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
         fov_deg_V=torch.from_numpy(scene.fov_deg.copy()),
         columns=columns,
         textures=surface_textures(scene),
-        sky=shining(scene.environment),
+        sky=lit_sky(scene.environment),
     )
 
 
 def tensors_of(scenes: SceneTensors | SceneBatch) -> dict[str, Tensor]:
-    """Return the fields that are tensors, by name."""
+    """Return the tensor fields by name."""
     return {name: value for name, value in vars(scenes).items() if isinstance(value, Tensor)}
 
 
-def converted(scenes: Scenes, convert: Callable[[Tensor], Tensor]) -> Scenes:
+def map_tensors(scenes: Scenes, convert: Callable[[Tensor], Tensor]) -> Scenes:
     """Return the same scenes with each tensor converted, such as moved to a device."""
     fields: dict[str, Any] = {name: convert(each) for name, each in tensors_of(scenes).items()}
     if scenes.traced is not None:
@@ -180,8 +173,8 @@ def converted(scenes: Scenes, convert: Callable[[Tensor], Tensor]) -> Scenes:
     return dataclasses.replace(scenes, **fields)
 
 
-def in_units(batch: SceneBatch, unit_B3: Tensor) -> SceneBatch:
-    """Return the batch with all radiance in units [B, 3] of each scene: log10(1 + x / unit)."""
+def in_light_units(batch: SceneBatch, unit_B3: Tensor) -> SceneBatch:
+    """Return the batch with radiance in units [B, 3] of each scene: log10(1 + x / unit)."""
     material_BTM = batch.material_BTM.clone()
     for column, part in laid_out(batch.columns):
         if column.is_radiance and column.is_colour and column.is_log_encoded:

@@ -1,7 +1,7 @@
-"""The view-independent stage: light transport between triangles, once per scene.
+"""View-independent stage: light transport between triangles, once per scene.
 
-Every triangle is one token: a learned vector plus what its material is plus how its normals point.
-Where it is enters through rotary positions alone. Registers stand at the mean of all vertices.
+Every triangle is one token: the sum of a learned vector, its material and its normals. Its position
+enters only through rotary encodings. Registers are at the mean of all vertices.
 """
 
 import torch
@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from model.attention import Keys
 from model.config import ModelConfig
-from model.encoded_scene import TokenPlaces
+from model.encoded_scene import TokenPositions
 from model.layers import TOKEN_NORM_EPS, EncoderLayer, Norm, dtype_of, run_layer
-from model.packing import Packing, packed
+from model.packing import Packing, pack_tokens
 from model.positions import (
     TriangleRotary,
     encode_normals,
@@ -19,16 +19,16 @@ from model.positions import (
     packed_rotation,
     world_rotation,
 )
-from model.precision import as_given
+from model.precision import without_autocast
 from model.scene_tensors import SceneBatch
 from storage.records.material import material_width
 
 SIDE_LIGHTS = 12
-"""Numbers of the light that the two sides of a triangle receive (model.hits.traced)."""
+"""Number of light values of the two sides of a triangle (model.hits.traced)."""
 
 
 class TriangleTokens(nn.Module):
-    """Material and normals -> token.
+    """Embedding of material and normals as tokens.
 
     The published network reads a 13 x 32 x 32 texture whose cells are all equal; that is a linear
     map of the ten numbers (its tangent-space normal is constant), at a thousandth of the input.
@@ -49,10 +49,11 @@ class TriangleTokens(nn.Module):
     ) -> Tensor:
         """Return tokens [B, T, W], float32 under autocast too.
 
-        `light` is what the triangles' sides receive, in units of the scene's mean light; networks
-        with the view stage `hits` are told so.
+        `light` is what the triangles' sides receive, in units of the scene's mean light, as an
+        input of networks with the view stage `hits`. It is compressed to log1p(4 x), since it spans
+        orders of magnitude; the curve is linear below a quarter of the mean, and logarithmic above.
         """
-        with as_given(material_BTM.device):
+        with without_autocast(material_BTM.device):
             material_BTW = self.material_norm(self.material(material_BTM))
             normal_BTW = self.normal_norm(self.normal(encode_normals(normals_BT33, self.octaves)))
             tokens_BTW = self.token_W + material_BTW + normal_BTW
@@ -62,7 +63,7 @@ class TriangleTokens(nn.Module):
 
 
 class TriangleEncoder(nn.Module):
-    """Scene batch -> context tokens, registers first."""
+    """Encoder of a batch of scenes to context tokens, registers first."""
 
     def __init__(self, config: ModelConfig, rotary: TriangleRotary) -> None:
         super().__init__()
@@ -76,21 +77,21 @@ class TriangleEncoder(nn.Module):
             for _ in range(config.encoder_layers)
         )
 
-    def packing(self, places: TokenPlaces) -> Packing | None:
-        """Return where the tokens are to be packed before the layers; None where they are not."""
+    def packing(self, places: TokenPositions) -> Packing | None:
+        """Return the packing of the tokens before the layers, or None without packing."""
         return places.packing(next(self.layers.parameters()), self.rotary.head_width)
 
     def forward(
         self,
         batch: SceneBatch,
-        places: TokenPlaces,
+        places: TokenPositions,
         light_BTL: Tensor | None = None,
         packing: Packing | None = None,
     ) -> Tensor:
         """Return the context [B, N, W] with N = registers + triangles.
 
-        `light_BTL` is as in TriangleTokens. With a packing the context is one row of all tokens
-        that exist, [1, P, W].
+        `light_BTL` is as in TriangleTokens. With a packing the context is one row of all valid
+        tokens, [1, P, W].
         """
         materials = batch.material_of(self.columns)
         tokens_BTW = self.tokens(materials, batch.normals_BT33, light_BTL)
@@ -99,7 +100,8 @@ class TriangleEncoder(nn.Module):
         rotation = world_rotation(self.rotary, places)
         keys: Keys = places.is_key_BN
         if packing is not None:
-            x_BNW, keys = packed(x_BNW, packing)[None], packing.sequences
+            x_BNW = pack_tokens(x_BNW, packing)[None]
+            keys = packing.sequences
             rotation = packed_rotation(rotation, packing)
         due_BNW = None
         for layer in self.layers:
@@ -109,5 +111,5 @@ class TriangleEncoder(nn.Module):
         return x_BNW if due_BNW is None else x_BNW + due_BNW
 
     def learned_tokens(self) -> list[nn.Parameter]:
-        """Return the tokens that are learned as they are: drawn small at the start."""
+        """Return the learned tokens, which are initialized with small values."""
         return [self.tokens.token_W, self.registers_NW]

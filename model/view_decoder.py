@@ -1,7 +1,7 @@
-"""The view stage: ray bundles of one camera ask the scene what they see.
+"""View stage: ray bundles of a camera attend to the tokens of the scene.
 
-It runs in camera space: the context is turned into each camera's frame by rotating its keys, the
-bundles stand at the origin. The scene's tokens themselves are the same for every view.
+It runs in camera space: rotating the keys transforms the context to each camera's space, and the
+bundles are at the origin. The scene's tokens themselves are the same for every view.
 """
 
 from collections.abc import Iterable
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from model.config import ModelConfig
-from model.encoded_scene import EncodedScene, KeysValues, TokenPlaces
+from model.encoded_scene import EncodedScene, KeysValues, TokenPositions
 from model.image_head import build_head, stack_taps
 from model.layers import TOKEN_NORM_EPS, DecoderLayer, Norm, dtype_of, run_layer
 from model.packing import Packing
@@ -21,18 +21,18 @@ from model.positions import (
     camera_rotation,
     packed_camera_rotation,
 )
-from model.precision import as_given
+from model.precision import without_autocast
 from model.rays import bundle_rays, ray_directions
 from model.rounding import rounded_call, rounded_parts_of
 from model.scene_tensors import Cameras
 from model.windows import Windows, cut_windows
 
 Cuts = tuple[Windows | None, Windows | None]
-"""Windows of even and of odd layers; None where every bundle sees all others."""
+"""Windows of even and of odd layers; None if every bundle attends to all others."""
 
 
 class ViewDecoder(nn.Module):
-    """Context and cameras -> pictures."""
+    """Decoder from context and cameras to pictures."""
 
     def __init__(self, config: ModelConfig, rotary: TriangleRotary) -> None:
         super().__init__()
@@ -50,11 +50,11 @@ class ViewDecoder(nn.Module):
         self.head = build_head(config)
 
     def keys_values(
-        self, context_BNW: Tensor, places: TokenPlaces, packing: Packing | None = None
+        self, context_BNW: Tensor, places: TokenPositions, packing: Packing | None = None
     ) -> tuple[KeysValues, ...]:
-        """Return what each layer asks of a context: once per scene, for any number of views.
+        """Return each layer's keys and values of a context: once per scene, for any views.
 
-        Keys are not rotated yet, wherever their tokens stand: that takes a camera.
+        Keys are not rotated yet, since that needs a camera.
         """
         layers = cast(Iterable[DecoderLayer], self.layers)
         return tuple(layer.cross.keys_values(context_BNW) for layer in layers)
@@ -62,11 +62,11 @@ class ViewDecoder(nn.Module):
     def forward(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
         """Return log10(1 + radiance) before the ELU, [B, V, R, R, 3].
 
-        Of a network that predicts light, what `model.demodulated.composed` reads, [B, V, R, R, 6].
+        A demodulated network returns light, [B, V, R, R, 6] (model.demodulated).
         """
-        # the packed keys of a view lie together, and so do its bundles: views come before scenes
-        is_turned = scene.packing is not None
-        fov_deg_BV = cameras.fov_deg_BV.T if is_turned else cameras.fov_deg_BV
+        # packed keys are grouped by view, so views come before scenes for the bundles too
+        views_first = scene.packing is not None
+        fov_deg_BV = cameras.fov_deg_BV.T if views_first else cameras.fov_deg_BV
         x_BVQW = self.bundle_tokens(fov_deg_BV, resolution)
         rotation = camera_rotation(self.rotary, scene.places, cameras.c2w_BV44)
         if scene.packing is not None:
@@ -76,12 +76,12 @@ class ViewDecoder(nn.Module):
         weights = rounded_parts_of(self.head, self.head.rounded_parts(), x_BVQW.device)
         picture_MCRR = rounded_call(self.head, weights, taps)
         picture_BVRRC = picture_MCRR.movedim(1, -1).unflatten(0, fov_deg_BV.shape)
-        return picture_BVRRC.transpose(0, 1) if is_turned else picture_BVRRC
+        return picture_BVRRC.transpose(0, 1) if views_first else picture_BVRRC
 
     def _taps(
         self, x_BVQW: Tensor, scene: EncodedScene, rotation: Rotation, cuts: Cuts
     ) -> list[Tensor]:
-        """Return what the head reads, [B V, Q, W] each; keys turn by `rotation`."""
+        """Return the outputs [B V, Q, W] of the layers that the head reads."""
         x_BVQW = x_BVQW.to(dtype_of(self.layers))
         keys = scene.keys(views=rotation[0].shape[1])
         outputs = {}
@@ -104,14 +104,14 @@ class ViewDecoder(nn.Module):
     def bundle_tokens(self, fov_deg_BV: Tensor, resolution: int) -> Tensor:
         """Return the tokens [B, V, Q, W] of square pictures, float32 under autocast too."""
         rays_BVQC = bundle_rays(ray_directions(fov_deg_BV, resolution), self.patch_px)
-        with as_given(rays_BVQC.device):
+        with without_autocast(rays_BVQC.device):
             return self.token_W + self.rays_norm(self.rays(rays_BVQC))
 
     def _cuts(self, per_side: int, device: torch.device) -> Cuts:
         if not self.window_bundles:
             return None, None
-        even, odd = (
+        even_cut, odd_cut = (
             cut_windows(per_side, self.window_bundles, shifted=shifted, device=device)
             for shifted in (False, True)
         )
-        return even, odd
+        return even_cut, odd_cut

@@ -1,4 +1,4 @@
-"""A network as one safetensors file: weights, configuration, what it was trained on. No pickle."""
+"""Safetensors files of networks: weights, configuration and trained range, without pickle."""
 
 import dataclasses
 import hashlib
@@ -21,23 +21,23 @@ from storage.records.safe_read import MAX_HEADER_BYTES, open_plain, safetensors_
 from storage.removed import without_removed
 
 RANGE_KEY = "trilight_trained_range"
-"""Metadata entry of a weights file."""
+"""Metadata entry of a weights file with its trained range as JSON."""
 
 MAX_LIGHTS = 8
-"""Emitting triangles of a training scene, at most: in the published data as in ours."""
+"""Maximum number of emitting triangles of a training scene, in the published data and in ours."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainedRange:
-    """The largest scenes and the picture width of the training data; None where it is unknown.
+    """Largest scene and picture width of the training data; None if unknown.
 
-    Renderers warn where a scene leaves this range; they do not refuse it.
+    Renderers warn about a scene outside this range; they do not refuse it.
     """
 
     max_triangles: int | None = None
-    """Most triangles of a whole scene."""
+    """Maximum number of triangles of a scene."""
     resolution: int | None = None
-    """Pixels across the pictures."""
+    """Width of the pictures in pixels."""
 
     def as_metadata(self) -> dict[str, str]:
         """Return the entries for the metadata of a safetensors file."""
@@ -49,7 +49,7 @@ PUBLISHED_RANGE = TrainedRange(max_triangles=4096, resolution=512)
 
 
 def trained_range(metadata: Mapping[str, str]) -> TrainedRange | None:
-    """Return what the metadata of a file says, or None where it says nothing.
+    """Return the trained range in the metadata of a file, or None without an entry.
 
     Raises:
         TrilightError: the entry is not readable.
@@ -71,19 +71,21 @@ CONFIG_KEY = "trilight_model"
 
 
 def encode_weights(model: RenderFormer, trained: TrainedRange | None = None) -> bytes:
-    """Return the file of a network; equal networks give equal bytes.
+    """Return the bytes of a network's file; equal networks give equal bytes.
 
     Args:
         model: the network.
-        trained: what it was trained on, where that is known.
+        trained: range of its training data, if known.
     """
     tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
     known = {} if trained is None else trained.as_metadata()
-    return _in_order(save(tensors, metadata={CONFIG_KEY: encode_config(model.config), **known}))
+    return _sort_metadata(
+        save(tensors, metadata={CONFIG_KEY: encode_config(model.config), **known})
+    )
 
 
 def network_digest(model: RenderFormer) -> str:
-    """Return the sha256 of configuration and weights, whatever file they came from."""
+    """Return the sha256 of configuration and weights, independent of the file format."""
     digest = hashlib.sha256(encode_config(model.config).encode())
     for name, tensor in sorted(model.state_dict().items()):
         digest.update(name.encode())
@@ -91,8 +93,8 @@ def network_digest(model: RenderFormer) -> str:
     return digest.hexdigest()
 
 
-def _in_order(data: bytes) -> bytes:
-    """Sort the metadata of a safetensors file, whose writer shuffles it from process to process."""
+def _sort_metadata(data: bytes) -> bytes:
+    """Sort the metadata of a safetensors file, whose writer orders it randomly per process."""
     end = 8 + int.from_bytes(data[:8], "little")
     header = json.loads(data[8:end])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
@@ -102,11 +104,11 @@ def _in_order(data: bytes) -> bytes:
 
 
 def decode_weights(data: bytes) -> RenderFormer:
-    """Return the network of a file of ours, in evaluation mode on the CPU.
+    """Return the network of a file in our format, in evaluation mode on the CPU.
 
     Raises:
-        TrilightError: not such a file, or its tensors are not those of its configuration; the
-            names are listed. `model.open` reads published checkpoints too.
+        TrilightError: not such a file, or its tensors do not match its configuration; the message
+            lists them. `model.open` reads published checkpoints too.
     """
     header = safetensors_header(data)
     try:
@@ -119,7 +121,7 @@ def decode_weights(data: bytes) -> RenderFormer:
 def from_tensors(
     tensors: Mapping[str, Tensor], metadata: Mapping[str, str], source: str = "network"
 ) -> RenderFormer:
-    """Return the network of our tensors; raises as `decode_weights`, with `source` first."""
+    """Return the network of tensors in our format; errors begin with `source`."""
     if CONFIG_KEY not in metadata:
         raise TrilightError(
             f"weights: the file has no {CONFIG_KEY} entry; expected a model.safetensors as "
@@ -129,24 +131,24 @@ def from_tensors(
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Return tensors and metadata of a safetensors file; its header is bounded first.
+    """Return tensors and metadata of a safetensors file; the size of its header is limited.
 
     Raises:
         TrilightError: the file cannot be read, is damaged, or is pickled code, which is never run.
     """
-    with _opened(path) as tensors:
+    with _open_tensors(path) as tensors:
         arrays = {name: tensors.get_tensor(name) for name in tensors.keys()}
         return arrays, tensors.metadata() or {}
 
 
 def read_metadata(path: Path) -> dict[str, str]:
     """Return the metadata of a safetensors file without its tensors; raises as `read_tensors`."""
-    with _opened(path) as tensors:
+    with _open_tensors(path) as tensors:
         return tensors.metadata() or {}
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_tensors(path: Path) -> Iterator[Any]:
     try:
         with open_plain(path) as file:
             start = file.read(8)
@@ -174,9 +176,9 @@ def _require_safetensors(path: Path, start: bytes) -> None:
 
 
 def network_of(config: ModelConfig, tensors: Mapping[str, Tensor]) -> RenderFormer:
-    """Return the network that holds these very tensors, in evaluation mode.
+    """Return a network that shares these tensors, in evaluation mode.
 
-    No weight is drawn and none is copied: at 483 M parameters that is seconds and gigabytes.
+    No weight is initialized or copied, which saves seconds and gigabytes at 483 M parameters.
 
     Raises:
         TrilightError: as `require_tensors`.
@@ -186,7 +188,7 @@ def network_of(config: ModelConfig, tensors: Mapping[str, Tensor]) -> RenderForm
     require_tensors(tensors, model.state_dict())
     model.load_state_dict(dict(tensors), assign=True)
     model.decoder.rotary.reset()
-    # a head of convolutions reads tokens as they lie, channels last; its weights then should too
+    # a head of convolutions reads tokens channels last, and is fastest with weights in that format
     model.decoder.head.to(memory_format=torch.channels_last)
     return model.eval()
 
@@ -198,24 +200,25 @@ def load_tensors(model: RenderFormer, tensors: Mapping[str, Tensor]) -> None:
 
 
 def require_tensors(got: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-    """Compare names and shapes.
+    """Compare names and shapes of tensors.
 
     Raises:
-        TrilightError: a name is missing, unknown, or has another shape; the first few are listed.
+        TrilightError: a name is missing or unknown, or a shape differs; the first few are listed.
     """
     shapes = {name: tuple(tensor.shape) for name, tensor in got.items()}
-    wanted = {name: tuple(tensor.shape) for name, tensor in expected.items()}
+    expected_shapes = {name: tuple(tensor.shape) for name, tensor in expected.items()}
     wrong = [
-        f"{name} is {shapes.get(name, 'missing')}, expected {wanted.get(name, 'no such tensor')}"
-        for name in sorted(shapes.keys() | wanted.keys())
-        if shapes.get(name) != wanted.get(name)
+        f"{name} is {shapes.get(name, 'missing')}, "
+        f"expected {expected_shapes.get(name, 'no such tensor')}"
+        for name in sorted(shapes.keys() | expected_shapes.keys())
+        if shapes.get(name) != expected_shapes.get(name)
     ]
     if wrong:
         more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
         raise TrilightError(f"weights: {'; '.join(wrong[:5])}{more}.")
 
 
-_LATER = (
+_OMITTED_AT_DEFAULT = (
     "material_columns",
     "view_stage",
     "hit_rays",
@@ -232,21 +235,21 @@ _LATER = (
 def encode_config(config: ModelConfig) -> str:
     """Return the JSON of a configuration.
 
-    Settings that came later stand there where they are not at their default, so that the bytes and
-    the digest of every other network stay what they were before there was a choice.
+    Later settings are omitted at their defaults, so that bytes and digests of older networks stay
+    unchanged.
     """
     fields = dataclasses.asdict(config)
     for each in dataclasses.fields(config):
-        if each.name in _LATER and fields[each.name] == each.default:
+        if each.name in _OMITTED_AT_DEFAULT and fields[each.name] == each.default:
             del fields[each.name]
     return json.dumps(fields, sort_keys=True)
 
 
 def decode_config(text: str, source: str = "network") -> ModelConfig:
-    """Return the configuration of its JSON; `source` stands first in a refusal.
+    """Return the configuration from its JSON; errors begin with `source`.
 
     Raises:
-        TrilightError: it is none, or uses what was removed.
+        TrilightError: the JSON is invalid, or uses removed settings.
     """
     try:
         fields = without_removed(json.loads(text), REMOVED, f"{source}: model")

@@ -1,9 +1,9 @@
-"""Shifted windows of ray bundles (Swin, Liu et al. 2021), attended without a mask.
+"""Attention in shifted windows of ray bundles (Swin, Liu et al. 2021), without a mask.
 
-A picture's bundles are cut into square windows, and attend within their own. Every second layer
-cuts half a window further on. The published code rolls the picture there and masks what the roll
-brought together; the same cut, made without a roll, leaves smaller windows at the borders and
-nothing to mask. Windows of equal size are attended together.
+A picture's bundles are split into square windows, with attention within each. Every second layer
+shifts the windows by half their width. The published code rolls the picture there and masks wrapped
+neighbors; without the roll, the same windows are smaller at the borders and need no mask. Windows
+of equal size are computed together.
 """
 
 from dataclasses import dataclass
@@ -19,23 +19,23 @@ from model.attention import attend
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Windows:
-    """One cut of a square picture."""
+    """Partition of a square picture into windows."""
 
     order_Q: Tensor
-    """Bundles, window by window."""
+    """int64 indices of the bundles, window by window."""
     back_Q: Tensor
-    """Puts such a sequence into the picture's order again."""
+    """int64 inverse permutation of `order_Q`."""
     groups: tuple[tuple[int, int], ...]
-    """(windows, bundles in each), as they follow each other in `order_Q`."""
+    """Pairs (number of windows, bundles in each), in the order of `order_Q`."""
 
 
 @lru_cache
 def cut_windows(per_side: int, width: int, *, shifted: bool, device: torch.device) -> Windows:
-    """Return the cut of per_side x per_side bundles into windows of width x width.
+    """Return the partition of per_side x per_side bundles into windows of width x width.
 
-    A shifted cut has its lines at width / 2, 3 width / 2, ...; per_side is a multiple of width.
-    It depends on these numbers alone, so it is computed once, on the processor: a graphics card
-    would have to be waited for, in every pass, to say how many windows of each size there are.
+    Shifted windows begin at width / 2, 3 width / 2, ...; per_side is a multiple of width. The
+    result depends only on these numbers, and is computed once on the CPU: on a GPU the numbers of
+    windows would need a sync in every pass.
     """
     offset = width // 2 if shifted else 0
     cell_S = (np.arange(per_side) + offset) // width
@@ -51,13 +51,14 @@ def cut_windows(per_side: int, width: int, *, shifted: bool, device: torch.devic
 
 @torch.inference_mode(False)
 def _on(device: torch.device, indices: NDArray[np.int64]) -> Tensor:
-    """Return indices that training may use too, even where inference asked for them first."""
+    """Return indices on a device, usable in training even if inference cached them."""
     return torch.from_numpy(indices).to(device)
 
 
 def attend_in_windows(q_MHQD: Tensor, k_MHQD: Tensor, v_MHQD: Tensor, windows: Windows) -> Tensor:
-    """Return the attention [M, H, Q, D] of each window to itself; all in `windows.order_Q`."""
-    parts, start = [], 0
+    """Return the attention [M, H, Q, D] within each window; all in the order `windows.order_Q`."""
+    parts = []
+    start = 0
     for count, size in windows.groups:
         inside = slice(start, start + count * size)
         q, k, v = (

@@ -1,1 +1,1 @@
-"""Which scenes exist: layouts drawn from a generator, without meshes, rendering or files."""
+"""Layouts of scenes, drawn from a generator without meshes, rendering or files."""

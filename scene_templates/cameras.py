@@ -35,8 +35,8 @@ class Sector:
         """Draw a unit direction [3], uniform by solid angle."""
         low, high = (math.sin(math.radians(angle)) for angle in self.elevation_deg)
         z = rng.uniform(low, high)
-        turn = rng.uniform(-self.half_width_deg, self.half_width_deg)
-        azimuth = math.radians(self.azimuth_deg + turn)
+        azimuth_offset_deg = rng.uniform(-self.half_width_deg, self.half_width_deg)
+        azimuth = math.radians(self.azimuth_deg + azimuth_offset_deg)
         across = math.sqrt(1 - z * z)
         return np.array([across * math.cos(azimuth), across * math.sin(azimuth), z])
 

@@ -33,7 +33,7 @@ def cosine(angle_rad: ArrayLike) -> Numbers:
     return sine(math.pi / 2 - np.abs(np.asarray(angle_rad, np.float64)))
 
 
-def eased(share: ArrayLike) -> Numbers:
+def smoothstep(share: ArrayLike) -> Numbers:
     """Return 3 s^2 - 2 s^3 of numbers clamped to [0, 1]: from 0 to 1 without a kink."""
     s = np.clip(np.asarray(share, np.float64), 0, 1)
     result: Numbers = s * s * (3 - 2 * s)
@@ -49,7 +49,7 @@ def ramp(distance_px: ArrayLike) -> Numbers:
     return np.clip(np.asarray(distance_px, np.float64) + 0.5, 0, 1)
 
 
-def mixed(one: ArrayLike, other: ArrayLike, share: ArrayLike) -> Numbers:
+def lerp(one: ArrayLike, other: ArrayLike, share: ArrayLike) -> Numbers:
     """Return `one` where `share` is 0 and `other` where it is 1."""
     first = np.asarray(one, np.float64)
     result: Numbers = first + (np.asarray(other, np.float64) - first) * np.asarray(share)

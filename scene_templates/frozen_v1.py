@@ -1,4 +1,4 @@
-"""What the published sets draw scenes from, with every number stated.
+"""Scene settings of the published sets, with every number stated.
 
 A frozen set asks no list of families or layouts and takes no default: those may change, and sets
 that networks are compared on may not. Test: tests/pipeline/builds/test_frozen_builds.py. The

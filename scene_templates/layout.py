@@ -1,4 +1,4 @@
-"""What a template returns: a shell, objects in their places, emitters, and surfaces.
+"""Results of a template: a shell, placed objects, emitters and surfaces.
 
 A layout holds no object meshes: an object has a pose, and `pipeline.scenes` puts its mesh there.
 """
@@ -15,16 +15,16 @@ RGB = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceLook:
-    """How a shell part or an object reflects, in linear colour."""
+    """Reflectance of a shell part or an object, in linear color."""
 
     diffuse_scale: float
     """Largest diffuse albedo that a channel may have; plus `specular_rgb` at most 1."""
     diffuse_rgb: RGB
     """Diffuse albedo where the surface has one colour."""
     specular_rgb: RGB
-    """Specular albedo."""
+    """Linear specular albedo, each channel in [0, 1]."""
     roughness: float
-    """In [0, 1]; the GGX width is its square."""
+    """Perceptual roughness in [0, 1]; the GGX width is its square."""
     smooth: bool
     """Normals interpolated across edges below the smoothing angle; otherwise flat."""
     colours: Literal["one", "groups", "triangles"]
@@ -39,11 +39,10 @@ class ShellPart:
     name: str
     """floor, wall0, wall1 or wall2."""
     positions: NDArray[np.float64]
-    """[81, 3] world units."""
+    """Grid vertices [81, 3] in world units."""
     faces: NDArray[np.uint32]
     """[128, 3], counter-clockwise seen from the room (but see SeparateSides.wall2_faces_out)."""
     surface: SurfaceLook
-    """Its material."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,9 +50,9 @@ class Pose:
     """Place of an object: a sphere that its mesh is scaled into, and its rotation."""
 
     centre: NDArray[np.float64]
-    """[3] world units."""
+    """Center of the bounding sphere [3], world units."""
     radius: float
-    """World units."""
+    """Radius of the bounding sphere, world units."""
     rotation: NDArray[np.float64]
     """[3, 3], applied to the mesh about the centre."""
 
@@ -63,9 +62,7 @@ class ObjectPlacement:
     """An object without its mesh."""
 
     pose: Pose
-    """Its place."""
     surface: SurfaceLook
-    """Its material."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,7 +72,7 @@ class Emitter:
     triangle: NDArray[np.float64]
     """[3, 3] corners in world units."""
     radiance_rgb: RGB
-    """Emitted radiance."""
+    """Emitted radiance, linear Rec.709."""
     reflectance: float
     """Diffuse albedo, the same in every channel."""
 
@@ -99,9 +96,9 @@ class Layout:
     """A scene without its meshes and cameras."""
 
     shell: tuple[ShellPart, ...]
-    """The floor first."""
+    """Floor and walls; the floor comes first."""
     objects: tuple[ObjectPlacement, ...]
-    """In the order of the shapes that they were placed with."""
+    """Placements in the order of the shapes."""
     emitters: tuple[Emitter, ...]
     """Outside the room, but for those that the settings put inside objects."""
 
@@ -113,4 +110,4 @@ class CameraPose:
     c2w: NDArray[np.float64]
     """[4, 4] camera to world (storage.conventions)."""
     fov_deg: float
-    """Full field of view."""
+    """Full field of view in degrees."""

@@ -30,19 +30,19 @@ class ScenePlan:
     family: Family
     """The layout, and what goes into it."""
     num_objects: int
-    """How many objects."""
     num_lights: int
-    """How many emitters."""
     overlaps: bool
-    """Whether objects may run into each other."""
+    """True: objects may intersect."""
 
 
 def scene_plan(settings: SceneSettings, *, seed: int, scene_index: int) -> ScenePlan:
     """Return the plan of a scene; a pure function of its arguments."""
     rng = rng_for(seed, "scene-plan", scene_index)
-    turn = scene_index // max(1, len(settings.excursions))  # every excursion meets every family
+    round_number = scene_index // max(
+        1, len(settings.excursions)
+    )  # every excursion meets every family
     settings = settings.of_scene(scene_index)
-    family = _family_rand(rng, settings, turn)
+    family = _family_rand(rng, settings, round_number)
     return ScenePlan(
         family=family,
         num_objects=_count_rand(rng, family.num_objects),
@@ -51,9 +51,9 @@ def scene_plan(settings: SceneSettings, *, seed: int, scene_index: int) -> Scene
     )
 
 
-def _family_rand(rng: np.random.Generator, settings: SceneSettings, turn: int) -> Family:
+def _family_rand(rng: np.random.Generator, settings: SceneSettings, round_number: int) -> Family:
     if settings.families_in_turn:
-        return settings.families[turn % len(settings.families)]
+        return settings.families[round_number % len(settings.families)]
     weights = np.array([family.weight for family in settings.families])
     # By hand: how numpy's choice uses its generator is not promised to stay.
     position = rng.random() * weights.sum()

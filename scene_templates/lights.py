@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scene_templates.cameras import Sector
 from scene_templates.checks import OFFSET, SIZE, Counts, Range
 from scene_templates.layout import Emitter
-from scene_templates.rotations import Orientation, rotated, rotation_rand
+from scene_templates.rotations import Orientation, rotate_points, rotation_rand
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 
@@ -81,16 +81,20 @@ def emitters_rand(
 def _spaced_direction(
     rng: np.random.Generator,
     sector: Sector,
-    others: list[NDArray[np.float64]],
+    placed_directions: list[NDArray[np.float64]],
     spacing: float,
 ) -> NDArray[np.float64]:
-    best, best_gap = sector.direction_rand(rng), -1.0
+    best = sector.direction_rand(rng)
+    best_gap = -1.0
     for _ in range(SPACING_TRIES):
         candidate = sector.direction_rand(rng)
-        away = [float(np.sqrt(np.sum(np.square(candidate - other)))) for other in others]
-        gap = SPACING_RADIUS * min(away, default=np.inf)
+        distances = [
+            float(np.sqrt(np.sum(np.square(candidate - other)))) for other in placed_directions
+        ]
+        gap = SPACING_RADIUS * min(distances, default=np.inf)
         if gap > best_gap:
-            best, best_gap = candidate, gap
+            best = candidate
+            best_gap = gap
         if gap > spacing:
             break
     return best
@@ -107,7 +111,9 @@ def _emitter_rand(
     rng: np.random.Generator, settings: LightSettings, centre: NDArray[np.float64], count: int
 ) -> Emitter:
     # About its own middle, so that its distance is the one drawn.
-    turned = rotated(TRIANGLE - TRIANGLE.mean(axis=0), rotation_rand(rng, settings.orientation))
+    turned = rotate_points(
+        TRIANGLE - TRIANGLE.mean(axis=0), rotation_rand(rng, settings.orientation)
+    )
     triangle = turned * rng.uniform(*settings.scale, size=3) + centre
     radiance = rng.uniform(*settings.total_emission) / count
     red, green, blue = radiance * _tint_rand(rng, settings.coloured_share)

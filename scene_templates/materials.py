@@ -62,7 +62,8 @@ class MaterialSettings:
         return {name: value for name, value in record.items() if name not in absent}
 
     def __post_init__(self) -> None:
-        low, bias = self.roughness_log[0], self.roughness_bias
+        low = self.roughness_log[0]
+        bias = self.roughness_bias
         require(low >= bias, "roughness_bias", bias, "at most roughness_log's low")
 
 

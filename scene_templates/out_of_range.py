@@ -15,7 +15,8 @@ from scene_templates.frozen_v1 import ONE_FAMILY_EACH, SCENES_V1
 from scene_templates.rooms import SharedRoom
 from scene_templates.settings import Excursion, SceneSettings
 
-_MEDIAN_EMISSION, _MEDIAN_SIZE = 3750.0, 2.25
+_MEDIAN_EMISSION = 3750.0
+_MEDIAN_SIZE = 2.25
 
 _SURFACES = (
     "checker", "stripes", "bricks", "tiles", "hexagons", "planks", "wood", "marble",
@@ -79,8 +80,11 @@ def out_of_range_2_settings(max_triangles: int) -> SceneSettings:
         before,
         excursions=(
             *before.excursions,
-            *(_textured("textured", share, share, 0.8) for share in (0.5, 1.0)),
-            *(_textured("texture_tile_m", tile_m, 1.0, tile_m) for tile_m in (0.1, 0.4, 1.6, 6.4)),
+            *(_texture_excursion("textured", share, share, 0.8) for share in (0.5, 1.0)),
+            *(
+                _texture_excursion("texture_tile_m", tile_m, 1.0, tile_m)
+                for tile_m in (0.1, 0.4, 1.6, 6.4)
+            ),
             *(_sky("sky", over_lamps, over_lamps=over_lamps) for over_lamps in (0.1, 1.0, 10.0)),
             _sky("sky_seen", 1, seen_share=1.0),
             *(_sky("sun_to_sky", v, families=_WITH_SUN, sun_to_sky=v) for v in (8.0, 64.0)),
@@ -128,7 +132,7 @@ def _objects(count: int) -> Excursion:
     return _excursion("objects", count, changes)
 
 
-def _textured(axis: str, value: float, share: float, tile_m: float) -> Excursion:
+def _texture_excursion(axis: str, value: float, share: float, tile_m: float) -> Excursion:
     """Every number of the surfaces is stated, since textures are in no scene of the base."""
     changes = {
         "textures.share": share,

@@ -1,7 +1,7 @@
 """Places objects in the room: resting or floating, and clear of each other.
 
 Sizes and rotations are drawn first, then places, the largest object first and each several times
-over, before sizes are given up and drawn anew. Drawing whole arrangements until one fits would be
+over, before sizes are given up and drawn again. Drawing whole arrangements until one fits would be
 exactly uniform, but takes ten times as long and prefers small objects; here sizes stay near their
 stated range. What an object looks like is asked of its `PlaceableShape`; a template knows no
 meshes.
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scene_templates.checks import Range
 from scene_templates.layout import Plane, Pose
 from scene_templates.rooms import SIDES, Room
-from scene_templates.rotations import Orientation, rotated, rotation_rand
+from scene_templates.rotations import Orientation, rotate_points, rotation_rand
 from storage.errors import Rejected
 from storage.settings.described import checked
 from storage.settings.ranges import Share
@@ -26,7 +26,7 @@ ARRANGEMENT_TRIES = 100
 """Draws of all sizes before the scene is given up."""
 
 PLACE_TRIES = 16
-"""Draws of one place before the sizes are drawn anew."""
+"""Draws of one place before the sizes are drawn again."""
 
 TOUCHING = 1e-9
 """World units below which a resting object still counts as inside: rounding of float64 sums."""
@@ -71,7 +71,6 @@ class ObjectSpace:
     parts: tuple[str, ...]
     """The shell parts that exist, the floor first."""
     planes: tuple[Plane, ...]
-    """Their planes."""
 
     @property
     def floor(self) -> Plane:
@@ -88,7 +87,8 @@ class ObjectSpace:
         low = np.clip(self.room.low, -0.5, 0.5) + radius / 2
         high = np.clip(self.room.high, -0.5, 0.5) - radius / 2
         for name in self.parts:
-            axis, lean = SIDES[name].axis, self.room.lean
+            axis = SIDES[name].axis
+            lean = self.room.lean
             if SIDES[name].sign > 0:
                 high[axis] = self.room.high[axis] - lean - points[:, axis].max()
             else:
@@ -127,8 +127,8 @@ def poses_rand(
         radii = rng.uniform(*object_scale, size=len(shapes)) / 4
         poses: dict[int, Pose] = {}
         for row in np.argsort(-radii, kind="stable").tolist():
-            others = [] if overlaps else [(shapes[other], at) for other, at in poses.items()]
-            pose = _pose_rand(rng, settings, space, shapes[row], float(radii[row]), others)
+            obstacles = [] if overlaps else [(shapes[other], at) for other, at in poses.items()]
+            pose = _pose_rand(rng, settings, space, shapes[row], float(radii[row]), obstacles)
             if pose is None:
                 break
             poses[row] = pose
@@ -143,17 +143,20 @@ def _pose_rand(
     space: ObjectSpace,
     shape: PlaceableShape,
     radius: float,
-    others: Sequence[tuple[PlaceableShape, Pose]],
+    obstacles: Sequence[tuple[PlaceableShape, Pose]],
 ) -> Pose | None:
     """Draw a place for an object clear of others, or None where none was found."""
     rotation = rotation_rand(rng, settings.orientation)
     rests = bool(rng.random() < settings.resting_share)
-    points = radius * rotated(shape.points, rotation)
-    low, high = np.full(3, -0.5), np.full(3, 0.5)
+    points = radius * rotate_points(shape.points, rotation)
+    low = np.full(3, -0.5)
+    high = np.full(3, 0.5)
     if settings.inside:
         low, high = space.centre_range(points, radius)
         if rests:
-            low[2], high[2] = 0.0, 0.0  # it is set down below
+            # it is set down below
+            low[2] = 0.0
+            high[2] = 0.0
     if (low > high).any():
         return None
     for _ in range(PLACE_TRIES):
@@ -163,7 +166,7 @@ def _pose_rand(
         if settings.inside and not space.holds(points + centre):
             continue
         pose = Pose(centre=centre, radius=radius, rotation=rotation)
-        if not any(shape.meets(pose, other, at) for other, at in others):
+        if not any(shape.meets(pose, other, at) for other, at in obstacles):
             return pose
     return None
 

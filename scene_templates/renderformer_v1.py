@@ -25,7 +25,9 @@ from scene_templates.separate_sides import SeparateSides, SideRanges
 
 Policy = Literal["original", "de-biased"]
 
-_SINGLE, _MULTI, _NONE = (1, 1), (2, 3), (0, 0)
+_SINGLE = (1, 1)
+_MULTI = (2, 3)
+_NONE = (0, 0)
 _NEAR: Range = (-0.05, 0.05)
 _FAR: Range = (-0.25, 0.25)
 _RAISED: Range = (0.15, 0.25)
@@ -45,7 +47,9 @@ def stage_1_families(policy: Policy) -> tuple[Family, ...]:
     """Return the 21 families of the 256-pixel stage (weights add up to 46)."""
     plane = _open_shell(policy, floor_z=_RAISED, wall=False)
     wall = _open_shell(policy, floor_z=_RAISED, wall=True)
-    corner, box, patch = _corner_shell(policy), _box_shell(policy), _exact_shell(policy)
+    corner = _corner_shell(policy)
+    box = _box_shell(policy)
+    patch = _exact_shell(policy)
     return (
         _family("corner-multi", 3, corner, _MULTI, (0.8, 1.8)),
         _family("corner-single", 3, corner, _SINGLE, (1.6, 2.1)),
@@ -79,7 +83,9 @@ def stage_2_families(policy: Policy) -> tuple[Family, ...]:
     more_z = _FREE if policy == "de-biased" else _RAISED
     more_plane = _open_shell(policy, floor_z=more_z, wall=False)
     more_wall = _open_shell(policy, floor_z=more_z, wall=True)
-    corner, box, patch = _corner_shell(policy), _box_shell(policy), _exact_shell(policy)
+    corner = _corner_shell(policy)
+    box = _box_shell(policy)
+    patch = _exact_shell(policy)
     return (
         _family("corner-multi", 3, corner, _MULTI, (0.8, 1.8)),
         _family("corner-single", 3, corner, _SINGLE, (1.6, 2.1)),

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from scene_templates.checks import OFFSET, SHIFT, SIZE, Range
 from scene_templates.layout import Plane
-from scene_templates.rotations import rotated, rotation_xyz
+from scene_templates.rotations import rotate_points, rotation_xyz
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 
@@ -52,7 +52,7 @@ SIDES = MappingProxyType(
 
 @dataclass(frozen=True, kw_only=True)
 class PatchPlacement:
-    """How a patch is brought from its side of the nominal room to its place."""
+    """Transform of a patch from its side of the nominal room."""
 
     rotation_deg: tuple[float, float, float]
     """About X, then Y, then Z, through the middle of the room; the angle about the side's own
@@ -60,9 +60,9 @@ class PatchPlacement:
     reach: float
     """Half the side of the square; 1 fills the side of the nominal room exactly."""
     scale: tuple[float, float, float]
-    """Per axis."""
+    """Factor for each axis, applied first."""
     translation: tuple[float, float, float]
-    """Translation after scaling."""
+    """Translation after scaling, world units."""
 
 
 def patch(side: Side, placement: PatchPlacement) -> NDArray[np.float64]:
@@ -71,16 +71,20 @@ def patch(side: Side, placement: PatchPlacement) -> NDArray[np.float64]:
     u, v = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
     local = np.zeros((len(u), 3))
     # The two axes in the plane, in the order that makes u x v point into the room.
-    first, second = (side.axis + 1) % 3, (side.axis + 2) % 3
+    first = (side.axis + 1) % 3
+    second = (side.axis + 2) % 3
     local[:, first], local[:, second] = (v, u) if side.sign > 0 else (u, v)
     local[:, side.axis] = side.sign
-    turned = rotated(local, rotation_xyz(placement.rotation_deg))
+    turned = rotate_points(local, rotation_xyz(placement.rotation_deg))
     return (turned * placement.scale + placement.translation) / 2
 
 
 def _patch_faces() -> NDArray[np.uint32]:
     rows = np.arange((QUADS + 1) ** 2, dtype=np.uint32).reshape(QUADS + 1, QUADS + 1)
-    a, b, c, d = (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:])
+    a = rows[:-1, :-1]
+    b = rows[1:, :-1]
+    c = rows[1:, 1:]
+    d = rows[:-1, 1:]
     pairs = np.stack([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)], axis=2)
     return pairs.reshape(-1, 3)
 
@@ -95,11 +99,11 @@ class Room:
     """The places of the shell parts, and the space between them."""
 
     patches: tuple[PatchPlacement, ...]
-    """One per shell part."""
+    """One placement for each shell part."""
     low: NDArray[np.float64]
     """[3] the lower corner of the upright room, world units."""
     high: NDArray[np.float64]
-    """[3] the upper corner."""
+    """Upper corner [3] in world units."""
     lean: float
     """How far a tilted wall may stand inside of these bounds at most."""
 
@@ -164,6 +168,8 @@ def _covering_reach(spin_deg: float, tilt_deg: float) -> float:
 
 def plane_of(positions: NDArray[np.float64]) -> Plane:
     """Return the plane of a floor or wall from its patch, vertices [81, 3]."""
-    origin, along, across = positions[0], positions[-9], positions[8]
+    origin = positions[0]
+    along = positions[-9]
+    across = positions[8]
     normal = np.cross(along - origin, across - origin)
     return Plane(point=positions.mean(axis=0), normal=normal / np.sqrt(np.sum(np.square(normal))))

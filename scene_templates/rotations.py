@@ -46,7 +46,9 @@ def rotation_xyz(angles_deg: ArrayLike) -> NDArray[np.float64]:
     )
 
 
-def rotated(points: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotate_points(
+    points: NDArray[np.float64], rotation: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return `points` [N, 3] turned by `rotation` [3, 3].
 
     By einsum rather than a matrix product: BLAS may sum in another order on another machine or

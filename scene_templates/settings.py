@@ -139,7 +139,8 @@ class SceneSettings:
 
     def _check_budget(self) -> None:
         for family in self.families:
-            lights, objects = self.lights.count[1], family.num_objects[1]
+            lights = self.lights.count[1]
+            objects = family.num_objects[1]
             least = family.shell_triangles + lights + 4 * objects
             require(
                 self.max_triangles >= least,

@@ -29,13 +29,12 @@ class LayoutParams:
     patches: tuple[PatchPlacement, ...]
     """Where each shell part stands."""
     surfaces: tuple[SurfaceLook, ...]
-    """What each shell part is made of."""
+    """One look for each shell part."""
     objects: tuple[ObjectPlacement, ...]
     """Where the objects are, and what they are made of."""
     emitters: tuple[Emitter, ...]
-    """The lights."""
     wall2_faces_out: bool = False
-    """See SeparateSides."""
+    """The second wall faces outward; see SeparateSides."""
 
 
 @dataclass(frozen=True, kw_only=True)

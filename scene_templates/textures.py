@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.checks import Range
-from scene_templates.own_maps import OwnMap, OwnTexture, drawn_own
 from scene_templates.surfaces.draw import SurfaceMapSettings, draw_surface
 from scene_templates.surfaces.maps import SurfaceMaps
+from scene_templates.user_maps import UserMap, UserTexture, draw_user_map
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 
@@ -40,19 +40,20 @@ class TexturedLook:
     """A texture, and how it lies on a surface."""
 
     maps: SurfaceMaps
-    """What repeats."""
+    """One repetition of the texture."""
     tile_m: float
-    """Its width."""
+    """Width of one repetition in meters."""
     quarter_turns: int
-    """0 to 3, counter-clockwise."""
+    """Quarter turns counter-clockwise, 0 to 3."""
     shift_uv: tuple[float, float]
     """Texture coordinates of the surface's own origin, each uniform in [0, 1)."""
     uid: str = ""
-    """Of a user's own, as objects.lock.jsonl names it."""
+    """Identifier of a user's texture in objects.lock.jsonl; empty for a procedural one."""
 
     def uv(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return texture coordinates of places [..., 2] on a flat side: to the right and up."""
-        x, y = places_m[..., 0] / self.tile_m, places_m[..., 1] / self.tile_m
+        x = places_m[..., 0] / self.tile_m
+        y = places_m[..., 1] / self.tile_m
         for _ in range(self.quarter_turns):
             x, y = y, -x  # the picture turns counter-clockwise where coordinates turn clockwise
         rows, columns = self.maps.diffuse_rgb.shape[:2]
@@ -64,7 +65,7 @@ class TexturedLook:
 def draw_look(
     rng: np.random.Generator,
     settings: TextureSettings,
-    own: Sequence[OwnMap[OwnTexture]] = (),
+    user_textures: Sequence[UserMap[UserTexture]] = (),
     licences: Sequence[str] = (),
 ) -> TexturedLook | None:
     """Return the texture of a surface, or None where it has none.
@@ -79,9 +80,10 @@ def draw_look(
     """
     if rng.random() >= settings.share:
         return None
-    tile_m, turns = rng.uniform(*settings.tile_m), int(rng.integers(4))
+    tile_m = rng.uniform(*settings.tile_m)
+    turns = int(rng.integers(4))
     shift_u, shift_v = rng.random(2)
-    chosen = drawn_own(rng, own, settings.own_share, licences)
+    chosen = draw_user_map(rng, user_textures, settings.own_share, licences)
     if chosen is None:
         maps = draw_surface(rng, settings.surfaces)
     else:

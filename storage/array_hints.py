@@ -1,4 +1,4 @@
-"""What an annotation says of an array: NDArray[X] is spelt in two ways by numpy."""
+"""Scalar types of array annotations: numpy spells NDArray[X] in two ways."""
 
 from typing import Any, get_args, get_origin
 
@@ -11,7 +11,8 @@ def array_scalar(hint: Any) -> Any:
 
     Until numpy 2.4 NDArray[X] is ndarray[shape, dtype[X]]; from 2.5 on it is an alias that keeps X.
     """
-    origin, args = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    args = get_args(hint)
     if origin is np.ndarray:
         (scalar,) = get_args(args[1])
         return scalar

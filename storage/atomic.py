@@ -31,8 +31,10 @@ def atomic_writer(path: Path, *, replace: bool = True) -> Iterator[BinaryIO]:
     Raises:
         TrilightError: the disk is full (an EnvironmentFailure), or the place cannot be written.
     """
-    own = f"{os.getpid()}-{os.urandom(4).hex()}"  # containers give all their processes number 1
-    temporary = path.with_name(f"{path.name}.{own}{TEMPORARY_SUFFIX}")
+    unique_suffix = (
+        f"{os.getpid()}-{os.urandom(4).hex()}"  # containers give all their processes number 1
+    )
+    temporary = path.with_name(f"{path.name}.{unique_suffix}{TEMPORARY_SUFFIX}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as stream:
@@ -86,7 +88,7 @@ def write_error(path: Path, error: OSError) -> TrilightError:
         step = "set TRILIGHT_CACHE to" if path.is_relative_to(cache_folder("")) else step
     return kind(
         f"{path.parent}: cannot write {path.name} ({error.strerror}). What was finished is safe: "
-        f"{step} a writable folder or mend its permissions, and run the same command again."
+        f"{step} a writable folder or fix its permissions, and run the same command again."
     )
 
 

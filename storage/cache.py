@@ -14,19 +14,19 @@ def cache_folder(name: str) -> Path:
     Raises:
         TrilightError: there is no home directory, or something else is where the cache would be.
     """
-    given = os.environ.get("TRILIGHT_CACHE")
+    configured = os.environ.get("TRILIGHT_CACHE")
     try:
-        root = Path(given) if given else Path.home() / ".cache" / "trilight"
+        root = Path(configured) if configured else Path.home() / ".cache" / "trilight"
     except RuntimeError as error:  # neither HOME nor an entry of /etc/passwd
         raise TrilightError(
             f"user {os.getuid()} has no home directory; expected one for the cache. Set "
             "TRILIGHT_CACHE to a folder of your own."
         ) from error
-    there = next((place for place in (root, *root.parents) if os.path.lexists(place)), root)
-    if os.path.lexists(there) and not os.path.isdir(there):
+    existing = next((place for place in (root, *root.parents) if os.path.lexists(place)), root)
+    if os.path.lexists(existing) and not os.path.isdir(existing):
         raise TrilightError(
-            f"the cache {str(root)!r}: {str(there)!r} is no folder; expected one, or a name that "
-            "is free. Set TRILIGHT_CACHE to a folder of your own."
+            f"the cache {str(root)!r}: {str(existing)!r} is no folder; expected one, or a name "
+            "that is free. Set TRILIGHT_CACHE to a folder of your own."
         )
     return root / name
 

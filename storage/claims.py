@@ -37,7 +37,7 @@ _unlocked = itertools.count()
 
 
 @contextlib.contextmanager
-def claimed(path: Path, *, wait: bool = False) -> Iterator[bool]:
+def hold_claim(path: Path, *, wait: bool = False) -> Iterator[bool]:
     """Hold a claim for the block; yield whether it is ours.
 
     Args:
@@ -47,7 +47,7 @@ def claimed(path: Path, *, wait: bool = False) -> Iterator[bool]:
     Raises:
         TrilightError: the folder cannot be written.
     """
-    descriptor = _locked(path, wait)
+    descriptor = _acquire_lock(path, wait)
     try:
         yield descriptor is not None
     finally:
@@ -84,7 +84,7 @@ def take_lock(descriptor: int, *, shared: bool = False, wait: bool = False) -> b
 
     Args:
         descriptor: of the file.
-        shared: beside other shared ones; else it excludes every other lock.
+        shared: together with other shared locks; otherwise it excludes every other lock.
         wait: until it is free, so that it always becomes ours.
     """
     operation = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
@@ -126,14 +126,15 @@ def describe_holder(path: Path) -> str:
 
 
 class WaitNotice:
-    """Says for whom a wait lasts, first after `_SILENT_S` and then after ever longer times."""
+    """Logs the holder of a claim: first after `_SILENT_S`, then at ever longer intervals."""
 
     def __init__(self) -> None:
         """Begin the wait."""
-        self._began_s, self._next_s = time.monotonic(), _SILENT_S
+        self._began_s = time.monotonic()
+        self._next_s = _SILENT_S
 
     def update(self, claim: Path) -> None:
-        """Take notice that the wait still lasts, for the holder of a claim."""
+        """Log that the wait for the holder of a claim still lasts, if that is due."""
         waited_s = time.monotonic() - self._began_s
         if waited_s < self._next_s:
             return
@@ -146,7 +147,7 @@ class WaitNotice:
         )
 
 
-def _locked(path: Path, wait: bool) -> int | None:
+def _acquire_lock(path: Path, wait: bool) -> int | None:
     """Return the descriptor that holds the lock, or None where another process holds it."""
     while True:
         descriptor = open_lock(path)
@@ -154,7 +155,7 @@ def _locked(path: Path, wait: bool) -> int | None:
             if not wait:
                 os.close(descriptor)
                 return None
-            with _announced(path):
+            with _announce_wait(path):
                 take_lock(descriptor, wait=True)
         if _is(path, descriptor):
             _write_holder(descriptor)
@@ -163,9 +164,10 @@ def _locked(path: Path, wait: bool) -> int | None:
 
 
 @contextlib.contextmanager
-def _announced(path: Path) -> Iterator[None]:
+def _announce_wait(path: Path) -> Iterator[None]:
     """Announce from a thread how long the block waits for a claim."""
-    notice, ended = WaitNotice(), threading.Event()
+    notice = WaitNotice()
+    ended = threading.Event()
 
     def announce() -> None:
         while not ended.wait(_SILENT_S / 4):

@@ -47,8 +47,8 @@ def require_readable(
 ) -> None:
     """Raise TrilightError unless `version` is among `versions`; `where` names the file."""
     if version not in versions:
-        *others, last = map(str, versions)
-        readable = f"{', '.join(others)} and {last}"
+        *earlier, last = map(str, versions)
+        readable = f"{', '.join(earlier)} and {last}"
         raise TrilightError(
             f"{where}: schema version {version}; this Trilight reads {readable}. Use the release "
             "that made it, or make it again with `trilight generate`."
@@ -74,14 +74,17 @@ def look_at_c2w(*, eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[
         c2w, float64 [4, 4]. Undefined (not finite) where the view direction is parallel to `up`
         within ALONG_THE_VIEW, or one of them has no length: callers choose other vectors.
     """
-    eye64, up64 = np.asarray(eye, np.float64), np.asarray(up, np.float64)
+    eye64 = np.asarray(eye, np.float64)
+    up64 = np.asarray(up, np.float64)
     backward = eye64 - np.asarray(target, np.float64)
     backward = backward / np.linalg.norm(backward)
     right = np.cross(up64, backward)
     across = np.linalg.norm(right)
     right = right / (across if across > ALONG_THE_VIEW * np.linalg.norm(up64) else np.nan)
     c2w = np.eye(4)
-    c2w[:3, 0], c2w[:3, 1], c2w[:3, 2] = right, np.cross(backward, right), backward
+    c2w[:3, 0] = right
+    c2w[:3, 1] = np.cross(backward, right)
+    c2w[:3, 2] = backward
     c2w[:3, 3] = eye64
     return c2w
 
@@ -164,7 +167,8 @@ def latlong_uv(directions: ArrayLike) -> NDArray[np.float64]:
 def latlong_direction(uv: ArrayLike) -> NDArray[np.float64]:
     """Return the unit directions [..., 3] that an environment map holds at u and v [..., 2]."""
     u, v = np.moveaxis(np.asarray(uv, np.float64), -1, 0)
-    azimuth, polar = (0.5 - u) * 2 * np.pi, (1 - v) * np.pi
+    azimuth = (0.5 - u) * 2 * np.pi
+    polar = (1 - v) * np.pi
     flat = np.sin(polar)
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.cos(polar)], axis=-1)
 

@@ -33,7 +33,8 @@ def seal_of(data: bytes, sha256: str) -> str:
     Raises:
         ValueError: the digits are not there.
     """
-    start, view = data.index(sha256.encode()), memoryview(data)
+    start = data.index(sha256.encode())
+    view = memoryview(data)
     digest = hashlib.sha256(view[:start])
     digest.update(view[start + len(sha256) :])
     return digest.hexdigest()

@@ -13,7 +13,7 @@ class TrilightError(ValueError):
     """
 
     exit_status: ClassVar[int] = 1
-    """What a process ends with that cannot go on."""
+    """Exit status of a process that ends with this error."""
 
 
 class EnvironmentFailure(TrilightError):

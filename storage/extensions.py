@@ -35,19 +35,18 @@ class Extension:
     """A file that was loaded."""
 
     path: Path
-    """Its absolute path."""
     sha256: str
-    """Digest of its bytes."""
+    """Hexadecimal digest of the file's bytes."""
     module: ModuleType
-    """What it defines."""
+    """Module that the file became."""
     decides: set[Decided] = field(default_factory=set)
-    """What the tables decide in which it has registered something."""
+    """Results that depend on the tables to which it added entries."""
     undo: list[Callable[[], None]] = field(default_factory=list)
     """Takes back each entry that it has registered."""
 
     @property
     def name(self) -> str:
-        """What may be published: the file without its folder."""
+        """The file's name without its folder, which may be published."""
         return self.path.name
 
 
@@ -84,7 +83,7 @@ def load_extension(file: str | Path, *, sha256: str | None = None) -> Extension:
 
 
 def unload(extension: Extension) -> None:
-    """Take back what an extension has registered, so that its file can be loaded anew."""
+    """Take back what an extension has registered, so that its file can be loaded again."""
     for undo in extension.undo:
         undo()
     del _loaded[extension.name], sys.modules[extension.module.__name__]
@@ -137,7 +136,7 @@ def function_name(name: str) -> str:
 
 
 @contextmanager
-def opened(reference: str) -> Iterator[Any]:
+def load_reference(reference: str) -> Iterator[Any]:
     """Provide what the function of FILE.py:FUNCTION returns, while its file may register it.
 
     What is no function stands for itself.
@@ -156,21 +155,21 @@ def opened(reference: str) -> Iterator[Any]:
     extension = load_extension(file)
     members = vars(extension.module)
     if match["function"] not in members:
-        own = [
+        defined = [
             member
             for member, value in members.items()
             if getattr(value, "__module__", "") == extension.module.__name__
         ]
         raise TrilightError(
             f"{reference}: {extension.name} does not define {match['function']}; "
-            f"{expected_one_of(match['function'], own)}."
+            f"{expected_one_of(match['function'], defined)}."
         )
-    found = members[match["function"]]
+    member = members[match["function"]]
     with _as_loading(extension), _mistakes_of(extension.path):
-        yield found() if callable(found) else found
+        yield member() if callable(member) else member
 
 
-def recorded(part: Decided) -> dict[str, str]:
+def extension_digests(part: Decided) -> dict[str, str]:
     """Return the sha256 of each extension that has part in what is made, by its name.
 
     One that registers nothing may do anything, and counts too. One that only adds a metric, a
@@ -211,15 +210,19 @@ def require_same_extensions(what: str, before: Mapping[str, str], now: Mapping[s
         raise TrilightError(f"{what} {said}; {step}, or choose another --out.")
 
 
-def _read(path: Path, shown: str) -> bytes:
+def _read(path: Path, display_path: str) -> bytes:
     if path.suffix != ".py" or os.pathsep in str(path):
-        raise TrilightError(f"extension {shown}: not the name of a Python file; {_EXPECTED}.")
+        raise TrilightError(
+            f"extension {display_path}: not the name of a Python file; {_EXPECTED}."
+        )
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
-        raise TrilightError(f"extension {shown}: no such file; {_EXPECTED}.") from error
+        raise TrilightError(f"extension {display_path}: no such file; {_EXPECTED}.") from error
     except OSError as error:
-        raise TrilightError(f"extension {shown}: cannot be read ({error.strerror}).") from error
+        raise TrilightError(
+            f"extension {display_path}: cannot be read ({error.strerror})."
+        ) from error
 
 
 def _run(path: Path, data: bytes, digest: str) -> Extension:
@@ -276,7 +279,8 @@ def mistake_in_extension(error: BaseException) -> TrilightError | None:
 
 def _mistake(name: str, line: int | None, error: BaseException) -> TrilightError:
     if isinstance(error, SyntaxError):
-        line, said = error.lineno, error.msg
+        line = error.lineno
+        said = error.msg
     else:
         said = str(error)
     kind = "" if isinstance(error, TrilightError) else f"{type(error).__name__}: "

@@ -46,9 +46,11 @@ def order_installed_first(paths: Sequence[str]) -> list[str]:
         return list(paths)
     if folder in [*_named_paths(), str(IMPORT_ROOT)]:
         return list(paths)
-    kept = [path for path in paths if path not in ("", folder)]
-    ours = [] if str(IMPORT_ROOT) in kept else [str(IMPORT_ROOT)]  # a hook of pip's finds us later
-    return [*kept, *ours, *(path for path in paths if path in ("", folder))]
+    other_paths = [path for path in paths if path not in ("", folder)]
+    ours = (
+        [] if str(IMPORT_ROOT) in other_paths else [str(IMPORT_ROOT)]
+    )  # a hook of pip's finds us later
+    return [*other_paths, *ours, *(path for path in paths if path in ("", folder))]
 
 
 def _named_paths() -> list[str]:

@@ -1,4 +1,4 @@
-"""How sure a mean is whose figures go together in clusters, as views of one scene do."""
+"""Confidence interval of a mean of clustered figures, such as the views of one scene."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""What licences ask for: the only place that says so.
+"""Duties of each license; no other module states them.
 
 A licence is an SPDX identifier. What is not known here (`LicenseRef-...`, expressions such as
 `MIT OR Apache-2.0`) is said to be unknown, never guessed. This is a summary for people who choose
@@ -18,7 +18,9 @@ DUTIES: Mapping[str, str] = {
 }
 """Everything that a licence may ask for, with what it means here, in the order of documents."""
 
-_NONE, _NOTICE, _NOTICE_CHANGES = (), ("notice",), ("changes", "notice")
+_NONE = ()
+_NOTICE = ("notice",)
+_NOTICE_CHANGES = ("changes", "notice")
 _SHARED_CODE = ("changes", "notice", "share-alike")
 
 _KNOWN: Mapping[str, tuple[str, ...]] = {
@@ -66,18 +68,18 @@ def duties_of(licence: str) -> tuple[str, ...] | None:
     """
     if match := _CREATIVE_COMMONS.fullmatch(licence):
         parts = match[1].upper().split("-")
-        asked = {duty for part in parts for duty in _ELEMENTS[part]}
+        duties = {duty for part in parts for duty in _ELEMENTS[part]}
     elif licence.casefold() in _BY_FOLDED:
-        asked = set(_KNOWN[_BY_FOLDED[licence.casefold()]])
+        duties = set(_KNOWN[_BY_FOLDED[licence.casefold()]])
     else:
         return None
-    return tuple(duty for duty in DUTIES if duty in asked)
+    return tuple(duty for duty in DUTIES if duty in duties)
 
 
 def union_of_duties(licences: Iterable[str]) -> tuple[str, ...]:
     """Return what several licences ask for together; unknown ones add nothing."""
-    asked = {duty for licence in licences for duty in duties_of(licence) or ()}
-    return tuple(duty for duty in DUTIES if duty in asked)
+    duties = {duty for licence in licences for duty in duties_of(licence) or ()}
+    return tuple(duty for duty in DUTIES if duty in duties)
 
 
 def share_alike_camp(licence: str) -> str:

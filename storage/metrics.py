@@ -1,4 +1,4 @@
-"""How far two pictures are apart: the only definitions (DESIGN section 4).
+"""Distances between two pictures: the only definitions (DESIGN section 4).
 
 Values in dB never stand alone: report the median, the 5th percentile and the share over a target.
 """

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, TypeVar
 
 from storage.errors import TrilightError, expected_one_of
-from storage.extensions import Decided, Extension, is_reference, loading, opened, short_name
+from storage.extensions import Decided, Extension, is_reference, load_reference, loading, short_name
 
 Entry = TypeVar("Entry")
 
@@ -67,14 +67,14 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             owner = origin.name if origin else "Trilight itself"
             raise TrilightError(f"{self.what} {name!r} is taken by {owner}; expected another name.")
         if not isinstance(entry, self._kind):
-            wanted = getattr(self._kind, "__name__", str(self._kind))
+            expected_type = getattr(self._kind, "__name__", str(self._kind))
             raise TrilightError(
-                f"{self.what} {name!r} is a {type(entry).__name__}; expected a {wanted}."
+                f"{self.what} {name!r} is a {type(entry).__name__}; expected a {expected_type}."
             )
-        own = getattr(entry, "name", name)
-        if own != name:
+        stated_name = getattr(entry, "name", name)
+        if stated_name != name:
             raise TrilightError(
-                f"{self.what} {name!r} has the name {own!r} itself; expected the same."
+                f"{self.what} {name!r} has the name {stated_name!r} itself; expected the same."
             )
         self._entries[name] = entry
         if extension:
@@ -82,8 +82,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             extension.decides.update(self._decides)
             extension.undo.append(lambda: self._remove(name))
 
-    def typed(self, typed: str, as_entry: Callable[[Any], Entry]) -> str:
-        """Return the name of an entry that a person typed on a command line, and nothing else did.
+    def resolve(self, reference: str, as_entry: Callable[[Any], Entry]) -> str:
+        """Return the name of an entry that was typed on a command line.
 
         FILE.py:FUNCTION runs a file of their own and registers what the function returns as
         `FILE.py:FUNCTION` without the folder.
@@ -95,12 +95,12 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         Raises:
             TrilightError: the file cannot be loaded (storage.extensions), or does not define it.
         """
-        if not is_reference(typed):
-            return typed
-        name = short_name(typed)
-        with opened(typed) as found:
+        if not is_reference(reference):
+            return reference
+        name = short_name(reference)
+        with load_reference(reference) as value:
             if name not in self._entries:
-                self.register(name, as_entry(found))
+                self.register(name, as_entry(value))
         return name
 
     def find(self, name: str) -> Entry:

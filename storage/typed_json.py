@@ -24,7 +24,7 @@ class Spelled:
     pattern: str
     """Regular expression that matches all of it."""
     expected: str
-    """What to write, for a person."""
+    """Description of valid texts, for error messages."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Let pydantic check the spelling with the type."""
@@ -38,7 +38,7 @@ class Finite:
     """Law of any JSON value: no NaN and no infinity in it."""
 
     expected: str = "JSON values with finite numbers"
-    """What to write, for a person."""
+    """Description of valid values, for error messages."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Let pydantic look for such numbers after the type."""
@@ -61,7 +61,8 @@ class Dropped:
         return core_schema.no_info_plain_validator_function(lambda value: None)
 
 
-DROPPED, FINITE = Dropped(), Finite()
+DROPPED = Dropped()
+FINITE = Finite()
 Sha256 = Annotated[str, Spelled("[0-9a-f]{64}", "64 hexadecimal digits")]
 ShortText = Annotated[str, Spelled(".{0,1000}", "a text of at most 1000 characters")]
 
@@ -99,7 +100,8 @@ def read_json_lines(data: bytes, kind: type[T], source: str, *, torn_end: bool =
         source: the file, for messages.
         torn_end: leave out a last line that a kill has cut.
     """
-    lines, rows = data.splitlines(), list[T]()
+    lines = data.splitlines()
+    rows = list[T]()
     for number, line in enumerate(lines, start=1):
         try:
             rows.append(read_json(line, kind, f"{source}:{number}"))

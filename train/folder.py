@@ -1,4 +1,4 @@
-"""Where things are in the folder of a run, and the claim of the trainer that writes them."""
+"""Paths in the folder of a run, and the lock of the trainer that writes them."""
 
 import contextlib
 from collections.abc import Iterator
@@ -6,28 +6,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from storage.claims import claimed, describe_holder
+from storage.claims import describe_holder, hold_claim
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
-    from train.loop.crew import Crew
+    from train.loop.distributed import DistributedContext
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """The paths of one run."""
+    """Paths of the files of one run."""
 
     root: Path
-    """The folder that users name."""
+    """Folder that the user names, such as by --out."""
 
     @property
     def checkpoints(self) -> Path:
-        """Folder of all that resuming needs (loop.checkpoints), one file per step."""
+        """Folder of the checkpoints (loop.checkpoints), one file per saved step."""
         return self.root / "checkpoints"
 
     @property
     def weights(self) -> Path:
-        """The finished network alone (model.weights), as inference reads it."""
+        """Weights of the finished network (model.weights), as inference reads them."""
         return self.root / "model.safetensors"
 
     @property
@@ -47,17 +47,17 @@ class RunFolder:
 
     @property
     def tensorboard(self) -> Path:
-        """What TensorBoard shows: the log's numbers as curves, and the sheets."""
+        """Folder of TensorBoard's files: the log's numbers and the sheets."""
         return self.root / "tensorboard"
 
     @property
     def notes(self) -> Path:
-        """What happened and when: beginnings, resumes, warnings (watching.notes)."""
+        """Dated notes: starts, resumes, warnings (watching.notes)."""
         return self.root / "notes.jsonl"
 
     @property
-    def watching(self) -> Path:
-        """Stacks of a step that hung, and traces of the profiler."""
+    def monitoring(self) -> Path:
+        """Folder of the stacks of hung steps, and of the profiler's traces."""
         return self.root / "watching"
 
     @property
@@ -67,25 +67,25 @@ class RunFolder:
 
     @property
     def claim(self) -> Path:
-        """Lock of the trainer at work; absent while nobody trains, but after a kill."""
+        """Lock file of the running trainer; a killed trainer leaves it behind."""
         return self.root / "train.claim"
 
 
 @contextlib.contextmanager
-def claim_run(folder: RunFolder, crew: "Crew") -> Iterator[None]:
-    """Keep other trainers out of a run's folder for the block; all processes must call it.
+def claim_run(folder: RunFolder, dist_context: "DistributedContext") -> Iterator[None]:
+    """Lock a run's folder against other trainers for the block; all processes must call it.
 
-    The first process holds the claim. A folder that is empty afterwards is as it was.
+    The first process holds the lock. Folders that are empty afterwards are removed again.
 
     Raises:
         TrilightError: another trainer has the folder, or it cannot be written.
     """
     new = [place for place in (folder.root, *folder.root.parents) if not place.exists()]
     problem: TrilightError | None = None
-    with contextlib.ExitStack() as held:
-        if crew.is_first:
+    with contextlib.ExitStack() as stack:
+        if dist_context.is_first:
             try:
-                if not held.enter_context(claimed(folder.claim)):
+                if not stack.enter_context(hold_claim(folder.claim)):
                     problem = TrilightError(
                         f"{folder.root}: {describe_holder(folder.claim)}, trains there; expected a "
                         "folder for this trainer alone. Wait until it has ended, or choose another "
@@ -93,12 +93,12 @@ def claim_run(folder: RunFolder, crew: "Crew") -> Iterator[None]:
                     )
             except TrilightError as error:
                 problem = error
-        if crew.any(problem is not None):
+        if dist_context.any(problem is not None):
             raise problem or TrilightError(f"{folder.root}: the first process cannot train there.")
         try:
             yield
         finally:
-            if crew.is_first:
+            if dist_context.is_first:
                 for remove in (folder.claim.unlink, *(place.rmdir for place in new)):
                     with contextlib.suppress(OSError):
                         remove()

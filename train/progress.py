@@ -1,16 +1,16 @@
-"""What a run reports to its caller. `train` itself prints nothing."""
+"""Progress events of a run for its caller. `train` itself prints nothing."""
 
 from collections.abc import Mapping
 
 
 class TrainProgress:
-    """Receives the events of a run: noted, then begin, then advance and validated in turns.
+    """Callbacks of a run: notes, then begin, then advance and validations alternately.
 
-    Each does nothing here; a subclass shows those that it overrides.
+    Each does nothing here; a subclass overrides those that it displays.
     """
 
-    def noted(self, text: str) -> None:
-        """A warning for the user, such as one about the data."""
+    def note(self, text: str) -> None:
+        """Receive a message for the user, such as a warning about the data."""
 
     def begin(
         self,
@@ -20,22 +20,22 @@ class TrainProgress:
         num_parameters: int,
         median_scores: Mapping[str, float] | None,
     ) -> None:
-        """The run starts at `step`, above 0 when it resumes.
+        """Receive the start of the run at `step`, which is above 0 when it resumes.
 
-        The median picture is the baseline; None where there is no validation split.
+        `median_scores` are those of the baseline; None without a validation split.
         """
 
     def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
-        """`step` steps are done; `loss` is the mean over the views of the last one."""
+        """Receive `step` finished steps; `loss` is the mean over the views of the last one."""
 
-    def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
-        """The validation split was judged after `step` steps (evaluation.scores)."""
+    def report_validation(self, *, step: int, scores: Mapping[str, float]) -> None:
+        """Receive the scores of a validation after `step` steps (evaluation.scores)."""
 
-    def hung(self, text: str) -> None:
-        """A step does not end and the run was asked to stop then; called from another thread.
+    def report_hang(self, text: str) -> None:
+        """Receive a hang of a run that is to stop on one; called from another thread.
 
-        Whoever runs it ends the process: nothing else ends a call that hangs. Here it goes on.
+        The caller has to end the process, since nothing else ends a call that hangs.
         """
 
-    def interrupted(self, times: int) -> None:
-        """A signal asks to stop, for the `times`-th time; called from another thread."""
+    def report_interrupt(self, times: int) -> None:
+        """Receive the `times`-th signal to stop; called from another thread."""

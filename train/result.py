@@ -1,4 +1,4 @@
-"""The result of a finished run, and how it is written."""
+"""Result of a finished run, and its files."""
 
 import dataclasses
 import json
@@ -10,23 +10,23 @@ from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData
 from train.evaluation.judge import Judge
 from train.evaluation.scores import Lead
-from train.evaluation.sheet import drawn_validation_sheet, write_picture
+from train.evaluation.sheet import draw_validation_sheet, write_picture
 from train.folder import RunFolder
-from train.going_on import Event
 from train.loop.state import TrainState
+from train.monitoring.rows import read_rows
+from train.resume import Event
 from train.settings import TrainSettings
-from train.watching.rows import read_rows
 
 LOSS_SHARE = 20
-"""The loss at start and end is the mean over the first and last 1 / LOSS_SHARE of the log."""
+"""Divisor of the log's rows: the start and end losses average the first and last twentieth."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainResult:
-    """What a finished run has to show."""
+    """Result of a finished run."""
 
     folder: RunFolder
-    """Where everything is."""
+    """Folder that holds all files of the run."""
     num_parameters: int
     """Numbers in the network's weights."""
     num_steps: int
@@ -44,34 +44,34 @@ class TrainResult:
     lead: Lead | None
     """Advantage of the network over the median picture."""
     unusable: tuple[str, ...]
-    """What was wrong with data that was left out in this call."""
+    """Error messages of the damaged data that this call left out."""
     history: tuple[Event, ...]
-    """What it began with, what was decided about it, and how it was executed otherwise."""
+    """Origin, decisions and execution changes of the run, oldest first."""
     seconds: float
     """Wall time of this call, from opening the data to writing the sheet."""
 
     @property
     def beats_median(self) -> bool | None:
-        """Whether the network is better than the median picture by more than chance explains."""
+        """True if the network beats the median picture by more than two standard errors."""
         return None if self.lead is None else self.lead.is_sure
 
 
-def finished(
+def finish_run(
     state: TrainState,
     settings: TrainSettings,
     folder: RunFolder,
     data: TrainingData,
     judge: Judge | None,
-    seconds_before: float,
+    seconds: float,
 ) -> TrainResult:
-    """Judge the finished network, write weights, sheet and summary, and return the result."""
+    """Evaluate the finished network, and write its weights, sheet and summary."""
     trained = TrainedRange(max_triangles=data.max_triangles, resolution=settings.resolution)
-    write_atomically(folder.weights, encode_weights(state.shown, trained))
+    write_atomically(folder.weights, encode_weights(state.eval_model, trained))
     loss_at_start, loss_at_end = _losses(folder)
-    judgement = None
+    validation = None
     if judge is not None:
-        judgement = judge.judge(state.shown)
-        write_picture(folder.sheet, drawn_validation_sheet(settings, judge, judgement, state.step))
+        validation = judge.judge(state.eval_model)
+        write_picture(folder.sheet, draw_validation_sheet(settings, judge, validation, state.step))
     result = TrainResult(
         folder=folder,
         num_parameters=count_parameters(state.model),
@@ -79,12 +79,12 @@ def finished(
         skipped_steps=state.skipped_steps,
         loss_at_start=loss_at_start,
         loss_at_end=loss_at_end,
-        scores=judgement.scores if judgement else None,
+        scores=validation.scores if validation else None,
         median_scores=judge.median_scores if judge else None,
-        lead=judgement.lead if judgement else None,
-        unusable=tuple(state.unusable.messages),
+        lead=validation.lead if validation else None,
+        unusable=tuple(state.bad_samples.messages),
         history=state.history,
-        seconds=seconds_before,
+        seconds=seconds,
     )
     record = dataclasses.asdict(result) | {"beats_median": result.beats_median}
     del record["folder"]
@@ -93,7 +93,7 @@ def finished(
 
 
 def pretty_json(record: object) -> bytes:
-    """Return JSON for people: indented, sorted, with a newline at its end."""
+    """Return indented, sorted JSON with a final newline."""
     return json.dumps(record, indent=1, sort_keys=True).encode() + b"\n"
 
 

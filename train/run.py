@@ -1,4 +1,4 @@
-"""One training run, from a dataset to weights, figures and a sheet: joins the parts."""
+"""One training run from a dataset to weights, scores and a sheet."""
 
 import dataclasses
 import time
@@ -10,39 +10,39 @@ from pathlib import Path
 import torch
 
 from model.renderformer import count_parameters
-from model.sky.known import require_known, shining
+from model.sky.known import lit_sky, require_known_sky
 from storage.dataset.mixed_data import open_mixture
 from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
-from train.beginning import beginning, begun
-from train.data.arrival import looks_up_itself, step_scenes
+from train.data.bad_samples import BadSampleCounter, first_samples
+from train.data.device_prefetch import decodes_on_device, step_scenes
 from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import Unusable, first_samples
-from train.data.workers import fitting_workers, this_machine
+from train.data.workers import choose_workers, detect_machine
+from train.evaluation.baselines import median_picture
 from train.evaluation.judge import Judge
-from train.evaluation.rivals import median_picture
 from train.folder import RunFolder, claim_run
+from train.initial_state import init_or_resume_state, plan_start
 from train.loop.checkpoints import saved_steps
-from train.loop.crew import Crew
+from train.loop.distributed import DistributedContext
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState
 from train.loop.trainer import Trainer, scene_flops
 from train.loss.lpips import load_lpips
 from train.loss.objective import Objective
+from train.monitoring.notes import add_note
+from train.monitoring.settings import WatchSettings
+from train.monitoring.weights_and_biases import require_wandb
 from train.progress import TrainProgress
-from train.result import TrainResult, finished
+from train.result import TrainResult, finish_run
 from train.settings import TrainSettings
-from train.start import Start
-from train.watching.notes import add_note
-from train.watching.settings import WatchSettings
-from train.watching.weights_and_biases import require_wandb
+from train.start_options import StartOptions
 
 MEDIAN_SCENES = 256
-"""Training scenes of which the median picture is taken; more would not move it."""
+"""Number of training scenes for the median picture; more would not change it."""
 
 VALIDATION = "validation"
-"""Split of the scenes that a run is judged on and never shown."""
+"""Split of the scenes that a run is evaluated on and never trained on."""
 
 UNJUDGED = (
     "the data has no validation split, so the network is not judged on scenes that it has never "
@@ -55,29 +55,29 @@ def train_run(
     *,
     data: Sequence[str],
     out: Path,
-    start: Start | None = None,
-    crew: Crew | None = None,
+    start: StartOptions | None = None,
+    dist_context: DistributedContext | None = None,
     workers: int | None = None,
     watched: WatchSettings | None = None,
     progress: TrainProgress | None = None,
 ) -> TrainResult | None:
-    """Train a network and judge it.
+    """Train a network and evaluate it.
 
     Args:
         settings: the run; `train.runs.named_run` returns those that have a name.
         data: root of a dataset, or of several that are mixed (storage.dataset.mixed_data), or a
             list of shards (storage.dataset.training_data), with a train split; without a validation
-            split nothing is judged.
+            split nothing is evaluated.
         out: folder of the run (train.folder), new unless it resumes.
-        start: how it begins; anew unless said.
-        crew: the processes that train together (loop.crew.join_crew); this one unless said.
-        workers: threads that read and decode samples; as many as fit unless said. The weights do
+        start: how the run starts; by default new, with random weights.
+        crew: the processes that train together (loop.crew.join_crew); by default this one alone.
+        workers: threads that read and decode samples; by default as many as fit. The weights do
             not depend on them.
-        watched: how the run is watched, which the weights do not depend on either.
+        watched: settings of the monitoring, on which the weights do not depend either.
         progress: receives the events of the run, in the first process.
 
     Returns:
-        What the run has to show; None in all processes but the first.
+        The result of the run; None in all processes but the first.
 
     Raises:
         TrilightError: no dataset, an empty split, a damaged shard, a bad target, a resolution or
@@ -86,17 +86,20 @@ def train_run(
             went dead, too little memory, or a signal that asked to stop.
     """
     require_wandb((watched or WatchSettings()).wandb)
-    crew, folder = crew or Crew(device=torch.device("cpu")), RunFolder(out)
-    with claim_run(folder, crew):
+    dist_context = dist_context or DistributedContext(device=torch.device("cpu"))
+    folder = RunFolder(out)
+    with claim_run(folder, dist_context):
         return _train(
             settings,
             data=data,
             folder=folder,
-            start=start or Start(),
-            crew=crew,
+            start=start or StartOptions(),
+            dist_context=dist_context,
             workers=workers,
             watched=watched or WatchSettings(),
-            progress=progress if progress is not None and crew.is_first else TrainProgress(),
+            progress=progress
+            if progress is not None and dist_context.is_first
+            else TrainProgress(),
         )
 
 
@@ -105,119 +108,129 @@ def _train(
     *,
     data: Sequence[str],
     folder: RunFolder,
-    start: Start,
-    crew: Crew,
+    start: StartOptions,
+    dist_context: DistributedContext,
     workers: int | None,
     watched: WatchSettings,
     progress: TrainProgress,
 ) -> TrainResult | None:
-    """Train and judge in a folder that is claimed; as `train_run`."""
-    began, opened = time.monotonic(), open_mixture(data)
-    start = _decided(start, folder, crew)
-    early = _EarlyNotes(progress)
-    for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
-        early.noted(note)
-    workers = _fitting_workers(settings, crew, early) if workers is None else workers
-    plan = beginning(settings, folder, opened.digest, start, crew, early)
+    """Train and evaluate in a folder that is locked; arguments as in `train_run`."""
+    began = time.monotonic()
+    dataset = open_mixture(data)
+    start = _resolve_restart(start, folder, dist_context)
+    early_notes = _NoteBuffer(progress)
+    for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
+        early_notes.note(note)
+    workers = _choose_workers(settings, dist_context, early_notes) if workers is None else workers
+    plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
     settings = plan.settings
-    lpips = crew.once_a_machine(partial(load_lpips, start.lpips))
-    objective = Objective(settings.loss, lpips).to(crew.device)
-    _check_data(opened, settings)
-    state = begun(plan, folder, opened, crew, early)
-    judge = _make_judge(opened, settings, state.unusable) if crew.is_first else None
+    lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
+    objective = Objective(settings.loss, lpips).to(dist_context.device)
+    _check_data(dataset, settings)
+    state = init_or_resume_state(plan, folder, dataset, dist_context, early_notes)
+    judge = _make_judge(dataset, settings, state.bad_samples) if dist_context.is_first else None
     recorder = None
-    if crew.is_first:
+    if dist_context.is_first:
         recorder = _recorder(state, settings, folder, judge, progress, watched)
-        _note_beginning(folder, state, crew, early.texts, resumed=start.resume)
+        _record_start(folder, state, dist_context, early_notes.texts, resumed=start.resume)
     trainer = Trainer(
         state=state,
         settings=settings,
         objective=objective,
-        crew=crew,
+        dist_context=dist_context,
         folder=folder,
-        data_digest=opened.digest,
+        data_digest=dataset.digest,
         recorder=recorder,
         watched=watched,
     )
-    with closing(_batches(opened, settings, state, crew, workers)) as batches:
-        cost, most = partial(scene_flops, settings), settings.scenes_per_pass
-        with closing(step_scenes(batches, cost, most, crew.device)) as steps:
+    with closing(_batches(dataset, settings, state, dist_context, workers)) as batches:
+        cost = partial(scene_flops, settings)
+        most = settings.scenes_per_pass
+        with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
             trainer.run(steps)
     if recorder is None:
         return None
     recorder.close()
-    return finished(state, settings, folder, opened, judge, time.monotonic() - began)
+    return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
 
 
-def _fitting_workers(settings: TrainSettings, crew: Crew, progress: TrainProgress) -> int:
-    """Return how many threads decode, and say why."""
-    fitting = fitting_workers(
-        this_machine(),
+def _choose_workers(
+    settings: TrainSettings, dist_context: DistributedContext, progress: TrainProgress
+) -> int:
+    """Return the number of decoding threads, and report the reason."""
+    choice = choose_workers(
+        detect_machine(),
         settings,
-        on_card=crew.device.type == "cuda",
+        on_gpu=dist_context.device.type == "cuda",
         busy_threads=torch.get_num_threads(),
     )
-    progress.noted(fitting.because)
-    return fitting.threads
+    progress.note(choice.reason)
+    return choice.threads
 
 
-def _decided(start: Start, folder: RunFolder, crew: Crew) -> Start:
-    """Return how all processes begin, where one may begin or resume.
+def _resolve_restart(
+    start: StartOptions, folder: RunFolder, dist_context: DistributedContext
+) -> StartOptions:
+    """Decide in all processes alike whether a restartable run resumes.
 
-    All must ask, since torchrun counts its restarts for each machine apart, and a network file
-    system shows a file to one machine before another.
+    All processes must call it: torchrun counts restarts for each machine separately, and a network
+    file system shows a new file to one machine before another.
     """
-    found = crew.any(start.restartable and bool(saved_steps(folder.checkpoints)))
-    return dataclasses.replace(start, resume=start.resume or found, restartable=False)
+    has_checkpoint = dist_context.any(start.restartable and bool(saved_steps(folder.checkpoints)))
+    return dataclasses.replace(start, resume=start.resume or has_checkpoint, restartable=False)
 
 
 def _batches(
-    data: TrainingData, settings: TrainSettings, state: TrainState, crew: Crew, workers: int
+    data: TrainingData,
+    settings: TrainSettings,
+    state: TrainState,
+    dist_context: DistributedContext,
+    workers: int,
 ) -> Generator[list[TrainingScene], None, None]:
-    """Return the scenes of this process for each step from the state's on."""
-    asked = dataclasses.replace(
-        stream_settings(settings), looked_up=not looks_up_itself(crew.device)
+    """Return the scenes of this process for each step, beginning with the state's step."""
+    stream = dataclasses.replace(
+        stream_settings(settings), lookup_in_threads=not decodes_on_device(dist_context.device)
     )
     return stream_batches(
         data.split("train"),
-        asked,
+        stream,
         state.step,
-        share=crew.share,
+        rank_slice=dist_context.rank_slice,
         workers=workers,
-        unusable=state.unusable,
+        unusable=state.bad_samples,
         mixture=state.mixture,
     )
 
 
-class _EarlyNotes(TrainProgress):
-    """Passes notes on, and keeps them until the folder of the run is known to be its own."""
+class _NoteBuffer(TrainProgress):
+    """Forwards notes, and keeps them until the run's folder may be written."""
 
     def __init__(self, progress: TrainProgress) -> None:
         self._progress = progress
         self.texts: list[str] = []
 
-    def noted(self, text: str) -> None:
-        self._progress.noted(text)
+    def note(self, text: str) -> None:
+        self._progress.note(text)
         self.texts.append(text)
 
 
-def _note_beginning(
+def _record_start(
     folder: RunFolder,
     state: TrainState,
-    crew: Crew,
+    dist_context: DistributedContext,
     notes: Sequence[str],
     *,
     resumed: bool,
 ) -> None:
-    """Write down that a call of the trainer began or went on, and what it said until now."""
+    """Write the start or resume of the trainer, and its notes so far, into notes.jsonl."""
     how = "went on" if resumed else "began"
-    many = "process" if crew.world_size == 1 else "processes"
-    for text in (f"{how} on {crew.device}, {crew.world_size} {many}", *notes):
+    many = "process" if dist_context.world_size == 1 else "processes"
+    for text in (f"{how} on {dist_context.device}, {dist_context.world_size} {many}", *notes):
         add_note(folder.notes, state.step, text)
 
 
 def stream_settings(settings: TrainSettings) -> StreamSettings:
-    """Return what a run asks of the stream of its scenes."""
+    """Return the settings of the stream that feeds a run."""
     return StreamSettings(
         seed=settings.seed,
         window=settings.shuffle_shards,
@@ -231,25 +244,27 @@ def stream_settings(settings: TrainSettings) -> StreamSettings:
 
 
 def _check_data(data: TrainingData, settings: TrainSettings) -> None:
-    """Refuse data that lacks views or lights before any work; damage is counted when it is read."""
+    """Raise if the data lacks views or lights; damage is only counted when it is read."""
     shards = data.split("train")
-    lights_apart = settings.augmentation.light_mix > 1
+    per_light = settings.augmentation.light_mix > 1
     num_views = [source.num_views for source in data.sources]
-    if None in num_views or lights_apart:
-        unusable = Unusable(settings.most_unusable)
+    if None in num_views or per_light:
+        unusable = BadSampleCounter(settings.most_unusable)
         samples = list(first_samples(shards, len(data.sources), unusable))
         num_views = [sample.scene.num_views for sample in samples]
         for sample in samples:
-            training_scene(sample, settings.resolution, lights_apart=lights_apart)
+            training_scene(sample, settings.resolution, lights_apart=per_light)
     fewest = min(count for count in num_views if count is not None)
     if settings.views_per_scene > fewest:
         raise TrilightError(
-            f"views_per_scene is {settings.views_per_scene}, but scenes of {data.shown} "
+            f"views_per_scene is {settings.views_per_scene}, but scenes of {data.display_name} "
             f"have {fewest} views; expected at most that many."
         )
 
 
-def _make_judge(data: TrainingData, settings: TrainSettings, unusable: Unusable) -> Judge | None:
+def _make_judge(
+    data: TrainingData, settings: TrainSettings, unusable: BadSampleCounter
+) -> Judge | None:
     if VALIDATION not in data.splits:
         return None
     training = [
@@ -257,9 +272,11 @@ def _make_judge(data: TrainingData, settings: TrainSettings, unusable: Unusable)
         for sample in first_samples(data.split("train"), MEDIAN_SCENES, unusable)
     ]
     # no damage is allowed here: a score over fewer scenes would be another score
-    samples = list(first_samples(data.split(VALIDATION), settings.validation_scenes, Unusable(0)))
+    samples = list(
+        first_samples(data.split(VALIDATION), settings.validation_scenes, BadSampleCounter(0))
+    )
     for sample in samples:  # before any step, not at the first validation
-        require_known(shining(sample.scene.environment), settings.model)
+        require_known_sky(lit_sky(sample.scene.environment), settings.model)
     return Judge(samples, settings.resolution, median_picture(training))
 
 

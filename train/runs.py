@@ -1,11 +1,11 @@
-"""The named runs. Any field can be replaced on the command line: `--set loss.perceptual=none`.
+"""Training presets. The command line can replace any field: `--set loss.perceptual=none`.
 
 `paper-*` are the recipe of RenderFormer (Zeng et al. 2025, and its published training code): two
-stages, AdamW, one cosine, random rigid motions; `-large` are those of its larger network. What we
-hold to be mistakes in the code is not repeated: positions rounded to bfloat16, a learning rate that
-starts again, samples drawn with replacement, and the loss behind the ELU. `pretrain` and `finetune`
-are ours: their rate is constant until the last fifth, so that they can be extended and branched.
-`builtin` and `hits` have the cosine with which the networks that come along were made.
+stages, AdamW, one cosine, random rigid motions; `-large` are those of its larger network. Likely
+mistakes of that code are not repeated: positions rounded to bfloat16, a learning rate that starts
+again, samples drawn with replacement, and the loss after the ELU. `pretrain` and `finetune` are
+ours: their rate is constant until the last fifth, so that they can be extended and branched.
+`builtin` and `hits` have the cosine schedule of the networks that Trilight ships.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 
 def smoke() -> TrainSettings:
-    """Return the run that shows, within five minutes on two CPU cores, that learning happens."""
+    """Return the run that proves within five minutes on two CPU cores that training works."""
     return TrainSettings(
         run="smoke",
         model=smoke_model(),
@@ -44,7 +44,7 @@ def smoke() -> TrainSettings:
 
 
 def builtin() -> TrainSettings:
-    """Return the run that the shipped network comes from: an hour on two CPU cores."""
+    """Return the run of the shipped pure network: an hour on two CPU cores."""
     return dataclasses.replace(
         smoke(),
         run="builtin",
@@ -61,9 +61,9 @@ def builtin() -> TrainSettings:
 
 
 def hits() -> TrainSettings:
-    """Return the run of a small network whose first hits and direct light are traced.
+    """Return the run of a small network whose visible surfaces and direct light are traced.
 
-    It asks no scene tokens: beside what is traced they bring nothing at this size (study S72).
+    It has no scene tokens: with traced inputs they gain nothing at this size (study S72).
     """
     return dataclasses.replace(
         builtin(),
@@ -85,15 +85,15 @@ def hits() -> TrainSettings:
 
 
 def hits_tokens() -> TrainSettings:
-    """Return the run `hits` with the scene's tokens: what they bring is measured beside it."""
+    """Return the run `hits` with scene tokens, to measure what they gain."""
     return dataclasses.replace(hits(), run="hits-tokens", model=hits_smoke())
 
 
 def hits_256() -> TrainSettings:
-    """Return our first stage with traced hits at Base size: for a card, which took steps of it.
+    """Return our first stage with traced hits at Base size, for a GPU; only tried for some steps.
 
-    Tracing a view of 256 pixels takes 0.1 to 0.35 core-seconds: the 256 views of a step keep 50
-    cores busy for a second or two, so the loader decides the pace where there are fewer.
+    Tracing a view of 256 pixels takes 0.1 to 0.35 CPU seconds: the 256 views of a step keep 50
+    cores busy for a second or two, so that with fewer cores the loader limits the speed.
     """
     return dataclasses.replace(
         pretrain(),
@@ -151,8 +151,8 @@ def paper_finetune() -> TrainSettings:
 def paper_pretrain_large() -> TrainSettings:
     """Return the first stage of the published Large recipe: 483 M parameters, Swin windows.
 
-    Its training code says 4 scenes a card, 2 views of each, 600,000 steps of which 8,000 rise to a
-    rate of 1e-4, and no recomputation. It does not say how many cards: 8, its documentation's
+    Its training code says 4 scenes a GPU, 2 views of each, 600,000 steps of which 8,000 rise to a
+    rate of 1e-4, and no recomputation. It does not say how many GPUs: 8, its documentation's
     example, make the 32 scenes here. The validation and its intervals are ours, since it has none.
     """
     return dataclasses.replace(
@@ -169,8 +169,8 @@ def paper_pretrain_large() -> TrainSettings:
 def paper_finetune_large() -> TrainSettings:
     """Return the second stage of the published Large recipe: 512 pixels, up to 4096 triangles.
 
-    6 scenes a card, 50,000 steps of which 4,000 rise to 5e-5, both stages of the network
-    recomputed. Of the number of cards see `paper_pretrain_large`.
+    6 scenes a GPU, 50,000 steps of which 4,000 rise to 5e-5, both stages of the network recomputed.
+    For the number of GPUs see `paper_pretrain_large`.
     """
     return dataclasses.replace(
         paper_finetune(),
@@ -189,13 +189,13 @@ def pretrain() -> TrainSettings:
 
     Which of these choices helps was measured in small trainings (study S79); at this size none
     has been. Half the steps with Muon are as good as all with AdamW at 1 million parameters, four
-    seeds (-4.7 to 2.8 % of the error); here they are what we would pay.
+    seeds (-4.7 to 2.8 % of the error).
 
     The rate is where Muon's error is least from 0.28 to 21 million parameters, and follows the
     width from 64 on (`base_widths`): two seeds, 2,000 steps of four scenes at 32 pixels, on an H100
     (study S80). Parabolas have their least error between 6.2e-4 and 8.5e-4 at each width, with no
-    trend. That it is the best at Base, of 195 million, in steps of 128 scenes or over 250,000 of
-    them, nobody has measured.
+    trend. It was not measured whether this rate is the best at Base, of 195 million, in steps of
+    128 scenes or over 250,000 of them.
     """
     return dataclasses.replace(
         paper_pretrain(),
@@ -220,9 +220,9 @@ def pretrain() -> TrainSettings:
 
 
 def finetune() -> TrainSettings:
-    """Return our second stage, which follows ours as the paper's second follows its first.
+    """Return our second stage, which follows our first as the paper's second follows its first.
 
-    Its rate is a third of the first stage's, as untried as that.
+    Its rate, a third of the first stage's, has not been tried at this size either.
     """
     return dataclasses.replace(
         pretrain(),
@@ -256,28 +256,28 @@ RUNS: Registry[Callable[[], TrainSettings]] = Registry(
     },
     decides=("weights",),
 )
-"""Every named run."""
+"""Training presets by name."""
 
 _INTERVALS = ("log_every", "validate_every", "checkpoint_every", "keep_every")
-"""Settings that say after how many steps something happens again."""
+"""Settings that are numbers of steps between two events."""
 
 
 def typed_run(typed: str) -> str:
-    """Return the name of a run as a person typed it on a command line.
+    """Return the name of a run that was typed on a command line.
 
-    Of FILE.py:FUNCTION, a file of their own, it registers the TrainSettings that the function
-    returns. Names that come from elsewhere must not be brought here, since the file is run.
+    For FILE.py:FUNCTION it registers the TrainSettings that the user's function returns. Names from
+    other sources must not be passed, since the file is executed.
 
     Raises:
         TrilightError: as `Registry.typed`, or the function returns something else.
     """
-    return RUNS.typed(typed, _as_run)
+    return RUNS.resolve(typed, _as_run)
 
 
-def _as_run(found: Any) -> Callable[[], TrainSettings]:
-    if not isinstance(found, TrainSettings):
-        raise TrilightError(f"it returned a {type(found).__name__}; expected TrainSettings.")
-    return lambda: found
+def _as_run(settings: Any) -> Callable[[], TrainSettings]:
+    if not isinstance(settings, TrainSettings):
+        raise TrilightError(f"it returned a {type(settings).__name__}; expected TrainSettings.")
+    return lambda: settings
 
 
 def named_run(name: str) -> TrainSettings:
@@ -287,7 +287,7 @@ def named_run(name: str) -> TrainSettings:
         name: one of RUNS.
 
     Raises:
-        TrilightError: an unknown name, or one from outside that passes for one of ours.
+        TrilightError: the name is unknown, or a user's run has the name of one of ours.
     """
     if name not in RUNS:
         raise TrilightError(f"run {name!r}: no such run; {expected_one_of(name, sorted(RUNS))}.")
@@ -307,56 +307,64 @@ def changed_run(
     steps: int | None = None,
     most_unusable: int | None = None,
 ) -> TrainSettings:
-    """Return the settings of a run, with what a person wants otherwise.
+    """Return the settings of a named run with some values replaced.
 
     Args:
-        name: of the run.
+        name: name of the run.
         changes: values by dotted name, as `storage.settings.changes` takes them.
-        steps: replaces the number of steps; where it is smaller, the warm-up and the intervals
-            that `changes` do not name become shorter in proportion.
+        steps: replaces the number of steps; if it is smaller, the warm-up and the intervals that
+            `changes` does not name shrink in proportion.
         most_unusable: replaces that setting, after the changes.
 
     Raises:
-        TrilightError: no such run or setting, or a value that is refused; the message names it.
+        TrilightError: no such run or setting, or an invalid value; the message names it.
     """
     run = named_run(name)
     every = dict(changes)
     if steps is not None:
-        every |= {**in_proportion(run, steps, changes), "num_steps": steps}
+        every |= {**scale_intervals(run, steps, changes), "num_steps": steps}
     if most_unusable is not None:
         every["most_unusable"] = most_unusable
     return changed(run, every)
 
 
-def in_proportion(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -> dict[str, int]:
-    """Return the warm-up and the intervals of a run of fewer steps; none where it has more.
+def scale_intervals(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -> dict[str, int]:
+    """Return the scaled warm-up and intervals of a shorter run; nothing for a longer one.
 
-    An interval is a multiple of the one that it must fit: validations and checkpoints fall on rows
-    of the log, checkpoints that stay on checkpoints.
+    Each interval is a multiple of another: validations and checkpoints fall on rows of the log, and
+    permanent checkpoints on checkpoints.
 
     Args:
-        run: as it is named.
-        steps: how many are wanted.
-        stated: the values by name that a person gave; these are kept.
+        run: settings of the named run.
+        steps: the smaller number of steps.
+        stated: values by name that the user gave; these are kept.
     """
     if not 0 < steps < run.num_steps:
         return {}
-    given = {name: stated[name] for name in _INTERVALS if name in stated}
+    stated_intervals = {name: stated[name] for name in _INTERVALS if name in stated}
     # other values are refused, by name, when the settings are made
-    kept = {name: value for name, value in given.items() if isinstance(value, int) and value > 0}
+    valid_intervals = {
+        name: value
+        for name, value in stated_intervals.items()
+        if isinstance(value, int) and value > 0
+    }
 
     def shorter(name: str, unit: int) -> int:
         exact = getattr(run, name) * steps / run.num_steps
-        return int(kept.get(name, max(round(exact / unit), 1) * unit))
+        return int(valid_intervals.get(name, max(round(exact / unit), 1) * unit))
 
-    on_rows = [kept[name] for name in ("validate_every", "checkpoint_every") if name in kept]
+    on_rows = [
+        valid_intervals[name]
+        for name in ("validate_every", "checkpoint_every")
+        if name in valid_intervals
+    ]
     row = math.gcd(shorter("log_every", 1), *on_rows)
-    found = {
+    scaled_steps = {
         "warmup_steps": round(run.warmup_steps * steps / run.num_steps),
         "log_every": row,
         "validate_every": shorter("validate_every", row),
         "checkpoint_every": shorter("checkpoint_every", row),
     }
     if run.keep_every:
-        found["keep_every"] = shorter("keep_every", found["checkpoint_every"])
-    return {name: value for name, value in found.items() if name not in stated}
+        scaled_steps["keep_every"] = shorter("keep_every", scaled_steps["checkpoint_every"])
+    return {name: value for name, value in scaled_steps.items() if name not in stated}

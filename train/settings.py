@@ -1,9 +1,9 @@
-"""Training runs: one frozen description of everything that decides the weights. Without torch.
+"""Settings of a training run: everything that decides the weights. Imports no torch.
 
-A run is a Python function that returns the whole description (train.runs); the command line picks
-one and may replace fields. What is not here cannot be changed. Fields marked EXECUTION may differ
-at every resume: the weights are the same but for rounding, or do not depend on them at all. All
-others are what the run means, and change by a decision that the run records (train.going_on).
+A run is a Python function that returns all settings (train.runs); the command line picks one and
+may replace fields. Fields marked EXECUTION may differ at every resume: the weights are equal up to
+rounding, or do not depend on them. All other fields are the meaning of the run, and change only by
+a decision that the run records (train.resume).
 """
 
 from dataclasses import field
@@ -17,13 +17,13 @@ from storage.settings.execution import EXECUTION
 from storage.settings.ranges import Seed, Share, Within
 
 Rotation = Literal["none", "recipe", "uniform"]
-"""`recipe`: a rotation vector of three normal numbers, which favours small turns; `uniform`: every
-orientation alike."""
+"""`recipe`: a rotation vector of three normal numbers, which favors small angles; `uniform`: every
+orientation is equally likely."""
 
 
 @checked("train settings")
 class AugmentationSettings:
-    """Random augmentation, drawn anew at every visit of a scene. The default changes nothing."""
+    """Random augmentation, drawn again at every visit of a scene. The default changes nothing."""
 
     rotation: Rotation = "none"
     """Distribution of the random rotation of scene and cameras together."""
@@ -32,7 +32,7 @@ class AugmentationSettings:
     mirror: bool = False
     """Mirror the scene at half of the visits."""
     channels: bool = False
-    """Permute the colour channels at random."""
+    """Permute the color channels at random."""
     vertex_order: bool = False
     """Rotate the order of each triangle's vertices at random; its winding stays."""
     light_scale: Annotated[float, Within(1, 1000)] = 1.0
@@ -41,8 +41,8 @@ class AugmentationSettings:
     """Scale each light by a log-uniform factor of its own between 1 / light_mix and light_mix;
     above 1 it needs a dataset with a picture for each light (`per_light`)."""
     withheld_inputs: Share = 0.0
-    """Chance with which a view has to do without one of the inputs that the view stage `hits` is
-    given, drawn for each input; other networks are given none."""
+    """Probability that a view lacks an input of the view stage `hits`, drawn for each input;
+    other networks have no such inputs."""
 
 
 Perceptual = Literal["lpips", "ms_ssim", "none"]
@@ -62,23 +62,23 @@ class LossSettings:
     """Root mean square noise of log10(1 + radiance) at which a view has half the weight of a
     noiseless one; 0 gives all views the same weight."""
     REMOVED: ClassVar = ("lpips_precision",)
-    """Settings of earlier versions."""
+    """Names of settings of earlier versions, which old files may hold."""
 
 
 Precision = Literal["float32", "bfloat16"]
-"""Precision of the network's matrix products. Positions, losses, weights and optimisers' memories
-stay float32."""
+"""Precision of the network's matrix products. Positions, losses, weights and optimizer state stay
+float32."""
 
 Compile = Literal["auto", "yes", "no"]
-"""Whether layers, head and LPIPS are compiled by torch: `auto` does so on a card with Triton, `yes`
-also on a processor, where it takes minutes and brings little."""
+"""Compilation of layers, head and LPIPS by torch: `auto` compiles on a GPU with Triton, `yes` also
+on a CPU, where it takes minutes and gains little."""
 
 Decayed = Literal["all", "matrices"]
 """Weights that decay: `all`, or `matrices` without norms, biases and learned tokens."""
 
 MuonTakes = Literal["matrices", "hidden"]
-"""Weights that Muon updates: all `matrices`, or the `hidden` ones of the layers alone, each of
-queries, keys and values for itself, as its authors do."""
+"""Weights that Muon updates: all `matrices`, or only the `hidden` ones of the layers, with queries,
+keys and values as separate matrices, as its authors do."""
 
 Schedule = Literal["wsd", "cosine"]
 """Course of the learning rate after its warm-up. `wsd` (warm-up, stable, decay) stays at the peak
@@ -88,7 +88,7 @@ Count = Annotated[int, Within(1, 10**9)]
 """Number of steps or of scenes; no run reaches a billion."""
 
 FreeCount = Annotated[Count, EXECUTION]
-"""The same for how a run is executed."""
+"""Number of steps or of scenes that decides no weight."""
 
 BelowOne = Within(0, 1, high_open=True)
 """Range of the decay of a running mean; with a decay of 1 the mean would never move."""
@@ -99,14 +99,14 @@ class TrainSettings:
     """Everything besides the data that decides the trained weights."""
 
     run: str
-    """Name of the run."""
+    """Name of the run, as its files and messages show it."""
     model: ModelConfig
     """Sizes of the network, or the name of a preset."""
     from_weights: bool = False
     """Start from given weights (`begin_with`) instead of random ones."""
     data_weights: Annotated[tuple[float, ...], Within(0, 1e9, low_open=True)] = ()
-    """Weights of the datasets that are mixed, in their order: the shares of the scenes, and so of
-    the views, that come from each; by default in proportion to their numbers of scenes."""
+    """Weights of the datasets that are mixed, in their order: the relative numbers of scenes that
+    come from each; by default in proportion to their numbers of scenes."""
     resolution: Annotated[int, Within(1, 2048, unit="pixels")]
     """Width of the training pictures in pixels: it divides the dataset's width, and is a multiple
     of the ray bundle's (with Swin windows, of a window's) width."""
@@ -125,15 +125,15 @@ class TrainSettings:
     scenes_per_step: Annotated[int, Within(1, 65_536, unit="scenes")]
     """Batch size: the number of scenes whose gradients are averaged into one update."""
     views_per_scene: Annotated[int, Within(1, 1000, unit="views")]
-    """Views of each scene in a step, drawn anew at every visit; at most as many as the dataset has.
-    """
+    """Views of each scene in a step, drawn again at every visit; at most as many as the dataset
+    has."""
     scenes_per_pass: Annotated[int, Within(1, 65_536, unit="scenes"), EXECUTION] = 16
     """Maximum number of scenes in one pass through the network; a step accumulates the gradients of
     its passes."""
     precision: Annotated[Precision, EXECUTION] = "float32"
     """Precision of the network's matrix products."""
     learning_rate: Annotated[float, Within(0, 1, low_open=True)]
-    """Peak learning rate."""
+    """Learning rate at its peak, after the warm-up."""
     muon_rate: Annotated[float, Within(0, 100, unit="x learning_rate")] = 0.0
     """Learning rate of Muon, which updates the matrices, as a multiple of `learning_rate`; with 0,
     AdamW updates every weight."""
@@ -141,22 +141,22 @@ class TrainSettings:
     """Widths for which the rates above and the initial weights are stated; no other width of the
     network changes them unless `width` is one."""
     muon_takes: MuonTakes = "matrices"
-    """Weights that Muon updates."""
+    """Weights that Muon updates: all matrices, or only the hidden ones of the layers."""
     warmup_steps: Annotated[int, Within(0, 10**9 - 1, unit="steps")]
     """Steps of linear warm-up to the peak learning rate."""
     schedule: Schedule = "cosine"
     """Course of the learning rate after the warm-up: `wsd` stays at the peak until the last steps,
-    so that a run can be made longer or branched; `cosine`, which all runs were that do not say,
-    falls from the start."""
+    so that a run can be extended or branched; `cosine`, the value of runs that store none, falls
+    from the start."""
     decay_share: Share = 0.2
-    """Last share of the steps, over which the rate of a `wsd` schedule falls; with 0 it never
-    does."""
+    """Fraction of the steps, at the end, over which the rate of a `wsd` schedule falls; with 0 it
+    never falls."""
     final_rate_share: Share = 0.05
-    """Learning rate at the last step, as a share of the peak."""
+    """Learning rate at the last step, as a fraction of the peak."""
     weight_decay: Annotated[float, Within(0, 10)] = 0.01
     """Decoupled weight decay (Loshchilov and Hutter 2019) of the weights that `decayed` names."""
     decayed: Decayed = "all"
-    """Weights that decay."""
+    """Weights that decay: all, or matrices without norms, biases and learned tokens."""
     betas: Annotated[tuple[float, float], BelowOne] = (0.9, 0.99)
     """Decay rates of AdamW's running means of the gradient and of its square."""
     grad_clip: Annotated[float, Within(0, 1e9, low_open=True)] = 1.0
@@ -168,7 +168,7 @@ class TrainSettings:
     """Recompute activations in the backward pass, which saves memory and takes a third more time
     (see RenderFormer.recompute_activations)."""
     compile: Annotated[Compile, EXECUTION] = "auto"
-    """Whether torch compiles layers, head and LPIPS; the first steps then take minutes."""
+    """Compile layers, head and LPIPS with torch; the first steps then take minutes."""
     shuffle_shards: Annotated[int, Within(1, 100_000, unit="shards")] = 4
     """Number of shards that are open at the same time; samples are shuffled among them."""
     most_unusable: Annotated[int, Within(0, 10**9, unit="samples"), EXECUTION] = 0
@@ -177,9 +177,9 @@ class TrainSettings:
     log_every: FreeCount = 10
     """Steps between rows of metrics.jsonl."""
     validate_every: FreeCount
-    """Steps between validations."""
+    """Number of steps between two validations."""
     checkpoint_every: FreeCount
-    """Steps between checkpoints."""
+    """Number of steps between two checkpoints."""
     checkpoints_kept: FreeCount = 2
     """Number of newest checkpoints to keep; older ones are deleted."""
     keep_every: Annotated[int, Within(0, 10**9, unit="steps"), EXECUTION] = 0

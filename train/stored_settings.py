@@ -1,6 +1,6 @@
-"""A run's settings as its checkpoints and settings.json hold them.
+"""Stored form of a run's settings, in checkpoints and settings.json.
 
-Removed settings stand there too, at the values that meant none: these files keep their bytes.
+It includes removed settings, at the values that switched them off, so that files keep their bytes.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from storage.settings.described import settings_record
 from train.settings import TrainSettings
 
 _REMOVED = {"model": REMOVED_FROM_MODEL, "loss": {"lpips_precision": "float32"}}
-"""Removed settings of each group."""
+"""Removed settings of each group, with the value that switched them off."""
 
 _BEFORE = {
     "projected_freqs": "rope_max_freq",
@@ -20,11 +20,11 @@ _BEFORE = {
     "sky_cells": "texture_cells",
     "lpips_precision": "perceptual_weight",
 }
-"""The setting behind which a removed one stands."""
+"""Name of the setting after which a removed one is stored."""
 
 
 def stored_settings(settings: TrainSettings) -> dict[str, Any]:
-    """Return the record of settings that is stored."""
+    """Return the settings as the record that files hold."""
     record = settings_record(settings)
     for group, removed in _REMOVED.items():
         for name, off in removed.items():

@@ -2,13 +2,13 @@
 
 from typing import TYPE_CHECKING
 
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.statistics import Statistics, dataset_statistics
 from storage.records.sample import Sample
 
 if TYPE_CHECKING:
-    from pipeline.making.run import Outcome
+    from pipeline.generation.run import Outcome
 
 __all__ = [
     "Dataset",
@@ -34,7 +34,7 @@ def generate(order: DatasetOrder) -> "Outcome":
         TrilightError: what the user can mend; what is finished is safe.
     """
     from pipeline.executors.threads import ThreadRunner
-    from pipeline.making.pipeline import make_dataset
+    from pipeline.generation.pipeline import make_dataset
 
     return make_dataset(order, ThreadRunner())
 
@@ -42,6 +42,6 @@ def generate(order: DatasetOrder) -> "Outcome":
 def __getattr__(name: str) -> object:
     if name != "Outcome":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from pipeline.making.run import Outcome
+    from pipeline.generation.run import Outcome
 
     return Outcome

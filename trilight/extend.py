@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from pipeline.executors.registry import EXECUTORS as EXECUTORS
     from pipeline.executors.registry import Executor as Executor
     from pipeline.executors.threads import ThreadRunner as ThreadRunner
-    from pipeline.making.dataset_order import DatasetOrder as DatasetOrder
-    from pipeline.making.dataset_order import generate_words as generate_words
-    from pipeline.making.pipeline import make_dataset as make_dataset
-    from pipeline.making.pipeline import prepare_dataset as prepare_dataset
-    from pipeline.making.run import Outcome as Outcome
+    from pipeline.generation.dataset_order import DatasetOrder as DatasetOrder
+    from pipeline.generation.dataset_order import generate_words as generate_words
+    from pipeline.generation.pipeline import make_dataset as make_dataset
+    from pipeline.generation.pipeline import prepare_dataset as prepare_dataset
+    from pipeline.generation.run import Outcome as Outcome
     from pipeline.objects.listing import Listing as Listing
     from pipeline.objects.ply import encode_ply as encode_ply
     from pipeline.objects.sources import SOURCES as SOURCES

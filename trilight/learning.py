@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infra.torch_library import require_torch
+from train.monitoring.settings import WatchSettings
 from train.runs import changed_run, named_run
 from train.settings import TrainSettings
-from train.start import Start
-from train.watching.settings import WatchSettings
+from train.start_options import StartOptions
 
 if TYPE_CHECKING:
     from infra.judging import Judgement
@@ -73,7 +73,7 @@ def train_network(
     require_torch("train_network")
     places = [data] if isinstance(data, str | os.PathLike) else data
     settings = changed_run(run, changes or {}, steps=steps)
-    start = Start(
+    start = StartOptions(
         resume=resume,
         branch=branch,
         decisions=decisions or {},
@@ -81,7 +81,7 @@ def train_network(
         lpips=lpips,
     )
     start.check(settings)
-    from train.loop.crew import Crew, choose_device
+    from train.loop.distributed import DistributedContext, choose_device
     from train.run import train_run
 
     result = train_run(
@@ -89,7 +89,7 @@ def train_network(
         data=[os.fspath(place) for place in places],
         out=Path(out),
         start=start,
-        crew=Crew(device=choose_device(device)),
+        dist_context=DistributedContext(device=choose_device(device)),
         workers=workers,
         watched=watched,
         progress=progress,

@@ -118,7 +118,7 @@ def render_views(
         resolution, noise_floor_db, noise_floor_linear_db, noise_floor_objects_db, max_spp, split,
             split_lobes, seed, threads: as `render`, which says what comes back and what is refused.
     """
-    from pipeline.making.path_tracer import PathTracer
+    from pipeline.generation.path_tracer import PathTracer
     from pipeline.renders.variant import choose_variant
 
     rows = range(scene.num_views) if views is None else views
@@ -137,7 +137,7 @@ def render_views(
         seed=seed,
         variant=choose_variant(),
         threads=threads or os.cpu_count() or 1,
-        sampled=lambda now: None,
+        on_samples=lambda now: None,
     )
     try:
         tracer.open(scene, "scene")

@@ -1,4 +1,4 @@
-"""All experiments, found by listing the folder `experiments`; each file holds one."""
+"""Catalogue of experiments: each file of the folder `experiments` holds one."""
 
 import importlib
 import pkgutil
@@ -11,10 +11,10 @@ from storage.errors import TrilightError
 def every_experiment() -> dict[str, Experiment]:
     """Return all experiments by name, in the order of the alphabet."""
     modules = sorted(module.name for module in pkgutil.iter_modules(experiments.__path__))
-    found = [
+    experiments_found = [
         importlib.import_module(f"{experiments.__name__}.{name}").EXPERIMENT for name in modules
     ]
-    return {one.name: one for one in found}
+    return {one.name: one for one in experiments_found}
 
 
 def experiment_of(name: str) -> Experiment:

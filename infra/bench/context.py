@@ -1,6 +1,6 @@
-"""Shared means of an experiment: children, scenes, objects, folders.
+"""Shared resources of an experiment: children, scenes, objects, folders.
 
-Everything is made when it is first asked for, so that an experiment costs no more than it needs.
+Each resource is made at its first use, so that an experiment pays only for what it uses.
 """
 
 import contextlib
@@ -18,8 +18,8 @@ from infra.bench_options import BenchOptions
 from infra.rendering.held_out_scenes import composing_child
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
+from pipeline.generation.prepare_isolated import preload_mesh_libraries
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
-from pipeline.making.prepare_isolated import preload_mesh_libraries
 from storage.errors import Rejected
 from storage.records.sample import Sample, encode_sample
 from storage.records.scene import Scene
@@ -28,7 +28,7 @@ from storage.settings.changes import changed
 Result = TypeVar("Result")
 
 _SAMPLES = 2
-"""Rendered scenes that are packed and read."""
+"""Number of rendered scenes for experiments on packing and reading."""
 
 
 def _do_nothing() -> None:
@@ -36,36 +36,37 @@ def _do_nothing() -> None:
 
 
 class BenchContext:
-    """Makes and holds what an experiment's trials share, until `close`."""
+    """Shared resources of an experiment's trials, until `close`."""
 
     def __init__(self, scale: BenchScale, options: BenchOptions) -> None:
         # before any child: pymeshlab takes a second to import, and would be counted as work
         preload_mesh_libraries()
-        self.scale, self.options = scale, options
+        self.scale = scale
+        self.options = options
         self.notes: list[str] = []
         """Notes that belong to the result."""
         self.cores = os.cpu_count() or 1
         self._stack = contextlib.ExitStack()
-        self._kept: dict[Any, Any] = {}
+        self._cache: dict[Any, Any] = {}
 
     def close(self) -> None:
-        """End the children, delete their folders."""
+        """End the children, and delete their folders."""
         self._stack.close()
 
-    def kept(self, key: Any, make: Callable[[], Result]) -> Result:
-        """Return what was made under a key, made now if it was not."""
-        if key not in self._kept:
-            self._kept[key] = make()
-        found: Result = self._kept[key]
-        return found
+    def get_or_make(self, key: Any, make: Callable[[], Result]) -> Result:
+        """Return the value of a key, made by `make` at its first use."""
+        if key not in self._cache:
+            self._cache[key] = make()
+        result: Result = self._cache[key]
+        return result
 
     def note(self, text: str) -> None:
-        """Keep a sentence with the result; once."""
+        """Add a sentence to the result's notes, once."""
         if text not in self.notes:
             self.notes.append(text)
 
     def folder(self) -> Path:
-        """Return an empty folder that is deleted in the end."""
+        """Return an empty folder, which `close` deletes."""
         return Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
 
     def render_child(
@@ -90,7 +91,7 @@ class BenchContext:
 
     @functools.cached_property
     def mesh_files(self) -> tuple[tuple[Path, int], ...]:
-        """Files of usable objects with their triangles after cleaning, the largest first.
+        """Files of usable objects with their number of triangles after cleaning, largest first.
 
         Raises:
             TrilightError: as `find_objects`.
@@ -99,22 +100,22 @@ class BenchContext:
         from pipeline.objects.sources import find_objects
         from storage.cache import cache_folder
 
-        found = find_objects(
+        objects = find_objects(
             self.options.objects,
             work_dir=cache_folder("objects"),
             allowed_licences=self.options.allowed_licences,
         )
         sizes = {}
-        for record in found.records:
+        for record in objects.records:
             with contextlib.suppress(Rejected, ChildFailed):
                 sizes[Path(record.path)] = self.mesh_child.call(count_faces, Path(record.path))
         return tuple(sorted(sizes.items(), key=lambda item: (-item[1], str(item[0]))))
 
     def scene(self, trial: str) -> Scene:
-        """Return the scene of the trial `sampled N`, or the one of the user's of that name."""
-        given = given_scenes(self.options.scenes)
-        if trial in given:
-            return given[trial](self.child)
+        """Return the scene of the trial `sampled N`, or the user's scene of that name."""
+        user_scenes = given_scenes(self.options.scenes)
+        if trial in user_scenes:
+            return user_scenes[trial](self.child)
         scene: Scene = self.child.call(sampled_scene, int(trial.split()[-1]))
         return scene
 

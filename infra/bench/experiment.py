@@ -18,35 +18,35 @@ Figures = Mapping[str, float]
 """Measured numbers of one point in one trial, by name."""
 
 Over = Literal["median", "mean", "least", "most", "p5", "p95", "low", "high", "pair"]
-"""How the figures of all trials become one number; `low` and `high` bound the mean: its 95 %
-interval, bootstrapped over clusters of trials. `pair` is the mean of the differences to the point's
-rival, trial by trial, and has its interval beside it."""
+"""Reduction of the figures of all trials to one number. `low` and `high` are the ends of the mean's
+95 % interval, bootstrapped over clusters of trials. `pair` is the mean of the differences to the
+point's rival, trial by trial, with its interval."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchScale:
-    """The amount that is measured: numbers that experiments draw their points and trials from."""
+    """Amount of measurement, from which experiments derive their points and trials."""
 
     name: str
     """Name of the scale, `quick` or `full`."""
     scenes: int
-    """Scenes of the experiments on pictures."""
+    """Number of scenes of the experiments on pictures."""
     resolution: int
     """Width of those pictures in pixels, a divisor of 256."""
     max_spp: int
-    """Most samples per pixel, of fixed numbers and as a cap; a multiple of 128."""
+    """Maximum number of samples per pixel; a multiple of 128."""
     reference_spp: int
     """Samples per pixel of references at 256 pixels."""
     picture_px: int
     """Width of pictures where whole samples are made, in pixels."""
     objects: int
-    """Objects that are decimated."""
+    """Number of objects of the experiment on decimation."""
     repeats: int
-    """Counted rounds where the same is done several times."""
+    """Number of measured rounds of the same work."""
     steps: int
     """Steps of each paired training, and of each preset on the GPU."""
     held_out: int
-    """Scenes that paired trainings are judged on."""
+    """Number of scenes on which paired trainings are evaluated."""
     growth: int
     """Number of sizes that growth is measured at, each four times the one before."""
 
@@ -62,7 +62,7 @@ QUICK = BenchScale(
 
 
 def device_of(options: BenchOptions) -> str:
-    """Return the device that is asked for, or the one that torch finds."""
+    """Return the device of the options, or the one that torch finds."""
     if options.device:
         return options.device
     if importlib.util.find_spec("torch") is None:
@@ -74,7 +74,7 @@ def device_of(options: BenchOptions) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """One column of the table: a figure of every trial, made one number."""
+    """Column of the table: a figure of every trial, reduced to one number."""
 
     name: str
     """Heading of the column, with the unit."""
@@ -88,59 +88,59 @@ class Column:
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """One setting that is measured; all but `settings` stands in the results."""
+    """Measured setting, a row of the table; the results hold all fields but `settings`."""
 
     name: str
     """Name of its row in the table."""
     settings: Any = None
-    """Value that the measure needs to know."""
+    """Value for the experiment's measure."""
     default: bool = False
-    """Whether this is the product's default."""
+    """True for the default of the product."""
     judged: bool = True
-    """Whether the point is a choice; False for a yardstick, such as a picture's own noise."""
+    """True for a choice; False for a yardstick, such as a picture's own noise."""
     group: str = ""
-    """Name of the points that it is compared with: its panel of the plot, and its front."""
+    """Group of points that are compared: they share a panel of the plot and a Pareto front."""
     kind: str = ""
     """Name of its color in the plot; by default all have one."""
     rival: str | None = None
     """Name of the point that columns over `pair` take the difference to; None of the rival."""
     size: float | None = None
-    """Size that the costs are plotted against, where they grow with one."""
+    """Size against which the costs are plotted; None without one."""
 
     def record(self) -> dict[str, Any]:
-        """Return what stands in the results, as JSON values."""
+        """Return the fields for the results as JSON values."""
         return {name: value for name, value in vars(self).items() if name != "settings"}
 
 
 Measure = Callable[["BenchContext", Sequence[Point], str], Iterable[tuple[str, Figures]]]
-"""Measures all points in one trial and yields their figures by name. Raises `Rejected` or
-`ChildFailed` where the trial's scene or object cannot be used: it then counts for no point."""
+"""Function that measures all points in one trial and yields their figures by name. It raises
+`Rejected` or `ChildFailed` if the trial's scene or object is unusable; it counts for no point."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """One experiment: points that are measured beside each other, trial by trial."""
+    """Experiment: points that are measured together, trial by trial."""
 
     name: str
     """Name on the command line."""
     title: str
     """Title of the table and of the plot."""
     about: str
-    """One sentence: what is measured, and on what."""
+    """Description of the measurement in one sentence."""
     cost: Column
-    """The first column; above 0."""
+    """First column of the table; above 0."""
     points: Callable[[BenchScale, BenchOptions], Sequence[Point]]
-    """The points, in the order of the table."""
+    """Function that returns the points, in the order of the table."""
     trials: Callable[[BenchScale, BenchOptions], Sequence[str]]
     """Scenes, objects or repeats: in each trial every point is measured once."""
     measure: Measure = field(repr=False)
-    """Measure of one trial."""
+    """Function that measures all points in one trial."""
     error: Column | None = None
-    """The second column; None where only costs are compared."""
+    """Second column of the table; None if only costs are compared."""
     better: Literal["higher", "lower"] = "lower"
     """Direction in which the error is better: decibels are higher where pictures agree."""
     columns: tuple[Column, ...] = ()
-    """Further columns."""
+    """Further columns of the table, after cost and error."""
     also_cost: tuple[str, ...] = ()
     """Further columns that count as costs: a point cheaper in any of them is not dominated."""
     because: str = ""
@@ -148,13 +148,13 @@ class Experiment:
     cluster: Callable[[str], str] = str
     """Name of a trial's cluster: trials of one cluster are alike; by default none is."""
     warm_up: bool = False
-    """Whether one trial that is not counted comes first, where all trials are repeats."""
+    """True for an additional first trial that is not counted, if all trials are repeats."""
     needs: tuple[Literal["torch", "blender", "data"], ...] = ()
-    """What the machine or the user has to provide."""
+    """Requirements on the machine or the options."""
 
 
 def missing_need(experiment: Experiment, options: BenchOptions) -> str:
-    """Return what an experiment needs that is missing; empty if nothing is."""
+    """Return the missing requirement of an experiment as text; empty if none is missing."""
     if "torch" in experiment.needs and importlib.util.find_spec("torch") is None:
         return "torch is not installed; run `make setup-all`"
     if "data" in experiment.needs and not options.data:
@@ -183,10 +183,10 @@ def public_options(options: BenchOptions) -> dict[str, Any]:
     from infra.rendering.methods import network_labels
     from storage.digests import sha256_hex
 
-    found = dataclasses.asdict(options)
-    found["scenes"] = options.scenes.name if options.scenes else None
-    found["checkpoint"] = list(network_labels(options.checkpoint))
+    values = dataclasses.asdict(options)
+    values["scenes"] = options.scenes.name if options.scenes else None
+    values["checkpoint"] = list(network_labels(options.checkpoint))
     if options.data:
         name = options.data.rstrip("/").rpartition("/")[2]
-        found["data"] = f"{name} ({sha256_hex(options.data.encode())[:8]})"
-    return found
+        values["data"] = f"{name} ({sha256_hex(options.data.encode())[:8]})"
+    return values

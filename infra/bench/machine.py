@@ -1,4 +1,4 @@
-"""The machine that a figure was measured on: processor, cores, system, libraries, commit."""
+"""Record of the measuring machine: processor, cores, system, libraries, commit."""
 
 import os
 import platform
@@ -17,7 +17,7 @@ _LIBRARIES = ("trilight", "mitsuba", "drjit", "pyoidn", "numpy", "torch", "pymes
 
 
 def machine_record(device: str) -> dict[str, Any]:
-    """Return what a figure depends on, as JSON values; on the device `cuda` with its GPU."""
+    """Return the record of this machine as JSON values; on the device `cuda` with its GPU."""
     versions = {}
     for library in _LIBRARIES:
         try:
@@ -41,9 +41,9 @@ def _gpu_name() -> str:
 
 
 def commit_text(root: Path = ROOT) -> str:
-    """Return the commit of a checkout, with -dirty where files besides the documents differ.
+    """Return the commit of a checkout, with -dirty if files other than documents differ.
 
-    Results are documents: a run that writes them resumes as the same commit.
+    Results are documents, so that a run that writes them resumes as the same commit.
     """
     if shutil.which("git") is None:
         return "unknown"  # an image has none

@@ -1,4 +1,4 @@
-"""The one plot of an experiment: costs against sizes, errors against costs, or costs as bars."""
+"""Plot of an experiment: costs against sizes, errors against costs, or costs as bars."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -17,11 +17,13 @@ from infra.cost_charts import (
     plain_log,
 )
 
-_WIDE, _HIGH, _DPI = 7.0, 5.2, 110
-"""Inches of a panel, and the resolution of the file."""
+_WIDE = 7.0
+_HIGH = 5.2
+_DPI = 110
+"""Width and height of a panel in inches, and resolution of the file."""
 _FONT = 9
 _SPREAD = 20
-"""Costs that differ by more than this factor stand on a logarithmic axis."""
+"""Ratio of costs above which their axis is logarithmic."""
 
 
 def plot(experiment: Experiment, run: Run, path: Path) -> None:
@@ -53,7 +55,7 @@ def _panels(plt: Any, count: int, high: float = _HIGH) -> tuple[Any, Sequence[An
 
 
 def _draw_growth(plt: Any, experiment: Experiment, rows: Sequence[Row]) -> Any:
-    """Draw each cost in a panel against the size, with a line of each kind."""
+    """Draw each cost against the size in a panel, with a line for each kind."""
     costs = (experiment.cost.name, *experiment.also_cost)
     figure, panels = _panels(plt, len(costs))
     for axes, cost in zip(panels, costs, strict=True):
@@ -75,7 +77,8 @@ def _draw_growth(plt: Any, experiment: Experiment, rows: Sequence[Row]) -> Any:
 def _draw_errors(plt: Any, experiment: Experiment, rows: Sequence[Row]) -> Any:
     """Draw errors against costs, each group in a panel and each kind in a color."""
     assert experiment.error is not None
-    error, costs = experiment.error.name, (experiment.cost.name, *experiment.also_cost)
+    error = experiment.error.name
+    costs = (experiment.cost.name, *experiment.also_cost)
     groups = defaultdict[str, list[SeriesPoint]](list)
     for row in rows:
         if error in row.values:

@@ -1,4 +1,4 @@
-"""The points of a run as rows of a table: columns, intervals, and whether on the front."""
+"""Table of a run: a row for each point, with its columns, intervals and Pareto front."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,23 +15,22 @@ from storage.intervals import mean_interval
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One point beside the others."""
+    """Row of the table: one point with its values."""
 
     point: Point
-    """The point's declaration, without its settings."""
+    """Declaration of the point, without its settings."""
     values: Mapping[str, float]
     """Value of each measured column, by name."""
     intervals: Mapping[str, tuple[float, float]]
-    """The 95 % interval of each column over `pair`, by name."""
+    """95 % interval of each column over `pair`, by name."""
     cost_range: tuple[float, float] | None
-    """Smallest and largest cost over the trials; None where there was one trial."""
+    """Smallest and largest cost over the trials; None for a single trial."""
     on_front: bool | None
-    """Whether no other point of its group dominates it; None without an error, and for what is no
-    choice."""
+    """True on the Pareto front of its group; None without an error, and for a yardstick."""
 
 
 def rows_of(experiment: Experiment, run: Run) -> list[Row]:
-    """Return the points of a run in their declared order, without those it did not measure.
+    """Return the measured points of a run in their declared order.
 
     Raises:
         TrilightError: the run is of another experiment, or nothing was measured.
@@ -61,7 +60,8 @@ def rows_of(experiment: Experiment, run: Run) -> list[Row]:
 
 def table_of(experiment: Experiment, run: Run) -> Iterator[list[str]]:
     """Yield the headings, and the cells of every point with the range of its cost."""
-    rows, columns = rows_of(experiment, run), columns_of(experiment)
+    rows = rows_of(experiment, run)
+    columns = columns_of(experiment)
     has_front = experiment.error is not None and any(row.on_front is not None for row in rows)
     yield ["setting", *(column.name for column in columns), *(["front"] if has_front else [])]
     for row in rows:
@@ -74,7 +74,7 @@ def table_of(experiment: Experiment, run: Run) -> Iterator[list[str]]:
 
 
 def _cell(column: Column, row: Row) -> str:
-    """Return one cell: decibels with one digit behind the point, n/a for what is not known."""
+    """Return one cell: decibels with one decimal, n/a for an unknown value."""
     value = row.values.get(column.name)
     if value is None:
         return "" if column.over == "pair" else "n/a"
@@ -96,17 +96,18 @@ _OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {
 
 
 def _values(experiment: Experiment, run: Run, point: Point) -> dict[str, float]:
-    whole, found = run.whole_trials(), {}
+    whole_trials = run.whole_trials()
+    values = {}
     for column in columns_of(experiment):
         if column.over == "pair":
             figures, trials = _differences(column, run, point)
         else:
-            trials = [t for t in whole if column.figure in run.trials[t][point.name]]
+            trials = [t for t in whole_trials if column.figure in run.trials[t][point.name]]
             figures = [run.trials[t][point.name][column.figure] for t in trials]
         if figures:
             value = _over(column, figures, [experiment.cluster(trial) for trial in trials])
-            found[column.name] = column.then(value) if column.then else value
-    return found
+            values[column.name] = column.then(value) if column.then else value
+    return values
 
 
 def _over(column: Column, figures: Sequence[float], clusters: Sequence[str]) -> float:
@@ -116,7 +117,7 @@ def _over(column: Column, figures: Sequence[float], clusters: Sequence[str]) -> 
 
 
 def _differences(column: Column, run: Run, point: Point) -> tuple[list[float], list[str]]:
-    """Return a point's figures less its rival's, with the trials that have both."""
+    """Return a point's figures minus its rival's, and the trials that have both."""
     if point.rival is None:
         return [], []
     name = column.figure
@@ -129,14 +130,14 @@ def _differences(column: Column, run: Run, point: Point) -> tuple[list[float], l
 
 
 def _intervals(experiment: Experiment, run: Run, point: Point) -> dict[str, tuple[float, float]]:
-    found = {}
+    intervals = {}
     for column in columns_of(experiment):
         if column.over == "pair":
             differences, trials = _differences(column, run, point)
             if differences:
                 clusters = [experiment.cluster(trial) for trial in trials]
-                found[column.name] = mean_interval(differences, clusters)
-    return found
+                intervals[column.name] = mean_interval(differences, clusters)
+    return intervals
 
 
 def _cost_range(experiment: Experiment, run: Run, point: str) -> tuple[float, float] | None:
@@ -152,11 +153,13 @@ def _cost_range(experiment: Experiment, run: Run, point: str) -> tuple[float, fl
 def _front(
     experiment: Experiment, known: Sequence[Point], values: Mapping[str, Mapping[str, float]]
 ) -> dict[str, bool]:
-    """Return which points of each group are on its front, by name."""
+    """Return by name whether a point is on the Pareto front of its group."""
     if experiment.error is None:
         return {}
-    error, sign = experiment.error.name, -1 if experiment.better == "higher" else 1
-    costs, found = (experiment.cost.name, *experiment.also_cost), dict[str, bool]()
+    error = experiment.error.name
+    sign = -1 if experiment.better == "higher" else 1
+    costs = (experiment.cost.name, *experiment.also_cost)
+    front = dict[str, bool]()
     for group in dict.fromkeys(point.group for point in known):
         names = [
             point.name
@@ -166,5 +169,5 @@ def _front(
         figures = [
             (sign * values[name][error], [values[name][cost] for cost in costs]) for name in names
         ]
-        found |= dict(zip(names, on_front(figures), strict=True))
-    return found
+        front |= dict(zip(names, on_front(figures), strict=True))
+    return front

@@ -1,7 +1,7 @@
 """Runs one experiment: every point once in each trial, stored as soon as it is measured.
 
-Machines drift. The points of an experiment are therefore measured in turn (A B A B ...), and only
-ratios within one run are claims.
+Machines drift. The points of an experiment are therefore measured alternately (A B A B ...), and
+only ratios within one run are meaningful.
 """
 
 import contextlib
@@ -30,11 +30,11 @@ from storage.errors import Rejected, TrilightError
 RESULTS = ROOT / "docs" / "results" / "bench"
 
 TrialDone = Callable[[int, int], None]
-"""Called with the number of finished trials and of all trials."""
+"""Callback with the number of finished trials and of all trials."""
 
 
 def results_path(name: str, scale: BenchScale) -> Path:
-    """Return the file of an experiment's results where no other one is named."""
+    """Return the default file of an experiment's results."""
     suffix = "" if scale.name == "full" else f"-{scale.name}"
     return RESULTS / f"{name}{suffix}.jsonl"
 
@@ -46,14 +46,12 @@ def run(
     out: Path,
     trial_done: TrialDone = lambda done, total: None,
 ) -> Run:
-    """Measure what is missing of an experiment, draw its plot beside `out`, and return its run.
+    """Measure the missing trials of an experiment, draw its plot next to `out`; return its run.
 
-    A run of the same plan that was interrupted resumes. Trials that were measured are not measured
-    again; an interrupted trial is.
+    An interrupted run of the same plan resumes. Only its interrupted trial is measured again.
 
     Raises:
-        TrilightError: something that the experiment needs is missing, or no trial could be
-            measured.
+        TrilightError: a requirement of the experiment is missing, or no trial could be measured.
     """
     if lack := missing_need(experiment, options):
         raise TrilightError(f"bench {experiment.name}: {lack}.")
@@ -105,7 +103,8 @@ def _measure(
     trial_done: TrialDone,
 ) -> None:
     """Measure the trials that a run lacks."""
-    missing, total = current.missing_trials(), len(current.plan["trials"])
+    missing = current.missing_trials()
+    total = len(current.plan["trials"])
     if experiment.warm_up and missing:
         for _ in experiment.measure(context, points, missing[0]):
             pass

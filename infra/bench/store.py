@@ -1,8 +1,8 @@
-"""Results on disk: one JSON line a point and trial, so that a killed run resumes.
+"""Results on disk: a JSON line for each point and trial, so that a killed run resumes.
 
-A file holds the runs of one experiment, one after the other. Of a run the first line is its plan
-with machine, commit and date, the last one its end; a line that was being written when the power
-failed is cut off.
+A file holds the runs of one experiment, one after the other. The first line of a run is its plan
+with machine, commit and date, its last line is the end; an incomplete line of a killed run is cut
+off.
 """
 
 import datetime
@@ -19,65 +19,65 @@ from storage.errors import TrilightError
 
 @dataclass(kw_only=True)
 class Run:
-    """One run, finished or not."""
+    """Run of an experiment, finished or not."""
 
     plan: Mapping[str, Any]
-    """All that its figures depend on: points, trials, scale, options, machine."""
+    """Everything that its figures depend on: points, trials, scale, options, machine."""
     date: str
-    """The day on which it began, such as 2026-11-22."""
+    """Day of its start, such as 2026-11-22."""
     trials: dict[str, dict[str, Figures]] = field(default_factory=dict)
     """Figures by trial and point."""
     left_out: dict[str, str] = field(default_factory=dict)
-    """Trials that count for no point: why."""
+    """Reason by trial of trials that count for no point."""
     notes: list[str] = field(default_factory=list)
-    """Facts that belong to the result, such as the network's name."""
+    """Remarks on the result, such as the network's name."""
     seconds: float | None = None
-    """Wall time since the run last resumed; None where it has not ended."""
+    """Wall-clock seconds since the run last resumed; None for an unfinished run."""
 
     def whole_trials(self) -> list[str]:
-        """Return the trials in which every point of the plan was measured."""
+        """Return the trials that have every point of the plan."""
         points = {point["name"] for point in self.plan["points"]}
         return [trial for trial in self.plan["trials"] if points <= set(self.trials.get(trial, {}))]
 
     def missing_trials(self) -> list[str]:
-        """Return the trials that are still to be measured."""
+        """Return the trials that are not measured yet."""
         done = {*self.whole_trials(), *self.left_out}
         return [trial for trial in self.plan["trials"] if trial not in done]
 
 
 class Store:
-    """The runs of one experiment in one file."""
+    """File with the runs of one experiment."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def runs(self) -> list[Run]:
-        """Return all runs, oldest first; none where there is no file.
+        """Return all runs, oldest first; empty without a file.
 
         Raises:
-            TrilightError: the file holds something else.
+            TrilightError: the file holds no runs.
         """
-        found: list[Run] = []
+        runs: list[Run] = []
         for number, line in enumerate(self._whole_lines(), 1):
             try:
                 record = json.loads(line)
                 if "plan" in record:
-                    found.append(Run(plan=record["plan"], date=record["date"]))
+                    runs.append(Run(plan=record["plan"], date=record["date"]))
                 else:
-                    _take(found[-1], record)
+                    _take(runs[-1], record)
             except (ValueError, LookupError, TypeError) as error:
                 raise TrilightError(
                     f"{self.path}: line {number} is no row of `trilight bench`; expected a file "
                     "that it wrote. Name another one by --out."
                 ) from error
-        return found
+        return runs
 
     def newest(self) -> Run | None:
-        """Return the last run that has ended."""
+        """Return the last finished run, or None."""
         return next((run for run in reversed(self.runs()) if run.seconds is not None), None)
 
     def begin(self, plan: Mapping[str, Any]) -> Run:
-        """Return the last run where it has this plan and has not ended, else a new one."""
+        """Return the last run if it is unfinished and has this plan, else a new run."""
         plain = json.loads(json.dumps(plan))
         runs = self.runs()
         if runs and runs[-1].seconds is None and runs[-1].plan == plain:
@@ -91,7 +91,7 @@ class Store:
         self._write(run, {"trial": trial, "point": point, "figures": dict(figures)})
 
     def leave_out(self, run: Run, trial: str, why: str) -> None:
-        """Write that a trial counts for no point."""
+        """Write that a trial counts for no point, and why."""
         self._write(run, {"trial": trial, "left_out": why})
 
     def end(self, run: Run, seconds: float, notes: list[str]) -> None:
@@ -122,4 +122,5 @@ def _take(run: Run, record: Mapping[str, Any]) -> None:
     elif "left_out" in record:
         run.left_out[record["trial"]] = record["left_out"]
     else:
-        run.seconds, run.notes = record["seconds"], record["notes"]
+        run.seconds = record["seconds"]
+        run.notes = record["notes"]

@@ -1,17 +1,17 @@
-"""For Blender: makes an imported Trilight scene look exactly as Trilight renders it.
+"""Blender script that makes an imported Trilight scene look exactly as Trilight renders it.
 
-USD has no word for Trilight's material, so that an import shows one that is alike: its gloss takes
-light from what is below it, and lamps are seen. Open the USD file (File > Import > Universal Scene
+USD cannot express Trilight's material, so that an import shows a similar one: its gloss takes light
+from the layer below, and lamps are visible. Open the USD file (File > Import > Universal Scene
 Description), open this file in the text editor and press Run Script; or, from the command line,
 
     blender --python exact_materials.py -- scene.usdz
 
 A material becomes Add(Principled BSDF without gloss, Glossy BSDF "Multiscatter GGX"), which has no
-Fresnel term. The Principled BSDF stays what people edit and what Blender exports: the gloss follows
-its roughness and its specular tint. Emitters are hidden from camera rays alone. Textures are
-interpolated between linear values instead of encoded ones. A sky is turned as the scene says, and
-seen by cameras only where it is there. (Blender imports a sky into the world of its scene; this
-needs one.) It needs nothing but Blender 4.2 or later.
+Fresnel term. The Principled BSDF stays the one that users edit and that Blender exports: the gloss
+follows its roughness and its specular tint. Emitters are hidden from camera rays only. Textures are
+interpolated between linear values instead of encoded ones. A sky is rotated as in the scene, and is
+visible to cameras only if the scene says so. (Blender imports a sky into the world of its scene,
+which must exist.) The script needs only Blender 4.2 or later.
 """
 
 import sys
@@ -23,8 +23,10 @@ from mathutils import Matrix
 
 _PREFIX = "trilight:"
 
-_GLOSS, _SUM, _LINEAR = "Trilight gloss", "Trilight sum", "Trilight linear"
-"""Names of what a restored material has beside its Principled BSDF; of textures the beginning."""
+_GLOSS = "Trilight gloss"
+_SUM = "Trilight sum"
+_LINEAR = "Trilight linear"
+"""Names of the nodes that are added to a restored material; the last is a prefix."""
 
 
 def restore_scene() -> tuple[int, int]:
@@ -47,9 +49,9 @@ def restore_scene() -> tuple[int, int]:
 
 
 def restore_sky() -> None:
-    """Turn the world's picture as the scene says, and hide it from cameras where it is not seen.
+    """Rotate the world's picture as in the scene, and hide it from cameras if the scene says so.
 
-    A scene without a sky has no world: the one that Blender begins with is grey, and lights it.
+    A scene without a sky gets no world: Blender's default one is gray, and would light it.
     """
     world = bpy.context.scene.world
     marked = [item for item in bpy.data.objects if f"{_PREFIX}skyVisibleToCamera" in item]
@@ -61,14 +63,15 @@ def restore_sky() -> None:
     world.cycles_visibility.camera = bool(marked[0][f"{_PREFIX}skyVisibleToCamera"])
     rows = np.array([list(marked[0][f"{_PREFIX}skyRotationRow{row}"]) for row in range(3)])
     for node in world.node_tree.nodes:
-        if node.bl_idname == "ShaderNodeMapping":  # of directions of the world to those of the map
+        if node.bl_idname == "ShaderNodeMapping":  # maps directions of the world to the map's
             node.vector_type = "POINT"
             node.inputs["Rotation"].default_value = Matrix(rows.T.tolist()).to_euler("XYZ")
 
 
 def restore_view() -> None:
-    """Look through the first camera at square pictures of Cycles, where no camera is chosen yet."""
-    scene, first = bpy.context.scene, bpy.data.objects.get("camera_0")
+    """Select Cycles, and if no camera is chosen yet, the first camera with square pictures."""
+    scene = bpy.context.scene
+    first = bpy.data.objects.get("camera_0")
     scene.render.engine = "CYCLES"
     if first is not None and scene.camera in (None, first):
         scene.camera = first
@@ -76,9 +79,9 @@ def restore_view() -> None:
 
 
 def interpolate_linear_values(image: Any) -> Any:
-    """Return a copy of a texture that holds linear values: Cycles decodes sRGB after interpolating.
+    """Return a copy of a texture with linear values, since Cycles decodes sRGB after interpolation.
 
-    None where the texture holds such values already.
+    None if the texture holds linear values already.
     """
     if image.is_float or image.colorspace_settings.name != "sRGB" or not image.size[0]:
         return None
@@ -102,14 +105,15 @@ def property_of(item: Any, name: str) -> Any:
 
 
 def restore_material(material: Any) -> None:
-    """Take the gloss of a material out of its Principled BSDF, and add it beside it."""
-    nodes, link = material.node_tree.nodes, material.node_tree.links.new
+    """Move the gloss of a material from its Principled BSDF into a separate shader."""
+    nodes = material.node_tree.nodes
+    link = material.node_tree.links.new
     base = next((n for n in nodes if n.bl_idname == "ShaderNodeBsdfPrincipled"), None)
     if base is None or _GLOSS in nodes:
         return
     for node in [node for node in nodes if node.bl_idname == "ShaderNodeTexImage" and node.image]:
         show_linear_values(material.node_tree, node)
-    gloss = nodes.new("ShaderNodeBsdfAnisotropic")  # what "Glossy BSDF" is called inside
+    gloss = nodes.new("ShaderNodeBsdfAnisotropic")  # internal name of "Glossy BSDF"
     gloss.name = gloss.label = _GLOSS
     gloss.distribution = "MULTI_GGX"
     follow(material, "specularAlbedo", base.inputs["Specular Tint"], gloss.inputs["Color"])
@@ -125,43 +129,46 @@ def restore_material(material: Any) -> None:
 
 
 def follow(material: Any, name: str, base: Any, gloss: Any) -> None:
-    """Let an input of the gloss have the texture of that of its base; without one, a property.
+    """Connect an input of the gloss to the texture of its base, or drive both by a property.
 
-    The property then is what people edit, and what Blender exports.
+    Users then edit the property, and Blender exports it.
     """
     if base.is_linked:
         material.node_tree.links.new(base.links[0].from_socket, gloss)
         return
     is_color = base.type == "RGBA"
-    shown = list(base.default_value)[:3] if is_color else base.default_value
-    if not np.allclose(shown, material[_PREFIX + name], rtol=1e-6):  # edited before this script
-        material[_PREFIX + name] = shown
+    value = list(base.default_value)[:3] if is_color else base.default_value
+    if not np.allclose(value, material[_PREFIX + name], rtol=1e-6):  # edited before this script
+        material[_PREFIX + name] = value
     for socket in (base, gloss):
         curves = socket.driver_add("default_value")
         for channel, curve in enumerate(curves[:3] if is_color else [curves]):
             curve.driver.type = "AVERAGE"
             target = curve.driver.variables.new().targets[0]
-            target.id_type, target.id = "MATERIAL", material
+            target.id_type = "MATERIAL"
+            target.id = material
             part = f"[{channel}]" if is_color else ""
             target.data_path = f'["{_PREFIX}{name}"]{part}'
 
 
 def show_linear_values(tree: Any, node: Any) -> None:
-    """Put a copy with linear values in the place of a texture, which stays what is exported."""
+    """Show a copy of a texture with linear values; the original is still the exported one."""
     held = interpolate_linear_values(node.image)
     if held is None:
         return
-    shown = tree.nodes.new("ShaderNodeTexImage")
-    shown.name, shown.image, shown.extension = f"{_LINEAR} {node.name}", held, node.extension
+    linear_node = tree.nodes.new("ShaderNodeTexImage")
+    linear_node.name = f"{_LINEAR} {node.name}"
+    linear_node.image = held
+    linear_node.extension = node.extension
     for known in node.inputs["Vector"].links:
-        tree.links.new(known.from_socket, shown.inputs["Vector"])
+        tree.links.new(known.from_socket, linear_node.inputs["Vector"])
     chosen = tree.nodes.new("ShaderNodeMix")  # Blender exports the first texture that it finds
     chosen.data_type = "RGBA"
     factor, first, second = (chosen.inputs[n] for n in (0, 6, 7))
     factor.default_value = 1.0
     targets = [known.to_socket for known in node.outputs["Color"].links]
     tree.links.new(node.outputs["Color"], first)
-    tree.links.new(shown.outputs["Color"], second)
+    tree.links.new(linear_node.outputs["Color"], second)
     for target in targets:
         tree.links.new(chosen.outputs[2], target)
 

@@ -1,4 +1,4 @@
-"""The command `trilight`: what it does with a mistake, and with Ctrl-C."""
+"""Entry point of the command `trilight`: handles mistakes, missing memory and Ctrl-C."""
 
 import logging
 import os
@@ -11,35 +11,35 @@ from types import FrameType
 from cyclopts import CycloptsError
 
 from infra.cli.commands import app, complaint
-from infra.cli.extending import extended
-from infra.cli.leaving import InertFormatter, leave, open_missing_streams
+from infra.cli.extend_option import load_extensions
+from infra.cli.process_exit import InertFormatter, leave, open_missing_streams
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.extensions import mistake_in_extension
 
 _ENOUGH_BYTES = 2 << 30
-_ROOM = [bytearray(16 << 20)]  # given back where memory lacks, so that it can be said
+_ROOM = [bytearray(16 << 20)]  # freed where memory lacks, so that a message can be printed
 
 
 def main() -> None:
     """Run the command line; a mistake of the user is one line on stderr and exit status 1."""
-    # torch's threads would wait for each other in busy loops, which beside other work made training
-    # twelve times slower; read when torch is imported, and a setting of the user's own wins
+    # torch's threads would spin while they wait, which made training beside other work twelve
+    # times slower; torch reads the variable at its import, and a value that the user set wins
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of caches
-    os.environ["MPLBACKEND"] = "agg"  # a notebook's, or one that is not there, ends the import
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it reports its caches
+    os.environ["MPLBACKEND"] = "agg"  # a notebook's or a missing backend fails at the import
     if not os.environ.get("COLUMNS", "80").strip("0"):  # rich prints nothing in no columns
         del os.environ["COLUMNS"]
-    signal.signal(signal.SIGINT, _interrupted)
+    signal.signal(signal.SIGINT, _on_interrupt)
     open_missing_streams()
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(InertFormatter())
     try:
         _require_usable_names()
         if "TRILIGHT_CONFINE" in os.environ:  # at once, though no file may have to be read
-            from pipeline.isolation.confinement import wanted_confinement
+            from pipeline.isolation.confinement import confinement_mode
 
-            wanted_confinement()
-        app(extended(sys.argv[1:]))
+            confinement_mode()
+        app(load_extensions(sys.argv[1:]))
         sys.stdout.flush()
     except CycloptsError as mistake:
         leave(f"trilight: {complaint(mistake)}", 2)
@@ -51,20 +51,20 @@ def main() -> None:
         if its_author is not None:
             leave(f"trilight: {its_author}", 1)
         if isinstance(error, OSError):
-            _blame_output(error)
+            _leave_without_output(error)
         _leave_without_memory(error)
         raise
 
 
 def _leave_without_memory(error: Exception) -> None:
-    """End with a sentence where memory lacks: every library fails in its own way then."""
+    """End with one sentence where memory lacks: each library fails in a different way then."""
     if isinstance(error, MemoryError) or _describe_limit():
         said = f"too little memory ({type(error).__name__}); what was finished is safe."
         leave(f"trilight: {said}{_describe_limit()}", EnvironmentFailure.exit_status)
 
 
 def _describe_limit() -> str:
-    """Return a sentence about a limit of memory that few commands get along with, or ""."""
+    """Return a sentence about a memory limit that is too low for most commands, or ""."""
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit == resource.RLIM_INFINITY or limit >= _ENOUGH_BYTES:
         return ""
@@ -74,8 +74,8 @@ def _describe_limit() -> str:
     )
 
 
-def _blame_output(error: OSError) -> None:
-    """Leave where nothing can be printed any more."""
+def _leave_without_output(error: OSError) -> None:
+    """End the process where standard output cannot be written."""
     try:
         os.write(sys.stdout.fileno(), b"\n")
     except OSError:
@@ -84,7 +84,7 @@ def _blame_output(error: OSError) -> None:
 
 
 def _require_usable_names() -> None:
-    """Refuse a working folder that is gone, and names that no file format can hold."""
+    """Refuse a missing working folder, and names that are no text."""
     try:
         names = [os.getcwd(), *sys.argv[1:]]
     except OSError as error:
@@ -100,9 +100,9 @@ def _require_usable_names() -> None:
             )
 
 
-def _interrupted(signal_number: int, frame: FrameType | None) -> None:
-    again = shlex.join(["trilight", *sys.argv[1:]])
-    leave(f"trilight: interrupted. What was finished is safe; to go on, run: {again}", 130)
+def _on_interrupt(signal_number: int, frame: FrameType | None) -> None:
+    command = shlex.join(["trilight", *sys.argv[1:]])
+    leave(f"trilight: interrupted. What was finished is safe; to go on, run: {command}", 130)
 
 
 if __name__ == "__main__":

@@ -18,29 +18,29 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
-from infra.cli.options import Shown, command
+from infra.cli.options import OutputOptions, command
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings, Profile
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.errors import TrilightError
 from storage.records.objects import count_by_reason
 from storage.remote.safe_url import safe_url
-from storage.settings.described import checked, described
+from storage.settings.described import checked, describe_fields
 from storage.settings.ranges import Within
 
 if TYPE_CHECKING:
-    from pipeline.making.make_assets import AssetFolder, AssetReport
+    from pipeline.generation.make_assets import AssetFolder, AssetReport
 
 _BUDGET = 1400
-"""The finest level of the builds with 1536 triangles a scene."""
+"""Triangles: the finest level of the dataset presets with 1536 triangles a scene."""
 _EPSILON_BUDGET = 4096
-"""What the largest published scene may hold in all."""
+"""Triangles that the largest scene of RenderFormer may hold in all."""
 _SHOWN = 12
-_LEVELS = next(field.within for field in described(AssetSettings) if field.name == "budgets")
+_LEVELS = next(field.within for field in describe_fields(AssetSettings) if field.name == "budgets")
 
 
 @checked()
-class Meshes:
-    """Which objects become meshes, and how."""
+class AssetOptions:
+    """Objects and meshes."""
 
     source: str
     """Source of 3D objects: a folder or a URL, builtin:, or objaverse:."""
@@ -49,56 +49,54 @@ class Meshes:
     budget: Annotated[int | None, _LEVELS] = None
     """Maximum number of triangles of an object; by default 1400, or 4096 with --epsilon."""
     epsilon: str | None = None
-    """Maximum distance to the source, such as 0.5% of the diagonal: each object gets the fewest
-    triangles that keep it; by default the budget decides."""
+    """Mesh tolerance, such as 0.5% of the diagonal, by the fewest triangles; by default none."""
     profile: Profile = "faithful"
-    """Method: faithful puts triangles where the shape needs them, uniform makes them about equally
-    large."""
+    """Triangles are placed by shape (faithful) or are equally large (uniform)."""
     own_materials: bool = False
-    """Keep the materials and textures of the objects: those that have any become GLB files in their
-    own colours."""
+    """Keep the materials and textures of the objects, as GLB files."""
     licence: str | None = None
-    """Licence of object files that state none; by default such files count as your own work."""
+    """Licence of object files that state none; by default your own work."""
     allow_licences: tuple[str, ...] = ()
-    """Licences to allow in addition to the usual ones; by default there are none."""
+    """Licences to allow in addition to the usual ones; by default none."""
     workers: Annotated[int | None, Within(1, 1024, unit="objects")] = None
-    """Number of objects to work on at the same time; by default the number of cores."""
+    """Objects to process at the same time; by default the number of cores."""
 
 
 @command("source")
-def assets(asked: Meshes, shown: Shown) -> None:
-    settings = _settings(asked)
-    source, out = asked.source, asked.out
-    first_words(f"Meshes of {safe_url(source)} to {out}", silent=shown.json)
-    from pipeline.making.make_assets import AssetFolder, make_assets
+def assets(options: AssetOptions, output: OutputOptions) -> None:
+    settings = _settings(options)
+    source = options.source
+    out = options.out
+    first_words(f"Meshes of {safe_url(source)} to {out}", silent=output.json)
+    from pipeline.generation.make_assets import AssetFolder, make_assets
 
     folder = AssetFolder(out)
     with progress_bars() as bars:
-        fetched = bars.add_task("download", total=None, note="", visible=not shown.json)
-        task = bars.add_task("objects", total=None, note="", visible=not shown.json)
+        fetched = bars.add_task("download", total=None, note="", visible=not output.json)
+        task = bars.add_task("objects", total=None, note="", visible=not output.json)
         report = make_assets(
             source,
             folder,
             settings,
-            allowed_licences=(*DEFAULT_ALLOWED, *asked.allow_licences),
-            licence=asked.licence,
-            workers=asked.workers or os.cpu_count() or 1,
-            downloaded=lambda done, total: bars.update(fetched, completed=done, total=total),
-            planned=lambda total: bars.update(task, total=total),
-            done=lambda: bars.advance(task),
+            allowed_licences=(*DEFAULT_ALLOWED, *options.allow_licences),
+            licence=options.licence,
+            workers=options.workers or os.cpu_count() or 1,
+            on_download=lambda done, total: bars.update(fetched, completed=done, total=total),
+            on_plan=lambda total: bars.update(task, total=total),
+            on_object=lambda: bars.advance(task),
         )
-    if shown.json:
+    if output.json:
         print_json(report.as_json())
     else:
-        _tell(report, asked, settings, folder)
+        _print_report(report, options, settings, folder)
     if not report.rows:
         sys.exit(1)
 
 
-def _tell(
-    report: "AssetReport", asked: Meshes, settings: AssetSettings, folder: "AssetFolder"
+def _print_report(
+    report: "AssetReport", options: AssetOptions, settings: AssetSettings, folder: "AssetFolder"
 ) -> None:
-    """Print what became of the objects, and what to look at and do next."""
+    """Print the result for the objects, the page to look at, and the next command."""
     _print_table(report)
     decimated = [row for row in report.rows if row.method != "source"]
     rows = [
@@ -117,15 +115,15 @@ def _tell(
         next_step(
             generate_from_meshes(
                 report.geometry_sha256,
-                asked.out,
-                asked.allow_licences,
-                own_materials=asked.own_materials,
+                options.out,
+                options.allow_licences,
+                own_materials=options.own_materials,
             )
         )
 
 
 def _unread_rows(report: "AssetReport", folder: "AssetFolder") -> list[tuple[str, str]]:
-    from pipeline.making.unread import format_unread
+    from pipeline.generation.unread_notes import format_unread
 
     lines = format_unread(report.unread, folder.logs)
     return [("" if row else "not read", line) for row, line in enumerate(lines)]
@@ -148,32 +146,32 @@ def _material_rows(
 ) -> list[tuple[str, str]]:
     if not settings.own_materials.keep:
         return []
-    from pipeline.making.unread import format_unread
+    from pipeline.generation.unread_notes import format_unread
 
-    kept = sum(row.colours is not None for row in report.rows)
-    found = {row.uid: row.materials.reason for row in report.rows if row.materials}
-    lost = format_unread({uid: (why,) for uid, why in found.items() if why}, folder.page)
-    lines = [f"{kept} of {len(report.rows)}", *lost]
+    num_kept = sum(row.colours is not None for row in report.rows)
+    reasons = {row.uid: row.materials.reason for row in report.rows if row.materials}
+    lost = format_unread({uid: (why,) for uid, why in reasons.items() if why}, folder.page)
+    lines = [f"{num_kept} of {len(report.rows)}", *lost]
     return [("" if row else "in their own materials", line) for row, line in enumerate(lines)]
 
 
-def _settings(asked: Meshes) -> AssetSettings:
-    usual = _EPSILON_BUDGET if asked.epsilon else _BUDGET
+def _settings(options: AssetOptions) -> AssetSettings:
+    usual = _EPSILON_BUDGET if options.epsilon else _BUDGET
     return AssetSettings(
-        profile=asked.profile,
-        budgets=(usual if asked.budget is None else asked.budget,),
-        epsilon=_share(asked.epsilon) if asked.epsilon else None,
-        own_materials=OwnMaterialSettings(keep=asked.own_materials),
+        profile=options.profile,
+        budgets=(usual if options.budget is None else options.budget,),
+        epsilon=_parse_fraction(options.epsilon) if options.epsilon else None,
+        own_materials=OwnMaterialSettings(keep=options.own_materials),
     )
 
 
-def _share(text: str) -> float:
+def _parse_fraction(text: str) -> float:
     """Read 0.5% or 0.005."""
     try:
         return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
     except ValueError as error:
         raise TrilightError(
-            f"--epsilon is {text!r}; expected a share of the diagonal such as 0.5% or 0.005."
+            f"--epsilon is {text!r}; expected a fraction of the diagonal such as 0.5% or 0.005."
         ) from error
 
 

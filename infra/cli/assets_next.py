@@ -1,4 +1,4 @@
-"""Which dataset the meshes of `trilight assets` suffice for, as a command that runs."""
+"""The `generate` command for which the meshes of `trilight assets` suffice."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,26 +16,26 @@ def generate_from_meshes(
     *,
     own_materials: bool = False,
 ) -> list[str]:
-    """Return the words of a `generate` for which there are objects in every split that it needs.
+    """Return the words of a `generate` command whose splits all have objects.
 
-    With few objects a split may be empty: then as many scenes as come before it is needed, or if
-    no object is for training, all for testing.
+    With few objects a split may be empty: then the command makes only the scenes before the first
+    one that needs it, or if no object is for training, all scenes for testing.
 
     Args:
-        geometry_sha256: digests of the meshes, by which objects are dealt to splits.
-        folder: where they are.
-        allow_licences: those that were allowed beside the usual ones.
-        own_materials: whether meshes keep their own.
+        geometry_sha256: digests of the meshes, by which objects are assigned to splits.
+        folder: folder of the meshes.
+        allow_licences: licences that were allowed in addition to the usual ones.
+        own_materials: whether meshes keep the materials of their source.
     """
     splits = named_build(_BUILD).splits
-    there = {split_of_object(digest, splits) for digest in geometry_sha256}
+    present = {split_of_object(digest, splits) for digest in geometry_sha256}
     words = ["generate", _BUILD, "--objects", str(folder), "--out", f"{folder}-{_BUILD}"]
     shards = shards_for(BUILDS[_BUILD].num_scenes, splits)
-    enough = next((i for i in range(shards) if split_of_shard(i, splits) not in there), shards)
+    usable = next((i for i in range(shards) if split_of_shard(i, splits) not in present), shards)
     if own_materials:
         words += ["--set", "scenes.materials.source=object"]
-    if enough == 0:
+    if usable == 0:
         words += ["--set", "splits.one_split=true"]
-    elif enough < shards:
-        words += ["--scenes", str(enough * splits.scenes_per_shard)]
+    elif usable < shards:
+        words += ["--scenes", str(usable * splits.scenes_per_shard)]
     return [*words, *(word for name in allow_licences for word in ("--allow-licences", name))]

@@ -1,4 +1,4 @@
-"""`trilight bench`: lists the experiments, measures one, or shows its results."""
+"""`trilight bench`: lists the experiments, runs one, or prints its results."""
 
 from collections import Counter
 from pathlib import Path
@@ -19,26 +19,26 @@ if TYPE_CHECKING:
 
 
 @checked()
-class BenchCommand:
-    """The experiment, and the file of its results."""
+class BenchRunOptions:
+    """Experiment and results."""
 
     names: tuple[str, ...] = ()
     """Name of an experiment; by default all are listed and none is run."""
     quick: bool = False
-    """Measure for minutes instead of hours: it shows that all works, and is nothing to quote."""
+    """Measure for minutes, not hours: a check, with no figures to quote."""
     out: Path | None = None
     """File for the results, with the plot beside it; by default docs/results/bench/NAME.jsonl of
     the checkout."""
     show: bool = False
-    """Measure nothing: print the table of the newest finished run in the file."""
+    """Print the newest finished run of the file, and measure nothing."""
 
 
 _COLUMNS = 8
-"""Most columns of a table that stay readable side by side; further ones stand below."""
+"""Maximum number of columns side by side; further ones are printed below."""
 
 
 @command("names")
-def bench(measured: BenchCommand, options: BenchOptions) -> None:
+def bench(run_options: BenchRunOptions, options: BenchOptions) -> None:
     try:
         from infra.bench.catalogue import experiment_of
         from infra.bench.experiment import FULL, QUICK
@@ -51,16 +51,16 @@ def bench(measured: BenchCommand, options: BenchOptions) -> None:
             "bench: an installed Trilight has no experiments; expected a checkout. Clone the "
             "repository and run the command there."
         ) from error
-    if not measured.names and not measured.show:
+    if not run_options.names and not run_options.show:
         _list_experiments()
         return
-    if len(measured.names) != 1:
-        number = len(measured.names)
+    if len(run_options.names) != 1:
+        number = len(run_options.names)
         raise TrilightError(f"bench: {number} experiments named; expected one of `trilight bench`.")
-    experiment = experiment_of(measured.names[0])
-    scale = QUICK if measured.quick else FULL
-    out = measured.out or results_path(experiment.name, scale)
-    if measured.show:
+    experiment = experiment_of(run_options.names[0])
+    scale = QUICK if run_options.quick else FULL
+    out = run_options.out or results_path(experiment.name, scale)
+    if run_options.show:
         newest = Store(out).newest()
         if newest is None:
             raise TrilightError(f"{out}: it has no finished run; leave --show out to measure one.")
@@ -69,14 +69,14 @@ def bench(measured: BenchCommand, options: BenchOptions) -> None:
     first_words(f"Measuring {experiment.name}: {experiment.title}")
     with progress_bars() as bars:
         task = bars.add_task("trials", total=None, note=experiment.name)
-        found = run(
+        result = run(
             experiment,
             scale,
             options,
             out,
             lambda done, total: bars.update(task, completed=done, total=total),
         )
-    _print_run(experiment, found)
+    _print_run(experiment, result)
     console.print(f"Written: {out} and {out.with_suffix('.png').name}", style="bold")
 
 
@@ -85,11 +85,11 @@ def _print_run(experiment: "Experiment", run: "Run") -> None:
 
     names, *lines = table_of(experiment, run)
     for first in range(1, len(names), _COLUMNS):
-        shown = slice(first, first + _COLUMNS)
+        columns = slice(first, first + _COLUMNS)
         title = experiment.title if first == 1 else "Further columns"
-        table = Table(names[0], *names[shown], box=None, title=title, title_justify="left")
+        table = Table(names[0], *names[columns], box=None, title=title, title_justify="left")
         for line in lines:
-            table.add_row(Text(line[0]), *map(Text, line[shown]))
+            table.add_row(Text(line[0]), *map(Text, line[columns]))
         console.print(table)
     machine = run.plan["machine"]
     measured_on = (machine.get("gpu"), machine["processor"], f"{machine['cores']} cores")

@@ -1,4 +1,4 @@
-"""Settings that differ from the named ones: as a dataset or run has them, of a file, by `--set`."""
+"""Changes to the settings of a preset: from a dataset, a run, a YAML file, or `--set`."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,25 +11,25 @@ from storage.settings.described import checked, settings_record
 from storage.typed_json import read_json
 
 _OF_SOURCES = ("build", "derived", "revisit")
-"""What the settings of a dataset say of its name and of the datasets that it was made of."""
+"""Settings of a dataset that name its preset and the datasets that it was made from."""
 
 if TYPE_CHECKING:
-    from infra.cli.settings_file import Stated
+    from infra.cli.settings_file import StatedSettings
 
 
 @checked()
-class Shared:
-    """Settings from elsewhere, which other options and --set change further."""
+class BaseSettings:
+    """Base settings."""
 
     like: str | None = None
-    """Dataset (a folder or a URL), or for train a run (its folder), whose settings to use; by
-    default those of the given name."""
+    """Dataset, or for train a run's folder, whose settings to use; by default those of the
+    preset."""
     settings: str | None = None
-    """YAML file of changed settings, nested or by dotted names; by default there is none."""
+    """YAML file of changed settings, nested or by dotted names; by default none."""
 
     @property
     def is_given(self) -> bool:
-        """Whether there are any."""
+        """Whether base settings are stated at all."""
         return (self.like, self.settings) != (None, None)
 
 
@@ -55,71 +55,71 @@ def parse_changes(texts: Iterable[str]) -> dict[str, Any]:
 
 
 def all_changes(
-    settings: Any, shared: Shared, liked: Mapping[str, Any], stated: Mapping[str, Any]
+    settings: Any, base: BaseSettings, liked: Mapping[str, Any], stated: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return by dotted name what differs from named settings, and check that all fits together.
+    """Return all changes to a preset's settings by dotted name, and check the changed settings.
 
     Args:
-        settings: the named ones.
-        shared: names a file, which counts more than `liked`.
-        liked: the record of other settings that was asked for, or none.
-        stated: values that other options and `--set` state, by dotted name; they count most.
+        settings: settings of the preset.
+        base: names a settings file, which overrides `liked`.
+        liked: record of the settings to use instead of the preset's; may be empty.
+        stated: values of other options and of `--set` by dotted name; they override both.
 
     Raises:
-        TrilightError: a file that cannot be read, or a value that is refused; where it is one of
-            the file, its line is named.
+        TrilightError: a file cannot be read, or a value is refused; for a value of the file, the
+            message names its line.
     """
-    filed = {} if shared.settings is None else _read(shared.settings)
+    filed = {} if base.settings is None else _read(base.settings)
     values = {name: value for name, (value, _) in filed.items()}
-    found: dict[str, Any] = {}
+    merged: dict[str, Any] = {}
     for layer in (differences(settings_record(settings), liked), values, stated):
-        for name, value in layer.items():  # a whole group takes the place of what was in it
-            kept = [old for old in found if not f"{old}.".startswith(f"{name}.")]
-            found = {old: found[old] for old in kept} | {name: value}
+        for name, value in layer.items():  # a whole group replaces the values within it
+            unchanged = [old for old in merged if not f"{old}.".startswith(f"{name}.")]
+            merged = {old: merged[old] for old in unchanged} | {name: value}
     try:
-        changed(settings, found)
+        changed(settings, merged)
     except TrilightError as error:
         lines = [line for name, (_, line) in filed.items() if f"'{name}'" in str(error)]
         if not lines:
             raise
-        raise TrilightError(f"{shared.settings}, line {lines[0]}: {error}") from error
-    return found
+        raise TrilightError(f"{base.settings}, line {lines[0]}: {error}") from error
+    return merged
 
 
-def _read(file: str) -> "Stated":
+def _read(file: str) -> "StatedSettings":
     from infra.cli.settings_file import read_settings_file  # YAML takes time to import
 
     return read_settings_file(file)
 
 
-def dataset_record(shared: Shared) -> dict[str, Any]:
-    """Return the settings of the dataset that is to be followed, without the name of its build."""
+def dataset_record(base: BaseSettings) -> dict[str, Any]:
+    """Return the settings of the dataset of `--like`, without the name of its preset."""
     from storage.dataset.dataset import open_dataset
 
-    settings = {} if shared.like is None else open_dataset(shared.like).manifest.settings
-    found = {name: value for name, value in settings.items() if name not in _OF_SOURCES}
-    if "listed_shards" in found.get("splits", {}):  # those of yet another dataset
-        splits = found["splits"].items()
-        found["splits"] = {name: value for name, value in splits if name != "listed_shards"}
-    return found
+    settings = {} if base.like is None else open_dataset(base.like).manifest.settings
+    record = {name: value for name, value in settings.items() if name not in _OF_SOURCES}
+    if "listed_shards" in record.get("splits", {}):  # those of yet another dataset
+        splits = record["splits"].items()
+        record["splits"] = {name: value for name, value in splits if name != "listed_shards"}
+    return record
 
 
-def run_record(shared: Shared) -> dict[str, Any]:
-    """Return the settings of the run that is to be followed, without its name.
+def run_record(base: BaseSettings) -> dict[str, Any]:
+    """Return the settings of the run of `--like`, without the name of its preset.
 
     Raises:
-        TrilightError: the folder is not that of a run, or the run uses what was removed.
+        TrilightError: the folder is not that of a run, or the run uses a removed feature.
     """
-    if shared.like is None:
+    if base.like is None:
         return {}
-    from train.stored_settings import known_settings  # it brings the checker of settings along
+    from train.stored_settings import known_settings  # slow: imports pydantic
 
-    path = Path(shared.like) / "settings.json"
+    path = Path(base.like) / "settings.json"
     try:
         settings = dict(read_json(read_plain(path), dict[str, Any], str(path))["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrilightError(
-            f"--like {shared.like}: {path} cannot be read; expected the folder of a run."
+            f"--like {base.like}: {path} cannot be read; expected the folder of a run."
         ) from error
-    known = known_settings(settings, f"--like {shared.like}")
+    known = known_settings(settings, f"--like {base.like}")
     return {name: value for name, value in known.items() if name != "run"}

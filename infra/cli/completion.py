@@ -1,4 +1,4 @@
-"""Names that a shell completes; asked at every press of the tab key."""
+"""Names that a shell completes; each press of the tab key imports this module."""
 
 from collections.abc import Callable
 
@@ -33,4 +33,4 @@ NAMES: dict[str, Callable[[], list[str]]] = {
     "network": _sizes,
     "runner": _runners,
 }
-"""Names that are known by the field that takes one, or something of the user's own."""
+"""Known names by the field that takes one; a field may also take a name that is not listed."""

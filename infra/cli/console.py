@@ -1,4 +1,4 @@
-"""What people see: first words, tables, progress bars with rate and ETA, and what to do next."""
+"""Output for people: first lines, tables, progress bars with rate and ETA, and next commands."""
 
 import json
 import os
@@ -24,7 +24,7 @@ from rich.segment import Segment
 from rich.table import Column, Table
 from rich.text import Text
 
-from infra.cli.extending import extend_words
+from infra.cli.extend_option import extend_words
 
 _OBEYED = dict.fromkeys(
     [
@@ -33,12 +33,12 @@ _OBEYED = dict.fromkeys(
         *(0x61C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)),
     ]
 )
-"""Characters that a terminal obeys instead of showing them, such as ESC, and those that turn the
-direction of writing; none has a width."""
+"""Control characters, such as ESC, and those that change the direction of writing; a terminal
+obeys them instead of showing them."""
 
 
 class _TextConsole(Console):
-    """Prints text as it is: names of strangers' files hold no colors, emojis or commands."""
+    """Console that prints text literally, so that file names cannot hold colors or commands."""
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
@@ -50,31 +50,30 @@ class _TextConsole(Console):
 
 console = _TextConsole(stderr=False, highlight=False, markup=False, emoji=False)
 if not console.is_terminal and "COLUMNS" not in os.environ:
-    console.width = 1000  # of a log, which is searched by whole words
+    console.width = 1000  # a log is searched by whole words, so that no line is wrapped
 
 _LEAST_RATED_S = 1.0
-"""No rate is printed for tasks that are shorter."""
+"""Seconds before a task's rate is printed."""
 
 
 def first_words(text: str, *, silent: bool = False) -> None:
-    """Print what begins now; call before anything slow is imported or read.
+    """Print what begins now, before slow imports and reads.
 
     Args:
         text: a sentence without its full stop.
-        silent: whether the outcome is printed as JSON, beside which nothing is printed.
+        silent: print nothing, because the output is JSON.
     """
     if not silent:
         console.print(Text(f"{text} ...", style="dim"), soft_wrap=True)
 
 
 def next_step(*commands: Sequence[str], recorded: Mapping[str, str] = MappingProxyType({})) -> None:
-    """Print commands that go on from here, one a line; each has to run as it is printed.
+    """Print the next commands, one a line, each as it can be typed.
 
     Args:
-        commands: the words of each without `trilight`; paths as they are, since they are quoted
-            here.
-        recorded: extensions of the dataset, as its manifest lists them; those that are loaded here
-            are named anyway.
+        commands: words of each command without `trilight`, not quoted.
+        recorded: extensions of the dataset by name, as its manifest lists them; those that this
+            process loaded are named anyway.
     """
     for row, words in enumerate(commands):
         lead = "     " if row else "\nNext:"
@@ -83,18 +82,18 @@ def next_step(*commands: Sequence[str], recorded: Mapping[str, str] = MappingPro
 
 
 def command_line(words: Sequence[str], recorded: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Return a command as it is typed, with the files of `extend_words`."""
+    """Return a command as it is typed, with its `--extend` files."""
     safe = [f"./{word}" if re.match("-[^-].*/", word) else word for word in words]
     return shlex.join(["trilight", *safe, *extend_words(recorded)])
 
 
 def look_at(text: str) -> None:
-    """Print where to look, or what else there is to do that is no command."""
+    """Print a file to look at, or a next step that is no command."""
     console.print(Text(f"\n{text}", style="bold"), soft_wrap=True)
 
 
 def duration(seconds: float) -> str:
-    """Return a time in the unit that suits it."""
+    """Return a time as text in hours, minutes or seconds."""
     for unit, size_s in (("hours", 3600), ("minutes", 60)):
         if seconds >= size_s:
             return f"{seconds / size_s:,.1f} {unit}"
@@ -102,12 +101,12 @@ def duration(seconds: float) -> str:
 
 
 def note(text: str) -> None:
-    """Print what a person should know of an outcome; a sentence without its full stop."""
+    """Print a warning about a result: a sentence without its full stop."""
     console.print(Text(f"Note: {text}.", style="yellow"))
 
 
 class RateColumn(ProgressColumn):
-    """Items per minute, or per second where they are quick."""
+    """Column with items per second, or per minute where they are slower."""
 
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
@@ -155,7 +154,7 @@ def _is_drawn(task: Task) -> bool:
 
 
 def progress_bars() -> Bars:
-    """Return progress bars with count, rate, elapsed time and ETA; silent without a terminal."""
+    """Return progress bars with count, rate, elapsed time and ETA; invisible without a terminal."""
     return Bars(
         TextColumn("{task.description:<8}", markup=False),
         BarColumn(bar_width=20),
@@ -163,7 +162,7 @@ def progress_bars() -> Bars:
         RateColumn(table_column=Column(no_wrap=True)),
         TimeElapsedColumn(),
         TextColumn("left"),
-        # a shard's scenes end together, so that the speed of the last seconds says little
+        # scenes of a shard end together, so that the speed of the last seconds means little
         TimeRemainingColumn(compact=True),
         TextColumn("{task.fields[note]}", markup=False),
         console=console,
@@ -183,7 +182,7 @@ def print_rows(title: str, rows: Sequence[tuple[str, str]]) -> None:
 
 
 def print_table(title: str, rows: Sequence[Mapping[str, object]]) -> None:
-    """Print rows that have the same names as a table with these names above."""
+    """Print rows with the same keys as a table whose header is these keys."""
     console.print(Text(title, style="bold"))
     table = Table(box=None, padding=(0, 1, 0, 0))
     for name in rows[0] if rows else ():

@@ -1,4 +1,4 @@
-"""`trilight doctor`: what this machine has and lacks."""
+"""`trilight doctor`: prints what this machine has and lacks."""
 
 import sys
 from dataclasses import asdict
@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from infra.cli.console import console, first_words, print_json
-from infra.cli.options import Shown, command
+from infra.cli.options import OutputOptions, command
 from storage.settings.described import checked
 
 if TYPE_CHECKING:
@@ -16,44 +16,43 @@ if TYPE_CHECKING:
 
 _STYLES = {"ok": "green", "slower": "yellow", "missing": "red"}
 _WIDTHS = (7, 16)
-"""Widths of the columns state and name: rows are printed one by one, as they are found."""
+"""Widths of the columns state and name; fixed, because rows are printed one by one."""
 
 
 @checked()
-class Looked:
-    """What is looked at."""
+class DoctorOptions:
+    """Checks."""
 
     measure: bool = False
-    """Measure as well what previews take here, for --seconds and --error of trilight render: about
-    half a minute on a machine that does nothing else."""
+    """Time previews too, for render --seconds and --error: half a minute."""
 
 
 @command()
-def doctor(looked: Looked, shown: Shown) -> None:
-    first_words("Looking at this machine", silent=shown.json)
+def doctor(options: DoctorOptions, output: OutputOptions) -> None:
+    first_words("Looking at this machine", silent=output.json)
     from infra.doctor import examine
 
     findings = []
     with console.status("") as status:
         for finding in examine(lambda name: status.update(f"looking at: {name}")):
             findings.append(finding)
-            if not shown.json:
+            if not output.json:
                 console.print(_row(finding))
-    if looked.measure:
-        findings.append(_measured(silent=shown.json))
-    if shown.json:
+    if options.measure:
+        findings.append(_measure_previews(silent=output.json))
+    if output.json:
         print_json([asdict(finding) for finding in findings])
     if any(finding.state == "missing" for finding in findings):
         sys.exit(1)
 
 
-def _measured(*, silent: bool) -> "Finding":
+def _measure_previews(*, silent: bool) -> "Finding":
     from infra.doctor import Finding
-    from infra.rendering.machine_costs import measured_costs
+    from infra.rendering.machine_costs import measure_costs
     from infra.rendering.way_table import keep_machine_costs, shipped_table
 
     with console.status("measuring previews"):
-        path = keep_machine_costs(measured_costs(shipped_table()))
+        path = keep_machine_costs(measure_costs(shipped_table()))
     finding = Finding(name="previews", state="ok", found=f"measured, and kept in {path}")
     if not silent:
         console.print(_row(finding))

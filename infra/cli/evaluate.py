@@ -1,4 +1,4 @@
-"""`trilight evaluate`: a trained network against the pictures of a dataset."""
+"""`trilight evaluate`: compares a trained network with the pictures of a dataset."""
 
 from pathlib import Path
 from typing import Any
@@ -7,19 +7,19 @@ from rich.table import Table
 from rich.text import Text
 
 from infra.cli.console import console, first_words, look_at, print_json, progress_bars
-from infra.cli.options import Shown, command
+from infra.cli.options import OutputOptions, command
 from infra.torch_library import require_torch
-from train.evaluation.order import EvaluationOrder
+from train.evaluation.options import EvaluationOptions
 
 
 @command("checkpoint")
-def evaluate(order: EvaluationOrder, shown: Shown) -> None:
-    first_words(f"Judging {order.checkpoint} on the split {order.split}", silent=shown.json)
+def evaluate(order: EvaluationOptions, output: OutputOptions) -> None:
+    first_words(f"Judging {order.checkpoint} on the split {order.split}", silent=output.json)
     require_torch("evaluate")
     from infra.judging import judge_network, write_judgement
 
     with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="", visible=not shown.json)
+        task = bars.add_task("scenes", total=None, note="", visible=not output.json)
         judgement = judge_network(
             order.checkpoint,
             order.data,
@@ -32,34 +32,34 @@ def evaluate(order: EvaluationOrder, shown: Shown) -> None:
             device=order.device,
             done=lambda now, total: bars.update(task, completed=now, total=total),
         )
-    first_words("Drawing the sheets", silent=shown.json)
-    found = judgement.record
-    out = write_judgement(judgement, order.place)
-    if shown.json:
-        print_json({name: found[name] for name in ("about", "contestants", "path tracer")})
+    first_words("Drawing the sheets", silent=output.json)
+    record = judgement.record
+    out = write_judgement(judgement, order.report_folder)
+    if output.json:
+        print_json({name: record[name] for name in ("about", "contestants", "path tracer")})
     else:
-        _report(found, out)
+        _report(record, out)
 
 
-def _report(found: dict[str, Any], out: Path) -> None:
+def _report(record: dict[str, Any], out: Path) -> None:
     from train.evaluation.metrics import METRICS
     from train.evaluation.same_time import sentences
 
-    contestants = found["contestants"]
+    contestants = record["contestants"]
     table = Table(box=None, title_justify="left", header_style="dim")
-    table.title = Text(f"Evaluation, medians over {len(found['views'])} views", style="bold")
+    table.title = Text(f"Evaluation, medians over {len(record['views'])} views", style="bold")
     table.add_column("", style="dim", no_wrap=True)
     for name in contestants:
         table.add_column(Text(name), justify="right")
     for name, metric in METRICS.items():
         medians = [scores[name]["median"] for scores in contestants.values()]
-        shown = ["n/a" if value is None else f"{value:.{metric.decimals}f}" for value in medians]
-        table.add_row(name, *shown)
+        texts = ["n/a" if value is None else f"{value:.{metric.decimals}f}" for value in medians]
+        table.add_row(name, *texts)
     near = [scores.get("near_floor") for scores in contestants.values()]
     table.add_row(
         "within 3 dB of the noise", *("" if share is None else f"{share:.1%}" for share in near)
     )
     console.print(table)
-    for sentence in sentences(found["path tracer"]):
+    for sentence in sentences(record["path tracer"]):
         console.print(sentence, soft_wrap=True)
     look_at(f"Read {out / 'evaluation.md'}, look at {out / 'worst.png'}")

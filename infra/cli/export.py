@@ -1,59 +1,60 @@
-"""`trilight export`: a dataset as files that another library opens."""
+"""`trilight export`: writes a dataset as files that another library opens."""
 
 from pathlib import Path
 from typing import Literal
 
 from infra.cli.console import first_words, note, print_json, print_rows, progress_bars
-from infra.cli.options import Shown, command
+from infra.cli.options import OutputOptions, command
 from pipeline.exchange.exports.export import ExportForm
 from storage.remote.safe_url import safe_url
 from storage.settings.described import checked
 
 
 @checked()
-class ExportAsked:
-    """The dataset, and the form to write."""
+class ExportOptions:
+    """Source and format."""
 
     source: str
-    """A dataset (folder or URL)."""
+    """Dataset, a folder or a URL."""
     form: ExportForm
-    """nerfstudio: transforms.json with pictures and depth; coco: masks and boxes of objects;
-    huggingface: a folder that datasets.load_dataset reads, with pictures, depth and ids; hypersim:
-    HDF5 of reflectance, illumination, residual and geometry (with renders.split_lobes=true); h5,
-    json, usd, exr: each scene as RenderFormer's HDF5, as its JSON with meshes or as USD, and the
-    pictures as OpenEXR; benchmark: these four, each in its folder, with a table of views."""
+    """Format of the files. nerfstudio: transforms.json, pictures and depth. coco: masks and boxes.
+    huggingface: pictures, depth and ids for datasets.load_dataset. hypersim: HDF5 of reflectance,
+    illumination, residual and geometry (needs renders.split_lobes=true). h5, json, usd: each scene
+    as RenderFormer's HDF5, as its JSON with meshes, or as USD. exr: pictures as OpenEXR. benchmark:
+    the last four, each in its folder, with a table of views."""
     out: Path
     """Folder to write, which must be empty or not exist."""
     split: Literal["train", "validation", "test"] | None = None
     """Write only the scenes of this split; by default all."""
     scene: str | None = None
-    """Key of the only scene; by default all."""
+    """Key of the only scene to write; by default all."""
 
 
 @command("source")
-def export(asked: ExportAsked, shown: Shown) -> None:
-    first_words(f"Exporting {safe_url(asked.source)} to {asked.out}", silent=shown.json)
+def export(options: ExportOptions, output: OutputOptions) -> None:
+    first_words(f"Exporting {safe_url(options.source)} to {options.out}", silent=output.json)
     from pipeline.exchange.exports.export import export_dataset  # slow: Pillow
 
     scenes = views = 0
     with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="", visible=not shown.json)
+        task = bars.add_task("scenes", total=None, note="", visible=not output.json)
 
-        def written(num_views: int) -> None:
+        def on_scene(num_views: int) -> None:
             nonlocal scenes, views
-            scenes, views = scenes + 1, views + num_views
+            scenes = scenes + 1
+            views = views + num_views
             bars.advance(task)
 
         notes = export_dataset(
-            asked.source,
-            asked.form,
-            asked.out,
-            split=asked.split,
-            scene=asked.scene,
-            done=lambda sample: written(sample.scene.num_views),
+            options.source,
+            options.form,
+            options.out,
+            split=options.split,
+            scene=options.scene,
+            done=lambda sample: on_scene(sample.scene.num_views),
         )
-    if shown.json:
-        about = {"form": asked.form, "out": str(asked.out), "scenes": scenes, "views": views}
+    if output.json:
+        about = {"form": options.form, "out": str(options.out), "scenes": scenes, "views": views}
         print_json({**about, "notes": list(notes)})
         return
     for text in notes:
@@ -61,8 +62,8 @@ def export(asked: ExportAsked, shown: Shown) -> None:
     print_rows(
         "Exported",
         [
-            ("form", asked.form),
-            ("out", str(asked.out)),
+            ("form", options.form),
+            ("out", str(options.out)),
             ("written", f"{scenes} scenes, {views} views"),
         ],
     )

@@ -1,4 +1,4 @@
-"""A flow run from the command line: asked for, watched, and reported when it has ended."""
+"""Runs a Prefect flow from the command line: submits it, watches it, and prints its summary."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -8,54 +8,53 @@ from storage.errors import TrilightError
 from storage.settings.described import checked
 
 if TYPE_CHECKING:
-    from pipeline.flows.submission import SeenRun, Submitted
+    from pipeline.flows.submission import RunStatus, SubmittedRun
 
 
 @checked()
-class FlowRuns:
-    """Runs on a Prefect server."""
+class FlowRunOptions:
+    """Prefect server."""
 
     deployment: str | None = None
-    """Name of the flow's deployment; by default local, which make serve makes, or the only one
-    there is."""
+    """Name of the flow's deployment; by default local (make serve), or the only one."""
     no_watch: bool = False
-    """Return as soon as the server has the run, instead of watching it to its end."""
+    """Return once the server has the run, without watching it."""
 
 
 def run_flow(
-    flow: str, given: Mapping[str, Any], runs: FlowRuns, *, where: str, as_json: bool
+    flow: str, parameters: Mapping[str, Any], runs: FlowRunOptions, *, where: str, as_json: bool
 ) -> bool:
-    """Run a flow by a worker of the server, and print how far it is and its summary.
+    """Run a flow by a worker of the server; print its progress and its summary.
 
     Args:
-        flow: its name.
-        given: its parameters.
-        runs: how it is run.
-        where: what is made, for the summary.
-        as_json: print the outcome as JSON, and nothing else.
+        flow: name of the flow.
+        parameters: parameters of the flow by name.
+        runs: deployment, and whether to watch the run.
+        where: folder or URL of the dataset, for the summary.
+        as_json: print the result as JSON, and nothing else.
 
     Returns:
-        Whether it has ended, since it was watched.
+        Whether the run has ended; False where it is not watched.
 
     Raises:
-        TrilightError: there is no such server or deployment, or the run did not end well.
+        TrilightError: there is no such server or deployment, or the run failed.
     """
-    from pipeline.flows import submission as prefect  # reads its settings now
+    from pipeline.flows import submission as prefect  # Prefect reads its settings at the import
 
     with prefect.server() as client:
-        run = prefect.submit(client, flow, runs.deployment, given)
+        run = prefect.submit(client, flow, runs.deployment, parameters)
         if not as_json:
-            _say_where(run, prefect.workers_online(client, run.pool))
+            _print_run(run, prefect.workers_online(client, run.pool))
         if runs.no_watch:
             if as_json:
                 print_json({"flow_run": str(run.id), "deployment": run.deployment})
             return False
-        last = _watched(prefect.looks(client, run.id), silent=as_json)
+        last = _watch_run(prefect.poll_run(client, run.id), silent=as_json)
     _report(run, last, where, as_json=as_json)
     return True
 
 
-def _say_where(run: "Submitted", workers: int) -> None:
+def _print_run(run: "SubmittedRun", workers: int) -> None:
     console.print(f"Run {run.name} of {run.deployment}: {run.page}", soft_wrap=True)
     console.print(
         f"Ctrl-C here leaves it running; prefect flow-run cancel {run.id} ends it", soft_wrap=True
@@ -65,8 +64,8 @@ def _say_where(run: "Submitted", workers: int) -> None:
         note(f"no worker of the pool {run.pool} is online, and the run waits for one: {start}")
 
 
-def _watched(looks: "Iterable[SeenRun]", *, silent: bool) -> "SeenRun":
-    """Draw what is seen of a run, and return the last look."""
+def _watch_run(looks: "Iterable[RunStatus]", *, silent: bool) -> "RunStatus":
+    """Draw the progress of a run, and return its last state."""
     last = None
     with progress_bars() as bars:
         bar = bars.add_task("percent", total=100, note="", visible=not silent)
@@ -81,7 +80,7 @@ def _watched(looks: "Iterable[SeenRun]", *, silent: bool) -> "SeenRun":
     return last
 
 
-def _report(run: "Submitted", last: "SeenRun", where: str, *, as_json: bool) -> None:
+def _report(run: "SubmittedRun", last: "RunStatus", where: str, *, as_json: bool) -> None:
     rows: Sequence[tuple[str, str]] = last.tables.get("summary", ())
     if as_json:
         print_json(

@@ -1,49 +1,51 @@
-"""`trilight generate`: objects, or scenes in files, to shards."""
+"""`trilight generate`: makes a dataset from objects or from scene files."""
 
 import time
 
-from infra.cli.changes import Shared
+from infra.cli.changes import BaseSettings
 from infra.cli.console import first_words, note
-from infra.cli.dataset_changes import with_shared
-from infra.cli.generate_progress import watched
+from infra.cli.dataset_changes import with_base_settings
+from infra.cli.generate_progress import show_progress
 from infra.cli.generate_report import report
-from infra.cli.options import Shown, command
+from infra.cli.options import OutputOptions, command
 from pipeline.executors.registry import find_executor
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import dataset_folder
 from storage.settings.described import checked
 
 
 @checked()
-class ExecutorChoice:
-    """The executor of the tasks."""
+class ExecutorOptions:
+    """Executor."""
 
     runner: str = "threads"
-    """Executor of the tasks: threads, in this process; slurm, if this command is one task of a job
-    array, which makes its share; prefect, as a flow run at PREFECT_API_URL; dask, on the workers of
-    a cluster; or an executor of your own (--extend)."""
+    """Executor of the tasks: threads, slurm, prefect, dask, or your own (--extend). slurm: this
+    command is one task of a job array. prefect: a flow run at PREFECT_API_URL. dask: the workers of
+    a cluster."""
     address: str | None = None
-    """With --runner dask: address of the scheduler, such as tcp://host:8786; by default there is
-    none."""
+    """Address of the dask scheduler, such as tcp://host:8786; by default none."""
 
 
 @command("build")
-def generate(order: DatasetOrder, shared: Shared, runner: ExecutorChoice, shown: Shown) -> None:
-    make(with_shared(order, shared), runner, shown)
+def generate(
+    order: DatasetOrder, base: BaseSettings, runner: ExecutorOptions, output: OutputOptions
+) -> None:
+    make(with_base_settings(order, base), runner, output)
 
 
-def make(order: DatasetOrder, runner: ExecutorChoice, shown: Shown) -> None:
-    """Make a dataset and say what came of it; raises TrilightError."""
-    folder, started = dataset_folder(order.place), time.monotonic()
-    first_words(f"Making {folder.shown} with the build {order.build}", silent=shown.json)
+def make(order: DatasetOrder, runner: ExecutorOptions, output: OutputOptions) -> None:
+    """Make a dataset and print the result; raises TrilightError."""
+    folder = dataset_folder(order.place)
+    started = time.monotonic()
+    first_words(f"Making {folder.display_name} with the build {order.build}", silent=output.json)
     executor = find_executor(runner.runner, runner.address, order.workers)
     from infra.planning import describe_run  # slow: every stage
 
-    if not shown.json and (text := describe_run(order, folder)):
+    if not output.json and (text := describe_run(order, folder)):
         first_words(text)
-    if (text := choose_variant().note) and not shown.json:
+    if (text := choose_variant().note) and not output.json:
         note(f"{text}; see trilight doctor")
-    with watched(folder, silent=shown.json):
+    with show_progress(folder, silent=output.json):
         outcome = executor.make(order, runner.address)
-    report(folder, outcome, time.monotonic() - started, as_json=shown.json)
+    report(folder, outcome, time.monotonic() - started, as_json=output.json)

@@ -1,4 +1,4 @@
-"""The bars of `trilight generate`, from the files of the dataset alone, whoever works on it."""
+"""Progress bars of `trilight generate`, from the files of the dataset, for any executor."""
 
 import contextlib
 import threading
@@ -14,7 +14,7 @@ _POLL_S = 0.5
 
 
 @contextlib.contextmanager
-def watched(folder: DatasetFolder, *, silent: bool) -> Iterator[None]:
+def show_progress(folder: DatasetFolder, *, silent: bool) -> Iterator[None]:
     """Draw progress bars while the block runs."""
     ended = threading.Event()
     with progress_bars() as bars:
@@ -28,7 +28,7 @@ def watched(folder: DatasetFolder, *, silent: bool) -> Iterator[None]:
 
 
 def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event, silent: bool) -> None:
-    drawn = _Drawn(bars, silent=silent)
+    drawn = _Bars(bars, silent=silent)
     waits = not silent and not folder.contact_sheet.exists()
     last = False
     while not last:
@@ -40,8 +40,8 @@ def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event, silent: bo
             bars.console.print(f"First pictures: {folder.contact_sheet}", soft_wrap=True)
 
 
-class _Drawn:
-    """Three bars: what is fetched, objects, and views, of which those at work count in part."""
+class _Bars:
+    """Three bars: downloads, objects, and views; a view in progress counts as a fraction."""
 
     def __init__(self, bars: Bars, *, silent: bool) -> None:
         self._bars = bars
@@ -53,23 +53,24 @@ class _Drawn:
         self._most = 0.0
 
     def show(self, now: Progress) -> None:
-        """Bring the bars up to date."""
-        downloads, objects = now.downloads_planned or None, now.objects_planned or None
+        """Update the bars."""
+        downloads = now.downloads_planned or None
+        objects = now.objects_planned or None
         self._bars.update(self._downloads, completed=now.downloads_done, total=downloads)
         self._bars.update(self._objects, completed=now.objects_done, total=objects)
         if not now.scenes_planned or now.objects_done < now.objects_planned:
             return
-        if self._already is None:  # rate and ETA count what this run makes, not what it found
+        if self._already is None:  # rate and ETA leave out the views of earlier runs
             self._already = now.views_done
             self._bars.reset(self._views)
         total = (now.scenes_planned - now.scenes_given_up) * now.num_views - self._already
-        # a scene that is begun again does not go back
+        # the bar does not go back where a scene begins again
         self._most = min(max(self._most, now.views_done - self._already), total)
         given_up = f", {now.scenes_given_up} given up" if now.scenes_given_up else ""
-        there = f", {self._already:.0f} views were there" if self._already else ""
+        earlier = f", {self._already:.0f} views were there" if self._already else ""
         self._bars.update(
             self._views,
             completed=self._most,
             total=total,
-            note=f"scenes {now.scenes_done} of {now.scenes_planned}{given_up}{there}",
+            note=f"scenes {now.scenes_done} of {now.scenes_planned}{given_up}{earlier}",
         )

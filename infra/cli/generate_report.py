@@ -1,4 +1,4 @@
-"""What `trilight generate` says when it is done."""
+"""Output of `trilight generate` at its end."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -14,16 +14,16 @@ from storage.dataset.statistics import Statistics
 from storage.records.objects import count_by_reason, read_failures, read_objects_lock
 
 if TYPE_CHECKING:
-    from pipeline.making.run import Outcome
+    from pipeline.generation.run import Outcome
 
 _MAX_NOTES = 20
-"""Most notes that are printed."""
+"""Maximum number of notes that are printed."""
 _RUN = "smoke"
-"""The run that is named as the next step."""
+"""Training preset that the next step names."""
 
 
 def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json: bool) -> None:
-    """Print the outcome, and what to do next."""
+    """Print the result and the next commands."""
     rejected = count_by_reason([*read_failures(folder.failures), *outcome.failures])
     if as_json:
         _print_json(folder, outcome, rejected, seconds)
@@ -38,44 +38,44 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json
     if statistics:
         looked_at = (folder.contact_sheet, folder.report, folder.card)
         rows.append(("dataset digest", outcome.digest))
-        rows.append(("look at", ", ".join(_place(folder, path) for path in looked_at)))
+        rows.append(("look at", ", ".join(_shown_path(folder, path) for path in looked_at)))
     rows += [
         ("wall time", f"{seconds:.0f} s"),
-        ("shards, manifest", folder.shown),
+        ("shards, manifest", folder.display_name),
     ]
     if rejected:
         later = "" if statistics else ", once the dataset is finished"
-        rows.append(("why rejected", f"{_place(folder, folder.failures)}{later}"))
+        rows.append(("why rejected", f"{_shown_path(folder, folder.failures)}{later}"))
     _print_notes(outcome.notes)
     if statistics is None and outcome.digest:
         print_rows("Dataset finished by another machine, which writes its documents", rows)
-        next_step(["verify", folder.shown])
+        next_step(["verify", folder.display_name])
         return
     if statistics is None:
-        there = f"{outcome.num_shards} of {outcome.num_shards_planned} shards are there"
-        print_rows(f"Range finished; {there}", rows)
-        next_step(["status", folder.shown])
+        progress = f"{outcome.num_shards} of {outcome.num_shards_planned} shards are there"
+        print_rows(f"Range finished; {progress}", rows)
+        next_step(["status", folder.display_name])
         return
     print_rows("Dataset finished", rows)
     next_step(*_next_steps(folder, statistics))
 
 
 def _next_steps(folder: DatasetFolder, statistics: Statistics) -> Iterator[Sequence[str]]:
-    """Yield what can be done with a finished dataset; training only where it is for training."""
-    yield ("verify", folder.shown)
-    yield ("inspect", folder.shown)
+    """Yield the next commands for a finished dataset; training only where it has such scenes."""
+    yield ("verify", folder.display_name)
+    yield ("inspect", folder.display_name)
     if statistics.scenes_by_split.get("train") and _fits_training(read_head(folder.manifest)):
-        yield ("train", _RUN, "--data", folder.shown)
+        yield ("train", _RUN, "--data", folder.display_name)
 
 
 def _fits_training(manifest: Manifest) -> bool:
-    """Return whether the smallest run can learn from such pictures, and is installed at all."""
-    from train.runs import named_run  # not before the end: the first words come sooner
+    """Return whether the smallest training preset fits the pictures, and torch is installed."""
+    from train.runs import named_run  # late, so that the first line is printed sooner
 
     run = named_run(_RUN)
     pictures = manifest.settings["renders"]["resolution"]
-    enough = manifest.num_views >= run.views_per_scene
-    return enough and pictures % run.resolution == 0 and find_spec("torch") is not None
+    has_views = manifest.num_views >= run.views_per_scene
+    return has_views and pictures % run.resolution == 0 and find_spec("torch") is not None
 
 
 def _print_json(
@@ -86,7 +86,7 @@ def _print_json(
 ) -> None:
     statistics = outcome.statistics
     row: dict[str, object] = {
-        "out": folder.shown,
+        "out": folder.display_name,
         "dataset_digest": outcome.digest,
         "finished": bool(outcome.digest),
         "shards": outcome.num_shards,
@@ -99,14 +99,15 @@ def _print_json(
         "seconds": round(seconds, 1),
     }
     if statistics:
-        row["scenes"], row["views"] = statistics.num_scenes, statistics.num_views
+        row["scenes"] = statistics.num_scenes
+        row["views"] = statistics.num_views
         row["bytes"] = statistics.num_bytes
     print_json(row)
 
 
-def _place(folder: DatasetFolder, path: Path) -> str:
-    """Return where people find a file of a dataset."""
-    return f"{folder.shown}/{path.relative_to(folder.root)}"
+def _shown_path(folder: DatasetFolder, path: Path) -> str:
+    """Return the path or URL of a file of a dataset, for people."""
+    return f"{folder.display_name}/{path.relative_to(folder.root)}"
 
 
 def _print_notes(notes: Sequence[str]) -> None:
@@ -118,5 +119,5 @@ def _print_notes(notes: Sequence[str]) -> None:
 
 def _licences(folder: DatasetFolder) -> str:
     counts = Counter(entry.licence for entry in read_objects_lock(folder.objects_lock))
-    shown = ", ".join(f"{name} ({count})" for name, count in counts.most_common())
-    return shown.replace(USER_PROVIDED, f"{USER_PROVIDED}, taken as yours to use")
+    text = ", ".join(f"{name} ({count})" for name, count in counts.most_common())
+    return text.replace(USER_PROVIDED, f"{USER_PROVIDED}, taken as yours to use")

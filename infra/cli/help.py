@@ -1,4 +1,4 @@
-"""How help looks: sections of names and sentences without boxes, readable at 80 columns."""
+"""Format of help pages: sections without boxes, readable at 80 columns."""
 
 from typing import Any
 
@@ -11,14 +11,14 @@ _NAMES_WIDTH = 27
 
 
 class Sections:
-    """Prints each section of a help page, as cyclopts asks its formatters to."""
+    """Formatter of cyclopts that prints each section of a help page."""
 
     def render_usage(self, console: Console, options: Any, usage: Any) -> None:
-        """Print how the words of a command are ordered."""
+        """Print the usage line of a command."""
         console.print(Text(f"Usage: {usage}"))
 
     def __call__(self, console: Console, options: Any, panel: HelpPanel) -> None:
-        """Print one section; none where it is empty."""
+        """Print one section; nothing where it is empty."""
         if not panel.entries:
             return
         console.print(Text(f"{panel.title}:", style="bold"))
@@ -33,5 +33,5 @@ class Sections:
 
 
 def _names(entry: HelpEntry) -> str:
-    """Return the names of an option, and what it takes."""
+    """Return the names of an option with its value's name."""
     return ", ".join(entry.display_labels_with_metavar)

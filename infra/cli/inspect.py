@@ -1,4 +1,4 @@
-"""`trilight inspect`: what is in a dataset, in a run or in one scene, for a person."""
+"""`trilight inspect`: prints a summary of a dataset, a training run or a scene."""
 
 import os
 import shlex
@@ -17,7 +17,7 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
-from infra.cli.options import Shown, command
+from infra.cli.options import OutputOptions, command
 from infra.run_record import is_run, run_facts, tensorboard_command
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
@@ -37,57 +37,54 @@ _READ_ONLY = "It cannot be written there: choose a folder for report and sheet w
 
 
 @checked()
-class Inspected:
-    """The dataset, run or scene, and the pictures to write."""
+class InspectOptions:
+    """Source and pictures."""
 
     source: str
-    """A dataset (folder or URL), the folder of a training run, or one scene in any form that render
-    reads."""
+    """Dataset (folder or URL), training run's folder, or one scene file."""
     scenes: Annotated[int, Within(1, 10_000, unit="scenes")] = 16
     """Number of scenes on the contact sheet."""
     by_template: Annotated[int | None, Within(1, 1000, unit="scenes")] = None
-    """Number of scenes of each layout on a second sheet, templates.png; by default it is not
-    written."""
+    """Scenes of each layout on a second sheet, templates.png; by default no such sheet."""
     out: Path | None = None
     """Folder for the report and the sheet; by default the dataset's own."""
     turntable: Path | None = None
-    """For one scene: picture X.png to write, with views from all sides; by default none is written.
-    """
+    """For one scene: picture X.png with views from all sides; by default none."""
 
 
 @command("source")
-def inspect(asked: Inspected, shown: Shown) -> None:
-    source = asked.source
+def inspect(options: InspectOptions, output: OutputOptions) -> None:
+    source = options.source
     if not ("://" in source or Path(source).is_dir()):
-        _inspect_scene(source, asked.turntable, json=shown.json)
+        _inspect_scene(source, options.turntable, json=output.json)
         return
-    if asked.turntable is not None:
+    if options.turntable is not None:
         raise TrilightError(f"--turntable: {source} is a folder; expected one scene.")
     if is_run(Path(source)):
-        _inspect_run(Path(source), json=shown.json)
+        _inspect_run(Path(source), json=output.json)
         return
-    first_words(f"Reading {safe_url(source)}", silent=shown.json)
+    first_words(f"Reading {safe_url(source)}", silent=output.json)
     opened = open_dataset(source)
     _require_shards(opened)
     from pipeline.documents.distributions import dataset_distributions  # slow: matplotlib
 
     with progress_bars() as bars:
         total = len(described_shards(opened))
-        task = bars.add_task("shards", total=total, note="", visible=not shown.json)
+        task = bars.add_task("shards", total=total, note="", visible=not output.json)
         statistics = dataset_statistics(opened)
-        found = dataset_distributions(opened, shard_done=lambda _: bars.advance(task))
-    folder = _folder_of_documents(opened, asked.out)
+        distributions = dataset_distributions(opened, shard_done=lambda _: bars.advance(task))
+    folder = _folder_of_documents(opened, options.out)
     if folder is not None:
-        _write(opened, statistics, found, folder, asked)
-    if shown.json:
-        print_json(_as_json(opened, statistics, found))
+        _write(opened, statistics, distributions, folder, options)
+    if output.json:
+        print_json(_as_json(opened, statistics, distributions))
         return
-    _print_summary(opened.shown, opened, statistics, found)
+    _print_summary(opened.display_name, opened, statistics, distributions)
     look_at(f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY)
 
 
 def _inspect_run(root: Path, *, json: bool) -> None:
-    """Say how far a run is."""
+    """Print the progress of a training run."""
     facts = run_facts(root)
     if json:
         print_json(facts)
@@ -99,13 +96,15 @@ def _inspect_run(root: Path, *, json: bool) -> None:
 def _require_shards(opened: Dataset) -> None:
     if not opened.manifest.shards:
         raise TrilightError(
-            f"{opened.shown}: the dataset is empty, since none of its shards is finished; expected "
-            f"at least one. See its progress with `trilight status {shlex.quote(opened.shown)}`."
+            f"{opened.display_name}: the dataset is empty, since none of its shards is finished; "
+            "expected "
+            "at least one. See its progress with `trilight status "
+            f"{shlex.quote(opened.display_name)}`."
         )
 
 
 def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | None:
-    """Return where report and sheet go; None where nobody said and it cannot be there."""
+    """Return the folder for report and sheet; None where --out is missing and no folder fits."""
     if out is not None:
         return DatasetFolder(out)
     if isinstance(opened.files, RemoteDatasetFiles) or not os.access(
@@ -118,16 +117,16 @@ def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | N
 def _inspect_scene(source: str, turntable: Path | None, *, json: bool) -> None:
     first_words(f"Reading {source}", silent=json)
     from pipeline.exchange.open_scene import scene_source
-    from pipeline.making.inspect_scene import inspect_scene
+    from pipeline.generation.inspect_scene import inspect_scene
 
-    found = inspect_scene(scene_source(source), turntable)
+    result = inspect_scene(scene_source(source), turntable)
     if json:
-        print_json({**found.facts, "notes": list(found.notes)})
+        print_json({**result.facts, "notes": list(result.notes)})
         return
-    for text in found.notes:
+    for text in result.notes:
         note(text)
     print_rows(
-        source, [(name.replace("_", " "), str(value)) for name, value in found.facts.items()]
+        source, [(name.replace("_", " "), str(value)) for name, value in result.facts.items()]
     )
     if turntable is not None:
         look_at(f"Look at {turntable}")
@@ -136,35 +135,37 @@ def _inspect_scene(source: str, turntable: Path | None, *, json: bool) -> None:
 def _write(
     opened: Dataset,
     statistics: Statistics,
-    found: "Distributions",
+    distributions: "Distributions",
     folder: DatasetFolder,
-    asked: Inspected,
+    options: InspectOptions,
 ) -> None:
     from pipeline.documents.report import write_report
     from pipeline.documents.sheets import write_contact_sheet, write_template_sheet
     from pipeline.documents.sums import renew_sums
 
-    write_contact_sheet(opened, statistics, max_scenes=asked.scenes, out=folder)
-    write_report(opened, found, out=folder)
-    if asked.by_template is not None:
-        write_template_sheet(opened, per_template=asked.by_template, out=folder)
+    write_contact_sheet(opened, statistics, max_scenes=options.scenes, out=folder)
+    write_report(opened, distributions, out=folder)
+    if options.by_template is not None:
+        write_template_sheet(opened, per_template=options.by_template, out=folder)
     renew_sums(folder.root)
 
 
-def _as_json(opened: Dataset, statistics: Statistics, found: "Distributions") -> dict[str, object]:
+def _as_json(
+    opened: Dataset, statistics: Statistics, distributions: "Distributions"
+) -> dict[str, object]:
     return {
         "bytes": statistics.num_bytes,
         "dataset_digest": opened.digest,
-        "distributions": found.as_json(),
-        "licences": Counter(entry.licence for entry in found.objects),
-        "noise_floor_db": _rounded(statistics.noise_floor_db),
-        "noise_floor_linear_db": _rounded(statistics.noise_floor_linear_db),
-        "object_noise_floor_db": _rounded(statistics.object_noise_floor_db),
+        "distributions": distributions.as_json(),
+        "licences": Counter(entry.licence for entry in distributions.objects),
+        "noise_floor_db": _round_db(statistics.noise_floor_db),
+        "noise_floor_linear_db": _round_db(statistics.noise_floor_linear_db),
+        "object_noise_floor_db": _round_db(statistics.object_noise_floor_db),
         "part_noise_floor_db": {
-            part: _rounded(floors_db) for part, floors_db in statistics.part_noise_floor_db.items()
+            part: _round_db(floors_db) for part, floors_db in statistics.part_noise_floor_db.items()
         },
-        "objects_by_split": Counter(entry.split for entry in found.objects),
-        "rejections": [list(row) for row in count_by_reason(found.failures)],
+        "objects_by_split": Counter(entry.split for entry in distributions.objects),
+        "rejections": [list(row) for row in count_by_reason(distributions.failures)],
         "scenes_by_split": statistics.scenes_by_split,
         "scenes_by_template": statistics.scenes_by_template,
         "spp": [int(v) for v in statistics.spp],
@@ -172,11 +173,11 @@ def _as_json(opened: Dataset, statistics: Statistics, found: "Distributions") ->
 
 
 def _print_summary(
-    title: str, opened: Dataset, statistics: Statistics, found: "Distributions"
+    title: str, opened: Dataset, statistics: Statistics, distributions: "Distributions"
 ) -> None:
-    licences = Counter(entry.licence for entry in found.objects)
-    splits = Counter(entry.split for entry in found.objects)
-    rejected = count_by_reason(found.failures)
+    licences = Counter(entry.licence for entry in distributions.objects)
+    splits = Counter(entry.split for entry in distributions.objects)
+    rejected = count_by_reason(distributions.failures)
     rows = [
         ("build", opened.manifest.build),
         *statistics.lines(),
@@ -188,5 +189,5 @@ def _print_summary(
     print_rows(title, rows)
 
 
-def _rounded(floors_db: NDArray[np.float64]) -> list[float]:
+def _round_db(floors_db: NDArray[np.float64]) -> list[float]:
     return [round(float(value), 2) for value in floors_db]

@@ -1,4 +1,4 @@
-"""`trilight leaderboard`: every engine, rung and network on one set, with what each costs."""
+"""`trilight leaderboard`: compares methods and networks on one dataset by error and cost."""
 
 from typing import Any
 
@@ -10,25 +10,25 @@ from infra.cli.console import (
     print_table,
     progress_bars,
 )
-from infra.cli.options import Shown, command
-from infra.leaderboard.order import LeaderboardOrder
+from infra.cli.options import OutputOptions, command
+from infra.leaderboard.options import LeaderboardOptions
 from infra.torch_library import require_torch
 from storage.remote.safe_url import safe_url
 
 
 @command("source")
-def leaderboard(order: LeaderboardOrder, shown: Shown) -> None:
-    first_words(f"Judging on {safe_url(order.source)}, into {order.out}", silent=shown.json)
+def leaderboard(order: LeaderboardOptions, output: OutputOptions) -> None:
+    first_words(f"Judging on {safe_url(order.source)}, into {order.out}", silent=output.json)
     require_torch("leaderboard")
     from infra.leaderboard.run import make_leaderboard
 
     with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="", visible=not shown.json)
+        task = bars.add_task("scenes", total=None, note="", visible=not output.json)
         board = make_leaderboard(
             order,
             lambda now, total, what: bars.update(task, completed=now, total=total, note=what),
         )
-    if shown.json:
+    if output.json:
         print_json({"out": str(board.out), "rival": board.rival, "widths": _plain(board)})
         return
     for one in board.widths:
@@ -44,7 +44,8 @@ def _row(standing: Any) -> dict[str, str]:
     from infra.leaderboard.page import interval
     from train.evaluation.pairs import METRIC
 
-    lead, scores = standing.lead, standing.scores[METRIC]
+    lead = standing.lead
+    scores = standing.scores[METRIC]
     ends = interval(lead, 1) if lead is not None else ""
     return {
         "": standing.name,

@@ -1,11 +1,11 @@
-"""`trilight model`: what a network is and costs; its export."""
+"""`trilight model`: prints the size and cost of a network, or exports it."""
 
 import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from infra.cli.console import first_words, print_json, print_rows
-from infra.cli.options import Shown, command
+from infra.cli.options import OutputOptions, command
 from storage.errors import TrilightError, expected_one_of
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -17,32 +17,31 @@ if TYPE_CHECKING:
 
 
 @checked()
-class Counted:
-    """The network, and the scene whose cost is computed."""
+class ModelOptions:
+    """Network and workload."""
 
     network: str
-    """A size (smoke, tiny, small, base, large) or a checkpoint."""
+    """Model size (smoke, tiny, small, base, large) or checkpoint."""
     triangles: Annotated[int, Within(1, 2**31 - 1, unit="triangles")] = 1536
     """Number of triangles of the scene whose cost is computed."""
     resolution: Annotated[int, Within(8, 8192, unit="pixels")] = 256
     """Width of a view in pixels."""
     views: Annotated[int, Within(1, 100_000, unit="views")] = 1
-    """Number of views of that scene."""
+    """Number of views of the scene whose cost is computed."""
 
 
 @checked()
-class Written:
-    """Files to write."""
+class PublishOptions:
+    """Export."""
 
     publish: Path | None = None
-    """Folder to export the checkpoint to, under the published names; by default it is not exported.
-    """
+    """Folder for an export of the checkpoint with RenderFormer's names; by default none."""
 
 
 @command("network")
-def model(counted: Counted, written: Written, shown: Shown) -> None:
-    name = counted.network
-    first_words(f"Looking at {name}", silent=shown.json)
+def model(options: ModelOptions, files: PublishOptions, output: OutputOptions) -> None:
+    name = options.network
+    first_words(f"Looking at {name}", silent=output.json)
     try:
         from model.config import SIZES
         from model.costs import Workload, costs
@@ -52,17 +51,17 @@ def model(counted: Counted, written: Written, shown: Shown) -> None:
         raise TrilightError("model: torch is not installed; run `make setup-all`.") from error
     network = None if name in SIZES else _open(name)
     config = network.config if network else SIZES[name]()
-    _require_pictures(config, counted.resolution)
+    _require_pictures(config, options.resolution)
     workload = Workload(
-        triangles=counted.triangles, views=counted.views, resolution=counted.resolution
+        triangles=options.triangles, views=options.views, resolution=options.resolution
     )
-    found = costs(config, workload)
-    if written.publish:
-        _publish(name, network, written.publish)
-    if shown.json:
-        print_json(_as_json(name, config, workload, found))
+    network_costs = costs(config, workload)
+    if files.publish:
+        _publish(name, network, files.publish)
+    if output.json:
+        print_json(_as_json(name, config, workload, network_costs))
         return
-    _report(name, workload, found)
+    _report(name, workload, network_costs)
 
 
 def _open(name: str) -> "RenderFormer":
@@ -110,7 +109,8 @@ def _as_json(
 
 
 def _report(name: str, workload: "Workload", counted: "Costs") -> None:
-    total, flops = sum(counted.parameters.values()), sum(counted.flops.values())
+    total = sum(counted.parameters.values())
+    flops = sum(counted.flops.values())
     rows = [("parameters", f"{total / 1e6:.2f} M")]
     rows += [(f"  {part}", f"{count / 1e6:.2f} M") for part, count in counted.parameters.items()]
     rows += [("work", f"{flops / 1e9:.1f} GFLOP")]

@@ -1,12 +1,12 @@
-"""Commands whose options are the fields of settings, so that each is described once.
+"""Commands whose options are the fields of settings classes, so that each is described once.
 
     @command("build")
     def generate(order: DatasetOrder, shown: Shown) -> None: ...
 
 makes the argument BUILD, and an option of every other field. Each parameter of the function is a
 class of settings (storage.settings.described) and a section of the help, with the class's first
-sentence as its title. Words only become values here (infra.cli.words): the class checks them, and
-what it says of a wrong one then names the option.
+sentence as its title. This module only converts words to values (infra.cli.words); the class checks
+them, and its complaint about a wrong value then names the option.
 """
 
 import inspect
@@ -19,10 +19,10 @@ from typing import Annotated, Any
 from cyclopts import Group, Parameter, Token
 
 from infra.cli.completion import NAMES
-from infra.cli.extending import registered
+from infra.cli.extend_option import resolve_reference
 from infra.cli.words import FileName, choices_of, is_repeated, kind_of, takes_names, value_of
 from storage.errors import TrilightError
-from storage.settings.described import Described, checked, described, option_of
+from storage.settings.described import FieldDescription, checked, describe_fields, option_of
 from storage.settings.ranges import shown_number
 
 ALIASES = {
@@ -40,62 +40,67 @@ ALIASES = {
     "noise_floor_linear_db": "--noise-floor-linear",
     "noise_floor_objects_db": "--noise-floor-objects",
 }
-"""Second, shorter words for options; the first is always the name of the field."""
+"""Second, shorter name of an option by its field; the first name is that of the field."""
 
 _METAVARS = {int: "INT", float: "NUMBER"}
+_BY_DEFAULT = re.compile(r"; by default (.+?)\.(?=\s|$)")
+_NONE = re.compile(r"^there (is|are) none$")
 
 
 @checked()
-class Shown:
-    """The form of the output."""
+class OutputOptions:
+    """Output."""
 
     json: bool = False
-    """Print the outcome as one JSON document, and nothing else."""
+    """Print the result as one JSON document, and nothing else."""
 
 
 def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Return a decorator that makes a command of a function of settings.
+    """Return a decorator that makes a command of a function of settings classes.
 
     Args:
-        arguments: fields that are given by their place, and must be given unless they are lists
-            with a default of none; all others are options.
+        arguments: fields that are positional arguments, and required unless they are lists that are
+            empty by default; all other fields are options.
     """
 
-    def made(function: Callable[..., None]) -> Callable[..., None]:
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
         kinds = typing.get_type_hints(function)
         kinds.pop("return")
         parameters = {
             field.name: _parameter(field, group, by_place=field.name in arguments)
             for kind in kinds.values()
             for group in [Group.create_ordered(_title(kind))]
-            for field in described(kind)
+            for field in describe_fields(kind)
         }
-        assert len(parameters) == sum(len(described(kind)) for kind in kinds.values()), parameters
+        assert len(parameters) == sum(len(describe_fields(kind)) for kind in kinds.values()), (
+            parameters
+        )
         in_order = [*arguments, *(name for name in parameters if name not in arguments)]
         signature = inspect.Signature([parameters[name] for name in in_order])
 
         def run(*_words: Any, **_options: Any) -> None:
-            given = signature.bind(*_words, **_options).arguments
-            function(**{name: _settings(kind, given) for name, kind in kinds.items()})
+            arguments_by_name = signature.bind(*_words, **_options).arguments
+            function(**{name: _settings(kind, arguments_by_name) for name, kind in kinds.items()})
 
         run.__name__ = function.__name__
         run.__signature__ = signature  # type: ignore[attr-defined]
         return run
 
-    return made
+    return decorate
 
 
 def _title(kind: type) -> str:
     return (inspect.getdoc(kind) or "").split("\n")[0].removesuffix(".")
 
 
-def _parameter(field: Described, group: Group, *, by_place: bool) -> inspect.Parameter:
-    """Return a field as cyclopts reads it from a function's signature."""
-    # a place for several may stay empty where the field says what none of them means
+def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> inspect.Parameter:
+    """Return a field as a parameter of the signature that cyclopts reads."""
+    # an argument that takes several words may be empty where the field has an empty default
     required = field.default is MISSING or (by_place and field.default != ())
     several = is_repeated(field.hint) or takes_names(field.hint)
     choices = choices_of(field.hint)
-    kind, complete = kind_of(field.hint), _completer(field.name)
+    kind = kind_of(field.hint)
+    complete = _completer(field.name)
     word: Any = bool if kind is bool else str  # numbers are read when the class is made
     if kind is str and not (choices or complete or takes_names(field.hint)):
         word = FileName
@@ -121,25 +126,35 @@ def _parameter(field: Described, group: Group, *, by_place: bool) -> inspect.Par
     )
 
 
-def _help(field: Described, choices: tuple[str, ...], *, several: bool, required: bool) -> str:
-    """Return the sentence of a field, and in brackets its choices, range and default."""
+def _help(
+    field: FieldDescription, choices: tuple[str, ...], *, several: bool, required: bool
+) -> str:
+    """Return the sentence of a field, and in brackets its choices, range and default.
+
+    A clause "; by default X." of the sentence stands in the brackets as "default: X".
+    """
     facts = [", ".join(choices)] if choices else []
     facts += [str(field.within)] if field.within else []
     facts += ["may be repeated"] if several else []
+    sentence = field.sentence
+    clause = _BY_DEFAULT.search(sentence)
     if required:
         facts.append("required")
     elif field.default is not None and field.default is not False and field.default not in ((), {}):
-        facts.append(f"default {_shown(field.default)}")
-    return f"{field.sentence} [{'; '.join(facts)}]" if facts else field.sentence
+        facts.append(f"default: {_default_text(field.default)}")
+    elif clause is not None:
+        sentence = f"{sentence[: clause.start()]}.{sentence[clause.end() :]}"
+        facts.append(f"default: {_NONE.sub('none', clause[1])}")
+    return f"{sentence} [{'; '.join(facts)}]" if facts else sentence
 
 
-def _shown(default: Any) -> str:
+def _default_text(default: Any) -> str:
     if isinstance(default, tuple):
-        return ", ".join(map(_shown, default))
+        return ", ".join(map(_default_text, default))
     return shown_number(default) if isinstance(default, int | float) else str(default)
 
 
-def _metavar(field: Described, choices: tuple[str, ...]) -> str:
+def _metavar(field: FieldDescription, choices: tuple[str, ...]) -> str:
     if takes_names(field.hint):
         return "NAME=VALUE"
     return "CHOICE" if choices else _METAVARS.get(kind_of(field.hint), "TEXT")
@@ -150,7 +165,7 @@ def _completer(name: str) -> Callable[[Any], list[str]] | None:
 
 
 def _word(_: Any, tokens: tuple[Token, ...]) -> str:
-    """Return what was typed, as it was typed."""
+    """Return the word that was typed, unchanged."""
     return tokens[0].value
 
 
@@ -158,12 +173,12 @@ def _several(_: Any, tokens: tuple[Token, ...]) -> list[str]:
     return [token.value for token in tokens]
 
 
-def _settings(kind: type, given: Mapping[str, Any]) -> Any:
-    """Return the instance that words make; a complaint about a field names its option."""
-    fields = {field.name: field for field in described(kind)}
+def _settings(kind: type, words_by_name: Mapping[str, Any]) -> Any:
+    """Return an instance of settings from words; a complaint about a field names its option."""
+    fields = {field.name: field for field in describe_fields(kind)}
     values = {
-        name: registered(name, value_of(words, fields[name].hint))
-        for name, words in given.items()
+        name: resolve_reference(name, value_of(words, fields[name].hint))
+        for name, words in words_by_name.items()
         if name in fields and words is not None
     }
     try:

@@ -1,10 +1,10 @@
-"""`trilight plan`: what a dataset will take, from a few scenes that are measured here."""
+"""`trilight plan`: predicts the cost of a dataset from a few scenes measured on this machine."""
 
 import dataclasses
 import itertools
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-from infra.cli.changes import Shared
+from infra.cli.changes import BaseSettings
 from infra.cli.console import (
     duration,
     first_words,
@@ -14,21 +14,24 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
-from infra.cli.dataset_changes import with_shared
-from infra.cli.leaving import temporary_folder
-from infra.cli.options import Shown, command
-from pipeline.making.dataset_order import DatasetOrder, generate_words
-from pipeline.making.machine import cores_owned
-from pipeline.making.price import CorePrice
+from infra.cli.dataset_changes import with_base_settings
+from infra.cli.options import OutputOptions, command
+from infra.cli.process_exit import temporary_folder
+from pipeline.generation.dataset_order import DatasetOrder, generate_words
+from pipeline.generation.machine import available_cores
+from pipeline.generation.price import CorePrice
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 
+if TYPE_CHECKING:
+    from infra.planning import Prediction
+
 
 @checked()
-class Prognosis:
-    """The measurement, and the machines to predict for."""
+class PlanOptions:
+    """Measurement and machines."""
 
     samples: Annotated[int, Within(4, 10_000, unit="scenes")] = 12
     """Number of scenes to measure."""
@@ -39,47 +42,53 @@ class Prognosis:
 @command("build")
 def plan(
     order: DatasetOrder,
-    shared: Shared,
-    prognosis: Prognosis,
+    base: BaseSettings,
+    options: PlanOptions,
     core: CorePrice,
-    shown: Shown,
+    output: OutputOptions,
 ) -> None:
     if (order.scenes_from, order.revisits, order.shards) != (None,) * 3:
         raise TrilightError(
             "plan: --scenes-from, --revisits or --shards was given; expected none of them, since a "
             "whole dataset of new scenes is predicted."
         )
-    order = with_shared(order, shared)
-    build, samples, cores = order.build, prognosis.samples, prognosis.cores
-    first_words(f"Measuring {samples} scenes of {build}", silent=shown.json)
+    order = with_base_settings(order, base)
+    build = order.build
+    samples = options.samples
+    cores = options.cores
+    first_words(f"Measuring {samples} scenes of {build}", silent=output.json)
     from infra.planning import measure_scenes, predict  # slow: every stage
 
     with progress_bars() as bars, temporary_folder("trilight-plan-") as place:
-        task = bars.add_task("scenes", total=samples, note="", visible=not shown.json)
+        task = bars.add_task("scenes", total=samples, note="", visible=not output.json)
         measured = measure_scenes(order, samples, place, lambda: bars.advance(task))
-    found = predict(measured, order, cores=cores, usd_per_core_hour=core.price)
-    if shown.json:
-        print_json(dataclasses.asdict(found))
+    prediction = predict(measured, order, cores=cores, usd_per_core_hour=core.price)
+    if output.json:
+        print_json(dataclasses.asdict(prediction))
         return
-    own = cores_owned()
-    print_rows(
-        f"{build}, {found.num_scenes} scenes, predicted from {samples} (90 % intervals)",
-        [
-            ("core-hours", found.core_hours.shown("{:,.2f}".format)),
-            (f"on {cores} cores", found.hours.shown(_hours)),
-            (f"on the {own} cores here", found.core_hours.shown(lambda hours: _hours(hours / own))),
-            ("USD", found.usd.shown("{:,.2f}".format)),
-            ("GB", found.gigabytes.shown("{:,.2f}".format)),
-            ("shards", f"{found.num_shards} of up to {found.scenes_per_shard} scenes"),
-            ("a shard", found.shard_hours.shown("{:,.2f} core-hours".format)),
-            ("Prefect's task runs", f"{found.num_tasks}, {found.task_minutes:.1f} minutes each"),
-            ("Prefect's database", f"{found.database_mb:.1f} MB"),
-            ("manifest.json", f"{found.manifest_mb:.1f} MB"),
-        ],
-    )
-    for text in found.notes:
+    title = f"{build}, {prediction.num_scenes} scenes, predicted from {samples} (90 % intervals)"
+    print_rows(title, _rows(prediction, cores))
+    for text in prediction.notes:
         note(text)
     next_step((*generate_words(order), "--out", _free(order.place)))
+
+
+def _rows(prediction: "Prediction", cores: int) -> list[tuple[str, str]]:
+    local_cores = available_cores()
+    here_text = prediction.core_hours.to_text(lambda hours: _hours(hours / local_cores))
+    tasks = f"{prediction.num_tasks}, {prediction.task_minutes:.1f} minutes each"
+    return [
+        ("core-hours", prediction.core_hours.to_text("{:,.2f}".format)),
+        (f"on {cores} cores", prediction.hours.to_text(_hours)),
+        (f"on the {local_cores} cores here", here_text),
+        ("USD", prediction.usd.to_text("{:,.2f}".format)),
+        ("GB", prediction.gigabytes.to_text("{:,.2f}".format)),
+        ("shards", f"{prediction.num_shards} of up to {prediction.scenes_per_shard} scenes"),
+        ("a shard", prediction.shard_hours.to_text("{:,.2f} core-hours".format)),
+        ("Prefect's task runs", tasks),
+        ("Prefect's database", f"{prediction.database_mb:.1f} MB"),
+        ("manifest.json", f"{prediction.manifest_mb:.1f} MB"),
+    ]
 
 
 def _hours(hours: float) -> str:
@@ -87,6 +96,6 @@ def _hours(hours: float) -> str:
 
 
 def _free(place: str) -> str:
-    """Return a place where no dataset is begun yet: this one, or with a number."""
+    """Return a folder or URL without a dataset: this one, or with a number added."""
     numbered = (place if number < 2 else f"{place}-{number}" for number in itertools.count(1))
     return next(name for name in numbered if not dataset_folder(name).manifest.exists())

@@ -1,33 +1,33 @@
-"""`trilight push`: a folder to a repository of the Hugging Face hub."""
+"""`trilight push`: uploads a folder to a repository of the Hugging Face hub."""
 
 from pathlib import Path
 
 from infra.cli.console import first_words, look_at, next_step, print_json, print_rows
-from infra.cli.options import Shown, command
+from infra.cli.options import OutputOptions, command
 from storage.settings.described import checked
 
 
 @checked()
-class PushAsked:
-    """What to upload, and where to."""
+class PushOptions:
+    """Upload."""
 
     folder: Path
     """Finished dataset, folder with model.safetensors, or page with index.html."""
     repository: str
-    """Repository USER/NAME; made where it is missing."""
+    """Repository USER/NAME, which is created if it is missing."""
     private: bool = False
     """Make a new repository private; refuse one that is public."""
     dry_run: bool = False
-    """Only check and say what would be uploaded."""
+    """Check the folder and print the upload, but upload nothing."""
 
 
 @command("folder", "repository")
-def push(asked: PushAsked, shown: Shown) -> None:
-    first_words(f"Looking through {asked.folder}", silent=shown.json)
+def push(options: PushOptions, output: OutputOptions) -> None:
+    first_words(f"Looking through {options.folder}", silent=output.json)
     from infra.release.push import planned_upload
     from infra.release.push import push as upload_all
 
-    upload = planned_upload(asked.folder, asked.repository)
+    upload = planned_upload(options.folder, options.repository)
     facts: dict[str, str | int] = {
         "folder": str(upload.folder),
         "repository": upload.repository,
@@ -35,18 +35,18 @@ def push(asked: PushAsked, shown: Shown) -> None:
         "files": upload.files,
         "bytes": upload.num_bytes,
     }
-    if not asked.dry_run:
-        first_words(f"Uploading to {upload.repository}", silent=shown.json)
-        facts["address"] = upload_all(upload, private=asked.private)
-    if shown.json:
+    if not options.dry_run:
+        first_words(f"Uploading to {upload.repository}", silent=output.json)
+        facts["address"] = upload_all(upload, private=options.private)
+    if output.json:
         print_json(facts)
         return
     rows = [(name, str(value)) for name, value in facts.items() if name != "bytes"]
-    title = "Would be uploaded" if asked.dry_run else "Uploaded"
+    title = "Would be uploaded" if options.dry_run else "Uploaded"
     print_rows(title, [*rows, ("size", f"{upload.num_bytes / 1e6:.1f} MB")])
-    if asked.dry_run:
-        private = ["--private"] if asked.private else []
-        next_step(["push", str(asked.folder), asked.repository, *private])
+    if options.dry_run:
+        private = ["--private"] if options.private else []
+        next_step(["push", str(options.folder), options.repository, *private])
     elif upload.kind == "dataset":
         next_step(["verify", f"hf://datasets/{upload.repository}"])
     else:

@@ -1,4 +1,4 @@
-"""`trilight render`: pictures of scenes, by path tracing, by a trained network, or by both."""
+"""`trilight render`: renders scenes by path tracing, by a trained network, or by both."""
 
 import time
 from typing import TYPE_CHECKING
@@ -7,8 +7,8 @@ from rich.progress import Progress
 from rich.text import Text
 
 from infra.cli.console import progress_bars
-from infra.cli.options import Shown, command
-from infra.rendering.request import Asked
+from infra.cli.options import OutputOptions, command
+from infra.rendering.options import RenderOptions
 
 if TYPE_CHECKING:
     from infra.rendering.ways import Choice
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
 
 
 @command("source")
-def render(asked: Asked, shown: Shown) -> None:
+def render(options: RenderOptions, output: OutputOptions) -> None:
     from infra.cli.rendered import print_outcome
-    from infra.rendering.run import render_asked
+    from infra.rendering.run import render_from_options
 
     started = time.monotonic()
     with progress_bars() as bars:
-        outcome = render_asked(asked, _Bars(bars, visible=not shown.json))
-    print_outcome(outcome, time.monotonic() - started, as_json=shown.json)
+        outcome = render_from_options(options, _Bars(bars, visible=not output.json))
+    print_outcome(outcome, time.monotonic() - started, as_json=output.json)
 
 
 class _Bars:
-    """Shows how many pictures are finished, and how many samples the one at hand has."""
+    """Progress bars of finished pictures, and of the samples of the current one."""
 
     def __init__(self, bars: Progress, *, visible: bool) -> None:
         self._bars = bars
@@ -35,14 +35,14 @@ class _Bars:
         self._samples = bars.add_task("samples", total=None, note="", visible=False)
         self._visible = visible
 
-    def chosen(self, choice: "Choice") -> None:
+    def on_choice(self, choice: "Choice") -> None:
         if self._visible:
             self._bars.console.print(Text(choice.sentence), soft_wrap=True)
 
-    def pictures(self, done: int, total: int) -> None:
+    def on_picture(self, done: int, total: int) -> None:
         self._bars.update(self._pictures, completed=done, total=total, visible=self._visible)
 
-    def sampled(self, now: "Sampling") -> None:
+    def on_samples(self, now: "Sampling") -> None:
         note = "" if now.missing_db is None else f"{now.missing_db:.1f} dB to go"
         self._bars.update(
             self._samples,

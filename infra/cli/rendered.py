@@ -1,4 +1,4 @@
-"""What `trilight render` says when it is done."""
+"""Output of `trilight render` at its end."""
 
 import dataclasses
 from collections import Counter
@@ -13,7 +13,7 @@ from infra.rendering.comparison import Flicker
 from infra.rendering.engines import EnginePlan, Facts, MitsubaPlan, NeuralPlan
 from infra.rendering.look import enlargement
 from infra.rendering.plan import RenderPlan
-from infra.rendering.run import FinishedShot, RenderOutcome
+from infra.rendering.run import FinishedShot, RenderResult
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.settings import RenderSettings
 
@@ -24,7 +24,7 @@ _FLOORS = {
     "noise_floor_linear_db": "psnr_linear_db",
     "object_noise_floor_db": "object_psnr_log_db",
 }
-"""The metric of each floor that a path traced picture states."""
+"""Metric by the name of the stated error (noise floor) of a path traced picture."""
 
 _FILTERS = {
     "fast": "one fast denoise",
@@ -38,8 +38,8 @@ _MEANING = {
 }
 
 
-def print_outcome(outcome: RenderOutcome, seconds: float, *, as_json: bool) -> None:
-    """Print files and figures: of the only picture, or summed up over all."""
+def print_outcome(outcome: RenderResult, seconds: float, *, as_json: bool) -> None:
+    """Print files and figures of the only picture, or a summary of many."""
     plan = outcome.plan
     if as_json:
         shots = [_shot_json(shot, timed=plan.choice is not None) for shot in outcome.shots]
@@ -53,25 +53,25 @@ def print_outcome(outcome: RenderOutcome, seconds: float, *, as_json: bool) -> N
         }
         if plan.choice is not None:
             common["choice"] = plan.choice.sentence
-        if not plan.place.is_sequence:
+        if not plan.output.is_sequence:
             print_json({**common, **shots[0]})
             return
-        video = plan.place.video
+        video = plan.output.video
         print_json({**common, "pictures": shots, "video": None if video is None else str(video)})
         return
     for note in outcome.notes:
         console.print(Text(f"Note: {note}.", style="yellow"))
-    if plan.place.is_sequence:
+    if plan.output.is_sequence:
         _print_sequence(plan, outcome.shots, seconds)
     else:
         _print_one(plan, outcome.shots[0], seconds)
 
 
 def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
-    """Return the figures of one shot; with one engine they stand beside those of the scene."""
+    """Return the figures of one shot; those of a single engine are not nested."""
     of_engines: Mapping[str, Any] = {
         name: {**picture.facts, "exr": str(picture.path), "kept": picture.was_kept}
-        | ({"picture_seconds": _rounded(picture.seconds)} if timed else {})
+        | ({"picture_seconds": _round_seconds(picture.seconds)} if timed else {})
         for name, picture in done.pictures.items()
     }
     for facts in of_engines.values():
@@ -94,7 +94,8 @@ def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
 
 
 def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
-    scene, width = done.scene, plan.resolution
+    scene = done.scene
+    width = plan.resolution
     factor = enlargement(width)
     enlarged = "" if factor == 1 else f"; in the PNG a pixel is {factor} x {factor}"
     rows: Rows = [
@@ -109,7 +110,7 @@ def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
         rows += _engine(engine, done.pictures[engine.name].facts)
     if done.psnr_log_db is not None:
         rows.append(("agreement", f"{done.psnr_log_db:.1f} dB (psnr_log_db)"))
-    rows += _taken(plan, [done])
+    rows += _time_rows(plan, [done])
     rows += [("wall time", f"{seconds:.1f} s"), ("scene digest", scene.digest)]
     print_rows("Rendered", rows)
     measure = " and ".join(str(picture.path) for picture in done.pictures.values())
@@ -134,7 +135,7 @@ def _engine(engine: EnginePlan, facts: Facts) -> Rows:
 
 
 def _layers(settings: RenderSettings, facts: Facts) -> Rows:
-    """Return the layers of the file with their floors."""
+    """Return a row for each layer of the file with its noise floor."""
     return [
         (f"layer {part}", f"{float(facts[f'{part}.noise_floor_db']):.1f} dB (psnr_log_db)")
         for part in settings.part_names
@@ -142,8 +143,9 @@ def _layers(settings: RenderSettings, facts: Facts) -> Rows:
 
 
 def _floor(settings: RenderSettings, facts: Facts, name: str, metric: str) -> str:
-    """Return one floor of a picture, and what came of its target if there is one."""
-    floor_db, target_db = float(facts[name]), settings.targets_db.get(metric)
+    """Return the text of one noise floor, and whether its target was reached."""
+    floor_db = float(facts[name])
+    target_db = settings.targets_db.get(metric)
     text = f"{floor_db:.1f} dB ({metric}{_MEANING.get(metric, '')}"
     if target_db is None:
         return f"{text})"
@@ -152,7 +154,7 @@ def _floor(settings: RenderSettings, facts: Facts, name: str, metric: str) -> st
 
 
 def _floors(shots: Sequence[FinishedShot]) -> dict[str, list[float]]:
-    """Return the floors of all pictures by metric; empty where none is path traced."""
+    """Return the noise floors of all pictures by metric; empty where none is path traced."""
     every = [shot.pictures["mitsuba"].facts for shot in shots if "mitsuba" in shot.pictures]
     traced = [facts for facts in every if "noise_floor_db" in facts]
     names = _FLOORS.items() if traced else ()
@@ -160,7 +162,7 @@ def _floors(shots: Sequence[FinishedShot]) -> dict[str, list[float]]:
 
 
 def _print_last(look: str, floors: Mapping[str, Sequence[float]]) -> None:
-    """Print where to look, and all three floors: one of them alone says little."""
+    """Print the file to look at, and all three noise floors, since one alone means little."""
     if floors:
         log, linear, objects = (np.median(values) for values in floors.values())
         which = "noise floor" if len(floors["psnr_log_db"]) == 1 else "median noise floor"
@@ -170,10 +172,10 @@ def _print_last(look: str, floors: Mapping[str, Sequence[float]]) -> None:
 
 def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: float) -> None:
     pictures = [picture for shot in shots for picture in shot.pictures.values()]
-    kept = Counter(picture.was_kept for picture in pictures)[True]
+    num_kept = Counter(picture.was_kept for picture in pictures)[True]
     rows: Rows = [
         ("pictures", f"{len(shots)} of {plan.resolution} x {plan.resolution}"),
-        ("files", f"{len(pictures)}, of which {kept} were there already"),
+        ("files", f"{len(pictures)}, of which {num_kept} were there already"),
     ]
     floors = _floors(shots)
     agreements = [shot.psnr_log_db for shot in shots if shot.psnr_log_db is not None]
@@ -181,16 +183,16 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
         rows += _spread("noise floor" if metric == "psnr_log_db" else "", values, metric)
     rows += _spread("agreement", agreements, "psnr_log_db")
     rows += _flicker([shot.flicker for shot in shots if shot.flicker is not None])
-    rows += _taken(plan, shots)
+    rows += _time_rows(plan, shots)
     rows.append(("wall time", f"{seconds:.1f} s"))
     print_rows("Rendered", rows)
-    folder = plan.place.folder
-    look = plan.place.video or folder
+    folder = plan.output.folder
+    look = plan.output.video or folder
     _print_last(f"Look at {look}; measure with the pictures in {folder}", floors)
 
 
-def _taken(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:
-    """Return what pictures took beside what was expected, where a way was chosen by that."""
+def _time_rows(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:
+    """Return measured and expected seconds, where --seconds or --error chose the preset."""
     taken = [each.seconds for shot in shots for each in shot.pictures.values() if each.seconds]
     if plan.choice is None or not taken:
         return []
@@ -199,21 +201,22 @@ def _taken(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:
     return [("picture took", f"{text}; expected {plan.choice.priced.seconds:.2g} s")]
 
 
-def _rounded(seconds: float | None) -> float | None:
+def _round_seconds(seconds: float | None) -> float | None:
     return None if seconds is None else float(f"{seconds:.4g}")
 
 
 def _spread(name: str, values_db: Sequence[float], metric: str) -> Rows:
     if not values_db:
         return []
-    median, low = np.median(values_db), np.percentile(values_db, 5)
+    median = np.median(values_db)
+    low = np.percentile(values_db, 5)
     return [(name, f"median {median:.1f} dB, 5th percentile {low:.1f} dB ({metric})")]
 
 
-def _flicker(found: Sequence[Flicker]) -> Rows:
-    if not found:
+def _flicker(flickers: Sequence[Flicker]) -> Rows:
+    if not flickers:
         return []
-    median = np.median([flicker.db for flicker in found])
-    noise = np.median([flicker.noise_db for flicker in found])
+    median = np.median([flicker.db for flicker in flickers])
+    noise = np.median([flicker.noise_db for flicker in flickers])
     text = f"median {median:.1f} dB from frame to frame; the traced frames' noise alone {noise:.1f}"
     return [("flicker", text)]

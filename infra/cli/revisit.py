@@ -1,15 +1,15 @@
-"""`trilight revisit`: a new dataset of the scenes of a finished one."""
+"""`trilight revisit`: makes a new dataset from the scenes of a finished one."""
 
-from infra.cli.changes import Shared
+from infra.cli.changes import BaseSettings
 from infra.cli.console import first_words
-from infra.cli.dataset_changes import with_shared
-from infra.cli.generate import ExecutorChoice, make
-from infra.cli.options import Shown, command
-from pipeline.making.revisit_order import Revisit, revisit_order
+from infra.cli.dataset_changes import with_base_settings
+from infra.cli.generate import ExecutorOptions, make
+from infra.cli.options import OutputOptions, command
+from pipeline.generation.revisit_options import RevisitOptions, revisit_order
 
 
 @command("dataset")
-def revisit(asked: Revisit, runner: ExecutorChoice, shown: Shown) -> None:
-    first_words(f"Reading {asked.dataset}", silent=shown.json)
-    order = with_shared(revisit_order(asked), Shared(like=asked.dataset))
-    make(order, runner, shown)
+def revisit(options: RevisitOptions, runner: ExecutorOptions, output: OutputOptions) -> None:
+    first_words(f"Reading {options.dataset}", silent=output.json)
+    order = with_base_settings(revisit_order(options), BaseSettings(like=options.dataset))
+    make(order, runner, output)

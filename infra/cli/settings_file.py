@@ -1,4 +1,4 @@
-"""`--settings FILE.yaml`: values by dotted name, each with the line that states it."""
+"""Reads `--settings FILE.yaml`: values by dotted name, each with its line in the file."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,18 +14,18 @@ from storage.settings.changes import json_or_word
 _MOST_BYTES = 1 << 16
 _EXAMPLE = "such as scenes.lights.coloured_share: 0.5"
 
-Stated = dict[str, tuple[Any, int]]
+StatedSettings = dict[str, tuple[Any, int]]
 """Value and line of each setting, by its dotted name."""
 
 
-def read_settings_file(file: str) -> Stated:
-    """Return what a YAML file of settings states, nested or by dotted names.
+def read_settings_file(file: str) -> StatedSettings:
+    """Return the settings of a YAML file, nested or by dotted names.
 
     Values are read as `--set` reads them: a quoted one is a text, a plain one is JSON or a word.
 
     Raises:
-        TrilightError: a file that cannot be read, is no mapping, or states something twice; file
-            and line are named.
+        TrilightError: the file cannot be read, is no mapping, or states a setting twice; the
+            message names file and line.
     """
     try:
         with open_plain(Path(file)) as stream:
@@ -45,7 +45,7 @@ def read_settings_file(file: str) -> Stated:
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or "it holds a character that YAML does not"
         raise TrilightError(f"{file}, line {mark.line + 1 if mark else 1}: {problem}.") from error
-    stated: Stated = {}
+    stated: StatedSettings = {}
     for name, value, line in [] if root is None else _entries(root, file, ""):
         if name in stated:
             raise TrilightError(f"{file}, line {line}: {name} is given twice; expected it once.")
@@ -54,7 +54,7 @@ def read_settings_file(file: str) -> Stated:
 
 
 class _Loader(yaml.SafeLoader):
-    """Reader without aliases, which could stand for any number of values, or for themselves."""
+    """Reader that refuses aliases, which could expand without limit or contain themselves."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -78,16 +78,16 @@ def _entries(node: yaml.Node, file: str, prefix: str) -> Iterator[tuple[str, Any
 
 
 def _json(node: yaml.Node, file: str, name: str) -> Any:
-    """Return a value as JSON has it; `name` is the setting, for messages."""
+    """Return a node as a JSON value; `name` is the setting, for messages."""
     if isinstance(node, yaml.SequenceNode):
         return [_json(entry, file, name) for entry in node.value]
     if isinstance(node, yaml.MappingNode):
-        found = {str(key.value): _json(value, file, name) for key, value in node.value}
-        if len(found) < len(node.value):
+        values = {str(key.value): _json(value, file, name) for key, value in node.value}
+        if len(values) < len(node.value):
             raise TrilightError(
                 f"{file}, line {_line(node)}: a name is given twice; expected it once."
             )
-        return found
+        return values
     try:
         return json_or_word(node.value) if node.style is None else node.value
     except TrilightError as error:

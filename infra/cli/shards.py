@@ -1,4 +1,4 @@
-"""`trilight shards`: new datasets made of finished ones."""
+"""`trilight shards`: makes new datasets from finished ones."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,10 +15,10 @@ from infra.cli.console import (
     print_table,
     progress_bars,
 )
-from infra.cli.options import Shown, command
-from pipeline.shards.derive import Derive
-from pipeline.shards.finished import open_finished
-from pipeline.shards.listing import listed_scenes
+from infra.cli.options import OutputOptions, command
+from pipeline.shards.derive import DeriveOptions
+from pipeline.shards.finished_dataset import open_finished
+from pipeline.shards.listing import list_scenes as read_scene_rows
 from pipeline.shards.plans import Selection
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -27,28 +27,28 @@ from storage.settings.ranges import Within
 app = App(name="shards", help_epilogue="")
 
 _MOST_LISTED = 40
-"""Most scenes that a person is shown."""
+"""Maximum number of scenes in a printed list."""
 
 
 @checked()
-class NewDataset:
-    """The new dataset."""
+class NewDatasetOptions:
+    """New dataset."""
 
     out: Path
     """Folder of the new dataset, which must not exist."""
 
 
 @checked()
-class Datasets:
-    """The source datasets."""
+class MergeOptions:
+    """Sources."""
 
     datasets: tuple[Path, ...]
-    """Folders of finished datasets."""
+    """Folders of two or more finished datasets."""
 
 
 @checked()
-class Selected:
-    """The dataset, and the scenes to keep."""
+class SelectOptions:
+    """Source and conditions."""
 
     dataset: Path
     """Folder of a finished dataset."""
@@ -57,15 +57,14 @@ class Selected:
     template: str | None = None
     """Keep only the scenes of this layout, such as plane; by default all."""
     min_noise_floor_db: Annotated[float | None, Within(-100, 200, unit="dB")] = None
-    """Keep only the scenes whose views all have at least this noise floor (psnr_log_db); by default
-    all."""
+    """Keep only scenes whose views all have this noise floor (psnr_log_db); by default all."""
     where: str | None = None
-    """Keep only the scenes for which this condition holds, such as "max(roughness) < 0.3 and
-    lights_per_scene > 1" (the reference page Quantities has the names); by default all."""
+    """Keep only scenes that meet a condition such as "max(roughness) < 0.3"; by default all. The
+    reference page Quantities has the names."""
 
     @property
     def selection(self) -> Selection:
-        """What is to be kept."""
+        """The conditions as the selection of a derived dataset."""
         return Selection(
             split=self.split,
             template=self.template,
@@ -75,8 +74,8 @@ class Selected:
 
 
 @checked()
-class Resharded:
-    """The dataset, and the size of its new shards."""
+class ReshardOptions:
+    """Source and shard size."""
 
     dataset: Path
     """Folder of a finished dataset."""
@@ -84,39 +83,37 @@ class Resharded:
     """Number of scenes in each new shard."""
 
 
-@app.command(
-    help="Put datasets together, shard by shard; later ones get keys beyond those of earlier ones."
-)
+@app.command(help="Merge datasets shard by shard; later ones get new keys.")
 @command("datasets")
-def merge(sources: Datasets, new: NewDataset, shown: Shown) -> None:
+def merge(sources: MergeOptions, new: NewDatasetOptions, output: OutputOptions) -> None:
     if len(sources.datasets) < 2:
         raise TrilightError(f"merge: {len(sources.datasets)} dataset; expected at least 2.")
-    _run(sources.datasets, Derive(operation="merge"), new.out, as_json=shown.json)
+    _run(sources.datasets, DeriveOptions(operation="merge"), new.out, as_json=output.json)
 
 
 @app.command(help="Keep the scenes that meet every condition, under their keys.")
 @command("dataset")
-def select(chosen: Selected, new: NewDataset, shown: Shown) -> None:
-    if chosen.selection == Selection():
+def select(options: SelectOptions, new: NewDatasetOptions, output: OutputOptions) -> None:
+    if options.selection == Selection():
         raise TrilightError("select: expected --where, --split, --template or --min-noise-floor.")
-    derive = Derive(operation="select", selection=chosen.selection)
-    _run([chosen.dataset], derive, new.out, as_json=shown.json)
+    derive = DeriveOptions(operation="select", selection=options.selection)
+    _run([options.dataset], derive, new.out, as_json=output.json)
 
 
 @app.command(
-    name="list", help="List the scenes that `select` would keep, by default all; nothing is made."
+    name="list", help="List the scenes that `select` would keep, without making a dataset."
 )
 @command("dataset")
-def list_scenes(chosen: Selected, shown: Shown) -> None:
-    first_words(f"Reading {chosen.dataset}", silent=shown.json)
+def list_scenes(chosen: SelectOptions, output: OutputOptions) -> None:
+    first_words(f"Reading {chosen.dataset}", silent=output.json)
     with progress_bars() as bars:
-        task = bars.add_task("shards", total=None, note="", visible=not shown.json)
-        scenes = listed_scenes(
+        task = bars.add_task("shards", total=None, note="", visible=not output.json)
+        scenes = read_scene_rows(
             open_finished(str(chosen.dataset)),
             chosen.selection,
             progress=lambda done, total: bars.update(task, completed=done, total=total),
         )
-    if shown.json:
+    if output.json:
         print_json({"of": scenes.of, "scenes": list(scenes.rows)})
         return
     title = f"{len(scenes.rows)} of {scenes.of} scenes; of several views the least, most spp"
@@ -131,20 +128,20 @@ def list_scenes(chosen: Selected, shown: Shown) -> None:
             "--min-noise-floor": chosen.min_noise_floor_db,
             "--where": chosen.where,
         }
-        given = [(name, str(value)) for name, value in options.items() if value is not None]
-        next_step([*words, *(word for pair in given for word in pair)])
+        stated = [(name, str(value)) for name, value in options.items() if value is not None]
+        next_step([*words, *(word for pair in stated for word in pair)])
 
 
-@app.command(help="Divide the scenes of every split into shards of another size, under their keys.")
+@app.command(help="Repack the scenes of every split into shards of another size.")
 @command("dataset")
-def reshard(asked: Resharded, new: NewDataset, shown: Shown) -> None:
-    derive = Derive(operation="reshard", scenes_per_shard=asked.scenes_per_shard)
-    _run([asked.dataset], derive, new.out, as_json=shown.json)
+def reshard(options: ReshardOptions, new: NewDatasetOptions, output: OutputOptions) -> None:
+    derive = DeriveOptions(operation="reshard", scenes_per_shard=options.scenes_per_shard)
+    _run([options.dataset], derive, new.out, as_json=output.json)
 
 
-def _run(datasets: Sequence[Path], derive: Derive, out: Path, *, as_json: bool) -> None:
+def _run(datasets: Sequence[Path], derive: DeriveOptions, out: Path, *, as_json: bool) -> None:
     first_words(f"Making {out}", silent=as_json)
-    from pipeline.making.derive_dataset import derive_dataset  # slow: matplotlib
+    from pipeline.generation.derive_dataset import derive_dataset  # slow: matplotlib
 
     places = [str(path) for path in datasets]
     with progress_bars() as bars:

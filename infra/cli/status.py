@@ -1,4 +1,4 @@
-"""`trilight status`: how far a dataset is, from its files alone."""
+"""`trilight status`: prints the progress of a dataset, from its files alone."""
 
 import dataclasses
 import time
@@ -13,8 +13,8 @@ from infra.cli.console import (
     print_json,
     print_rows,
 )
-from infra.cli.options import Shown, command
-from pipeline.making.price import CorePrice
+from infra.cli.options import OutputOptions, command
+from pipeline.generation.price import CorePrice
 from storage.dataset.progress import DatasetStatus, missing_shards, read_status
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
@@ -23,19 +23,17 @@ from storage.settings.ranges import Within
 
 
 @checked()
-class StatusOrder:
-    """The dataset."""
+class StatusOptions:
+    """Dataset."""
 
     dataset: str
-    """The dataset, a folder or a URL."""
+    """Dataset, a folder or a URL."""
     missing: bool = False
-    """Print only the numbers of the missing shards, such as 0-3,7, and nothing if none is: what a
-    scheduler needs to start them again."""
+    """Print only the missing shards' numbers, such as 0-3,7, for schedulers."""
     shards_per_task: Annotated[int, Within(1, 10**6, unit="shards")] = 1
-    """With --missing: print instead the numbers of the tasks that make so many shards each."""
+    """Number of shards of a task; --missing then prints numbers of tasks."""
     lines: bool = False
-    """With --missing: print a range A:B of shards a line instead, as --shards of generate takes
-    it."""
+    """Print missing shards as ranges A:B, one a line, for generate --shards."""
 
     def __post_init__(self) -> None:
         if self.shards_per_task != 1 and not self.missing:
@@ -47,38 +45,41 @@ class StatusOrder:
 
 
 @command("dataset")
-def status(watched: StatusOrder, core: CorePrice, shown: Shown) -> None:
-    if watched.missing:
-        _print_missing(watched, as_json=shown.json)
+def status(options: StatusOptions, core: CorePrice, output: OutputOptions) -> None:
+    if options.missing:
+        _print_missing(options, as_json=output.json)
         return
-    found = read_status(watched.dataset)
-    cost = None if found.core_hours is None else found.core_hours * core.price
-    if shown.json:
-        row = {**dataclasses.asdict(found), "next": _next(found), "cost_usd": cost}
+    progress = read_status(options.dataset)
+    cost = None if progress.core_hours is None else progress.core_hours * core.price
+    if output.json:
+        row = {**dataclasses.asdict(progress), "next": _next(progress), "cost_usd": cost}
         print_json(row)
         return
     rows = [
-        ("shards", f"{found.shards_done} of {found.shards_planned}"),
-        ("scenes", f"{found.scenes_done} of {found.scenes_planned}"),
-        *([("given up", f"{found.scenes_given_up} scenes")] if found.scenes_given_up else []),
-        ("views", f"{found.scenes_done * found.num_views}"),
-        *_speed(found),
-        *(("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in found.failures),
-        ("dataset digest", found.digest if found.finished else "known once it is finished"),
+        ("shards", f"{progress.shards_done} of {progress.shards_planned}"),
+        ("scenes", f"{progress.scenes_done} of {progress.scenes_planned}"),
+        *([("given up", f"{progress.scenes_given_up} scenes")] if progress.scenes_given_up else []),
+        ("views", f"{progress.scenes_done * progress.num_views}"),
+        *_rate_rows(progress),
+        *(
+            ("rejected", f"{count} x {stage}: {reason}")
+            for stage, reason, count in progress.failures
+        ),
+        ("dataset digest", progress.digest if progress.finished else "known once it is finished"),
     ]
     if cost is not None:
-        rows.append(("cost so far", f"{found.core_hours:.2f} core-hours, {cost:.2f} USD"))
-    title = "finished" if found.finished else "unfinished"
-    print_rows(f"{found.shown}: {found.build}, {title}", rows)
-    if found.next_words:
-        next_step(found.next_words, recorded=found.extensions)
+        rows.append(("cost so far", f"{progress.core_hours:.2f} core-hours, {cost:.2f} USD"))
+    title = "finished" if progress.finished else "unfinished"
+    print_rows(f"{progress.display_name}: {progress.build}, {title}", rows)
+    if progress.next_words:
+        next_step(progress.next_words, recorded=progress.extensions)
     else:
-        look_at(_next(found))
+        look_at(_next(progress))
 
 
-def _print_missing(watched: StatusOrder, *, as_json: bool) -> None:
-    each = watched.shards_per_task
-    tasks = sorted({shard // each for shard in missing_shards(watched.dataset)})
+def _print_missing(options: StatusOptions, *, as_json: bool) -> None:
+    each = options.shards_per_task
+    tasks = sorted({shard // each for shard in missing_shards(options.dataset)})
     ranges = [f"{task * each}:{(task + 1) * each}" for task in tasks]
     if as_json:
         print_json(
@@ -89,27 +90,27 @@ def _print_missing(watched: StatusOrder, *, as_json: bool) -> None:
                 "shards_per_task": each,
             }
         )
-    elif watched.lines:
+    elif options.lines:
         console.file.writelines(f"{shards}\n" for shards in ranges)
     elif tasks:
         console.print(number_ranges(tasks), soft_wrap=True)
 
 
-def _next(found: DatasetStatus) -> str:
-    if found.next_words:
-        return command_line(found.next_words, found.extensions)
+def _next(progress: DatasetStatus) -> str:
+    if progress.next_words:
+        return command_line(progress.next_words, progress.extensions)
     return (
-        f"To resume: trilight generate {found.build} --scenes {found.scenes_planned}, with the "
-        "same other options as before."
+        f"To resume: trilight generate {progress.build} --scenes {progress.scenes_planned}, with "
+        "the same other options as before."
     )
 
 
-def _speed(found: DatasetStatus) -> list[tuple[str, str]]:
+def _rate_rows(progress: DatasetStatus) -> list[tuple[str, str]]:
     rows = []
-    if found.views_per_hour is not None and found.remaining_s is not None:
-        left = f"{duration(found.remaining_s)} left at that rate"
-        rows.append(("rate", f"{found.views_per_hour:.0f} views an hour; {left}"))
-    if found.last_scene_unix_s is not None and not found.finished:
-        ago = max(0.0, time.time() - found.last_scene_unix_s)
+    if progress.views_per_hour is not None and progress.remaining_s is not None:
+        remaining = f"{duration(progress.remaining_s)} left at that rate"
+        rows.append(("rate", f"{progress.views_per_hour:.0f} views an hour; {remaining}"))
+    if progress.last_scene_unix_s is not None and not progress.finished:
+        ago = max(0.0, time.time() - progress.last_scene_unix_s)
         rows.append(("last scene", f"{duration(ago)} ago"))
     return rows

@@ -1,4 +1,4 @@
-"""`trilight submit slurm` and `kubernetes`: what is missing, as an array."""
+"""`trilight submit slurm` and `kubernetes`: submits the missing shards as an array of tasks."""
 
 import shlex
 from collections.abc import Sequence
@@ -8,12 +8,12 @@ from infra.cli.console import console, first_words, next_step, note, print_json,
 from pipeline.executors.array_job import ArrayJob, array_job
 from pipeline.executors.kubernetes_array import (
     KubernetesOptions,
-    create_words,
+    create_command,
     submit_job,
     write_manifest,
 )
-from pipeline.executors.slurm_array import sbatch_environment, sbatch_words, submit_array
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.executors.slurm_array import sbatch_command, sbatch_environment, submit_array
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
 from storage.settings.described import checked
@@ -21,67 +21,67 @@ from storage.settings.ranges import Within
 
 SLURM = "slurm"
 ARRAYS = (SLURM, "kubernetes")
-"""The schedulers."""
+"""Schedulers that take an array of tasks."""
 
 
 @checked()
-class ArrayAsked:
-    """With slurm or kubernetes: how the array is cut."""
+class ArrayOptions:
+    """Array (slurm or kubernetes)."""
 
     shards_per_task: Annotated[int | None, Within(1, 10**6, unit="shards")] = None
     """Number of shards of an array task; by default as few as 1000 tasks allow."""
     at_once: Annotated[int | None, Within(1, 10**6, unit="tasks")] = None
-    """Maximum number of tasks that run at the same time; by default the cluster decides."""
+    """Maximum number of tasks at the same time; by default the cluster decides."""
     sbatch: tuple[str, ...] = ()
-    """With slurm: further options of sbatch, such as --sbatch=--partition=cpu; by default there are
-    none."""
+    """slurm: further options of sbatch, such as --sbatch=--partition=cpu; by default none."""
     dry_run: bool = False
-    """Print the commands instead of submitting; files that they name are written."""
+    """Write the files and print the commands, but submit nothing."""
 
 
 def submit_to_array(
-    order: DatasetOrder, on: str, asked: ArrayAsked, machines: KubernetesOptions, *, as_json: bool
+    order: DatasetOrder, on: str, array: ArrayOptions, machines: KubernetesOptions, *, as_json: bool
 ) -> None:
-    """Submit the missing shards of a dataset, and say what was submitted; raises TrilightError."""
-    _refuse_of_others(on, asked, machines)
+    """Submit the missing shards of a dataset and print the job; raises TrilightError."""
+    _refuse_foreign_options(on, array, machines)
     first_words(f"Looking for what is missing of {order.place}", silent=as_json)
-    job = array_job(order, per_task=asked.shards_per_task, at_once=asked.at_once, on=on)
+    job = array_job(order, per_task=array.shards_per_task, at_once=array.at_once, on=on)
     if not job.tasks:
-        _say_finished(order, as_json=as_json)
+        _print_nothing_missing(order, as_json=as_json)
     elif on == SLURM:
-        _submit_slurm(job, asked, as_json=as_json)
+        _submit_slurm(job, array, as_json=as_json)
     else:
-        _submit_kubernetes(job, asked, machines, as_json=as_json)
+        _submit_kubernetes(job, array, machines, as_json=as_json)
 
 
-def _refuse_of_others(on: str, asked: ArrayAsked, machines: KubernetesOptions) -> None:
+def _refuse_foreign_options(on: str, array: ArrayOptions, machines: KubernetesOptions) -> None:
     if on == SLURM and machines != KubernetesOptions():
         raise TrilightError(
             "submit slurm: --image, --where and the other options of machines are those of "
             "submit kubernetes; leave them out, and use --sbatch."
         )
-    if on != SLURM and asked.sbatch:
+    if on != SLURM and array.sbatch:
         raise TrilightError(f"submit {on}: --sbatch is an option of submit slurm; leave it out.")
 
 
-def _submit_slurm(job: ArrayJob, asked: ArrayAsked, *, as_json: bool) -> None:
-    number = None if asked.dry_run else submit_array(job, asked.sbatch)
+def _submit_slurm(job: ArrayJob, array: ArrayOptions, *, as_json: bool) -> None:
+    number = None if array.dry_run else submit_array(job, array.sbatch)
     if as_json:
-        array = number_ranges(job.tasks)
-        print_json({"job": number, "array": array, "shards_per_task": job.per_task})
+        numbers = number_ranges(job.tasks)
+        print_json({"job": number, "array": numbers, "shards_per_task": job.per_task})
         return
-    _say(job, number, dry_run=asked.dry_run)
-    if asked.dry_run:
-        console.print(_slurm_line(job, asked.sbatch), soft_wrap=True)
+    _print_submitted(job, number, dry_run=array.dry_run)
+    if array.dry_run:
+        console.print(_slurm_line(job, array.sbatch), soft_wrap=True)
     else:
-        _say_how_to_go_on(job)
+        _print_next(job)
 
 
 def _submit_kubernetes(
-    job: ArrayJob, asked: ArrayAsked, options: KubernetesOptions, *, as_json: bool
+    job: ArrayJob, array: ArrayOptions, options: KubernetesOptions, *, as_json: bool
 ) -> None:
-    manifest = (write_manifest if asked.dry_run else submit_job)(job, options)
-    name, words = manifest.parent.name, create_words(manifest)
+    manifest = (write_manifest if array.dry_run else submit_job)(job, options)
+    name = manifest.parent.name
+    words = create_command(manifest)
     if as_json:
         print_json(
             {
@@ -90,18 +90,18 @@ def _submit_kubernetes(
                 "shards_per_task": job.per_task,
                 "files": [str(manifest)],
                 "commands": [words],
-                "submitted": not asked.dry_run,
+                "submitted": not array.dry_run,
             }
         )
         return
-    _say(job, name, dry_run=asked.dry_run)
-    if asked.dry_run:
+    _print_submitted(job, name, dry_run=array.dry_run)
+    if array.dry_run:
         console.print(shlex.join(words), soft_wrap=True)
     else:
-        _say_how_to_go_on(job)
+        _print_next(job)
 
 
-def _say(job: ArrayJob, name: str | None, *, dry_run: bool) -> None:
+def _print_submitted(job: ArrayJob, name: str | None, *, dry_run: bool) -> None:
     rows = [
         ("tasks", f"{len(job.tasks)}: {number_ranges(job.tasks)}"),
         ("shards a task", str(job.per_task)),
@@ -110,12 +110,12 @@ def _say(job: ArrayJob, name: str | None, *, dry_run: bool) -> None:
     print_rows("Would be submitted" if dry_run else "Submitted", rows)
 
 
-def _say_how_to_go_on(job: ArrayJob) -> None:
+def _print_next(job: ArrayJob) -> None:
     note("the same command submits again what is missing then, once no task is left in the queue")
     next_step(["status", job.order.place])
 
 
-def _say_finished(order: DatasetOrder, *, as_json: bool) -> None:
+def _print_nothing_missing(order: DatasetOrder, *, as_json: bool) -> None:
     if as_json:
         print_json({"job": None, "array": "", "shards_per_task": None})
         return
@@ -124,7 +124,7 @@ def _say_finished(order: DatasetOrder, *, as_json: bool) -> None:
 
 
 def _slurm_line(job: ArrayJob, options: Sequence[str]) -> str:
-    """Return the command for a shell; without the folder of their logs, Slurm fails all tasks."""
+    """Return the shell command; it makes the folder of the logs, without which all tasks fail."""
     variables = sbatch_environment(job).items()
     settings = [f"{name}={shlex.quote(value)}" for name, value in variables]
-    return " ".join(["mkdir -p logs &&", *settings, shlex.join(sbatch_words(job, options))])
+    return " ".join(["mkdir -p logs &&", *settings, shlex.join(sbatch_command(job, options))])

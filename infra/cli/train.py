@@ -1,4 +1,4 @@
-"""`trilight train`: a named run on the shards of a dataset, alone or under torchrun."""
+"""`trilight train`: trains a preset on the shards of a dataset, alone or under torchrun."""
 
 import dataclasses
 import os
@@ -12,34 +12,34 @@ from rich.progress import Progress as Bars
 from rich.progress import TaskID
 from rich.text import Text
 
-from infra.cli.changes import Shared, all_changes, run_record
+from infra.cli.changes import BaseSettings, all_changes, run_record
 from infra.cli.console import console, look_at, print_rows, progress_bars
-from infra.cli.options import Shown, command
+from infra.cli.options import OutputOptions, command
 from infra.run_record import tensorboard_command
 from infra.torch_library import require_torch
-from infra.train_order import TrainOrder
+from infra.train_options import TrainOptions
 from storage.errors import TrilightError
 from storage.installation import child_environment
 from storage.settings.described import option_words
+from train.monitoring.settings import WatchSettings
 from train.progress import TrainProgress
-from train.runs import in_proportion, named_run
+from train.runs import named_run, scale_intervals
 from train.settings import TrainSettings
-from train.watching.settings import WatchSettings
 
 if TYPE_CHECKING:
-    from train.going_on import Event
     from train.result import TrainResult
+    from train.resume import Event
 
 
 class _BarProgress(TrainProgress):
-    """Shows a run as a progress bar, and each validation as a line."""
+    """Progress of a run as a bar, with a line for each validation."""
 
     def __init__(self, bars: Bars) -> None:
         self._bars = bars
         self._task: TaskID = bars.add_task("steps", total=None, start=False, note="")
         self._first_step = 0
 
-    def noted(self, text: str) -> None:
+    def note(self, text: str) -> None:
         console.print(Text(f"Note: {text}.", style="yellow"))
 
     def begin(
@@ -65,14 +65,14 @@ class _BarProgress(TrainProgress):
         note = f"loss {loss:.4f}, {views_per_s:.1f} views/s"
         self._bars.update(self._task, completed=step - self._first_step, note=note)
 
-    def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
+    def report_validation(self, *, step: int, scores: Mapping[str, float]) -> None:
         console.print(
             f"step {step}: validation log L1 {scores['log_l1']:.4f}, median "
             f"{scores['psnr_log_db_median']:.2f} dB log, {scores['psnr_linear_db_median']:.2f} dB "
             "linear"
         )
 
-    def interrupted(self, times: int) -> None:
+    def report_interrupt(self, times: int) -> None:
         if times == 1:
             console.print(
                 "Stopping after this step and saving. Press Ctrl-C again to end without saving."
@@ -81,15 +81,15 @@ class _BarProgress(TrainProgress):
         self._bars.stop()
         _end("ended at once", 130)
 
-    def hung(self, text: str) -> None:
+    def report_hang(self, text: str) -> None:
         self._bars.stop()
         _end(text, 1)
 
 
 class _QuietProgress(TrainProgress):
-    """Shows nothing."""
+    """Progress that prints nothing."""
 
-    def hung(self, text: str) -> None:
+    def report_hang(self, text: str) -> None:
         _end(text, 1)
 
 
@@ -101,44 +101,46 @@ def _end(text: str, status: int) -> NoReturn:
 
 
 @command("run")
-def train(order: TrainOrder, watched: WatchSettings, shared: Shared, shown: Shown) -> None:
-    if shared.is_given:
-        changes = all_changes(named_run(order.run), shared, run_record(shared), order.changes)
+def train(
+    order: TrainOptions, watched: WatchSettings, base: BaseSettings, output: OutputOptions
+) -> None:
+    if base.is_given:
+        changes = all_changes(named_run(order.run), base, run_record(base), order.changes)
         order = dataclasses.replace(order, changes=changes)
     settings = order.settings()  # without torch, so that mistakes are named at once
     if order.processes > 1:
-        _launch(order, watched, shown)
-    if os.environ.get("RANK", "0") == "0" and not shown.json:
+        _launch(order, watched, output)
+    if os.environ.get("RANK", "0") == "0" and not output.json:
         _announce(order, settings)
-    result = _trained(order, settings, watched, quiet=shown.json)
+    result = _run_training(order, settings, watched, quiet=output.json)
     if result is None:
         return
-    if shown.json:
+    if output.json:
         sys.stdout.write(result.folder.summary.read_text())
     else:
         _report(result)
 
 
-def _launch(order: TrainOrder, watched: WatchSettings, shown: Shown) -> NoReturn:
+def _launch(order: TrainOptions, watched: WatchSettings, output: OutputOptions) -> NoReturn:
     """Become torchrun, which starts this command once for each process."""
     if "RANK" in os.environ:
         raise TrilightError(
             f"--processes is {order.processes} under torchrun, which sets their number; omit it."
         )
-    words = [*order.command(), *option_words(watched), *option_words(shown)]
+    words = [*order.command(), *option_words(watched), *option_words(output)]
     os.execve(words[0], words, child_environment())
 
 
-def _trained(
-    order: TrainOrder, settings: TrainSettings, watched: WatchSettings, *, quiet: bool
+def _run_training(
+    order: TrainOptions, settings: TrainSettings, watched: WatchSettings, *, quiet: bool
 ) -> "TrainResult | None":
-    """Train as train.run.train_run does; torch is imported here, which takes seconds."""
+    """Train by `train.run.train_run`; imports torch, which takes seconds."""
     require_torch("train")
-    from train.loop.crew import join_crew
+    from train.loop.distributed import join_processes
     from train.loop.interrupts import Stopped
     from train.run import train_run
 
-    with join_crew(order.device) as crew, progress_bars() as bars:
+    with join_processes(order.device) as crew, progress_bars() as bars:
         progress = _QuietProgress() if quiet else _BarProgress(bars)
         try:
             return train_run(
@@ -148,28 +150,28 @@ def _trained(
                 start=order.start(),
                 workers=order.workers,
                 watched=watched,
-                crew=crew,
+                dist_context=crew,
                 progress=progress,
             )
         except Stopped as stopped:
             if crew.world_size > 1:  # torchrun's own arguments are not known here
                 raise
             typed = [part for part in sys.argv[1:] if part != "--resume"]
-            again = [] if order.restartable else ["--resume"]
-            command = shlex.join(["trilight", *typed, *again])
+            resume = [] if order.restartable else ["--resume"]
+            command = shlex.join(["trilight", *typed, *resume])
             raise Stopped(stopped.step, command) from stopped
 
 
-def _announce(order: TrainOrder, settings: TrainSettings) -> None:
-    """Say what begins or goes on, before torch is imported."""
-    if order.start().goes_on:  # how, the checkpoint says
+def _announce(order: TrainOptions, settings: TrainSettings) -> None:
+    """Print the start or the continuation of a run, before torch is imported."""
+    if order.start().continues_run:  # how, the checkpoint says
         console.print(f"Run {settings.run} goes on. Loading torch and the checkpoint ...")
         return
     if (steps := order.steps) is not None:
-        shorter = in_proportion(named_run(order.run), steps, order.changes)
+        shorter = scale_intervals(named_run(order.run), steps, order.changes)
         if shorter:
-            shown = ", ".join(f"{name}={value}" for name, value in shorter.items())
-            console.print(f"In proportion to {steps} steps: {shown}")
+            text = ", ".join(f"{name}={value}" for name, value in shorter.items())
+            console.print(f"In proportion to {steps} steps: {text}")
     console.print(
         f"Run {settings.run}: {settings.num_steps} steps of {settings.scenes_per_step} scenes at "
         f"{settings.resolution} pixels. Loading torch and the data ..."
@@ -182,10 +184,10 @@ def _report(result: "TrainResult") -> None:
             "training loss",
             f"{result.loss_at_start:.4f} at the start, {result.loss_at_end:.4f} at end",
         ),
-        *_judged(result),
+        *_validation_rows(result),
         ("steps", f"{result.num_steps}, of which {result.skipped_steps} not finite and skipped"),
         *(("left out", message) for message in result.unusable),
-        *(("changed", _said(event)) for event in result.history if event.kind == "meaning"),
+        *(("changed", _event_text(event)) for event in result.history if event.kind == "meaning"),
         ("wall time", f"{result.seconds / 60:.1f} min"),
         ("weights", str(result.folder.weights)),
     ]
@@ -194,16 +196,19 @@ def _report(result: "TrainResult") -> None:
     look_at(f"{sheet}Curves and pictures: {tensorboard_command(result.folder.root)}")
 
 
-def _said(event: "Event") -> str:
-    before, after = event.before, event.after
+def _event_text(event: "Event") -> str:
+    before = event.before
+    after = event.after
     return f"{event.name} from {before} to {after} at step {event.step}"
 
 
-def _judged(result: "TrainResult") -> list[tuple[str, str]]:
-    scores, rival, lead = result.scores, result.median_scores, result.lead
+def _validation_rows(result: "TrainResult") -> list[tuple[str, str]]:
+    scores = result.scores
+    rival = result.median_scores
+    lead = result.lead
     if scores is None or rival is None or lead is None:
         return [("validation", "none: the data has no validation split")]
-    # of a median picture without any error there is no percentage
+    # a median picture without any error allows no percentage
     unit, form = (rival["log_l1"], ".1%") if rival["log_l1"] else (1.0, ".4f")
     ahead = f"{lead.log_l1 / unit:+{form}}"
     chance = "one scene" if lead.error is None else f"chance {2 * lead.error / unit:{form}}"

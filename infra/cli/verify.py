@@ -1,4 +1,4 @@
-"""`trilight verify`: is a dataset what its manifest says?"""
+"""`trilight verify`: checks a dataset against its manifest."""
 
 import sys
 
@@ -10,7 +10,7 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
-from infra.cli.options import Shown, command
+from infra.cli.options import OutputOptions, command
 from storage.dataset.asked import read_asked, value_of
 from storage.dataset.dataset import open_dataset
 from storage.dataset.derived import derivation_of
@@ -21,45 +21,48 @@ from storage.settings.described import checked
 
 
 @checked()
-class Checked:
-    """The dataset, and what to check."""
+class VerifyOptions:
+    """Dataset and checks."""
 
     dataset: str
-    """The dataset, a folder or a URL."""
+    """Dataset, a folder or a URL."""
     fast: bool = False
     """Check sizes and counts only."""
     repair: bool = False
-    """Make missing and bad shards anew, and check again."""
+    """Make missing and bad shards again, and check again."""
     objects: str | None = None
-    """With --repair: source of objects; by default that of the generate command."""
+    """Source of objects for --repair; by default that of the generate command."""
     scenes_from: str | None = None
-    """With --repair: folder of the scene files that the dataset was made of; by default none."""
+    """Folder of the dataset's scene files, for --repair; by default none."""
 
 
 @command("dataset")
-def verify(asked: Checked, shown: Shown) -> None:
-    first_words(f"Verifying {safe_url(asked.dataset)}", silent=shown.json)
-    found = _verified(asked.dataset, fast=asked.fast, silent=shown.json)
-    if asked.repair and found.bad_shards and found.is_finished:
+def verify(options: VerifyOptions, output: OutputOptions) -> None:
+    first_words(f"Verifying {safe_url(options.dataset)}", silent=output.json)
+    verification = _verify(options.dataset, fast=options.fast, silent=output.json)
+    if options.repair and verification.bad_shards and verification.is_finished:
         from infra.repair import repair as make_anew  # slow: the whole pipeline
 
-        if not shown.json:
-            _report(found, fast=asked.fast)
+        if not output.json:
+            _report(verification, fast=options.fast)
             first_words("Repairing the named shards")
         make_anew(
-            asked.dataset, found.bad_shards, objects=asked.objects, scenes_from=asked.scenes_from
+            options.dataset,
+            verification.bad_shards,
+            objects=options.objects,
+            scenes_from=options.scenes_from,
         )
-        found = _verified(asked.dataset, fast=asked.fast, silent=shown.json)
-    if shown.json:
-        print_json(_as_json(found))
+        verification = _verify(options.dataset, fast=options.fast, silent=output.json)
+    if output.json:
+        print_json(_as_json(verification))
     else:
-        _report(found, fast=asked.fast)
-        _print_repair(found, asked.dataset)
-    if found.problems or not found.is_finished:
+        _report(verification, fast=options.fast)
+        _print_repair(verification, options.dataset)
+    if verification.problems or not verification.is_finished:
         sys.exit(1)
 
 
-def _verified(dataset: str, *, fast: bool, silent: bool) -> Verification:
+def _verify(dataset: str, *, fast: bool, silent: bool) -> Verification:
     opened = open_dataset(dataset)
     with progress_bars() as bars:
         total = len(opened.manifest.shards) or None
@@ -67,19 +70,21 @@ def _verified(dataset: str, *, fast: bool, silent: bool) -> Verification:
         return verify_dataset(opened, fast=fast, shard_done=lambda _: bars.advance(task))
 
 
-def _print_repair(found: Verification, dataset: str) -> None:
-    """Print how to complete or repair a dataset, which depends on how it was made."""
-    asked = read_asked(open_dataset(dataset))
+def _print_repair(verification: Verification, dataset: str) -> None:
+    """Print how to complete or repair a dataset, depending on how it was made."""
+    generate_command = read_asked(open_dataset(dataset))
     is_remote = isinstance(parse_url(dataset, what="dataset"), RemoteUrl)
-    derivation = derivation_of(found.manifest.settings)
-    if not found.is_finished:
-        if asked is not None:
-            next_step((*asked, "--out", dataset), recorded=found.manifest.extensions)
+    derivation = derivation_of(verification.manifest.settings)
+    if not verification.is_finished:
+        if generate_command is not None:
+            next_step(
+                (*generate_command, "--out", dataset), recorded=verification.manifest.extensions
+            )
         else:
             look_at("To resume, run the trilight generate command that began it.")
-    elif not found.problems:
+    elif not verification.problems:
         return
-    elif not found.bad_shards:
+    elif not verification.bad_shards:
         look_at(
             "No shard was found wrong. Verify again what could not be read, and restore other "
             "named files from a copy."
@@ -93,43 +98,45 @@ def _print_repair(found: Verification, dataset: str) -> None:
         look_at(f"Make it again from its sources: trilight shards {derivation.operation}.")
     else:
         sources = ("--objects", "--scenes-from")
-        given = [(option, value_of(asked or (), option)) for option in sources]
-        named = [word for option, value in given if value for word in (option, value)]
+        values = [(option, value_of(generate_command or (), option)) for option in sources]
+        named = [word for option, value in values if value for word in (option, value)]
         words = ("verify", dataset, "--repair", *named)
-        next_step(words, recorded=found.manifest.extensions)
+        next_step(words, recorded=verification.manifest.extensions)
 
 
-def _as_json(found: Verification) -> dict[str, object]:
+def _as_json(verification: Verification) -> dict[str, object]:
     return {
-        "bad_shards": list(found.bad_shards),
-        "dataset_digest": found.manifest.dataset_digest,
-        "finished": found.is_finished,
-        "problems": list(found.problems),
-        "samples": found.num_samples,
-        "scenes_planned": found.manifest.num_scenes,
-        "shards": len(found.manifest.shards),
-        "shards_planned": found.num_shards_planned,
+        "bad_shards": list(verification.bad_shards),
+        "dataset_digest": verification.manifest.dataset_digest,
+        "finished": verification.is_finished,
+        "problems": list(verification.problems),
+        "samples": verification.num_samples,
+        "scenes_planned": verification.manifest.num_scenes,
+        "shards": len(verification.manifest.shards),
+        "shards_planned": verification.num_shards_planned,
     }
 
 
-def _report(found: Verification, *, fast: bool) -> None:
-    manifest = found.manifest
+def _report(verification: Verification, *, fast: bool) -> None:
+    manifest = verification.manifest
     rows = [
         ("dataset digest", manifest.dataset_digest),
-        ("shards", f"{_shards(found)}, {manifest.num_bytes / 1e6:.1f} MB"),
-        ("scenes", f"{found.num_samples} of {manifest.num_scenes} planned"),
+        ("shards", f"{_shards(verification)}, {manifest.num_bytes / 1e6:.1f} MB"),
+        ("scenes", f"{verification.num_samples} of {manifest.num_scenes} planned"),
         ("checked", "sizes and counts" if fast else "hashes, members, laws, pictures, splits"),
-        *(("wrong", problem) for problem in found.problems),
+        *(("wrong", problem) for problem in verification.problems),
     ]
-    print_rows(_verdict(found), rows)
+    print_rows(_verdict(verification), rows)
 
 
-def _shards(found: Verification) -> str:
-    there = len(found.manifest.shards)
-    return f"{there}" if found.is_finished else f"{there} of {found.num_shards_planned}"
+def _shards(verification: Verification) -> str:
+    count = len(verification.manifest.shards)
+    return (
+        f"{count}" if verification.is_finished else f"{count} of {verification.num_shards_planned}"
+    )
 
 
-def _verdict(found: Verification) -> str:
-    if found.problems:
+def _verdict(verification: Verification) -> str:
+    if verification.problems:
         return "Does not match its manifest"
-    return "Verified" if found.is_finished else "Unfinished; everything present is valid"
+    return "Verified" if verification.is_finished else "Unfinished; everything present is valid"

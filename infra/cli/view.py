@@ -1,4 +1,4 @@
-"""`trilight view`: a page on this machine to look at scenes or a dataset."""
+"""`trilight view`: serves a local page to look at scenes or a dataset."""
 
 import os
 import signal
@@ -16,17 +16,15 @@ from storage.settings.ranges import Within
 
 
 @checked()
-class Viewed:
-    """What to look at, and where the page is."""
+class ViewOptions:
+    """Source and page."""
 
     source: str
-    """A scene in any form that render reads, a folder of such files, or a dataset (folder or
-    URL)."""
+    """Scene file, folder of scene files, or dataset (folder or URL)."""
     checkpoint: str | None = None
-    """A network to show beside the two that come with Trilight, in any form that render takes; by
-    default only these."""
+    """Network to show in addition to the built-in ones; by default none."""
     port: Annotated[int, Within(0, 65_535)] = 0
-    """Port of this machine at which the page is served; 0 finds a free one."""
+    """Local port of the page; 0 finds a free one."""
     threads: Annotated[int | None, Within(1, 1024, unit="threads")] = None
     """Number of CPU threads of the path tracer; by default one for each core."""
     no_browser: bool = False
@@ -34,25 +32,25 @@ class Viewed:
 
 
 @command("source")
-def view(asked: Viewed) -> None:
-    first_words(f"Opening {safe_url(asked.source)}")
-    from infra.viewer.later import LaterRoom, page_of
+def view(options: ViewOptions) -> None:
+    first_words(f"Opening {safe_url(options.source)}")
+    from infra.viewer.deferred_handlers import DeferredHandlers, page_of
     from infra.viewer.server import PageServer
 
-    if asked.checkpoint is not None:
+    if options.checkpoint is not None:
         require_torch("--checkpoint")
-    later = LaterRoom(page_of(asked.source))
-    server = PageServer(later.gets, later.posts, port=asked.port)
+    later = DeferredHandlers(page_of(options.source))
+    server = PageServer(later.gets, later.posts, port=options.port)
     stopped = threading.Event()
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     look_at(f"Look at {server.address}")
     console.print("Only this machine reaches it, with this address. Ctrl-C ends it.", style="dim")
-    if not asked.no_browser and _has_screen():
+    if not options.no_browser and _has_screen():
         webbrowser.open(server.address)
-    from infra.viewer.open_source import opened_room  # slow: formats, renderers
+    from infra.viewer.open_source import open_handlers  # slow: formats, renderers
 
-    room = opened_room(asked.source, checkpoint=asked.checkpoint, threads=asked.threads)
+    room = open_handlers(options.source, checkpoint=options.checkpoint, threads=options.threads)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
     later.opened.set_result(room)
@@ -65,6 +63,6 @@ def view(asked: Viewed) -> None:
 
 
 def _has_screen() -> bool:
-    """Return whether a browser would open a window: others take over the terminal."""
+    """Return whether a browser would open a window instead of taking over the terminal."""
     screens = ("DISPLAY", "WAYLAND_DISPLAY")
     return sys.platform != "linux" or any(os.environ.get(name) for name in screens)

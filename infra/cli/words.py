@@ -1,4 +1,4 @@
-"""Words of the command line as the values of fields, by their types; the classes check them."""
+"""Converts words of the command line to values by the types of fields; the classes check them."""
 
 import os
 import types
@@ -12,19 +12,19 @@ from storage.remote.url import parse_local_path
 
 
 class FileName(Path):
-    """The type of an option that takes any text, which is most often a file: shells complete it."""
+    """Type of an option that takes any text; shells complete it as a file name."""
 
 
 def value_of(words: bool | str | Sequence[str], hint: Any) -> Any:
-    """Return the value that words state for a field.
+    """Return the value of a field from its words.
 
     Args:
-        words: what was typed, several where the field takes several; or whether a switch is set.
-        hint: the field's type. A word that is no value of it comes back as it is, for the class to
-            say what it expects.
+        words: the typed word, a list for a field that takes several, or a bool for a switch.
+        hint: type of the field. A word that is no value of it is returned unchanged, so that the
+            class reports what it expects.
 
     Raises:
-        TrilightError: a field of names with values, of which one is not written NAME=VALUE.
+        TrilightError: the field takes names with values, and a word is not NAME=VALUE.
     """
     if isinstance(words, bool):
         return words
@@ -47,13 +47,13 @@ def _one(word: str, hint: Any) -> Any:
 
 
 def choices_of(hint: Any) -> tuple[str, ...]:
-    """Return the words of which a field takes one; none where it takes others too."""
+    """Return the choices of a field; empty where it takes other words too."""
     inner = get_args(bare(hint))[0] if is_repeated(hint) else hint
     return tuple(kind for kind in _kinds(inner) if isinstance(kind, str))
 
 
 def kind_of(hint: Any) -> type:
-    """Return the type of one word of a field: bool, int, float, or str for every text."""
+    """Return the type of one word of a field: bool, int, float, or str for any text."""
     inner = get_args(bare(hint))[0] if is_repeated(hint) else hint
     return next((kind for kind in (bool, int, float) if kind in _kinds(inner)), str)
 
@@ -79,8 +79,8 @@ def bare(hint: Any) -> Any:
 
 
 def _kinds(hint: Any) -> tuple[Any, ...]:
-    """Return what a value may be: types, and the words of a choice."""
+    """Return the types and the choices that a value may be."""
     kind = bare(hint)
     if get_origin(kind) in (typing.Union, types.UnionType, Literal):
-        return tuple(found for part in get_args(kind) for found in _kinds(part))
+        return tuple(inner for part in get_args(kind) for inner in _kinds(part))
     return (kind,)

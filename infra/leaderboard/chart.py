@@ -1,4 +1,4 @@
-"""The chart of a leaderboard: a panel for each width, core-seconds against the median picture."""
+"""Chart of a leaderboard: a panel for each width, CPU seconds against the median error."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ _COSTS = ("a scene's first view", "a further view")
 
 
 def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
-    """Draw the panels into a PNG file; who has no price is a line across, NOISE a dashed one."""
+    """Draw the panels into a PNG file; entries without a price are lines, NOISE a dashed one."""
     import matplotlib
 
     matplotlib.use("Agg")  # before pyplot: no display is needed
@@ -42,9 +42,9 @@ def _plot(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
         layout="constrained",
     )
     figure.suptitle(title, fontsize=12)
-    shown = [_points(one) for one in widths]
-    colors = colors_of([point for points in shown for point in points])
-    for axes, one, points in zip(panels.flat, widths, shown, strict=True):
+    points_by_width = [_points(one) for one in widths]
+    colors = colors_of([point for points in points_by_width for point in points])
+    for axes, one, points in zip(panels.flat, widths, points_by_width, strict=True):
         axes.set_title(f"{one.width} x {one.width} pixels, {one.num_views} views", fontsize=11)
         axes.set_xlabel("core-seconds, one thread", fontsize=_FONT)
         axes.set_ylabel(f"median {METRIC}, higher is better", fontsize=_FONT)
@@ -54,7 +54,7 @@ def _plot(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
                 _line_across(axes, standing)
     draw_legend(figure, _COSTS, colors)
     figure.canvas.draw()  # places are known from here on
-    for axes, points in zip(panels.flat, shown, strict=True):
+    for axes, points in zip(panels.flat, points_by_width, strict=True):
         name_points(axes, points)
     figure.savefig(path, metadata={"Software": None})
     plt.close(figure)

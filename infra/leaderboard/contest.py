@@ -1,6 +1,6 @@
-"""Every contestant judged on every view: what is missing among the rows is made, one row each.
+"""Evaluates every contestant on every view, and adds the missing rows.
 
-The judging is that of `trilight evaluate`: targets, masks, metrics and floors are its own.
+The evaluation is that of `trilight evaluate`: targets, masks, metrics and noise floors are equal.
 """
 
 import dataclasses
@@ -18,59 +18,59 @@ from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
 from storage.records.sample import Sample
 from storage.seeds import rng_for
-from train.data.unusable import Unusable, first_samples
-from train.evaluation.judge import JudgedScene, judged_scene
-from train.evaluation.judged_view import JudgedView, facts_of
+from train.data.bad_samples import BadSampleCounter, first_samples
+from train.evaluation.judge import ValidationScene, validation_scene
+from train.evaluation.judged_view import JudgedView, scene_facts
 from train.evaluation.metrics import METRICS, noise_floors, picture_scores
 from train.loss.lpips import Lpips
 
 NOISE = "noise of the references"
-"""Name of the row that says what the targets leave open: nobody can be asked for more."""
+"""Name of the row of the targets' own noise, which bounds what any method can score."""
 
-Told = Callable[[int, int, str], None]
-"""Called with (finished, all) pairs of scene and width, and what is being done."""
+OnProgress = Callable[[int, int, str], None]
+"""Callback with (finished, all) pairs of scene and width, and the current step as text."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoardContest:
-    """Who is judged on what."""
+    """Scenes, widths and contestants of a leaderboard."""
 
     shards: ShardSet
-    """The split."""
+    """Shards of the split."""
     keys: Sequence[str]
-    """The scenes that are judged: the first ones of the split."""
+    """Keys of the evaluated scenes, the first ones of the split."""
     num_views: int
-    """Cameras of each scene."""
+    """Number of cameras of each scene."""
     timed_scenes: int
-    """And on the first so many of these everything is timed."""
+    """Number of scenes, from the start of `keys`, on which contestants are timed."""
     machine: str
-    """On which: prices of another one do not compare with those of this one."""
+    """Name of this processor; times of different processors are not comparable."""
     widths: Sequence[int]
-    """Pixels across, rising."""
+    """Widths of pictures in pixels, ascending."""
     contestants: Sequence[Contestant]
-    """In the order of their turns."""
+    """Contestants in the order of evaluation."""
     lpips: Lpips | None
-    """None where its weights are not at hand."""
+    """LPIPS metric; None without its weights."""
     rows: BoardRows
-    """What was judged already, and is from now on."""
+    """Stored rows, to which new ones are added."""
     left_out: dict[tuple[int, str], str] = field(default_factory=dict)
-    """Scenes that somebody could not show, by width and key: why."""
+    """Reason by (width, key) of scenes that a contestant cannot render."""
     notes: Sequence[str] = ()
-    """What a reader should know that no contestant says."""
+    """Notes for the reader, in addition to those of contestants."""
 
     @functools.cached_property
     def judged_by(self) -> str:
-        """The digest of how pictures are judged."""
+        """Digest of the metrics' definitions."""
         meanings = {metric: METRICS[metric].meaning for metric in METRICS}
         return sha256_hex(canonical_json([meanings, self.lpips is not None]))
 
     def row_key(self, width: int, name: str, made_by: str, key: str, view: int) -> RowKey:
-        """Return what a row is known by; `made_by` is the digest of what made the picture."""
+        """Return the key of a row; `made_by` is the digest of the method of the picture."""
         digest = sha256_hex(f"{made_by} {self.judged_by}".encode())
         return RowKey(width=width, scene=key, view=view, name=name, digest=digest)
 
     def key_of(self, contestant: Contestant, width: int, key: str, view: int) -> RowKey:
-        """Return what the row of a contestant is known by."""
+        """Return the key of a contestant's row."""
         return self.row_key(width, contestant.name, contestant.digest(key, view), key, view)
 
     def present(self, width: int) -> list[Contestant]:
@@ -80,48 +80,52 @@ class BoardContest:
 
 def first_keys(shards: ShardSet, limit: int) -> list[str]:
     """Return the keys of the first scenes of a split; no picture is read."""
-    found: list[str] = []
+    keys: list[str] = []
     for number in range(len(shards.names)):
-        if len(found) < limit:
+        if len(keys) < limit:
             with closing(shards.open(number)) as shard:
-                found += shard.keys
-    return found[:limit]
+                keys += shard.keys
+    return keys[:limit]
 
 
-def judge_all(contest: BoardContest, told: Told) -> None:
-    """Add every row that is missing.
+def judge_all(contest: BoardContest, on_progress: OnProgress) -> None:
+    """Add every missing row.
 
     Raises:
-        TrilightError: damaged data, or a network that cannot show a scene.
+        TrilightError: damaged data, or a network that cannot render a scene.
     """
     total = len(contest.keys) * len(contest.widths)
     done = 0
-    told(done, total, "")
-    samples = first_samples(contest.shards, len(contest.keys), Unusable(0))
+    on_progress(done, total, "")
+    samples = first_samples(contest.shards, len(contest.keys), BadSampleCounter(0))
     for number, sample in enumerate(samples):
         for width in contest.widths:
-            turn = _Turn(contest, sample, width, timed=number < contest.timed_scenes)
-            for contestant in turn.missing():
-                told(done, total, f"{width} px, {contestant.name}")
-                turn.judge(contestant)
-            turn.judge_noise()
+            scene_run = _SceneAtWidth(contest, sample, width, timed=number < contest.timed_scenes)
+            for contestant in scene_run.missing():
+                on_progress(done, total, f"{width} px, {contestant.name}")
+                scene_run.judge(contestant)
+            scene_run.judge_noise()
             done += 1
-            told(done, total, "")
+            on_progress(done, total, "")
 
 
-class _Turn:
-    """One scene at one width."""
+class _SceneAtWidth:
+    """Evaluation of one scene at one width."""
 
     def __init__(self, contest: BoardContest, sample: Sample, width: int, *, timed: bool) -> None:
-        self._contest, self._sample, self._width, self._timed = contest, sample, width, timed
-        self._scene: JudgedScene | None = None
+        self._contest = contest
+        self._sample = sample
+        self._width = width
+        self._timed = timed
+        self._scene: ValidationScene | None = None
 
     def missing(self) -> list[Contestant]:
-        """Return who has not all of the scene's rows, or not its times."""
+        """Return the contestants that lack rows or times of the scene."""
         return [one for one in self._contest.present(self._width) if not self._has_all(one)]
 
     def _has_all(self, contestant: Contestant) -> bool:
-        rows, machine = self._contest.rows, self._contest.machine
+        rows = self._contest.rows
+        machine = self._contest.machine
         keys = [self._key(contestant, view) for view in self._views()]
         is_priced = not (self._timed and contestant.is_timed) or rows.price(keys[0], machine)
         return bool(is_priced) and all(rows.get(key) is not None for key in keys)
@@ -133,29 +137,30 @@ class _Turn:
         return range(self._sample.scene.num_views)
 
     def judge(self, contestant: Contestant) -> None:
-        """Add a contestant's rows, or remember why the scene is left out."""
+        """Add a contestant's rows, or record why the scene is left out."""
         timed = self._timed and contestant.is_timed
         try:
-            shown = contestant.shown(self._sample, self._width, timed=timed)
+            pictures = contestant.shown(self._sample, self._width, timed=timed)
         except (Rejected, ChildFailed) as error:
             self._contest.left_out[self._width, self._sample.key] = f"{contestant.name}: {error}"
             return
         scene = self._judged_scene()
-        for view, picture in enumerate(shown.radiance_VRR3):
+        for view, picture in enumerate(pictures.radiance_VRR3):
             scores = picture_scores(
                 picture, scene.target_VRR3[view], scene.hits_VRR[view], self._contest.lpips
             )
             row = BoardRow(
                 scores=scores,
-                first_s=shown.first_s if view == 0 else None,
-                further_s=shown.further_s if view == 0 else None,
+                first_s=pictures.first_s if view == 0 else None,
+                further_s=pictures.further_s if view == 0 else None,
                 machine=self._contest.machine if timed and view == 0 else None,
             )
             self._contest.rows.add(self._key(contestant, view), row)
 
     def judge_noise(self) -> None:
-        """Add what the noise of the targets alone scores, with what is known of the scene."""
-        sample, facts = self._sample, facts_of(self._sample)
+        """Add the scores of the targets' own noise, with facts of the scene."""
+        sample = self._sample
+        facts = scene_facts(self._sample)
         for view in self._views():
             key = self._contest.row_key(self._width, NOISE, "", sample.key, view)
             if self._contest.rows.get(key) is None:
@@ -169,38 +174,38 @@ class _Turn:
                 )
                 self._contest.rows.add(key, BoardRow(scores=floors, facts=facts))
 
-    def _judged_scene(self) -> JudgedScene:
+    def _judged_scene(self) -> ValidationScene:
         if self._scene is None:
-            self._scene = judged_scene(self._sample, self._width)
+            self._scene = validation_scene(self._sample, self._width)
         return self._scene
 
 
 @dataclass(frozen=True, kw_only=True)
 class JudgedWidth:
-    """All that is known at one width."""
+    """Scores and times of all contestants at one width."""
 
     width: int
-    """Pixels across."""
+    """Width of the pictures in pixels."""
     views: tuple[JudgedView, ...]
-    """Views that every contestant of the width has, each with NOISE as a contestant too."""
+    """Views that every contestant of the width has, with NOISE as a further contestant."""
     first_s: dict[str, list[float]]
-    """Core-seconds of first views by contestant, one for each timed scene."""
+    """CPU seconds of first views by contestant, one for each timed scene."""
     further_s: dict[str, list[float]]
-    """And of further views."""
+    """CPU seconds of further views by contestant, one for each timed scene."""
 
 
 def judged_width(contest: BoardContest, width: int) -> JudgedWidth:
-    """Return the rows of a width, put together by view."""
-    found = JudgedWidth(width=width, views=tuple(_views(contest, width)), first_s={}, further_s={})
-    shown = {view.key for view in found.views}
-    timed = [key for key in contest.keys[: contest.timed_scenes] if key in shown]
+    """Return the rows of a width, grouped by view."""
+    judged = JudgedWidth(width=width, views=tuple(_views(contest, width)), first_s={}, further_s={})
+    scene_keys = {view.key for view in judged.views}
+    timed = [key for key in contest.keys[: contest.timed_scenes] if key in scene_keys]
     for one in contest.present(width):
         for key in timed:
             price = contest.rows.price(contest.key_of(one, width, key, 0), contest.machine)
             if price is not None:
-                found.first_s.setdefault(one.name, []).append(price[0])
-                found.further_s.setdefault(one.name, []).append(price[1])
-    return found
+                judged.first_s.setdefault(one.name, []).append(price[0])
+                judged.further_s.setdefault(one.name, []).append(price[1])
+    return judged
 
 
 def _views(contest: BoardContest, width: int) -> Iterator[JudgedView]:
@@ -220,8 +225,8 @@ def _views(contest: BoardContest, width: int) -> Iterator[JudgedView]:
 
 
 def _facts(facts: Any) -> dict[str, Any]:
-    """Return facts as they were before JSON made a list of a pair."""
+    """Return facts of a view from JSON, with the pair that JSON turned into a list."""
     excursion = facts["excursion"]
     known = {one.name for one in dataclasses.fields(JudgedView)}
-    whole = {**facts, "excursion": None if excursion is None else tuple(excursion)}
-    return {name: value for name, value in whole.items() if name in known}
+    values = {**facts, "excursion": None if excursion is None else tuple(excursion)}
+    return {name: value for name, value in values.items() if name in known}

@@ -1,6 +1,6 @@
-"""Who stands on a leaderboard: traced light, networks, the path tracer, and the nearest picture.
+"""Contestants of a leaderboard: traced light, networks, the path tracer, and the nearest picture.
 
-Each shows all views of a sample at a width, and says by a digest what decides its pictures.
+Each renders all views of a sample at a width, and has a digest of everything that decides them.
 """
 
 import functools
@@ -31,14 +31,16 @@ from storage.records.scene import Scene
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
-    from train.evaluation.rivals import Rivals
+    from train.evaluation.baselines import Baselines
 
-TRACED_LIGHT, TRACER = KINDS[1], KINDS[2]
-BASELINE, ELSEWHERE = "picture of another scene", "pictures made elsewhere"
-"""Kinds of contestants, beside those of infra.rendering.methods."""
+TRACED_LIGHT = KINDS[1]
+TRACER = KINDS[2]
+BASELINE = "picture of another scene"
+ELSEWHERE = "pictures made elsewhere"
+"""Kinds of contestants, in addition to those of infra.rendering.methods."""
 
 _REPEATS = 1
-"""Counted times after one to warm up: the median over scenes counts, not that over repeats."""
+"""Measured repetitions after the warm-up; one, because the result is the median over scenes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,41 +48,41 @@ class ShownViews:
     """All views of a scene by one contestant."""
 
     radiance_VRR3: NDArray[np.floating]
-    """Linear radiance of at least 0."""
+    """[V, R, R, 3] linear radiance of at least 0."""
     first_s: float | None = None
-    """Core-seconds of the first view, loading included; None where it was not timed."""
+    """CPU seconds of the first view, loading included; None if it was not timed."""
     further_s: float | None = None
-    """And of a further one."""
+    """CPU seconds of a further view; None if it was not timed."""
 
 
 class Contestant(Protocol):
-    """One row of the table."""
+    """Method that a leaderboard compares with others, one row of its table."""
 
     name: str
-    """Its name in the table."""
+    """Name of the row, unique on a leaderboard."""
     kind: str
-    """What it is one of, for the chart's colours."""
+    """Kind of method, which decides the chart's color."""
     is_timed: bool
-    """Whether core-seconds are measured of it."""
+    """True if CPU seconds are measured."""
     notes: Sequence[str]
-    """What a reader should know of it."""
+    """Notes on the method for the reader."""
 
     def why_not(self, width: int) -> str:
-        """Return why it has no pictures of this width; empty where it has."""
+        """Return why pictures of a width are unsupported; empty if they are supported."""
 
     def digest(self, key: str, view: int) -> str:
-        """Return the digest of all that decides its picture of a view."""
+        """Return the digest of everything that decides the picture of a view."""
 
     def shown(self, sample: Sample, width: int, *, timed: bool) -> ShownViews:
-        """Return its pictures of a sample.
+        """Return the pictures of a sample.
 
         Raises:
-            Rejected, ChildFailed: this scene cannot be shown.
+            Rejected, ChildFailed: the scene cannot be rendered.
         """
 
 
 def shown_by(method: Method, scene: Scene, *, timed: bool) -> ShownViews:
-    """Return all views of a scene by a method; core-seconds are of this process, kernels warm."""
+    """Return all views of a scene by a method, with CPU seconds of this process after a warm-up."""
     if not timed:
         return ShownViews(radiance_VRR3=_all_views(method, scene))
 
@@ -89,8 +91,8 @@ def shown_by(method: Method, scene: Scene, *, timed: bool) -> ShownViews:
         return lambda: view(scene.c2w[0], float(scene.fov_deg[0]))
 
     first = timed_views(load, repeats=_REPEATS)
-    whole = first.radiance_rgb[None] if scene.num_views == 1 else _all_views(method, scene)
-    return ShownViews(radiance_VRR3=whole, first_s=first.first_s, further_s=first.further_s)
+    pictures = first.radiance_rgb[None] if scene.num_views == 1 else _all_views(method, scene)
+    return ShownViews(radiance_VRR3=pictures, first_s=first.first_s, further_s=first.further_s)
 
 
 def _all_views(method: Method, scene: Scene) -> NDArray[np.float32]:
@@ -103,7 +105,7 @@ def _digest_of(**facts: Any) -> str:
 
 
 class MethodContestant:
-    """A method that is shown in this process: traced light alone, or a network."""
+    """Method that runs in this process: traced light without a network, or a network."""
 
     is_timed = True
 
@@ -115,8 +117,10 @@ class MethodContestant:
         weights: str = "",
         notes: Sequence[str],
     ) -> None:
-        """Take a method by its width; `weights` is the digest of what it has learned."""
-        self.name, self.kind, self.notes = name, kind_of(name), notes
+        """Store a function from width to method; `weights` is the digest of the network."""
+        self.name = name
+        self.kind = kind_of(name)
+        self.notes = notes
         self._method_of = functools.lru_cache(method_of)
         self._own = _digest_of(name="" if weights else name, weights=weights)
 
@@ -134,7 +138,7 @@ class MethodContestant:
 
 
 class NetworkContestant(MethodContestant):
-    """A network, at the widths that it can show."""
+    """Network, at the widths that it supports."""
 
     def __init__(self, name: str, renderer: "NeuralRenderer", notes: Sequence[str]) -> None:
         super().__init__(
@@ -157,17 +161,19 @@ class NetworkContestant(MethodContestant):
 
 
 class SampledContestant:
-    """Few samples a pixel with one denoise, in a child that traces on one thread."""
+    """Few samples per pixel with one denoise, in a child that traces on one thread."""
 
-    kind, is_timed = TRACER, True
+    kind = TRACER
+    is_timed = True
     notes: Sequence[str] = ()
 
     def __init__(
         self, level: tuple[int, Filtered], variant: Variant, child: Callable[[], IsolatedChild]
     ) -> None:
-        """Take samples a pixel with the filter; the child is asked for when it is needed."""
+        """Store samples per pixel, filter, and a function that starts the child when needed."""
         self.name = samples_name(level)
-        self._level, self._child = level, child
+        self._level = level
+        self._child = child
         libraries = {name: metadata.version(name) for name in ("mitsuba", "pyoidn")}
         self._own = _digest_of(level=list(level), variant=variant.name, libraries=libraries)
 
@@ -185,41 +191,45 @@ class SampledContestant:
 def shown_by_samples(
     scene: Scene, width: int, level: tuple[int, Filtered], timed: bool
 ) -> ShownViews:
-    """Return all views of a scene by samples a pixel; runs in the child."""
+    """Return all views of a scene by few samples per pixel; runs in the child."""
     if timed:
         warm_up_denoiser(width)
     return shown_by(sampled_method(width, *level), scene, timed=timed)
 
 
 class NearestContestant:
-    """The picture closest to the target among those of other scenes: what looking up can do.
+    """Picture of another scene that is nearest to the target: the bound of any lookup.
 
-    It is found by the target itself, so that no method that looks up a picture by the scene can do
+    The lookup uses the target itself, so that no method that looks up a picture by the scene can be
     better.
     """
 
-    kind, is_timed = BASELINE, False
+    kind = BASELINE
+    is_timed = False
 
     def __init__(
         self,
         name: str,
-        rivals_of: Callable[[int], "Rivals"],
+        rivals_of: Callable[[int], "Baselines"],
         *,
         pool: str,
         not_itself: bool,
         notes: Sequence[str],
     ) -> None:
-        """Take what is looked up.
+        """Store the pictures of the lookup.
 
         Args:
-            name: in the table.
-            rivals_of: the pictures of a width.
-            pool: digest of what they are of.
-            not_itself: whether the judged scenes are among them.
-            notes: what a reader should know.
+            name: name of the row.
+            rivals_of: function from width to the pictures of the lookup.
+            pool: digest of the dataset of these pictures.
+            not_itself: whether the evaluated scenes are among them.
+            notes: notes for the reader.
         """
-        self.name, self.notes, self._not_itself = name, notes, not_itself
-        self._rivals_of, self._own = functools.lru_cache(rivals_of), _digest_of(pool=pool)
+        self.name = name
+        self.notes = notes
+        self._not_itself = not_itself
+        self._rivals_of = functools.lru_cache(rivals_of)
+        self._own = _digest_of(pool=pool)
 
     def why_not(self, width: int) -> str:
         return ""

@@ -1,4 +1,4 @@
-"""A leaderboard as Markdown for people and as two CSV tables for programs."""
+"""Leaderboard as Markdown for people and as two CSV tables for programs."""
 
 import csv
 import io
@@ -23,10 +23,10 @@ def page(
     """Return leaderboard.md.
 
     Args:
-        about: facts of the set, by name.
-        widths: the table of each width.
-        notes: what a reader should know.
-        rival: name of the one that all others are compared with.
+        about: facts of the dataset by name.
+        widths: table of each width.
+        notes: notes for the reader.
+        rival: name of the row that all others are compared with.
     """
     lines = ["# Leaderboard", "", *(f"- {name}: {text(value)}" for name, value in about.items())]
     lines += [
@@ -91,14 +91,14 @@ def _pair_cells(lead: PairedLead) -> list[str]:
 
 
 def interval(lead: PairedLead, decimals: int) -> str:
-    """Return the ends of an interval; empty where there is none."""
+    """Return the ends of an interval as text; empty if there is no interval."""
     if lead.low is None or lead.high is None:
         return ""
     return f"{lead.low:+.{decimals}f} to {lead.high:+.{decimals}f}"
 
 
 def _paper(widths: Sequence[WidthStandings]) -> list[str]:
-    """Return the paper's table, and our means at its width below it."""
+    """Return RenderFormer's table, with the means at its width below it."""
     rows = [
         [name, *(f"{figures[metric]:g}" for metric in PUBLISHED)]
         for name, figures in PUBLISHED_ROWS.items()
@@ -109,11 +109,11 @@ def _paper(widths: Sequence[WidthStandings]) -> list[str]:
             [f"here: {text(each.name)}", *(_mean(metric, each) for metric in PUBLISHED)]
             for each in one.standings
         ]
-    here = f" Below it our means at {_PAPER_PX} pixels." if ours else ""
+    ours_text = f" Below it our means at {_PAPER_PX} pixels." if ours else ""
     return [
         "## Beside the paper",
         "",
-        f"{PUBLISHED_WHERE} Means, as there.{here}",
+        f"{PUBLISHED_WHERE} Means, as there.{ours_text}",
         "",
         table(["", *PUBLISHED], rows, numbers=len(PUBLISHED)),
     ]
@@ -130,7 +130,7 @@ _PARTS = ("median", "worse_5_percent", "mean", "median_worse_than_noise")
 def standings_csv(widths: Sequence[WidthStandings], machine: str) -> bytes:
     """Return leaderboard.csv: a row for each width and contestant, a column for each figure.
 
-    Prices go with the machine that they were measured on, since tables are put together.
+    Each row names the machine of its times, since tables of several machines may be merged.
     """
     columns = [f"{metric}_{part}" for metric in METRICS for part in _PARTS]
     head = [
@@ -157,12 +157,12 @@ def standings_csv(widths: Sequence[WidthStandings], machine: str) -> bytes:
 
 
 def pairs_csv(widths: Sequence[WidthStandings]) -> bytes:
-    """Return pairs.csv: what every contestant has more than every other one."""
+    """Return pairs.csv: the difference of every contestant from every other one."""
     head = ["width", "name", "than", "mean_db", "low_db", "high_db", "share_better"]
     rows = [
-        [one.width, inert(first), inert(second), *_lead_cells(found)]
+        [one.width, inert(first), inert(second), *_lead_cells(lead)]
         for one in widths
-        for (first, second), found in one.pairs.items()
+        for (first, second), lead in one.pairs.items()
     ]
     return _csv(head, rows)
 

@@ -1,4 +1,4 @@
-"""A folder of anybody's OpenEXR pictures as a contestant: one a view, all looked at first."""
+"""Folder of OpenEXR pictures from elsewhere as a contestant; all are checked at the start."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,44 +15,45 @@ from storage.records.safe_read import read_plain
 from storage.records.sample import Sample
 
 _LEAST = -1e-2
-"""Radiance below this is no rounding of a network's black."""
+"""Least radiance that still counts as a network's rounding of 0."""
 
 Views = Sequence[tuple[str, int]]
-"""Scene and camera of every view that is judged."""
+"""Scene key and camera of every evaluated view."""
 
 
 class FolderContestant:
-    """Pictures that were made elsewhere, at the one width that they have.
+    """Pictures from elsewhere, all of one width.
 
-    Values a little below 0, as networks of logarithms give them, count as 0; alpha is left out.
+    Values slightly below 0, which networks of logarithms return, count as 0; alpha is ignored.
     """
 
-    kind, is_timed = ELSEWHERE, False
+    kind = ELSEWHERE
+    is_timed = False
 
     def __init__(self, folder: Path, views: Views, widths: Sequence[int]) -> None:
-        """Look at the picture of every view.
+        """Check the picture of every view.
 
         Raises:
-            TrilightError: one is missing, no picture, of another width than the first one or than
-                is judged, or has values that are not finite or below 0.
+            TrilightError: a picture is missing, unreadable, of another width than the first one or
+                than the evaluated ones, or has values that are not finite or below 0.
         """
         self.name = f"pictures of {folder.name or folder.resolve().name}"
         self._folder = folder
         self._require_all(views)
         self._sha256: dict[tuple[str, int], str] = {}
-        found: dict[int, Path] = {}
+        by_width: dict[int, Path] = {}
         for key, view in views:
             path = self._path(key, view)
             data = _bytes_of(path)
-            found.setdefault(_picture(data, path, widths).shape[0], path)
+            by_width.setdefault(_picture(data, path, widths).shape[0], path)
             self._sha256[key, view] = sha256_hex(data)
-        if len(found) > 1:
-            shown = ", ".join(f"{path.name} has {width}" for width, path in found.items())
+        if len(by_width) > 1:
+            listed = ", ".join(f"{path.name} has {width}" for width, path in by_width.items())
             raise TrilightError(
-                f"--pictures {folder}: its pictures have several widths ({shown}); expected one. "
+                f"--pictures {folder}: its pictures have several widths ({listed}); expected one. "
                 "Put those of each width into a folder of their own."
             )
-        (self._width,) = found
+        (self._width,) = by_width
         self.notes: Sequence[str] = (
             f"{self.name} were made elsewhere: what they cost is not known, and they are judged at "
             f"{self._width} pixels alone",
@@ -127,13 +128,13 @@ def _refuse(radiance_rgb: NDArray[np.float32], legal: NDArray[np.bool_], name: s
 def folder_contestants(
     folders: Sequence[Path], views: Views, widths: Sequence[int]
 ) -> Mapping[str, FolderContestant]:
-    """Return the folders as contestants by name; raises TrilightError where two have one name."""
-    found: dict[str, FolderContestant] = {}
+    """Return the folders as contestants by name; raises TrilightError for equal names."""
+    by_name: dict[str, FolderContestant] = {}
     for folder in folders:
         one = FolderContestant(folder, views, widths)
-        if one.name in found:
+        if one.name in by_name:
             raise TrilightError(
                 f"--pictures {folder}: another folder has the same name; expected different ones."
             )
-        found[one.name] = one
-    return found
+        by_name[one.name] = one
+    return by_name

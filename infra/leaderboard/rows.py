@@ -1,7 +1,7 @@
-"""rows.jsonl: who scored what on which view, one JSON line each, so that nothing is judged twice.
+"""Store of a leaderboard's scores in rows.jsonl, so that no view is evaluated twice.
 
-A line is known by width, scene, view, name of the contestant, and the digest of all that decides
-the picture and how it is judged. The first line says of which set the others are.
+The key of a line is width, scene, view, the contestant's name, and the digest of everything that
+decides the picture and its evaluation. The first line names the dataset of the others.
 """
 
 import json
@@ -16,7 +16,7 @@ from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
 
 UNKNOWN_MACHINE = "a machine that is not named"
-"""Of rows that were written before they named it."""
+"""Machine of old rows, which do not name theirs."""
 
 Scores = Mapping[str, float | None]
 """Value by metric; None is n/a."""
@@ -24,43 +24,43 @@ Scores = Mapping[str, float | None]
 
 @dataclass(frozen=True, kw_only=True)
 class RowKey:
-    """What a row is known by."""
+    """Key of a row."""
 
     width: int
-    """Pixels across the picture."""
+    """Width of the picture in pixels."""
     scene: str
-    """Key of the sample."""
+    """Key of the scene's sample in the dataset."""
     view: int
-    """Which of its cameras."""
+    """Row of the camera in the scene."""
     name: str
-    """Who made the picture."""
+    """Name of the contestant, as in the table."""
     digest: str
-    """Of all that decides it, and of how it is judged."""
+    """SHA-256 of everything that decides the picture and its evaluation."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BoardRow:
-    """One picture's scores."""
+    """Scores and times of one picture."""
 
     scores: Scores
     first_s: float | None = None
-    """Core-seconds of the scene's first view, its loading included; None where it is not timed."""
+    """CPU seconds of the scene's first view, loading included; None if it is not timed."""
     further_s: float | None = None
-    """And of a further view."""
+    """CPU seconds of a further view; None if it is not timed."""
     machine: str | None = None
-    """What these were measured on, as infra.processor.processor calls it."""
+    """Processor of the times, named by infra.processor; None without times."""
     facts: Mapping[str, Any] | None = None
-    """What is known of the scene, beside the scores of the reference's own noise."""
+    """Facts of the scene, in rows of the targets' noise only."""
 
 
 class BoardRows:
-    """The rows of a folder."""
+    """Rows in rows.jsonl of a folder."""
 
     def __init__(self, path: Path, set_digest: str) -> None:
-        """Read what is there.
+        """Read the file if it exists, else begin it.
 
         Raises:
-            TrilightError: the rows are of another set, or are no rows.
+            TrilightError: the file holds rows of another dataset, or no rows.
         """
         self.path = path
         self._rows: dict[RowKey, BoardRow] = {}
@@ -70,7 +70,7 @@ class BoardRows:
             self._append({"set": set_digest})
             return
         try:
-            found = str(json.loads(lines[0])["set"])
+            stored_digest = str(json.loads(lines[0])["set"])
             for line in lines[1:]:
                 self._keep(*_row(json.loads(line)))
         except (ValueError, KeyError, TypeError) as error:
@@ -78,29 +78,29 @@ class BoardRows:
                 f"{path}: not the rows of a leaderboard ({error}). Choose another --out, or delete "
                 "the file."
             ) from error
-        if found != set_digest:
+        if stored_digest != set_digest:
             raise TrilightError(
-                f"{path}: its rows are of the set {found[:12]}, and SOURCE is {set_digest[:12]}; "
-                "expected the same set. Choose another --out."
+                f"{path}: its rows are of the set {stored_digest[:12]}, and SOURCE is "
+                f"{set_digest[:12]}; expected the same set. Choose another --out."
             )
 
     def get(self, key: RowKey) -> BoardRow | None:
-        """Return the row of a key, if it is there."""
+        """Return the row of a key, or None."""
         return self._rows.get(key)
 
     def price(self, key: RowKey, machine: str) -> tuple[float, float] | None:
-        """Return the core-seconds of first and further view on a machine; None where they lack."""
+        """Return the CPU seconds of first and further view on a machine, or None."""
         row = self._priced.get((key, machine))
         if row is None or row.first_s is None or row.further_s is None:
             return None
         return row.first_s, row.further_s
 
     def machines(self) -> set[str]:
-        """Return the names of all machines that something was timed on."""
+        """Return the names of all machines with times."""
         return {machine for _, machine in self._priced}
 
     def add(self, key: RowKey, row: BoardRow) -> None:
-        """Write a row at once; of two with one key the later one counts."""
+        """Append a row to the file; of two rows with one key the later one counts."""
         plain = {name: value for name, value in asdict(row).items() if value is not None}
         self._append({**asdict(key), **plain})
         self._keep(key, row)
@@ -111,7 +111,7 @@ class BoardRows:
             self._priced[key, row.machine or UNKNOWN_MACHINE] = row
 
     def _whole_lines(self) -> list[bytes]:
-        """Return the lines, and cut off one that was being written when a run was killed."""
+        """Return the whole lines, and truncate an incomplete one of a killed run."""
         data = read_plain(self.path) if self.path.is_file() else b""
         end = data.rfind(b"\n") + 1
         if end < len(data):

@@ -1,4 +1,4 @@
-"""A leaderboard from its order to its files: who never lacks, who is asked for, what is written."""
+"""Makes a leaderboard: selects the contestants, evaluates them, and writes the files."""
 
 import contextlib
 import functools
@@ -11,7 +11,7 @@ from infra.leaderboard.chart import plot_leaderboard
 from infra.leaderboard.contest import (
     BoardContest,
     JudgedWidth,
-    Told,
+    OnProgress,
     first_keys,
     judge_all,
     judged_width,
@@ -23,7 +23,7 @@ from infra.leaderboard.contestants import (
     NetworkContestant,
     SampledContestant,
 )
-from infra.leaderboard.order import LeaderboardOrder
+from infra.leaderboard.options import LeaderboardOptions
 from infra.leaderboard.page import page, pairs_csv, standings_csv
 from infra.leaderboard.picture_folder import folder_contestants
 from infra.leaderboard.rows import BoardRows
@@ -46,7 +46,7 @@ from pipeline.renders.variant import choose_variant
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
-from train.evaluation.evaluate import RIVAL_SCENES, make_rivals, stored_resolution
+from train.evaluation.evaluate import BASELINE_SCENES, make_baselines, stored_resolution
 from train.loop.checkpoints import network_of_run
 from train.loss.lpips import load_lpips
 
@@ -54,40 +54,42 @@ if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
 
 USUAL_WIDTHS = (64, 256, 512)
-"""Widths that are judged where nobody names any and the set has them."""
+"""Default widths in pixels, as far as they divide the dataset's width."""
 
 FILTER = "fast"
-"""The filter of the path tracer's rows."""
+"""Filter of the path tracer's rows."""
 
-NEAREST_TRAINED, NEAREST_OTHER = "nearest training view", "nearest other scene"
+NEAREST_TRAINED = "nearest training view"
+NEAREST_OTHER = "nearest other scene"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Leaderboard:
-    """A finished leaderboard."""
+    """Finished leaderboard."""
 
     widths: tuple[WidthStandings, ...]
-    """The table of each width."""
+    """Table of each width, ascending."""
     notes: tuple[str, ...]
-    """What a reader should know."""
+    """Notes for the reader, each once."""
     rival: str
     """Name of the row that all others are compared with."""
     out: Path
-    """Its folder."""
+    """Folder of the leaderboard's files."""
 
 
-def make_leaderboard(order: LeaderboardOrder, told: Told) -> Leaderboard:
-    """Judge what is missing, and write leaderboard.md, .csv and .png and pairs.csv.
+def make_leaderboard(order: LeaderboardOptions, on_progress: OnProgress) -> Leaderboard:
+    """Evaluate the missing views; write leaderboard.md, leaderboard.csv, pairs.csv and a chart.
 
     Raises:
-        TrilightError: the set, a network or a folder of pictures is unusable, the rows in the
-            folder are of another set, or nothing could be judged.
+        TrilightError: the dataset, a network or a folder of pictures is unusable, the folder's rows
+            are of another dataset, or no view could be evaluated.
     """
     opened = open_training_data([order.source])
     shards = opened.split(order.split)
     if opened.num_views is None:
         raise TrilightError(
-            f"SOURCE is {opened.shown}, a list of shards; expected a dataset with its manifest."
+            f"SOURCE is {opened.display_name}, a list of shards; expected a dataset with its "
+            "manifest."
         )
     widths = widths_of(order.width, stored_resolution(shards))
     keys = first_keys(shards, order.scenes)
@@ -105,35 +107,35 @@ def make_leaderboard(order: LeaderboardOrder, told: Told) -> Leaderboard:
             contestants=[
                 *folder_contestants(order.pictures, views, widths).values(),
                 *([nearest] if nearest else []),
-                *_never_lacking(stack),
+                *_builtin_entries(stack),
                 *_networks(order),
             ],
             lpips=load_lpips(order.lpips),
             rows=BoardRows(order.out / "rows.jsonl", opened.digest),
             notes=() if nearest else (ALONE,),
         )
-        judge_all(contest, told)
-    return _written(order, opened, contest, rival)
+        judge_all(contest, on_progress)
+    return _write_leaderboard(order, opened, contest, rival)
 
 
-def widths_of(asked: Sequence[int], stored: int) -> list[int]:
-    """Return the widths to judge at, rising; raises TrilightError where the set lacks one."""
-    if wrong := [width for width in asked if stored % width]:
+def widths_of(requested: Sequence[int], stored: int) -> list[int]:
+    """Return the widths to evaluate, ascending; raises TrilightError if one does not divide."""
+    if wrong := [width for width in requested if stored % width]:
         raise TrilightError(
             f"--width is {wrong[0]}; expected a divisor of {stored}, the width of the set. "
             "Generate it at another --resolution for wider pictures."
         )
     usual = [width for width in USUAL_WIDTHS if stored % width == 0]
-    return sorted(set(asked or usual or [stored]))
+    return sorted(set(requested or usual or [stored]))
 
 
 def _names(places: Sequence[str]) -> list[str]:
-    """Return what networks are called: by the folder of a run, by no path of this machine."""
+    """Return the row names of networks, by the folder of a run and without paths."""
     return [network_name(label) for label in network_labels(places)]
 
 
-def _never_lacking(stack: contextlib.ExitStack) -> Iterator[Contestant]:
-    """Yield what is traced, which stands on every leaderboard as the networks that come along."""
+def _builtin_entries(stack: contextlib.ExitStack) -> Iterator[Contestant]:
+    """Yield the traced contestants, which every leaderboard has."""
     yield MethodContestant(DIRECT_LIGHT, direct_light_method, notes=())
     traced = functools.cache(traced_network)
     yield MethodContestant(TRACED_LIGHT, lambda width: network_method(traced(), width), notes=())
@@ -152,40 +154,41 @@ ALONE = "no picture is looked up: the set has no scene beside the one that is ju
 
 
 def _nearest(
-    order: LeaderboardOrder, opened: TrainingData, keys: Sequence[str]
+    order: LeaderboardOptions, opened: TrainingData, keys: Sequence[str]
 ) -> NearestContestant | None:
-    """Return the pictures that are looked up: of the training split, or of the other scenes.
+    """Return the lookup among pictures of the training split, or of the other scenes.
 
-    None where the only scene to look up is the only one that is judged.
+    None if the only scene to look up is the only evaluated one.
     """
     pool = open_training_data(order.train_data) if order.train_data else opened
     trained = "train" in pool.splits
     split = "train" if trained else order.split
     if order.train_data and not trained:
         raise TrilightError(
-            f"--train-data {pool.shown}: it has no training split; expected one. Leave it out to "
+            f"--train-data {pool.display_name}: it has no training split; expected one. Leave it "
+            "out to "
             "look up the other scenes of the set."
         )
     if pool.digest == opened.digest and first_keys(pool.split(split), 2) == keys[:2] == keys[:1]:
         return None
     name = NEAREST_TRAINED if trained else NEAREST_OTHER
     note = (
-        f"{name} is found by the target itself, among the first {RIVAL_SCENES} scenes of the "
+        f"{name} is found by the target itself, among the first {BASELINE_SCENES} scenes of the "
         f"{split} split: no way to look one of them up can do better"
     )
     if not trained:
         note += ". The set has no training split, so that its other scenes are looked up"
     return NearestContestant(
         name,
-        lambda width: make_rivals(pool.split(split), width),
+        lambda width: make_baselines(pool.split(split), width),
         pool=f"{pool.digest} {split}",
         not_itself=pool.digest == opened.digest,
         notes=(note,),
     )
 
 
-def _networks(order: LeaderboardOrder) -> Iterator[Contestant]:
-    """Yield the networks that come along and those asked for, each once."""
+def _networks(order: LeaderboardOptions) -> Iterator[Contestant]:
+    """Yield the built-in networks and those of the options, each once."""
     from model.neural_renderer import NeuralRenderer
 
     places = [
@@ -211,15 +214,15 @@ def _about_network(name: str, renderer: "NeuralRenderer") -> str:
     return f"{name} is {renderer.digest[:8]}, trained at {width}{most}"
 
 
-def _written(
-    order: LeaderboardOrder, opened: TrainingData, contest: BoardContest, rival: str
+def _write_leaderboard(
+    order: LeaderboardOptions, opened: TrainingData, contest: BoardContest, rival: str
 ) -> Leaderboard:
     kinds = {one.name: one.kind for one in contest.contestants}
     judged = [judged_width(contest, width) for width in contest.widths]
     tables = tuple(standings_of(one, kinds, rival) for one in judged if one.views)
     if not tables:
         why = next(iter(contest.left_out.values()), "the split is empty")
-        raise TrilightError(f"leaderboard: no scene could be shown by everybody ({why}).")
+        raise TrilightError(f"leaderboard: no scene could be rendered by all entries ({why}).")
     about = {
         "set": f"{opened.build or 'a set of unknown build'}, digest {opened.digest[:12]}",
         "split": order.split,
@@ -236,7 +239,7 @@ def _written(
 
 
 FEW_SCENES = 10
-"""Below this an interval over scenes is a hint at most."""
+"""Number of scenes below which intervals over scenes are too narrow."""
 
 
 def _notes(contest: BoardContest, tables: Sequence[WidthStandings]) -> Iterator[str]:
@@ -268,7 +271,7 @@ def _notes(contest: BoardContest, tables: Sequence[WidthStandings]) -> Iterator[
 
 
 def _beyond(contest: BoardContest, judged: Sequence[JudgedWidth]) -> Iterator[str]:
-    """Yield which networks were shown larger scenes than they were trained on."""
+    """Yield a note for each network that rendered larger scenes than it was trained on."""
     sizes = {view.key: view.num_triangles for one in judged for view in one.views}
     for one in contest.contestants:
         most = one.most_triangles if isinstance(one, NetworkContestant) else None

@@ -1,4 +1,4 @@
-"""What the rows say of each contestant: medians, tails, price, and pairs with one of them."""
+"""Table of each width from the rows: medians, tails, costs, and paired differences."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -9,78 +9,78 @@ import numpy as np
 
 from infra.cost_tables import on_front
 from infra.leaderboard.contest import NOISE, JudgedWidth
-from train.evaluation.judged_view import summary
-from train.evaluation.pairs import METRIC, PairedLead, pair
+from train.evaluation.judged_view import summarize_views
+from train.evaluation.pairs import METRIC, PairedLead, paired_lead
 
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """One contestant at one width."""
+    """Figures of one contestant at one width."""
 
     name: str
-    """Its name."""
+    """Name of the contestant, or NOISE."""
     kind: str
-    """What it is one of; empty for NOISE."""
+    """Kind of method; empty for NOISE."""
     first_s: float | None
-    """Median core-seconds of a scene's first view; None where nothing was timed."""
+    """Median CPU seconds of a scene's first view; None without times."""
     further_s: float | None
-    """Median core-seconds of a further view."""
+    """Median CPU seconds of a further view; None without times."""
     timed_scenes: int
-    """Scenes that these are medians of."""
+    """Number of scenes behind these medians."""
     scores: Mapping[str, Any]
-    """As train.evaluation.judged_view.summary."""
+    """Summary of each metric by name (train.evaluation.judged_view.summary)."""
     lead: PairedLead | None
-    """What it has more than the rival; None for the rival itself and for NOISE."""
+    """Paired difference from the rival; None for the rival and for NOISE."""
     on_front: bool | None
-    """Whether no other one is as good at its price; None where the price is not known."""
+    """True on the Pareto front of error and costs; None without costs."""
 
     @property
     def median_db(self) -> float:
-        """Median of METRIC, by which the table is sorted."""
+        """Median of METRIC over the views, by which the table is sorted."""
         return float(self.scores[METRIC]["median"])
 
 
 @dataclass(frozen=True, kw_only=True)
 class WidthStandings:
-    """The table of one width."""
+    """Table of one width."""
 
     width: int
-    """Pixels across."""
+    """Width of the pictures in pixels."""
     num_scenes: int
-    """Scenes that everybody showed."""
+    """Number of scenes that all contestants rendered."""
     num_views: int
-    """Views of them."""
+    """Number of views of these scenes."""
     standings: tuple[Standing, ...]
-    """The best one first; NOISE before all others."""
+    """Rows, NOISE first, then sorted from the best to the worst."""
     pairs: Mapping[tuple[str, str], PairedLead]
-    """What the first one has more than the second, of every two."""
+    """Paired difference of the first from the second, for every pair of names."""
 
 
 def standings_of(judged: JudgedWidth, kinds: Mapping[str, str], rival: str) -> WidthStandings:
     """Return the table of a width.
 
     Args:
-        judged: with one view at least.
-        kinds: of each contestant, by its name.
-        rival: name of the one that all others are compared with.
+        judged: scores and times, with one view at least.
+        kinds: kind of each contestant by name.
+        rival: name of the row that all others are compared with.
     """
     names = [name for name in judged.views[0].scores if name != NOISE]
-    pairs = {two: pair(judged.views, *two) for two in itertools.permutations(names, 2)}
+    pairs = {two: paired_lead(judged.views, *two) for two in itertools.permutations(names, 2)}
     front = _front(judged, names)
-    found = [
+    standings = [
         Standing(
             name=name,
             kind=kinds.get(name, ""),
             first_s=_median(judged.first_s.get(name)),
             further_s=_median(judged.further_s.get(name)),
             timed_scenes=len(judged.first_s.get(name, ())),
-            scores=summary(judged.views, name),
+            scores=summarize_views(judged.views, name),
             lead=pairs.get((name, rival)),
             on_front=front.get(name),
         )
         for name in [NOISE, *names]
     ]
-    order = sorted(found, key=lambda one: (one.name != NOISE, -one.median_db))
+    order = sorted(standings, key=lambda one: (one.name != NOISE, -one.median_db))
     return WidthStandings(
         width=judged.width,
         num_scenes=len({view.key for view in judged.views}),
@@ -94,7 +94,7 @@ def _front(judged: JudgedWidth, names: Sequence[str]) -> dict[str, bool]:
     priced = [name for name in names if judged.first_s.get(name)]
     figures = []
     for name in priced:
-        median_db = float(summary(judged.views, name)[METRIC]["median"])
+        median_db = float(summarize_views(judged.views, name)[METRIC]["median"])
         costs = [float(np.median(each[name])) for each in (judged.first_s, judged.further_s)]
         figures.append((-median_db, costs))
     return dict(zip(priced, on_front(figures), strict=True))

@@ -1,1 +1,1 @@
-"""What can be downloaded: a dataset, a network and a page of pictures, ready for a hub."""
+"""Releases for a hub: a dataset, a network and a page of pictures."""

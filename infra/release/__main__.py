@@ -1,9 +1,9 @@
-"""`make release`: beside a finished dataset, the network and a page, checked and summed.
+"""`make release`: adds the network, a page and checksums to a finished dataset.
 
     python -m infra.release FOLDER
 
-FOLDER holds `dataset`, as `trilight generate` made it. `network` and `gallery` are written beside
-it; each of the three is a repository of a hub.
+FOLDER holds `dataset`, an output of `trilight generate`. `network` and `gallery` are written next
+to it; each of the three is a repository of a hub.
 """
 
 import shutil
@@ -16,7 +16,7 @@ from cyclopts import Parameter
 from infra.cli.console import first_words, next_step, print_rows, progress_bars
 from infra.release.hub_limits import require_within_limits
 from infra.release.page import write_page
-from infra.release.pictures import chosen_scenes, pictures_beside
+from infra.release.pictures import chosen_scenes, compare_scenes
 from infra.release.push import NETWORK_FILE, kind_of
 from model.open import BUILTIN_NETWORKS
 from pipeline.documents.markdown import front_matter
@@ -37,12 +37,12 @@ def main(
     folder: Annotated[Path, Parameter(help="folder that holds dataset")],
     pictures: Annotated[int, Parameter(help="scenes on the page")] = 24,
 ) -> None:
-    """Write network, gallery and sums beside a finished dataset."""
+    """Write network, gallery and checksums next to a finished dataset."""
     first_words(f"Releasing {folder}")
     place = folder / "dataset"
     dataset = open_dataset(str(place))
-    found = verify_dataset(dataset)
-    if found.problems or not found.is_finished:
+    verification = verify_dataset(dataset)
+    if verification.problems or not verification.is_finished:
         raise TrilightError(f"{place}: unfinished or damaged; see trilight verify {place}.")
     licences = {entry.licence for entry in read_objects_lock(dataset.folder.objects_lock)}
     if licences - FREE:
@@ -52,17 +52,15 @@ def main(
     chosen = chosen_scenes(dataset, pictures)
     with progress_bars() as bars:
         task = bars.add_task("scenes", total=len(chosen), note="")
-        shown = list(
-            pictures_beside(
-                dataset, chosen, checkpoint=_CHECKPOINT, done=lambda: bars.advance(task)
-            )
+        comparisons = list(
+            compare_scenes(dataset, chosen, checkpoint=_CHECKPOINT, done=lambda: bars.advance(task))
         )
     about = [
         ("dataset", f"{dataset.manifest.build}, digest {dataset.digest}"),
         ("network", _CHECKPOINT),
-        ("scenes", f"{len(shown)} of {dataset.manifest.num_samples}"),
+        ("scenes", f"{len(comparisons)} of {dataset.manifest.num_samples}"),
     ]
-    write_page(folder / "gallery", shown, about=about)
+    write_page(folder / "gallery", comparisons, about=about)
     _sum_and_say(folder)
 
 

@@ -1,4 +1,4 @@
-"""What a repository of the Hugging Face hub should keep within, as its documents say.
+"""Limits of a repository of the Hugging Face hub, from its documents.
 
 Source: https://huggingface.co/docs/hub/storage-limits, "Repository limitations" (2026-11).
 """
@@ -10,18 +10,18 @@ from pipeline.documents.sums import published_files
 from storage.errors import TrilightError
 
 MOST_FILES = 100_000
-"""Of a repository."""
+"""Maximum number of files of a repository."""
 MOST_ENTRIES = 10_000
-"""Of one folder."""
+"""Maximum number of entries of a folder."""
 MOST_FILE_BYTES = 20_000_000_000
-"""Of one file."""
+"""Maximum size of a file."""
 
 
 def require_within_limits(folder: Path) -> tuple[int, int]:
-    """Return how many files and bytes a folder uploads.
+    """Return the numbers of files and bytes of a folder's upload.
 
     Raises:
-        TrilightError: nothing is there, or more than the hub advises.
+        TrilightError: the folder is empty, or exceeds the hub's limits.
     """
     files = list(published_files(folder))
     sizes = {path: path.stat().st_size for path in files}

@@ -1,12 +1,12 @@
-"""The page of a release: traced, network, error and few samples, side by side, from disk."""
+"""Page of a release: traced, network, error and few samples side by side; works from disk."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from infra.release.pictures import NETWORK, Beside
-from pipeline.documents.html import Markup, element, enlargeable, joined, page, table
+from infra.release.pictures import NETWORK, SceneComparison
+from pipeline.documents.html import Markup, element, enlargeable, join_markup, page, table
 from pipeline.documents.markdown import front_matter
 from pipeline.documents.png import encode_png
 from storage.atomic import write_atomically
@@ -25,32 +25,34 @@ figcaption { font-size: .85rem; color: var(--soft); margin-top: .2rem }
 """
 
 
-def write_page(folder: Path, shown: Sequence[Beside], *, about: Sequence[tuple[str, str]]) -> Path:
-    """Write `index.html`, its pictures and the card of a static space, and return the page.
+def write_page(
+    folder: Path, comparisons: Sequence[SceneComparison], *, about: Sequence[tuple[str, str]]
+) -> Path:
+    """Write `index.html`, its pictures and the README of a static space; return the page's path.
 
-    Pictures of an earlier page, which would be uploaded too, are deleted.
+    Pictures of an earlier page, which would be uploaded, too, are deleted.
 
     Args:
-        folder: where they go.
-        shown: the scenes, each by the same ones.
-        about: what the pictures are of, as names and values.
+        folder: folder of the page.
+        comparisons: scenes, each rendered by the same methods.
+        about: facts of the pictures, as names and values.
 
     Raises:
         TrilightError: the folder cannot be written.
     """
     for old in sorted((folder / _PICTURES).glob("[0-9]" * 9 + "-*.png")):
         old.unlink()
-    rows = [part for each in shown for part in _scene(folder, each)]
+    rows = [part for each in comparisons for part in _scene(folder, each)]
     body = [
         element("h1", _TITLE),
         element("p", _EXPLAINED),
         table((), about, class_="narrow"),
         element("h2", "In the median"),
-        _medians(shown),
+        _medians(comparisons),
         *rows,
     ]
     path = folder / "index.html"
-    write_atomically(path, page(_TITLE, joined(body), style=_STYLE))
+    write_atomically(path, page(_TITLE, join_markup(body), style=_STYLE))
     card = front_matter({"title": _TITLE, "sdk": "static", "license": "cc0-1.0"})
     write_atomically(folder / "README.md", f"{card}\n# {_TITLE}\n\n{_EXPLAINED}\n".encode())
     return path
@@ -63,14 +65,14 @@ _EXPLAINED = (
 )
 
 
-def _scene(folder: Path, each: Beside) -> list[Markup]:
+def _scene(folder: Path, each: SceneComparison) -> list[Markup]:
     error = error_picture(each.pictures_rgb[NETWORK], each.target_rgb)
     pictures = [
         ("traced", preview_srgb8(each.target_rgb), f"traced, noise floor {each.floor_db:.1f} dB")
     ]
-    for place, (name, shown) in enumerate(each.pictures_rgb.items()):
+    for place, (name, radiance_rgb) in enumerate(each.pictures_rgb.items()):
         caption = f"{name}, {each.psnr_db[name]:.1f} dB"
-        pictures.append((str(place), preview_srgb8(shown), caption))
+        pictures.append((str(place), preview_srgb8(radiance_rgb), caption))
         if name == NETWORK:
             pictures.append(("error", error, "error of the network"))
     figures = []
@@ -83,13 +85,13 @@ def _scene(folder: Path, each: Beside) -> list[Markup]:
     return [heading, element("div", *figures, class_="row")]
 
 
-def _medians(shown: Sequence[Beside]) -> Markup:
-    names = list(shown[0].psnr_db)
+def _medians(comparisons: Sequence[SceneComparison]) -> Markup:
+    names = list(comparisons[0].psnr_db)
     rows = []
     for name in names:
-        values = [each.psnr_db[name] for each in shown]
-        better = sum(each.psnr_db[name] > each.psnr_db[NETWORK] for each in shown)
-        beaten = "" if name == NETWORK else f"{better} of {len(shown)}"
+        values = [each.psnr_db[name] for each in comparisons]
+        better = sum(each.psnr_db[name] > each.psnr_db[NETWORK] for each in comparisons)
+        beaten = "" if name == NETWORK else f"{better} of {len(comparisons)}"
         rows.append((name, f"{np.median(values):.1f}", f"{np.min(values):.1f}", beaten))
     head = ("picture", "median psnr_log_db, dB", "worst, dB", "better than the network in")
     return table(head, rows, numbers=3, class_="narrow")

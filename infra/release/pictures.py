@@ -1,4 +1,4 @@
-"""Pictures of a release: traced to a floor, by the network, and by few samples."""
+"""Pictures of a release: the dataset's, the network's, and those of few samples."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from infra.rendering.cameras import own_camera
 from infra.rendering.engines import Engine, MitsubaPlan, NeuralPlan
 from model.weights import MAX_LIGHTS
-from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
+from pipeline.documents.scene_choice import ChosenScene, choose_scenes, read_chosen
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.variant import choose_variant
 from storage.conventions import SPLITS
@@ -20,36 +20,34 @@ from storage.metrics import psnr_log_db
 from storage.records.sample import Sample
 
 RIVALS = (1, 4, 16)
-"""Samples a pixel of the previews beside the network, filtered by Open Image Denoise."""
+"""Samples per pixel of the previews in the comparison, filtered by Open Image Denoise."""
 
 NETWORK = "network"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Beside:
-    """The first view of one scene, by everybody."""
+class SceneComparison:
+    """First view of one scene, rendered by all methods."""
 
     key: str
-    """Of the scene."""
+    """Key of the scene's sample in the dataset."""
     caption: str
-    """What it shows."""
+    """Split, layout and number of triangles as text."""
     target_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance, as the dataset has it."""
+    """[R, R, 3] linear radiance of the dataset's picture."""
     floor_db: float
-    """Of the target."""
+    """Stated error of the target as psnr_log_db."""
     pictures_rgb: Mapping[str, NDArray[np.float32]]
-    """[R, R, 3] linear radiance, by who made it."""
+    """[R, R, 3] linear radiance by method."""
     psnr_db: Mapping[str, float]
-    """psnr_log_db to the target, by who made it."""
+    """psnr_log_db to the target by method."""
 
 
-def chosen_scenes(dataset: Dataset, count: int) -> list[Chosen]:
-    """Return up to `count` scenes that no network of this dataset learned from, if there are any.
-
-    They are those of the test split; of all splits where it is empty.
+def chosen_scenes(dataset: Dataset, count: int) -> list[ChosenScene]:
+    """Return up to `count` scenes of the test split, or of all splits if it is empty.
 
     Raises:
-        TrilightError: none is asked for, or the dataset holds none.
+        TrilightError: `count` is below 1, or the dataset is empty.
     """
     judged = any(shard.num_samples for shard in dataset.shards_of("test"))
     splits = ("test",) if judged else SPLITS
@@ -61,19 +59,19 @@ def chosen_scenes(dataset: Dataset, count: int) -> list[Chosen]:
     return chosen
 
 
-def pictures_beside(
-    dataset: Dataset, chosen: Sequence[Chosen], *, checkpoint: str, done: Callable[[], None]
-) -> Iterator[Beside]:
-    """Yield the first view of each scene.
+def compare_scenes(
+    dataset: Dataset, chosen: Sequence[ChosenScene], *, checkpoint: str, done: Callable[[], None]
+) -> Iterator[SceneComparison]:
+    """Yield the comparison of each scene's first view.
 
     Args:
-        dataset: the dataset.
-        chosen: its scenes.
-        checkpoint: the network, as `trilight render --checkpoint` takes it.
+        dataset: dataset of the scenes.
+        chosen: scenes to compare.
+        checkpoint: network, as in `trilight render --checkpoint`.
         done: called after each scene.
 
     Raises:
-        TrilightError: a sample is unreadable, or the network or the path tracer cannot show it.
+        TrilightError: a sample is unreadable, or the network or the path tracer cannot render it.
     """
     by_width: dict[int, Mapping[str, Engine]] = {}
     with contextlib.ExitStack() as stack:
@@ -83,7 +81,7 @@ def pictures_beside(
                 by_width[width] = _engines(width, checkpoint)
                 for engine in by_width[width].values():
                     stack.callback(engine.close)
-            yield _beside(sample, entry.split, by_width[width])
+            yield _compare_scene(sample, entry.split, by_width[width])
             done()
 
 
@@ -105,15 +103,15 @@ def _engines(resolution: int, checkpoint: str) -> Mapping[str, Engine]:
         lights_per_pass=MAX_LIGHTS,
         threads=None,
     )
-    started = {NETWORK: network.start(_unwatched)}
-    return started | {name: plan.start(_unwatched) for name, plan in tracers.items()}
+    started = {NETWORK: network.start(_ignore_samples)}
+    return started | {name: plan.start(_ignore_samples) for name, plan in tracers.items()}
 
 
-def _unwatched(_sampling: object) -> None:
-    """Say nothing of the samples."""
+def _ignore_samples(_sampling: object) -> None:
+    """Ignore the progress of the samples."""
 
 
-def _beside(sample: Sample, split: str, engines: Mapping[str, Engine]) -> Beside:
+def _compare_scene(sample: Sample, split: str, engines: Mapping[str, Engine]) -> SceneComparison:
     camera = own_camera(sample.scene, 0)
     target = sample.radiance_rgb[0]
     pictures = {
@@ -121,11 +119,11 @@ def _beside(sample: Sample, split: str, engines: Mapping[str, Engine]) -> Beside
         for name, engine in engines.items()
     }
     template = sample.scene.provenance.get("template", "")
-    return Beside(
+    return SceneComparison(
         key=sample.key,
         caption=f"{split}, {template}, {sample.scene.num_triangles} triangles",
         target_rgb=target,
         floor_db=float(sample.views[0].noise_floor_db),
         pictures_rgb=pictures,
-        psnr_db={name: float(psnr_log_db(shown, target)) for name, shown in pictures.items()},
+        psnr_db={name: float(psnr_log_db(picture, target)) for name, picture in pictures.items()},
     )

@@ -1,4 +1,4 @@
-"""Uploads a folder to a repository of the Hugging Face hub, by its own package."""
+"""Upload of a folder to a repository of the Hugging Face hub, by the package huggingface_hub."""
 
 import re
 from dataclasses import dataclass
@@ -20,27 +20,27 @@ NETWORK_FILE = "model.safetensors"
 
 _PART = r"(?!\S*(?:--|\.\.))\w(?:[\w.-]{0,94}\w)?"
 _REPOSITORY = re.compile(f"{_PART}/{_PART}", re.ASCII)
-"""As huggingface_hub refuses others, only later."""
+"""Names that huggingface_hub accepts; it would refuse others only later."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Upload:
-    """What goes where."""
+    """Planned upload of a folder."""
 
     folder: Path
-    """All of it is uploaded, but for what is ignored."""
+    """Folder whose files are uploaded, except UNPUBLISHED ones."""
     repository: str
-    """USER/NAME."""
+    """Name of the repository as USER/NAME."""
     kind: RepositoryKind
-    """Of the repository."""
+    """Kind of the repository on the hub."""
     files: int
-    """Number of files."""
+    """Number of files to upload."""
     num_bytes: int
-    """Of all files together."""
+    """Size of all files together."""
 
 
 def kind_of(folder: Path) -> RepositoryKind:
-    """Return what kind of repository a folder makes; raises TrilightError where it is none."""
+    """Return the kind of repository that a folder makes; raises TrilightError if it makes none."""
     if DatasetFolder(folder).manifest.is_file():
         return "dataset"
     if (folder / NETWORK_FILE).is_file():
@@ -55,11 +55,11 @@ def kind_of(folder: Path) -> RepositoryKind:
 
 
 def planned_upload(folder: Path, repository: str) -> Upload:
-    """Return what would be uploaded, after looking whether it should be.
+    """Return the planned upload of a folder, after checking the folder.
 
     Raises:
-        TrilightError: the name is none, the folder is no release, an unfinished or damaged dataset,
-            a network without its card, sums of other files, or more than the hub advises.
+        TrilightError: the repository's name is invalid, or the folder is no release: an unfinished
+            or damaged dataset, a missing card, wrong checksums, or more than the hub's limits.
     """
     if not _REPOSITORY.fullmatch(repository) or repository.endswith(".git"):
         raise TrilightError(
@@ -85,7 +85,7 @@ def planned_upload(folder: Path, repository: str) -> Upload:
 
 
 def push(upload: Upload, *, private: bool) -> str:
-    """Upload a folder, as far as the repository does not have it, and return its address.
+    """Upload the files that a repository lacks, and return its URL.
 
     The token is that of HF_TOKEN or of `hf auth login`; the hub is HF_ENDPOINT or the usual one.
 
@@ -124,13 +124,13 @@ def push(upload: Upload, *, private: bool) -> str:
         if error.response is not None and error.response.status_code in (401, 403):
             raise TrilightError(_NO_TOKEN.format(repository=upload.repository)) from error
         raise _broken_off(upload, "the hub refused", error) from error
-    except Exception as error:  # of whichever library the package speaks HTTP with
+    except Exception as error:  # of whichever HTTP library the package uses
         raise _broken_off(upload, "the upload broke off", error) from error
     return str(made.url)
 
 
 def _require_private(hub: "HfApi", upload: Upload) -> None:
-    """Refuse to show the world what should be private: who made a repository, chose that."""
+    """Refuse a public repository if the upload should be private; never change an existing one."""
     if not hub.repo_info(upload.repository, repo_type=upload.kind).private:
         raise TrilightError(
             f"{upload.repository}: is there already and public; expected a private one. Make it "
@@ -152,13 +152,13 @@ def _broken_off(upload: Upload, what: str, error: Exception) -> TrilightError:
 
 
 def _require_sound(folder: Path) -> None:
-    found = verify_dataset(str(folder), fast=True)
-    if not found.is_finished:
+    verification = verify_dataset(str(folder), fast=True)
+    if not verification.is_finished:
         raise TrilightError(
             f"{folder}: is not finished; expected a whole dataset. Run its trilight generate again."
         )
-    if found.problems:
+    if verification.problems:
         raise TrilightError(
-            f"{folder}: is damaged ({found.problems[0].rstrip('.')}); expected a whole dataset. "
-            f"See trilight verify {folder}."
+            f"{folder}: is damaged ({verification.problems[0].rstrip('.')}); expected a whole "
+            f"dataset. See trilight verify {folder}."
         )

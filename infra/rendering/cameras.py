@@ -1,4 +1,4 @@
-"""Where pictures are taken from: a scene's own camera, a turn around the scene, or a path."""
+"""Cameras of pictures: one of the scene's cameras, an orbit around the scene, or a camera path."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from storage.records.scene import Scene
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ShotCamera:
-    """One camera."""
+    """Pose and field of view of one picture."""
 
     c2w: NDArray[np.float32]
     """[4, 4] camera to world."""
@@ -22,16 +22,16 @@ class ShotCamera:
     """Full field of view in degrees."""
 
 
-def paired(
+def pair_cameras(
     sources: Sequence[SceneSource], cameras: Sequence[ShotCamera | int]
 ) -> list[tuple[SceneSource, ShotCamera | int]]:
-    """Return which scene is seen by which camera, in the order of the pictures.
+    """Return scene and camera of each picture, in order.
 
-    One scene is seen by all cameras, many scenes each by the only one; as many cameras as scenes go
-    together in pairs. A number is the row of a scene's own camera.
+    One scene is combined with all cameras, and one camera with all scenes; equally many scenes and
+    cameras are paired. A number is the row of a camera of the scene.
 
     Raises:
-        TrilightError: many of both, but not as many.
+        TrilightError: several scenes and several cameras, but not equally many.
     """
     if len(sources) > 1 and len(cameras) > 1 and len(sources) != len(cameras):
         raise TrilightError(
@@ -43,7 +43,7 @@ def paired(
 
 
 def own_camera(scene: Scene, view: int, named: str = "--view") -> ShotCamera:
-    """Return a camera of a scene; raises TrilightError, with `named`, where it has no such view."""
+    """Return a camera of a scene; raises TrilightError, with `named`, if there is no such view."""
     if not 0 <= view < scene.num_views:
         raise TrilightError(
             f"{named} is {view}; expected 0 to {scene.num_views - 1}: the scene has "
@@ -53,32 +53,33 @@ def own_camera(scene: Scene, view: int, named: str = "--view") -> ShotCamera:
 
 
 def orbit(scene: Scene, start: ShotCamera, count: int, arc_deg: float) -> list[ShotCamera]:
-    """Return `count` cameras on a circle around what `start` looks at, about the vertical.
+    """Return `count` cameras on a horizontal circle around the point that `start` looks at.
 
-    The middle of the circle is the point on the camera's axis that is nearest to the middle of all
-    that reflects. The whole circle begins at `start`; a shorter arc has it in its middle.
+    The circle's center is the point of the camera's axis nearest to the center of all surfaces that
+    reflect. The whole circle begins at `start`; a shorter arc has `start` in its middle.
     """
     points = scene.vertex_positions[scene.faces[~scene.triangle_emits]].reshape(-1, 3)
     if not len(points):
         points = scene.vertex_positions
     middle = (points.min(axis=0).astype(np.float64) + points.max(axis=0)) / 2
     pose = start.c2w.astype(np.float64)
-    eye, forward = pose[:3, 3], -pose[:3, 2]
+    eye = pose[:3, 3]
+    forward = -pose[:3, 2]
     target = eye + forward * max(float(np.einsum("i,i->", middle - eye, forward)), 0.0)
     if arc_deg == 360:
-        turns_deg = 360 * np.arange(count) / count
+        angles_deg = 360 * np.arange(count) / count
     else:
-        turns_deg = np.linspace(-arc_deg / 2, arc_deg / 2, count) if count > 1 else np.zeros(1)
-    return [_turned(start, target, float(np.radians(turn))) for turn in turns_deg]
+        angles_deg = np.linspace(-arc_deg / 2, arc_deg / 2, count) if count > 1 else np.zeros(1)
+    return [_orbit_camera(start, target, float(np.radians(angle_deg))) for angle_deg in angles_deg]
 
 
 def camera_path(text: str, reader: SceneReader, view: int) -> list[ShotCamera]:
-    """Return the cameras of a file: all of one scene, or one of each frame of a stage that moves.
+    """Return the cameras of a file: all of one scene, or one of each frame of an animated stage.
 
     Args:
-        text: a JSON file with a list `cameras` as in RenderFormer's scenes, or any scene.
-        reader: opens it.
-        view: which camera of each frame.
+        text: JSON file with a list `cameras` as in RenderFormer's scenes, or any scene.
+        reader: reader that opens the file.
+        view: row of the camera in each frame.
 
     Raises:
         TrilightError: the file is unusable, or has no such camera.
@@ -93,9 +94,10 @@ def camera_path(text: str, reader: SceneReader, view: int) -> list[ShotCamera]:
     ]
 
 
-def _turned(start: ShotCamera, target: NDArray[np.float64], turn: float) -> ShotCamera:
-    """Return a camera that went around the vertical through `target`, as a rigid body."""
-    cos, sin = np.cos(turn), np.sin(turn)
+def _orbit_camera(start: ShotCamera, target: NDArray[np.float64], angle_rad: float) -> ShotCamera:
+    """Return a camera rotated about the vertical axis through `target`, by radians."""
+    cos = np.cos(angle_rad)
+    sin = np.sin(angle_rad)
     rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
     pose = start.c2w.astype(np.float64)
     pose[:3, :3] = np.einsum("ij,jk->ik", rotation, pose[:3, :3])

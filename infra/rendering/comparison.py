@@ -1,6 +1,6 @@
-"""Two engines' pictures of one view: side by side, and how their difference flickers.
+"""Comparison of two engines' pictures of one view: side by side, and the flicker of their error.
 
-An error that stays where it is on the screen is hardly seen in motion; one that jumps is
+In motion an error that stays at its pixels is hardly seen; one that jumps is
 (storage.metrics.flicker_log_db).
 """
 
@@ -10,36 +10,38 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from infra.rendering.look import Look, enlarged, shown
+from infra.rendering.look import Look, display_pixels, enlarge
 from pipeline.exchange.formats import FORMATS, SceneSource
 from storage.conventions import log10_radiance
 from storage.metrics import flicker_log_db, psnr_log_db
-from train.evaluation.error_colours import ERROR_WHITE, error_picture
+from train.evaluation.error_colors import ERROR_WHITE, error_picture
 
-_CAPTION_PX, _GAP_PX, _FONT_PX = 24, 8, 14
-_INK, _PAPER = (30, 30, 30), (250, 250, 248)
+_CAPTION_PX = 24
+_GAP_PX = 8
+_FONT_PX = 14
+_INK = (30, 30, 30)
+_PAPER = (250, 250, 248)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame:
-    """What is remembered of one view by both engines, to compare the next frame with it."""
+    """Data of one view by both engines, with which the next frame is compared."""
 
     source: SceneSource
-    """Its scene."""
     error_RR3: NDArray
-    """The network's error of log10(1 + radiance) against the traced picture."""
+    """[R, R, 3] the network's error of log10(1 + radiance) against the traced picture."""
     noise_floor_db: float
-    """Of the traced picture."""
+    """Stated error of the traced picture as psnr_log_db."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Flicker:
-    """How much of the network's error changes between two frames in a row; 100 dB at most."""
+    """Change of the network's error between two consecutive frames; at most 100 dB."""
 
     db: float
-    """Higher is calmer."""
+    """Flicker in dB; a higher value is calmer."""
     noise_db: float
-    """What the noise of the traced pictures alone would show: no network can measure higher."""
+    """Flicker in dB of the traced pictures' noise alone, an upper bound for any network."""
 
 
 def log_error(neural_rgb: NDArray[np.float32], traced_rgb: NDArray[np.float32]) -> NDArray:
@@ -49,8 +51,8 @@ def log_error(neural_rgb: NDArray[np.float32], traced_rgb: NDArray[np.float32]) 
 
 
 def flicker(before: Frame | None, now: Frame) -> Flicker | None:
-    """Return the flicker from one frame to the next; None where the scenes are strangers."""
-    if before is None or not _goes_on(before.source, now.source):
+    """Return the flicker from one frame to the next; None where their scenes do not belong."""
+    if before is None or not _is_same_sequence(before.source, now.source):
         return None
     noise = 10 ** (-before.noise_floor_db / 10) + 10 ** (-now.noise_floor_db / 10)
     return Flicker(db=flicker_log_db(before.error_RR3, now.error_RR3), noise_db=_db(noise))
@@ -67,22 +69,23 @@ def comparison_sheet(
     agreement = psnr_log_db(neural_rgb, traced_rgb)
     stops = f", {look.exposure_ev:+g} EV" if look.exposure_ev else ""
     tiles = (
-        (f"mitsuba{stops}", shown(traced_rgb, look)),
-        (f"neural, {agreement:.1f} dB (log){stops}", shown(neural_rgb, look)),
-        (f"error (white: {ERROR_WHITE} log10)", enlarged(error_picture(neural_rgb, traced_rgb))),
+        (f"mitsuba{stops}", display_pixels(traced_rgb, look)),
+        (f"neural, {agreement:.1f} dB (log){stops}", display_pixels(neural_rgb, look)),
+        (f"error (white: {ERROR_WHITE} log10)", enlarge(error_picture(neural_rgb, traced_rgb))),
     )
     width = len(tiles[0][1])
     sheet = Image.new("RGB", (3 * width + 2 * _GAP_PX, width + _CAPTION_PX), _PAPER)
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=_FONT_PX)
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=_FONT_PX)
     for column, (caption, pixels) in enumerate(tiles):
-        left = column * (width + _GAP_PX)
-        sheet.paste(Image.fromarray(pixels), (left, _CAPTION_PX))
-        draw.text((left + 2, 3), caption, fill=_INK, font=font)
+        column_px = column * (width + _GAP_PX)
+        sheet.paste(Image.fromarray(pixels), (column_px, _CAPTION_PX))
+        draw.text((column_px + 2, 3), caption, fill=_INK, font=font)
     return np.asarray(sheet)
 
 
-def _goes_on(before: SceneSource, now: SceneSource) -> bool:
-    """Return whether both are one scene, or moments of one stage, unlike the scenes of a shard."""
+def _is_same_sequence(before: SceneSource, now: SceneSource) -> bool:
+    """Return whether both are one scene or frames of one stage, unlike the scenes of a shard."""
     if before == now:
         return True
     return before.path == now.path and not FORMATS[now.path.suffix.lower()].always_many

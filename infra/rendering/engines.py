@@ -1,7 +1,7 @@
-"""The two ways to a picture behind one face: path tracing, and a trained network.
+"""Path tracing and a trained network behind one interface.
 
-A plan of an engine is what a command decided about it; `start` loads what it needs. A started
-engine opens one scene after the other, and an opened scene gives the pictures of its cameras.
+An engine's plan holds the decisions of a command; `start` loads what the engine needs. A started
+engine opens one scene after the other, and an opened scene returns the pictures of its cameras.
 """
 
 import time
@@ -23,111 +23,112 @@ from storage.records.scene import Scene
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
-    from pipeline.making.path_tracer import PathTracer
+    from pipeline.generation.path_tracer import PathTracer
     from pipeline.renders.results import Sampling
 
 Fact = str | int | float
 Facts = Mapping[str, Fact]
-"""What an engine says of a picture, by name; it stands in the picture's header."""
+"""Facts of a picture by name, which the header of its file holds."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rendered:
-    """A picture as an engine gives it."""
+    """Picture as an engine returns it."""
 
     radiance_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance that half floats can hold."""
+    """[R, R, 3] linear radiance within the range of half floats."""
     facts: Facts
     layers_rgb: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    """[R, R, 3] of other pictures that stand in the same file, by name: the parts of this one."""
+    """[R, R, 3] linear radiance of further layers of the file by name; their sum is the picture."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OpenedScene:
-    """A scene that an engine has taken, until the engine opens the next one."""
+    """Scene that an engine holds until it opens the next one."""
 
     notes: tuple[str, ...]
-    """What a person should know of this scene with this engine."""
+    """Warnings about this scene with this engine."""
     render: Callable[[ShotCamera, str], Rendered]
-    """Returns the picture of a camera. Its name stands in the TrilightError of a failure."""
+    """Returns the picture of a camera; the second argument names it in a TrilightError."""
     seconds: float
-    """Wall-clock seconds that taking it took, the start of a process aside."""
+    """Wall-clock seconds of opening the scene, without the start of a process."""
 
 
 class Engine(Protocol):
-    """A started engine."""
+    """Started engine."""
 
     identity: Mapping[str, Any]
-    """All that decides a picture beside scene and camera, as JSON values."""
+    """Everything but scene and camera that decides a picture, as JSON values."""
 
     def open(self, scene: Scene, name: str) -> OpenedScene:
-        """Take the next scene; raises TrilightError, with `name`, where it cannot be rendered."""
+        """Open the next scene; raises TrilightError, with `name`, where it cannot be rendered."""
 
     def close(self) -> None:
-        """End what the engine holds."""
+        """Release the engine's process and memory."""
 
 
 class EnginePlan(Protocol):
-    """All that a command decided about one engine."""
+    """Decisions of a command about one engine."""
 
     @property
     def name(self) -> str:
-        """The engine as the user calls it."""
+        """Name of the engine, as in `--engine`."""
 
     def start(self, sampled: "Callable[[Sampling], None]") -> Engine:
         """Load what the engine needs; raises TrilightError where that is unusable.
 
         Args:
-            sampled: a path tracer calls this after each pass of samples.
+            sampled: callback that a path tracer calls after each pass of samples.
         """
 
     def caveats(self, pictures: Sequence[Facts]) -> list[str]:
-        """Return what a person should know of all pictures together."""
+        """Return warnings about all pictures together."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MitsubaPlan:
-    """Path tracing to a measured noise floor, or of a fixed number of samples."""
+    """Path tracing to a measured noise floor, or with a fixed number of samples."""
 
     settings: RenderSettings | PreviewSettings
     seed: int
-    """Of the samples."""
+    """Seed of the path tracer's samples."""
     threads: int
     variant: Variant
-    """What Mitsuba runs on."""
+    """Mitsuba variant, such as llvm_ad_rgb, with its library."""
     name: str = "mitsuba"
 
     def start(self, sampled: "Callable[[Sampling], None]") -> "MitsubaEngine":
-        from pipeline.making.path_tracer import PathTracer
+        from pipeline.generation.path_tracer import PathTracer
 
         tracer = PathTracer(
             self.settings,
             seed=self.seed,
             variant=self.variant,
             threads=self.threads,
-            sampled=sampled,
+            on_samples=sampled,
         )
         return MitsubaEngine(tracer, is_preview=isinstance(self.settings, PreviewSettings))
 
     def caveats(self, pictures: Sequence[Facts]) -> list[str]:
-        found = []
+        notes = []
         if isinstance(self.settings, PreviewSettings):
-            found.append(
+            notes.append(
                 "the error of a preview is not measured, so that its noise floor is unknown: "
                 "--noise-floor 40 measures it and samples on to it"
             )
         elif any(int(facts["spp"]) < FIRST_SPP for facts in pictures):
-            found.append(f"below {FIRST_SPP} samples the measured noise floor may flatter")
+            notes.append(f"below {FIRST_SPP} samples the measured noise floor may flatter")
         if self.variant.note:
-            found.append(f"{self.variant.note}; see trilight doctor")
-        return found
+            notes.append(f"{self.variant.note}; see trilight doctor")
+        return notes
 
 
 class MitsubaEngine:
-    """A path tracer in a child process."""
+    """Path tracer in a child process."""
 
     def __init__(self, tracer: "PathTracer", *, is_preview: bool = False) -> None:
-        self._tracer, self._is_preview = tracer, is_preview
+        self._tracer = tracer
+        self._is_preview = is_preview
         self.identity = tracer.identity
 
     def open(self, scene: Scene, name: str) -> OpenedScene:
@@ -168,18 +169,18 @@ class MitsubaEngine:
 
 @dataclass(frozen=True, kw_only=True)
 class NeuralPlan:
-    """A trained network, and how it renders."""
+    """Trained network with its rendering options."""
 
     checkpoint: str
-    """Where the network is; only the last part of this is published."""
+    """Path or name of the network; headers of pictures hold only its last component."""
     precision: str
-    """In which it is loaded (model.precision)."""
+    """Name of the precision of matrix products (model.precision)."""
     resolution: int
-    """Width of pictures."""
+    """Width of pictures in pixels."""
     lights_per_pass: int
-    """Most emitting triangles of a group (model.light_groups)."""
+    """Maximum number of emitting triangles in a pass (model.light_groups)."""
     threads: int | None
-    """Of the processor; None for as many as torch takes."""
+    """CPU threads; None for torch's own choice."""
     name: str = "neural"
 
     def start(self, sampled: "Callable[[Sampling], None]") -> "NeuralEngine":
@@ -200,14 +201,15 @@ class NeuralPlan:
 
 
 class NeuralEngine:
-    """A network in this process."""
+    """Network in this process."""
 
     def __init__(self, renderer: "NeuralRenderer", plan: NeuralPlan) -> None:
-        """Take a network; raises TrilightError where the resolution is none for it."""
+        """Wrap a network; raises TrilightError where it cannot render the resolution."""
         import torch
 
         renderer.require_resolution(plan.resolution)
-        self._renderer, self._plan = renderer, plan
+        self._renderer = renderer
+        self._plan = plan
         self.identity: Mapping[str, Any] = {
             "checkpoint": Path(plan.checkpoint).name,
             "network_sha256": renderer.digest,
@@ -221,7 +223,8 @@ class NeuralEngine:
         }
 
     def open(self, scene: Scene, name: str) -> OpenedScene:
-        renderer, plan = self._renderer, self._plan
+        renderer = self._renderer
+        plan = self._plan
         began = time.perf_counter()
         prepared = renderer.prepare(scene, lights_per_pass=plan.lights_per_pass)
         seconds = time.perf_counter() - began
@@ -231,7 +234,7 @@ class NeuralEngine:
             too_bright = int((picture > HALF_FLOAT_MAX).any(axis=-1).sum())
             facts: dict[str, Fact] = {
                 "passes": len(prepared.groups),
-                "clipped_pixels": too_bright,  # a network may say anything; files end at 65504
+                "clipped_pixels": too_bright,  # a network has no limit; half floats end at 65504
             }
             return Rendered(radiance_rgb=np.minimum(picture, HALF_FLOAT_MAX), facts=facts)
 
@@ -243,4 +246,4 @@ class NeuralEngine:
         )
 
     def close(self) -> None:
-        """Do nothing: the network goes with this process."""
+        """Do nothing: the network is freed with this process."""

@@ -1,7 +1,7 @@
-"""Scenes that no network learned from, composed in a render child.
+"""Held-out scenes, which no network was trained on, composed in a render child.
 
-`builtin:benchmark-v1` has no object in common with any other source, and no preset to train on
-draws from it. Previews are judged and timed on these scenes, and so are methods.
+`builtin:benchmark-v1` shares no object with any other source, and no preset for training uses it.
+Previews and methods are evaluated and timed on these scenes.
 """
 
 import contextlib
@@ -11,12 +11,12 @@ from pathlib import Path
 
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
+from pipeline.generation.accept_objects import accept_objects
+from pipeline.generation.attempt_scene import MAX_ATTEMPTS, SceneRecipe, assets_of, set_up_child
+from pipeline.generation.begin_dataset import begin
+from pipeline.generation.environment import environment
+from pipeline.generation.object_options import ObjectOptions
 from pipeline.isolation import ChildLimits, IsolatedChild
-from pipeline.making.accept_objects import accept_objects
-from pipeline.making.asked_objects import AskedObjects
-from pipeline.making.attempt_scene import MAX_ATTEMPTS, SceneRecipe, assets_of, set_up_child
-from pipeline.making.begin_publication import begin
-from pipeline.making.environment import environment
 from pipeline.renders.variant import choose_variant
 from pipeline.scenes.compose import compose_scene
 from scene_templates.settings import SceneSettings
@@ -27,7 +27,7 @@ from storage.records.scene import Scene
 from storage.settings.changes import changed
 
 TRIANGLES = 768
-"""Maximum number of triangles of a scene: what the built-in networks are trained on."""
+"""Maximum number of triangles of a scene, as in the training data of the built-in networks."""
 
 _SEED = 20_261_122
 """Seed of the scenes; no dataset preset and no run uses it."""
@@ -39,30 +39,31 @@ _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=4 * 3600, calls_per_child=10
 def composing_child(
     build: BuildSettings, objects: str, folder: Path, threads: int | None = None
 ) -> IsolatedChild:
-    """Return a child that composes the scenes of a preset and renders them; close it in the end.
+    """Return a child that composes and renders the scenes of a preset; the caller closes it.
 
     Args:
-        build: the preset's settings.
+        build: settings of the preset.
         objects: source of the objects.
-        folder: empty; it keeps the record of the objects.
-        threads: of Mitsuba and the denoiser, if fewer than there are cores.
+        folder: empty folder for the record of the objects.
+        threads: CPU threads of Mitsuba and the denoiser; None for all cores.
     """
-    variant, workers = choose_variant(), threads or os.cpu_count() or 1
+    variant = choose_variant()
+    workers = threads or os.cpu_count() or 1
     publication = begin(
         DatasetFolder(folder), build, environment(variant), 1, accept_environment=False
     )
-    asked = AskedObjects(
-        source=objects, licence=None, settings=build, publication=publication, workers=workers
+    objects_order = ObjectOptions(
+        source=objects, licence=None, settings=build, writer=publication, workers=workers
     )
-    accepted = accept_objects(asked)
+    accepted = accept_objects(objects_order)
     recipe = SceneRecipe(settings=build, variant=variant, threads=workers, pool=accepted.pool)
     return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(recipe,))
 
 
 def held_out_build() -> BuildSettings:
-    """Return `smoke` for scenes of at most TRIANGLES triangles, its objects as much coarser.
+    """Return the preset `smoke` with at most TRIANGLES triangles a scene and coarser objects.
 
-    All of its objects are to judge by, as those of `builtin:benchmark-v1` are.
+    All objects belong to the evaluation split, as those of `builtin:benchmark-v1` do.
     """
     build = changed(smoke(), {"splits.one_split": True})
     most = build.scenes.max_triangles
@@ -87,7 +88,7 @@ def held_out_scene(index: int) -> Scene:
 def first_composed(
     settings: SceneSettings, scene_index: int, *, seed: int = 0, split: str = "train"
 ) -> Scene | None:
-    """Return a scene's first attempt that passes, or None; runs in a render child."""
+    """Return the first accepted attempt at a scene, or None; runs in a render child."""
     pool = assets_of(split)
     for attempt in range(MAX_ATTEMPTS):
         with contextlib.suppress(Rejected):

@@ -1,7 +1,7 @@
-"""How pictures are shown to people: how bright, by which curve, how large; EXR is for measuring.
+"""Display of pictures for people: exposure, tone mapping and enlargement; EXR is for measuring.
 
-The film-like curve is the Academy's ACES 2.0 output transform for screens of 100 nits, as
-OpenColorIO carries it: highlights roll off and lose colour instead of being clipped.
+The filmic curve is the Academy's ACES 2.0 output transform for screens of 100 nits from
+OpenColorIO: highlights roll off and lose color instead of being clipped.
 """
 
 import functools
@@ -17,54 +17,55 @@ from storage.errors import TrilightError
 ToneMap = Literal["plain", "filmic"]
 
 SHOWN_PX = 256
-"""Narrower pictures are enlarged to this width or more, by a whole number."""
+"""Width in pixels to which narrower pictures are enlarged at least, by a whole factor."""
 
 _CONFIG = "cg-config-v4.0.0_aces-v2.0_ocio-v2.5"
-"""One of the configurations that OpenColorIO has built in, by version: pictures stay the same."""
+"""Built-in configuration of OpenColorIO by version, so that pictures stay the same."""
 _OURS = "Linear Rec.709 (sRGB)"
-_DISPLAY, _VIEW = "sRGB - Display", "ACES 2.0 - SDR 100 nits (Rec.709)"
+_DISPLAY = "sRGB - Display"
+_VIEW = "ACES 2.0 - SDR 100 nits (Rec.709)"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """How the user wants to see pictures.
+    """Display options of pictures.
 
     Raises:
         TrilightError: the tone map needs a library that is not installed.
     """
 
     tone_map: ToneMap = "plain"
-    """Curve from radiance to what a screen shows."""
+    """Tone curve: plain (sRGB, clipped) or filmic (ACES 2.0)."""
     exposure_ev: float = 0.0
-    """Stops by which radiance is brightened before: each doubles it."""
+    """Exposure in stops, applied before the tone curve; each stop doubles the radiance."""
 
     def __post_init__(self) -> None:
         if self.tone_map == "filmic":
             _filmic()
 
 
-def shown(radiance_rgb: NDArray[np.float32], look: Look) -> NDArray[np.uint8]:
-    """Return what a person sees of linear radiance [R, R, 3], enlarged as `enlarged` does."""
+def display_pixels(radiance_rgb: NDArray[np.float32], look: Look) -> NDArray[np.uint8]:
+    """Return linear radiance [R, R, 3] as display pixels, enlarged as by `enlarge`."""
     exposed = radiance_rgb * np.float32(2.0**look.exposure_ev)
-    return enlarged(tone_mapped(exposed, look.tone_map))
+    return enlarge(tone_mapped(exposed, look.tone_map))
 
 
 def enlargement(width: int) -> int:
-    """Return how many pixels of the screen, each way, stand for a pixel of such a picture."""
+    """Return the factor by which pictures of a width are enlarged."""
     return -(-SHOWN_PX // width)
 
 
-def enlarged(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a picture [R, R, 3] in which each pixel is a square; as it is from SHOWN_PX on."""
+def enlarge(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a picture [R, R, 3] whose pixels are repeated; unchanged from SHOWN_PX on."""
     factor = enlargement(len(pixels))
     return pixels.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
 def tone_mapped(radiance_rgb: NDArray[np.float32], tone_map: ToneMap) -> NDArray[np.uint8]:
-    """Return a picture [H, W, 3] for people, sRGB-encoded, of linear radiance of at least 0.
+    """Return linear radiance of at least 0 as an sRGB-encoded picture [H, W, 3].
 
-    `plain` is storage.conventions.preview_srgb8. `filmic` shows a radiance of 0.18 as middle grey
-    (about a tenth of the screen's light), and 1 at about half of it.
+    `plain` is storage.conventions.preview_srgb8. `filmic` maps a radiance of 0.18 to middle gray
+    (about a tenth of the screen's light), and 1 to about half of the screen's light.
     """
     if tone_map == "plain":
         return preview_srgb8(radiance_rgb)

@@ -1,8 +1,8 @@
-"""Times the parts of previews on this machine, for the choices of `trilight render`.
+"""Times the components of previews on this machine, for `trilight render --seconds` and `--error`.
 
-Two of the scenes of the shipped table are made again and timed, on one thread and on all. How much
-quicker or slower each part is here than where the table was measured is what counts: times of a
-sample differ by a factor of two between scenes, and two scenes are not the table's twelve.
+Two scenes of the shipped table are made again and timed, on one thread and on all. Each shipped
+cost is multiplied by this machine's time relative to that of the table's machine: times of a sample
+differ by a factor of two between scenes, and two scenes are not the table's twelve.
 """
 
 import contextlib
@@ -32,39 +32,39 @@ from pipeline.renders.variant import choose_variant
 from storage.records.scene import Scene
 
 PROBES = (1, 2)
-"""Numbers of the held-out scenes whose parts every machine times."""
+"""Numbers of the held-out scenes that every machine times."""
 
 PROBED_PX = (64, 256)
-"""Widths that are timed; between and beyond them machines differ by what they differ there."""
+"""Widths in pixels that are timed; ratios at other widths are interpolated or those of the end."""
 
-Timed = dict[tuple[int, int], Mapping[str, float]]
-"""Seconds of the parts by width and threads."""
+PartSeconds = dict[tuple[int, int], Mapping[str, float]]
+"""Seconds of each part by (width, threads)."""
 
 
-def measured_costs(table: WayTable) -> PictureCosts:
-    """Return what the parts take here, in well under a minute on an idle machine."""
+def measure_costs(table: WayTable) -> PictureCosts:
+    """Return the costs of the parts here; takes less than a minute on an idle machine."""
     cores = os.cpu_count() or 1
     with tempfile.TemporaryDirectory() as name:
         child = composing_child(held_out_build(), BENCHMARK, Path(name))
         with contextlib.closing(child):
             scenes = [child.call(held_out_scene, index) for index in PROBES]
-            timed = [_timed(child, scene, cores) for scene in scenes]
-    mean: Timed = {
+            timed = [_time_scene(child, scene, cores) for scene in scenes]
+    mean: PartSeconds = {
         key: {part: float(np.mean([one[key][part] for one in timed])) for part in timed[0][key]}
         for key in timed[0]
     }
     return costs_of(table, mean, cores, machine_name(choose_variant()))
 
 
-def costs_of(table: WayTable, timed: Timed, cores: int, machine: str) -> PictureCosts:
-    """Return the shipped costs times what the probes take here by what they took there.
+def costs_of(table: WayTable, timed: PartSeconds, cores: int, machine: str) -> PictureCosts:
+    """Return the shipped costs times the ratio of this machine's time to the table's.
 
     Args:
-        table: with the core-seconds of the probes.
-        timed: mean seconds of the probes' parts, on one thread and on `cores`; a part that was not
-            timed costs what is shipped.
-        cores: threads at most.
-        machine: its name.
+        table: shipped table, with the CPU seconds of the probes.
+        timed: mean seconds of the probes' parts, on one thread and on `cores`; a part without a
+            time keeps its shipped cost.
+        cores: maximum number of threads.
+        machine: name of this machine.
     """
     then = {(row.part, row.width): row.serial_s + row.parallel_s for row in table.probe.rows}
     rows = []
@@ -95,7 +95,7 @@ def costs_of(table: WayTable, timed: Timed, cores: int, machine: str) -> Picture
 def _serial_and_parallel(one_s: float, all_s: float, cores: int) -> Any:
     """Return [serial, parallel] seconds s and p with s + p = `one_s` and s + p / cores = `all_s`.
 
-    Where that would make one of them negative, it is 0 and the other is what one thread took.
+    Where one of them would be negative, it is 0 and the other is `one_s`.
     """
     if cores == 1:
         return np.array([0.0, one_s])
@@ -103,18 +103,18 @@ def _serial_and_parallel(one_s: float, all_s: float, cores: int) -> Any:
     return np.array([one_s - parallel, parallel])
 
 
-def _timed(child: Any, scene: Scene, cores: int) -> Timed:
-    found: Timed = {}
+def _time_scene(child: Any, scene: Scene, cores: int) -> PartSeconds:
+    seconds: PartSeconds = {}
     for threads in {1, cores}:
         networks = _network_parts(scene, threads)
         for px in PROBED_PX:
             parts = child.call(parts_with_threads, scene, px, threads)
-            found[px, threads] = {**parts, **networks.get(px, {})}
-    return found
+            seconds[px, threads] = {**parts, **networks.get(px, {})}
+    return seconds
 
 
 def parts_with_threads(scene: Scene, resolution: int, threads: int) -> dict[str, float]:
-    """Return `timed_parts` with so many threads; runs in a render child."""
+    """Return `timed_parts` with a number of threads; runs in a render child."""
     set_threads(threads)
     return timed_parts(scene, resolution)
 
@@ -128,7 +128,8 @@ def _network_parts(scene: Scene, threads: int) -> dict[int, dict[str, float]]:
     from model.neural_renderer import NeuralRenderer
 
     torch.set_num_threads(threads)
-    renderer, found = NeuralRenderer.load("builtin:tokens"), {}
+    renderer = NeuralRenderer.load("builtin:tokens")
+    seconds = {}
     for px in PROBED_PX:
         spent = []
         for _ in range(4):
@@ -138,6 +139,6 @@ def _network_parts(scene: Scene, threads: int) -> dict[int, dict[str, float]]:
             renderer.view(prepared, scene.c2w[0], float(scene.fov_deg[0]), px)
             marks.append(time.perf_counter())
             spent.append(np.diff(marks))
-        encoding_s, view_s = np.median(spent[1:], axis=0)  # memory and threads are new to the first
-        found[px] = {NETWORK_SCENE: float(encoding_s), NETWORK_VIEW: float(view_s)}
-    return found
+        encoding_s, view_s = np.median(spent[1:], axis=0)  # the first allocates memory and threads
+        seconds[px] = {NETWORK_SCENE: float(encoding_s), NETWORK_VIEW: float(view_s)}
+    return seconds

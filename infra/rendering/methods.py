@@ -1,6 +1,6 @@
-"""Methods that make a picture: networks, traced light without a network, the path tracer.
+"""Methods that render a picture: networks, traced light without a network, the path tracer.
 
-A method loads a scene and then shows any camera. The benchmark and the leaderboard compare them.
+A method loads a scene and then renders any camera. The benchmark and the leaderboard compare them.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,14 +22,15 @@ if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
 
 View = Callable[[NDArray[np.float32], float], NDArray[np.float32]]
-"""Makes the picture [R, R, 3] of a camera to world [4, 4] and its full field of view in degrees."""
+"""Function that renders [R, R, 3] from camera to world [4, 4] and full field of view in degrees."""
 
 Method = Callable[[Scene], View]
-"""Loads a scene, and returns its view; all pictures are of one width."""
+"""Function that loads a scene and returns its `View`; all pictures have one width."""
 
-DIRECT_LIGHT, TRACED_LIGHT = "direct light, no network", "all traced light, no network"
+DIRECT_LIGHT = "direct light, no network"
+TRACED_LIGHT = "all traced light, no network"
 BUILTIN_NETWORKS = ("builtin:", "builtin:tokens")
-"""Networks of every comparison: the better one, and the one that traces nothing."""
+"""Networks of every comparison: the hybrid one (more accurate), and the pure one."""
 
 SAMPLES: tuple[tuple[int, Filtered], ...] = (
     (1, "fast"),
@@ -39,7 +40,7 @@ SAMPLES: tuple[tuple[int, Filtered], ...] = (
     (16, "fast"),
     (16, "high"),
 )
-"""Samples a pixel, and the filter of Open Image Denoise."""
+"""Pairs of samples per pixel and filter of Open Image Denoise."""
 
 KINDS = ("network", "traced light, no network", "path tracer, denoised")
 
@@ -47,7 +48,7 @@ SAMPLE_SEED = 20_261_122
 """Seed of the path tracer's samples; no dataset preset and no run uses it."""
 
 _WEIGHTS = "model.safetensors"
-"""File of weights in the folder of a run."""
+"""Name of the weights file in the folder of a run."""
 
 
 def network_name(label: str) -> str:
@@ -56,34 +57,34 @@ def network_name(label: str) -> str:
 
 
 def network_labels(paths: Sequence[str]) -> tuple[str, ...]:
-    """Return short names of networks: the folder of a run, and no path of this machine."""
+    """Return short names of networks, such as the folder of a run, without paths."""
     named = [Path(path) for path in paths]
     return tuple(path.parent.name if path.name == _WEIGHTS else path.name for path in named)
 
 
 def samples_name(level: tuple[int, Filtered]) -> str:
-    """Return the name of the row of so many samples with a filter."""
+    """Return the row's name of a number of samples with a filter."""
     return f"{level[0]} sample{'s' if level[0] > 1 else ''}, {level[1]}"
 
 
 def kind_of(name: str) -> str:
-    """Return the kind, one of KINDS, of a row's name."""
+    """Return the kind (one of KINDS) of a method by its row's name."""
     if name.startswith("network"):
         return KINDS[0]
     return KINDS[1] if name in (DIRECT_LIGHT, TRACED_LIGHT) else KINDS[2]
 
 
 def warm_up_denoiser(resolution: int, quality: Quality = "high") -> None:
-    """Let this process make its filter for pictures of a size."""
+    """Create this process's denoiser for pictures of a size."""
     black = np.zeros((resolution, resolution, 3), np.float32)
     denoise(black, Features(albedo=black, normal=black), quality)
 
 
 def sampled_method(resolution: int, spp: int, denoiser: Filtered) -> Method:
-    """Return the path tracer with so many samples a pixel and one denoise.
+    """Return the path tracer with a number of samples per pixel and one denoise.
 
-    It works in a render child alone. Samples have the same seed in every view, as those of
-    `trilight render --orbit`.
+    It runs only in a render child. Samples have the same seed in every view, as those of `trilight
+    render --orbit`.
     """
     settings = PreviewSettings(resolution=resolution, spp=spp, denoiser=denoiser)
 
@@ -97,7 +98,7 @@ def sampled_method(resolution: int, spp: int, denoiser: Filtered) -> Method:
 
 
 def network_method(renderer: "NeuralRenderer", resolution: int) -> Method:
-    """Return the method that shows a network's pictures."""
+    """Return the method that renders with a network."""
 
     def load(scene: Scene) -> View:
         prepared = renderer.prepare(scene)
@@ -107,10 +108,10 @@ def network_method(renderer: "NeuralRenderer", resolution: int) -> Method:
 
 
 def direct_light_method(resolution: int) -> Method:
-    """Return the method that shows the lamps' light without a bounce, as the stage `hits` has it.
+    """Return the method that renders the direct light of lamps, as the view stage `hits` does.
 
-    Nothing is gathered or mirrored and no network runs. Smooth surfaces show lamps by points drawn
-    on the lamps alone, so that sharp reflections of lamps are noisy.
+    Nothing is gathered or mirrored and no network runs. Light is sampled by points on the lamps
+    only, so that sharp reflections of lamps in smooth surfaces are noisy.
     """
     from model.config import hits_smoke
     from model.hits.lit_scene import LitScene
@@ -128,12 +129,12 @@ def direct_light_method(resolution: int) -> Method:
         light = SceneLight(direct_2T3=dark, indirect_2T3=dark, mean_3=np.ones(3, np.float32))
 
         def view(c2w: NDArray[np.float32], fov_deg: float) -> NDArray[np.float32]:
-            found = view_inputs(
+            inputs = view_inputs(
                 lit, light, c2w, fov_deg, resolution,
                 rays_a_side=hits_smoke().hit_rays, anchors_a_side=1, gather_rays=0,
             )  # fmt: skip
-            of_lamps = found.pixels[..., Channel.SHOWN_DIFFUSE]
-            return of_lamps + found.pixels[..., Channel.DIRECT_SPECULAR]
+            of_lamps = inputs.pixels[..., Channel.SHOWN_DIFFUSE]
+            return of_lamps + inputs.pixels[..., Channel.DIRECT_SPECULAR]
 
         return view
 
@@ -141,10 +142,10 @@ def direct_light_method(resolution: int) -> Method:
 
 
 def traced_network() -> "NeuralRenderer":
-    """Return a network that shows the traced light of the view stage `hits`, without training.
+    """Return an untrained network that renders the traced light of the view stage `hits`.
 
-    Every gain is 1, nothing is added or filtered, and gathered light is mixed by how near anchors
-    are. Layers are as small as they can be: what is timed is the tracing.
+    Every gain is 1, nothing is added or filtered, and gathered light is weighted by the distance of
+    anchors. Layers have the least possible size, so that only the tracing takes time.
     """
     import dataclasses
 
@@ -159,15 +160,15 @@ def traced_network() -> "NeuralRenderer":
 
 
 def untrained_network(config: "ModelConfig") -> "NeuralRenderer":
-    """Return a network of hits of any size that shows the traced light, and nothing else."""
+    """Return a hybrid network of any size that renders only the traced light."""
     import torch
 
     from model.neural_renderer import NeuralRenderer
     from model.renderformer import RenderFormer
 
     model = RenderFormer(config)
-    model.initialise(torch.Generator().manual_seed(0))
+    model.initialize(torch.Generator().manual_seed(0))
     with torch.no_grad():
         model.decoder.head.query.weight.zero_()
-        model.decoder.head.last.bias[-6:] = -30.0  # softplus of what would be learned: nothing
+        model.decoder.head.last.bias[-6:] = -30.0  # softplus of this is 0: nothing is added
     return NeuralRenderer(model)

@@ -1,4 +1,4 @@
-"""One EXR file of a picture that says how it was made, and is kept if it would come out again."""
+"""EXR file of a picture; by the header an equal picture is kept instead of rendered again."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,24 +26,24 @@ _REQUEST = "request_sha256"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Request:
-    """All that decides a picture."""
+class PictureKey:
+    """Everything that decides a picture."""
 
     engine: str
-    """Name of the engine."""
+    """Name of the engine, as in `--engine`."""
     identity: Mapping[str, Any]
-    """What it depends on beside scene and camera."""
+    """Everything but scene and camera that decides the picture, as JSON values."""
     source: str
     """Name of the scene's file, without its folders."""
     scene_sha256: str
-    """Digest of the scene."""
+    """storage.records.scene_file.scene_digest."""
     camera: ShotCamera
     view: int | None
-    """Row of the camera among the scene's own; None if the camera is none of these."""
+    """Row of the camera in the scene; None for a camera from elsewhere."""
 
     @property
     def header(self) -> dict[str, Fact]:
-        """What a picture says about itself: nothing of the clock, and no folder."""
+        """Header of the file, without times and folders."""
         camera: dict[str, Any] = {"c2w": self.camera.c2w.tolist(), "fov_deg": self.camera.fov_deg}
         values = {
             "engine": self.engine,
@@ -61,59 +61,58 @@ class Request:
 
 @dataclass(frozen=True, kw_only=True)
 class PictureFile:
-    """A picture on disk: what is remembered of it, and a film may have thousands."""
+    """Picture on disk, without its pixels, since a video may have thousands."""
 
     path: Path
-    """The EXR file."""
+    """Path of the EXR file."""
     facts: Facts
-    """What its engine says of it."""
     was_kept: bool
-    """Whether it was there already."""
+    """True where an equal file existed already."""
     is_black: bool
-    """Whether it shows nothing at all."""
+    """True where all pixels are 0."""
     seconds: float | None = None
-    """Wall-clock seconds that it took, with its scene where it is the first picture of it; None
-    where it was kept."""
+    """Wall-clock seconds of rendering, those of loading the scene included for its first picture;
+    None where the file was kept."""
 
 
-def kept_picture(path: Path, wanted: Request) -> tuple[PictureFile, Radiance] | None:
-    """Return the picture in a file, as `write_picture`, if it is the one that is wanted."""
+def load_matching_picture(path: Path, key: PictureKey) -> tuple[PictureFile, Radiance] | None:
+    """Return the picture in a file if its key matches; else, or if it is unreadable, None."""
     try:
         data = read_plain(path)
         header = read_header(data)
-        if header.get(_PREFIX + _REQUEST) != wanted.header[_REQUEST]:
+        if header.get(_PREFIX + _REQUEST) != key.header[_REQUEST]:
             return None
         names = {channel.name.rpartition(".")[0] for channel in header["channels"]}
         radiance_rgb = decode_picture(data, names - {""})
     except (OSError, RuntimeError, ValueError, TrilightError):
         return None
-    described = {_PREFIX + name for name in wanted.header}
+    described = {_PREFIX + name for name in key.header}
     facts = {
         name.removeprefix(_PREFIX): value
         for name, value in header.items()
         if name.startswith(_PREFIX) and name not in described
     }
-    return _remembered(path, facts, radiance_rgb, was_kept=True), radiance_rgb
+    return _picture_file(path, facts, radiance_rgb, was_kept=True), radiance_rgb
 
 
-def write_picture(path: Path, wanted: Request, rendered: Rendered) -> tuple[PictureFile, Radiance]:
+def write_picture(path: Path, key: PictureKey, rendered: Rendered) -> tuple[PictureFile, Radiance]:
     """Write a picture, and return it as the file holds it.
 
-    Equal requests and pictures give equal bytes.
+    Equal keys and pictures give equal bytes.
 
     Raises:
         TrilightError: a value is not finite, or the file cannot be written.
     """
-    header = {
-        _PREFIX + name: value for name, value in (wanted.header | dict(rendered.facts)).items()
-    }
+    header = {_PREFIX + name: value for name, value in (key.header | dict(rendered.facts)).items()}
     picture = encode_picture(rendered.radiance_rgb, rendered.layers_rgb, header)
     write_atomically(path, picture)
     radiance_rgb = rounded_to_half(rendered.radiance_rgb)
-    return _remembered(path, rendered.facts, radiance_rgb, was_kept=False), radiance_rgb
+    return _picture_file(path, rendered.facts, radiance_rgb, was_kept=False), radiance_rgb
 
 
-def _remembered(path: Path, facts: Facts, radiance_rgb: Radiance, *, was_kept: bool) -> PictureFile:
+def _picture_file(
+    path: Path, facts: Facts, radiance_rgb: Radiance, *, was_kept: bool
+) -> PictureFile:
     return PictureFile(
         path=path, facts=dict(facts), was_kept=was_kept, is_black=not radiance_rgb.any()
     )

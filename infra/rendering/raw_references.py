@@ -1,10 +1,10 @@
-"""Raw references that no denoiser has seen, and the true errors of pictures against them.
+"""Raw references without denoising, and the true errors of pictures against them.
 
-A reference is two halves of raw samples; a smaller picture's is its means of blocks of pixels, with
-as many more samples. The squared error of a picture P is the mean of (P - A) (P - B), in which the
-noise of the two halves A and B cancels on average: neither needs to be converged. In a curve of
-radiance it is taken times the slope of the curve's secant between the picture and the mean of both
-halves, as pipeline.renders.noise_floor does.
+A reference is two independent halves of raw samples, A and B. For smaller pictures, blocks of its
+pixels are averaged, which adds their samples. The squared error of a picture P is the mean of
+(P - A) (P - B): the noise of A and of B is independent, so that it cancels on average and neither
+half needs to be converged. Errors in a tone curve are multiplied by the slope of the curve's secant
+between the picture and the mean of both halves, as in pipeline.renders.noise_floor.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ LEAST_ERROR = 1e-10
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawReference:
-    """Two halves of raw samples that share nothing."""
+    """Two independent halves of raw samples."""
 
     a_rgb: NDArray[np.float64]
     """[R, R, 3] mean of the first half."""
@@ -46,14 +46,15 @@ def raw_reference(scene: Scene, camera: Camera, spp: int, *name: int) -> RawRefe
     """Return two halves of raw samples of a view; runs in a render child.
 
     Args:
-        scene: that passes `Scene.check`.
-        camera: the view.
-        spp: samples per pixel, both halves together, a multiple of 128.
-        name: numbers that its seeds are made of.
+        scene: scene that passes `Scene.check`.
+        camera: camera of the view.
+        spp: samples per pixel of both halves together, a multiple of 128.
+        name: numbers that the seeds are derived from.
     """
     depths = {"max_depth": RenderSettings.max_depth, "rr_depth": RenderSettings.rr_depth}
     tracer = load_tracer(scene, **depths)
-    size, halves = PASS_SPP[0], []
+    size = PASS_SPP[0]
+    halves = []
     for half in range(2):
         total = np.zeros((camera.resolution, camera.resolution, 3))
         passes = spp // (2 * size)
@@ -70,19 +71,21 @@ def true_error_db(
     curve: Curve,
     pixels: NDArray[np.bool_],
 ) -> tuple[float, float]:
-    """Return a picture's error in dB, and by how many dB the reference's noise may move that.
+    """Return a picture's error in dB, and its standard deviation in dB by the reference's noise.
 
     Args:
         picture_rgb: [R, R, 3] linear radiance.
-        reference: of the same width.
-        curve: what errors are taken in.
-        pixels: [R, R] that count; one at least.
+        reference: reference of the same width.
+        curve: tone curve in which errors are taken.
+        pixels: [R, R] mask of the pixels that count, at least one.
     """
     picture = picture_rgb.astype(np.float64)
     mean = 0.5 * (reference.a_rgb + reference.b_rgb)
     weight = np.square(secant_slope(curve, picture, mean)) * pixels[..., None] / (3 * pixels.sum())
     error = float((weight * (picture - reference.a_rgb) * (picture - reference.b_rgb)).sum())
-    # The halves are off by n and -n beside the mean: (e + n)(e - n) varies by e n and n^2.
+    # With M the mean of both halves, A = M + n and B = M - n; e = P - M is the picture's error. So
+    # (P - A)(P - B) = (e - n)(e + n) = e^2 - n^2, and a pixel's variance is about (e^2 + n^2) n^2:
+    # the error times the noise (e n)^2, and the noise's own n^4. Pixels are independent.
     noise_sq = np.square(0.5 * (reference.a_rgb - reference.b_rgb))
     variance = np.square(weight) * (np.square(picture - mean) + noise_sq) * noise_sq
     spread = float(np.sqrt(variance.sum()))

@@ -1,4 +1,4 @@
-"""One call of `trilight render`: a plan, and then every picture of it, made or kept."""
+"""One call of `trilight render`: renders every picture of a plan, or keeps an equal one."""
 
 import dataclasses
 import itertools
@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Protocol
 from infra.rendering.cameras import own_camera
 from infra.rendering.comparison import Flicker, Frame, comparison_sheet, flicker, log_error
 from infra.rendering.engines import Engine, OpenedScene
-from infra.rendering.look import Look, shown
+from infra.rendering.look import Look, display_pixels
+from infra.rendering.options import RenderOptions
 from infra.rendering.picture_file import (
     PictureFile,
+    PictureKey,
     Radiance,
-    Request,
-    kept_picture,
+    load_matching_picture,
     write_picture,
 )
 from infra.rendering.plan import RenderPlan, Shot, plan_render
-from infra.rendering.request import Asked
 from infra.rendering.video import write_video
 from infra.rendering.ways import Choice
 from pipeline.documents.png import encode_png
@@ -37,78 +37,79 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneIdentity:
-    """What there is to say of a scene."""
+    """Digest and size of a scene."""
 
     digest: str
-    """storage.records.scene_file.scene_digest."""
+    """SHA-256 by storage.records.scene_file.scene_digest."""
     num_triangles: int
-    """All of them, emitting ones too."""
+    """Number of triangles, emitting ones included."""
     num_lights: int
-    """Emitter objects."""
+    """Number of emitter objects, not of their triangles."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FinishedShot:
-    """What came of one shot."""
+    """Result of one shot."""
 
     shot: Shot
     scene: SceneIdentity
     pictures: Mapping[str, PictureFile]
-    """By engine."""
+    """Files by the name of their engine."""
     psnr_log_db: float | None
-    """Of the network's picture against the traced one, where there are both."""
+    """PSNR of the network's picture against the traced one; None without both."""
     flicker: Flicker | None
-    """Since the picture before, of the same scene or stage, where there are both engines."""
+    """Flicker since the preceding picture of the scene or stage; None without both engines."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RenderOutcome:
-    """What came of a plan."""
+class RenderResult:
+    """Result of a plan."""
 
     plan: RenderPlan
     shots: Sequence[FinishedShot]
-    """Picture by picture."""
+    """Results in the order of the plan's shots."""
     notes: Sequence[str]
-    """What a person should know."""
+    """Warnings about scenes and pictures, each once."""
 
 
-class RenderWatcher(Protocol):
-    """Is told how far a render is."""
+class RenderProgress(Protocol):
+    """Callbacks on the progress of a render."""
 
-    def chosen(self, choice: Choice) -> None:
-        """The way to the pictures was chosen."""
+    def on_choice(self, choice: Choice) -> None:
+        """Report the quality preset that --seconds or --error chose."""
 
-    def pictures(self, done: int, total: int) -> None:
-        """So many pictures are finished."""
+    def on_picture(self, done: int, total: int) -> None:
+        """Report the number of finished pictures and of all."""
 
-    def sampled(self, now: "Sampling") -> None:
-        """The path tracer has finished a pass."""
-
-
-def render_asked(asked: Asked, watcher: RenderWatcher) -> RenderOutcome:
-    """Plan what was asked for and carry it out; raises TrilightError as these two do."""
-    with SceneReader(asked.albedo_over_one) as reader:
-        return carry_out(plan_render(asked, reader), reader, watcher)
+    def on_samples(self, now: "Sampling") -> None:
+        """Report a finished pass of the path tracer."""
 
 
-def carry_out(plan: RenderPlan, reader: SceneReader, watcher: RenderWatcher) -> RenderOutcome:
-    """Make every picture of a plan, and the video.
+def render_from_options(options: RenderOptions, watcher: RenderProgress) -> RenderResult:
+    """Plan a render and run the plan; raises TrilightError as these two do."""
+    with SceneReader(options.albedo_over_one) as reader:
+        return run_plan(plan_render(options, reader), reader, watcher)
+
+
+def run_plan(plan: RenderPlan, reader: SceneReader, watcher: RenderProgress) -> RenderResult:
+    """Render every picture of a plan, and write the video.
 
     Raises:
-        TrilightError: a network or a scene that cannot be loaded or rendered, or a file that
-            cannot be written.
+        TrilightError: a network or a scene cannot be loaded or rendered, or a file cannot be
+            written.
     """
-    finished, notes = list[FinishedShot](), dict[str, None]()
+    finished = list[FinishedShot]()
+    notes = dict[str, None]()
     choice = plan.choice
     if choice is not None:
-        watcher.chosen(choice)
+        watcher.on_choice(choice)
     before: Frame | None = None
     with ExitStack() as stack:
         engines = {
-            each.name: stack.enter_context(closing(each.start(watcher.sampled)))
+            each.name: stack.enter_context(closing(each.start(watcher.on_samples)))
             for each in plan.engines
         }
-        watcher.pictures(0, len(plan.shots))
+        watcher.on_picture(0, len(plan.shots))
         for scene, shot in _with_scenes(plan.shots, reader):
             made = {
                 name: _picture(shot, name, engine, scene, choice)
@@ -117,26 +118,26 @@ def carry_out(plan: RenderPlan, reader: SceneReader, watcher: RenderWatcher) -> 
             done, before = _finish(shot, scene.identity, made, plan.look, before)
             finished.append(done)
             notes |= dict.fromkeys(scene.notes)
-            watcher.pictures(len(finished), len(plan.shots))
-    if plan.place.video is not None:
-        write_video(plan.place.video, [done.shot.png for done in finished], plan.fps)
-    return RenderOutcome(plan=plan, shots=finished, notes=[*notes, *_caveats(plan, finished)])
+            watcher.on_picture(len(finished), len(plan.shots))
+    if plan.output.video is not None:
+        write_video(plan.output.video, [done.shot.png for done in finished], plan.fps)
+    return RenderResult(plan=plan, shots=finished, notes=[*notes, *_caveats(plan, finished)])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _SceneAtHand:
-    """The scene of the shots at hand."""
+    """Scene of the current shots."""
 
     scene: Scene
     identity: SceneIdentity
     notes: list[str]
-    """Those on its file, and then those of each engine that opened it."""
+    """Warnings about its file, and then those of each engine that opened it."""
     opened: dict[str, OpenedScene]
-    """By engine. An engine opens the scene for the first picture that is not kept."""
+    """Opened scene by the name of its engine, from the first picture on that is not kept."""
 
 
 def _with_scenes(shots: Sequence[Shot], reader: SceneReader) -> Iterator[tuple[_SceneAtHand, Shot]]:
-    """Yield shots with their scenes; a scene is read once for all shots in a row."""
+    """Yield shots with their scenes; a scene is read once for consecutive shots."""
     for source, same_scene in itertools.groupby(shots, key=lambda shot: shot.source):
         loaded = reader.load(source)
         identity = SceneIdentity(
@@ -154,10 +155,10 @@ def _with_scenes(shots: Sequence[Shot], reader: SceneReader) -> Iterator[tuple[_
 def _picture(
     shot: Shot, name: str, engine: Engine, at_hand: _SceneAtHand, choice: Choice | None
 ) -> tuple[PictureFile, Radiance]:
-    """Return the picture of one engine, which is kept or made."""
+    """Return the picture of one engine, from an equal file or rendered."""
     view = shot.camera if isinstance(shot.camera, int) else None
     camera = own_camera(at_hand.scene, shot.camera) if isinstance(shot.camera, int) else shot.camera
-    wanted = Request(
+    key = PictureKey(
         engine=name,
         identity=engine.identity,
         source=shot.source.name,
@@ -165,9 +166,9 @@ def _picture(
         camera=camera,
         view=view,
     )
-    kept = kept_picture(shot.exrs[name], wanted) if shot.keep else None
-    if kept is not None:
-        return kept
+    existing = load_matching_picture(shot.exrs[name], key) if shot.keep else None
+    if existing is not None:
+        return existing
     seconds = 0.0
     if name not in at_hand.opened:
         at_hand.opened[name] = engine.open(at_hand.scene, shot.source.name)
@@ -178,7 +179,7 @@ def _picture(
     seconds += time.perf_counter() - began
     if choice is not None:
         rendered = dataclasses.replace(rendered, facts={**rendered.facts, **choice.facts})
-    written, radiance_rgb = write_picture(shot.exrs[name], wanted, rendered)
+    written, radiance_rgb = write_picture(shot.exrs[name], key, rendered)
     return dataclasses.replace(written, seconds=seconds), radiance_rgb
 
 
@@ -189,15 +190,17 @@ def _finish(
     look: Look,
     before: Frame | None,
 ) -> tuple[FinishedShot, Frame | None]:
-    """Write what people look at; return the shot, and the frame if there are both engines."""
+    """Write the PNG; return the finished shot, and the frame if there are both engines."""
     files = {name: file for name, (file, _) in made.items()}
     radiances = {name: radiance_rgb for name, (_, radiance_rgb) in made.items()}
-    now, agreement = None, None
+    now = None
+    agreement = None
     if len(made) == 1:
         (radiance_rgb,) = radiances.values()
-        pixels = shown(radiance_rgb, look)
+        pixels = display_pixels(radiance_rgb, look)
     else:
-        traced, neural = radiances["mitsuba"], radiances["neural"]
+        traced = radiances["mitsuba"]
+        neural = radiances["neural"]
         pixels = comparison_sheet(traced, neural, look)
         agreement = psnr_log_db(neural, traced)
         now = Frame(
@@ -217,7 +220,7 @@ def _finish(
 
 
 def _caveats(plan: RenderPlan, finished: Sequence[FinishedShot]) -> list[str]:
-    """Return what a person should know of all pictures together."""
+    """Return warnings about all pictures together."""
     notes = []
     for engine in plan.engines:
         pictures = [shot.pictures[engine.name] for shot in finished]

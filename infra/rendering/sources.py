@@ -1,4 +1,4 @@
-"""What `SRC` means where many scenes will do: a file of many, a folder, or numbered files."""
+"""Scenes of a source that may hold many: a file, a folder, or numbered files."""
 
 import re
 from pathlib import Path
@@ -6,27 +6,27 @@ from pathlib import Path
 from pipeline.exchange.formats import SceneSource, readable
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
-from storage.dataset.shard_places import expanded
+from storage.dataset.shard_places import expand_pattern
 from storage.errors import TrilightError
 
 
 def scene_sources(text: str, reader: SceneReader) -> list[SceneSource]:
-    """Return every scene that the user's `SRC` names, in order.
+    """Return every scene of a source, in order.
 
     Args:
         text: one file; `scenes/{000..119}.json` for numbered ones; or a folder, whose scene files
-            are taken in the order of the numbers in their names. Of a shard all samples are taken,
-            of a USD stage that moves all frames.
-        reader: opens files that may hold many.
+            are sorted by the numbers in their names. A shard stands for all of its samples, an
+            animated USD stage for all of its frames.
+        reader: reader for files that may hold many scenes.
 
     Raises:
-        TrilightError: as `pipeline.exchange.open_scene.scene_source`, or there is no scene.
+        TrilightError: a file is unusable, or there is no scene.
     """
     if "://" not in text and Path(text).is_dir():
         return [scene_source(str(path)) for path in _scene_files(Path(text))]
-    names = expanded(text, "scenes") if "{" in text else [text]
-    found = [scene_source(name, many=True) for name in names]
-    return [scene for source in found for scene in reader.scenes_of(source)]
+    names = expand_pattern(text, "scenes") if "{" in text else [text]
+    files = [scene_source(name, many=True) for name in names]
+    return [scene for source in files for scene in reader.scenes_of(source)]
 
 
 def _scene_files(folder: Path) -> list[Path]:

@@ -1,6 +1,6 @@
-"""Pictures in a row as one file: H.264 in .mp4, which everything plays, or animated .webp.
+"""Videos of pictures: H.264 in .mp4, which every player reads, or animated .webp.
 
-WebP needs nothing but Pillow and shows in browsers; MP4 is made by FFmpeg through PyAV.
+WebP needs only Pillow and is shown by browsers; MP4 is written by FFmpeg through PyAV.
 """
 
 import io
@@ -17,51 +17,55 @@ from storage.errors import TrilightError
 SUFFIXES = (".mp4", ".webp")
 
 _CRF = "16"
-"""Quality of H.264: below about 18 losses are not seen; 0 would be none."""
+"""Quality of H.264: losses are invisible below about 18, and absent at 0."""
 _WEBP_QUALITY = 90
-_BT709, _SRGB, _STUDIO_RANGE = 1, 13, 1
-"""Of the video's colours, by their numbers in ITU-T H.273 and in FFmpeg."""
+_BT709 = 1
+_SRGB = 13
+_STUDIO_RANGE = 1
+"""Color properties of the video, by their numbers in ITU-T H.273 and in FFmpeg."""
 
 
 def require_encoder(path: Path) -> None:
-    """Raise TrilightError where the file's form cannot be made here; cheap, so asked first."""
+    """Raise TrilightError where the encoder of a video is missing; cheap, so called first."""
     if path.suffix.lower() == ".mp4":
         _av()
 
 
 def write_video(path: Path, frames: Sequence[Path], fps: int) -> None:
-    """Write pictures of equal size, of even width and height, as a video.
+    """Write pictures of equal, even width and height as a video.
 
     A .webp takes all pictures into memory; an .mp4 one after the other.
 
     Args:
         path: X.mp4 or X.webp.
         frames: PNG files in order.
-        fps: pictures a second.
+        fps: frames per second.
 
     Raises:
-        TrilightError: the form needs a package that is missing, or the file cannot be written.
+        TrilightError: the format needs a missing package, or the file cannot be written.
     """
     encode = _mp4 if path.suffix.lower() == ".mp4" else _webp
     write_atomically(path, encode(frames, fps))
 
 
-def _opened(frames: Sequence[Path]) -> Iterator[Image.Image]:
+def _iter_frames(frames: Sequence[Path]) -> Iterator[Image.Image]:
     for path in frames:
         with Image.open(path) as picture:
             yield picture.convert("RGB")
 
 
 def _mp4(frames: Sequence[Path], fps: int) -> bytes:
-    av, stream = _av(), io.BytesIO()
+    av = _av()
+    stream = io.BytesIO()
     with av.open(stream, "w", format="mp4") as container:
         track: Any = None
-        for picture in _opened(frames):
+        for picture in _iter_frames(frames):
             if track is None:
                 track = container.add_stream("libx264", Fraction(fps), options={"crf": _CRF})
-                track.width, track.height, track.pix_fmt = *picture.size, "yuv420p"
+                track.width, track.height = picture.size
+                track.pix_fmt = "yuv420p"
                 track.codec_context.thread_count = 1  # more once gave other bytes
-                track.codec_context.colorspace = _BT709  # players guess by size where none is told
+                track.codec_context.colorspace = _BT709  # without it players guess by the size
                 track.codec_context.color_primaries = _BT709
                 track.codec_context.color_trc = _SRGB
                 track.codec_context.color_range = _STUDIO_RANGE
@@ -72,13 +76,13 @@ def _mp4(frames: Sequence[Path], fps: int) -> bytes:
 
 
 def _webp(frames: Sequence[Path], fps: int) -> bytes:
-    first, *others = _opened(frames)
+    first, *remaining = _iter_frames(frames)
     stream = io.BytesIO()
     first.save(
         stream,
         "WEBP",
         save_all=True,
-        append_images=others,
+        append_images=remaining,
         duration=round(1000 / fps),
         loop=0,
         quality=_WEBP_QUALITY,

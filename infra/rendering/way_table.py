@@ -1,8 +1,8 @@
-"""What ways to a picture cost and how far they are from the truth: the tables that choices read.
+"""Tables of cost and error of quality presets, for `trilight render --seconds` and `--error`.
 
-Errors are shipped: they do not depend on the machine. Costs are shipped as well, as core-seconds of
-the machine on which they were measured, until `trilight doctor --measure` has timed the same parts
-on this one and keeps them in the user's cache.
+Errors are shipped: they do not depend on the machine. Costs are shipped as well, as CPU seconds of
+the machine on which they were measured; `trilight doctor --measure` times the same parts on this
+machine and writes them into the user's cache.
 """
 
 import functools
@@ -25,16 +25,17 @@ from storage.settings.described import checked, from_record, settings_record
 from storage.settings.ranges import Within
 
 SHIPPED = Path(__file__).with_name("previews.json")
-"""Measured and written by infra.setup.preview_table."""
+"""File that infra.setup.preview_table measures and writes."""
 
-NETWORK_SCENE, NETWORK_VIEW = "network scene", "network view"
-"""Parts of a picture of the network builtin:tokens, beside pipeline.renders.preview_parts."""
+NETWORK_SCENE = "network scene"
+NETWORK_VIEW = "network view"
+"""Parts of a picture of the network builtin:tokens, in addition to preview_parts."""
 
 MEASURE = "trilight doctor --measure"
-"""Writes the costs of this machine."""
+"""Command that writes the costs of this machine."""
 
 Rung = Literal["traced", "network"]
-"""Few samples and a filter, or the network builtin:tokens, whose further views cost the least."""
+"""Method: few samples and a filter, or the network builtin:tokens, cheapest for further views."""
 
 Seconds = Annotated[float, Within(0, 1e6, unit="seconds")]
 Decibels = Annotated[float, Within(-MAX_DB, MAX_DB, unit="dB")]
@@ -42,88 +43,89 @@ Decibels = Annotated[float, Within(-MAX_DB, MAX_DB, unit="dB")]
 
 @checked("costs of a part")
 class PartCost:
-    """What one part of a picture takes at a width: `serial_s` + `parallel_s` / threads."""
+    """Seconds of one part of a picture at a width: `serial_s` + `parallel_s` / threads."""
 
     part: str
-    """Its name."""
+    """Name of the part, such as a sample, the filter, or `network view`."""
     width: Resolution
     """Width of the picture in pixels."""
     serial_s: Seconds
     """Seconds that more threads do not shorten."""
     parallel_s: Seconds
-    """Core-seconds that threads share."""
+    """CPU seconds that are divided by the number of threads."""
 
 
 @checked("costs of previews")
 class PictureCosts:
-    """What the parts of pictures take on a machine."""
+    """Costs of the parts of pictures on one machine."""
 
     machine: str
     """Processor, cores and variant of Mitsuba."""
     rows: tuple[PartCost, ...]
-    """Each part at each width."""
+    """Costs of each part at each width."""
 
 
 @checked("errors of a way")
 class WayError:
-    """How far the pictures of one way are from the truth at a width."""
+    """Error of the pictures of one quality preset at a width."""
 
     rung: Rung
-    """Traced, or by the network."""
+    """Method: traced, or by the network."""
     spp: Annotated[int, Within(0, MOST_SPP, unit="samples")]
-    """Samples per pixel; 0 of the network."""
+    """Samples per pixel; 0 for the network."""
     denoiser: Filtered
-    """Filter; off with the network."""
+    """Filter of Open Image Denoise; off for the network."""
     width: Resolution
     """Width of the pictures in pixels."""
     median_db: Decibels
     """Median psnr_log_db over the scenes, against raw references."""
     least_db: Decibels
-    """That of the worst scene."""
+    """psnr_log_db of the worst scene."""
 
 
 @checked("the table of previews")
 class WayTable:
-    """All ways that are shipped."""
+    """Shipped errors and costs of all quality presets."""
 
     scenes: Annotated[int, Within(1, 1_000_000, unit="scenes")]
     """Number of scenes, one view each."""
     errors: tuple[WayError, ...]
-    """Each way at the widths at which it was measured."""
+    """Errors of each preset at each measured width."""
     costs: PictureCosts
-    """Median core-seconds of the parts, one thread."""
+    """Median CPU seconds of the parts on one thread."""
     probe: PictureCosts
-    """The same of the mean of the first scenes alone, which other machines time as well."""
+    """Mean CPU seconds of the parts over the probe scenes, which other machines time as well."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class KnownCosts:
-    """The costs that hold here, and where they are from."""
+    """Costs that apply to this machine, and their source."""
 
     costs: PictureCosts
     source: str
-    """Where they are from, as the end of a sentence."""
+    """Source of the costs, as the end of a sentence."""
 
 
 @functools.cache
 def shipped_table() -> WayTable:
-    """Return the table that comes with Trilight."""
+    """Return the shipped table."""
     return from_record(WayTable, json.loads(SHIPPED.read_bytes()))
 
 
 def machine_name(variant: Variant) -> str:
-    """Return what costs depend on."""
+    """Return processor, cores and Mitsuba variant, on which costs depend."""
     return f"{processor()}, {os.cpu_count()} cores, {variant.name}"
 
 
 def machine_costs_path() -> Path:
-    """Return where the costs of this machine are kept."""
+    """Return the cache file with the costs of this machine."""
     return cache_folder("previews") / "costs.json"
 
 
 def known_costs(variant: Variant) -> KnownCosts:
-    """Return the costs of this machine where they were measured, else those that are shipped."""
-    shipped, path = shipped_table().costs, machine_costs_path()
+    """Return the measured costs of this machine, or the shipped ones without a measurement."""
+    shipped = shipped_table().costs
+    path = machine_costs_path()
     try:
         record: Any = json.loads(path.read_bytes())
         costs = from_record(PictureCosts, record)
@@ -143,7 +145,7 @@ def known_costs(variant: Variant) -> KnownCosts:
 
 
 def keep_machine_costs(costs: PictureCosts) -> Path:
-    """Keep costs as those of this machine and return their file; TrilightError as of files."""
+    """Write the costs of this machine, and return their file; raises TrilightError."""
     path = machine_costs_path()
     write_atomically(path, canonical_json(settings_record(costs)) + b"\n")
     return path

@@ -1,7 +1,7 @@
-"""Which way to a picture a person's seconds or decibels choose, from what ways cost and miss.
+"""Chooses samples per pixel and denoiser, or the network, for a time or error budget.
 
-What is expected is what the shipped scenes had in their median. It says nothing certain of the
-picture at hand: a measured error needs more samples (`--noise-floor`).
+The expected error is the median over the shipped scenes; a single picture may differ from it. A
+measured error needs more samples (`--noise-floor`).
 """
 
 import math
@@ -26,34 +26,34 @@ from pipeline.renders.settings import Filtered
 from storage.errors import TrilightError
 
 _LEAST_S = 1e-9
-"""Seconds below this count as this, so that logarithms can be taken."""
+"""Lower bound of seconds, so that logarithms can be taken."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Way:
-    """One way to make a picture."""
+    """Quality preset: samples per pixel and denoiser, or the network."""
 
     rung: Rung
-    """Traced, or by the network."""
+    """Method: traced, or by the network."""
     spp: int
-    """Samples per pixel; 0 of the network."""
+    """Samples per pixel; 0 for the network."""
     denoiser: Filtered
-    """Filter of Open Image Denoise; off with the network."""
+    """Filter of Open Image Denoise; off for the network."""
 
     def __str__(self) -> str:
-        """Return the way for a person."""
+        """Return the preset as text."""
         if self.rung == "network":
             return "the network builtin:tokens"
         return f"{self.spp} sample{'s' if self.spp > 1 else ''} a pixel, filter {self.denoiser}"
 
     @property
     def scene_part(self) -> str:
-        """Name of what a scene takes before its first picture."""
+        """Name of the part that a scene costs once, before its first picture."""
         return NETWORK_SCENE if self.rung == "network" else SCENE
 
     @property
     def view_parts(self) -> Counter[str]:
-        """How often each part occurs in a picture."""
+        """Number of occurrences of each part in a picture."""
         if self.rung == "network":
             return Counter([NETWORK_VIEW])
         return preview_parts(self.spp, self.denoiser)
@@ -61,56 +61,55 @@ class Way:
 
 @dataclass(frozen=True, kw_only=True)
 class Priced:
-    """A way with what is expected of it at one width."""
+    """Quality preset with its expected cost and error at one width."""
 
     way: Way
     seconds: float
-    """Wall-clock seconds of a picture, start-up aside."""
+    """Wall-clock seconds of a picture, without start-up."""
     db: float
     """Median psnr_log_db over the scenes of the table."""
     least_db: float
-    """That of the worst of them."""
+    """psnr_log_db of the worst scene of the table."""
     judged_px: int
-    """Width in pixels of which this error is: that of the pictures asked for, or the nearest of
-    those at which the way was measured where it lies beyond them."""
+    """Width in pixels at which the error was measured: that of the pictures, or beyond the measured
+    widths the nearest of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """What was chosen for whom, and what is expected of it."""
+    """Chosen quality preset, and its expected cost and error."""
 
-    asked: str
-    """The option with its value."""
+    option: str
+    """Option that chose the preset, with its value."""
     priced: Priced
-    """The way."""
     fits: bool
-    """Whether it keeps to what was asked."""
+    """True where the preset keeps to the budget."""
     scenes: int
     """Number of scenes behind the expected error."""
     costs: str
-    """Where the costs are from, as the end of a sentence."""
+    """Source of the costs, as the end of a sentence."""
 
     @property
     def engine(self) -> Literal["mitsuba", "neural"]:
-        """The engine that makes its pictures."""
+        """Engine that renders the preset."""
         return "neural" if self.priced.way.rung == "network" else "mitsuba"
 
     @property
     def sentence(self) -> str:
-        """The choice for a person, in one line."""
+        """The choice as one line of text."""
         one = self.priced
         lead = "chosen" if self.fits else "nothing is as quick; the quickest is chosen"
         return (
-            f"{self.asked}: {lead}: {one.way}; expected {one.db:.1f} dB in the median of "
+            f"{self.option}: {lead}: {one.way}; expected {one.db:.1f} dB in the median of "
             f"{self.scenes} scenes at {one.judged_px} pixels ({one.least_db:.1f} in the worst), in "
-            f"{_shown_s(one.seconds)} s after start-up; {self.costs}"
+            f"{_seconds_text(one.seconds)} s after start-up; {self.costs}"
         )
 
     @property
     def facts(self) -> Mapping[str, str | float]:
-        """What the header of a picture says of it."""
+        """Facts for the header of a picture."""
         return {
-            "chosen_for": self.asked,
+            "chosen_for": self.option,
             "expected_db": round(self.priced.db, 2),
             "expected_seconds": float(f"{self.priced.seconds:.4g}"),
         }
@@ -125,16 +124,16 @@ def priced_ways(
     per_scene: float,
     network: bool,
 ) -> list[Priced]:
-    """Return every way with its price and error.
+    """Return every quality preset with its expected cost and error.
 
     Args:
-        table: the ways and their errors.
-        costs: of their parts.
-        width: of a picture in pixels.
-        threads: that work; no more than there are cores.
+        table: presets and their errors.
+        costs: costs of the parts of pictures.
+        width: width of a picture in pixels.
+        threads: number of threads; no more than there are cores.
         per_scene: pictures that share the loading of a scene, at least 1.
-        network: whether the network can run here; it is a way only at widths between those at which
-            it was judged.
+        network: whether the network can run here; it is offered only between the widths at which it
+            was measured.
     """
     part_s = _part_seconds(costs, width, threads)
     rows: dict[Way, list[WayError]] = {}
@@ -152,31 +151,31 @@ def priced_ways(
             judged_px=min(max(width, of_way[0].width), of_way[-1].width),
         )
         for way, of_way in rows.items()
-        # samples come nearer the truth as pictures grow, a network leaves what it was trained on
+        # more pixels do not harm samples; a network fails beyond the widths of its training
         if way.rung == "traced" or of_way[0].width <= width <= of_way[-1].width
     ]
 
 
-def within_seconds(ways: Sequence[Priced], seconds: float) -> tuple[Priced, bool]:
-    """Return the way of least error that keeps to the seconds, the cheaper of equals, and True.
+def within_seconds(candidates: Sequence[Priced], seconds: float) -> tuple[Priced, bool]:
+    """Return the preset of least error within the seconds, the cheaper of equals, and True.
 
-    Where none does, return the quickest and False.
+    Where none fits, return the fastest preset and False.
     """
-    fitting = [one for one in ways if one.seconds <= seconds]
+    fitting = [one for one in candidates if one.seconds <= seconds]
     if not fitting:
-        return min(ways, key=lambda one: (one.seconds, -one.db)), False
+        return min(candidates, key=lambda one: (one.seconds, -one.db)), False
     return max(fitting, key=lambda one: (one.db, -one.seconds)), True
 
 
-def reaching(ways: Sequence[Priced], db: float, width: int) -> Priced:
-    """Return the quickest way whose median error reaches `db`, the better of equals.
+def reaching(candidates: Sequence[Priced], db: float, width: int) -> Priced:
+    """Return the fastest preset whose median error reaches `db`, the better of equals.
 
     Raises:
-        TrilightError: none does.
+        TrilightError: no preset reaches it.
     """
-    good = [one for one in ways if one.db >= db]
+    good = [one for one in candidates if one.db >= db]
     if not good:
-        most = max(one.db for one in ways)
+        most = max(one.db for one in candidates)
         raise TrilightError(
             f"--error is {db:g}; expected at most {math.floor(10 * most) / 10} dB at {width} "
             f"pixels, the most that previews reach; --noise-floor {db:g} samples until the error "
@@ -186,7 +185,7 @@ def reaching(ways: Sequence[Priced], db: float, width: int) -> Priced:
 
 
 def chosen_way(
-    ways: Sequence[Priced],
+    candidates: Sequence[Priced],
     table: WayTable,
     known: KnownCosts,
     *,
@@ -194,26 +193,29 @@ def chosen_way(
     error_db: float | None,
     width: int,
 ) -> Choice:
-    """Return the choice of seconds or of an error, one of which is given; as `reaching`."""
+    """Return the preset for seconds or for an error; raises TrilightError as `reaching`."""
     if seconds is not None:
-        asked, (priced, fits) = f"--seconds {seconds:g}", within_seconds(ways, seconds)
+        option = f"--seconds {seconds:g}"
+        priced, fits = within_seconds(candidates, seconds)
     else:
         assert error_db is not None
-        asked, priced, fits = f"--error {error_db:g}", reaching(ways, error_db, width), True
-    return Choice(asked=asked, priced=priced, fits=fits, scenes=table.scenes, costs=known.source)
+        option = f"--error {error_db:g}"
+        priced = reaching(candidates, error_db, width)
+        fits = True
+    return Choice(option=option, priced=priced, fits=fits, scenes=table.scenes, costs=known.source)
 
 
 def _part_seconds(costs: PictureCosts, width: int, threads: int) -> dict[str, float]:
     """Return the seconds of every part, interpolated between widths in logarithms.
 
-    Below the least width they are those of that width, which is more than they are; above the
-    greatest they grow with the pixels.
+    Below the least width they are those of that width, which is an upper bound; above the greatest
+    they grow with the number of pixels.
     """
-    found: dict[str, dict[int, float]] = {}
+    by_part: dict[str, dict[int, float]] = {}
     for row in costs.rows:
         seconds = max(row.serial_s + row.parallel_s / threads, _LEAST_S)
-        found.setdefault(row.part, {})[row.width] = seconds
-    return {part: _cost_at(width, by_width) for part, by_width in found.items()}
+        by_part.setdefault(row.part, {})[row.width] = seconds
+    return {part: _cost_at(width, by_width) for part, by_width in by_part.items()}
 
 
 def _cost_at(width: int, by_width: Mapping[int, float]) -> float:
@@ -223,11 +225,11 @@ def _cost_at(width: int, by_width: Mapping[int, float]) -> float:
 
 
 def _at_width(width: int, by_width: Mapping[int, float]) -> float:
-    """Return a value between those of measured widths; beyond them, that of the nearest."""
+    """Return a value interpolated between measured widths; beyond them, that of the nearest."""
     widths = sorted(by_width)
     values = [by_width[each] for each in widths]
     return float(np.interp(math.log2(width), np.log2(widths), values))
 
 
-def _shown_s(seconds: float) -> str:
+def _seconds_text(seconds: float) -> str:
     return f"{seconds:.2g}" if seconds < 10 else f"{seconds:.0f}"

@@ -1,5 +1,5 @@
-"""What a served deployment needs beside the flows: server, limits, access, the flow that trains."""
+"""Local Prefect deployment: server, limits, access, and the flow that trains."""
 
 from storage.extensions import load_named_extensions
 
-load_named_extensions()  # first: the forms list what is registered
+load_named_extensions()  # first, since the flows' forms list the registered names

@@ -1,11 +1,10 @@
-"""The way in to what `make serve` started, for the user who started it and for nobody else.
+"""Access to the server of `make serve`, for the user who started it only.
 
 Prefect's commands read `prefect.toml` in the folder where they run. So the server's URL and
-password stand in a file of that name among what serving keeps (mode 0600), and in the checkout a
-link leads there: every command of the documents works from the checkout with nothing exported, the
-password is in no copy of the checkout, and it goes with `make stop`. Where TRILIGHT_STATE names
-another folder there is no link, since a second server must not take the commands away from the
-first.
+password are in a file of that name in the state folder (mode 0600), and the checkout holds a link
+to it: every command of the documents works from the checkout without exported variables, no copy of
+the checkout holds the password, and `make stop` deletes it. If TRILIGHT_STATE names another state
+folder, there is no link, since a second server must not take the commands away from the first.
 """
 
 import contextlib
@@ -21,11 +20,11 @@ from storage.installation import FILES_ROOT
 
 ROOT = FILES_ROOT
 LINK = ROOT / "prefect.toml"
-"""Where Prefect's commands look in the checkout; git ignores it."""
+"""Link in the checkout that Prefect's commands read; git ignores it."""
 
 
 def state_folder() -> Path:
-    """Return where serving keeps logs, password and mark: TRILIGHT_STATE, or in the cache."""
+    """Return the folder of logs, password and mark: TRILIGHT_STATE, or one in the cache."""
     place = os.environ.get("TRILIGHT_STATE")
     return private_folder(Path(place).absolute() if place else cache_folder("serve").absolute())
 
@@ -36,12 +35,12 @@ def settings_file() -> Path:
 
 
 def grant(url: str) -> dict[str, str]:
-    """Write the settings file and its link, and return what servers and clients are told.
+    """Write the settings file and its link; return the environment of server and clients.
 
     The password is a new one each time, or that of PREFECT_SERVER_API_AUTH_STRING.
 
     Raises:
-        TrilightError: somebody's own prefect.toml is in the checkout, or nothing can be written.
+        TrilightError: the checkout holds a prefect.toml of the user, or a file cannot be written.
     """
     _require_no_other_link()
     password = os.environ.get(PASSWORD) or new_password()
@@ -57,7 +56,7 @@ def grant(url: str) -> dict[str, str]:
 
 
 def revoke() -> None:
-    """Remove the settings file and the link that leads there."""
+    """Delete the settings file and its link."""
     file = settings_file()
     file.unlink(missing_ok=True)
     if LINK.is_symlink() and LINK.readlink() == file:
@@ -66,7 +65,7 @@ def revoke() -> None:
 
 
 def next_command() -> str:
-    """Return what starts a flow at the server."""
+    """Return the command that starts a flow on the server."""
     command = "prefect deployment run generate-scenes/local --watch"
     if not os.environ.get("TRILIGHT_STATE"):
         return command

@@ -1,51 +1,35 @@
-"""The limits of flows on what they share, wherever a server runs: of `make serve`, of the images.
+"""Concurrency limits of flows on shared resources, for `make serve` and the container images.
 
-A flow takes a slot of a limit where it writes documents, and where it uses a graphics card. A limit
-that does not exist limits nothing, so every deployment makes them first:
-
-    python -m infra.serving.limits
-
-The server is the one that Prefect's settings name.
+A flow takes a slot of a limit while it writes documents, and while it uses a GPU. A limit that does
+not exist limits nothing, so infra.serving.deployments creates them first.
 """
 
-import os
-import sys
 from collections.abc import Mapping
 
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
-from pipeline.making.machine import visible_gpus
+from pipeline.generation.machine import visible_gpus
 from storage.errors import TrilightError
 
 _DISK_SLOTS = 2
-"""Runs that write documents at the same time: each reads its whole dataset."""
+"""Number of runs that may write documents at the same time: each reads its whole dataset."""
 _MOST_CARDS = 100_000
 
 
 def limits(environment: Mapping[str, str]) -> dict[str, int]:
-    """Return the slots of each limit.
+    """Return the number of slots by limit.
 
     Args:
-        environment: TRILIGHT_CARDS says how many graphics cards all workers have, where that is
-            not those of this machine.
+        environment: TRILIGHT_CARDS is the number of GPUs of all workers, if these have others than
+            this machine.
 
     Raises:
-        TrilightError: TRILIGHT_CARDS is no number of cards.
+        TrilightError: TRILIGHT_CARDS is no number of GPUs.
     """
     return {DISK_LIMIT: _DISK_SLOTS, GPU_LIMIT: _cards(environment)}
 
 
-def make_limits() -> None:
-    """Make the limits at the server, or set them anew; raises as `limits`."""
-    slots = limits(os.environ)
-    from prefect.client.orchestration import get_client
-
-    with get_client(sync_client=True) as client:
-        for name, number in slots.items():
-            client.upsert_global_concurrency_limit_by_name(name, number)
-
-
 def _cards(environment: Mapping[str, str]) -> int:
-    """Return the cards, or 1 where there is none: a limit of 0 would let nothing begin."""
+    """Return the number of GPUs, at least 1, because a limit of 0 would block every flow."""
     text = environment.get("TRILIGHT_CARDS")
     if text is None:
         return len(visible_gpus()) or 1
@@ -54,10 +38,3 @@ def _cards(environment: Mapping[str, str]) -> int:
             f"TRILIGHT_CARDS is {text!r}; expected a whole number from 1 to {_MOST_CARDS}."
         )
     return int(text)
-
-
-if __name__ == "__main__":
-    try:
-        make_limits()
-    except TrilightError as mistake:
-        sys.exit(f"trilight: {mistake}")

@@ -1,22 +1,22 @@
-"""`make serve` and `make stop`: Prefect's server, a pool, a worker and the deployments, here.
+"""`make serve` and `make stop`: Prefect's server, a pool, workers and deployments on this machine.
 
-Everything binds to loopback, unless TRILIGHT_HOST says otherwise, and answers only who knows the
-password of this start (infra.serving.access), by its own name and for its own pages
+Everything binds to loopback, unless TRILIGHT_HOST says otherwise. The server only answers requests
+with the password of this start (infra.serving.access), its own host name and its own origin
 (pipeline.flows.guarded_server): other users of this machine, its containers and the pages in its
-user's browser can reach loopback too.
+user's browser can reach loopback, too.
 
-Prefect knows no roles. Who has the password may do what its API can do, and with deployments and
-pools of their own that is whatever the worker's account can do: give it to nobody who may not
-have that account. What is held against accidents, stolen forms and careless automation: a run
-of our flows is given parameters and nothing else (infra/serving/pool.json and its kin let nobody
-choose a command, an image, an environment or a folder to work in), Prefect checks these by the
-flow's form, and no parameter names a program. A parameter does name places: `out` may be any folder
-that the worker may write, `objects` and `data` any that it may read.
+Prefect has no roles. The password gives access to the whole API, and by new deployments and pools
+to everything that the worker's account can do: share it only with users who may have that account.
+Against accidents, stolen forms and careless automation, a run of these flows takes only parameters
+(infra/serving/pool.json and the other templates leave no choice of command, image, environment or
+working folder), Prefect checks the parameters by the flow's form, and no parameter names a program.
+Parameters do name paths: `out` may be any folder that the worker may write, `objects` and `data`
+any that it may read.
 
-What is started carries a mark in its environment, which flow runs and their children inherit, so
-that `stop` ends exactly those, also where a worker was killed, and never a stranger. Several
-workers share the cores and the graphics cards evenly. The database is SQLite, or what
-PREFECT_API_DATABASE_CONNECTION_URL says.
+Started processes carry a mark in their environment, which flow runs and their children inherit, so
+that `stop` ends exactly those, also after a worker was killed, and no other process. Several
+workers share the cores and the GPUs evenly. The database is SQLite, or that of
+PREFECT_API_DATABASE_CONNECTION_URL.
 """
 
 import contextlib
@@ -35,22 +35,21 @@ from infra.serving.access import ROOT, grant, next_command, revoke, settings_fil
 from pipeline.flows.guarded_server import NAMES
 from pipeline.flows.prefect_server import (
     SERVER,
-    TOLD_BY_ITS_STARTER,
+    STOPPED_BY_PARENT,
     quiet_prefect,
     wait_until_healthy,
 )
-from pipeline.making.machine import cores_owned, visible_gpus
+from pipeline.generation.machine import available_cores, visible_gpus
 from storage.atomic import write_atomically
 from storage.cache import open_private
 from storage.errors import TrilightError
 
 POOL = "local"
-_TEMPLATE = ("--base-job-template", "infra/serving/pool.json")
 _FLOWS = {
     "PREFECT_LOGGING_EXTRA_LOGGERS": "trilight",
     "PREFECT_RESULTS_PERSIST_BY_DEFAULT": "false",
 }
-"""What a worker's environment says to its flows; nobody who starts one can add to it."""
+"""Environment variables of a worker for its flows; the form of a flow cannot add to them."""
 _MARK = "TRILIGHT_SERVED"
 _END_S = 20.0
 _RELEASE_S = 5.0
@@ -59,26 +58,26 @@ _MOST = {"TRILIGHT_PORT": 65535, "TRILIGHT_WORKERS": 1024}
 
 
 def start(*, host: str, port: int, workers: int) -> str:
-    """Start everything and return the URL of the API.
+    """Start server, pool, workers and deployments; return the URL of the API.
 
     Args:
-        host: name, or address of IPv4, to bind to.
-        port: of the server.
-        workers: workers of the pool; each runs one flow at a time.
+        host: host name or IPv4 address to bind to.
+        port: port of the server.
+        workers: number of workers of the pool; each runs one flow at a time.
 
     Raises:
-        TrilightError: it runs already, the address cannot be bound to, or a part does not start;
-            then the other parts are ended again.
+        TrilightError: the server runs already, the address is unusable, or a process does not
+            start; then the other processes are ended.
     """
     if running():
         raise TrilightError("make serve: the server runs already; run make stop first.")
     if shutil.which("prefect") is None:
         raise TrilightError("make serve: there is no command `prefect`; run make setup.")
     _require_free(host, port)
-    shares = [_share(number, workers) for number in range(workers)]
+    shares = [_worker_environment(number, workers) for number in range(workers)]
     quiet_prefect()
     url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}/api"
-    environment = {**os.environ, **grant(url), **_surroundings(host)}
+    environment = {**os.environ, **grant(url), **_shared_environment(host)}
     try:
         _say(f"starting Prefect's server at {url.removesuffix('/api')}; all takes about a minute")
         server = [*SERVER, "--host", host, "--port", str(port)]
@@ -96,8 +95,8 @@ def start(*, host: str, port: int, workers: int) -> str:
     return url
 
 
-def _surroundings(host: str) -> dict[str, str]:
-    """Return what all parts are told of where they are, and the mark by which they are known."""
+def _shared_environment(host: str) -> dict[str, str]:
+    """Return the environment variables of all processes, and write the mark file."""
     mark = uuid.uuid4().hex
     write_atomically(_mark_file(), mark.encode())
     names = [host, socket.gethostname(), *os.environ.get(NAMES, "").split(",")]
@@ -111,14 +110,14 @@ def _surroundings(host: str) -> dict[str, str]:
 
 
 def stop() -> int:
-    """End what `start` started, with every flow run and child of theirs; return how many it was.
+    """End all processes of `start` with their flow runs and children; return their number.
 
-    Training is told to save by the flow run that started it, and by nobody else.
+    A training gets its signal only from the flow run that started it, so that it saves once.
     """
     ours = running()
     for number in (signal.SIGTERM, signal.SIGKILL):
-        told = running() if number == signal.SIGKILL else running(without=TOLD_BY_ITS_STARTER)
-        for pid in told:
+        pids = running() if number == signal.SIGKILL else running(without=STOPPED_BY_PARENT)
+        for pid in pids:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, number)
         deadline = time.monotonic() + _END_S
@@ -130,7 +129,7 @@ def stop() -> int:
 
 
 def _all_ended() -> bool:
-    """Look twice: while a process becomes another program (execve), it shows no environment."""
+    """Return whether two looks see no process: during execve a process shows no environment."""
     for _ in range(2):
         if running():
             return False
@@ -139,40 +138,31 @@ def _all_ended() -> bool:
 
 
 def running(*, without: str | None = None) -> list[int]:
-    """Return the living processes that `start` started, and theirs, by the mark that they carry.
+    """Return the ids of the living processes of `start` and their children, by their mark.
 
     Args:
-        without: leave out those that have this variable in their environment.
+        without: leave out processes that have this variable in their environment.
     """
     try:
         mark = f"{_MARK}={_mark_file().read_text()}".encode()
     except FileNotFoundError:
         return []
-    found = []
+    pids = []
     for place in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # ended meanwhile, or of another user
             alive = (place / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
             variables = (place / "environ").read_bytes().split(b"\0")
             other = without and any(text.startswith(f"{without}=".encode()) for text in variables)
             if alive and mark in variables and not other:
-                found.append(int(place.name))
-    return found
+                pids.append(int(place.name))
+    return pids
 
 
 def _prepare(environment: Mapping[str, str]) -> None:
-    """Make pool, limits and deployments; what is there already is replaced."""
-    prefect = [str(shutil.which("prefect")), "--no-prompt"]
-    pool = ["work-pool", "create", POOL, "--type", "process", "--overwrite", *_TEMPLATE]
-    limits = [sys.executable, "-m", f"{__package__}.limits"]
-    deployments = ["deploy", "--name", f"*/{POOL}"]
-    steps = {
-        f"the pool `{POOL}`": [*prefect, *pool],
-        "its limits": limits,
-        "the deployments": [*prefect, *deployments],
-    }
-    for what, command in steps.items():
-        _say(f"making {what}")
-        _call(command, environment)
+    """Create pool, limits and deployments, or replace existing ones."""
+    _say(f"making the pool `{POOL}`, its limits and the deployments")
+    module = f"{__package__}.deployments"
+    _call([sys.executable, "-m", module, POOL, "infra/serving/pool.json"], environment)
 
 
 def _call(command: Sequence[str], environment: Mapping[str, str]) -> None:
@@ -206,10 +196,10 @@ def _launch(
 
 
 def _refusal(host: str, port: int) -> str | None:
-    """Return why nobody can listen there, or None."""
+    """Return why the address cannot be bound, or None if it can."""
     try:
         with socket.socket() as probe:
-            # as servers do: connections of one that was stopped just now are no obstacle
+            # as servers do, so that the connections of a server stopped just now do not matter
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
     except OSError as error:
@@ -218,7 +208,7 @@ def _refusal(host: str, port: int) -> str | None:
 
 
 def _require_free(host: str, port: int) -> None:
-    """Refuse an address that is none of ours, or where somebody listens, be it another Prefect."""
+    """Refuse an address of another machine, or one at which a server listens already."""
     if ":" in host:
         raise TrilightError(
             f"make serve: TRILIGHT_HOST is {host!r}; expected a name or an address of IPv4, such "
@@ -232,15 +222,15 @@ def _require_free(host: str, port: int) -> None:
         raise TrilightError(
             f"make serve: {host}:{port} cannot be opened ({refused}); expected an address "
             "of this machine and a free port. Set TRILIGHT_PORT to another port, "
-            "or mend TRILIGHT_HOST."
+            "or fix TRILIGHT_HOST."
         )
 
 
-def _share(number: int, workers: int) -> dict[str, str]:
-    """Return what a worker's environment says of its part of the machine; alone, it has all."""
+def _worker_environment(number: int, workers: int) -> dict[str, str]:
+    """Return the environment variables of a worker's cores and GPUs; empty for a single worker."""
     if workers == 1:
         return {}
-    share = {"TRILIGHT_CORES": str(max(1, cores_owned() // workers))}
+    share = {"TRILIGHT_CORES": str(max(1, available_cores() // workers))}
     if cards := visible_gpus():  # with fewer cards than workers, some share one
         share["CUDA_VISIBLE_DEVICES"] = ",".join(cards[number % len(cards) :: workers])
     return share
@@ -259,7 +249,8 @@ def _say(text: str) -> None:
 
 
 def _number(variable: str, default: int) -> int:
-    text, most = os.environ.get(variable, str(default)), _MOST[variable]
+    text = os.environ.get(variable, str(default))
+    most = _MOST[variable]
     if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= most:
         raise TrilightError(
             f"make serve: {variable} is {text!r}; expected a whole number from 1 to {most}."
@@ -268,16 +259,17 @@ def _number(variable: str, default: int) -> int:
 
 
 def main(arguments: list[str]) -> None:
-    """Start or stop, as the only argument says; TRILIGHT_HOST, _PORT and _WORKERS say how."""
+    """Start the server, or with `stop` end it; reads TRILIGHT_HOST, _PORT and _WORKERS."""
     try:
         if arguments == ["stop"]:
             _say(f"ended: {stop()} processes")
             return
         host = os.environ.get("TRILIGHT_HOST", "127.0.0.1")
-        port, workers = _number("TRILIGHT_PORT", _DEFAULT_PORT), _number("TRILIGHT_WORKERS", 1)
+        port = _number("TRILIGHT_PORT", _DEFAULT_PORT)
+        workers = _number("TRILIGHT_WORKERS", 1)
         url = start(host=host, port=port, workers=workers)
         _say(f"Prefect: {url.removesuffix('/api')}; logs: {state_folder()}")
-        # not the password itself: what is on a screen gets into recordings and logs of others
+        # not the password itself, because output gets into recordings and logs
         _say(f"The page asks for a password: it is the auth_string in {settings_file()}")
         _say(f"Next: {next_command()}")
     except TrilightError as mistake:

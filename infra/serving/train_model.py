@@ -1,7 +1,7 @@
-"""The flow `train-model`: a training run as a process, or as several by torchrun.
+"""Flow `train-model`: a training run as a process, or as several by torchrun.
 
-It stands in `infra`, where making and learning may both be seen: the form has every setting of
-`train.settings`, and what a run refuses is refused before its process exists, without torch.
+It is in `infra`, which may import both `pipeline` and `train`: the form has every setting of
+`train.settings`, and wrong settings are refused before the training process exists, without torch.
 """
 
 import contextlib
@@ -12,19 +12,19 @@ from prefect import flow
 from prefect.concurrency.sync import concurrency
 from prefect.logging import get_run_logger
 
-from infra.train_order import TrainOrder
+from infra.train_options import TrainOptions
 from pipeline.flows.forms import PublicUrl, changed_values, changes_form, parameters_of
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.process import run_to_end
-from pipeline.making.machine import visible_gpus
+from pipeline.generation.machine import visible_gpus
 from storage.errors import TrilightError
 from train.runs import RUNS, smoke
 from train.settings import TrainSettings
 
 RunName = Literal[tuple(RUNS)]  # type: ignore[valid-type]
-"""A list to choose from."""
+"""Names of the training presets, a list of choices in the form."""
 RunChanges = changes_form(TrainSettings, smoke())
-"""Every setting of a run; what stays empty is as the run has it."""
+"""Form of every setting; an empty one keeps the preset's value."""
 
 
 TRAIN_FORMS: Mapping[str, Any] = {
@@ -35,38 +35,42 @@ TRAIN_FORMS: Mapping[str, Any] = {
     "lpips": PublicUrl | None,
     "changes": RunChanges | None,
 }
-"""Types of parameters that are narrower in a form than in an order."""
+"""Types of parameters that are narrower in the form than on the command line."""
 
 
-def train_order(parameters: Mapping[str, Any]) -> TrainOrder:
-    """Return the order that the flow's parameters state.
+def train_order(parameters: Mapping[str, Any]) -> TrainOptions:
+    """Return the training options of the flow's parameters.
 
     Raises:
-        TrilightError: a value that no schema can refuse, such as one that does not fit another
-            setting of the run; the message names it.
+        TrilightError: a value that no schema can refuse, such as one that contradicts another
+            setting; the message names it.
     """
-    given = {"data": tuple(parameters["data"]), "changes": changed_values(parameters["changes"])}
-    order = TrainOrder(**{**parameters, **given})
+    converted = {
+        "data": tuple(parameters["data"]),
+        "changes": changed_values(parameters["changes"]),
+    }
+    order = TrainOptions(**{**parameters, **converted})
     order.settings()
     return order
 
 
 def _run_name() -> str:
-    """Return what the flow run that begins is called: what is trained, and where."""
+    """Return the name of the flow run: training preset and folder."""
     from prefect.runtime import flow_run
 
-    given = {"run": TrainOrder.run, **flow_run.parameters}
-    return "-".join(filter(None, [given["run"], given.get("out")]))
+    parameters = {"run": TrainOptions.run, **flow_run.parameters}
+    return "-".join(filter(None, [parameters["run"], parameters.get("out")]))
 
 
 @flow(name="train-model", flow_run_name=_run_name, persist_result=False)
-@parameters_of(TrainOrder, **TRAIN_FORMS)
+@parameters_of(TrainOptions, **TRAIN_FORMS)
 def train_model(**parameters: Any) -> None:
     """Train a model on a dataset, in processes of its own; a run that is cancelled is saved.
 
     Prefect waits for half a minute then; `resume` goes on from there.
     """
-    order, log = train_order(parameters), get_run_logger()
+    order = train_order(parameters)
+    log = get_run_logger()
     cards = len(visible_gpus())
     limit = (
         concurrency(GPU_LIMIT, occupy=min(order.processes, cards), strict=False)

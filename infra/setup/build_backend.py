@@ -1,8 +1,8 @@
-"""What pip calls to build Trilight: setuptools, which builds wheels from the tree of wheel_tree.
+"""Build backend of Trilight: setuptools, with wheels built from the tree of wheel_tree.
 
-Editable installs see the checkout as it is, by its path: beside a clone, whose folder is called as
-our package is, Python asks no import hook. A wheel is an ordinary setuptools build of another
-folder, so that neither metadata nor file list need to know of the move.
+Editable installs use the checkout's path: next to a clone, whose folder has the name of the
+package, Python would not call an import hook. A wheel is an ordinary setuptools build of another
+folder, so that neither metadata nor file list depend on the move.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ __all__ = [
 def build_editable(
     wheel_directory: str, config_settings: Any = None, metadata_directory: str | None = None
 ) -> str:
-    """Build what an editable install is into a folder and return its name (PEP 660)."""
+    """Build an editable wheel into a folder and return its name (PEP 660)."""
     settings = {"editable_mode": "compat", **(config_settings or {})}
     return str(build_meta.build_editable(wheel_directory, settings, metadata_directory))
 
@@ -61,7 +61,7 @@ def prepare_metadata_for_build_wheel(metadata_directory: str, config_settings: A
 
 @contextlib.contextmanager
 def _in_wheel_tree() -> Iterator[None]:
-    checkout = Path.cwd()  # where a front end calls from, by PEP 517
+    checkout = Path.cwd()  # a front end calls from the checkout, by PEP 517
     with tempfile.TemporaryDirectory() as tree:
         write_wheel_tree(checkout, Path(tree))
         with contextlib.chdir(tree):

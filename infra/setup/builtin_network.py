@@ -1,11 +1,11 @@
-"""Ships a trained network: a folder of `model/builtin/`, its weights and its card.
+"""Writes a built-in network: its folder in `model/builtin/`, with weights and model card.
 
     trilight evaluate RUN --data SET --split test --out EVALUATION
     python -m infra.setup.builtin_network RUN --data SET --evaluation EVALUATION --command "..."
 
-With `--also OTHER`, evaluations of it on other sets, such as benchmark-v1, stand on the card too.
+With `--also OTHER`, the card has evaluations on other sets, too, such as benchmark-v1.
 
-Only data of objects that ask for nothing (CC0) may be behind it, and only a small file is shipped.
+The training data must have only objects under CC0, and the weights must be small.
 """
 
 import json
@@ -28,7 +28,7 @@ from train.evaluation.same_time import sentences
 from train.folder import RunFolder
 
 MOST_BYTES = 10_000_000
-"""Of the weights: everybody who clones the project gets them."""
+"""Maximum size of the weights, since every clone of the project holds them."""
 
 _HEADS = {
     "builtin:hits": (
@@ -42,10 +42,10 @@ _HEADS = {
         "does not replace the path tracer."
     ),
 }
-"""What each network that comes along is for, by its name."""
+"""Introduction of each built-in network's card, by its name."""
 
 WORST = 5
-"""Views that the card names as its worst."""
+"""Number of worst views on the card."""
 
 ALLOWED_LICENCES = {"CC0-1.0"}
 
@@ -58,20 +58,21 @@ def main(
     also: Annotated[tuple[Path, ...], Parameter(help="folders of other evaluations of it")] = (),
     name: Annotated[str, Parameter(help="by which it will be opened")] = "builtin:hits",
 ) -> None:
-    """Copy the weights and write the card."""
-    folder, dataset = RunFolder(run), open_dataset(data)
+    """Copy the weights and write the model card."""
+    folder = RunFolder(run)
+    dataset = open_dataset(data)
     weights = folder.weights.read_bytes()
     about = json.loads(folder.settings.read_text())
     judged = json.loads((evaluation / "evaluation.json").read_text())
     _check(dataset, weights, about, judged["about"])
-    others = [json.loads((each / "evaluation.json").read_text()) for each in also]
-    for each in others:
+    other_evaluations = [json.loads((each / "evaluation.json").read_text()) for each in also]
+    for each in other_evaluations:
         _require_same(each["about"], weights)
     place = BUILTIN_NETWORKS[name]
     summary = json.loads(folder.summary.read_text())
     lines = [f"# The network `{name}`", "", _HEADS[name], ""]
     lines += _card(dataset, about, judged, summary, weights, command)
-    for each in others:
+    for each in other_evaluations:
         lines += ["", *_scores(each)]
     lines += [
         "",
@@ -117,7 +118,8 @@ def _card(
     weights: bytes,
     command: str,
 ) -> list[str]:
-    settings, model = about["settings"], about["settings"]["model"]
+    settings = about["settings"]
+    model = about["settings"]["model"]
     most = dataset.manifest.settings["scenes"]["max_triangles"]
     by_hits = model.get("view_stage") == "hits"
     encoder = model["encoder_layers"] if model.get("scene_tokens", True) else 0
@@ -145,8 +147,9 @@ def _card(
 
 
 def _scores(judged: Mapping[str, Any]) -> list[str]:
-    everybody, about = judged["contestants"], judged["about"]
-    contestants = {NETWORK: everybody[NETWORK]} | everybody  # the file has them by their names
+    all_scores = judged["contestants"]
+    about = judged["about"]
+    ordered = {NETWORK: all_scores[NETWORK]} | all_scores  # the file has them by their names
     traced = judged["path tracer"] or {}
     lines = [
         f"Scores on {about['scenes']} scenes of split {about['split']} of build {about['build']}, "
@@ -157,8 +160,8 @@ def _scores(judged: Mapping[str, Any]) -> list[str]:
         f"| | {' | '.join(judged['metrics'])} |",
         f"|{'---|' * (len(judged['metrics']) + 1)}",
         *(
-            f"| {who} | {' | '.join(_shown(scores[each]) for each in judged['metrics'])} |"
-            for who, scores in contestants.items()
+            f"| {who} | {' | '.join(_figure_text(scores[each]) for each in judged['metrics'])} |"
+            for who, scores in ordered.items()
         ),
     ]
     if traced:
@@ -173,7 +176,7 @@ def _scores(judged: Mapping[str, Any]) -> list[str]:
 
 
 def _worst(views: Sequence[Mapping[str, Any]]) -> str:
-    """Return a sentence on the views that it misses most."""
+    """Return a sentence on the views with the greatest error."""
     by_error = sorted(views, key=lambda view: view["scores"][NETWORK]["psnr_log_db"])
     each = [
         f"{view['key']} ({view['scores'][NETWORK]['psnr_log_db']:.1f} dB, {view['template']}, "
@@ -187,7 +190,7 @@ def _lights(count: int) -> str:
     return f"{count} light{'' if count == 1 else 's'}"
 
 
-def _shown(figures: Mapping[str, Any]) -> str:
+def _figure_text(figures: Mapping[str, Any]) -> str:
     if figures["median"] is None:
         return "n/a"
     return f"{figures['median']:.4g} ({figures['worse_5_percent']:.4g})"

@@ -1,4 +1,4 @@
-"""The page of commands: every command with its options, as --help shows them."""
+"""Reference page of commands: every command with its options, as --help shows them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,42 +21,42 @@ is in [settings.md](settings.md).
 
 @dataclass(frozen=True)
 class Option:
-    """An option of a command, or an argument that is given by its place."""
+    """Option or positional argument of a command."""
 
     field: str
-    """Name of the field that it fills."""
+    """Name of the settings field that it fills."""
     names: tuple[str, ...]
-    """Its words; of an argument, its name in capitals."""
+    """Names of the option, or the argument's name in capitals."""
     takes: str
-    """What stands after it; empty for a switch."""
+    """Name of the value, such as INT; empty for a switch."""
     help: str
-    """Sentence, and in brackets range, choices and default."""
+    """Sentence, with choices, range and default in brackets."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command with its options."""
+    """Command with its options."""
 
     name: str
-    """What is typed after trilight."""
+    """Words after `trilight`, such as `shards merge`."""
     help: str
-    """What it does."""
+    """Help text of the command."""
     options: tuple[Option, ...]
-    """In the order of the help."""
+    """Arguments and options in the order of the help."""
 
 
 def every_command() -> list[Command]:
-    """Return every command that does something, those within groups included."""
-    return [found for name in COMMANDS for found in _commands(app[name], name)]
+    """Return every command, those within groups included."""
+    return [command for name in COMMANDS for command in _commands(app[name], name)]
 
 
-def _commands(found: App, name: str) -> Iterator[Command]:
-    if found.default_command is not None:
-        options = tuple(map(_option, found.assemble_argument_collection()))
-        yield Command(name=name, help=found.help, options=options)
-    for inner in found:
+def _commands(group: App, name: str) -> Iterator[Command]:
+    if group.default_command is not None:
+        options = tuple(map(_option, group.assemble_argument_collection()))
+        yield Command(name=name, help=group.help, options=options)
+    for inner in group:
         if not inner.startswith("-"):
-            yield from _commands(found[inner], f"{name} {inner}")
+            yield from _commands(group[inner], f"{name} {inner}")
 
 
 def _option(argument: Any) -> Option:
@@ -73,11 +73,11 @@ def _option(argument: Any) -> Option:
 def command_line_page() -> str:
     """Return every command with its options, as --help shows them."""
     parts = [_HEAD]
-    for found in every_command():
-        parts.append(f"## `trilight {found.name}`\n\n{found.help}\n")
+    for command in every_command():
+        parts.append(f"## `trilight {command.name}`\n\n{command.help}\n")
         rows = [
             (f"`{', '.join(option.names)}`", option.takes, option.help.replace("|", "\\|"))
-            for option in found.options
+            for option in command.options
         ]
         parts.append(table(("option", "takes", "meaning"), rows) + "\n")
     return "\n".join(parts)

@@ -1,10 +1,10 @@
-"""MkDocs hook: adds the pages that the program declares, and those of linked files.
+"""MkDocs hook: adds generated reference pages, and pages for linked files outside docs/.
 
-Pages of the reference that `generated_pages` makes are in no file: each build makes them.
+The pages of `generated_pages` are stored in no file; each build generates them.
 
-Pages of docs/ link to files beside that folder (`../../examples/template.py`), which a reader of
-the checkout can follow. A site holds only its own folder, so each of those files gets a page under
-`source/`, outside the navigation, and the links lead there.
+Pages of docs/ link to files outside that folder (`../../examples/template.py`), which works in a
+checkout. A site holds only its own folder, so that each of those files gets a page under `source/`,
+outside the navigation, to which the links lead.
 """
 
 import os
@@ -20,11 +20,11 @@ from infra.setup.generated_pages import PAGES
 
 ROOT = Path(__file__).parents[2]
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#:\s]+)(#[^)\s]*)?\)")
-"""A relative link or picture: bang, words, target, anchor."""
+"""Relative link or picture: bang, words, target, anchor."""
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the generated pages, and one for every file outside docs/ that is linked to."""
+    """Add the generated pages, and a page for every linked file outside docs/."""
     waiting = [f"docs/{file.src_uri}" for file in files.documentation_pages()]
     known = set(waiting)
     while waiting:
@@ -44,34 +44,39 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Lead links out of docs/ to the pages under `source/`; what has no page loses its link."""
-    here = page.file.src_uri
-    origin = here.removeprefix("source/") if here.startswith("source/") else f"docs/{here}"
+    """Point links out of docs/ to the pages under `source/`; remove links without such a page."""
+    page_uri = page.file.src_uri
+    origin = (
+        page_uri.removeprefix("source/") if page_uri.startswith("source/") else f"docs/{page_uri}"
+    )
 
-    def led(found: re.Match[str]) -> str:
-        bang, words, target, anchor = found[1], found[2], found[3], found[4] or ""
-        path = _resolved(origin, target)
+    def replace_link(match: re.Match[str]) -> str:
+        bang = match[1]
+        words = match[2]
+        target = match[3]
+        anchor = match[4] or ""
+        path = _resolve_link(origin, target)
         if not origin.startswith("docs/") or not path.startswith("docs/"):
             if files.get_file_from_path(_site_uri(path)) is None:
                 return words
-            target = posixpath.relpath(_site_uri(path), posixpath.dirname(here) or ".")
+            target = posixpath.relpath(_site_uri(path), posixpath.dirname(page_uri) or ".")
         return f"{bang}[{words}]({target}{anchor})"
 
-    return LINK.sub(led, markdown)
+    return LINK.sub(replace_link, markdown)
 
 
 def _targets(page: str, text: str) -> Iterator[str]:
-    for found in LINK.finditer(text):
-        yield _resolved(page, found[3])
+    for match in LINK.finditer(text):
+        yield _resolve_link(page, match[3])
 
 
-def _resolved(page: str, target: str) -> str:
+def _resolve_link(page: str, target: str) -> str:
     """Return a link's target as a path below the checkout."""
     return posixpath.normpath(posixpath.join(posixpath.dirname(page), target))
 
 
 def _site_uri(path: str) -> str:
-    """Return where the site has a file of the checkout, as a source of MkDocs."""
+    """Return the MkDocs source path of a file of the checkout."""
     if path.startswith("docs/"):
         return path.removeprefix("docs/")
     return f"source/{path}" if path.endswith(".md") else f"source/{path}.md"

@@ -1,4 +1,4 @@
-"""Pages of the reference that are made when the site is built, from what the program declares."""
+"""Reference pages that each build of the site generates from the program's declarations."""
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
@@ -7,11 +7,11 @@ from infra.setup.command_line_page import command_line_page
 from infra.setup.settings_page import settings_page
 from pipeline.documents.markdown import table
 from pipeline.shards.expression import TEXTS
+from scene_templates.recorded_sampler import RecordedDraw
 from scene_templates.skies.draw import SkyMapSettings
 from scene_templates.skies.draws import PALEST, SkyDraws
 from scene_templates.skies.families import OUR_SKIES, SKIES
 from scene_templates.skies.texels import SkyTexels
-from scene_templates.stated_draws import StatedDraw
 from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.surfaces.draws import LEAST_TINT, SurfaceDraws
 from scene_templates.surfaces.families import OUR_SURFACES, SURFACES
@@ -68,7 +68,7 @@ depth, normals, object ids, diffuse albedo and roughness, computed when they are
 - `Z`, `A`, `N`, `P` and `Ng` are the names that compositors and viewers of OpenEXR use for depth,
   alpha and layers of normals and positions. Other layers have the name of the pass, and channels
   have one letter. Blender 4.5 opens the files as layers and takes `Depth` and `Alpha` from them
-  (`tests/pipeline/renders/test_passes_beside_cycles.py`); nobody has opened them in Nuke yet.
+  (`tests/pipeline/renders/test_passes_beside_cycles.py`); they have not been tested in Nuke.
 - `A` is `coverage`, and is in every file. Numbers are not multiplied by it. Where it is 0, nothing
   is met: ids are -1, depths infinite, and other channels 0 instead of NaN.
 
@@ -137,11 +137,11 @@ such as the power of each lamp, stands once.
 """
 
 _SEEDS = 32
-"""Draws of each family, so that what it draws only sometimes is seen too."""
+"""Number of seeds for each family, so that rare draws are listed, too."""
 
 
 def passes_page() -> str:
-    """Return the page: every pass with its meaning, channels, unit and averaging."""
+    """Return the page of passes, with meaning, channels, unit and averaging."""
     rows = [_row(each) for each in declared_passes()]
     columns = (
         *("pass", "shorter", "what it means", "channels", "unit", "frame", "averaging"),
@@ -163,18 +163,18 @@ def _row(each: Pass) -> tuple[str, ...]:
 
 
 def quantities_page() -> str:
-    """Return the page: what can be asked of a scene in `--where`."""
+    """Return the page of quantities that `--where` accepts."""
     numbers = [
         (f"`{name}`", "a number" if each.per == "scene" else f"numbers, for each {each.per}",
          each.label)
         for name, each in QUANTITIES.items()
     ]  # fmt: skip
-    others = [(f"`{name}`", _KINDS[kind], means) for name, (kind, means) in TEXTS.items()]
-    return f"{_QUANTITIES}\n{table(('name', 'what it is', 'of what'), [*numbers, *others])}\n"
+    texts = [(f"`{name}`", _KINDS[kind], means) for name, (kind, means) in TEXTS.items()]
+    return f"{_QUANTITIES}\n{table(('name', 'what it is', 'of what'), [*numbers, *texts])}\n"
 
 
 def maps_page() -> str:
-    """Return the page: what every procedural surface and sky is drawn from."""
+    """Return the page of the distributions of procedural surfaces and skies."""
     parts = [_MAPS.format(least_tint=LEAST_TINT, palest=PALEST), "## Surfaces\n"]
     for name in OUR_SURFACES:
         parts += _family(name, SURFACES[name], surface_draws(name))
@@ -184,9 +184,9 @@ def maps_page() -> str:
     return "\n".join(parts)
 
 
-def surface_draws(name: str) -> Mapping[str, StatedDraw]:
-    """Return all that a family of surfaces draws by name, in natural colours."""
-    made: dict[str, StatedDraw] = {}
+def surface_draws(name: str) -> Mapping[str, RecordedDraw]:
+    """Return all draws of a family of surfaces by name, for natural colors."""
+    made: dict[str, RecordedDraw] = {}
     albedo = SurfaceMapSettings().albedo
     for seed in range(_SEEDS):
         draws = SurfaceDraws(rng_for(seed, "page"), natural_share=1.0, albedo=albedo)
@@ -195,9 +195,9 @@ def surface_draws(name: str) -> Mapping[str, StatedDraw]:
     return _but(made, "natural colours", ": tint")
 
 
-def sky_draws(name: str) -> Mapping[str, StatedDraw]:
-    """Return all that a family of skies draws by name, in natural colours."""
-    made: dict[str, StatedDraw] = {}
+def sky_draws(name: str) -> Mapping[str, RecordedDraw]:
+    """Return all draws of a family of skies by name, for natural colors."""
+    made: dict[str, RecordedDraw] = {}
     settings = SkyMapSettings()
     for seed in range(_SEEDS):
         draws = SkyDraws(
@@ -211,12 +211,12 @@ def sky_draws(name: str) -> Mapping[str, StatedDraw]:
     return _but(made, "coloured lights")
 
 
-def _but(made: Mapping[str, StatedDraw], *said_above: str) -> dict[str, StatedDraw]:
+def _but(made: Mapping[str, RecordedDraw], *said_above: str) -> dict[str, RecordedDraw]:
     return {label: draw for label, draw in made.items() if not label.endswith(said_above)}
 
 
 def _family(
-    name: str, family: Callable[..., object], made: Mapping[str, StatedDraw]
+    name: str, family: Callable[..., object], made: Mapping[str, RecordedDraw]
 ) -> Iterator[str]:
     yield f"### `{name}`\n\n{' '.join((inspect.getdoc(family) or '').split())}\n"
     yield table(("drawn", "distribution"), [(label, str(draw)) for label, draw in made.items()])
@@ -230,4 +230,4 @@ PAGES: dict[str, Callable[[], str]] = {
     "quantities": quantities_page,
     "surfaces-and-skies": maps_page,
 }
-"""Pages below docs/reference by their names."""
+"""Function that returns each page below docs/reference, by the page's name."""

@@ -1,9 +1,9 @@
-"""Adds to a lock the sha256 of every file that an index offers for its exact versions.
+"""Adds to a lock file the sha256 of every file that a package index offers for its versions.
 
-`pip-compile --generate-hashes` asks one index by name and, where that does not answer, loads every
-file of every release to compute what each index states anyway. This asks the indices that pip is
-set up with, and computes nothing but the digests of files of this machine. Versions for other
-systems are in it too, so that one lock serves all.
+`pip-compile --generate-hashes` queries one index by name; if that fails, it downloads every file of
+every release to compute digests that each index states anyway. This script queries the indices of
+pip's configuration, and computes only the digests of local files. Files for other systems are
+included, so that one lock serves all.
 
     python -m infra.setup.hashes requirements/all.txt ...
 """
@@ -22,7 +22,7 @@ _AT_ONCE = 8
 
 
 def main(paths: list[Path]) -> None:
-    """Write the locks again, each package followed by its digests; ValueError if it has none."""
+    """Write the locks again with the digests of each package; raises ValueError if one has none."""
     from piptools.repositories import PyPIRepository
 
     locks = {path: read_lock(path) for path in paths}
@@ -30,8 +30,8 @@ def main(paths: list[Path]) -> None:
     with TemporaryDirectory() as cache:
         repository = PyPIRepository([], cache_dir=cache)
         with repository.allow_all_wheels(), ThreadPoolExecutor(_AT_ONCE) as threads:
-            found = threads.map(lambda pin: _digests(repository, *pin), pins)
-            by_pin = dict(zip(pins, found, strict=True))
+            digests = threads.map(lambda pin: _digests(repository, *pin), pins)
+            by_pin = dict(zip(pins, digests, strict=True))
     for path, rows in locks.items():
         hashed = [
             LockedPackage(name=row.name, version=row.version, sha256=by_pin[row.name, row.version])
@@ -41,15 +41,15 @@ def main(paths: list[Path]) -> None:
 
 
 def _digests(repository: Any, name: str, version: str) -> tuple[str, ...]:
-    found = {
+    digests = {
         digest
         for candidate in repository.find_all_candidates(name)
         if str(candidate.version).partition("+")[0] == version  # both as packaging writes them
         for digest in _digest(candidate.link)
     }
-    if not found:
+    if not digests:
         raise ValueError(f"{name}=={version}: no index gives the sha256 of a file of it.")
-    return tuple(sorted(found))
+    return tuple(sorted(digests))
 
 
 def _digest(link: Any) -> Iterator[str]:

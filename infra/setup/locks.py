@@ -1,4 +1,4 @@
-"""Lock files: exact versions, and the sha256 of every file that may be installed for them."""
+"""Lock files: exact versions, with the sha256 of every file that may be installed."""
 
 import re
 from collections.abc import Iterable
@@ -11,18 +11,18 @@ _DIGEST = re.compile(r"--hash=sha256:([0-9a-f]{64})")
 
 @dataclass(frozen=True, kw_only=True)
 class LockedPackage:
-    """One package of a lock."""
+    """Package of a lock file."""
 
     name: str
-    """As the lock writes it."""
+    """Name in the lock's spelling."""
     version: str
-    """Without a tag of one build, such as +cpu."""
+    """Version without a build tag such as +cpu."""
     sha256: tuple[str, ...]
-    """Of the files that may be installed, sorted."""
+    """Sorted digests of the files that may be installed."""
 
 
 def read_lock(path: Path) -> list[LockedPackage]:
-    """Return the packages of a lock; ValueError where a line is none and no comment."""
+    """Return the packages of a lock; raises ValueError for any other line but a comment."""
     rows = []
     for line in path.read_text().replace("\\\n", " ").splitlines():
         if not line.strip() or line.lstrip().startswith("#"):
@@ -36,7 +36,7 @@ def read_lock(path: Path) -> list[LockedPackage]:
 
 
 def write_lock(path: Path, rows: Iterable[LockedPackage]) -> None:
-    """Write a lock as pip reads it, one digest a line."""
+    """Write a lock in pip's format, one digest a line."""
     entries = (
         " \\\n    ".join(
             [f"{row.name}=={row.version}", *(f"--hash=sha256:{digest}" for digest in row.sha256)]

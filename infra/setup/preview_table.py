@@ -1,9 +1,9 @@
-"""Makes infra/rendering/previews.json, by which `trilight render --seconds` and `--error` choose.
+"""Measures infra/rendering/previews.json, the table of `trilight render --seconds` and `--error`.
 
     python -m infra.setup.preview_table
 
-One view each of held-out scenes is rendered by the network builtin:tokens and with more and more
-samples, on one thread, and the parts of a preview are timed: some hours.
+One view of each held-out scene is rendered by the network builtin:tokens and with increasing
+numbers of samples, on one thread, and the parts of a preview are timed. It takes some hours.
 """
 
 import contextlib
@@ -50,13 +50,13 @@ if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
 
 SCENES = 12
-"""Scenes that are judged and timed."""
+"""Number of scenes that are evaluated and timed."""
 
 WIDTHS = {64: (1024, 2048), 128: (256, 512), 256: (64, 128), 512: (16, 128)}
-"""By width in pixels: most samples of a preview, and samples of the references' halves together."""
+"""Maximum samples of a preview, and samples of both halves of a reference, by width in pixels."""
 
 Method = tuple[int, Filtered]
-"""Samples a pixel and filter; NETWORK is the network builtin:tokens."""
+"""Samples per pixel and filter; NETWORK stands for the network builtin:tokens."""
 
 NETWORK: Method = (0, "off")
 
@@ -64,15 +64,16 @@ Errors = Mapping[int, Mapping[Method, float]]
 """Error in dB of one scene's pictures, by width and method."""
 
 Costs = Mapping[int, Mapping[str, float]]
-"""Core-seconds of one scene's parts, by width and part."""
+"""CPU seconds of one scene's parts, by width and part."""
 
 _SERIAL = (SCENE,)
-"""Parts that one thread does, however many there are."""
+"""Parts that run on one thread, however many there are."""
 
 
 def main() -> None:
     """Measure, and write the file."""
-    errors, costs = dict[int, Errors](), dict[int, Costs]()
+    errors = dict[int, Errors]()
+    costs = dict[int, Costs]()
     with _held_out_child() as (renderer, child):
         for index in range(SCENES):
             sys.stdout.write(f"scene {index + 1} of {SCENES}\n")
@@ -102,7 +103,7 @@ def part_names() -> tuple[str, ...]:
 
 
 def table_of(errors: Mapping[int, Errors], costs: Mapping[int, Costs], machine: str) -> WayTable:
-    """Return the table of some scenes, by their numbers: medians, and the mean of the PROBES."""
+    """Return the table of scenes by their numbers: medians, and the mean of the PROBES."""
     return WayTable(
         scenes=len(errors),
         errors=tuple(
@@ -119,7 +120,8 @@ def sampled_errors(
     scene: Scene, px: int, reference: RawReference
 ) -> Sequence[tuple[Method, float]]:
     """Return the error of each sampled picture of the first view; runs in a render child."""
-    everywhere, errors = np.ones((px, px), np.bool_), []
+    everywhere = np.ones((px, px), np.bool_)
+    errors = []
     for method in ladder(px):
         picture = sampled_method(px, *method)(scene)(scene.c2w[0], float(scene.fov_deg[0]))
         errors.append((method, true_error_db(picture, reference, log10_radiance, everywhere)[0]))
@@ -152,26 +154,27 @@ def _errors_of(
 def _costs_of(
     renderer: "NeuralRenderer", child: IsolatedChild, scene: Scene, px: int
 ) -> dict[str, float]:
-    found: dict[str, float] = child.call(timed_parts, scene, px, time.process_time)
-    pose, fov_deg = scene.c2w[0], float(scene.fov_deg[0])
+    core_s: dict[str, float] = child.call(timed_parts, scene, px, time.process_time)
+    pose = scene.c2w[0]
+    fov_deg = float(scene.fov_deg[0])
     renderer.view(renderer.prepare(scene), pose, fov_deg, px)  # warms up
     began = time.process_time()
     prepared = renderer.prepare(scene)
     encoded = time.process_time()
     renderer.view(prepared, pose, fov_deg, px)
-    found[NETWORK_SCENE] = encoded - began
-    found[NETWORK_VIEW] = time.process_time() - encoded
-    return found
+    core_s[NETWORK_SCENE] = encoded - began
+    core_s[NETWORK_VIEW] = time.process_time() - encoded
+    return core_s
 
 
-def _way_error(px: int, method: Method, found: list[float]) -> WayError:
+def _way_error(px: int, method: Method, errors_db: list[float]) -> WayError:
     return WayError(
         rung="network" if method == NETWORK else "traced",
         spp=method[0],
         denoiser=method[1],
         width=px,
-        median_db=round(float(np.median(found)), 2),
-        least_db=round(min(found), 2),
+        median_db=round(float(np.median(errors_db)), 2),
+        least_db=round(min(errors_db), 2),
     )
 
 

@@ -1,9 +1,9 @@
-"""Writes the bill of materials of a release: the packages of all locks, in CycloneDX 1.6.
+"""Writes the software bill of materials of a release: the packages of all locks in CycloneDX 1.6.
 
     python -m infra.setup.sbom FILE
 
-The same locks give the same bytes: neither a time nor a serial number is in it. Licenses are those
-that pip-licenses finds for what is installed.
+Equal locks give equal bytes: the file holds neither a time nor a serial number. Licenses are those
+that pip-licenses reports for the installed packages.
 """
 
 import json
@@ -22,11 +22,11 @@ THREE_SHA256 = {
     "three.core.min.js": "61ba0df005b05991361d040d8ff670e1aadfd0ce7aeebd1fdb0725957a8957de",
     "three.module.min.js": "e2b5ee6bccd38fd6d8a2428546b83c5f2426d84b152ef82be8055556e3b40eb6",
 }
-"""Files of three.js (MIT) in infra/viewer/static/three, as `build/` of its npm package has them."""
+"""Files of three.js (MIT) in infra/viewer/static/three, from `build/` of its npm package."""
 
 
 def bill_of_materials(root: Path, licenses: Mapping[str, str]) -> dict[str, Any]:
-    """Return the bill of a checkout; ValueError where a lock cannot be read."""
+    """Return the bill of materials of a checkout; raises ValueError if a lock cannot be read."""
     locks: dict[tuple[str, str], list[str]] = {}
     for path in sorted((root / "requirements").glob("*.txt")):
         for row in read_lock(path):
@@ -51,24 +51,29 @@ def bill_of_materials(root: Path, licenses: Mapping[str, str]) -> dict[str, Any]
 
 
 def installed_licenses() -> dict[str, str]:
-    """Return the license of each installed package; some packages give its whole text."""
+    """Return the license of each installed package, the first line of a whole text."""
     command = [sys.executable, "-m", "piplicenses", "--format=json", "--from=mixed"]
     rows = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     return {plain_name(row["Name"]): row["License"].strip().splitlines()[0][:80] for row in rows}
 
 
 def plain_name(name: str) -> str:
-    """Return the name of a package as indices compare it."""
+    """Return the normalized name of a package (PEP 503)."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def _component(source: str, name: str, version: str, license_name: str | None) -> dict[str, Any]:
     url = f"pkg:{source}/{name}@{version}"
-    found: dict[str, Any] = {"type": "library", "bom-ref": url, "name": name, "version": version}
-    found["purl"] = url
+    component: dict[str, Any] = {
+        "type": "library",
+        "bom-ref": url,
+        "name": name,
+        "version": version,
+    }
+    component["purl"] = url
     if license_name:
-        found["licenses"] = [{"license": {"name": license_name}}]
-    return found
+        component["licenses"] = [{"license": {"name": license_name}}]
+    return component
 
 
 if __name__ == "__main__":

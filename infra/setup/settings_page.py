@@ -1,4 +1,4 @@
-"""The page of settings: every setting with its meaning, range and default."""
+"""Reference page of settings: every setting with its meaning, range and default."""
 
 import dataclasses
 import inspect
@@ -7,32 +7,32 @@ import typing
 from collections.abc import Iterator
 from typing import Any, get_args
 
-from infra.leaderboard.order import LeaderboardOrder
-from infra.rendering.request import Asked
-from infra.serving.train_model import TrainOrder
+from infra.leaderboard.options import LeaderboardOptions
+from infra.rendering.options import RenderOptions
+from infra.serving.train_model import TrainOptions
 from pipeline.builds.settings import BuildSettings
 from pipeline.documents.markdown import table
 from pipeline.flows.orders import DatasetInRuns
-from pipeline.making.price import CorePrice
-from pipeline.making.revisit_order import Revisit
+from pipeline.generation.price import CorePrice
+from pipeline.generation.revisit_options import RevisitOptions
 from storage.records.scene import Scene
-from storage.settings.described import described, field_sentences
+from storage.settings.described import describe_fields, field_sentences
 from storage.settings.ranges import declared_ranges, shown_number
-from train.evaluation.order import EvaluationOrder
+from train.evaluation.options import EvaluationOptions
+from train.monitoring.settings import WatchSettings
 from train.settings import TrainSettings
-from train.watching.settings import WatchSettings
 
 ROOTS: dict[str, tuple[type, ...]] = {
     "Scene": (Scene,),
     "Generate": (DatasetInRuns, BuildSettings),
-    "Revisit": (Revisit,),
-    "Render": (Asked,),
+    "Revisit": (RevisitOptions,),
+    "Render": (RenderOptions,),
     "Plan": (CorePrice,),
-    "Train": (TrainOrder, TrainSettings, WatchSettings),
-    "Evaluate": (EvaluationOrder,),
-    "Leaderboard": (LeaderboardOrder,),
+    "Train": (TrainOptions, TrainSettings, WatchSettings),
+    "Evaluate": (EvaluationOptions,),
+    "Leaderboard": (LeaderboardOptions,),
 }
-"""The settings of each command; `reachable` finds the settings within them."""
+"""Settings classes by command; `reachable` finds the classes within them."""
 
 _HEAD = """# Settings
 
@@ -64,20 +64,20 @@ def settings_page() -> str:
 
 
 def reachable(*roots: type) -> list[type]:
-    """Return dataclasses and those that their fields hold, each once, outer ones first."""
-    found: dict[type, None] = {}
+    """Return dataclasses and those in their fields, each once, outer ones first."""
+    kinds: dict[type, None] = {}
     for root in roots:
-        found[root] = None
+        kinds[root] = None
         hints = typing.get_type_hints(root)
         for field in dataclasses.fields(root):
             for kind in _kinds(hints[field.name]):
                 if dataclasses.is_dataclass(kind):
-                    found |= dict.fromkeys(reachable(kind))
-    return list(found)
+                    kinds |= dict.fromkeys(reachable(kind))
+    return list(kinds)
 
 
 def _kinds(hint: Any) -> Iterator[type]:
-    """Yield the classes that a type is made of."""
+    """Yield the classes within a type."""
     if isinstance(hint, type) and not get_args(hint):
         yield hint
     for part in get_args(hint):
@@ -85,13 +85,13 @@ def _kinds(hint: Any) -> Iterator[type]:
 
 
 def _rows(kind: type) -> Iterator[tuple[str, ...]]:
-    if kind is Scene:  # arrays, which no person writes as settings
+    if kind is Scene:  # its fields are arrays, and no settings
         for declared in declared_ranges(Scene):
             part = "" if declared.part is None else f", {declared.part.name}"
             sentence = _first_sentence(field_sentences(Scene)[declared.name])
             yield f"`{declared.name}`{part}", sentence, str(declared.within), ""
         return
-    fields = described(kind) if hasattr(kind, "__pydantic_fields__") else ()
+    fields = describe_fields(kind) if hasattr(kind, "__pydantic_fields__") else ()
     is_marked = any(field.is_execution for field in fields)
     for field in fields:
         named = [name for kind in _kinds(field.hint) for name in getattr(kind, "PRESETS", ())]
@@ -100,24 +100,24 @@ def _rows(kind: type) -> Iterator[tuple[str, ...]]:
             f"`{field.name}`",
             _first_sentence(field.sentence).replace("|", "\\|"),
             (field.expected + presets).replace("|", "\\|"),
-            _shown(field.default),
+            _default_text(field.default),
             *(["free" if field.is_execution else ""] if is_marked else []),
         )
 
 
-def _shown(default: Any) -> str:
+def _default_text(default: Any) -> str:
     if default is dataclasses.MISSING or dataclasses.is_dataclass(default):
         return ""
     if default is None or default in ((), {}):
         return "none"
     if isinstance(default, tuple):
-        return ", ".join(map(_shown, default))
+        return ", ".join(map(_default_text, default))
     if isinstance(default, bool):
         return str(default).lower()
     return shown_number(default) if isinstance(default, int | float) else f"`{default}`"
 
 
 def _first_sentence(doc: str) -> str:
-    """Return a text up to its first full stop before a space, in one line."""
-    found = re.match(r".*?(?<! al)\.(?=\s|$)", " ".join(doc.split()))
-    return found[0] if found else doc
+    """Return a text up to its first full stop before a space, as one line."""
+    match = re.match(r".*?(?<! al)\.(?=\s|$)", " ".join(doc.split()))
+    return match[0] if match else doc

@@ -1,12 +1,12 @@
-"""The source tree that a wheel is built from: our packages below `trilight`, imports with them.
+"""Source tree of a wheel: all packages below `trilight`, with their imports rewritten.
 
-In a checkout `storage`, `model` and `train` are top-level packages. In somebody's environment such
-names would collide with modules of the user's own, so a wheel has them as `trilight.storage` and so
-on, as pip holds the libraries that it brings along. Only import statements change, in their own
-line, so that line numbers stay. Names of modules in strings are not touched: code that needs one
-asks storage.installation, or uses `__package__`.
+In a checkout `storage`, `model` and `train` are top-level packages. In a user's environment such
+names would collide with other modules, so that a wheel has them as `trilight.storage` and so on, as
+pip does with its vendored libraries. Only import statements change, within their line, so that line
+numbers stay. Module names in strings are not rewritten: code that needs one calls
+storage.installation, or uses `__package__`.
 
-Nothing outside Python's standard library is imported here: builds run in environments of their own.
+This module imports only Python's standard library, since builds run in isolated environments.
 """
 
 import ast
@@ -18,26 +18,26 @@ FACE = "trilight"
 PACKAGES = ("storage", "scene_templates", "pipeline", "model", "train", "infra")
 """Packages that move below FACE."""
 
-_BESIDE = ("pyproject.toml", "README.md", "LICENSE", "requirements")
-"""What a build reads beside the packages."""
+_BUILD_FILES = ("pyproject.toml", "README.md", "LICENSE", "requirements")
+"""Files that a build reads in addition to the packages."""
 CHECKOUT_ONLY = "infra/bench"
-"""Experiments, which a wheel does not have."""
-_LEFT_OUT = shutil.ignore_patterns("__pycache__", "*.pyc", ".*")
+"""Folder of the experiments, which wheels leave out."""
+_IGNORED = shutil.ignore_patterns("__pycache__", "*.pyc", ".*")
 
 
 def write_wheel_tree(checkout: Path, tree: Path) -> None:
-    """Copy all that a wheel is built from into the empty folder `tree`, imports rewritten.
+    """Copy the sources of a wheel into the empty folder `tree`, with rewritten imports.
 
     Raises:
-        SyntaxError: an import that cannot be rewritten in place; it names file and line.
+        SyntaxError: an import cannot be rewritten in place; the error names file and line.
     """
-    for name in _BESIDE:
+    for name in _BUILD_FILES:
         source = checkout / name
         copy = shutil.copytree if source.is_dir() else shutil.copy2
         copy(source, tree / name)
-    shutil.copytree(checkout / FACE, tree / FACE, ignore=_LEFT_OUT)
+    shutil.copytree(checkout / FACE, tree / FACE, ignore=_IGNORED)
     for package in PACKAGES:
-        shutil.copytree(checkout / package, tree / FACE / package, ignore=_LEFT_OUT)
+        shutil.copytree(checkout / package, tree / FACE / package, ignore=_IGNORED)
     shutil.rmtree(tree / FACE / CHECKOUT_ONLY)
     shutil.copy2(checkout / "prefect.yaml", tree / FACE)
     for path in (tree / FACE).rglob("*.py"):
@@ -46,25 +46,26 @@ def write_wheel_tree(checkout: Path, tree: Path) -> None:
 
 
 def with_prefix(source: str, name: str = "<source>") -> str:
-    """Return a module's source with `trilight.` before our packages wherever it imports them.
+    """Return a module's source with `trilight.` before the packages that it imports.
 
     Args:
-        source: text of the module.
-        name: of the file, for messages.
+        source: source text of the module.
+        name: name of the file, for messages.
 
     Raises:
-        SyntaxError: the source is none, or a statement such as `import storage.errors`, which binds
-            the name `storage` and has no form with a prefix: write `from storage import errors`.
+        SyntaxError: the source is invalid, or has a statement such as `import storage.errors`,
+            which binds the name `storage`, so that it cannot get a prefix: write `from storage
+            import errors`.
     """
     lines = source.splitlines(keepends=True)
-    for line, column in sorted(_places(ast.parse(source, name), name), reverse=True):
+    for line, column in sorted(_import_positions(ast.parse(source, name), name), reverse=True):
         row = lines[line - 1].encode()  # ast counts columns in bytes
         lines[line - 1] = (row[:column] + f"{FACE}.".encode() + row[column:]).decode()
     return "".join(lines)
 
 
-def _places(module: ast.Module, name: str) -> Iterator[tuple[int, int]]:
-    """Yield line and column of the name of every package of ours that is imported."""
+def _import_positions(module: ast.Module, name: str) -> Iterator[tuple[int, int]]:
+    """Yield line and column of every imported name of a Trilight package."""
     for node in ast.walk(module):
         if isinstance(node, ast.ImportFrom) and node.level == 0 and _is_ours(node.module):
             yield node.lineno, node.col_offset + len("from ")

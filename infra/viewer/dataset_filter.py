@@ -1,4 +1,4 @@
-"""Which scenes of a dataset a page shows, and the command that selects the same ones."""
+"""Filter of the scenes on a dataset's page, and the command that selects the same scenes."""
 
 import math
 import shlex
@@ -15,31 +15,31 @@ _WHERE = {
     "coverage": "min(coverage)",
     "floor": "min(noise_floor_db)",
 }
-"""Columns with ends, as `trilight shards select --where` calls them."""
+"""Columns with limits, by their quantity in `trilight shards select --where`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFilter:
-    """What a person chose."""
+    """Conditions and order of a dataset's page."""
 
     split: str = ""
-    """Empty for all."""
+    """Split of the scenes; empty for all splits."""
     template: str = ""
-    """Empty for all."""
+    """Layout of the scenes; empty for all layouts."""
     least: Mapping[str, float]
-    """Least value by column."""
+    """Lower limits, inclusive, by column."""
     most: Mapping[str, float]
-    """Greatest value by column."""
+    """Upper limits, inclusive, by column."""
     sort: str = "key"
     descending: bool = False
 
     def rows(self, rows: Sequence[SceneRow]) -> list[SceneRow]:
-        """Return the rows that are shown, in their order."""
-        shown = [row for row in rows if self._takes(row)]
-        return sorted(shown, key=SORTED_BY[self.sort], reverse=self.descending)
+        """Return the rows that meet the conditions, sorted."""
+        matching = [row for row in rows if self._matches(row)]
+        return sorted(matching, key=SORTED_BY[self.sort], reverse=self.descending)
 
     def command(self, dataset: Path, out: Path) -> str:
-        """Return the command that makes a dataset of what is shown; empty where that is all."""
+        """Return the command that selects the matching scenes; empty without conditions."""
         words = ["trilight", "shards", "select", str(dataset)]
         conditions = [
             f"{_WHERE[name]} {sign} {value:g}"
@@ -51,7 +51,7 @@ class SceneFilter:
         chosen = [word for option, value in options.items() if value for word in (option, value)]
         return shlex.join([*words, *chosen, "--out", str(out)]) if chosen else ""
 
-    def _takes(self, row: SceneRow) -> bool:
+    def _matches(self, row: SceneRow) -> bool:
         return (
             self.split in ("", row.split)
             and self.template in ("", row.template)
@@ -61,13 +61,13 @@ class SceneFilter:
 
 
 def filter_of(query: Mapping[str, str]) -> SceneFilter:
-    """Return what a query says.
+    """Return the filter of a query.
 
     Args:
         query: `split`, `template`, `sort`, `descending`, and `COLUMN_min` and `COLUMN_max`.
 
     Raises:
-        TrilightError: a limit is no number, or there is no such column.
+        TrilightError: a limit is no number, or the sort column is unknown.
     """
     sort = query.get("sort", "key")
     if sort not in SORTED_BY:
@@ -92,7 +92,7 @@ def filter_of(query: Mapping[str, str]) -> SceneFilter:
 
 def _number(text: str, name: str) -> float:
     try:
-        # as the command will say it
+        # rounded as in the command, so that both select the same scenes
         value = float(f"{float(text):g}")
     except ValueError as error:
         raise TrilightError(f"{name}: {text:.20} is no number.") from error

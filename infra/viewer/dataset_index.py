@@ -1,7 +1,7 @@
-"""What is known of each scene of a dataset without loading it: read once, in the background.
+"""Index of a dataset's scenes, read once in the background without loading them.
 
-Of a scene the record is read, and of its arrays no more than the header that says how many
-triangles there are. All rows stay in memory, a few hundred bytes each.
+It reads the record of each scene, and of its arrays only the header with the number of triangles.
+All rows stay in memory, a few hundred bytes each.
 """
 
 import json
@@ -23,44 +23,44 @@ from storage.errors import TrilightError
 from storage.records.profiles import PACKED, PLAIN
 
 MOST_SCENES = 500_000
-"""Rows that are held; of a larger dataset the first ones."""
+"""Maximum number of rows; a larger dataset is cut."""
 
 _MOST_HEADER = 1 << 20
 
 _PATIENCE_S = 20.0
-"""How long a scene is waited for that is not read yet."""
+"""Seconds to wait for a scene that is not read yet."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SceneRow:
-    """One scene."""
+    """Facts of one scene."""
 
     key: str
     shard: int
-    """Row of the manifest's shards."""
+    """Index of the shard in the manifest."""
     split: str
     template: str
     views: int
     triangles: int
     lights: int
-    """Emitter objects."""
+    """Number of emitter objects, not of their triangles."""
     floor: float
-    """Noise floor of the worst view, psnr_log_db."""
+    """Noise floor of the worst view as psnr_log_db."""
     coverage: float
-    """Least share of a view on objects."""
+    """Least fraction over the views of pixels on objects."""
     spp: int
-    """Most samples per pixel of a view."""
+    """Greatest number of samples per pixel over the views."""
 
 
 SORTED_BY: Mapping[str, Callable[[SceneRow], Any]] = {
     name: attrgetter(name, "key")
     for name in ("key", "split", "template", "triangles", "lights", "floor", "coverage", "spp")
 }
-"""What rows may be sorted by."""
+"""Sort key of rows by column."""
 
 
 class DatasetIndex:
-    """The rows of a dataset so far."""
+    """Growing index of a dataset's scenes."""
 
     def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset
@@ -69,15 +69,15 @@ class DatasetIndex:
         self._closed = False
         self.shards_read = 0
         self.problems: list[str] = []
-        """Shards that could not be read, each with a sentence."""
+        """Messages on shards that could not be read."""
         self._thread = threading.Thread(target=self._read_all, daemon=True)
 
     def begin(self) -> None:
-        """Start to read."""
+        """Start the reading thread."""
         self._thread.start()
 
     def wait(self) -> None:
-        """Wait until all is read."""
+        """Wait until all shards are read."""
         self._thread.join()
 
     def close(self) -> None:
@@ -90,7 +90,7 @@ class DatasetIndex:
         return self._rows[:]
 
     def row(self, key: str) -> SceneRow:
-        """Return the row of a scene, which is waited for; TrilightError where it does not come."""
+        """Wait for the row of a scene, and return it; raises TrilightError without one."""
         deadline = time.monotonic() + _PATIENCE_S
         while key not in self._by_key:
             if not self._thread.is_alive():
@@ -113,12 +113,12 @@ class DatasetIndex:
     def _read_shard(self, number: int, shard: ShardEntry) -> None:
         dataset = self._dataset
         with dataset.files.open(shard, checked=False) as stream:
-            with reading(dataset.shown, shard.name):
+            with reading(dataset.display_name, shard.name):
                 samples = contents_of(stream, shard.name).samples
             for key, members in samples.items():
                 if self._closed:
                     return
-                with reading(dataset.shown, shard.name):
+                with reading(dataset.display_name, shard.name):
                     row = _row(stream, key, members, number, shard.split)
                 self._rows.append(row)
                 self._by_key[key] = row

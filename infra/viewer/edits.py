@@ -1,7 +1,7 @@
-"""What a person changed of a scene in the page: where lamps are, how bright, and materials.
+"""Edits of a scene in the page: positions and brightness of lamps, and materials.
 
-The page holds the changes and sends all of them with every request; the scene that was read stays
-as it is, so that nothing has to be undone.
+The page holds the edits and sends all of them with every request; the loaded scene stays unchanged,
+so that nothing has to be undone.
 """
 
 import dataclasses
@@ -19,32 +19,34 @@ from storage.records.scene import MAX_POSITION_M, Scene
 from storage.records.texture import CONSTANT, TEXTURED
 
 MOST_GAIN = 1000.0
-"""By which a lamp may become brighter."""
+"""Maximum factor by which a lamp may become brighter."""
 
 _COLUMNS = {"diffuse": DIFFUSE, "specular": SPECULAR}
 
 
-def edited(scene: Scene, edits: Mapping[str, Any]) -> Scene:
-    """Return the scene with changes.
+def apply_edits(scene: Scene, edits: Mapping[str, Any]) -> Scene:
+    """Return the scene with edits.
 
     Args:
-        scene: as it was read.
-        edits: `lamps`: by row of the emitter, `move` [3] in metres and `gain`; `materials`: by row,
-            `diffuse` and `specular` [3] and `roughness`. What is left out stays. A colour or number
-            that is given stands in the place of a texture.
+        scene: scene as it was loaded.
+        edits: `lamps`: by row of the emitter, `move` [3] in meters and `gain`; `materials`: by row,
+            `diffuse` and `specular` [3] and `roughness`. Values that are left out stay. A stated
+            color or number replaces a texture.
 
     Raises:
-        TrilightError: a change that means nothing, or one that breaks a law of scenes.
+        TrilightError: an edit is malformed, or breaks a rule of scenes.
     """
-    lamps, materials = _group(edits, "lamps"), _group(edits, "materials")
+    lamps = _group(edits, "lamps")
+    materials = _group(edits, "materials")
     if not lamps and not materials:
         return scene
-    positions, rows = scene.vertex_positions.copy(), scene.materials.copy()
+    positions = scene.vertex_positions.copy()
+    rows = scene.materials.copy()
     worn = None if scene.material_textures is None else scene.material_textures.copy()
     for row, change in lamps.items():
         _move_lamp(scene, row, change, positions, rows)
     for row, change in materials.items():
-        _dress(scene, row, change, rows, worn)
+        _change_material(scene, row, change, rows, worn)
     worn_scene = dataclasses.replace(scene, material_textures=worn)
     every = (np.arange(scene.num_triangles), np.arange(len(rows)))
     changed = dataclasses.replace(
@@ -55,9 +57,9 @@ def edited(scene: Scene, edits: Mapping[str, Any]) -> Scene:
 
 
 def _group(edits: Mapping[str, Any], name: str) -> dict[int, Mapping[str, Any]]:
-    found = edits.get(name, {})
+    changes = edits.get(name, {})
     try:
-        group = {int(row): dict(change) for row, change in found.items()}
+        group = {int(row): dict(change) for row, change in changes.items()}
     except (AttributeError, TypeError, ValueError) as error:
         raise TrilightError(f"edits: {name} is no table of changes by row.") from error
     return dict(group)
@@ -80,7 +82,7 @@ def _move_lamp(
         rows[material, EMISSION] = scene.materials[material, EMISSION] * gain
 
 
-def _dress(
+def _change_material(
     scene: Scene,
     row: int,
     change: Mapping[str, Any],
@@ -100,9 +102,11 @@ def _dress(
 
 def _numbers(values: Any, name: str, count: int, low: float, high: float) -> NDArray[np.float64]:
     try:
-        found = [float(value) for value in values]
+        numbers = [float(value) for value in values]
     except (TypeError, ValueError) as error:
         raise TrilightError(f"edits: {name} is no list of numbers.") from error
-    if len(found) != count or not all(math.isfinite(v) and low <= v <= high for v in found):
-        raise TrilightError(f"edits: {name} is {found}; expected {count} from {low:g} to {high:g}.")
-    return np.array(found)
+    if len(numbers) != count or not all(math.isfinite(v) and low <= v <= high for v in numbers):
+        raise TrilightError(
+            f"edits: {name} is {numbers}; expected {count} from {low:g} to {high:g}."
+        )
+    return np.array(numbers)

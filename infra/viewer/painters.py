@@ -1,4 +1,4 @@
-"""The ways to a picture that a page offers: tracers, networks, passes, and what a file holds."""
+"""Renderers that a page offers: path tracers, networks, passes, and the picture in the file."""
 
 import dataclasses
 import importlib.util
@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.viewer.wanted import Wanted
-from pipeline.documents.scene_passes import SHOWN_PASSES, ShownPass
-from pipeline.making.progressive_tracer import ProgressiveTracer
+from infra.viewer.picture_options import PictureOptions
+from pipeline.documents.scene_passes import PASS_VIEWS, PassView
+from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders.preview import usual_filter
 from pipeline.renders.results import GrowingPicture, Sampling
 from pipeline.renders.settings import FIRST_SPP, RenderSettings, one_picture
@@ -28,61 +28,63 @@ if TYPE_CHECKING:
 
 SAMPLES_PREFIX = "samples-"
 SAMPLES = (1, 4, 16, 64)
-"""Samples a pixel of the tracer's rungs below the picture that grows."""
+"""Samples per pixel of the previews, beside the progressive picture."""
 
 MOST_SPP = 4096
-"""Cap of a tracer's samples."""
+"""Maximum number of samples per pixel."""
 
 _LIGHTS_PER_PASS = 8
 
 _numbers = itertools.count()
-"""Of the scenes of this process."""
+"""Numbers of the scenes of this process."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Painted:
-    """A picture, or one on its way to become better."""
+class RenderedImage:
+    """Picture, which may be an intermediate one."""
 
     radiance_rgb: NDArray[np.float32] | None
-    """[R, R, 3] linear radiance; None where it shows something else."""
+    """[R, R, 3] linear radiance; None where the picture shows a pass."""
     pixels: NDArray[np.uint8] | None = None
-    """[R, R, 3] or [R, R] as it is shown, where it shows something else."""
+    """[R, R, 3] or [R, R] display pixels of a pass."""
     core_s: float | None
-    """Core-seconds that it took, the scene's own preparation aside; None where it was stored."""
+    """CPU seconds of the picture, without the scene's preparation; None where it was stored."""
     scene_core_s: float | None = None
-    """Core-seconds that the scene took before its first picture, where that is known."""
+    """CPU seconds of the scene's preparation; None where they are unknown."""
     spp: int | None = None
-    """Samples per pixel."""
+    """Samples per pixel; None where no path is sampled."""
     floor_db: float | None = None
-    """Its stated error as psnr_log_db, where it has one."""
+    """Stated error as psnr_log_db; None without one."""
     says: str = ""
-    """What a person should know of it."""
+    """Remark on the picture for the page; may be empty."""
     notes: Sequence[str] = field(default_factory=tuple)
-    """The same of the scene with this engine."""
+    """Warnings about the scene with this engine."""
 
 
-Show = Callable[[Painted | Sampling], None]
-"""Receives each state of a picture; raises where nobody wants it any more."""
+Show = Callable[[RenderedImage | Sampling], None]
+"""Callback for each state of a picture; it raises where the picture is cancelled."""
 
 
 class Painter(Protocol):
-    """One way to a picture."""
+    """Renderer of the page."""
 
     title: str
-    """For the page."""
+    """Title on the page, such as `Path traced`."""
     means: str
-    """A sentence that says what it does."""
+    """Description on the page, one sentence."""
 
-    def paint(self, scene: Scene, wanted: Wanted, show: Show) -> None:
-        """Show the picture; raises TrilightError where there is none."""
+    def paint(self, scene: Scene, options: PictureOptions, show: Show) -> None:
+        """Render the picture through `show`; raises TrilightError where there is none."""
 
 
 class TracedPainter:
-    """Path tracing, of all light or of that which comes straight from lamps."""
+    """Path tracing, of all light or of direct light only."""
 
     def __init__(self, tracer: ProgressiveTracer, scene_number: int, *, direct: bool) -> None:
-        """Take what traces, and a number that no other scene of this process has."""
-        self._tracer, self._number, self._direct = tracer, scene_number, direct
+        """Store the path tracer, and the scene's number, which is unique in this process."""
+        self._tracer = tracer
+        self._number = scene_number
+        self._direct = direct
         self.title = "Direct light" if direct else "Path traced"
         self.means = (
             "Lamp, surface, camera: traced without any further bounce."
@@ -90,51 +92,54 @@ class TracedPainter:
             else "All light, traced until the measured error reaches its goal."
         )
 
-    def paint(self, scene: Scene, wanted: Wanted, show: Show) -> None:
-        settings = _traced_settings(wanted)
+    def paint(self, scene: Scene, options: PictureOptions, show: Show) -> None:
+        settings = _traced_settings(options)
         if self._direct:
             settings = dataclasses.replace(settings, max_depth=2)
 
-        def shown(step: Sampling) -> None:
-            show(_traced(step) if isinstance(step, GrowingPicture) else step)
+        def on_step(step: Sampling) -> None:
+            show(_image_of_step(step) if isinstance(step, GrowingPicture) else step)
 
-        camera = (wanted.camera.c2w, wanted.camera.fov_deg)
-        self._tracer.paint(scene, (self._number, wanted.scene_key), camera, settings, shown)
+        camera = (options.camera.c2w, options.camera.fov_deg)
+        self._tracer.render(scene, (self._number, options.scene_key), camera, settings, on_step)
 
 
 class SamplesPainter:
-    """Few samples a pixel with one denoise; the loaded scene is that of `TracedPainter`."""
+    """Few samples per pixel with one denoise; shares the loaded scene of `TracedPainter`."""
 
     def __init__(self, tracer: ProgressiveTracer, scene_number: int, spp: int) -> None:
-        """Take what `TracedPainter` takes, and the samples."""
-        self._tracer, self._number, self.spp = tracer, scene_number, spp
+        """Store the path tracer, the scene's number, and the samples per pixel."""
+        self._tracer = tracer
+        self._number = scene_number
+        self.spp = spp
         self.title = f"{spp} sample{'s' if spp > 1 else ''}, filtered"
         self.means = (
             f"{spp} path{'s' if spp > 1 else ''} a pixel, then Open Image Denoise "
             f"({usual_filter(spp)})."
         )
 
-    def paint(self, scene: Scene, wanted: Wanted, show: Show) -> None:
-        def shown(step: Sampling) -> None:
-            show(_traced(step) if isinstance(step, GrowingPicture) else step)
+    def paint(self, scene: Scene, options: PictureOptions, show: Show) -> None:
+        def on_step(step: Sampling) -> None:
+            show(_image_of_step(step) if isinstance(step, GrowingPicture) else step)
 
-        camera = (wanted.camera.c2w, wanted.camera.fov_deg)
-        key, settings = (self._number, wanted.scene_key), _traced_settings(wanted)
-        self._tracer.paint(scene, key, camera, settings, shown, preview_spp=self.spp)
+        camera = (options.camera.c2w, options.camera.fov_deg)
+        key = (self._number, options.scene_key)
+        settings = _traced_settings(options)
+        self._tracer.render(scene, key, camera, settings, on_step, preview_spp=self.spp)
 
 
-def _traced_settings(wanted: Wanted) -> RenderSettings:
+def _traced_settings(options: PictureOptions) -> RenderSettings:
     return one_picture(
-        resolution=wanted.resolution, max_spp=MOST_SPP, noise_floor_db=wanted.error_db
+        resolution=options.resolution, max_spp=MOST_SPP, noise_floor_db=options.error_db
     )
 
 
-def _traced(look: GrowingPicture) -> Painted:
+def _image_of_step(look: GrowingPicture) -> RenderedImage:
     floor_db = None if look.floor is None else look.floor.log_db
     few = "a preview: its error is not measured" if floor_db is None else ""
     if floor_db is not None and look.spp < FIRST_SPP:
         few = f"below {FIRST_SPP} samples the stated error may flatter"
-    return Painted(
+    return RenderedImage(
         radiance_rgb=look.radiance_rgb,
         core_s=look.core_s,
         spp=look.spp,
@@ -144,35 +149,36 @@ def _traced(look: GrowingPicture) -> Painted:
 
 
 class NetworkPainter:
-    """A network; loaded with its first picture, and ready for more cameras of the last scene."""
+    """Network, loaded with its first picture; it keeps the last scene for further cameras."""
 
     def __init__(self, checkpoint: str, title: str, means: str) -> None:
-        self.title, self.means = title, means
+        self.title = title
+        self.means = means
         self.checkpoint = checkpoint
         self._renderer: NeuralRenderer | None = None
         self._prepared: tuple[str, PreparedScene, float] | None = None
 
-    def paint(self, scene: Scene, wanted: Wanted, show: Show) -> None:
-        renderer = self._loaded()
-        renderer.require_resolution(wanted.resolution)
-        if self._prepared is None or self._prepared[0] != wanted.scene_key:
+    def paint(self, scene: Scene, options: PictureOptions, show: Show) -> None:
+        renderer = self._load()
+        renderer.require_resolution(options.resolution)
+        if self._prepared is None or self._prepared[0] != options.scene_key:
             began_s = time.process_time()
             prepared = renderer.prepare(scene, lights_per_pass=_LIGHTS_PER_PASS)
-            self._prepared = (wanted.scene_key, prepared, time.process_time() - began_s)
+            self._prepared = (options.scene_key, prepared, time.process_time() - began_s)
         _, prepared, scene_core_s = self._prepared
         began_s = time.process_time()
-        camera = wanted.camera
-        picture = renderer.view(prepared, camera.c2w, camera.fov_deg, wanted.resolution)
+        camera = options.camera
+        picture = renderer.view(prepared, camera.c2w, camera.fov_deg, options.resolution)
         show(
-            Painted(
+            RenderedImage(
                 radiance_rgb=np.minimum(picture, HALF_FLOAT_MAX),
                 core_s=time.process_time() - began_s,
                 scene_core_s=scene_core_s,
-                notes=(*prepared.notes, *renderer.resolution_notes(wanted.resolution)),
+                notes=(*prepared.notes, *renderer.resolution_notes(options.resolution)),
             )
         )
 
-    def _loaded(self) -> "NeuralRenderer":
+    def _load(self) -> "NeuralRenderer":
         if self._renderer is None:
             from model.neural_renderer import NeuralRenderer
             from train.loop.checkpoints import network_of_run
@@ -182,88 +188,101 @@ class NetworkPainter:
 
 
 class PassPainter:
-    """What the pixels see: a function of scene and camera, without any light."""
+    """Pass of the visible surfaces, such as depth: a function of scene and camera without light."""
 
-    def __init__(self, shown: ShownPass) -> None:
-        self.title, self.means = shown.title.capitalize(), "What the pixels see, without light."
-        self._shown = shown
+    def __init__(self, shown_pass: PassView) -> None:
+        self.title = shown_pass.title.capitalize()
+        self.means = "What the pixels see, without light."
+        self._shown = shown_pass
 
-    def paint(self, scene: Scene, wanted: Wanted, show: Show) -> None:
+    def paint(self, scene: Scene, options: PictureOptions, show: Show) -> None:
         (name,) = pass_names([self._shown.word])
-        pose, angle = wanted.camera.c2w[None], np.array([wanted.camera.fov_deg], np.float32)
+        pose = options.camera.c2w[None]
+        angle = np.array([options.camera.fov_deg], np.float32)
         began_s = time.process_time()
-        seen = view_passes(
-            scene.with_cameras(pose, angle), [name], view=0, resolution=wanted.resolution
+        values = view_passes(
+            scene.with_cameras(pose, angle), [name], view=0, resolution=options.resolution
         )[name]
         core_s = time.process_time() - began_s
-        met = np.isfinite(seen).any() if seen.dtype.kind == "f" else bool((seen >= 0).any())
-        says = self._shown.caption(seen).partition(", in the")[0] if met else "nothing is met"
-        pixels = self._shown.pixels(seen)
-        show(Painted(radiance_rgb=None, pixels=pixels, core_s=core_s, says=says))
+        has_hits = (
+            np.isfinite(values).any() if values.dtype.kind == "f" else bool((values >= 0).any())
+        )
+        says = (
+            self._shown.caption(values).partition(", in the")[0] if has_hits else "nothing is met"
+        )
+        pixels = self._shown.pixels(values)
+        show(RenderedImage(radiance_rgb=None, pixels=pixels, core_s=core_s, says=says))
 
 
 class TargetPainter:
-    """The picture that a dataset or an HDF5 file holds of one of the scene's own cameras."""
+    """Picture that a dataset or an HDF5 file holds of one of the scene's cameras."""
 
     title = "Target"
     means = "The picture that the file holds of this camera."
 
     def __init__(self, radiance_rgb: NDArray[np.float32], floors_db: Sequence[float]) -> None:
-        """Take the pictures [V, R, R, 3] and their stated errors, which may be none."""
-        self._pictures, self._floors_db = radiance_rgb, floors_db
+        """Store the pictures [V, R, R, 3] and their stated errors, which may be empty."""
+        self._pictures = radiance_rgb
+        self._floors_db = floors_db
 
     @property
     def width_px(self) -> int:
-        """Width of the pictures."""
+        """Width of the pictures in pixels."""
         return int(self._pictures.shape[1])
 
-    def paint(self, scene: Scene, wanted: Wanted, show: Show) -> None:
-        if wanted.view is None or wanted.view >= len(self._pictures):
+    def paint(self, scene: Scene, options: PictureOptions, show: Show) -> None:
+        if options.view is None or options.view >= len(self._pictures):
             raise TrilightError(
                 "The file holds pictures of the scene's own cameras alone; choose one of them."
             )
-        if wanted.edits:
+        if options.edits:
             raise TrilightError("The file's picture shows the scene without your changes.")
-        floor_db = self._floors_db[wanted.view] if self._floors_db else None
-        picture = self._pictures[wanted.view]
-        show(Painted(radiance_rgb=picture, core_s=None, floor_db=floor_db, says="as it was stored"))
+        floor_db = self._floors_db[options.view] if self._floors_db else None
+        picture = self._pictures[options.view]
+        show(
+            RenderedImage(
+                radiance_rgb=picture, core_s=None, floor_db=floor_db, says="as it was stored"
+            )
+        )
 
 
-def render_words(painter: Painter, wanted: Wanted) -> list[str]:
-    """Return the options by which `trilight render` goes the way of a painter; else it traces."""
+def render_words(painter: Painter, options: PictureOptions) -> list[str]:
+    """Return the options of `trilight render` for the same picture; by default path tracing."""
     if isinstance(painter, NetworkPainter):
         return ["--engine", "neural", "--checkpoint", painter.checkpoint]
     if isinstance(painter, SamplesPainter):
         return ["--spp", str(painter.spp)]
-    return ["--noise-floor", f"{wanted.error_db:g}"]
+    return ["--noise-floor", f"{options.error_db:g}"]
 
 
 def painters_of(
     tracer: ProgressiveTracer, target: TargetPainter | None, checkpoint: str | None
 ) -> Mapping[str, Painter]:
-    """Return the ways to pictures by name, in the order of the page.
+    """Return the renderers by name, in the order of the page.
 
     Args:
-        tracer: for what is traced.
-        target: of the file, if it holds pictures.
-        checkpoint: a network of the user's own.
+        tracer: path tracer of this page.
+        target: pictures of the file; None where it holds none.
+        checkpoint: network of the user; may be None.
     """
     number = next(_numbers)
-    found: dict[str, Painter] = {"traced": TracedPainter(tracer, number, direct=False)}
+    painters: dict[str, Painter] = {"traced": TracedPainter(tracer, number, direct=False)}
     if importlib.util.find_spec("torch") is not None:
         if checkpoint is not None:
-            found["network"] = NetworkPainter(
+            painters["network"] = NetworkPainter(
                 checkpoint, "Your network", "The network that --checkpoint names."
             )
-        found["hits"] = NetworkPainter(
+        painters["hits"] = NetworkPainter(
             "builtin:", "Network, hits", "First hits and direct light are traced, the rest learned."
         )
-        found["tokens"] = NetworkPainter(
+        painters["tokens"] = NetworkPainter(
             "builtin:tokens", "Network, tokens", "RenderFormer's way: nothing is traced."
         )
     for spp in SAMPLES:
-        found[f"{SAMPLES_PREFIX}{spp}"] = SamplesPainter(tracer, number, spp)
-    found["direct"] = TracedPainter(tracer, number, direct=True)
+        painters[f"{SAMPLES_PREFIX}{spp}"] = SamplesPainter(tracer, number, spp)
+    painters["direct"] = TracedPainter(tracer, number, direct=True)
     if target is not None:
-        found["target"] = target
-    return found | {f"pass-{shown.word}": PassPainter(shown) for shown in SHOWN_PASSES}
+        painters["target"] = target
+    return painters | {
+        f"pass-{shown_pass.word}": PassPainter(shown_pass) for shown_pass in PASS_VIEWS
+    }

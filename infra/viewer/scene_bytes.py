@@ -1,11 +1,11 @@
-"""A scene as a browser draws it: one block of bytes, read in place.
+"""Scene as one block of bytes for the browser's 3D view, which reads it in place.
 
     4 bytes      length of the JSON, little-endian; the JSON is padded to a multiple of 4
     JSON         groups, materials, textures, sky, cameras, lamps, bounds
     float32      positions [3T, 3], normals [3T, 3], and uv [3T, 2] where anything is textured
 
-Triangles are sorted into groups of one object and one material. What is drawn is a help to find
-one's way; the pictures beside it are what counts.
+Triangles are sorted into groups of one object and one material. The 3D view is for orientation
+only; the rendered pictures beside it are exact.
 """
 
 import dataclasses
@@ -28,22 +28,22 @@ from storage.records.scene_facts import lights
 from storage.records.texture import TEXTURED, Texture
 
 MOST_TRIANGLES = 1_500_000
-"""A browser holds 96 bytes of each, three times."""
+"""Maximum number of triangles; a browser holds 96 bytes of each, three times."""
 
 MOST_GROUPS = 5000
-"""Pairs of object and material; each is drawn by a call of its own."""
+"""Maximum number of pairs of object and material; each needs a draw call."""
 
 _SIDE = 2048
-"""Wider textures are made smaller for the browser."""
+"""Maximum width and height in pixels of textures for the browser; larger ones are reduced."""
 
 _SKY_ROWS = 128
 
 
 def scene_bytes(scene: Scene) -> bytes:
-    """Return a scene for the browser.
+    """Return the block of bytes of a scene.
 
     Raises:
-        TrilightError: it has more triangles or groups than a browser draws.
+        TrilightError: the scene has more triangles or groups than a browser draws.
     """
     if scene.num_triangles > MOST_TRIANGLES:
         raise TrilightError(
@@ -79,7 +79,7 @@ def scene_bytes(scene: Scene) -> bytes:
 
 
 def texture_png(texture: Texture) -> bytes:
-    """Return a texture as PNG: colours sRGB-encoded, a number as it is, the bottom row last."""
+    """Return a texture as PNG: colors sRGB-encoded, numbers linear, the bottom row last."""
     linear = texture.linear(texture.texels)[::-1]
     if texture.channels == 3:
         pixels = srgb8(linear)
@@ -93,14 +93,14 @@ def texture_png(texture: Texture) -> bytes:
 
 
 def sky_bytes(scene: Scene) -> bytes:
-    """Return the environment as three.js looks it up by directions of our world.
+    """Return the environment map in the layout of three.js, for directions of Trilight's world.
 
     There u is atan2(z, x) / 2 pi + 1/2 and v is asin(y) / pi + 1/2: small, [rows, 2 rows, 4] in
     float32, v rising, after its width and height as two unsigned integers.
     """
     assert scene.environment is not None
     sky = dataclasses.replace(
-        scene.environment, radiance_rgb=_reduced(scene.environment.radiance_rgb)
+        scene.environment, radiance_rgb=_downsample_map(scene.environment.radiance_rgb)
     )
     rows = len(sky.radiance_rgb)
     height = (np.arange(rows) + 0.5) / rows * np.pi - np.pi / 2
@@ -113,8 +113,8 @@ def sky_bytes(scene: Scene) -> bytes:
     return struct.pack("<II", 2 * rows, rows) + rgba.tobytes()
 
 
-def _reduced(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a map of at most twice _SKY_ROWS rows, by means of whole texels."""
+def _downsample_map(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a map of fewer than twice _SKY_ROWS rows, by averaging blocks of texels."""
     step = max(1, len(radiance_rgb) // _SKY_ROWS)
     rows = len(radiance_rgb) // step
     cut = radiance_rgb[: rows * step, : 2 * rows * step]
@@ -123,7 +123,7 @@ def _reduced(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _groups(scene: Scene) -> tuple[NDArray[np.int64], list[Mapping[str, int]]]:
-    """Return the order of triangles, and where each pair of object and material stands in it."""
+    """Return the order of triangles, and the range of each pair of object and material in it."""
     pair = scene.object_index.astype(np.int64) << 16 | scene.material_index
     order = np.argsort(pair, kind="stable")
     values, first, count = np.unique(pair[order], return_index=True, return_counts=True)

@@ -1,4 +1,4 @@
-"""The scene files below a folder: their names alone, read once, so that a page only chooses."""
+"""Names of the scene files below a folder, read once, so that a page only selects from a list."""
 
 import os
 from collections.abc import Iterator
@@ -9,27 +9,27 @@ from pipeline.exchange.formats import readable
 from storage.errors import TrilightError
 
 MOST_FILES = 5000
-"""Files that are listed; of a larger folder the first ones."""
+"""Maximum number of listed files; a larger folder is cut."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneList:
-    """Files that may be scenes, in order."""
+    """Sorted files that may be scenes."""
 
     root: Path
     names: tuple[str, ...]
-    """Relative to the folder, with slashes."""
+    """Paths relative to the folder, with slashes."""
     is_cut: bool
-    """Whether there are more files than these."""
+    """True where the folder has more files than are listed."""
 
 
 def scene_list(root: Path) -> SceneList:
-    """Return the files of a folder and of those in it whose suffix is that of a scene.
+    """Return the files with a scene's suffix in a folder and its subfolders.
 
     Hidden folders and links to folders are left out.
 
     Raises:
-        TrilightError: there is none.
+        TrilightError: there is no such file.
     """
     suffixes = frozenset(readable())
     names = list[str]()

@@ -1,4 +1,4 @@
-"""The server of a page: answers guarded requests from a table of routes, on this machine alone."""
+"""HTTP server of a page: dispatches guarded requests by a table of routes, on loopback only."""
 
 import contextlib
 import json
@@ -13,70 +13,70 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qsl, unquote
 
-from infra.viewer.guard import HOST, SAFE_HEADERS, new_word, refusal
+from infra.viewer.guard import HOST, SAFE_HEADERS, new_token, refusal
 from storage.errors import TrilightError
 
 MOST_CONNECTIONS = 32
-"""Requests that are answered at a time; a browser opens six, and more wait."""
+"""Maximum number of concurrent responses; a browser opens six connections, and others wait."""
 
 _REQUEST_S = 15.0
-"""Time in which a whole request must arrive; a connection without one is closed then."""
+"""Seconds within which a whole request must arrive before its connection is closed."""
 
 _MOST_AWAITED = 64
-"""Connections without a whole request; for each further one, the oldest of them is closed."""
+"""Maximum number of connections without a whole request; one more closes the oldest."""
 
 _STALLED_S = 30.0
-"""A browser that takes nothing for so long is left."""
+"""Seconds without progress after which a connection is dropped."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Answer:
-    """What a request gets."""
+class Response:
+    """Response to a request."""
 
     body: bytes
     kind: str = "application/json"
-    """Media type."""
+    """Media type of the body."""
     headers: Mapping[str, str] = field(default_factory=dict)
-    """Further ones."""
+    """Headers in addition to SAFE_HEADERS."""
 
 
-def json_answer(value: Any) -> Answer:
-    """Return a value as JSON."""
-    return Answer(body=json.dumps(value, allow_nan=False).encode())
+def json_response(value: Any) -> Response:
+    """Return a response with a value as JSON."""
+    return Response(body=json.dumps(value, allow_nan=False).encode())
 
 
 @dataclass(frozen=True, kw_only=True)
-class Question:
-    """A request that may pass."""
+class Request:
+    """Request that passed the guard."""
 
     path: str
-    """Below the password, decoded, without the first slash."""
+    """Decoded path below the token, without the first slash."""
     query: Mapping[str, str]
-    """What stands behind the question mark."""
+    """Parameters after the question mark, by name."""
     body: Any = None
-    """JSON of a POST."""
+    """JSON value of a POST; None for a GET."""
 
 
-class NotThere(TrilightError):
-    """There is nothing at a path."""
+class NotFound(TrilightError):
+    """Error of a path without a route or a resource (404)."""
 
 
-Route = Callable[[Question], Answer]
-"""Answers the requests of one path, or of all paths below a prefix that ends in a slash; raises
-TrilightError with a sentence for the page, NotThere where there is nothing."""
+Route = Callable[[Request], Response]
+"""Handler of one path, or of all paths below a prefix that ends in a slash; raises TrilightError
+with a sentence for the page, NotFound where there is no resource."""
 
 
-def routed(routes: Mapping[str, Route], question: Question) -> Answer:
-    """Return what the route of a question answers; raises TrilightError as a `Route` does."""
-    path = question.path
+def dispatch(routes: Mapping[str, Route], request: Request) -> Response:
+    """Return the response of the route of a request; raises TrilightError as a `Route` does."""
+    path = request.path
     for prefix, route in routes.items():
         if path == prefix or (prefix.endswith("/") and path.startswith(prefix)):
-            return route(question)
-    raise NotThere(f"{path or 'the page'}: nothing is there.")
+            return route(request)
+    raise NotFound(f"{path or 'the page'}: nothing is there.")
 
 
 class PageServer(ThreadingHTTPServer):
-    """Listens on loopback; `address` is what a person opens."""
+    """Server on loopback; `address` is the URL to open."""
 
     daemon_threads = True
     request_queue_size = 64
@@ -84,13 +84,15 @@ class PageServer(ThreadingHTTPServer):
     def __init__(
         self, gets: Mapping[str, Route], posts: Mapping[str, Route], *, port: int = 0
     ) -> None:
-        """Take a port; 0 for any that is free.
+        """Listen on a port; 0 stands for any free one.
 
         Raises:
-            TrilightError: the port is taken.
+            TrilightError: the port cannot be used.
         """
-        self.gets, self.posts, self.word = gets, posts, new_word()
-        self.places = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        self.gets = gets
+        self.posts = posts
+        self.token = new_token()
+        self.slots = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self._awaited: dict[socket.socket, float] = {}
         self._changing = threading.Lock()
         try:
@@ -103,36 +105,36 @@ class PageServer(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """URL with the password."""
-        return f"http://{HOST}:{self.server_port}/{self.word}/"
+        """URL of the page, with the secret token."""
+        return f"http://{HOST}:{self.server_port}/{self.token}/"
 
     def await_request(self, connection: socket.socket) -> None:
-        """Take notice that a connection has no request yet; of too many, close the oldest."""
+        """Record that a connection has no request yet; of too many, close the oldest."""
         with self._changing:
             self._awaited[connection] = time.monotonic()
             if len(self._awaited) > _MOST_AWAITED:
                 self._end(next(iter(self._awaited)))
 
     def note_arrival(self, connection: socket.socket) -> None:
-        """Take notice that a connection has a whole request, or has ended."""
+        """Record that a connection has a whole request, or has ended."""
         with self._changing:
             self._awaited.pop(connection, None)
 
     def service_actions(self) -> None:
-        """Close connections whose request takes too long; called twice a second."""
+        """Close connections whose request takes too long; the server calls this twice a second."""
         with self._changing:
             before = time.monotonic() - _REQUEST_S
             for connection in [key for key, began in self._awaited.items() if began < before]:
                 self._end(connection)
 
     def _end(self, connection: socket.socket) -> None:
-        """Wake the thread that reads from a connection, which closes it."""
+        """Shut a connection down, which wakes its reading thread; that thread closes it."""
         del self._awaited[connection]
         with contextlib.suppress(OSError):
             connection.shutdown(socket.SHUT_RDWR)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Await the first request of a connection, in a thread of its own."""
+        """Start a thread for a connection, and await its first request."""
         self.await_request(request)
         super().process_request(request, client_address)
 
@@ -142,77 +144,81 @@ class PageServer(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing: a browser that goes away in the middle of an answer is no news."""
+        """Print nothing: a browser may leave in the middle of a response."""
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One connection."""
+    """Handler of one connection."""
 
     server: PageServer
     protocol_version = "HTTP/1.1"
     timeout = _STALLED_S
-    server_version, sys_version = "trilight", ""
+    server_version = "trilight"
+    sys_version = ""
 
     def do_GET(self) -> None:
-        self._answer("GET")
+        self._respond("GET")
 
     def do_POST(self) -> None:
-        self._answer("POST")
+        self._respond("POST")
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing: the path holds the password."""
+        """Print nothing: the path holds the secret token."""
 
-    def _answer(self, method: str) -> None:
-        port, word = self.server.server_port, self.server.word
-        refused = refusal(method, self.path, self.headers.items(), port=port, word=word)
+    def _respond(self, method: str) -> None:
+        port = self.server.server_port
+        token = self.server.token
+        refused = refusal(method, self.path, self.headers.items(), port=port, token=token)
         if refused is not None:
             self.close_connection = True
-            self._say(refused.status, refused.sentence)
+            self._send_sentence(refused.status, refused.sentence)
             return
         data = self.rfile.read(int(self.headers["Content-Length"])) if method == "POST" else b""
         self.server.note_arrival(self.connection)
         status = HTTPStatus.OK
-        with self.server.places:
+        with self.server.slots:
             try:
-                answer = self._routed(method, data)
-            except NotThere as error:
-                status, sentence = HTTPStatus.NOT_FOUND, str(error)
+                response = self._dispatch(method, data)
+            except NotFound as error:
+                status = HTTPStatus.NOT_FOUND
+                sentence = str(error)
             except TrilightError as error:
-                status, sentence = HTTPStatus.UNPROCESSABLE_ENTITY, str(error)
+                status = HTTPStatus.UNPROCESSABLE_ENTITY
+                sentence = str(error)
             except Exception as error:
                 status = HTTPStatus.INTERNAL_SERVER_ERROR
                 sentence = f"The viewer cannot answer this ({type(error).__name__})."
         if status == HTTPStatus.OK:
-            self._send(status, answer)
+            self._send(status, response)
         else:
-            self._say(status, sentence)
+            self._send_sentence(status, sentence)
         self.server.await_request(self.connection)
 
-    def _routed(self, method: str, data: bytes) -> Answer:
+    def _dispatch(self, method: str, data: bytes) -> Response:
         path, _, query = self.path.partition("?")
-        below = unquote(path.removeprefix(f"/{self.server.word}")).removeprefix("/")
+        below = unquote(path.removeprefix(f"/{self.server.token}")).removeprefix("/")
         body = _parse_body(data) if method == "POST" else None
-        question = Question(path=below, query=dict(parse_qsl(query)), body=body)
-        return routed(self.server.posts if method == "POST" else self.server.gets, question)
+        request = Request(path=below, query=dict(parse_qsl(query)), body=body)
+        return dispatch(self.server.posts if method == "POST" else self.server.gets, request)
 
-    def _say(self, status: HTTPStatus, sentence: str) -> None:
-        """Send a sentence: to a script as JSON, to a person as text."""
+    def _send_sentence(self, status: HTTPStatus, sentence: str) -> None:
+        """Send a sentence: as text where HTML is accepted, else as JSON."""
         if "text/html" in self.headers.get("Accept", ""):
-            self._send(status, Answer(body=sentence.encode(), kind="text/plain; charset=utf-8"))
+            self._send(status, Response(body=sentence.encode(), kind="text/plain; charset=utf-8"))
         else:
-            self._send(status, json_answer({"error": sentence}))
+            self._send(status, json_response({"error": sentence}))
 
-    def _send(self, status: HTTPStatus, answer: Answer) -> None:
+    def _send(self, status: HTTPStatus, response: Response) -> None:
         self.send_response(status)
-        headers = {"Content-Type": answer.kind, "Content-Length": str(len(answer.body))}
-        for name, value in {**SAFE_HEADERS, **headers, **answer.headers}.items():
+        headers = {"Content-Type": response.kind, "Content-Length": str(len(response.body))}
+        for name, value in {**SAFE_HEADERS, **headers, **response.headers}.items():
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(answer.body)
+        self.wfile.write(response.body)
 
 
 def _parse_body(data: bytes) -> Any:
-    """Return the JSON of a request; raises TrilightError for anything else, NaN and infinities."""
+    """Return the JSON of a request; raises TrilightError for anything else, also for NaN."""
     parsers = dict.fromkeys(("parse_float", "parse_int", "parse_constant"), _parse_number)
     try:
         return json.loads(data, **parsers)  # type: ignore[arg-type]

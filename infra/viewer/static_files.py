@@ -1,11 +1,11 @@
-"""Files of the pages: scripts, styles and three.js, all from the package and none from elsewhere.
+"""Static files of the pages: scripts, styles and three.js, all from the package.
 
-They are listed when the server starts, so that a path of a request only ever chooses from a list.
+They are listed when the server starts, so that a request's path only selects from a list.
 """
 
 from pathlib import Path
 
-from infra.viewer.server import Answer, NotThere, Question, Route
+from infra.viewer.server import NotFound, Request, Response, Route
 
 STATIC = Path(__file__).with_name("static")
 
@@ -19,18 +19,18 @@ _KINDS = {
 
 
 def static_routes(page: str) -> dict[str, Route]:
-    """Return the routes of the files below `static/`, and of a page at the address itself."""
+    """Return the routes of the files below `static/`, and of the page at the root."""
     files = {
         path.relative_to(STATIC).as_posix(): path for path in STATIC.rglob("*") if path.is_file()
     }
 
-    def file(question: Question) -> Answer:
-        name = question.path.removeprefix("static/")
+    def file(request: Request) -> Response:
+        name = request.path.removeprefix("static/")
         if name not in files:
-            raise NotThere("there is no such file.")
-        return Answer(body=files[name].read_bytes(), kind=_KINDS[files[name].suffix])
+            raise NotFound("there is no such file.")
+        return Response(body=files[name].read_bytes(), kind=_KINDS[files[name].suffix])
 
-    def index(question: Question) -> Answer:
-        return Answer(body=files[page].read_bytes(), kind=_KINDS[".html"])
+    def index(request: Request) -> Response:
+        return Response(body=files[page].read_bytes(), kind=_KINDS[".html"])
 
     return {"": index, "static/": file}

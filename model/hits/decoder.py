@@ -21,7 +21,7 @@ from torch.nn.functional import silu, softplus
 
 from model.attention import Keys, attend
 from model.config import ModelConfig
-from model.encoded_scene import EncodedScene, KeysValues, TokenPlaces
+from model.encoded_scene import EncodedScene, KeysValues, TokenPositions
 from model.hits.lie import FARTHEST, NEIGHBOURS, PLACE, Lie, lies_to
 from model.hits.light_filter import LightFilter, filter_flops
 from model.hits.traced import INPUTS, Traced
@@ -38,7 +38,7 @@ from model.layers import (
 )
 from model.packing import Packing
 from model.positions import Rotation, TriangleRotary, packed_rotation, rotate, world_rotation
-from model.precision import as_given, quick_products
+from model.precision import fast_float32_products, without_autocast
 
 _SURFACE = 3 + 3 + 3 + 1 + 3 + 3 + 1 + 1 + 1 + 4
 """Numbers that say what surface a pixel sees, and what its mirrored ray (`_surface`)."""
@@ -179,7 +179,7 @@ class HitDecoder(nn.Module):
         self.head = PixelHead(config)
 
     def keys_values(
-        self, context_BNW: Tensor, places: TokenPlaces, packing: Packing | None = None
+        self, context_BNW: Tensor, places: TokenPositions, packing: Packing | None = None
     ) -> tuple[KeysValues, ...]:
         """Return what each layer asks of a context, keys rotated in the world: once a scene."""
         rotation_BND = world_rotation(self.rotary, places)
@@ -198,7 +198,7 @@ class HitDecoder(nn.Module):
             scene: B scenes.
             traced: V views of each, as `model.hits.traced.stack_traced` makes them.
         """
-        with as_given(traced.pixels_VRRC.device):
+        with without_autocast(traced.pixels_VRRC.device):
             unit_B1113 = traced.unit_3[:, None, None, None, :]
             told, mirrored = self._told(traced, unit_B1113)
             at = _at_anchors(traced)
@@ -209,7 +209,7 @@ class HitDecoder(nn.Module):
         x_BVAW = self._asked(scene, traced, anchor, place[..., Channel.POSITION])
         device = traced.pixels_VRRC.device
         trains = torch.is_grad_enabled() and torch.is_autocast_enabled("cuda")
-        with as_given(device), quick_products(device, wanted=trains):
+        with without_autocast(device), fast_float32_products(device, enabled=trains):
             return self._pictures(traced, told, mirrored, x_BVAW.to(told.dtype), place, unit_B1113)
 
     def _told(self, traced: Traced, unit_B1113: Tensor) -> tuple[Tensor, Tensor]:

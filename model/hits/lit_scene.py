@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from model.hits.textures import SurfaceTextures
 from model.hits.vectors import Floats, as_rows, brightest, dot, unit
-from model.sky.drawn import DrawnSky
+from model.sky.sampler import SkySampler
 from storage.records.environment import Environment
 from storage.records.lobes import lobes_of
 from storage.records.material import EMISSION, ROUGHNESS
@@ -144,10 +144,10 @@ class LitScene:
         return len(self.area)
 
     @cached_property
-    def drawn_sky(self) -> DrawnSky:
+    def drawn_sky(self) -> SkySampler:
         """The sky of a scene that has one, for rays."""
         assert self.sky is not None
-        return DrawnSky(self.sky)
+        return SkySampler(self.sky)
 
     @cached_property
     def seen(self) -> Triangles:

@@ -108,7 +108,7 @@ def _mirrored(
     if scene.sky is not None:
         # blurred: no other ray shares the sun with this one, which is met once in thousands
         beyond_all = np.flatnonzero(~met & (weight > 0))
-        sky = scene.drawn_sky.blurred(onward[:, beyond_all])
+        sky = scene.drawn_sky.blurred_radiance(onward[:, beyond_all])
         arrives[:, beyond_all] = weight[beyond_all] * sky
     return gloss.colour * arrives
 

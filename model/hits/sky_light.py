@@ -46,7 +46,7 @@ def add_sky_light(
     for number in range(rays):
         u = spread(shift, turn * rays + number)
         if number < by_map:
-            direction = scene.drawn_sky.drawn(u)
+            direction = scene.drawn_sky.sample_directions(u)
         else:
             direction = cosine_direction(u, points.normal, points.edge)
         _add(light, scene, points, gloss, direction, by_map, rays - by_map, lobe_rays)
@@ -88,7 +88,7 @@ def sky_density(
     scene: LitScene, direction: Floats, cosine: Floats, by_map: int, by_surface: int
 ) -> Floats:
     """Return how many rays [P] `add_sky_light` sends along directions, per steradian."""
-    density: Floats = by_map * scene.drawn_sky.density(direction)
+    density: Floats = by_map * scene.drawn_sky.pdf(direction)
     density += by_surface * _INV_PI * np.maximum(cosine, 0)
     return np.maximum(density, _LEAST)
 

@@ -14,7 +14,7 @@ from model.hits.textures import SurfaceTextures
 from model.hits.traced import INPUTS, Traced, stack_traced
 from model.hits.view_inputs import ViewInputs, view_inputs
 from model.scene_tensors import Cameras, SceneBatch, SceneTensors
-from model.sky.known import require_known
+from model.sky.known import require_known_sky
 from storage.conventions import radiance_from_log10
 from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
@@ -102,7 +102,7 @@ def with_traced(
 
     `seed` is that of the noise: a network that saw one noise alone might learn it.
     """
-    require_known(scene.sky, config)
+    require_known_sky(scene.sky, config)
     lit = lit_scene_of(scene)
     ready = TracedScene(lit=lit, light=scene_light(lit))
     traced = traced_views(ready, scene.c2w_V44, scene.fov_deg_V, resolution, config, seed)

@@ -1,7 +1,7 @@
-"""The published configuration: its JSON to ours and back.
+"""Conversion between the published configuration and ours.
 
-Of what it could describe, one architecture was published, in two families: V1-Base, and V1.1-Large
-with Swin windows. A field that asks for anything else is refused by name.
+Of the configurations that its JSON allows, two families were published: V1-Base, and V1.1-Large
+with Swin windows. Any other value of a field is refused by name.
 """
 
 from collections.abc import Mapping
@@ -40,7 +40,7 @@ _FIXED: dict[str, Any] = {
     "turn_to_cam_coord": True,
     "use_ldr": False,
 }
-"""Fields with one published value, which is also their default there."""
+"""Fields with a single published value, which is also their default there."""
 
 _DEFAULTS: dict[str, Any] = {
     "latent_dim": 768,
@@ -62,31 +62,31 @@ _DEFAULTS: dict[str, Any] = {
     "dpt_out_channels": [96, 192, 384, 768],
     "dpt_out_layers": None,
 }
-"""The other fields and their published defaults, which a configuration may leave out."""
+"""Other fields with their published defaults, which a configuration may omit."""
 
 _EQUAL = (
     ("view_transformer_latent_dim", "latent_dim"),
     ("view_transformer_ffn_hidden_dim", "dim_feedforward"),
     ("view_transformer_n_heads", "num_heads"),
 )
-"""Fields of the view stage that equal those of the other in both families, and here always."""
+"""Pairs of fields of the two stages that are equal in both families, and always here."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PublishedConfig:
-    """What a published configuration says."""
+    """Content of a published configuration."""
 
     model: ModelConfig
-    """The network."""
+    """Configuration of the network."""
     texture_patch: int
     """Width P of its texture input in cells."""
 
 
 def decode_published(fields: Mapping[str, Any]) -> PublishedConfig:
-    """Return what a published config.json says.
+    """Return the content of a published config.json.
 
     Raises:
-        TrilightError: a field is unknown or asks for what was never published; all are named.
+        TrilightError: a field is unknown or has an unpublished value; the message lists all.
     """
     _require_known(fields)
     got = _DEFAULTS | dict(fields)
@@ -115,24 +115,24 @@ def decode_published(fields: Mapping[str, Any]) -> PublishedConfig:
 
 
 def encode_published(config: PublishedConfig) -> dict[str, Any]:
-    """Return the config.json of a network, with every field spelled out.
+    """Return the config.json of a network, with all fields.
 
     Raises:
-        TrilightError: the network is none of the two families: a linear head, other material
-            columns, windows of another width, or rotary frequencies that their code does not build.
+        TrilightError: the network is of neither family: a linear head, other material columns,
+            windows of another width, or rotary frequencies that the published code cannot build.
     """
     model = config.model
     doubled = model.rope_max_freq == _max_freq(model.rope_num_freqs, doubled=True)
     if model.head != "dpt":
-        _unpublished("head linear", "dpt")
+        _raise_unpublished("head linear", "dpt")
     if model.demodulated:
-        _unpublished("demodulated True", "False")
+        _raise_unpublished("demodulated True", "False")
     if model.material_columns != PUBLISHED_COLUMNS:
-        _unpublished(f"material_columns {model.material_columns}", f"{PUBLISHED_COLUMNS}")
+        _raise_unpublished(f"material_columns {model.material_columns}", f"{PUBLISHED_COLUMNS}")
     if model.window_bundles not in (0, WINDOW_BUNDLES):
-        _unpublished(f"window_bundles {model.window_bundles}", f"0 or {WINDOW_BUNDLES}")
+        _raise_unpublished(f"window_bundles {model.window_bundles}", f"0 or {WINDOW_BUNDLES}")
     if not doubled and model.rope_max_freq != _max_freq(model.rope_num_freqs, doubled=False):
-        _unpublished(
+        _raise_unpublished(
             f"rope_max_freq {model.rope_max_freq} of {model.rope_num_freqs} frequencies",
             "one less than their number, or than twice their number",
         )
@@ -159,7 +159,7 @@ def encode_published(config: PublishedConfig) -> dict[str, Any]:
 
 
 def _max_freq(num_freqs: int, *, doubled: bool) -> int:
-    """Return the highest frequency as their code derives it."""
+    """Return the highest frequency as the published code derives it."""
     return 2 * num_freqs - 1 if doubled else num_freqs - 1
 
 
@@ -190,7 +190,7 @@ def _require_known(fields: Mapping[str, Any]) -> None:
         )
 
 
-def _unpublished(got: str, expected: str) -> None:
+def _raise_unpublished(got: str, expected: str) -> None:
     raise TrilightError(
         f"export: {got}; the published code builds {expected} only. Keep our own file, which "
         "`trilight` reads."

@@ -1,10 +1,10 @@
-"""Tensors under published names -> a network of ours, and back.
+"""Conversion between tensors under published names and our networks.
 
-All layers are copied under another name but one. The published material encoder reads a 13 x P x P
+All layers but one are copied under another name. The published material encoder reads a 13 x P x P
 texture. Its input is always the same 13 numbers in every cell (x, y) with x + y <= P, and zero
-elsewhere, and three of them, the tangent-space normal, are always (0.5, 0.5, 1). So its weights may
-be summed over those cells, and the normal's share of the result belongs to the bias: the same
-function at a thousandth of the input and 10 million fewer weights (P = 32).
+elsewhere, and three of them, the tangent-space normal, are always (0.5, 0.5, 1). So its weights are
+summed over those cells, and the normal's contribution is added to the bias: the same function at a
+thousandth of the input and 10 million fewer weights (P = 32).
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from model.weights import network_of, require_tensors
 from storage.errors import TrilightError
 
 FREQUENCY_TOLERANCE = 1e-6
-"""Largest relative difference of the stored frequencies from the formula's: float32's rounding."""
+"""Maximum relative difference of stored frequencies from the formula: float32's rounding."""
 
 
 def from_published(tensors: Mapping[str, Tensor], config: PublishedConfig) -> RenderFormer:
@@ -29,8 +29,8 @@ def from_published(tensors: Mapping[str, Tensor], config: PublishedConfig) -> Re
         tensors, config: as published.
 
     Raises:
-        TrilightError: names or shapes are not those of the configuration, each listed; or the
-            rotary frequencies are not those that the configuration means.
+        TrilightError: names or shapes do not match the configuration (all are listed), or the
+            rotary frequencies do not.
     """
     with torch.device("meta"):
         expected = to_published(RenderFormer(config.model), config.texture_patch)
@@ -57,9 +57,9 @@ def from_published(tensors: Mapping[str, Tensor], config: PublishedConfig) -> Re
 
 
 def to_published(model: RenderFormer, texture_patch: int) -> dict[str, Tensor]:
-    """Return a network's tensors under published names; the texture encoder is unfolded.
+    """Return a network's tensors under published names, with the texture encoder unfolded.
 
-    Reading them back gives the same network, bit by bit.
+    Reading them back gives exactly the same network.
     """
     state = model.state_dict()
     material = "encoder.tokens.material"
@@ -88,10 +88,10 @@ def _require_frequencies(name: str, got_F: Tensor, expected_F: Tensor) -> None:
 
 
 TEXTURE = "texture_encoder"
-"""The one layer that is folded and not copied (`fold`)."""
+"""Published name of the layer that is folded and not copied (`fold`)."""
 
 FREQUENCIES = ("transformer.rope_emb.freqs", "view_transformer.transformer.rope_emb.freqs")
-"""Rotary frequencies of both stages, frozen and equal; ours follow from the configuration."""
+"""Published names of the rotary frequencies of both stages, which our configuration determines."""
 
 TRIANGLE_TOKEN = "tri_token"
 REGISTERS = "reg_tokens"
@@ -102,7 +102,7 @@ _VIEW = "view_transformer"
 
 
 def module_names(config: ModelConfig) -> dict[str, str]:
-    """Return the published name of every layer with weights, by our name, but the material's."""
+    """Return the published name of every layer with weights by our name, without the material's."""
     table = {
         "encoder.tokens.material_norm": f"{TEXTURE}_norm",
         "encoder.tokens.normal": "vn_encoding_proj",
@@ -158,7 +158,8 @@ def _dpt(ours: str, theirs: str) -> dict[str, str]:
         f"{ours}.last": f"{scratch}.output_conv2.2",
     }
     for level in range(NUM_TAPS):
-        fuse, block = f"{ours}.fuse.{level}", f"{scratch}.refinenet{level + 1}"
+        fuse = f"{ours}.fuse.{level}"
+        block = f"{scratch}.refinenet{level + 1}"
         table |= {
             f"{ours}.project.{level}": f"{theirs}.projects.{level}",
             f"{ours}.resize.{level}": f"{theirs}.resize_layers.{level}",
@@ -183,7 +184,7 @@ TANGENT_NORMAL = (0.5, 0.5, 1.0)
 def fold(weight_WC: Tensor, bias_W: Tensor, patch: int) -> tuple[Tensor, Tensor]:
     """Return weight [W, 10] and bias [W] for the published weight [W, 13 P P] and bias.
 
-    Sums in float64, returns the type it was given.
+    It sums in float64, and returns the type of its inputs.
     """
     cells = weight_WC.double().unflatten(1, (TEXTURE_CHANNELS, patch, patch))
     place = torch.arange(patch, device=weight_WC.device)
@@ -195,10 +196,10 @@ def fold(weight_WC: Tensor, bias_W: Tensor, patch: int) -> tuple[Tensor, Tensor]
 
 
 def unfold(weight_WC: Tensor, bias_W: Tensor, patch: int) -> tuple[Tensor, Tensor]:
-    """Return a published weight [W, 13 P P] and bias that `fold` turns into these, bit by bit.
+    """Return a published weight [W, 13 P P] and bias that `fold` converts exactly to these.
 
-    What was summed cannot be told apart again: the whole weight stands in the first cell, and the
-    normal's columns are zero.
+    The sum cannot be undone: the whole weight is in the first cell, and the normal's columns are
+    zero.
     """
     cells = weight_WC.new_zeros((len(weight_WC), TEXTURE_CHANNELS, patch, patch))
     cells[:, : NORMAL.start, 0, 0] = weight_WC[:, : NORMAL.start]

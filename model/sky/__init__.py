@@ -1,1 +1,1 @@
-"""Light from far away, for networks: directions drawn by it, and its symmetries."""
+"""Environment light for networks: importance sampling, and its symmetries."""

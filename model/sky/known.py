@@ -1,25 +1,25 @@
-"""Which networks know the light of a sky, and what happens to scenes that have one."""
+"""Check that a network supports the environment light of a scene."""
 
 from typing import TYPE_CHECKING
 
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 
-if TYPE_CHECKING:  # it brings the checker of settings along
+if TYPE_CHECKING:  # it loads pydantic
     from model.config import ModelConfig
 
 
-def shining(sky: Environment | None) -> Environment | None:
-    """Return an environment that gives light; None for one that is black, which is none."""
+def lit_sky(sky: Environment | None) -> Environment | None:
+    """Return the environment, or None if it is missing or black."""
     return sky if sky is not None and sky.radiance_rgb.any() else None
 
 
-def require_known(sky: Environment | None, config: "ModelConfig") -> None:
-    """Refuse a sky whose light a network is not told: its picture would be that of another scene.
+def require_known_sky(sky: Environment | None, config: "ModelConfig") -> None:
+    """Raise if a scene has a sky that the network does not support.
 
     Raises:
-        TrilightError: the network knows no sky, or cameras see the sky itself, which no network
-            shows behind things.
+        TrilightError: the network has no input for a sky, or cameras see the sky directly, which no
+            network renders.
     """
     if sky is None:
         return

@@ -1,6 +1,6 @@
-"""Symmetries of light that hold for an environment too: each returns another map of the same light.
+"""Symmetries of environment maps, for augmentation.
 
-A turn changes no texel; a mirror turns the order of columns, and so does no more than a turn.
+A rotation changes no texel; a mirror reverses the order of columns, and then is a rotation.
 """
 
 import dataclasses
@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from storage.records.environment import Environment
 
 _FLIP = np.diag([1.0, -1.0, 1.0])
-"""What reversed columns do: azimuths change their signs."""
+"""Matrix of reversed columns, which negate azimuths."""
 
 
-def turned(sky: Environment, rotation_33: NDArray[np.float64]) -> Environment:
-    """Return the sky after a rotation of the world."""
+def rotate_sky(sky: Environment, rotation_33: NDArray[np.float64]) -> Environment:
+    """Return the sky after a rotation of the world space."""
     rotation = rotation_33 @ sky.rotation.astype(np.float64)
     return dataclasses.replace(sky, rotation=rotation.astype(np.float32))
 
 
-def behind_mirror(sky: Environment, sides_3: NDArray[np.float32]) -> Environment:
-    """Return the sky behind a mirror, which turns the coordinates whose `sides` are -1: one of 3.
+def mirror_sky(sky: Environment, sides_3: NDArray[np.float32]) -> Environment:
+    """Return the mirrored sky; the one coordinate whose `sides` is -1 is negated.
 
-    Texels of reversed columns stand where the reflection puts them, to the last bit.
+    Texels of reversed columns are exactly where the reflection puts them.
     """
     rotation = np.diag(sides_3.astype(np.float64)) @ sky.rotation.astype(np.float64) @ _FLIP
     return dataclasses.replace(
@@ -33,11 +33,11 @@ def behind_mirror(sky: Environment, sides_3: NDArray[np.float32]) -> Environment
     )
 
 
-def with_channels(sky: Environment, order: NDArray[np.integer]) -> Environment:
-    """Return the sky with its colour channels in another order."""
+def permute_sky_channels(sky: Environment, order: NDArray[np.integer]) -> Environment:
+    """Return the sky with permuted color channels."""
     return dataclasses.replace(sky, radiance_rgb=np.ascontiguousarray(sky.radiance_rgb[..., order]))
 
 
-def scaled(sky: Environment, factor: float) -> Environment:
-    """Return the sky with all of its light `factor` times as strong."""
+def scale_sky(sky: Environment, factor: float) -> Environment:
+    """Return the sky with its radiance multiplied by `factor`."""
     return dataclasses.replace(sky, radiance_rgb=sky.radiance_rgb * np.float32(factor))

@@ -128,7 +128,7 @@ def _key(
             kind, digest = source_digest(source, settings, root)
         else:
             with borrow_child() as child:
-                child.may(reach(files=[source, root or source]))
+                child.allow_files(reach(files=[source, root or source]))
                 kind, digest = call_with_retries(child, source_digest, source, settings, root)
     except ChildFailed as failure:
         raise Rejected(failure.reason, failure.sentence) from failure
@@ -164,7 +164,7 @@ def _outcome(
     """
     try:
         with borrow_child() as child:
-            child.may(reach(files=[source, root or source]))
+            child.allow_files(reach(files=[source, root or source]))
             return _by_any_method(child, source, root, settings, methods)
     except Rejected as rejection:
         return rejection

@@ -7,7 +7,6 @@ uses it; then it is made again.
 """
 
 import contextlib
-import json
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -16,10 +15,11 @@ from pathlib import Path
 from pipeline.assets.recipe import READERS, RECIPE
 from pipeline.assets.settings import AssetSettings
 from storage.atomic import TEMPORARY_SUFFIX, write_atomically
-from storage.claims import claimed
+from storage.claims import hold_claim
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
 from storage.records.asset import Asset, encode_asset
+from storage.typed_json import read_json
 
 _FAN_OUT = 2
 """Letters of the name that choose a sub-folder, so that no folder holds every outcome."""
@@ -29,6 +29,14 @@ _OLD_S = 24 * 3600
 _LOCKS = 3
 """Letters of the name that choose a lock: 4096 files that need no clearing away, at the price of a
 rare wait for another object."""
+
+
+@dataclass(frozen=True)
+class _Refusal:
+    """Content of the file of a refused source."""
+
+    reason: str
+    message: str
 
 
 @dataclass(frozen=True)
@@ -48,14 +56,17 @@ class AssetStore:
         return self.root / key[:_FAN_OUT] / f"{key}.safetensors"
 
     def refusal(self, key: str) -> Rejected | None:
-        """Return why the source was refused, where it was."""
+        """Return why the source was refused, where it was; TrilightError of a damaged file."""
         path = self._refusal_path(key)
-        return Rejected(**json.loads(path.read_bytes())) if path.exists() else None
+        if not path.exists():
+            return None
+        refusal = read_json(path.read_bytes(), _Refusal, _named(path))
+        return Rejected(refusal.reason, refusal.message)
 
     def unread(self, key: str) -> tuple[str, ...]:
-        """Return what of the source no code has read."""
+        """Return what of the source no code has read; TrilightError of a damaged file."""
         path = self._unread_path(key)
-        return tuple(json.loads(path.read_bytes())) if path.exists() else ()
+        return tuple(read_json(path.read_bytes(), list[str], _named(path))) if path.exists() else ()
 
     def keep(self, key: str, asset: Asset, unread: tuple[str, ...] = ()) -> None:
         """Store an asset; raises TrilightError where that cannot be written."""
@@ -77,7 +88,7 @@ class AssetStore:
         Raises:
             TrilightError: the store cannot be written.
         """
-        with claimed(self.root / "locks" / key[:_LOCKS], wait=True):
+        with hold_claim(self.root / "locks" / key[:_LOCKS], wait=True):
             yield
 
     def _unread_path(self, key: str) -> Path:
@@ -85,6 +96,10 @@ class AssetStore:
 
     def _refusal_path(self, key: str) -> Path:
         return self.asset_path(key).with_suffix(".json")
+
+
+def _named(path: Path) -> str:
+    return f"{path} of the asset store (delete it, and it is made again)"
 
 
 def _remove_old_leftovers(folder: Path) -> None:

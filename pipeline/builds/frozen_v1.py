@@ -1,7 +1,7 @@
-"""What the published sets are made with, with every number stated: no default may change them.
+"""Frozen settings of the published sets, with every number stated: no default may change them.
 
-See scene_templates.frozen_v1. A build that networks are trained on may move on; these may
-not, so they are built from nothing that does.
+See scene_templates.frozen_v1. A build for training may change in later versions; these may not, so
+they use no settings that do.
 """
 
 from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
@@ -91,7 +91,7 @@ BUILD_V1 = BuildSettings(
     storage=StorageSettings(profile="compact", passes=()),
     revisit=None,
 )
-"""What the published sets have in common; each says what it changes of it."""
+"""Common settings of the published sets; each set states its changes."""
 
 JUDGING_SPLITS = SplitSettings(
     scenes_per_shard=20,
@@ -101,4 +101,4 @@ JUDGING_SPLITS = SplitSettings(
     listed_scenes=None,
     listed_shards=(),
 )
-"""Of sets whose scenes are all of the split `test`."""
+"""Split settings of sets whose scenes all belong to the split `test`."""

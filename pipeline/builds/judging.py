@@ -1,6 +1,6 @@
-"""The builds that networks are judged on, and never trained: all of their scenes are of `test`.
+"""Builds for the evaluation of networks, never for training: all scenes belong to `test`.
 
-Their pictures are kept without loss: there are few, and all figures are measured against them.
+Their pictures are stored without loss: there are few, and all figures are measured against them.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ _EXACT = StorageSettings(profile="lossless", passes=())
 
 
 def out_of_range() -> BuildSettings:
-    """One axis at a time beyond the trained range: 37 values of nine axes in four layouts."""
+    """Scenes with one axis beyond the trained range: 37 values of nine axes in four layouts."""
     return dataclasses.replace(
         BUILD_V1,
         build="out-of-range",
@@ -29,9 +29,9 @@ def out_of_range() -> BuildSettings:
 
 
 def out_of_range_2() -> BuildSettings:
-    """`out-of-range` with twelve values of five axes of textures and skies after the others.
+    """`out-of-range` with twelve more values: five axes of textures and skies.
 
-    Another set: the scenes of the first nine axes are drawn as there, and are others.
+    It is another set: the first nine axes have the same distribution, and different scenes.
     """
     build = out_of_range()
     return dataclasses.replace(
@@ -45,8 +45,8 @@ def out_of_range_2() -> BuildSettings:
 def benchmark_v1() -> BuildSettings:
     """200 frozen scenes, 50 of each layout, one view each, to 48 dB or 2048 samples.
 
-    The settings, the seed and the built-in objects are frozen: whoever runs it gets the same
-    scenes (their digest is below, and in docs/reference). For the second resolution use
+    The settings, the seed and the built-in objects are frozen: every run gives the same scenes
+    (their digest is below, and in docs/reference). For the second resolution use
     `--resolution 512`.
     """
     return dataclasses.replace(

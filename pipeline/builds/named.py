@@ -1,4 +1,4 @@
-"""The named builds: each a function that returns the full settings of a dataset."""
+"""Registry of named builds: each is a function that returns the full settings of a dataset."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -23,31 +23,31 @@ BUILDS: Registry[NamedBuild] = Registry(
     {**TRAINING_BUILDS, **RENDERFORMER_BUILDS, **JUDGING_BUILDS},
     decides=("data",),
 )
-"""By the name that the command line takes."""
+"""Builds by the name that the command line takes."""
 
 
 def typed_build(typed: str) -> str:
-    """Return the name of a build as a person typed it on a command line.
+    """Return the name of a build that was typed on a command line; executes a user's file.
 
-    Of FILE.py:FUNCTION, a file of their own, it registers what the function returns: BuildSettings,
-    of which a cycle of shards is made unless said otherwise, or a NamedBuild. Names that come from
-    elsewhere, a dataset or a form, must not be brought here, since the file is run.
+    For FILE.py:FUNCTION it registers the function's result: a NamedBuild, or BuildSettings, which
+    get one cycle of shards by default. Names from a dataset or a form must not be passed, since the
+    file is executed.
 
     Raises:
         TrilightError: as `Registry.typed`, or the function returns something else.
     """
-    return BUILDS.typed(typed, _as_build)
+    return BUILDS.resolve(typed, _as_build)
 
 
-def _as_build(found: Any) -> NamedBuild:
-    if isinstance(found, BuildSettings):
-        splits = found.splits
+def _as_build(returned: Any) -> NamedBuild:
+    if isinstance(returned, BuildSettings):
+        splits = returned.splits
         num_scenes = splits.shards_per_cycle * splits.scenes_per_shard
-        return NamedBuild(settings=lambda: found, num_scenes=num_scenes)
-    if isinstance(found, NamedBuild):
-        return found
+        return NamedBuild(settings=lambda: returned, num_scenes=num_scenes)
+    if isinstance(returned, NamedBuild):
+        return returned
     raise TrilightError(
-        f"it returned a {type(found).__name__}; expected BuildSettings or a NamedBuild."
+        f"it returned a {type(returned).__name__}; expected BuildSettings or a NamedBuild."
     )
 
 
@@ -62,18 +62,18 @@ def named_build(
     allow_licences: tuple[str, ...] = (),
     changes: Mapping[str, Any] | None = None,
 ) -> BuildSettings:
-    """Return the settings of a build with what the caller wants otherwise.
+    """Return the settings of a build with the caller's changes.
 
     Args:
         name: one of BUILDS.
-        seed, resolution: replace the build's value where not None.
-        noise_floor_db, noise_floor_linear_db, noise_floor_objects_db: where one is a number, they
-            replace the build's, so that those left out do not count.
-        allow_licences: allowed in addition to the build's.
+        seed, resolution: replace the build's value unless None.
+        noise_floor_db, noise_floor_linear_db, noise_floor_objects_db: if one is a number, they
+            replace all of the build's targets, and None means no such target.
+        allow_licences: licences that are allowed in addition to the build's.
         changes: any other settings by dotted name, such as `scenes.lights.coloured_share`.
 
     Raises:
-        TrilightError: an unknown name, or values that contradict each other.
+        TrilightError: the name is unknown, or values contradict each other.
     """
     build = BUILDS.find(name).settings()
     if not BUILDS.is_ours(name) and BUILDS.is_ours(build.build):
@@ -83,22 +83,22 @@ def named_build(
             f"build='my-{build.build}')."
         )
     named = {"seed": seed, "renders.resolution": resolution}
-    wanted: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
+    overrides: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
     floors = asked_floors(noise_floor_db, noise_floor_linear_db, noise_floor_objects_db)
-    wanted |= {f"renders.{name}": db for name, db in floors.items()}
-    build = changed(build, wanted)
+    overrides |= {f"renders.{name}": db for name, db in floors.items()}
+    build = changed(build, overrides)
     licences = tuple(sorted({*build.allowed_licences, *allow_licences}))
     return changed(dataclasses.replace(build, allowed_licences=licences), changes or {})
 
 
 def object_source(settings: BuildSettings, objects: str | None) -> str:
-    """Return where objects come from.
+    """Return the source of the objects.
 
     Raises:
-        TrilightError: the build is frozen with another source than the one given.
+        TrilightError: the build is frozen with another source than the given one.
     """
     if settings.source is None:
-        # Who is judged may have learnt from the built-in objects of everybody.
+        # An evaluated network may have been trained on the built-in objects.
         return objects or (BENCHMARK if settings.splits.one_split else BUILTIN)
     if objects is not None and objects != settings.source:
         raise TrilightError(
@@ -109,7 +109,7 @@ def object_source(settings: BuildSettings, objects: str | None) -> str:
 
 
 def frozen_note(build: str, statistics: Statistics) -> tuple[str, ...]:
-    """Return a note on whether the scenes of a frozen set are the published ones."""
+    """Return a note that compares the scenes of a frozen set with the published digest."""
     named = BUILDS[build]
     if named.scene_digest is None or statistics.num_scenes != named.num_scenes:
         return ()

@@ -41,7 +41,7 @@ def renderformer_v1_256(policy: Policy = "de-biased") -> BuildSettings:
         BUILD_V1,
         build="renderformer-v1-256" + _suffix(policy),
         assets=dataclasses.replace(BUILD_V1.assets, budgets=(1188, 840, 594, 396, 297, 198)),
-        scenes=_published(stage_1_families(policy), max_triangles=1572),
+        scenes=_published_scenes(stage_1_families(policy), max_triangles=1572),
     )
 
 
@@ -51,13 +51,13 @@ def renderformer_v1_512(policy: Policy = "de-biased") -> BuildSettings:
         BUILD_V1,
         build="renderformer-v1-512" + _suffix(policy),
         assets=dataclasses.replace(BUILD_V1.assets, budgets=(3968, 2380, 1188, 840, 594, 396)),
-        scenes=_published(stage_2_families(policy), max_triangles=4192),
+        scenes=_published_scenes(stage_2_families(policy), max_triangles=4192),
         renders=dataclasses.replace(BUILD_V1.renders, resolution=512),
         splits=dataclasses.replace(BUILD_V1.splits, scenes_per_shard=64),
     )
 
 
-def _published(families: tuple[Family, ...], *, max_triangles: int) -> SceneSettings:
+def _published_scenes(families: tuple[Family, ...], *, max_triangles: int) -> SceneSettings:
     return dataclasses.replace(
         SCENES_V1,
         families=families,

@@ -1,4 +1,4 @@
-"""What is new in a dataset whose scenes are those of a finished one."""
+"""Settings of a dataset that renders the scenes of a finished one again with changes."""
 
 from typing import Annotated, Literal
 
@@ -20,7 +20,7 @@ class GivenCamera:
     c2w: Annotated[tuple[float, ...], Within(-FLOAT32_MAX, FLOAT32_MAX)]
     """Camera to world, 4 x 4, row by row."""
     fov_deg: Annotated[float, Within(0, 180, low_open=True, high_open=True, unit="degrees")]
-    """Full field of view."""
+    """Full field of view of the camera."""
 
     def __post_init__(self) -> None:
         if len(self.c2w) != _POSE:
@@ -29,7 +29,7 @@ class GivenCamera:
 
 @checked("revisit settings")
 class RevisitSettings:
-    """What is new in the scenes of a finished dataset."""
+    """Changes to the scenes of a finished dataset."""
 
     source_digest: str
     """Dataset digest of the finished dataset."""
@@ -44,12 +44,12 @@ class RevisitSettings:
     given_cameras: tuple[GivenCamera, ...] = ()
     """Cameras that each scene gets after those; by default there are none."""
     lights: Literal["keep", "new"] = "keep"
-    """Whether lights stay, or are drawn anew by `scenes.lights`, as each scene's layout is lit."""
+    """Choice to keep the lights, or to draw new ones by `scenes.lights` and each scene's layout."""
     num_lights: Annotated[int | None, Within(1, 64, unit="emitters")] = None
     """Number of the new lights of each scene; by default as many as it has."""
     materials: Literal["keep", "new"] = "keep"
-    """Whether materials stay, or are drawn anew by `scenes.materials`; faces that share a colour
-    still do."""
+    """Choice to keep the materials, or to draw new ones by `scenes.materials`; faces that share a
+    color still do."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_views <= MOST_CAMERAS:
@@ -63,10 +63,10 @@ class RevisitSettings:
 
     @property
     def num_views(self) -> int:
-        """Views of each scene."""
+        """Number of views of each scene."""
         return self.kept_cameras + self.new_cameras + len(self.given_cameras)
 
     @property
     def keeps_light(self) -> bool:
-        """Whether all but the cameras stays, so that a kept camera sees the same picture."""
+        """True if only cameras change, so that a kept camera sees the same picture."""
         return self.lights == "keep" and self.materials == "keep"

@@ -1,4 +1,4 @@
-"""`BuildSettings`: everything that decides what a dataset holds, except how many scenes."""
+"""`BuildSettings`: all settings that decide the contents of a dataset, except its size."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
@@ -20,7 +20,7 @@ from storage.settings.ranges import Seed
 
 @checked()
 class BuildSettings:
-    """The settings of one dataset. They stand in its manifest and never change."""
+    """The settings of one dataset. They are stored in its manifest and never change."""
 
     build: str
     """Name of the build that the settings come from."""
@@ -31,23 +31,23 @@ class BuildSettings:
     allowed_licences: tuple[str, ...]
     """Licences of objects that may be used."""
     assets: AssetSettings
-    """How objects become meshes."""
+    """Settings of the mesh stage, which converts objects to meshes."""
     scenes: SceneSettings
-    """How meshes become scenes."""
+    """Settings of composition, which places meshes, lights and cameras in scenes."""
     renders: RenderSettings
-    """How scenes become pictures."""
+    """Settings of rendering, which makes a picture of each view."""
     splits: SplitSettings
-    """How objects and scenes are divided into splits and shards."""
+    """Settings that divide objects and scenes into splits and shards."""
     storage: StorageSettings = dataclasses.field(default_factory=StorageSettings)
-    """How arrays and pictures are packed."""
+    """Settings of the files in which arrays and pictures are packed."""
     revisit: RevisitSettings | None = None
-    """What is new, if the scenes are those of a finished dataset; by default they are composed."""
+    """Changes to the scenes of a finished dataset; by default scenes are composed."""
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave `revisit` out where there is none: digests of earlier builds stay.
+        """Omit `revisit` if there is none, so that digests of earlier builds stay.
 
-        The mesh stage is recorded as it is run, with what scenes ask of it.
+        The settings of the mesh stage are recorded with the changes that scenes require.
         """
         record: dict[str, Any] = as_usual(self)
         if self.mesh_settings.own_materials.keep:
@@ -60,12 +60,16 @@ class BuildSettings:
 
     @property
     def mesh_settings(self) -> AssetSettings:
-        """Settings of the mesh stage: objects keep their materials where scenes ask for those."""
-        own = self.assets.own_materials
-        asked = self.scenes.materials.source == "object"
-        emission = own.emission or (asked and self.scenes.materials.own_emission > 0)
-        own = dataclasses.replace(own, keep=own.keep or asked, emission=emission)
-        return dataclasses.replace(self.assets, own_materials=own)
+        """Settings of the mesh stage: objects keep their materials if scenes require them."""
+        source_materials = self.assets.own_materials
+        keeps_materials = self.scenes.materials.source == "object"
+        emission = source_materials.emission or (
+            keeps_materials and self.scenes.materials.own_emission > 0
+        )
+        source_materials = dataclasses.replace(
+            source_materials, keep=source_materials.keep or keeps_materials, emission=emission
+        )
+        return dataclasses.replace(self.assets, own_materials=source_materials)
 
     def as_json(self) -> dict[str, Any]:
         """Return the settings as JSON values."""
@@ -82,7 +86,7 @@ class NamedBuild:
     """A build that the command line knows by name."""
 
     settings: Callable[[], BuildSettings]
-    """A function that returns the settings."""
+    """Function that returns the settings of the dataset."""
     num_scenes: int
     """Number of scenes to make unless the user asks for another."""
     scene_digest: str | None = None
@@ -95,7 +99,8 @@ def differences(
 ) -> Iterator[tuple[str, Any, Any]]:
     """Yield (dotted name, value before, value now) for each setting that differs."""
     for name in sorted({*before, *now}):
-        old, new = before.get(name), now.get(name)
+        old = before.get(name)
+        new = now.get(name)
         if isinstance(old, Mapping) and isinstance(new, Mapping):
             yield from differences(old, new, f"{prefix}{name}.")
         elif old != new:

@@ -1,4 +1,4 @@
-"""The builds that networks are trained on: `smoke`, `pretrain-256`, `finetune-512` and others.
+"""Builds for the training of networks: `smoke`, `pretrain-256`, `finetune-512` and others.
 
 They keep the published ranges of sizes, materials, lights and cameras, and deviate where the
 published scenes have defects (reference: renderformer.md, G):
@@ -34,7 +34,7 @@ from storage.dataset.settings import SplitSettings
 
 
 def smoke() -> BuildSettings:
-    """Minutes on a laptop: small shards, 256 pixels, pictures to 38 dB or 256 samples."""
+    """A set of minutes on a laptop: small shards, 256 pixels, pictures to 38 dB or 256 samples."""
     return BuildSettings(
         build="smoke",
         seed=0,

@@ -1,4 +1,4 @@
-"""`attribution.csv`: whom to thank for objects, textures and maps, and what licences ask for."""
+"""`attribution.csv`: authors, licences and changes of all objects, textures and maps."""
 
 import csv
 import io
@@ -14,14 +14,14 @@ _OF_KIND = {
     TEXTURE: "resampled, and laid on other surfaces",
     SKY: "resampled, turned, and scaled in strength",
 }
-"""What is done to textures and maps."""
+"""Changes to textures and maps, by kind."""
 AS_IN_FILE = "rendered as its scene file says"
-"""What is done to the meshes of scene files."""
+"""Changes to the meshes of scene files."""
 _FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 
 
 class HasRights(Protocol):
-    """An object with the rights to it, whatever else is known of it."""
+    """An object with its rights."""
 
     @property
     def uid(self) -> str: ...
@@ -38,7 +38,7 @@ class HasRights(Protocol):
 
 
 def encode_attribution(objects: Iterable[HasRights], *, changes: str = _REMESHED) -> bytes:
-    """Return the file: one row per object, sorted by uid, each with what was done to it."""
+    """Return the file: one row per object, sorted by uid, with the changes made to it."""
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(_COLUMNS)
@@ -51,7 +51,7 @@ def encode_attribution(objects: Iterable[HasRights], *, changes: str = _REMESHED
 
 
 def attribution_of(objects: Iterable[HasRights], settings: Mapping[str, Any]) -> bytes:
-    """Return the file of a dataset with these settings, which say what was done to its objects."""
+    """Return the file of a dataset; its settings decide the changes made to objects."""
     return encode_attribution(objects, changes=" or ".join(sorted(_changes(settings))))
 
 
@@ -63,5 +63,5 @@ def _changes(settings: Mapping[str, Any]) -> set[str]:
 
 
 def inert(cell: str) -> str:
-    """Return text from outside so that it is no formula when a spreadsheet opens the file."""
+    """Return untrusted text, escaped so that a spreadsheet reads no formula in it."""
     return f"'{cell}" if cell.startswith(_FORMULA_STARTS) else cell

@@ -1,6 +1,6 @@
-"""`README.md` of a dataset: its card, with the front matter that Hugging Face reads.
+"""`README.md` of a dataset: the dataset card, with the front matter that Hugging Face reads.
 
-It tells nothing of the clock, the machine or the order of work: equal datasets give equal cards.
+It holds no time, machine or order of work: equal datasets give equal cards.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -35,19 +35,19 @@ _SETTINGS = (
     ("scenes of a shard", "splits.scenes_per_shard"),
     ("profile", "storage.profile"),
 )
-"""What the card shows of the settings; the manifest has all of them."""
+"""Labels and names of the settings that the card shows; the manifest has all of them."""
 
 
 def encode_card(
-    folder: DatasetFolder, manifest: Manifest, found: Distributions, rights: Rights
+    folder: DatasetFolder, manifest: Manifest, distributions: Distributions, rights: Rights
 ) -> bytes:
     """Return the card.
 
     Args:
-        folder: of the dataset; only the names of its documents are used.
-        manifest: of the dataset.
-        found: its distributions.
-        rights: of its objects.
+        folder: folder of the dataset; only the names of its documents are used.
+        manifest: manifest of the dataset.
+        distributions: distributions of the dataset.
+        rights: rights to its objects.
     """
     title = f"Trilight dataset {manifest.build}"
     parts = [
@@ -56,16 +56,18 @@ def encode_card(
         _lead(manifest),
         f"![some of the scenes]({folder.contact_sheet.name})",
         "## What it holds",
-        f"Views, errors and contents are those {found.sample}." if found.sample else "",
-        _by_split(manifest, found),
+        f"Views, errors and contents are those {distributions.sample}."
+        if distributions.sample
+        else "",
+        _by_split(manifest, distributions),
         _NOISE_FLOOR,
-        _contents(manifest, found),
+        _contents(manifest, distributions),
         "## How it was made",
-        _made(manifest),
+        _generation(manifest),
         "## Licences",
         rights_markdown(rights),
         "## How to read it",
-        _reading(manifest, found.packings),
+        _reading(manifest, distributions.packings),
         "## How to check it",
         _CHECK.format(digest=manifest.dataset_digest),
     ]
@@ -136,13 +138,13 @@ def _lead(manifest: Manifest) -> str:
     )
 
 
-def _by_split(manifest: Manifest, found: Distributions) -> str:
+def _by_split(manifest: Manifest, distributions: Distributions) -> str:
     rows: list[Sequence[object]] = []
-    for split in found.splits:
-        floors = {name: summary(found.values[split][name]) for name in MEASURED.values()}
+    for split in distributions.splits:
+        floors = {name: summary(distributions.values[split][name]) for name in MEASURED.values()}
         num_views = int(floors["noise_floor_db"]["count"])
         shards = [shard for shard in manifest.shards if shard.split == split]
-        reached = found.reached(split)
+        reached = distributions.reaches_targets(split)
         rows.append(
             (
                 split,
@@ -151,7 +153,7 @@ def _by_split(manifest: Manifest, found: Distributions) -> str:
                 len(shards),
                 *(_three(floors, name) if num_views else "" for name in ("median", "p5")),
                 f"{reached.mean():.0%}" if reached is not None and num_views else "",
-                f"{found.views_at_cap.get(split, 0) / max(num_views, 1):.0%}",
+                f"{distributions.views_at_cap.get(split, 0) / max(num_views, 1):.0%}",
             )
         )
     head = (
@@ -166,44 +168,53 @@ def _three(floors: Mapping[str, Mapping[str, float]], statistic: str) -> str:
     return f"{log:.1f} ({linear:.1f}, {objects:.1f})"
 
 
-def _contents(manifest: Manifest, found: Distributions) -> str:
+def _contents(manifest: Manifest, distributions: Distributions) -> str:
     templates: dict[str, int] = {}
-    for (template, _), count in sorted(found.scenes.items()):
+    for (template, _), count in sorted(distributions.scenes.items()):
         templates[template] = templates.get(template, 0) + count
-    triangles = summary(found.all("triangles_per_scene"))
-    shown = ", ".join(f"{count} {code(name)}" for name, count in templates.items())
+    triangles = summary(distributions.all("triangles_per_scene"))
+    layouts = ", ".join(f"{count} {code(name)}" for name, count in templates.items())
     rows = [
-        ("scenes by layout", shown or "none"),
-        ("objects", f"{len(found.objects)}, of which {len(found.placements)} stand in scenes"),
-        *_own_maps(found),
-        ("rejected on the way", f"{len(found.failures)}, each with its reason in failures.jsonl"),
+        ("scenes by layout", layouts or "none"),
+        (
+            "objects",
+            f"{len(distributions.objects)}, of which {len(distributions.placements)} stand in "
+            "scenes",
+        ),
+        *_user_maps(distributions),
+        (
+            "rejected on the way",
+            f"{len(distributions.failures)}, each with its reason in failures.jsonl",
+        ),
     ]
-    rows[1:1] = list(maps_in_words(found).items())
+    rows[1:1] = list(maps_in_words(distributions).items())
     if triangles["count"]:
         spread = f"median {triangles['median']:.0f}, most {triangles['max']:.0f}"
         rows.insert(1, ("triangles of a scene", spread))
     return table(("", ""), rows)
 
 
-def _own_maps(found: Distributions) -> list[tuple[str, str]]:
-    """Return a row for textures and for maps that are not procedural, where there are such."""
+def _user_maps(distributions: Distributions) -> list[tuple[str, str]]:
+    """Return a row for the user's textures, and one for the user's maps, if there are any."""
     rows = []
     for kind, name in ((TEXTURE, "textures, not procedural"), (SKY, "skies, not procedural")):
-        uids = {entry.uid for entry in found.own_maps if entry.kind == kind}
+        uids = {entry.uid for entry in distributions.user_maps if entry.kind == kind}
         if uids:
-            rows.append((name, f"{len(uids)}, of which {len(uids & set(found.map_uses))} are used"))
+            rows.append(
+                (name, f"{len(uids)}, of which {len(uids & set(distributions.map_uses))} are used")
+            )
     return rows
 
 
-def _made(manifest: Manifest) -> str:
+def _generation(manifest: Manifest) -> str:
     derivation = derivation_of(manifest.settings)
-    how = _derived(derivation) if derivation else code(f"trilight generate {manifest.build}")
+    how = _derivation(derivation) if derivation else code(f"trilight generate {manifest.build}")
     rows = []
     for label, name in _SETTINGS:
         value = _setting(manifest.settings, name)
         if value is not None:
-            shown = value if isinstance(value, int | float) else code(value)
-            rows.append((label, shown))
+            cell = value if isinstance(value, int | float) else code(value)
+            rows.append((label, cell))
     for label, name in (("Mitsuba variant", "mitsuba_variant"), ("processor", "processor")):
         if name in manifest.environment:
             rows.append((label, code(manifest.environment[name])))
@@ -211,13 +222,13 @@ def _made(manifest: Manifest) -> str:
     return "\n\n".join([how, _PICTURES, table(("setting", "value"), rows), more])
 
 
-def _derived(derivation: Derivation) -> str:
+def _derivation(derivation: Derivation) -> str:
     rows = [
         (code(source["build"]), source["num_scenes"], source["key_offset"], code(source["digest"]))
         for source in derivation.sources
     ]
-    asked = ", ".join(code(f"{name}={value}") for name, value in derivation.arguments.items())
-    of = f" with {asked}" if asked else ""
+    arguments = ", ".join(code(f"{name}={value}") for name, value in derivation.arguments.items())
+    of = f" with {arguments}" if arguments else ""
     head = ("made of build", "its scenes", "added to keys", "its dataset digest")
     command = code(f"trilight shards {derivation.operation}")
     return f"{command}{of}.\n\n{table(head, rows)}"
@@ -246,13 +257,13 @@ floor. Lengths are metres, +Z is up, colours are linear Rec.709 radiance, camera
 
 
 def _arrays(packings: Collection[str]) -> list[str]:
-    """Return how a sample's arrays are got; a merged dataset may have them in both packings."""
-    *others, last = sorted(packings) or [PLAIN]
-    return [*(f'sample.get("{packing}")' for packing in others), f'sample["{last}"]']
+    """Return expressions for a sample's arrays; a merged dataset may have both packings."""
+    *rest, last = sorted(packings) or [PLAIN]
+    return [*(f'sample.get("{packing}")' for packing in rest), f'sample["{last}"]']
 
 
 def _setting(settings: Mapping[str, Any], name: str) -> Any:
-    """Return a setting by its dotted name; None where the manifest does not say."""
+    """Return a setting by its dotted name; None if the manifest lacks it."""
     value: Any = settings
     for part in name.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None

@@ -1,8 +1,8 @@
 """`croissant.json`: the dataset in the Croissant 1.1 vocabulary of MLCommons, as JSON-LD.
 
-It is written as plain JSON: mlcroissant, which validates it in the tests, would only be a slower
-way to spell the same dictionary, and brings rdflib and pandas along. There is no date of
-publication in it: equal datasets give equal bytes.
+It is written as plain JSON: mlcroissant, which validates it in the tests, would be a slower way to
+write the same dictionary, and needs rdflib and pandas. It has no date of publication: equal
+datasets give equal bytes.
 """
 
 import json
@@ -49,8 +49,8 @@ def encode_croissant(manifest: Manifest, rights: Rights) -> bytes:
     """Return the file of a dataset: every shard with its sha256, and a record for each scene.
 
     Args:
-        manifest: of the dataset.
-        rights: of its objects; a licence without a known address is given by its name.
+        manifest: manifest of the dataset.
+        rights: rights to its objects; a licence without a known URL is stated by its name.
     """
     digest = manifest.dataset_digest
     shards = list(manifest.shards)
@@ -75,7 +75,7 @@ def encode_croissant(manifest: Manifest, rights: Rights) -> bytes:
 
 
 MOST_LISTED = 10_000
-"""Shards that are listed one by one; of more, `manifest.json` alone has sizes and digests."""
+"""Most shards that are listed one by one; beyond that only `manifest.json` has their digests."""
 
 
 def _distribution(shards: list[ShardEntry]) -> list[dict[str, Any]]:
@@ -105,7 +105,7 @@ def _shard(shard: ShardEntry) -> dict[str, Any]:
 
 
 def _file_sets(archives: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the kinds of members that all shards hold; `archives` are the names of those."""
+    """Return the kinds of members in all shards; `archives` are the names of the shards."""
     kinds = (
         (_RECORDS, "objects, provenance and the record of each view", "application/json", "*.json"),
         (
@@ -146,7 +146,7 @@ def _splits(shards: list[ShardEntry]) -> dict[str, Any]:
 
 
 def _scenes() -> dict[str, Any]:
-    """Return the records of scenes: key and whole JSON, all that mlcroissant reads of many tars."""
+    """Return the records of scenes: key and JSON, which is all mlcroissant reads of many tars."""
     key = {"extract": {"fileProperty": "filename"}, "transform": {"regex": r"^([^.]+)\."}}
     content = {"extract": {"fileProperty": "content"}}
     return {

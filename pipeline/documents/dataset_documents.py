@@ -1,4 +1,4 @@
-"""Everything that stands beside the shards of a finished dataset, for people and for hubs."""
+"""Writes the documents beside the shards of a finished dataset, for readers and hubs."""
 
 import dataclasses
 
@@ -21,25 +21,27 @@ from storage.digests import sha256_hex, sha256_of_file
 def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Statistics:
     """Write card, licences, croissant, attribution, contact sheet and report of a dataset.
 
-    Each appears whole or not at all. They depend on the dataset alone, so equal datasets have equal
-    documents whoever made them.
+    Each file is written atomically. They depend on the dataset alone, so equal datasets have equal
+    documents.
 
     Args:
-        dataset: in a folder, or on a server.
-        out: the folder to write into; that of the dataset where None.
+        dataset: a dataset in a folder, or on a server.
+        out: folder to write into; None for the dataset's folder.
 
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
     """
-    out, manifest = out or dataset.folder, dataset.manifest
-    statistics, found = dataset_statistics(dataset), dataset_distributions(dataset)
-    rights = rights_of(found.locked)
-    write_atomically(out.attribution, attribution_of(found.locked, manifest.settings))
+    out = out or dataset.folder
+    manifest = dataset.manifest
+    statistics = dataset_statistics(dataset)
+    distributions = dataset_distributions(dataset)
+    rights = rights_of(distributions.locked)
+    write_atomically(out.attribution, attribution_of(distributions.locked, manifest.settings))
     write_atomically(out.licences, encode_licences(rights))
     write_contact_sheet(dataset, statistics, out=out)
-    write_report(dataset, found, out=out)
+    write_report(dataset, distributions, out=out)
     write_atomically(out.croissant, encode_croissant(manifest, rights))
-    card = encode_card(out, manifest, found, rights)
+    card = encode_card(out, manifest, distributions, rights)
     if out.manifest.exists():
         _write_digests(out, card)
     write_atomically(out.card, card)  # last: with it, the dataset is finished
@@ -48,8 +50,8 @@ def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Stati
 
 
 def _write_digests(folder: DatasetFolder, card: bytes) -> None:
-    """Have the manifest vouch for the documents; `card` is still to be written."""
-    with folder.turn("manifest"):
+    """Store the digests of the documents in the manifest; `card` is still to be written."""
+    with folder.mutex("manifest"):
         written = (folder.attribution, folder.licences, folder.croissant)
         documents = {path.name: sha256_of_file(path) for path in written}
         documents[folder.card.name] = sha256_hex(card)

@@ -1,4 +1,4 @@
-"""What a dataset holds, as distributions: read scene by scene, without the pictures."""
+"""Distributions of a dataset's contents: reads it scene by scene, without the pictures."""
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -26,46 +26,46 @@ class Distributions:
     """Counts and values over all scenes of a dataset."""
 
     values: Mapping[str, Mapping[str, Values]]
-    """By split, then by name (storage.records.quantities): every value, float32."""
+    """All values, float32, by split, then by name (storage.records.quantities)."""
     num_scenes: int
-    """Scenes of the dataset; where fewer were read, everything here is of those."""
+    """Number of scenes of the dataset; if only a sample was read, the other fields describe it."""
     scenes: Mapping[tuple[str, str], int]
-    """Scenes by (template, split)."""
+    """Number of scenes by (template, split)."""
     placements: Mapping[str, int]
-    """How often each object stands in a scene, by uid; objects that stand in none are missing."""
+    """Number of placements of each object in scenes, by uid; unused objects are missing."""
     map_uses: Mapping[str, int]
-    """In how many scenes each texture and map of a user's own is, likewise."""
+    """Number of scenes with each of the user's textures and maps, by uid; unused are missing."""
     surfaces: Mapping[tuple[str, str], int]
-    """Surfaces by (object or shell; all, smooth, many_colours or textured)."""
+    """Number of surfaces by (object or shell; all, smooth, many_colours or textured)."""
     maps: Mapping[tuple[str, str], int]
-    """Scenes by (texture or sky; its family, or what its map is called)."""
+    """Number of scenes by (texture or sky; its family, or the name of its map)."""
     views_at_cap: Mapping[str, int]
     """Views whose sampling ended at the cap, by split."""
     packings: Collection[str]
     """Suffixes under which samples have their arrays (storage.records.profiles)."""
     objects: Sequence[LockedObject]
     """The objects that scenes may draw from."""
-    own_maps: Sequence[LockedObject]
-    """The textures and maps of a user's own that they may draw from."""
+    user_maps: Sequence[LockedObject]
+    """The user's textures and maps that scenes may draw from."""
     failures: Sequence[Failure]
-    """What was rejected."""
+    """Rejections of objects, scenes and views."""
     targets: Mapping[str, float | None]
-    """What the settings ask for: max_triangles, the three noise floors, min_spp, max_spp; None
-    where the manifest does not say."""
+    """Target values of the settings: max_triangles, the three noise floors, min_spp, max_spp; None
+    if the manifest lacks one."""
 
     def all(self, name: str) -> Values:
         """Return the values of one quantity over all splits."""
         chunks = [by_name[name] for by_name in self.values.values()]
         return np.concatenate(chunks) if chunks else np.zeros(0, np.float32)
 
-    def reached(self, split: str) -> NDArray[np.bool_] | None:
-        """Return whether each view of a split reaches all targets; None where there is none."""
-        met = [
+    def reaches_targets(self, split: str) -> NDArray[np.bool_] | None:
+        """Return a mask of the views of a split that reach all targets; None without targets."""
+        checks = [
             self.values[split][measured] >= target
             for name, measured in MEASURED.items()
             if (target := self.targets[name]) is not None
         ]
-        return np.logical_and.reduce(met) if met else None
+        return np.logical_and.reduce(checks) if checks else None
 
     @property
     def splits(self) -> list[str]:
@@ -87,25 +87,25 @@ class Distributions:
     @property
     def locked(self) -> list[LockedObject]:
         """All rows of the lock, whose rights documents list."""
-        return [*self.objects, *self.own_maps]
+        return [*self.objects, *self.user_maps]
 
     @property
     def licences(self) -> Mapping[str, tuple[int, int, int]]:
-        """Per licence: objects and maps, those that a scene uses, and their places in scenes."""
+        """Counts per licence: objects and maps, those in scenes, and their placements."""
         rows: dict[str, tuple[int, int, int]] = {}
         for entry in self.locked:
             count, used, places = rows.get(entry.licence, (0, 0, 0))
-            here = self.placements.get(entry.uid, 0) + self.map_uses.get(entry.uid, 0)
-            rows[entry.licence] = (count + 1, used + (here > 0), places + here)
+            uses = self.placements.get(entry.uid, 0) + self.map_uses.get(entry.uid, 0)
+            rows[entry.licence] = (count + 1, used + (uses > 0), places + uses)
         return dict(sorted(rows.items()))
 
     @property
     def sample(self) -> str:
-        """What people are told where a sample of the scenes was read; empty else."""
+        """Note for the reader if only a sample of the scenes was read; else empty."""
         return of_how_many(sum(self.scenes.values()), self.num_scenes)
 
     def uses_per_object(self) -> list[int]:
-        """Return how often each object is used, zeros included, the most used first."""
+        """Return the number of placements of each object, zeros included, in falling order."""
         unused = [entry.uid for entry in self.objects if entry.uid not in self.placements]
         return sorted([*self.placements.values(), *(0 for _ in unused)], reverse=True)
 
@@ -146,7 +146,7 @@ MEASURED = {
     "noise_floor_linear_db": "noise_floor_linear_db",
     "noise_floor_objects_db": "object_noise_floor_db",
 }
-"""What is measured of a view, by the name of its target in the settings of renders."""
+"""Measured quantity of a view, by the name of its target in the settings of renders."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -185,8 +185,8 @@ def dataset_distributions(
 ) -> Distributions:
     """Read the scenes of a dataset, one at a time and without their pictures: all, or a sample.
 
-    What is kept is about 200 bytes a scene (of the sample: storage.dataset.sampled). The digests of
-    the shards are not checked.
+    Memory grows by about 200 bytes per read scene (storage.dataset.sampled chooses the sample). The
+    digests of the shards are not checked.
 
     Args:
         dataset: the dataset.
@@ -208,11 +208,11 @@ def dataset_distributions(
                     "`trilight verify`."
                 ) from error
         if rows:
-            tally.values.setdefault(shard.split, []).append(_concatenated(rows))
+            tally.values.setdefault(shard.split, []).append(_concatenate(rows))
         shard_done(shard.name)
     locked = dataset.objects_lock()
     return Distributions(
-        values={split: _concatenated(chunks) for split, chunks in tally.values.items()},
+        values={split: _concatenate(chunks) for split, chunks in tally.values.items()},
         num_scenes=dataset.manifest.num_samples,
         scenes=tally.scenes,
         placements=tally.placements,
@@ -222,23 +222,23 @@ def dataset_distributions(
         views_at_cap=tally.views_at_cap,
         packings=tally.packings,
         objects=[entry for entry in locked if entry.kind == OBJECT],
-        own_maps=[entry for entry in locked if entry.kind != OBJECT],
+        user_maps=[entry for entry in locked if entry.kind != OBJECT],
         failures=dataset.failures(),
         targets=_targets(dataset.manifest),
     )
 
 
-def _concatenated(rows: Sequence[Mapping[str, Values]]) -> Mapping[str, Values]:
+def _concatenate(rows: Sequence[Mapping[str, Values]]) -> Mapping[str, Values]:
     return {name: np.concatenate([row[name] for row in rows]) for name in QUANTITIES}
 
 
 def _targets(manifest: Manifest) -> dict[str, float | None]:
-    """Return what the settings ask for; a dataset that was not generated here may not say."""
+    """Return the target values of the settings; a derived dataset may lack them."""
     places = {"max_triangles": "scenes"}
     places |= dict.fromkeys((*MEASURED, "min_spp", "max_spp"), "renders")
-    found: dict[str, float | None] = {}
+    targets: dict[str, float | None] = {}
     for name, group in places.items():
         settings = manifest.settings.get(group)
         value = settings.get(name) if isinstance(settings, Mapping) else None
-        found[name] = value if isinstance(value, int | float) else None
-    return found
+        targets[name] = value if isinstance(value, int | float) else None
+    return targets

@@ -1,6 +1,6 @@
-"""Figures of one style, drawn without a display and without the reader's own matplotlib settings.
+"""Draws figures in one style, without a display and without the user's matplotlib settings.
 
-Equal data give equal bytes: no clock and no version is written into a figure.
+Equal data give equal bytes: a figure holds no time and no version.
 """
 
 import contextlib
@@ -20,13 +20,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.documents.html import Markup, data_uri, image
 
-BLUE, RED, INK, FAINT = "#3b6ea5", "#c8443f", "#333333", "#dddddd"
+BLUE = "#3b6ea5"
+RED = "#c8443f"
+INK = "#333333"
+FAINT = "#dddddd"
 SERIES = ("#3b6ea5", "#e0a03b", "#5f9e6e", "#a56cb4", "#8c8c8c", "#c8443f", "#4bb0b8", "#6b5b4b")
-"""Colours of the parts of stacked bars."""
+"""Colors of the segments of stacked bars."""
 
 _PANEL_INCHES = (2.9, 1.95)
 _DPI = 180
-_MOST_BINS, _LONGEST_LABEL = 30, 26
+_MOST_BINS = 30
+_LONGEST_LABEL = 26
 _MOST_WHOLE_NUMBERS = 24
 
 _STYLE: dict[str, Any] = {
@@ -44,7 +48,7 @@ _STYLE: dict[str, Any] = {
     "grid.linewidth": 0.6,
     "legend.fontsize": 7,
     "legend.frameon": False,
-    "text.parse_math": False,  # names from outside may hold dollar signs
+    "text.parse_math": False,  # untrusted names may hold dollar signs
     "xtick.color": "#666666",
     "ytick.color": "#666666",
     "xtick.labelcolor": INK,
@@ -56,10 +60,10 @@ _STYLE: dict[str, Any] = {
 
 @contextlib.contextmanager
 def drawing() -> Iterator[None]:
-    """Give everything that is drawn within the block the style of all figures."""
+    """Apply the common style to all figures that are drawn within the block."""
     style = matplotlib.style.context(["default", _STYLE], after_reset=True)
     with style, warnings.catch_warnings():
-        # a name from outside may need a script that the font lacks: it shows boxes
+        # an untrusted name may need a script that the font lacks: it shows boxes
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
 
@@ -77,7 +81,7 @@ def panels(count: int, *, columns: int = 2, polar: Sequence[int] = ()) -> tuple[
     return figure, axes
 
 
-def encoded(figure: Figure, alt: str) -> Markup:
+def encode_figure(figure: Figure, alt: str) -> Markup:
     """Return the figure as a picture for a page."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=_DPI, metadata={"Software": None})
@@ -93,14 +97,14 @@ def histogram(
     marks: Mapping[str, float | None] | None = None,
     bounds: tuple[float, float] | None = None,
 ) -> None:
-    """Draw how often values occur: one bar for each whole number, else up to thirty bins.
+    """Draw a histogram: one bar for each whole number, else up to thirty bins.
 
     Args:
-        axes: where.
-        values: [N]; those that are not finite are left out.
-        xlabel, ylabel: what the axes say.
-        marks: lines at values that matter, by name; None draws nothing.
-        bounds: the range of the bins; that of the values where None.
+        axes: axes to draw on.
+        values: [N] values; those that are not finite are left out.
+        xlabel, ylabel: labels of the axes.
+        marks: vertical lines at values, by name; None draws nothing.
+        bounds: range of the bins; None for the range of the values.
     """
     finite = finite_values(values)
     axes.set_xlabel(xlabel)
@@ -117,7 +121,8 @@ def histogram(
             linewidth=0,
         )
         if _whole_numbers(finite):
-            low, high = int(finite.min()), int(finite.max())
+            low = int(finite.min())
+            high = int(finite.max())
             axes.set_xticks(range(low, high + 1, 1 + (high - low) // 9))
     axes.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(4, integer=True))
     for name, value in (marks or {}).items():
@@ -143,22 +148,22 @@ def rose(axes: Axes, degrees: ArrayLike, title: str) -> None:
 def stacked_bars(
     bars: Sequence[str], parts: Mapping[str, ArrayLike], *, xlabel: str
 ) -> tuple[Figure, Axes]:
-    """Return a figure of horizontal bars, the first on top, each made of the same parts.
+    """Return a figure of horizontal stacked bars, the first on top.
 
     Args:
         bars: the name of each bar.
-        parts: the lengths [bars] of each part, by its name.
-        xlabel: what the lengths are.
+        parts: the lengths [bars] of each segment, by its name.
+        xlabel: label of the lengths.
     """
     width, height = _PANEL_INCHES
     figure = Figure(figsize=(2 * width, max(height, 0.8 + 0.21 * len(bars))), layout="constrained")
     axes = figure.add_subplot()
-    left = np.zeros(len(bars))
+    offset = np.zeros(len(bars))
     rows = np.arange(len(bars))
     for number, (name, lengths) in enumerate(parts.items()):
         colour = SERIES[number % len(SERIES)]
-        axes.barh(rows, lengths, left=left, height=0.68, color=colour, label=short_label(name))
-        left += np.asarray(lengths)
+        axes.barh(rows, lengths, left=offset, height=0.68, color=colour, label=short_label(name))
+        offset += np.asarray(lengths)
     axes.set_yticks(rows, [short_label(name) for name in bars])
     axes.set_ylim(len(bars) - 0.4, -0.6)
     axes.set_xlabel(xlabel)
@@ -173,7 +178,7 @@ def stacked_bars(
 
 
 def short_label(text: str) -> str:
-    """Return a name from outside as a label: one line, printable, not too long."""
+    """Return an untrusted name as a label: one printable line of limited length."""
     visible = "".join(letter if letter.isprintable() else " " for letter in str(text))
     line = " ".join(visible.split())
     return line if len(line) <= _LONGEST_LABEL else line[: _LONGEST_LABEL - 1] + "…"

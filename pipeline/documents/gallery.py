@@ -1,15 +1,15 @@
-"""The gallery of a report: cards that lead to a page of each scene."""
+"""The gallery of a report: thumbnails that link to a page of each scene."""
 
 from collections.abc import Mapping, Sequence
 
-from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
 from pipeline.documents.gallery_controls import (
     CardFacts,
     card_attributes,
     card_facts,
     gallery_controls,
 )
-from pipeline.documents.html import Markup, element, image, joined, png_uri
+from pipeline.documents.html import Markup, element, image, join_markup, png_uri
+from pipeline.documents.scene_choice import ChosenScene, choose_scenes, read_chosen
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, preview
 from storage.atomic import write_atomically
 from storage.conventions import preview_gain
@@ -28,13 +28,13 @@ _CARD_PX = 176
 def write_gallery(
     dataset: Dataset, failures: Sequence[Failure], out: DatasetFolder, max_scenes: int
 ) -> Markup:
-    """Write the pages of up to `max_scenes` scenes and return the cards that lead to them.
+    """Write the pages of up to `max_scenes` scenes and return the thumbnails that link to them.
 
     Pages of scenes that are no longer shown are deleted.
 
     Raises:
-        TrilightError: too many scenes are asked for, a sample is unreadable, or the folder cannot
-            be written.
+        TrilightError: `max_scenes` is too large, a sample is unreadable, or the folder cannot be
+            written.
     """
     if not 0 <= max_scenes <= MOST_SCENES:
         raise TrilightError(
@@ -56,13 +56,13 @@ def write_gallery(
         cards.append((_card(sample, entry.split), f"{out.report_pages.name}/{names[row]}"))
         facts.append(card_facts(sample, entry.split))
     _remove_others(out, names)
-    shown = f"{len(chosen)} of {dataset.manifest.num_samples} scenes, by their first view."
+    caption = f"{len(chosen)} of {dataset.manifest.num_samples} scenes, by their first view."
     linked = [
         element("a", card, href=link, class_="card", **attributes)
         for (card, link), attributes in zip(cards, card_attributes(facts), strict=True)
     ]
     gallery = element("div", *linked, class_="cards")
-    return joined([element("p", shown), gallery_controls(facts), gallery])
+    return join_markup([element("p", caption), gallery_controls(facts), gallery])
 
 
 def _card(sample: Sample, split: str) -> Markup:
@@ -73,11 +73,13 @@ def _card(sample: Sample, split: str) -> Markup:
     caption = f"{template}, {num_objects} {'object' if num_objects == 1 else 'objects'}"
     name = f"{sample.key} {split}"
     text = element("span", name, Markup("<br>"), element("span", caption, class_="faint"))
-    return joined([picture, text], "")
+    return join_markup([picture, text], "")
 
 
-def _by_scene(failures: Sequence[Failure], chosen: Sequence[Chosen]) -> Mapping[str, list[Failure]]:
-    """Return the rejections of each chosen scene, those of its views included."""
+def _by_scene(
+    failures: Sequence[Failure], chosen: Sequence[ChosenScene]
+) -> Mapping[str, list[Failure]]:
+    """Return the rejections of each chosen scene and its views."""
     rejected: dict[str, list[Failure]] = {entry.key: [] for entry in chosen}
     for failure in failures:
         key = str(failure.item).partition(".")[0]
@@ -87,7 +89,7 @@ def _by_scene(failures: Sequence[Failure], chosen: Sequence[Chosen]) -> Mapping[
 
 
 def _remove_others(out: DatasetFolder, names: Sequence[str]) -> None:
-    """Delete pages of an earlier report; what else lies in the folder is not ours."""
+    """Delete pages of an earlier report; other files of the folder stay."""
     for old in sorted(out.report_pages.glob("[0-9]" * 9 + ".html")):
         if old.name not in names:
             old.unlink(missing_ok=True)

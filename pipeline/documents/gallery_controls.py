@@ -13,14 +13,14 @@ from storage.records.lights import num_lights
 from storage.records.sample import Sample
 
 _MOST_CHOICES = 12
-"""Of one filter; a dataset with more layouts has the first ones by name."""
+"""Most choices of one filter; a dataset with more layouts shows the first ones by name."""
 
 _CAPS = {False: "within the target", True: "at the cap"}
 
 _SELECT = "trilight shards select . --out ../selected"
 
 _OPTIONS = {"split": "--split", "layout": "--template", "views": "--where"}
-"""What selects the scenes of a choice, by the name of its filter."""
+"""Option that selects the scenes of a choice, by the name of its filter."""
 
 _WHERE = {_CAPS[False]: "not any(at_cap)", _CAPS[True]: "any(at_cap)"}
 
@@ -56,16 +56,16 @@ addEventListener("pageshow", show);  // a browser that comes back restores the b
 
 @dataclass(frozen=True, kw_only=True)
 class CardFacts:
-    """What the gallery can be filtered and sorted by."""
+    """Filter and sort values of one scene in the gallery."""
 
     choices: Mapping[str, str]
-    """What the scene is, by the name of the filter; empty where that is not known."""
+    """Value of the scene for each filter, by its name; empty if unknown."""
     orders: Mapping[str, float]
-    """Values to sort by, by what a person calls them; the least value comes first."""
+    """Values to sort by, by the label of the order; the least value comes first."""
 
 
 def card_facts(sample: Sample, split: str) -> CardFacts:
-    """Return what is known of a scene's card."""
+    """Return the filter and sort values of a scene."""
     return CardFacts(
         choices={
             "split": split,
@@ -83,7 +83,7 @@ def card_facts(sample: Sample, split: str) -> CardFacts:
 
 
 def gallery_controls(cards: Sequence[CardFacts]) -> Markup:
-    """Return filters by split, layout and cap, and orders; where there is no choice, no button."""
+    """Return buttons to filter by split, layout and cap, and to sort; none without a choice."""
     buttons = []
     for name in _OPTIONS:
         known = [card.choices[name] for card in cards if card.choices[name]]
@@ -103,7 +103,7 @@ def gallery_controls(cards: Sequence[CardFacts]) -> Markup:
 
 
 def card_attributes(cards: Sequence[CardFacts]) -> list[dict[str, str]]:
-    """Return what the script reads of each card: its choices, and its rank in every order."""
+    """Return the attributes of each thumbnail for the script: filters, and ranks in each order."""
     ranks: list[list[int]] = [[] for _ in cards]
     for order in cards[0].orders if cards else ():
         ordered = sorted(range(len(cards)), key=lambda card: cards[card].orders[order])

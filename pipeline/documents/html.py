@@ -1,6 +1,6 @@
-"""HTML pages that load nothing, and in which text from outside never becomes markup.
+"""HTML pages that load nothing, and in which untrusted text never becomes markup.
 
-Every function here escapes what it is given, unless it is `Markup`, which only these functions and
+Every function here escapes its arguments, unless they are `Markup`, which only these functions and
 the documents themselves make.
 """
 
@@ -19,7 +19,7 @@ Cell = str | int | float
 
 
 class Markup(str):
-    """Text that is HTML already. Nothing that comes from a file may become one unescaped."""
+    """Text that is HTML already. Text of a file must be escaped before it becomes Markup."""
 
     __slots__ = ()
 
@@ -58,16 +58,16 @@ table.narrow { width: auto } table.narrow td:first-child { overflow-wrap: break-
 table.narrow td, table.narrow th { padding-right: 1.6rem }
 @media (max-width: 30rem) { table.narrow td, table.narrow th { padding-right: .8rem } }
 """
-"""What all pages look like."""
+"""Style sheet of all pages."""
 
 
 def escape(text: object) -> Markup:
-    """Return text as HTML that shows exactly it; Markup comes back as it is."""
+    """Return text as HTML that shows it unchanged; Markup is returned as it is."""
     return text if isinstance(text, Markup) else Markup(html.escape(str(text)))
 
 
-def joined(parts: Iterable[str], separator: str = "\n") -> Markup:
-    """Return parts one after another, escaped where they are not Markup."""
+def join_markup(parts: Iterable[str], separator: str = "\n") -> Markup:
+    """Join parts, escaping those that are not Markup."""
     return Markup(separator.join(escape(part) for part in parts))
 
 
@@ -83,7 +83,7 @@ def image(uri: str, alt: str, **attributes: object) -> Markup:
 
 
 def enlargeable(uri: str, alt: str) -> Markup:
-    """Return a picture that fills the window after a click or the space bar, and goes back so."""
+    """Return a picture that a click or the space bar enlarges to the window and back."""
     mark = f"{html.escape(alt)}, fill the window"
     box = Markup(f'<input type="checkbox" class="zoom" aria-label="{mark}">')
     return element("label", box, image(uri, alt))
@@ -96,7 +96,7 @@ def table(
     first = max(len(head), *(len(row) for row in rows), 0) - numbers
 
     def line(tag: str, cells: Sequence[Cell]) -> Markup:
-        return joined(
+        return join_markup(
             (
                 element(tag, cell, class_="n") if column >= first else element(tag, cell)
                 for column, cell in enumerate(cells)
@@ -107,29 +107,29 @@ def table(
     lines = [element("tr", line("td", row)) for row in rows]
     if head:
         lines.insert(0, element("tr", line("th", head)))
-    return element("table", joined(lines), **attributes)
+    return element("table", join_markup(lines), **attributes)
 
 
 def page(title: str, body: str, *, style: str = "", script: str = "") -> bytes:
-    """Return a whole page; `style` is added to that of all pages, and `script` alone runs."""
+    """Return a complete page with the common style and `style`; only `script` may run."""
     policy = ""
     if script:
         sha256 = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
         allowed = f"script-src 'sha256-{sha256}'"
         policy = f'<meta http-equiv="Content-Security-Policy" content="{allowed}">'
-        body = joined([body, Markup(f"<script>{script}</script>")])
+        body = join_markup([body, Markup(f"<script>{script}</script>")])
     text = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width">'
         f"{policy}<title>{escape(title)}</title><style>{STYLE}{style}</style></head><body>\n"
         f"{escape(body)}\n</body></html>\n"
     )
-    # a lone surrogate, which JSON from outside may hold, has no UTF-8
+    # a lone surrogate, which untrusted JSON may hold, has no UTF-8
     return text.encode(errors="replace")
 
 
 def outside_link(url: str) -> Markup:
-    """Return a link to a page elsewhere, or only its text where it is not plain http or https."""
+    """Return a link to an external page, or only its text if it is not plain http or https."""
     text = str(url)
     try:
         parts = urlsplit(text)

@@ -1,4 +1,4 @@
-"""Markdown and YAML in which text from outside never becomes markup."""
+"""Markdown and YAML in which untrusted text never becomes markup."""
 
 import json
 import re
@@ -10,12 +10,12 @@ _ENTITIES = {"&": "&amp;", "<": "&lt;", ">": "&gt;"}
 
 
 def plain(value: object) -> str:
-    """Return a value as one line: what cannot be printed, line ends among it, becomes a space."""
+    """Return a value as one line; line ends and unprintable characters become spaces."""
     return "".join(c if c.isprintable() else " " for c in str(value)).strip()
 
 
 def text(value: object) -> str:
-    """Return a value as Markdown that shows exactly it, in one line."""
+    """Return a value as one line of Markdown that shows it unchanged."""
     escaped = _SPECIAL.sub(r"\\\g<0>", plain(value))
     return "".join(_ENTITIES.get(c, c) for c in escaped)
 
@@ -36,7 +36,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, numbers: int
 def front_matter(values: Mapping[str, Any]) -> str:
     """Return values (texts, numbers, lists and mappings of them) as a block of YAML.
 
-    Keys are ours and stand as they are; every text is quoted as JSON quotes it, which YAML reads.
+    Keys are trusted and not quoted; every text is quoted as JSON, which YAML reads.
     """
     return "\n".join(["---", *_lines(values), "---"])
 

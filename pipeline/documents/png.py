@@ -1,4 +1,4 @@
-"""Pictures as PNG files: for people, never for measuring."""
+"""Encodes pictures as PNG files, for display, never for measurement."""
 
 import io
 

@@ -1,6 +1,6 @@
-"""`quality.html`: what the mesh stage did to a folder of objects, for people to look at.
+"""`quality.html`: a page on the results of the mesh stage for a folder of objects.
 
-One file without scripts or links to elsewhere; text from outside is escaped.
+It is one file without scripts or external links; untrusted text is escaped.
 """
 
 from collections import Counter
@@ -11,8 +11,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.documents.figures import drawing, encoded, histogram, panels
-from pipeline.documents.html import Markup, element, image, joined, page, png_uri, table
+from pipeline.documents.figures import drawing, encode_figure, histogram, panels
+from pipeline.documents.html import Markup, element, image, join_markup, page, png_uri, table
 from storage.records.asset import AssetRow
 from storage.records.objects import Failure
 
@@ -30,7 +30,7 @@ class Pair:
     """Pictures of one object before and after."""
 
     row: AssetRow
-    """What is known of it."""
+    """The object's row in the catalogue, with its quality figures."""
     source: NDArray[np.uint8]
     """[W, W] grey: the cleaned source."""
     result: NDArray[np.uint8]
@@ -50,50 +50,50 @@ def encode_quality_page(
 
     Args:
         rows: the accepted objects.
-        failures: the rejected ones.
+        failures: the rejected objects.
         pairs: pictures by the name of their group.
-        unread: what no code has read of accepted objects, by uid.
+        unread: unread parts of accepted objects, by uid.
         budget: most triangles of an object.
-        target: what was asked for, in words.
+        target: target of the mesh stage, in words.
     """
     parts = [
         element("h1", f"Assets: {target}"),
         _summary(rows, failures),
         *([_histograms(rows, budget)] if rows else []),
         *(_group(name, group) for name, group in pairs.items() if group),
-        *([_rejected(failures)] if failures else []),
-        *([_unread(unread)] if unread else []),
-        _accepted(rows),
+        *([_rejected_table(failures)] if failures else []),
+        *([_unread_table(unread)] if unread else []),
+        _accepted_table(rows),
     ]
-    return page("Assets", joined(parts), style=_STYLE)
+    return page("Assets", join_markup(parts), style=_STYLE)
 
 
 def _summary(rows: Sequence[AssetRow], failures: Sequence[Failure]) -> Markup:
     repaired = sum(row.source.repaired for row in rows)
     closed = sum(row.source.watertight for row in rows)
     licences = Counter(row.licence for row in rows)
-    shown = ", ".join(f"{name} ({count})" for name, count in licences.most_common())
+    licence_text = ", ".join(f"{name} ({count})" for name, count in licences.most_common())
     return element(
         "p",
         f"{len(rows)} objects accepted, {repaired} of them repaired (triangles dropped or turned "
         f"outward), {closed} watertight; {len(failures)} rejected.",
         Markup("<br>"),
-        f"Licences: {shown or 'none'}.",
-        *_own_materials(rows),
+        f"Licences: {licence_text or 'none'}.",
+        *_source_materials(rows),
     )
 
 
-def _own_materials(rows: Sequence[AssetRow]) -> list[str | Markup]:
-    """Return how many objects have their own materials, and why others do not."""
-    asked = [row.materials for row in rows if row.materials is not None]
-    if not asked:
+def _source_materials(rows: Sequence[AssetRow]) -> list[str | Markup]:
+    """Return the number of objects with their own materials, and the reasons of the others."""
+    requested = [row.materials for row in rows if row.materials is not None]
+    if not requested:
         return []
-    kept = sum(row.colours is not None for row in rows)
-    reasons = Counter(found.reason for found in asked if found.reason)
-    lost = Counter(word for found in asked for word in found.lost)
+    num_kept = sum(row.colours is not None for row in rows)
+    reasons = Counter(materials.reason for materials in requested if materials.reason)
+    lost = Counter(word for materials in requested for word in materials.lost)
     why = ", ".join(f"{name} ({count})" for name, count in reasons.most_common())
     unseen = ", ".join(f"{name} ({count})" for name, count in lost.most_common())
-    text = f"In their own materials: {kept} of {len(rows)}"
+    text = f"In their own materials: {num_kept} of {len(rows)}"
     text += f"; the others: {why}." if why else "."
     return [Markup("<br>"), text + (f" Not shown of those: {unseen}." if unseen else "")]
 
@@ -112,15 +112,16 @@ def _histograms(rows: Sequence[AssetRow], budget: int) -> Markup:
         histogram(axes[1], angles, smallest, bounds=(0, 60))
         histogram(axes[2], areas, "variation of triangle areas\n(0: all equal)")
         histogram(axes[3], faces, f"triangles\n(budget {budget})", bounds=(0, budget))
-        return encoded(figure, "histograms")
+        return encode_figure(figure, "histograms")
 
 
 def _group(name: str, pairs: Sequence[Pair]) -> Markup:
-    return joined([element("h2", name), *(_pair(pair) for pair in pairs)])
+    return join_markup([element("h2", name), *(_pair(pair) for pair in pairs)])
 
 
 def _pair(pair: Pair) -> Markup:
-    row, quality = pair.row, pair.row.quality
+    row = pair.row
+    quality = pair.row.quality
     facts = (
         f"{row.source.num_faces} to {row.num_faces} triangles by {row.method}; p99 "
         f"{quality.error_p99:.2%}, largest {quality.error_max:.2%}, normals "
@@ -141,15 +142,17 @@ def _pair(pair: Pair) -> Markup:
     )
 
 
-def _rejected(failures: Sequence[Failure]) -> Markup:
+def _rejected_table(failures: Sequence[Failure]) -> Markup:
     cells = [(row.item, row.reason, row.message) for row in failures]
-    return joined([element("h2", "Rejected"), table(("object", "reason", "what was found"), cells)])
+    return join_markup(
+        [element("h2", "Rejected"), table(("object", "reason", "what was found"), cells)]
+    )
 
 
-def _unread(unread: Mapping[str, Sequence[str]]) -> Markup:
+def _unread_table(unread: Mapping[str, Sequence[str]]) -> Markup:
     cells = [(uid, ", ".join(unread[uid])) for uid in sorted(unread)]
     heading = element("h2", "Not read")
-    return joined([heading, table(("object", "what its file holds beside that"), cells)])
+    return join_markup([heading, table(("object", "what its file holds beside that"), cells)])
 
 
 def _materials_of(row: AssetRow) -> str:
@@ -158,16 +161,16 @@ def _materials_of(row: AssetRow) -> str:
     return f"drawn: {row.materials.reason}" if row.materials else "drawn"
 
 
-def _accepted(rows: Sequence[AssetRow]) -> Markup:
-    asked = any(row.materials for row in rows)
-    texts = ("object", "licence", "method", *(["materials"] if asked else []))
+def _accepted_table(rows: Sequence[AssetRow]) -> Markup:
+    has_materials = any(row.materials for row in rows)
+    texts = ("object", "licence", "method", *(["materials"] if has_materials else []))
     head = (*texts, "read", "triangles", "p99 %", "normals", "open edges")
     cells = [
         (
             row.uid,
             row.licence,
             row.method + (", repaired" if row.source.repaired else ""),
-            *([_materials_of(row)] if asked else []),
+            *([_materials_of(row)] if has_materials else []),
             f"{row.source.num_faces_read}",
             f"{row.num_faces}",
             f"{100 * row.quality.error_p99:.2f}",
@@ -177,4 +180,4 @@ def _accepted(rows: Sequence[AssetRow]) -> Markup:
         for row in sorted(rows, key=lambda row: (-row.quality.error_p99, row.uid))
     ]
     heading = element("h2", "Accepted, the largest error first")
-    return joined([heading, table(head, cells, numbers=5)])
+    return join_markup([heading, table(head, cells, numbers=5)])

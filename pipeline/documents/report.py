@@ -1,7 +1,7 @@
-"""`report.html`: a gallery of a dataset and its distributions, for people to look at.
+"""`report.html`: a gallery of a dataset and its distributions.
 
-The report is one file, whose only script filters its gallery; the pages of the gallery lie beside
-it in `report/`. It tells nothing of the clock or the machine: equal datasets give equal reports.
+The report is one file, whose only script filters its gallery; the pages of the gallery are in
+`report/`. It holds no time and no machine: equal datasets give equal reports.
 """
 
 import json
@@ -12,7 +12,7 @@ from pipeline.documents import report_sections
 from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.gallery import write_gallery
 from pipeline.documents.gallery_controls import CONTROLS_SCRIPT, CONTROLS_STYLE
-from pipeline.documents.html import Markup, element, joined, page, table
+from pipeline.documents.html import Markup, element, join_markup, page, table
 from pipeline.documents.report_maps import maps_section
 from pipeline.documents.scene_passes import passes_command
 from storage.atomic import write_atomically
@@ -48,12 +48,12 @@ _SECTIONS = {
     "rejections": report_sections.rejections_section,
     "licences": report_sections.licences_section,
 }
-"""What makes each section, by the name that links to it; one of which there is nothing is empty."""
+"""Functions that make the sections, by the name that links to them; a section may be empty."""
 
 
 def write_report(
     dataset: Dataset,
-    found: Distributions,
+    distributions: Distributions,
     *,
     max_scenes: int = 48,
     out: DatasetFolder | None = None,
@@ -62,66 +62,76 @@ def write_report(
 
     Args:
         dataset: the dataset.
-        found: its distributions.
+        distributions: distributions of the dataset.
         max_scenes: most scenes in the gallery, up to 1000; they are spread over splits and shards.
-        out: the folder to write into; that of the dataset where None.
+        out: folder to write into; None for the dataset's folder.
 
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
     """
     folder = out or dataset.folder
-    gallery = write_gallery(dataset, found.failures, folder, max_scenes)
-    made = {name: make(found) for name, make in _SECTIONS.items()} if found.scenes else {}
+    gallery = write_gallery(dataset, distributions.failures, folder, max_scenes)
+    made = (
+        {name: make(distributions) for name, make in _SECTIONS.items()}
+        if distributions.scenes
+        else {}
+    )
     anchors = ["gallery", *(name for name, section in made.items() if section), "settings"]
     body = [
         element("h1", f"Dataset {dataset.manifest.build}"),
-        element("p", _in_one_line(dataset, found), class_="faint"),
+        element("p", _in_one_line(dataset, distributions), class_="faint"),
         element("p", *(element("a", name, href=f"#{name}") for name in anchors), class_="toc"),
         element("p", element("code", "trilight view .", class_="command"), _VIEWED),
         element("h2", "Gallery", id="gallery"),
         gallery,
         element("h2", "In numbers"),
-        _overview(dataset, found),
+        _overview(dataset, distributions),
         *made.values(),
         _settings(dataset),
     ]
     title = f"Dataset {dataset.manifest.build}"
     style = _STYLE + CONTROLS_STYLE
-    data = page(title, joined(body), style=style, script=CONTROLS_SCRIPT)
+    data = page(title, join_markup(body), style=style, script=CONTROLS_SCRIPT)
     write_atomically(folder.report, data)
     return folder.report
 
 
-def _in_one_line(dataset: Dataset, found: Distributions) -> str:
-    """Return what the dataset is, above its pictures."""
+def _in_one_line(dataset: Dataset, distributions: Distributions) -> str:
+    """Return the summary line of the dataset, shown above its pictures."""
     manifest = dataset.manifest
-    floors = summary(found.all("noise_floor_db"))
+    floors = summary(distributions.all("noise_floor_db"))
     median = f", median noise floor {floors['median']:.1f} dB" if floors["count"] else ""
-    views = len(found.all("noise_floor_db"))
+    views = len(distributions.all("noise_floor_db"))
     return (
         f"{manifest.num_samples} scenes, {views} views{median}, {manifest.num_bytes / 1e6:.1f} MB"
     )
 
 
-def _overview(dataset: Dataset, found: Distributions) -> Markup:
+def _overview(dataset: Dataset, distributions: Distributions) -> Markup:
     manifest = dataset.manifest
-    per_split = {split: 0 for split in found.splits}
-    for (_, split), count in found.scenes.items():
+    per_split = {split: 0 for split in distributions.splits}
+    for (_, split), count in distributions.scenes.items():
         per_split[split] += count
     scenes = ", ".join(f"{count} {split}" for split, count in per_split.items())
     rows = [
-        *([("what follows is", found.sample)] if found.sample else []),
+        *([("what follows is", distributions.sample)] if distributions.sample else []),
         ("scenes", f"{sum(per_split.values())} ({scenes or 'none'})"),
-        ("views", f"{len(found.all('noise_floor_db'))}, {manifest.num_views} of each scene"),
+        (
+            "views",
+            f"{len(distributions.all('noise_floor_db'))}, {manifest.num_views} of each scene",
+        ),
     ]
     for name in MEASURED.values():
-        floors = summary(found.all(name))
+        floors = summary(distributions.all(name))
         if floors["count"]:
             text = f"median {floors['median']:.1f} dB, 5th percentile {floors['p5']:.1f} dB"
             rows.append((QUANTITIES[name].label.removesuffix(", dB"), text))
     rows += [
-        ("objects", f"{len(found.objects)}, {len(found.placements)} of them in scenes"),
-        ("rejections", f"{len(found.failures)}"),
+        (
+            "objects",
+            f"{len(distributions.objects)}, {len(distributions.placements)} of them in scenes",
+        ),
+        ("rejections", f"{len(distributions.failures)}"),
         ("passes", _passes(manifest.passes)),
         ("size", f"{manifest.num_bytes / 1e6:.1f} MB in {len(manifest.shards)} shards"),
         ("dataset digest", manifest.dataset_digest),
@@ -130,28 +140,28 @@ def _overview(dataset: Dataset, found: Distributions) -> Markup:
 
 
 def _passes(names: Sequence[str]) -> Markup:
-    """Return which passes the shards hold; where they hold none, the command that writes some."""
+    """Return the passes in the shards; if there are none, the command that writes some."""
     if names:
-        return joined([", ".join(names), "beside each picture"], " ")
+        return join_markup([", ".join(names), "beside each picture"], " ")
     command = element("code", passes_command())
-    return joined(["none stored;", command, "in the dataset's folder writes them"], " ")
+    return join_markup(["none stored;", command, "in the dataset's folder writes them"], " ")
 
 
 def _settings(dataset: Dataset) -> Markup:
-    return joined(
+    return join_markup(
         [
             element("h2", "Settings", id="settings"),
-            _folded("Of the build", _own_settings(dataset.manifest.settings)),
-            _folded("What the bytes depend on besides", dataset.manifest.environment),
+            _details("Of the build", _without_sources(dataset.manifest.settings)),
+            _details("What the bytes depend on besides", dataset.manifest.environment),
         ]
     )
 
 
-def _folded(title: str, values: Mapping[str, object]) -> Markup:
+def _details(title: str, values: Mapping[str, object]) -> Markup:
     return element("details", element("summary", title), element("pre", *_lines(values)))
 
 
-def _own_settings(settings: Mapping[str, object]) -> Mapping[str, object]:
+def _without_sources(settings: Mapping[str, object]) -> Mapping[str, object]:
     """Return settings without those of the sources, which the manifest holds in full."""
     return {name: value for name, value in settings.items() if name != "derived"}
 

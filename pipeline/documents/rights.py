@@ -1,4 +1,4 @@
-"""The licences of a dataset's objects, and what they ask for together."""
+"""The licences of a dataset's objects, and the union of their duties."""
 
 import re
 from collections import Counter
@@ -15,7 +15,7 @@ _HUB_LICENCES = frozenset(
     "cc-by-nc-sa-3.0 cc-by-nc-sa-4.0 cc-by-nd-4.0 cc-by-sa-3.0 cc-by-sa-4.0 cc0-1.0 "
     "cdla-permissive-1.0 cdla-permissive-2.0 cdla-sharing-1.0 isc mit mpl-2.0 unlicense".split()
 )
-"""Identifiers that Hugging Face has in lower case and otherwise as SPDX has them."""
+"""SPDX identifiers that Hugging Face knows in lower case."""
 _HUB_SPELLING: Mapping[str, str] = {
     "odbl-1.0": "odbl",
     "odc-by-1.0": "odc-by",
@@ -28,10 +28,10 @@ _HUB_SPELLING: Mapping[str, str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Rights:
-    """What is known of the rights to a dataset's objects."""
+    """The licences of a dataset's objects."""
 
     objects_by_licence: Mapping[str, int]
-    """How many objects, textures and maps are under each licence, sorted by its name."""
+    """Number of objects, textures and maps by licence, sorted by its name."""
 
     @property
     def licences(self) -> list[str]:
@@ -39,12 +39,12 @@ class Rights:
 
     @property
     def duties(self) -> tuple[str, ...]:
-        """What the licences ask for together, as keys of storage.licences.DUTIES."""
+        """Union of the licences' duties, as keys of storage.licences.DUTIES."""
         return union_of_duties(self.licences)
 
     @property
     def unknown(self) -> list[str]:
-        """Licences whose duties are not known here."""
+        """Licences whose duties are unknown."""
         return [name for name in self.licences if duties_of(name) is None]
 
 
@@ -55,11 +55,11 @@ def rights_of(objects: Iterable[LockedObject]) -> Rights:
 
 
 def hub_licence(rights: Rights, *, link: str) -> dict[str, str]:
-    """Return the licence as the front matter of a Hugging Face card states it.
+    """Return the licence fields of the front matter of a Hugging Face card.
 
     Args:
-        rights: of the objects; where there are none, nothing is stated.
-        link: file that says more where it is not one licence that Hugging Face knows.
+        rights: rights to the objects; without objects the result is empty.
+        link: file with details, unless there is only one licence and Hugging Face knows it.
     """
     if not rights.licences:
         return {}
@@ -75,23 +75,24 @@ def hub_licence(rights: Rights, *, link: str) -> dict[str, str]:
 def rights_markdown(rights: Rights) -> str:
     """Return the licences with their counts and duties, and the union of these."""
     rows = [
-        (_linked(name), _duties(name), count) for name, count in rights.objects_by_licence.items()
+        (_licence_link(name), _duties(name), count)
+        for name, count in rights.objects_by_licence.items()
     ]
     parts = [table(("licence", "asks for", "objects"), rows, numbers=1)]
     if rights.duties:
-        parts.append("Whoever uses all of the dataset has to keep all of these:")
+        parts.append("Users of the whole dataset have to keep all of these:")
         parts.append("\n".join(f"- **{duty}**: {DUTIES[duty]}" for duty in rights.duties))
     elif rights.licences and not rights.unknown:
         parts.append("None of them asks for anything.")
     if rights.unknown:
         names = ", ".join(code(name) for name in rights.unknown)
         parts.append(
-            f"What {names} asks for is **not known here**: ask whoever made the dataset before "
+            f"The duties of {names} are **not known here**: ask the maker of the dataset before "
             "you use or share it."
         )
     if "share-alike" in rights.duties:
         parts.append("No scene holds objects under two different share-alike licences.")
-    parts.append("Whom to name for each object, and what was changed, stands in `attribution.csv`.")
+    parts.append("`attribution.csv` names the author of each object, and what was changed.")
     return "\n\n".join(parts)
 
 
@@ -105,7 +106,7 @@ def encode_licences(rights: Rights) -> bytes:
     return f"{head}\n\n{rights_markdown(rights)}\n".encode(errors="replace")
 
 
-def _linked(licence: str) -> str:
+def _licence_link(licence: str) -> str:
     url = licence_url(licence)
     return f"[{code(licence)}]({url})" if url else code(licence)
 

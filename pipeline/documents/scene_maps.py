@@ -1,4 +1,4 @@
-"""The textures and the sky of a scene on its page: small pictures, and whose they are."""
+"""The textures and the sky of a scene on its page: small pictures with their rights."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +15,17 @@ MAPS_STYLE = """
 .maps { display: flex; flex-wrap: wrap; gap: .8rem; margin-bottom: 1.2rem }
 .maps figure { width: min-content } .maps figure img { width: auto; height: 112px }
 """
-"""What `maps_section` needs of the page's style."""
+"""Style sheet of `maps_section`."""
 
 _SIDE_PX = 112
 _MOST_SHOWN = 48
-"""More textures than this stand in the table only."""
+"""Most textures shown as pictures; the table has all."""
 
 
 def maps_section(scene: Scene) -> list[Markup]:
-    """Return pictures of the textures and of the sky with their rights, where there are any."""
-    figures, rows = [], list[list[Cell]]()
+    """Return pictures of the textures and of the sky with their rights, if there are any."""
+    figures = []
+    rows = list[list[Cell]]()
     for row, texture in enumerate(scene.textures):
         role = " and ".join(_columns(scene, row))
         rows.append([texture.source.name, f"texture: {role}", *_rest(texture.texels, texture)])
@@ -64,7 +65,7 @@ def _rest(values: NDArray, one: Texture | Environment) -> list[Cell]:
 
 
 def _texture_pixels(texture: Texture) -> NDArray[np.uint8]:
-    """Return a texture with its top row first; linear numbers are shown as they look."""
+    """Return the pixels of a texture, top row first; linear values are converted to sRGB."""
     height, width = texture.texels.shape[:2]
     step = max(1, height // _SIDE_PX, width // (4 * _SIDE_PX))
     linear = texture.linear(texture.texels[::-1][::step, ::step])
@@ -72,7 +73,7 @@ def _texture_pixels(texture: Texture) -> NDArray[np.uint8]:
 
 
 def _sky_pixels(sky: Environment) -> NDArray[np.uint8]:
-    """Return a map in the tones of pictures of its mean: a sun is white, and all else is seen."""
+    """Return the pixels of a sky, exposed by its mean: a sun is white, the rest visible."""
     facts = sky_facts(sky)
     scale = 0.5 / facts.mean_radiance if facts.mean_radiance else 1.0
     pixels = preview_srgb8((sky.radiance_rgb * np.float32(scale)).astype(np.float32))

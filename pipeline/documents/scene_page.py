@@ -1,4 +1,4 @@
-"""The HTML page of one scene: its pictures, and tables of what they show."""
+"""The HTML page of one scene: its pictures, and tables of its contents."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -13,13 +13,13 @@ from pipeline.documents.html import (
     Markup,
     element,
     enlargeable,
-    joined,
+    join_markup,
     outside_link,
     page,
     png_uri,
     table,
 )
-from pipeline.documents.pass_colours import id_colours
+from pipeline.documents.pass_colors import id_colors
 from pipeline.documents.scene_maps import MAPS_STYLE, maps_section
 from pipeline.documents.scene_passes import PASSES_STYLE, passes_section
 from storage.conventions import preview_gain, preview_srgb8, srgb8
@@ -44,14 +44,14 @@ nav { display: flex; gap: 1.5rem } td:first-child { min-width: 9rem }
 
 @dataclass(frozen=True, kw_only=True)
 class Neighbours:
-    """Where a page leads to, as relative links."""
+    """Relative links of a scene's page."""
 
     report: str
-    """The report."""
+    """Link to the report with all scenes."""
     before: str | None
-    """The scene before, if there is one."""
+    """Link to the previous scene, if there is one."""
     after: str | None
-    """The scene after."""
+    """Link to the next scene, if there is one."""
 
 
 def encode_scene_page(
@@ -60,9 +60,9 @@ def encode_scene_page(
     """Return the page of one scene.
 
     Args:
-        sample: the scene with its pictures, lawful.
-        split: its split.
-        rejected: the rejected attempts at it and its views.
+        sample: a valid scene with its pictures.
+        split: split of the scene.
+        rejected: rejected attempts at the scene and its views.
         links: relative links to the other pages.
     """
     scene = sample.scene
@@ -89,11 +89,11 @@ def encode_scene_page(
         element("h2", "Provenance"),
         _provenance(scene.provenance),
     ]
-    return page(title, joined(body), style=_STYLE + PASSES_STYLE + MAPS_STYLE)
+    return page(title, join_markup(body), style=_STYLE + PASSES_STYLE + MAPS_STYLE)
 
 
 def preview(radiance_rgb: NDArray[np.float32], width: int) -> NDArray[np.uint8]:
-    """Return a picture tone-mapped for people, reduced to at most `width` pixels [W, W, 3]."""
+    """Return a picture tone-mapped for display, reduced to at most `width` pixels [W, W, 3]."""
     pixels = preview_srgb8(radiance_rgb)
     if pixels.shape[1] <= width:
         return pixels
@@ -102,16 +102,17 @@ def preview(radiance_rgb: NDArray[np.float32], width: int) -> NDArray[np.uint8]:
 
 
 def _navigation(links: Neighbours) -> Markup:
-    shown = [element("a", "All scenes", href=links.report)]
+    anchors = [element("a", "All scenes", href=links.report)]
     if links.before is not None:
-        shown.append(element("a", "← before", href=links.before))
+        anchors.append(element("a", "← before", href=links.before))
     if links.after is not None:
-        shown.append(element("a", "next →", href=links.after))
-    return element("nav", *shown)
+        anchors.append(element("a", "next →", href=links.after))
+    return element("nav", *anchors)
 
 
 def _figures(sample: Sample) -> list[Markup]:
-    figures, gain = [], preview_gain(sample.radiance_rgb)
+    figures = []
+    gain = preview_gain(sample.radiance_rgb)
     for view, (picture, record) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
         uri = png_uri(preview(picture * gain, _PICTURE_PX))
         mark = ", at the cap" if record.at_cap else ""
@@ -153,17 +154,19 @@ def _views(sample: Sample) -> Markup:
 
 
 def _parts(sample: Sample) -> list[Markup]:
-    """Return the pictures of the parts that are stored, with their floors."""
+    """Return the pictures of the stored light components, with their noise floors."""
     if sample.parts_rgb is None:
         return []
-    figures, rows, gain = [], list[list[Cell]](), preview_gain(sample.radiance_rgb)
+    figures = []
+    rows = list[list[Cell]]()
+    gain = preview_gain(sample.radiance_rgb)
     for view, record in enumerate(sample.views):
         for part, floor in (record.parts or {}).items():
             picture = sample.parts_rgb[part][view]
             together = picture.sum(axis=0) if picture.ndim == 4 else picture
             name = f"view {view}, {part}"
-            shown = enlargeable(png_uri(preview(together * gain, _PICTURE_PX)), name)
-            figures.append(element("figure", shown, element("figcaption", name)))
+            picture_box = enlargeable(png_uri(preview(together * gain, _PICTURE_PX)), name)
+            figures.append(element("figure", picture_box, element("figcaption", name)))
             floors = (
                 floor.noise_floor_db,
                 floor.noise_floor_linear_db,
@@ -180,7 +183,7 @@ def _objects(scene: Scene) -> Markup:
     shading = {s.row: "smooth" if s.smooth else "flat" for s in surfaces(scene)}
     rows: list[list[Cell]] = [
         [
-            joined([_square(id_colours(row), class_="id"), entry.name], " "),
+            join_markup([_square(id_colors(row), class_="id"), entry.name], " "),
             entry.kind,
             entry.uid,
             entry.licence,

@@ -1,7 +1,7 @@
-"""What the pixels of a scene's views see, as small pictures for its page.
+"""Small pictures of passes (depth, normals, ids and others) for the page of a scene.
 
 They are computed from the scene when the page is written, so that a dataset stores nothing for
-them. At 96 pixels a side, all views of a scene cost about half of what its page costs without them.
+them. At 96 pixels a side, all views of a scene cost about half as much as the rest of its page.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.documents.html import Markup, element, enlargeable, png_uri
-from pipeline.documents.pass_colours import (
-    albedo_colours,
-    depth_greys,
+from pipeline.documents.pass_colors import (
+    albedo_colors,
+    depth_grays,
     finite_range,
-    id_colours,
-    normal_colours,
-    share_greys,
+    fraction_grays,
+    id_colors,
+    normal_colors,
 )
 from storage.records.passes.declared import pass_names
 from storage.records.passes.pictures import view_passes
@@ -30,25 +30,25 @@ PASSES_STYLE = """
 @media (max-width: 32rem) { .passes { grid-template-columns: 1fr 1fr } }
 section code { display: block; overflow-x: auto; white-space: nowrap; margin-bottom: 1rem }
 """
-"""What `passes_section` needs of the page's style."""
+"""Style sheet of `passes_section`."""
 
 _PREVIEW_PX = 96
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShownPass:
-    """How one pass is shown."""
+class PassView:
+    """Display of one pass."""
 
     word: str
-    """The pass, as `trilight passes` takes it."""
+    """Name of the pass, as `trilight passes` takes it."""
     title: str
     pixels: Callable[[NDArray], NDArray[np.uint8]]
-    """Returns the picture."""
+    """Converts the values of the pass to a picture."""
     caption: Callable[[NDArray], str]
-    """Returns what the picture's colours mean; it is asked only where something is met."""
+    """Returns the meaning of the picture's colors; called only if a pixel meets a surface."""
 
 
-def _ranged(form: str) -> Callable[[NDArray], str]:
+def _range_caption(form: str) -> Callable[[NDArray], str]:
     return lambda values: form.format(*finite_range(values) or ())
 
 
@@ -57,38 +57,38 @@ def _ids_seen(ids: NDArray) -> str:
     return f"{seen} seen, in the colours of the table Objects"
 
 
-SHOWN_PASSES = (
-    ShownPass(
+PASS_VIEWS = (
+    PassView(
         word="depth",
         title="depth",
-        pixels=depth_greys,
-        caption=_ranged("{:.2f} to {:.2f} m, near is bright"),
+        pixels=depth_grays,
+        caption=_range_caption("{:.2f} to {:.2f} m, near is bright"),
     ),
-    ShownPass(
+    PassView(
         word="normal",
         title="shading normal",
-        pixels=normal_colours,
+        pixels=normal_colors,
         caption=lambda _: "x, y, z of the world from -1 to 1 as red, green, blue",
     ),
-    ShownPass(word="object", title="object ids", pixels=id_colours, caption=_ids_seen),
-    ShownPass(
+    PassView(word="object", title="object ids", pixels=id_colors, caption=_ids_seen),
+    PassView(
         word="diffuse",
         title="diffuse albedo",
-        pixels=albedo_colours,
-        caption=_ranged("{:.2f} to {:.2f} (no unit)"),
+        pixels=albedo_colors,
+        caption=_range_caption("{:.2f} to {:.2f} (no unit)"),
     ),
-    ShownPass(
+    PassView(
         word="roughness",
         title="roughness",
-        pixels=share_greys,
-        caption=_ranged("{:.2f} to {:.2f} (no unit), rough is bright"),
+        pixels=fraction_grays,
+        caption=_range_caption("{:.2f} to {:.2f} (no unit), rough is bright"),
     ),
 )
 
 
 def passes_section(sample: Sample) -> Markup:
-    """Return small pictures of what each view of a sample sees, and the command for the numbers."""
-    words = [shown.word for shown in SHOWN_PASSES]
+    """Return small pictures of the passes of each view, and the command that writes the numbers."""
+    words = [pass_view.word for pass_view in PASS_VIEWS]
     intro = element(
         "p",
         f"What each view sees through the centres of {_PREVIEW_PX} x {_PREVIEW_PX} pixels, "
@@ -101,10 +101,10 @@ def passes_section(sample: Sample) -> Markup:
 
 
 def passes_command(words: Sequence[str] = (), *, scene: str | None = None) -> str:
-    """Return the command that writes passes beside the dataset in whose folder it runs.
+    """Return the command that writes passes beside a dataset; it is run in the dataset's folder.
 
     Args:
-        words: passes, as `trilight passes` takes them; none for those it writes by default.
+        words: passes, as `trilight passes` takes them; empty for its default.
         scene: key of the only scene; None for all.
     """
     one = "" if scene is None else f" --scene {scene}"
@@ -114,13 +114,13 @@ def passes_command(words: Sequence[str] = (), *, scene: str | None = None) -> st
 
 def _view(sample: Sample, view: int, words: Sequence[str]) -> Markup:
     names = [pass_names([word])[0] for word in words]
-    found = view_passes(sample.scene, names, view=view, resolution=_PREVIEW_PX)
+    passes = view_passes(sample.scene, names, view=view, resolution=_PREVIEW_PX)
     figures = []
-    for shown, name in zip(SHOWN_PASSES, names, strict=True):
-        values = found[name]
-        met = np.any(values != MISS if values.dtype == np.int32 else np.isfinite(values))
-        means = shown.caption(values) if met else "nothing is met"
-        title = f"view {view}, {shown.title}"
-        picture = enlargeable(png_uri(shown.pixels(values)), title)
+    for pass_view, name in zip(PASS_VIEWS, names, strict=True):
+        values = passes[name]
+        is_hit = np.any(values != MISS if values.dtype == np.int32 else np.isfinite(values))
+        means = pass_view.caption(values) if is_hit else "nothing is met"
+        title = f"view {view}, {pass_view.title}"
+        picture = enlargeable(png_uri(pass_view.pixels(values)), title)
         figures.append(element("figure", picture, element("figcaption", f"{title}: {means}")))
     return element("div", *figures, class_="passes")

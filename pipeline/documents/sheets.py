@@ -1,4 +1,4 @@
-"""Sheets: one picture that shows many of a dataset's, for people; tones as preview_srgb8."""
+"""Sheets: one picture with many pictures of a dataset, tone-mapped by `preview_srgb8`."""
 
 from collections.abc import Mapping
 
@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from pipeline.documents.chosen import choose_scenes, read_chosen
 from pipeline.documents.png import encode_png
+from pipeline.documents.scene_choice import choose_scenes, read_chosen
 from storage.atomic import write_atomically
 from storage.conventions import preview_gain, preview_srgb8
 from storage.dataset.dataset import Dataset
@@ -18,10 +18,15 @@ from storage.dataset.statistics import Statistics
 from storage.records.sample import Sample
 
 _TILE_PX = 192
-_MARGIN_PX, _TEMPLATE_MARGIN_PX = 8, 4
-_CAPTION_PX, _LABEL_PX, _TITLE_PX = 50, 22, 64
+_MARGIN_PX = 8
+_TEMPLATE_MARGIN_PX = 4
+_CAPTION_PX = 50
+_LABEL_PX = 22
+_TITLE_PX = 64
 _TILES_PER_ROW = 8
-_BACKGROUND, _INK, _FAINT = (24, 24, 26), (235, 235, 235), (160, 160, 165)
+_BACKGROUND = (24, 24, 26)
+_INK = (235, 235, 235)
+_FAINT = (160, 160, 165)
 
 
 def write_contact_sheet(
@@ -35,7 +40,7 @@ def write_contact_sheet(
 
     Args:
         dataset: the dataset.
-        statistics: its statistics.
+        statistics: statistics of the dataset.
         max_scenes: most scenes that are shown.
         out: the folder to write into; the folder of the dataset by default.
 
@@ -59,19 +64,19 @@ def write_contact_sheet(
     _write(sheet, _MARGIN_PX, 36, floors, 14, _FAINT)
     for number, (entry, sample) in enumerate(read_chosen(dataset, chosen)):
         row, column = divmod(number, per_row)
-        left = column * (row_width // per_row) + _MARGIN_PX
-        _draw_cell(sheet, sample, entry.split, left, _TITLE_PX + row * row_height)
+        left_px = column * (row_width // per_row) + _MARGIN_PX
+        _draw_cell(sheet, sample, entry.split, left_px, _TITLE_PX + row * row_height)
     write_atomically((out or dataset.folder).contact_sheet, encode_png(np.asarray(sheet)))
 
 
 def write_first_pictures(folder: DatasetFolder, sample: Sample, *, build: str, split: str) -> None:
-    """Write `contact_sheet.png` of one scene, for whoever looks before the dataset is finished.
+    """Write `contact_sheet.png` of one scene, as a preview before the dataset is finished.
 
     Args:
-        folder: the dataset in the making.
+        folder: folder of the unfinished dataset.
         sample: its first finished scene.
         build: name of the build.
-        split: of the scene.
+        split: split of the scene.
 
     Raises:
         TrilightError: the folder cannot be written.
@@ -97,27 +102,27 @@ def write_template_sheet(
     row_height = _TILE_PX + _LABEL_PX + _TEMPLATE_MARGIN_PX
     width = per_template * (_TILE_PX + _TEMPLATE_MARGIN_PX) + _TEMPLATE_MARGIN_PX
     sheet = Image.new("RGB", (width, row_height * len(rows)), _BACKGROUND)
-    for row, (template, places) in enumerate(sorted(rows.items())):
+    for row, (template, scenes) in enumerate(sorted(rows.items())):
         top = row * row_height
         _write(sheet, _TEMPLATE_MARGIN_PX, top + 3, f"{dataset.manifest.build}: {template}", 14)
-        for column, (key, shard) in enumerate(places.items()):
-            left = _TEMPLATE_MARGIN_PX + column * (_TILE_PX + _TEMPLATE_MARGIN_PX)
+        for column, (key, shard) in enumerate(scenes.items()):
+            left_px = _TEMPLATE_MARGIN_PX + column * (_TILE_PX + _TEMPLATE_MARGIN_PX)
             for sample in dataset.read_samples(shard, [key]):
                 picture = sample.radiance_rgb[0] * preview_gain(sample.radiance_rgb)
-                sheet.paste(_tile(picture), (left, top + _LABEL_PX))
+                sheet.paste(_tile(picture), (left_px, top + _LABEL_PX))
     write_atomically((out or dataset.folder).template_sheet, encode_png(np.asarray(sheet)))
 
 
-def _draw_cell(sheet: Image.Image, sample: Sample, split: str, left: int, top: int) -> None:
+def _draw_cell(sheet: Image.Image, sample: Sample, split: str, left_px: int, top: int) -> None:
     origin = sample.scene.provenance
     excursion = origin.get("excursion")
     beyond = f"  {excursion['axis']} {excursion['value']:g}" if excursion else ""
-    _write(sheet, left, top, f"{sample.key}  {split}{beyond}", 13)
+    _write(sheet, left_px, top, f"{sample.key}  {split}{beyond}", 13)
     triangles = f"{origin['template']}  {sample.scene.num_triangles} triangles"
-    _write(sheet, left, top + 16, triangles, 13)
+    _write(sheet, left_px, top + 16, triangles, 13)
     exposed = sample.radiance_rgb * preview_gain(sample.radiance_rgb)
     for view, (picture, record) in enumerate(zip(exposed, sample.views, strict=True)):
-        x = left + view * _TILE_PX
+        x = left_px + view * _TILE_PX
         sheet.paste(_tile(picture), (x, top + _CAPTION_PX))
         mark = " (cap)" if record.at_cap else ""
         floor = f"{record.noise_floor_db:.1f} dB, {record.spp} spp{mark}"
@@ -135,11 +140,11 @@ def _tile(radiance_rgb: NDArray[np.float32]) -> Image.Image:
 
 
 def _first_scenes(dataset: Dataset, per_template: int) -> Mapping[str, dict[str, ShardEntry]]:
-    """Return the shard of each scene to show by key, by template."""
+    """Return the scenes to show by template: their shards by key."""
     rows: dict[str, dict[str, ShardEntry]] = {}
     for shard in described_shards(dataset):
         for record in dataset.read_scenes(shard):
-            places = rows.setdefault(str(record.scene.provenance["template"]), {})
-            if len(places) < per_template:
-                places[record.key] = shard
+            scenes = rows.setdefault(str(record.scene.provenance["template"]), {})
+            if len(scenes) < per_template:
+                scenes[record.key] = shard
     return rows

@@ -1,7 +1,7 @@
-"""`SHA256SUMS` of a folder that is published: as `sha256sum -c` reads it, and never stale.
+"""`SHA256SUMS` of a published folder, in the format of `sha256sum -c`.
 
-Whoever rewrites documents beside it renews their lines. Lines of shards stay: a shard that is
-damaged later must not be summed as if it were right.
+Code that rewrites documents renews their lines. Lines of shards stay: a shard that is damaged later
+must not get a new sum.
 """
 
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ from storage.errors import TrilightError
 SUMS = "SHA256SUMS"
 
 UNPUBLISHED = ("logs/*", ".staging/*", ".cache/*", "*.claim", "*.part", "*.tmp")
-"""Never published: how the files came to be, and what is not finished."""
+"""Patterns of files that are never published: logs, claims and unfinished files."""
 
 _SHARD = ".tar"
 
@@ -29,15 +29,15 @@ def published_files(folder: Path) -> Iterator[Path]:
 
 
 def write_sums(folder: Path) -> None:
-    """Write the sums of all published files; TrilightError where they cannot be written."""
+    """Write the sums of all published files; raises TrilightError if they cannot be written."""
     _write(folder, known={})
 
 
 def renew_sums(folder: Path) -> None:
-    """Write the sums anew where they are, but for those of shards, which stay as they are.
+    """Write existing sums again, except those of shards, which stay as they are.
 
     Raises:
-        TrilightError: they cannot be written, or are no sums.
+        TrilightError: the file cannot be written, or is malformed.
     """
     if (folder / SUMS).is_file():
         known = _read(folder)
@@ -45,22 +45,22 @@ def renew_sums(folder: Path) -> None:
 
 
 def stale_sums(folder: Path) -> list[str]:
-    """Return the files, shards aside, that are not as the sums say; none where there are no sums.
+    """Return the files, without shards, that differ from the sums; empty without sums.
 
     Raises:
-        TrilightError: the sums are none.
+        TrilightError: the file of sums is malformed.
     """
     if not (folder / SUMS).is_file():
         return []
     known = _read(folder)
-    there = {path.relative_to(folder).as_posix(): path for path in published_files(folder)}
-    del there[SUMS]
+    files = {path.relative_to(folder).as_posix(): path for path in published_files(folder)}
+    del files[SUMS]
     return sorted(
         name
-        for name in known.keys() | there.keys()
+        for name in known.keys() | files.keys()
         if name not in known
-        or name not in there
-        or (not name.endswith(_SHARD) and sha256_of_file(there[name]) != known[name])
+        or name not in files
+        or (not name.endswith(_SHARD) and sha256_of_file(files[name]) != known[name])
     )
 
 
@@ -74,7 +74,7 @@ def _write(folder: Path, known: dict[str, str]) -> None:
 
 
 def _read(folder: Path) -> dict[str, str]:
-    found = {}
+    sums = {}
     for line in (folder / SUMS).read_text(errors="replace").splitlines():
         sha256, separator, name = line.partition("  ")
         if not separator or len(sha256) != 64:
@@ -82,5 +82,5 @@ def _read(folder: Path) -> dict[str, str]:
                 f"{folder / SUMS}: {line:.40} is no sum; expected lines of `sha256sum`. Delete the "
                 "file, and write it again with make release."
             )
-        found[name] = sha256
-    return found
+        sums[name] = sha256
+    return sums

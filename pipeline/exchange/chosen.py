@@ -42,6 +42,6 @@ def chosen_samples(
         which = f"scene {wanted}" if wanted else "scene"
         where = "" if split is None else f" in split {split}"
         raise TrilightError(
-            f"{dataset.shown}: no {which}{where}; expected one of its "
+            f"{dataset.display_name}: no {which}{where}; expected one of its "
             f"{dataset.manifest.num_samples}. List them with `trilight inspect`."
         )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scenes.pieces import ScenePiece, joined
+from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading import ShadedMesh
 from storage.records.material import EMISSION, distinct_rows, laid_out
 from storage.records.retextured import AnyScene, with_textures
@@ -112,7 +112,7 @@ def dressed(entry: SceneObject, triangles: DressedTriangles) -> DressedPiece:
 
 def joined_arrays(pieces: Sequence[DressedPiece]) -> dict[str, Any]:
     """Return geometry and materials of a Scene, without the textures."""
-    return joined([each.piece for each in pieces])
+    return concatenate_pieces([each.piece for each in pieces])
 
 
 def with_worn_textures(scene: AnyScene, pieces: Sequence[DressedPiece]) -> AnyScene:

@@ -26,10 +26,10 @@ from pipeline.exchange.description import (
     DescribedObject,
     SceneDescription,
 )
-from pipeline.scenes.pieces import ScenePiece, joined
+from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
-from scene_templates.rotations import rotated, rotation_xyz
+from scene_templates.rotations import rotate_points, rotation_xyz
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
@@ -101,7 +101,7 @@ def scene_from_description(
         _check_counts(pieces)
         c2w, fov_deg = described_cameras(description.cameras[:num_views])
         scene = Scene(
-            **joined(pieces),
+            **concatenate_pieces(pieces),
             c2w=c2w,
             fov_deg=fov_deg,
             objects=tuple(piece.entry for piece in pieces),
@@ -119,7 +119,7 @@ def placed(mesh: LoadedMesh, described: DescribedObject) -> NDArray[np.float32]:
     points = mesh.positions
     if transform.normalize:
         points = (points - mesh.centre) / (2 * mesh.reach)
-    turned = rotated(points, rotation_xyz(transform.rotation_deg))
+    turned = rotate_points(points, rotation_xyz(transform.rotation_deg))
     world = turned * np.array(transform.scale) + np.array(transform.translation)
     return world.astype(np.float32)
 

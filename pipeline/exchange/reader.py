@@ -46,7 +46,7 @@ class SceneReader:
         Raises:
             TrilightError: the file is unusable, or holds no scene.
         """
-        self._child.may(reach_of(source))
+        self._child.allow_files(reach_of(source))
         keys = self._call(source.name, source_keys, source)
         if not keys:
             raise TrilightError(f"{source.name}: holds no scene.")
@@ -55,12 +55,12 @@ class SceneReader:
     def load(self, source: SceneSource, *, pictures: bool = False) -> LoadedScene:
         """Read one scene; arguments and TrilightError as of `scene_source.load_source`."""
         source = dataclasses.replace(source, albedo_over_one=self._over_one)
-        self._child.may(reach_of(source))
+        self._child.allow_files(reach_of(source))
         return self._call(source.name, _load_with_pictures if pictures else load_source, source)
 
     def cameras(self, source: SceneSource) -> Cameras:
         """Return poses and angles; raises TrilightError as `scene_source.load_cameras`."""
-        self._child.may(reach_of(source))
+        self._child.allow_files(reach_of(source))
         return self._call(source.name, load_cameras, source)
 
     def mesh(self, path: Path, licence: str) -> LoadedMesh:
@@ -68,7 +68,7 @@ class SceneReader:
 
         What of the file nothing reads is logged.
         """
-        self._child.may(reach(files=[path]))
+        self._child.allow_files(reach(files=[path]))
         wanted = (path, path.name, path.name, AssetSettings(), licence)
         mesh, _ = self._call(path.name, load_mesh_file, *wanted)
         if mesh.unread:

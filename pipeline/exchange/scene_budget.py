@@ -11,7 +11,7 @@ from pipeline.assets.cleaning.clean import clean, normalise
 from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.recipe import methods_of
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.scenes.pieces import ScenePiece, joined
+from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, face_normals, flat_shaded, smooth_shaded
 from storage.errors import Rejected, TrilightError
@@ -53,7 +53,7 @@ def within_budget(scene: Scene, budget: int) -> tuple[Scene, tuple[str, ...]]:
             f"(emitters take {counts[emits].sum()} of them)."
         )
     reduced = Scene(
-        **joined(pieces),
+        **concatenate_pieces(pieces),
         c2w=scene.c2w,
         fov_deg=scene.fov_deg,
         objects=tuple(piece.entry for piece in pieces),

@@ -1,8 +1,8 @@
-"""What is missing of a dataset as an array of tasks, for Slurm and for Kubernetes.
+"""Divides the missing shards of a dataset into an array of tasks, for Slurm and for Kubernetes.
 
-Task K makes `per_task` shards from K times that number on, so that a task means the same whenever
-it is submitted, and what is missing can be submitted alone. Slurm names tasks by these numbers;
-Kubernetes counts from 0, and is given the numbers as TASKS (pipeline.executors.kubernetes).
+Task K makes `per_task` shards from shard K * `per_task` on, so that a task means the same whenever
+it is submitted, and missing tasks can be submitted alone. Slurm numbers tasks so; Kubernetes counts
+from 0, and gets these numbers as TASKS (pipeline.executors.kubernetes).
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pipeline.builds.named import BUILDS, named_build
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.dataset import dataset_files
 from storage.dataset.layout import dataset_folder
 from storage.dataset.progress import missing_shards
@@ -22,8 +22,8 @@ from storage.settings.changes import changed
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 
-MOST_TASKS = 1000
-"""Of one array: a Slurm cluster whose MaxArraySize is not changed refuses task 1001."""
+MAX_TASKS = 1000
+"""Most tasks of one array: a Slurm cluster with the default MaxArraySize refuses task 1001."""
 
 
 @checked()
@@ -31,7 +31,7 @@ class DatasetByArray(DatasetOrder):
     """A dataset made by the tasks of a scheduler's array."""
 
     scheduler: Literal["slurm", "kubernetes", "none"] = "slurm"
-    """Scheduler that is asked for what is missing; none only watches what others have submitted."""
+    """Scheduler that gets the missing tasks; none only shows the progress of submitted ones."""
     shards_per_task: Annotated[int | None, Within(1, 10**6, unit="shards")] = None
     """Number of shards of an array task; by default as few as 1000 tasks allow."""
     at_once: Annotated[int | None, Within(1, 10**6, unit="tasks")] = None
@@ -42,7 +42,7 @@ class DatasetByArray(DatasetOrder):
 
     @property
     def dataset(self) -> DatasetOrder:
-        """The dataset alone, as the tasks are asked for it."""
+        """The options of the dataset alone, without those of the array."""
         return DatasetOrder(
             **{each.name: getattr(self, each.name) for each in dataclasses.fields(DatasetOrder)}
         )
@@ -50,31 +50,31 @@ class DatasetByArray(DatasetOrder):
 
 @dataclass(frozen=True, kw_only=True)
 class ArrayJob:
-    """One submission."""
+    """One submission of an array."""
 
     order: DatasetOrder
-    """The dataset, with its number of scenes."""
+    """Options of the dataset, with its number of scenes."""
     tasks: Sequence[int]
-    """Numbers of the tasks that have something to make; none where nothing is missing."""
+    """Numbers of the tasks with missing shards; empty if nothing is missing."""
     per_task: int
-    """Shards of a task."""
+    """Number of shards of a task."""
     at_once: int | None
-    """Most tasks that run at the same time; None for as many as the scheduler lets."""
+    """Most tasks that run at the same time; None leaves it to the scheduler."""
 
 
 def array_job(
     order: DatasetOrder, *, per_task: int | None, at_once: int | None, on: str = "slurm"
 ) -> ArrayJob:
-    """Return the array that makes what is missing of a dataset, which need not be begun.
+    """Return the array that makes the missing shards of a dataset, which need not exist yet.
 
     Args:
-        order: the dataset.
-        per_task: shards of a task; by default as few as an array has tasks for.
-        at_once: most tasks at the same time.
-        on: the scheduler, for messages.
+        order: options of the dataset.
+        per_task: shards of a task; by default as few as MOST_TASKS tasks allow.
+        at_once: most tasks that run at the same time.
+        on: name of the scheduler, for messages.
 
     Raises:
-        TrilightError: the order is of scene files or of a part, names a password, its dataset
+        TrilightError: the options name scene files, a range of shards or a password, the dataset
             cannot be read, or the array would have too many tasks.
     """
     if order.scenes_from or order.revisits or order.shards:
@@ -91,27 +91,27 @@ def array_job(
     scenes = order.scenes or BUILDS.find(order.build).num_scenes
     splits = changed(named_build(order.build), order.changes).splits
     planned = shards_for(scenes, splits)
-    begun = _is_begun(order.place)
-    missing = missing_shards(order.place, scenes) if begun else list(range(planned))
-    each = per_task or -(-planned // MOST_TASKS)
+    is_begun = _is_begun(order.place)
+    missing = missing_shards(order.place, scenes) if is_begun else list(range(planned))
+    each = per_task or -(-planned // MAX_TASKS)
     tasks = sorted({shard // each for shard in missing})
-    if tasks and tasks[-1] >= MOST_TASKS:
+    if tasks and tasks[-1] >= MAX_TASKS:
         raise TrilightError(
             f"--shards-per-task is {each}: the array would end with task {tasks[-1]}; expected at "
-            f"most {MOST_TASKS - 1}, which schedulers allow by default. {-(-planned // MOST_TASKS)}"
+            f"most {MAX_TASKS - 1}, which schedulers allow by default. {-(-planned // MAX_TASKS)}"
             " shards a task fit."
         )
     order = dataclasses.replace(order, scenes=scenes, out=order.place, workers=None)
     return ArrayJob(order=order, tasks=tasks, per_task=each, at_once=at_once)
 
 
-def _is_begun(place: str) -> bool:
-    """Return whether a folder or bucket holds a dataset's manifest."""
-    folder = dataset_folder(place)
+def _is_begun(location: str) -> bool:
+    """Return True if a folder or bucket holds a dataset's manifest."""
+    folder = dataset_folder(location)
     if not folder.bucket:
         return folder.manifest.exists()
-    found = dataset_files(place).open_beside(folder.manifest.name)
-    if found is None:
+    stream = dataset_files(location).open_beside(folder.manifest.name)
+    if stream is None:
         return False
-    found.close()
+    stream.close()
     return True

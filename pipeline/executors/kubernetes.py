@@ -1,11 +1,11 @@
-"""`--runner kubernetes`: one task of an indexed Job, on threads.
+"""`--runner kubernetes`: makes the shards of one task of an indexed Job, on threads.
 
-Kubernetes starts the same container with the places 0, 1, 2, ... in JOB_COMPLETION_INDEX, and again
-with the same place when a task is lost. TASKS says which task each place has, such as 0-3,7, so
-that only what is missing is made; SHARDS_PER_TASK says how many shards a task makes. No task waits
-for another: they meet in the bucket, and whoever makes the last shard finishes the dataset.
-`trilight submit kubernetes` makes such jobs (pipeline.executors.kubernetes_array). Nobody has run
-one on a real cluster yet; tests give tasks the variables that the manual promises.
+Kubernetes starts the same container with the index 0, 1, 2, ... in JOB_COMPLETION_INDEX, and again
+with the same index when a task is lost. TASKS maps each index to a task, such as 0-3,7, so that
+only missing shards are made; SHARDS_PER_TASK sets the shards of a task. No task waits for another:
+they share the bucket, and the task that makes the last shard finishes the dataset. `trilight submit
+kubernetes` makes such jobs (pipeline.executors.kubernetes_array). It has not run on a real cluster
+yet; tests give tasks the variables that the manual documents.
 """
 
 import dataclasses
@@ -13,22 +13,22 @@ import os
 from collections.abc import Mapping
 
 from pipeline.executors.threads import ThreadRunner
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.pipeline import make_dataset
-from pipeline.making.run import Outcome
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import make_dataset
+from pipeline.generation.run import Outcome
 from storage.errors import TrilightError
 from storage.number_ranges import MOST_NUMBERS, numbers_of
 
 PLACE = "JOB_COMPLETION_INDEX"
-"""Variable that tells a task its place, from 0."""
+"""Variable with the index of a task in the Job, from 0."""
 
 
 def make(order: DatasetOrder, address: str | None) -> Outcome:
     """Make the shards of this task.
 
     Raises:
-        TrilightError: this is no task of an indexed Job, or the order has a range of its own; or as
-            `make_dataset`.
+        TrilightError: this is no task of an indexed Job, or the options have a range of shards; or
+            as `make_dataset`.
     """
     if order.shards is not None:
         raise TrilightError(
@@ -40,13 +40,13 @@ def make(order: DatasetOrder, address: str | None) -> Outcome:
 
 
 def shards_of_place(environment: Mapping[str, str]) -> str:
-    """Return the range A:B of shards that falls to this task.
+    """Return the range A:B of shards of this task.
 
     Args:
-        environment: what Kubernetes and the Job's description set.
+        environment: variables that Kubernetes and the Job's manifest set.
 
     Raises:
-        TrilightError: a variable is missing or malformed, or the place is beyond the tasks.
+        TrilightError: a variable is missing or malformed, or the index is beyond the tasks.
     """
     text = _text(environment, "TASKS")
     tasks = numbers_of(text)

@@ -1,8 +1,8 @@
-"""An array as an indexed Job of Kubernetes, each of whose pods makes one task.
+"""Submits an array as an indexed Job of Kubernetes, each of whose pods makes one task.
 
-A pod that its node takes along (a spot machine, a drain, an eviction) does not count; one that
-fails is started again so often, each index for itself; one that was asked something wrong (exit
-status 2) fails at once. Indices that are made are not run again, whatever becomes of the others.
+A pod that is lost with its node (a spot machine, a drain, an eviction) does not count as a failure;
+a failing pod is started again up to the option `tries`, each index by itself; one with invalid
+options (exit status 2) fails at once. Finished indices are not run again.
 """
 
 import json
@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar
 import yaml
 
 from pipeline.executors.array_job import ArrayJob
-from pipeline.making.dataset_order import DatasetOrder, generate_words
+from pipeline.generation.dataset_order import DatasetOrder, generate_words
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -27,17 +27,17 @@ from storage.settings.described import checked, from_record
 from storage.settings.ranges import Within
 
 MACHINES = "TRILIGHT_MACHINES"
-"""Variable that names a file of JSON: options of machines, such as {"where": "a-namespace"}."""
+"""Variable with the path of a JSON file: options of machines, such as {"where": "a-namespace"}."""
 _KEPT_S = 86400
-"""How long an ended job stays to be looked at."""
+"""Seconds that an ended job stays visible in the cluster."""
 
 
 @checked()
 class KubernetesOptions:
-    """With kubernetes: the machines."""
+    """With kubernetes: options of the machines."""
 
     REMOVED: ClassVar = ("on_demand",)
-    """Options of earlier versions."""
+    """Options of earlier versions, which are refused with a message."""
     image: str | None = None
     """Address of Trilight's image (infra/images/cpu.Dockerfile) as the machines pull it, best by
     digest; by default TRILIGHT_IMAGE of the environment."""
@@ -60,11 +60,11 @@ class KubernetesOptions:
     """Folder for the manifest of the array, which gets a folder of its own in it."""
 
 
-def options_here() -> KubernetesOptions:
-    """Return the options that whoever started this process has chosen (MACHINES).
+def options_from_environment() -> KubernetesOptions:
+    """Return the options of the file that the environment names (MACHINES).
 
     Raises:
-        TrilightError: the file cannot be read, or states no such options.
+        TrilightError: the file cannot be read, or holds other options.
     """
     name = os.environ.get(MACHINES)
     if not name:
@@ -92,8 +92,8 @@ def write_manifest(job: ArrayJob, options: KubernetesOptions) -> Path:
     return path
 
 
-def create_words(manifest: Path) -> list[str]:
-    """Return the words of the command that submits a job, `kubectl` first."""
+def create_command(manifest: Path) -> list[str]:
+    """Return the command that submits a job, `kubectl` first."""
     return ["kubectl", "create", "--filename", str(manifest)]
 
 
@@ -109,7 +109,7 @@ def submit_job(job: ArrayJob, options: KubernetesOptions) -> Path:
             "submit kubernetes: no kubectl here; expected it installed and logged in. The "
             "manifest is written; --dry-run prints the command that submits it."
         )
-    done = subprocess.run(create_words(path), capture_output=True, text=True, check=False)
+    done = subprocess.run(create_command(path), capture_output=True, text=True, check=False)
     if done.returncode:
         why = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
         raise TrilightError(
@@ -131,7 +131,7 @@ def job_manifest(job: ArrayJob, options: KubernetesOptions) -> dict[str, Any]:
     environment = {
         "SHARDS_PER_TASK": str(job.per_task),
         "TASKS": number_ranges(job.tasks),
-        "TRILIGHT_CORES": str(options.cores),  # containers see all cores of a machine
+        "TRILIGHT_CORES": str(options.cores),  # a container sees all cores of its machine
         "HOME": "/tmp",
     }
     said = repr((words, environment, job.at_once, options))
@@ -219,7 +219,7 @@ def _image(options: KubernetesOptions) -> str:
 
 
 def _require_bucket_alone(order: DatasetOrder) -> None:
-    """Raise TrilightError where a task would need a file of this machine."""
+    """Raise TrilightError if a task would need a file of this machine."""
     if order.place.partition("://")[0] not in WRITABLE:
         raise TrilightError(
             f"submit kubernetes: --out is {order.place}; expected a bucket such as "

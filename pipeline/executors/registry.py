@@ -1,8 +1,8 @@
-"""Who runs the tasks of a dataset, by the name that `--runner` takes.
+"""The executors that run a dataset's tasks, by the name that `--runner` takes.
 
-Executors are peers: each is a module with a function `make`, and none is known to the engine
-(pipeline.making). `make` narrows an order or begins a flow, and then calls `make_dataset` with a
-`Runner` (pipeline.making.runner).
+Each executor is a module with a function `make`; the engine (pipeline.generation) imports none.
+`make` narrows the options or begins a flow, and then calls `make_dataset` with a `Runner`
+(pipeline.generation.runner).
 """
 
 from collections.abc import Callable
@@ -10,33 +10,33 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.errors import TrilightError, expected_one_of
 from storage.installation import module_name
 from storage.registry import Registry
 
 if TYPE_CHECKING:
-    from pipeline.making.run import Outcome
+    from pipeline.generation.run import Outcome
 
 Make = Callable[[DatasetOrder, str | None], "Outcome"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Executor:
-    """A way to make a dataset; the same order gives the same bytes in each."""
+    """Runs the tasks of a dataset; equal options give equal bytes with each executor."""
 
     make: Make
-    """Makes an order, or what is missing of it; the second argument is `--address`."""
+    """Makes the dataset of some options; the second argument is `--address`."""
     needs_address: bool = False
-    """Whether `--address` says where; without, it is refused."""
+    """True if `--address` is required; otherwise it is refused."""
     takes_workers: bool = True
-    """Whether `--workers` says how many tasks run at a time."""
+    """True if `--workers` sets how many tasks run at the same time."""
 
 
-def _made_by(module: str) -> Make:
-    """Return the function `make` of a module, which is loaded when a dataset is made.
+def _load_on_use(module: str) -> Make:
+    """Return a function that imports a module when it is called, and calls its `make`.
 
-    Loading brings every stage, and for some executors packages that may not be installed.
+    The import loads every stage, and for some executors packages that may not be installed.
     """
 
     def make(order: DatasetOrder, address: str | None) -> "Outcome":
@@ -50,27 +50,27 @@ EXECUTORS: Registry[Executor] = Registry(
     "runner",
     Executor,
     {
-        "threads": Executor(make=_made_by("pipeline.executors.threads")),
-        "slurm": Executor(make=_made_by("pipeline.executors.slurm")),
-        "kubernetes": Executor(make=_made_by("pipeline.executors.kubernetes")),
-        "prefect": Executor(make=_made_by("pipeline.flows.on_prefect")),
+        "threads": Executor(make=_load_on_use("pipeline.executors.threads")),
+        "slurm": Executor(make=_load_on_use("pipeline.executors.slurm")),
+        "kubernetes": Executor(make=_load_on_use("pipeline.executors.kubernetes")),
+        "prefect": Executor(make=_load_on_use("pipeline.flows.on_prefect")),
         "dask": Executor(
-            make=_made_by("pipeline.flows.on_dask"), needs_address=True, takes_workers=False
+            make=_load_on_use("pipeline.flows.on_dask"), needs_address=True, takes_workers=False
         ),
     },
 )
-"""By name. How a dataset is made does not stand in it."""
+"""Executors by name. No dataset records which one made it."""
 
 
 def find_executor(name: str, address: str | None, workers: int | None) -> Executor:
     """Return an executor.
 
     Args:
-        name: as `--runner` gives it.
-        address, workers: what `--address` and `--workers` say.
+        name: value of `--runner`.
+        address, workers: values of `--address` and `--workers`.
 
     Raises:
-        TrilightError: an unknown name, or an option that the executor has no use for, or lacks.
+        TrilightError: the name is unknown, or an option is missing or not supported.
     """
     if name not in EXECUTORS:
         raise TrilightError(f"--runner is {name!r}; {expected_one_of(name, EXECUTORS)}.")

@@ -1,9 +1,9 @@
-"""`--runner slurm`: makes the shards that fall to one task of a Slurm array, on threads.
+"""`--runner slurm`: makes the shards of one task of a Slurm array, on threads.
 
 infra/slurm/generate.sbatch submits such an array. No task submits another, and none waits for
-another: they meet in the folder, or the bucket, that `--out` names, and whoever makes the last
-shard finishes the dataset. Nobody has run this on a real Slurm cluster yet; tests give it the
-variables that Slurm's manual promises.
+another: they share the folder or bucket that `--out` names, and the task that makes the last shard
+finishes the dataset. It has not run on a real Slurm cluster yet; tests give it the variables that
+Slurm's manual documents.
 """
 
 import dataclasses
@@ -11,10 +11,10 @@ import os
 from collections.abc import Callable, Mapping
 
 from pipeline.executors.threads import ThreadRunner
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.pipeline import make_dataset, prepare_dataset
-from pipeline.making.run import Outcome
-from pipeline.making.tasks import shard_ranges
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import make_dataset, prepare_dataset
+from pipeline.generation.run import Outcome
+from pipeline.generation.tasks import shard_ranges
 from storage.errors import TrilightError
 
 
@@ -22,7 +22,7 @@ def make(order: DatasetOrder, address: str | None) -> Outcome:
     """Make the shards of this array task.
 
     Raises:
-        TrilightError: this is no task of an array, or the order has a range of its own; or as
+        TrilightError: this is no task of an array, or the options have a range of shards; or as
             `make_dataset`.
     """
     if order.shards is not None:
@@ -35,18 +35,18 @@ def make(order: DatasetOrder, address: str | None) -> Outcome:
 
 
 def shards_of_task(environment: Mapping[str, str], num_shards: Callable[[], int]) -> str:
-    """Return the range A:B of shards that falls to this task.
+    """Return the range A:B of shards of this task.
 
-    With SHARDS_PER_TASK it follows from SLURM_ARRAY_TASK_ID alone, so that single tasks can be
-    submitted again. Without, every task of the array gets an equal share; where there are more
-    tasks than shards, several share one range.
+    With SHARDS_PER_TASK it depends on SLURM_ARRAY_TASK_ID alone, so that single tasks can be
+    submitted again. Without it, all tasks get equal ranges; if there are more tasks than shards,
+    several tasks get the same range.
 
     Args:
-        environment: what Slurm and the user set.
-        num_shards: returns how many shards the dataset will have; only called if that matters.
+        environment: variables that Slurm and the user set.
+        num_shards: returns the number of shards of the dataset; called only if it is needed.
 
     Raises:
-        TrilightError: a variable is missing or is no number, or the array has gaps.
+        TrilightError: a variable is missing or not a number, or the array has gaps.
     """
     task = _number(environment, "SLURM_ARRAY_TASK_ID", least=0)
     if environment.get("SHARDS_PER_TASK"):

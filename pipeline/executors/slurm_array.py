@@ -1,4 +1,4 @@
-"""An array of what is missing of a dataset, as Slurm takes it: its command, and its submission."""
+"""Submits the missing shards of a dataset as a Slurm array, by sbatch."""
 
 import os
 import shutil
@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pipeline.executors.array_job import ArrayJob
-from pipeline.making.dataset_order import generate_words
+from pipeline.generation.dataset_order import generate_words
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
 
@@ -18,12 +18,12 @@ _OF_THE_SCRIPT = ("--out", "--scenes", "--objects")
 """Options that the script takes from its environment."""
 
 
-def sbatch_words(job: ArrayJob, options: Sequence[str] = ()) -> list[str]:
-    """Return the words of the submission, `sbatch` first.
+def sbatch_command(job: ArrayJob, options: Sequence[str] = ()) -> list[str]:
+    """Return the command that submits an array, `sbatch` first.
 
     Args:
-        job: what is missing.
-        options: of sbatch, besides, such as --partition=cpu.
+        job: the array.
+        options: further options of sbatch, such as --partition=cpu.
     """
     limit = f"%{job.at_once}" if job.at_once else ""
     array = f"--array={number_ranges(job.tasks)}{limit}"
@@ -32,14 +32,14 @@ def sbatch_words(job: ArrayJob, options: Sequence[str] = ()) -> list[str]:
 
 
 def sbatch_environment(job: ArrayJob) -> Mapping[str, str]:
-    """Return what the script reads."""
+    """Return the environment variables that the script reads."""
     return {
         "OUT": job.order.place,
         "BUILD": job.order.build,
         "SCENES": str(job.order.scenes),
         "SHARDS_PER_TASK": str(job.per_task),
         "TRILIGHT": str(Path(sys.executable).with_name("trilight")),
-        "OBJECTS": job.order.objects or "",  # also where this shell has one of its own
+        "OBJECTS": job.order.objects or "",  # also overrides a variable of this shell
     }
 
 
@@ -54,9 +54,9 @@ def submit_array(job: ArrayJob, options: Sequence[str] = ()) -> str:
             "submit slurm: no sbatch here; expected a login node of a Slurm cluster. --dry-run "
             "prints the command."
         )
-    Path("logs").mkdir(exist_ok=True)  # where the script's tasks write
+    Path("logs").mkdir(exist_ok=True)  # the script's tasks write their logs here
     done = subprocess.run(
-        sbatch_words(job, options),
+        sbatch_command(job, options),
         env={**os.environ, **sbatch_environment(job)},
         capture_output=True,
         text=True,
@@ -70,10 +70,10 @@ def submit_array(job: ArrayJob, options: Sequence[str] = ()) -> str:
 
 def _without(words: Sequence[str], options: Sequence[str]) -> list[str]:
     """Return option words without some options and their values."""
-    kept: list[str] = []
+    rest: list[str] = []
     skip = False
     for word in words:
         if not skip and word not in options:
-            kept.append(word)
+            rest.append(word)
         skip = not skip and word in options
-    return kept
+    return rest

@@ -1,13 +1,13 @@
-"""Tasks on threads of this process, each with its own render child: no server, no scheduler."""
+"""`--runner threads`: runs tasks on threads of this process, each with its own render child."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.pipeline import make_dataset, make_task
-from pipeline.making.run import Outcome, ShardJob, TaskOutcome
-from pipeline.making.runner import in_window
-from pipeline.making.tasks import Piece
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import make_dataset, make_task
+from pipeline.generation.run import Outcome, ShardJob, TaskResult
+from pipeline.generation.runner import in_window
+from pipeline.generation.tasks import Piece
 from storage.dataset.statistics import Statistics
 
 
@@ -17,12 +17,12 @@ def make(order: DatasetOrder, address: str | None) -> Outcome:
 
 
 class ThreadRunner:
-    """As many threads as the order has workers; native code runs in their render children."""
+    """Runs each task on one of `job.num_at_once` threads; native code runs in render children."""
 
     num_at_once = None
     window = None
 
-    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
+    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
         pool = ThreadPoolExecutor(job.num_at_once)
         try:
             yield from in_window(
@@ -39,5 +39,5 @@ class ThreadRunner:
         return write_documents()
 
 
-def _first_done(running: list["Future[TaskOutcome]"]) -> "Future[TaskOutcome]":
+def _first_done(running: list["Future[TaskResult]"]) -> "Future[TaskResult]":
     return next(iter(wait(running, return_when=FIRST_COMPLETED).done))

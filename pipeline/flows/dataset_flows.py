@@ -1,4 +1,4 @@
-"""The flows `prepare-assets`, `generate-scenes` and `build-dataset`, which is both of them."""
+"""The flows `prepare-assets`, `generate-scenes` and `build-dataset`, which combines both."""
 
 import dataclasses
 from typing import Any
@@ -16,11 +16,11 @@ from pipeline.flows.orders import (
     run_name,
 )
 from pipeline.flows.prefect_runner import PrefectRunner
-from pipeline.flows.watching import make_watched
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.pipeline import prepare_dataset
-from pipeline.making.run import Outcome
-from pipeline.making.tasks import shard_ranges
+from pipeline.flows.run_artifacts import make_with_artifacts
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import prepare_dataset
+from pipeline.generation.run import Outcome
+from pipeline.generation.tasks import shard_ranges
 from storage.dataset.progress import read_status
 
 
@@ -37,29 +37,29 @@ def prepare_assets(**parameters: Any) -> None:
 @flow(name="generate-scenes", flow_run_name=run_name, persist_result=False)
 @parameters_of(DatasetOrder, **DATASET_FORMS)
 def generate_scenes(**parameters: Any) -> Outcome:
-    """Make a dataset, or what is missing of it, or of a range of its shards."""
-    return make_watched(dataset_order(parameters), PrefectRunner())
+    """Make a dataset: all its missing shards, or those of a range."""
+    return make_with_artifacts(dataset_order(parameters), PrefectRunner())
 
 
 @flow(name="build-dataset", flow_run_name=run_name, persist_result=False)
 @parameters_of(DatasetInRuns, **DATASET_FORMS)
 def build_dataset(**parameters: Any) -> None:
-    """Make a dataset: its objects, its scenes, its documents; on several workers if asked for.
+    """Make a dataset: its objects, its scenes, its documents; on several workers if requested.
 
     With N flow runs there are N ranges of shards: N - 1 are runs of their own, and this run makes
-    the first. Then it makes what is left and nobody is at, so that it ends whether or not another
-    worker ever comes.
+    the first. Then it makes all remaining shards that no worker has claimed, so that it ends even
+    if no other worker ever starts.
     """
     order = dataset_in_runs(parameters)
-    given = {field.name: parameters[field.name] for field in dataclasses.fields(DatasetOrder)}
-    prepare_assets(**given)
+    values = {field.name: parameters[field.name] for field in dataclasses.fields(DatasetOrder)}
+    prepare_assets(**values)
     if order.flow_runs > 1:
-        own, *others = shard_ranges(read_status(order.place).shards_planned, order.flow_runs)
-        for shards in others:
-            ranged = {name: _json(value) for name, value in given.items()} | {"shards": shards}
+        first, *rest = shard_ranges(read_status(order.place).shards_planned, order.flow_runs)
+        for shards in rest:
+            ranged = {name: _json(value) for name, value in values.items()} | {"shards": shards}
             run_deployment(order.deployment, parameters=ranged, timeout=0, as_subflow=False)
-        generate_scenes(**{**given, "shards": own})
-    generate_scenes(**given)
+        generate_scenes(**{**values, "shards": first})
+    generate_scenes(**values)
 
 
 def _json(value: Any) -> Any:

@@ -1,8 +1,8 @@
-"""Typed parameters of flows, made of our frozen settings: Prefect's forms show names and docs.
+"""Converts settings classes to typed parameters of flows, so that Prefect's forms show their docs.
 
-A flow takes the fields of a class of settings as its parameters: what is described there
-(storage.settings.described) becomes the schema that Prefect checks before a run exists, and of
-which it draws a form. The groups of a build's settings become forms within the form, where every
+A flow takes the fields of a settings class as its parameters: their descriptions
+(storage.settings.described) become the schema that Prefect checks before a run exists, and from
+which it draws a form. The groups of a build's settings become forms within the form, in which every
 field may stay empty.
 """
 
@@ -19,17 +19,17 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from pipeline.builds.named import BUILDS
 from pipeline.builds.settings import BuildSettings
 from pipeline.objects.sources import SOURCES
-from storage.settings.described import described
+from storage.settings.described import describe_fields
 
 Returned = TypeVar("Returned")
 
 
 def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
-    """Give a function that takes keywords the signature of a class of settings; for flows.
+    """Return a decorator that gives a flow's function the signature of a settings class.
 
     Args:
-        settings: the class.
-        annotations: types that take the place of those of some fields.
+        settings: the settings class.
+        annotations: types that replace those of some fields.
     """
 
     def with_signature(function: Callable[..., Returned]) -> Callable[..., Returned]:
@@ -40,9 +40,9 @@ def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
                 default=inspect.Parameter.empty if field.default is MISSING else field.default,
                 annotation=annotations.get(field.name, _form_type(field.hint)),
             )
-            for field in described(settings)
+            for field in describe_fields(settings)
         ]
-        lines = [f"    {field.name}: {field.sentence}" for field in described(settings)]
+        lines = [f"    {field.name}: {field.sentence}" for field in describe_fields(settings)]
         function.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         text = inspect.getdoc(function) or ""
         function.__doc__ = "\n".join([text, "", "Args:", *lines])
@@ -52,15 +52,16 @@ def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
 
 
 def changes_form(settings: type, example: Any) -> type[BaseModel]:
-    """Return a form of all settings of a class in which every field may stay empty.
+    """Return a form of all fields of a settings class, in which every field may stay empty.
 
     Args:
         settings: the class, whose fields may be groups, or tuples of groups.
         example: an instance, which says what the groups within tuples are.
     """
     fields: dict[str, Any] = {}
-    for field in described(settings):
-        value, kind = getattr(example, field.name), _form_type(field.hint)
+    for field in describe_fields(settings):
+        value = getattr(example, field.name)
+        kind = _form_type(field.hint)
         first = value[0] if isinstance(value, tuple) and value else value
         if dataclasses.is_dataclass(first) and not isinstance(first, type):
             kind = changes_form(type(first), first)
@@ -71,9 +72,11 @@ def changes_form(settings: type, example: Any) -> type[BaseModel]:
 
 
 def changed_values(form: BaseModel | None) -> dict[str, Any]:
-    """Return what was filled in, by dotted name, as `storage.settings.changes` takes it."""
+    """Return the filled-in fields by dotted name, as `storage.settings.changes` takes them."""
     values: dict[str, Any] = {}
-    fields = type(form).model_fields if form else {}  # in order, which the set of those given lacks
+    fields = (
+        type(form).model_fields if form else {}
+    )  # in declared order; `model_fields_set` has none
     for name in fields:
         value = getattr(form, name)
         if isinstance(value, BaseModel):
@@ -84,7 +87,7 @@ def changed_values(form: BaseModel | None) -> dict[str, Any]:
 
 
 def _form_type(hint: Any) -> Any:
-    """Return a type as forms know it: mappings are objects with any values."""
+    """Return the type of a field in a form: mappings become objects with any values."""
     return dict[str, Any] if get_origin(hint) in (Mapping, dict) else hint
 
 
@@ -93,17 +96,17 @@ _NO_SECRET = (
     rf"^(?:env:TRILIGHT_SOURCE_\w*|(?:{_NAMED}):[^@?]*"
     r"|[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|[^:]*)$"
 )
-"""URLs without a user, a password or a query: whoever may see the server would see them too. The
-same holds for variables that are not for sources (pipeline.objects.sources)."""
+"""Pattern of URLs without user, password or query: all users of the server can see a parameter. It
+also refuses variables that are not for sources (pipeline.objects.sources)."""
 
 PublicUrl = Annotated[str, Field(pattern=_NO_SECRET)]
-"""A path or URL that may be seen by everybody who sees the server."""
+"""A path or URL without secrets: all users of the server can see it."""
 PublicPlace = Annotated[
     str,
     Field(pattern=r"^(?:[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|(?:[^:]|:+[^:/]|:+/[^:/])*:*/?)$"),
 ]
-"""The same for a place to write to: a folder of any name, or a URL."""
+"""An output folder of any name, or a URL without secrets."""
 BuildName = typing.Literal[tuple(BUILDS)]  # type: ignore[valid-type]
-"""A list to choose from."""
+"""Names of the registered builds, as a list to choose from."""
 BuildChanges = changes_form(BuildSettings, BUILDS["smoke"].settings())
 """Every setting of a build."""

@@ -1,17 +1,17 @@
-"""Prefect's server behind a door: a password, one host name, one origin, files of one's own.
+"""Prefect's server behind a guard: a password, one host name, one origin, private files.
 
-A page that somebody opens in a browser can send requests to this machine's ports, also to those of
-loopback, and Prefect answers any page. So nothing is answered here without the password (but for
-the page that asks for it, and whether the server is healthy), and nothing at all that
+A page in a browser can send requests to this machine's ports, also to those of loopback, and
+Prefect answers any page. So the server answers no request without the password (except for the page
+that asks for it, and the health check), and none at all that
 
-- asks for a name that is not this server's: a page of evil.example may let its own name point to
+- names a host that is not this server: a page of evil.example may let its own name point to
   127.0.0.1 and is then, for the browser, of the same origin (DNS rebinding). An address cannot be
-  pointed elsewhere, so that addresses are admitted;
-- comes from a page of another origin, whatever it sends: fetch, form or websocket;
-- puts our pages into a frame of its own, to have somebody click in them.
+  redirected, so that addresses are admitted;
+- comes from a page of another origin, by fetch, form or websocket.
 
-Tokens against forged requests (PREFECT_SERVER_CSRF_PROTECTION_ENABLED) would add nothing: no
-browser sends this password of its own accord, as it is no cookie.
+Other pages cannot show the server's pages in a frame either, which prevents clickjacking. CSRF
+tokens (PREFECT_SERVER_CSRF_PROTECTION_ENABLED) would add nothing: no browser sends this password by
+itself, since it is not a cookie.
 """
 
 import argparse
@@ -31,9 +31,9 @@ from storage.cache import private_folder
 from storage.errors import TrilightError
 
 NAMES = "TRILIGHT_HOST_NAMES"
-"""Variable with the names, between commas, by which the server is known beside localhost."""
+"""Variable with further host names of the server beside localhost, separated by commas."""
 REQUEST_S = 15.0
-"""Time in which the head of a request must arrive."""
+"""Seconds in which the head of a request must arrive."""
 _UNFRAMED = (b"content-security-policy", b"frame-ancestors 'none'")
 
 Scope = MutableMapping[str, Any]
@@ -43,21 +43,21 @@ Send = Callable[[Message], Awaitable[None]]
 
 
 class Application(Protocol):
-    """An application as ASGI has it."""
+    """An ASGI application."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection."""
 
 
-class Door:
-    """An application that passes on what may come in, and refuses everything else."""
+class RequestGuard:
+    """An ASGI application that passes on allowed requests, and refuses all others."""
 
     def __init__(self, inner: Application, names: Collection[str]) -> None:
-        """Stand before an application.
+        """Guard an application.
 
         Args:
-            inner: what is guarded.
-            names: by which this server is known, beside localhost and addresses.
+            inner: the guarded application.
+            names: host names of this server, beside localhost and addresses.
         """
         self._inner = inner
         self._names = {"localhost", *(name.lower() for name in names)}
@@ -79,8 +79,8 @@ class Door:
     def _refusal(self, headers: Collection[tuple[bytes, bytes]]) -> str | None:
         """Return why a request is refused, or None."""
         hosts, origins = (
-            [value.decode("latin-1").lower() for name, value in headers if name == wanted]
-            for wanted in (b"host", b"origin")
+            [value.decode("latin-1").lower() for name, value in headers if name == header]
+            for header in (b"host", b"origin")
         )
         if len(hosts) != 1 or not self._is_ours(hosts[0]):
             return f"this is no name of this server; set {NAMES} where it has others"
@@ -106,11 +106,10 @@ async def _refuse(kind: str, refusal: str, send: Send) -> None:
     await send({"type": "http.response.body", "body": refusal.encode()})
 
 
-def impatient_protocol() -> type[asyncio.Protocol]:
-    """Return uvicorn's HTTP protocol with a limit of time for requests, which it lacks.
+def request_timeout_protocol() -> type[asyncio.Protocol]:
+    """Return uvicorn's HTTP protocol with a time limit for requests, which it lacks.
 
-    A connection without a whole head of a request for REQUEST_S, or once that long after an
-    answer, is closed.
+    A connection is closed after REQUEST_S without a complete head of a request.
     """
     from uvicorn.protocols.http.auto import AutoHTTPProtocol
 
@@ -133,9 +132,9 @@ def impatient_protocol() -> type[asyncio.Protocol]:
 
 
 def serve(host: str, port: int) -> None:
-    """Serve Prefect at an address until this process is told to end.
+    """Serve Prefect at an address until this process gets a signal to end.
 
-    What this process writes is for its user only, the database of SQLite too.
+    All files that it writes are readable by its user only, the SQLite database included.
 
     Raises:
         TrilightError: there is no password.
@@ -147,13 +146,15 @@ def serve(host: str, port: int) -> None:
     quiet_prefect()
     home = private_folder(Path(os.environ["PREFECT_HOME"]))
     for database in home.glob("prefect.db*"):
-        database.chmod(0o600)  # of a version that was more generous
-    here = {
-        "PREFECT_UI_API_URL": "/api",  # the page asks where it came from, by whatever name
-        "PREFECT_UI_STATIC_DIRECTORY": str(home / "ui"),  # not in the packages, which others use
+        database.chmod(0o600)  # earlier versions wrote it readable for others
+    defaults = {
+        "PREFECT_UI_API_URL": "/api",  # relative: valid under each of the host names
+        "PREFECT_UI_STATIC_DIRECTORY": str(
+            home / "ui"
+        ),  # not in the packages, which other users share
         "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": f"http://{host}:{port}",
     }
-    for variable, value in here.items():
+    for variable, value in defaults.items():
         os.environ.setdefault(variable, value)
     import uvicorn
     from prefect.server.api.server import create_app
@@ -161,8 +162,8 @@ def serve(host: str, port: int) -> None:
 
     settings = get_current_settings()
     uvicorn.run(
-        Door(create_app(final=True), names),
-        http=impatient_protocol(),
+        RequestGuard(create_app(final=True), names),
+        http=request_timeout_protocol(),
         host=host,
         port=port,
         log_level=settings.server.logging_level.lower(),
@@ -173,16 +174,16 @@ def serve(host: str, port: int) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Serve as the arguments say."""
+    """Parse the arguments and serve."""
     parser = argparse.ArgumentParser(description="Prefect's server, behind a password.")
     parser.add_argument("--host", default="127.0.0.1", help="address to bind to")
     parser.add_argument("--port", type=int, default=4200, help="port to listen at")
     parser.add_argument("--with-parent", action="store_true", help="end when the parent does")
-    given = parser.parse_args(arguments)
-    if given.with_parent:
+    options = parser.parse_args(arguments)
+    if options.with_parent:
         die_with_parent()
     try:
-        serve(given.host, given.port)
+        serve(options.host, options.port)
     except TrilightError as mistake:
         sys.exit(f"trilight: {mistake}")
 

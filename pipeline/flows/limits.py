@@ -1,10 +1,10 @@
-"""Limits in Prefect of what flows share, by name.
+"""Names of the concurrency limits in Prefect that flows share.
 
-One that does not exist at the server limits nothing, so whatever sets a server up makes them
-(infra.serving.limits).
+A limit that does not exist at the server has no effect, so the setup of a server creates them
+(infra.serving.deployments).
 """
 
 DISK_LIMIT = "trilight-disk"
-"""Of runs that write documents."""
+"""Limit of runs that write documents at the same time."""
 GPU_LIMIT = "trilight-gpu"
-"""Of graphics cards that are rendered or learned on."""
+"""Limit of tasks that render or train on a GPU at the same time."""

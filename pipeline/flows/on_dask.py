@@ -1,8 +1,8 @@
-"""The tasks of a dataset on a Dask cluster, whose workers see the same folder and cache.
+"""`--runner dask`: runs tasks on a Dask cluster, whose workers see the same folder and cache.
 
 Each worker process runs its tasks with a render child of its own, so it must be allowed to have
-children: `dask worker ADDRESS --nthreads 1 --no-nanny`, one for each graphics card or for each
-share of the cores (TRILIGHT_CORES says how many cores a worker owns).
+children: `dask worker ADDRESS --nthreads 1 --no-nanny`, one for each GPU or for each group of cores
+(TRILIGHT_CORES sets how many cores a worker uses).
 """
 
 import contextlib
@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.flows.on_prefect import as_flow
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.render_children import close_idle_children
-from pipeline.making.run import Outcome
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.render_children import close_idle_children
+from pipeline.generation.run import Outcome
 from storage.atomic import write_atomically
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 _AHEAD = 2
-"""Tasks handed out for each thread of the cluster, so that none waits for the next one."""
+"""Tasks submitted for each thread of the cluster, so that none waits for the next one."""
 
 
 def make(order: DatasetOrder, address: str | None) -> Outcome:
@@ -68,7 +68,7 @@ def _client(address: str) -> Iterator["Client"]:
 
     try:
         client = Client(address, timeout=20, set_as_default=False)
-    except (OSError, ValueError) as error:  # a ValueError is an address that is none
+    except (OSError, ValueError) as error:  # ValueError: a malformed address
         raise TrilightError(
             f"--address {address}: no Dask scheduler answers there ({type(error).__name__}); "
             "expected the address of one, such as tcp://host:8786, as `dask scheduler` starts it."
@@ -78,7 +78,7 @@ def _client(address: str) -> Iterator["Client"]:
 
 
 def _threads(client: "Client", address: str) -> list[int]:
-    """Return how many threads each worker of a cluster has."""
+    """Return the number of threads of each worker of a cluster."""
     workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
     if not workers:
         raise TrilightError(
@@ -89,7 +89,7 @@ def _threads(client: "Client", address: str) -> list[int]:
 
 
 def _require_shared(client: "Client", order: DatasetOrder) -> None:
-    """Refuse a cluster of whose workers one would make its scenes where nobody finds them."""
+    """Raise if a worker of the cluster cannot see the output folder."""
     folder = dataset_folder(order.place)
     seen_by_all = folder.staging.resolve() / f"met-{uuid.uuid4().hex}"
     write_atomically(seen_by_all, b"")
@@ -99,7 +99,8 @@ def _require_shared(client: "Client", order: DatasetOrder) -> None:
         seen_by_all.unlink(missing_ok=True)
     if blind := sorted(worker for worker, sees in seen.items() if not sees):
         raise TrilightError(
-            f"{folder.shown}: {len(blind)} of {len(seen)} Dask workers do not see this folder, "
+            f"{folder.display_name}: {len(blind)} of {len(seen)} Dask workers do not see this "
+            "folder, "
             f"such as {blind[0]}; expected all to see the same --out at the same place (for a "
             "bucket, the same TRILIGHT_CACHE). Share it."
         )

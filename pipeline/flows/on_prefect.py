@@ -1,4 +1,4 @@
-"""`--runner prefect`: a dataset as a flow run of this process, shown on Prefect's page.
+"""`--runner prefect`: makes a dataset as a flow run of this process, shown on Prefect's page.
 
 The server is the one of PREFECT_API_URL; where that is not set, a private one for this run.
 """
@@ -6,18 +6,20 @@ The server is the one of PREFECT_API_URL; where that is not set, a private one f
 from typing import TYPE_CHECKING, Any
 
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 
 if TYPE_CHECKING:
     from pipeline.flows.prefect_runner import PrefectRunner
-    from pipeline.making.run import Outcome
+    from pipeline.generation.run import Outcome
 
 
 def make(order: DatasetOrder, address: str | None) -> "Outcome":
-    """Make a dataset; raises as `make_dataset`, or the private server does not start."""
+    """Make a dataset; raises as `make_dataset`, or if the private server does not start."""
     quiet_prefect()
     with prefect_server():
-        from pipeline.flows.prefect_runner import PrefectRunner  # Prefect reads its settings now
+        from pipeline.flows.prefect_runner import (
+            PrefectRunner,  # late: Prefect reads its settings on import
+        )
 
         return as_flow(order, PrefectRunner())
 
@@ -26,9 +28,9 @@ def as_flow(order: DatasetOrder, runner: "PrefectRunner", **options: Any) -> "Ou
     """Make a dataset as a flow run, with its artifacts; `options` are Prefect's of a flow."""
     from prefect import flow
 
-    from pipeline.flows.watching import make_watched
+    from pipeline.flows.run_artifacts import make_with_artifacts
 
     def generate() -> "Outcome":
-        return make_watched(order, runner)
+        return make_with_artifacts(order, runner)
 
     return flow(name="generate-scenes", persist_result=False, **options)(generate)()

@@ -1,4 +1,4 @@
-"""Converts the parameters of a flow run (from Prefect's forms) to orders."""
+"""Converts the parameters of a flow run (from Prefect's forms) to dataset options."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeVar
@@ -10,7 +10,7 @@ from pipeline.flows.forms import (
     PublicUrl,
     changed_values,
 )
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.shard_places import MAX_SHARDS
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -24,7 +24,7 @@ DATASET_FORMS: Mapping[str, Any] = {
     "out": PublicPlace | None,
     "changes": BuildChanges | None,
 }
-"""Types of parameters that are narrower in a form than in an order."""
+"""Types of parameters that are narrower in a form than in the options."""
 
 
 @checked()
@@ -46,21 +46,21 @@ class DatasetInRuns(DatasetOrder):
 
 
 def dataset_order(parameters: Mapping[str, Any]) -> DatasetOrder:
-    """Return the order that a flow's parameters state.
+    """Return the dataset options of a flow's parameters.
 
     Raises:
-        TrilightError: a value that no schema can refuse; the message names it.
+        TrilightError: an invalid value that the form's schema cannot detect; the message names it.
     """
     return order_of(parameters, DatasetOrder)
 
 
 def dataset_in_runs(parameters: Mapping[str, Any]) -> DatasetInRuns:
-    """Return the order in several runs that a flow's parameters state; raises as above."""
+    """Return the options of a dataset in several flow runs; raises as `dataset_order`."""
     return order_of(parameters, DatasetInRuns)
 
 
 def order_of(parameters: Mapping[str, Any], kind: type[Order]) -> Order:
-    """Return the order of a kind that a flow's parameters state; raises as above."""
+    """Return the options of a class that a flow's parameters state; raises as `dataset_order`."""
     values = {name: parameters[name] for name in kind.__dataclass_fields__}
     values["allow_licences"] = tuple(values["allow_licences"])
     values["changes"] = changed_values(values["changes"])
@@ -68,9 +68,9 @@ def order_of(parameters: Mapping[str, Any], kind: type[Order]) -> Order:
 
 
 def run_name() -> str:
-    """Return what the flow run that begins is called: what is made of what, and where."""
+    """Return the name of the starting flow run: build, number of scenes and output folder."""
     from prefect.runtime import flow_run
 
-    given = {"build": DatasetOrder.build, **flow_run.parameters}
-    parts = (given["build"], given.get("scenes"), given.get("out"))
+    parameters = {"build": DatasetOrder.build, **flow_run.parameters}
+    parts = (parameters["build"], parameters.get("scenes"), parameters.get("out"))
     return "-".join(str(part) for part in parts if part is not None)

@@ -1,7 +1,7 @@
-"""The tasks of a dataset as Prefect's: scheduled, displayed, and tried again where that can help.
+"""`PrefectRunner`: runs a dataset's tasks as Prefect tasks, with retries after transient errors.
 
-A task run is some minutes of scenes (pipeline.making.tasks). Native code runs in children of our
-own, never in a process pool of Prefect's, which one segfault breaks as a whole.
+A task run is some minutes of scenes (pipeline.generation.tasks). Native code runs in our own child
+processes, never in a process pool of Prefect's, which a single segfault breaks entirely.
 """
 
 import contextlib
@@ -16,10 +16,10 @@ from prefect.futures import PrefectFuture, as_completed
 from prefect.tasks import Task, exponential_backoff
 
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
-from pipeline.making.pipeline import make_task
-from pipeline.making.run import ShardJob, TaskOutcome
-from pipeline.making.runner import in_window
-from pipeline.making.tasks import Piece
+from pipeline.generation.pipeline import make_task
+from pipeline.generation.run import ShardJob, TaskResult
+from pipeline.generation.runner import in_window
+from pipeline.generation.tasks import Piece
 from pipeline.renders.variant import choose_variant
 from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure
@@ -28,8 +28,8 @@ _RETRIES = 3
 _FIRST_DELAY_S = 10
 
 
-def may_pass(task_: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
-    """Say whether a failed task is tried again: not where it would only fail once more."""
+def is_retryable(task_: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
+    """Return True if a failed task may succeed when it is tried again."""
     try:
         state.result()
     except (EnvironmentFailure, OSError, MemoryError):
@@ -47,19 +47,19 @@ def may_pass(task_: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
     retries=_RETRIES,
     retry_delay_seconds=exponential_backoff(_FIRST_DELAY_S),
     retry_jitter_factor=0.5,
-    retry_condition_fn=may_pass,
+    retry_condition_fn=is_retryable,
 )
-def make_scenes(first: str, work: "Sealed") -> TaskOutcome:
-    """Make some pieces; `first` says for people where they begin.
+def make_scenes(first: str, work: "OpaqueWork") -> TaskResult:
+    """Make some pieces; `first` names their first scene on Prefect's page.
 
-    Where pictures are made on a graphics card, GPU_LIMIT says how many tasks may run at a time.
+    If pictures are rendered on a GPU, GPU_LIMIT limits the tasks that run at the same time.
     """
-    with _card():
+    with _gpu_slot():
         return make_task(work.job, work.pieces)
 
 
-class Sealed:
-    """What a task needs, in a form that Prefect does not search for futures, however large."""
+class OpaqueWork:
+    """Input of a task, wrapped so that Prefect does not search it for futures."""
 
     def __init__(self, job: ShardJob, pieces: tuple[Piece, ...]) -> None:
         self.job = job
@@ -67,32 +67,31 @@ class Sealed:
 
 
 class PrefectRunner:
-    """Task runs of the flow run that is going on, by that flow's task runner."""
+    """Submits tasks to the task runner of the current flow run."""
 
     def __init__(self, *, window: int | None = None, num_at_once: int | None = None) -> None:
-        """Say how much runs at the same time.
+        """Set how many tasks run at the same time.
 
         Args:
-            window: task runs that are submitted and not finished, at most; by default as many as
-                run at once here.
-            num_at_once: tasks at a time in one process; by default what the order says.
+            window: most submitted and unfinished task runs; by default as many as run at once here.
+            num_at_once: parallel tasks of one process; by default the options' number.
         """
         self.window = window
         self.num_at_once = num_at_once
 
-    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
-        """Yield outcomes as they come; raises what a task raised after its last try."""
+    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
+        """Yield results as tasks end; raises the error of a task's last try."""
         return in_window(
             tasks,
-            submit=lambda pieces: make_scenes.submit(_named(pieces), Sealed(job, pieces)),
+            submit=lambda pieces: make_scenes.submit(_task_label(pieces), OpaqueWork(job, pieces)),
             first_done=_first_done,
             result=lambda future: future.result(),
             window=self.window or job.num_at_once,
         )
 
     def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
-        """Call what finishes a dataset as a task run of its own."""
-        return write_documents_task(Deferred(write_documents))
+        """Call `write_documents` as a task run of its own."""
+        return write_documents_task(OpaqueCall(write_documents))
 
 
 @task(
@@ -102,30 +101,30 @@ class PrefectRunner:
     retries=_RETRIES,
     retry_delay_seconds=exponential_backoff(_FIRST_DELAY_S),
     retry_jitter_factor=0.5,
-    retry_condition_fn=may_pass,
+    retry_condition_fn=is_retryable,
 )
-def write_documents_task(write: "Deferred") -> Statistics:
-    """Write what people and hubs look at; DISK_LIMIT says how many may at the same time."""
+def write_documents_task(write: "OpaqueCall") -> Statistics:
+    """Write the documents of a dataset; DISK_LIMIT limits how many run at the same time."""
     with concurrency(DISK_LIMIT, occupy=1, strict=False):
         return write.call()
 
 
-class Deferred:
-    """A call that Prefect does not look into."""
+class OpaqueCall:
+    """A function, wrapped so that Prefect does not search it for futures."""
 
     def __init__(self, call: Callable[[], Statistics]) -> None:
         self.call = call
 
 
-def _card() -> contextlib.AbstractContextManager[None]:
+def _gpu_slot() -> contextlib.AbstractContextManager[None]:
     if choose_variant().name != "cuda_ad_rgb":
         return contextlib.nullcontext()
     return concurrency(GPU_LIMIT, occupy=1, strict=False)
 
 
-def _first_done(running: list[PrefectFuture[TaskOutcome]]) -> PrefectFuture[TaskOutcome]:
+def _first_done(running: list[PrefectFuture[TaskResult]]) -> PrefectFuture[TaskResult]:
     return next(iter(as_completed(running)))
 
 
-def _named(pieces: tuple[Piece, ...]) -> str:
+def _task_label(pieces: tuple[Piece, ...]) -> str:
     return f"{pieces[0].shard_index} from scene {pieces[0].first}"

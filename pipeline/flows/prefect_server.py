@@ -1,9 +1,9 @@
-"""A private Prefect server for runs that nobody has started a server for.
+"""Starts a private Prefect server for a run, unless PREFECT_API_URL names one.
 
 Prefect's own temporary server outlives a parent that is killed. This one asks the kernel to end
-with its parent, keeps its database in Trilight's cache, binds to loopback, wants a password that
-only this run knows (pipeline.flows.guarded_server), and is quiet. Where PREFECT_API_URL is set (a
-served deployment, a team's server) that server is used instead.
+with its parent, keeps its database in Trilight's cache, binds to loopback, requires a password that
+only this run knows (pipeline.flows.guarded_server), and prints nothing. If PREFECT_API_URL is set
+(a served deployment, a team's server), that server is used instead.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from storage.cache import cache_folder, open_private, private_folder
-from storage.claims import claimed
+from storage.claims import hold_claim
 from storage.errors import TrilightError
 from storage.installation import IMPORT_ROOT, child_environment
 from storage.remote.safe_url import safe_text
@@ -33,12 +33,18 @@ if TYPE_CHECKING:
     import httpx
     from prefect.client.orchestration import SyncPrefectClient
 
-TOLD_BY_ITS_STARTER = "TRILIGHT_TOLD_BY_ITS_STARTER"
-"""In the environment of processes that get SIGTERM from who started them, and from nobody else."""
+STOPPED_BY_PARENT = "TRILIGHT_TOLD_BY_ITS_STARTER"
+"""Variable that marks a process which gets SIGTERM from its parent, and from no other process."""
 PASSWORD = "PREFECT_SERVER_API_AUTH_STRING"
-"""Variable of a server with USER:PASSWORD, which every request must name."""
+"""Variable of the server: USER:PASSWORD, which every request must state."""
 CLIENT_PASSWORD = "PREFECT_API_AUTH_STRING"
-"""Variable of who sends requests, with the same."""
+"""Variable of the client, with the same value."""
+_NO_PAGE = {
+    "PREFECT_UI_ENABLED": "false",
+    "PREFECT_SERVER_REGISTER_BLOCKS_ON_START": "false",
+    "PREFECT_SERVER_MEMOIZE_BLOCK_AUTO_REGISTRATION": "false",
+}
+"""Variables of a server without its page, and without the blocks of that page, which are slow."""
 _START_UP_S = 120.0
 _LOG_NAME = "server.log"
 SERVER = (sys.executable, "-m", f"{__package__}.guarded_server")
@@ -46,9 +52,9 @@ SERVER = (sys.executable, "-m", f"{__package__}.guarded_server")
 
 
 def quiet_prefect() -> None:
-    """Set what Prefect reads when it is imported: no telemetry, a private home, no chatter.
+    """Set Prefect's environment variables: no telemetry, a private home, no log output.
 
-    Call before the first import of prefect. What the user has set already is kept.
+    Call before the first import of prefect. Variables that the user has set are kept.
     """
     quiet = {
         "DO_NOT_TRACK": "1",
@@ -63,15 +69,15 @@ def quiet_prefect() -> None:
 
 
 def load_prefect() -> None:
-    """Import Prefect, which reads environment, profile and files of the working folder then.
+    """Import Prefect, which reads its settings from environment, profile and working folder.
 
     Raises:
-        TrilightError: a setting is refused.
+        TrilightError: Prefect refuses a setting.
     """
-    own = [os.environ.get(name) for name in ("no_proxy", "NO_PROXY")]
-    os.environ["no_proxy"] = ",".join([*filter(None, own), "localhost", "127.0.0.1"])
+    existing = [os.environ.get(name) for name in ("no_proxy", "NO_PROXY")]
+    os.environ["no_proxy"] = ",".join([*filter(None, existing), "localhost", "127.0.0.1"])
     try:
-        with contextlib.redirect_stderr(io.StringIO()):  # where it prints what it raises too
+        with contextlib.redirect_stderr(io.StringIO()):  # it prints the error too
             from prefect.settings import get_current_settings
 
             get_current_settings()
@@ -86,9 +92,9 @@ def load_prefect() -> None:
 
 @contextlib.contextmanager
 def name_prefect_failures(
-    next_step: str = "Run make serve, or mend PREFECT_API_URL",
+    next_step: str = "Run make serve, or fix PREFECT_API_URL",
 ) -> Iterator[None]:
-    """Raise what a Prefect server fails to do in the block as one sentence, TrilightError."""
+    """Convert errors of a Prefect server within the block to TrilightError with one sentence."""
     import httpx
     from prefect.exceptions import PrefectException
     from prefect.settings import get_current_settings
@@ -99,7 +105,7 @@ def name_prefect_failures(
     except httpx.HTTPStatusError as refusal:
         status = refusal.response.status_code
         reason = (
-            "it wants a password. Set PREFECT_API_AUTH_STRING=USER:PASSWORD"
+            "it requires a password. Set PREFECT_API_AUTH_STRING=USER:PASSWORD"
             if status in (401, 403)
             else f"it answers {status}: {_detail(refusal.response)}"
         )
@@ -111,10 +117,10 @@ def name_prefect_failures(
 
 @contextlib.contextmanager
 def prefect_client() -> Iterator["SyncPrefectClient"]:
-    """Provide a client of the server that is set, which answers as Prefect's does.
+    """Provide a client of the configured Prefect server, after a check that it answers.
 
     Raises:
-        TrilightError: it refuses or does not answer, or certificates cannot be read.
+        TrilightError: the server refuses or does not answer, or certificates cannot be read.
     """
     from prefect.client.orchestration import get_client
 
@@ -134,13 +140,13 @@ def prefect_client() -> Iterator["SyncPrefectClient"]:
             if not isinstance(version, str) or not version[:1].isdigit():
                 raise TrilightError(
                     f"{safe_text(str(client.api_url))} is no API of Prefect; expected one, such "
-                    "as http://127.0.0.1:4200/api. Run make serve, or mend PREFECT_API_URL."
+                    "as http://127.0.0.1:4200/api. Run make serve, or fix PREFECT_API_URL."
                 )
             yield client
 
 
 def _detail(response: "httpx.Response") -> str:
-    """Return what the server says is wrong: of a parameter, which, and why."""
+    """Return the server's reason of an error, such as the name of a wrong parameter."""
     try:
         detail = response.json().get("detail", "")
     except ValueError:
@@ -154,25 +160,25 @@ def prefect_server() -> Iterator[str]:
     """Provide the URL of a Prefect API for the block, and set PREFECT_API_URL to it.
 
     Raises:
-        TrilightError: the server that is set does not answer, or the private one does not start;
-            or what the block raises because of it.
+        TrilightError: the configured server does not answer, or the private one does not start;
+            also for errors of the server within the block.
     """
-    if given := os.environ.get("PREFECT_API_URL"):
+    if configured := os.environ.get("PREFECT_API_URL"):
         load_prefect()
         with prefect_client():
             pass
         with name_prefect_failures():
-            yield given
+            yield configured
         return
     home = private_folder(Path(os.environ["PREFECT_HOME"]))
     password = new_password()
     with contextlib.ExitStack() as starting, open_private(home / _LOG_NAME, "ab") as log:
         # two first starts at once would both migrate the database
-        starting.enter_context(claimed(home / "start.lock", wait=True))
+        starting.enter_context(hold_claim(home / "start.lock", wait=True))
         port = _free_port()
         server = subprocess.Popen(
             [*SERVER, "--port", str(port), "--with-parent"],
-            env={**child_environment(), PASSWORD: password, "PREFECT_UI_ENABLED": "false"},
+            env={**child_environment(), PASSWORD: password, **_NO_PAGE},
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
@@ -196,21 +202,23 @@ def prefect_server() -> Iterator[str]:
 
 
 def new_password() -> str:
-    """Return USER:PASSWORD that nobody can guess."""
+    """Return USER:PASSWORD with a random password."""
     return f"trilight:{secrets.token_urlsafe(24)}"
 
 
 def wait_until_healthy(url: str, server: "subprocess.Popen[bytes]", log: Path) -> None:
-    """Return when a server answers; raises TrilightError where it ends, or takes too long."""
+    """Wait until a server answers; raises TrilightError if it ends or takes too long."""
     deadline = time.monotonic() + _START_UP_S
-    direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # it is on this machine
+    direct = urllib.request.build_opener(
+        urllib.request.ProxyHandler({})
+    )  # no proxy: it is on this machine
     while time.monotonic() < deadline and server.poll() is None:
         with contextlib.suppress(urllib.error.URLError, OSError, http.client.HTTPException):
             with direct.open(f"{url}/health", timeout=2):
-                if server.poll() is None:  # else it was somebody else who answered
+                if server.poll() is None:  # else another server answered at this port
                     return
         time.sleep(0.1)
-    load_prefect()  # which names a setting that the server refused
+    load_prefect()  # raises if a setting made the server fail
     lines = log.read_text(errors="replace").splitlines() if log.exists() else []
     said = safe_text(lines[-1]) if lines else "without a word"
     what = "ended" if server.poll() is not None else f"did not answer within {_START_UP_S:.0f} s"

@@ -1,29 +1,29 @@
-"""A program that a flow runs, told to end when the flow is: it may save, and then both are done."""
+"""Runs a program for a flow, and passes the flow's end on to it, so that it can save."""
 
 import signal
 import subprocess
 from collections.abc import Callable, Sequence
 
-from pipeline.flows.prefect_server import TOLD_BY_ITS_STARTER
+from pipeline.flows.prefect_server import STOPPED_BY_PARENT
 from pipeline.isolation import die_with_parent
 from storage.installation import child_environment
 from storage.remote.safe_url import safe_text
 
 
 def run_to_end(command: Sequence[str], say: Callable[[str], None]) -> tuple[int, str]:
-    """Run a program and pass on what it says.
+    """Run a program and pass on its output.
 
-    Whatever ends this call early (a flow that is cancelled gets SIGTERM, which Prefect raises as an
-    exception) is passed on as one SIGTERM; then the program is waited for. It has a session of its
-    own, so that no signal to the group of this process reaches it beside ours: training takes a
-    second one as an order to end at once. If this process is killed, the program is too.
+    If this call ends early (a canceled flow gets SIGTERM, which Prefect raises as an exception),
+    the program gets one SIGTERM, and the call waits for it. It has a session of its own, so that no
+    signal to the group of this process reaches it too: training ends at once after a second signal.
+    If this process is killed, the program is too.
 
     Args:
         command: program and arguments.
-        say: called with each line of its output, without secrets.
+        say: called with each line of the output, without secrets.
 
     Returns:
-        Its status, and its last line.
+        The exit status of the program, and its last line.
     """
     last = ""
     with subprocess.Popen(
@@ -32,7 +32,7 @@ def run_to_end(command: Sequence[str], say: Callable[[str], None]) -> tuple[int,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        env={**child_environment(), TOLD_BY_ITS_STARTER: "1"},
+        env={**child_environment(), STOPPED_BY_PARENT: "1"},
         start_new_session=True,
         preexec_fn=die_with_parent,
     ) as process:

@@ -1,7 +1,7 @@
-"""A flow run of whoever serves the flow: the deployment is found by the flow's name, and watched.
+"""Submits a flow run to a Prefect server and polls its state and artifacts.
 
-Prefect itself wants FLOW/DEPLOYMENT, and shows states alone; what a run has made so far it keeps in
-artifacts (pipeline.flows.watching), which are read here.
+The deployment is found by the flow's name alone, while Prefect needs FLOW/DEPLOYMENT. Prefect shows
+only states; the progress of a run is in its artifacts (pipeline.flows.run_artifacts).
 """
 
 import json
@@ -25,52 +25,51 @@ from prefect.settings import get_current_settings
 from pipeline.flows.prefect_server import prefect_client
 from storage.errors import TrilightError
 from storage.remote.safe_url import safe_text
-from storage.settings.described import described
+from storage.settings.described import describe_fields
 
 POLL_S = 1.0
-"""Between two looks at a run."""
+"""Seconds between two polls of a run."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Submitted:
-    """A flow run that the server knows of."""
+class SubmittedRun:
+    """A flow run that the server has accepted."""
 
     id: UUID
-    """Of the flow run."""
     name: str
-    """Of the flow run, as the page shows it."""
+    """Name of the flow run, as the page shows it."""
     deployment: str
-    """FLOW/DEPLOYMENT."""
+    """Name of the deployment in the form FLOW/DEPLOYMENT."""
     pool: str
-    """Pool whose workers take it up."""
+    """Work pool whose workers execute the run."""
     page: str
-    """URL of its page."""
+    """URL of the run's page."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class SeenRun:
-    """What is known of a run at one moment."""
+class RunStatus:
+    """State and artifacts of a run at one moment."""
 
     state: str
-    """Of the flow run, such as Scheduled, Late, Running or Completed."""
+    """State of the flow run, such as Scheduled, Late, Running or Completed."""
     message: str
-    """What Prefect says of that state."""
+    """Prefect's message on that state."""
     percent: float
-    """Of the shards that are there."""
+    """Finished shards in percent, 0 to 100."""
     tables: Mapping[str, Sequence[tuple[str, str]]]
-    """Rows of `progress` and, at the end, of `summary`."""
+    """Rows of the artifact `progress` and, at the end, of `summary`."""
     is_final: bool
-    """Whether nothing will change any more."""
+    """True if the state will not change any more."""
     is_completed: bool
-    """Whether it ended as it should."""
+    """True if the run ended without an error."""
 
 
 @contextmanager
 def server() -> Iterator[SyncPrefectClient]:
-    """Provide a client of the server that is set for this folder or account.
+    """Provide a client of the configured Prefect server.
 
     Raises:
-        TrilightError: none is set, or it refuses, or does not answer.
+        TrilightError: none is configured, or it refuses, or does not answer.
     """
     if not get_current_settings().api.url:
         raise TrilightError(
@@ -82,41 +81,41 @@ def server() -> Iterator[SyncPrefectClient]:
 
 
 def parameters(order: Any) -> dict[str, Any]:
-    """Return the build of an order and what it asks beside its defaults, as its flow's form has it.
+    """Return the build and all fields that are not defaults, in the layout of the flow's form.
 
     Args:
-        order: of a class of settings whose fields are the flow's parameters.
+        order: options of a class whose fields are the flow's parameters.
     """
     kind: type = type(order)
-    given: dict[str, Any] = {}
-    for field in described(kind):
+    values: dict[str, Any] = {}
+    for field in describe_fields(kind):
         value = getattr(order, field.name)
         if field.name == "build" or value not in (field.default, {}):
-            given[field.name] = _nested(value) if isinstance(value, Mapping) else value
-    plain: dict[str, Any] = json.loads(json.dumps(given))
+            values[field.name] = _nest_groups(value) if isinstance(value, Mapping) else value
+    plain: dict[str, Any] = json.loads(json.dumps(values))
     return plain
 
 
 def submit(
-    client: SyncPrefectClient, flow: str, deployment: str | None, given: Mapping[str, Any]
-) -> Submitted:
-    """Ask for a flow run; return it as soon as the server has it.
+    client: SyncPrefectClient, flow: str, deployment: str | None, values: Mapping[str, Any]
+) -> SubmittedRun:
+    """Create a flow run; return as soon as the server has accepted it.
 
     Args:
-        client: of the server.
-        flow: its name.
-        deployment: its deployment's name; None: the only one, or the one that make serve makes.
-        given: its parameters.
+        client: client of the server.
+        flow: name of the flow.
+        deployment: name of its deployment; None: the only one, or the one that make serve makes.
+        values: parameters of the flow run.
 
     Raises:
         TrilightError: the flow is not served there, or not by such a deployment.
     """
-    found = client.read_deployments(flow_filter=FlowFilter(name=FlowFilterName(any_=[flow])))
-    by_name = {one.name: one for one in found}
+    deployments = client.read_deployments(flow_filter=FlowFilter(name=FlowFilterName(any_=[flow])))
+    by_name = {one.name: one for one in deployments}
     if not by_name:
         raise TrilightError(
             f"submit: the server knows no deployment of the flow {flow}. Run make serve, which "
-            "makes them, or prefect deploy in the checkout."
+            "makes them, or python -m infra.serving.deployments in the checkout."
         )
     name = deployment or ("local" if "local" in by_name else next(iter(by_name)))
     if name not in by_name or (deployment is None and len(by_name) > 1 and name != "local"):
@@ -124,9 +123,9 @@ def submit(
             f"submit: --deployment is {deployment!r}; expected one of {', '.join(sorted(by_name))}."
         )
     chosen = by_name[name]
-    run = client.create_flow_run_from_deployment(chosen.id, parameters=dict(given))
+    run = client.create_flow_run_from_deployment(chosen.id, parameters=dict(values))
     base = str(get_current_settings().ui_url or client.api_url).removesuffix("/api/")
-    return Submitted(
+    return SubmittedRun(
         id=run.id,
         name=run.name,
         deployment=f"{flow}/{name}",
@@ -136,37 +135,37 @@ def submit(
 
 
 def workers_online(client: SyncPrefectClient, pool: str) -> int:
-    """Return how many workers of a pool are there to take runs up."""
+    """Return the number of online workers of a pool."""
     workers = client.read_workers_for_work_pool(pool) if pool else []
     return sum(worker.status == WorkerStatus.ONLINE for worker in workers)
 
 
-def looks(
+def poll_run(
     client: SyncPrefectClient, run: UUID, sleep: Callable[[float], None] = time.sleep
-) -> Iterator[SeenRun]:
-    """Yield what is known of a run until it has ended."""
+) -> Iterator[RunStatus]:
+    """Poll a flow run; yield its status until it has ended."""
     while True:
-        look = _look(client, client.read_flow_run(run))
+        look = _read_status(client, client.read_flow_run(run))
         yield look
         if look.is_final:
             return
         sleep(POLL_S)
 
 
-def _look(client: SyncPrefectClient, run: FlowRun) -> SeenRun:
+def _read_status(client: SyncPrefectClient, run: FlowRun) -> RunStatus:
     state = run.state
     is_final = state is not None and state.is_final()
-    shown = client.read_artifacts(
+    artifacts = client.read_artifacts(
         artifact_filter=ArtifactFilter(flow_run_id=ArtifactFilterFlowRunId(any_=[run.id]))
     )
-    in_order = sorted(shown, key=lambda artifact: str(artifact.updated))
+    in_order = sorted(artifacts, key=lambda artifact: str(artifact.updated))
     bars = [artifact for artifact in in_order if artifact.type == "progress"]
     tables = {
         artifact.key: rows
         for artifact in in_order
         if artifact.type == "table" and artifact.key and (rows := _rows(artifact.data))
     }
-    return SeenRun(
+    return RunStatus(
         state=state.name or state.type.value if state else "Pending",
         message=safe_text(state.message or "") if state else "",
         percent=float(str(bars[-1].data)) if bars else 0.0,
@@ -177,18 +176,18 @@ def _look(client: SyncPrefectClient, run: FlowRun) -> SeenRun:
 
 
 def _rows(data: Any) -> list[tuple[str, str]]:
-    """Return the rows of a table of names and values; none of one with other columns."""
+    """Return the rows of a table with columns `what` and `value`; none of any other table."""
     rows = json.loads(data) if isinstance(data, str) else data or []
     return [(str(row["what"]), str(row["value"])) for row in rows if {"what", "value"} <= set(row)]
 
 
-def _nested(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return dotted names as the groups of the flow's form."""
+def _nest_groups(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert dotted names to the nested groups of the flow's form."""
     nested: dict[str, Any] = {}
     for name, value in changes.items():
         *groups, last = name.split(".")
-        place = nested
+        level = nested
         for group in groups:
-            place = place.setdefault(group, {})
-        place[last] = value
+            level = level.setdefault(group, {})
+        level[last] = value
     return nested

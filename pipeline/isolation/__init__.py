@@ -1,12 +1,13 @@
-"""Child processes that we own: native code may crash, hang or eat memory there, and costs one item.
+"""Child processes for native code: a crash, a hang or a memory leak costs one item, not the run.
 
-- `child`: the owner's side: children are started, called, replaced and ended.
-- `inside`: the child's side: it keeps its limits and never outlives its owner.
-- `waiting`: for an answer, without punishing a child for a pause of the whole command.
-- `confinement`: what a child may reach that reads strangers' files, by `landlock` and `seccomp`.
-- `deaths`: what can end a call, how often it is tried again, and which ends are verdicts.
+- `child`: the owner's side: starts, calls, replaces and ends children.
+- `inside`: the child's side: applies its limits and never outlives its owner.
+- `waiting`: waits for an answer; a pause of the whole command does not count as time.
+- `confinement`: restricts children that read untrusted files, by `landlock` and `seccomp`.
+- `deaths`: the ways a call can fail, the number of retries, and which failures are verdicts.
 """
 
+from pipeline.isolation.call_failures import ChildFailed, Result, is_transient, with_retries
 from pipeline.isolation.child import (
     ChildClosed,
     ChildLimits,
@@ -14,9 +15,8 @@ from pipeline.isolation.child import (
     call_with_retries,
     preload,
 )
+from pipeline.isolation.child_main import die_with_parent
 from pipeline.isolation.confinement import NO_FILES, Reach, reach
-from pipeline.isolation.deaths import ChildFailed, Result, is_passing, with_retries
-from pipeline.isolation.inside import die_with_parent
 
 __all__ = [
     "ChildClosed",
@@ -28,7 +28,7 @@ __all__ = [
     "Result",
     "call_with_retries",
     "die_with_parent",
-    "is_passing",
+    "is_transient",
     "preload",
     "reach",
     "with_retries",

@@ -1,4 +1,4 @@
-"""What a child answers to a call, and what its owner makes of that; no byte of it is run.
+"""Encodes a child's answer to a call and decodes it in the owner; no byte of it is executed.
 
 Errors are sentences, and their types come from a list. The parts of an answer are
 
@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.isolation.deaths import ENDS, ChildFailed
+from pipeline.isolation.call_failures import ENDS, ChildFailed
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.remote.safe_url import escape_lines
 
 CLASS = ""
-"""Key of a dataclass's name among its fields: in a union two may have the same fields."""
+"""Key of a dataclass's name among its fields: two classes of a union may have the same fields."""
 MOST_HEAD_BYTES = 16 << 20
-"""Most bytes of an answer's words, and of its value."""
+"""Most bytes of the part `words` of an answer, and of the part `value`."""
 _MISTAKES = {kind.__name__: kind for kind in (TrilightError, EnvironmentFailure)}
 _FAILURES = ("out_of_memory", "exception")
 assert set(_FAILURES) <= set(ENDS)
@@ -34,33 +34,34 @@ _MOST_CHARACTERS = 20_000
 
 
 def encode_result(value: Any) -> list[bytes | memoryview]:
-    """Return the parts of an answer; TypeError where a value is of no type that is known."""
+    """Return the parts of an answer; raises TypeError for a value of an unknown type."""
     parts: list[bytes | memoryview] = []
 
-    def put(part: bytes | memoryview) -> int:
+    def append_part(part: bytes | memoryview) -> int:
         parts.append(part)
         return len(parts) - 1
 
-    def plain(held: Any) -> Any:
-        if isinstance(held, np.generic):
-            return held.item()
-        if isinstance(held, np.ndarray):
-            name, order = held.dtype.name, "F" if held.flags.fnc else "C"
-            rows = np.ascontiguousarray(held.T if held.flags.fnc else held, name)
-            return [put(rows.reshape(-1).view(np.uint8).data), name, held.shape, order]
-        if isinstance(held, bytes | Path):
-            return put(os.fsencode(held))
-        if isinstance(held, Mapping):
-            return dict(held)
-        names = [field.name for field in dataclasses.fields(held) if field.init]
-        return {CLASS: type(held).__name__} | {name: getattr(held, name) for name in names}
+    def to_plain(item: Any) -> Any:
+        if isinstance(item, np.generic):
+            return item.item()
+        if isinstance(item, np.ndarray):
+            name = item.dtype.name
+            order = "F" if item.flags.fnc else "C"
+            rows = np.ascontiguousarray(item.T if item.flags.fnc else item, name)
+            return [append_part(rows.reshape(-1).view(np.uint8).data), name, item.shape, order]
+        if isinstance(item, bytes | Path):
+            return append_part(os.fsencode(item))
+        if isinstance(item, Mapping):
+            return dict(item)
+        names = [field.name for field in dataclasses.fields(item) if field.init]
+        return {CLASS: type(item).__name__} | {name: getattr(item, name) for name in names}
 
-    head = json.dumps(value, default=plain, ensure_ascii=False, separators=(",", ":"))
+    head = json.dumps(value, default=to_plain, ensure_ascii=False, separators=(",", ":"))
     return [b'["result"]', head.encode(errors="replace"), *parts]
 
 
 def encode_error(kind: str, *words: str) -> list[bytes | memoryview]:
-    """Return the parts of an answer that is a failure: `rejected`, a mistake's class, or an end."""
+    """Return the parts of an error: `rejected`, the class of a mistake, or a reason of `ENDS`."""
     return [json.dumps([kind, *(word[:_MOST_CHARACTERS] for word in words)]).encode()]
 
 
@@ -68,15 +69,15 @@ def decode_answer(parts: list[NDArray[np.uint8]], function: Callable[..., Any]) 
     """Return the result of a call.
 
     Args:
-        parts: any bytes; the result's arrays lie in their memory.
-        function: what was called.
+        parts: untrusted bytes; the result's arrays share their memory.
+        function: the function that was called.
 
     Raises:
         Rejected, TrilightError: as the function raised them.
-        ChildFailed: it raised something else; or `nonsense`, where the bytes are no answer.
-        MemoryError: this process has no room for it.
+        ChildFailed: the function raised another error; or `nonsense`, if the bytes are no answer.
+        MemoryError: this process has no memory for it.
     """
-    from pipeline.isolation.declared import first_wrong, result_reader  # children do without
+    from pipeline.isolation.result_schema import first_wrong, result_reader  # children do without
 
     try:
         heads = [part.tobytes() for part in parts[:2] if len(part) <= MOST_HEAD_BYTES]
@@ -93,7 +94,7 @@ def decode_answer(parts: list[NDArray[np.uint8]], function: Callable[..., Any]) 
                 raise ValueError("expected a result or an error that is known")
     except MemoryError:
         raise
-    except Exception as error:  # checks of a class that is made raise what they like
+    except Exception as error:  # the checks of a dataclass may raise any error
         name = f"{function.__module__}.{getattr(function, '__qualname__', function)}"
         wrong = f"what came back from {name} is not what it returns ({first_wrong(error)})"
         raise ChildFailed("nonsense", make_printable(wrong)) from error
@@ -101,5 +102,5 @@ def decode_answer(parts: list[NDArray[np.uint8]], function: Callable[..., Any]) 
 
 
 def make_printable(text: str) -> str:
-    """Return the first of a text, with escapes for what would command a terminal."""
+    """Return the beginning of a text, with control characters escaped."""
     return escape_lines(text[:_MOST_CHARACTERS])

@@ -1,9 +1,9 @@
-"""The owner's side of a child process: it is started, called, replaced and ended.
+"""`IsolatedChild`: the owner's side of a child process, which starts, calls and ends it.
 
 A child runs calls one after another, so that slow imports and compiled kernels are paid once. It
-has limits on memory and on wall time, is replaced after a number of calls, ignores Ctrl-C (the
-parent decides), and dies with its owner even if that is killed with SIGKILL while native code holds
-the child: the kernel ends it with its parent, the fork server, which ends with the owner.
+has limits on memory and wall time, is replaced after a number of calls, ignores Ctrl-C (the owner
+decides), and dies with its owner even if that is killed with SIGKILL while native code runs in the
+child: the kernel ends it with its parent, the fork server, which ends with the owner.
 """
 
 import contextlib
@@ -22,10 +22,10 @@ from types import ModuleType
 from typing import Any
 
 from pipeline.isolation.answers import decode_answer
-from pipeline.isolation.confinement import Reach, code_of, confine, confinement_wanted
-from pipeline.isolation.deaths import ChildFailed, Result, with_retries
-from pipeline.isolation.frames import TooLong, patient, receive, send
-from pipeline.isolation.inside import serve
+from pipeline.isolation.call_failures import ChildFailed, Result, with_retries
+from pipeline.isolation.child_main import serve
+from pipeline.isolation.confinement import Reach, code_of, confine, should_confine
+from pipeline.isolation.frames import TooLong, receive, send, wait_within
 from pipeline.isolation.waiting import CallTime
 from storage.errors import EnvironmentFailure
 from storage.extensions import load_same, loaded_files
@@ -35,14 +35,14 @@ from storage.remote.safe_url import escape_lines
 _START_UP_S = 180.0
 _LAUNCHES = 3
 _MOST_BYTES = 16 << 30
-"""Most bytes of one answer; of a child with less memory no more than that."""
+"""Most bytes of one answer; a child's memory limit also bounds it."""
 _LONGEST_FOLDER = 70
-"""Bytes: the name of a socket, which the fork server has there, must not be longer than 107."""
+"""Most bytes of the temporary folder: the fork server's socket path there is limited to 107."""
 _CRASHES = (signal.SIGABRT, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV, signal.SIGTRAP)
-"""Signals by which native code ends itself. All others come from outside, SIGBUS too:
-a file that cannot be read or a disk that is full behind a memory map."""
+"""Signals by which native code ends itself. All others come from outside, SIGBUS too: an unreadable
+file or a full disk behind a memory map."""
 _one_start = threading.Lock()
-"""Threads start children one after another: `__main__` is hidden meanwhile."""
+"""Held while a child starts, since `__main__` is hidden meanwhile."""
 
 
 class ChildClosed(Exception):
@@ -51,14 +51,14 @@ class ChildClosed(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class ChildLimits:
-    """What one child may use."""
+    """Resource limits of one child."""
 
     memory_bytes: int
     """Address space; an allocation beyond it fails inside the child."""
     wall_s: float
     """Seconds for one call; a child that takes longer is killed."""
     cpu_s: int | None = None
-    """Processor seconds for one call, which a busy machine does not use up; None for no limit."""
+    """CPU seconds for one call, independent of other load on the machine; None for no limit."""
     calls_per_child: int
     """A fresh child is started after this many calls, so that leaks stay bounded."""
 
@@ -74,31 +74,32 @@ class IsolatedChild:
         setup_args: tuple[Any, ...] = (),
         confined_to: Reach | None = None,
     ) -> None:
-        """Remember how to start a child.
+        """Configure the child; the first call starts it.
 
         Args:
-            limits: what it may use.
+            limits: resource limits.
             setup: an importable function that prepares a new child, such as loading a library.
-            setup_args: its arguments; they must survive the way into another process.
-            confined_to: the files that it may use, beside libraries, where children can be
-                confined; `may` adds to them. None for a child that nothing confines.
+            setup_args: picklable arguments of `setup`.
+            confined_to: files that the child may use beside libraries, if the machine can confine
+                children; `may` adds to them. None for an unconfined child.
 
         Raises:
-            TrilightError: TRILIGHT_CONFINE is no word that is known, or asks for what is missing.
+            TrilightError: TRILIGHT_CONFINE has an unknown value, or requires a missing feature.
         """
-        self._is_confined = confined_to is not None and confinement_wanted()
+        self._is_confined = confined_to is not None and should_confine()
         self._limits = limits
         self._setup = (setup, setup_args)
         self._process: Any = None
         self._connection: Connection | None = None
         self._calls_left = 0
         self._closed = False
-        self._reach, self._code = confined_to, frozenset[Path]()
+        self._reach = confined_to
+        self._code = frozenset[Path]()
 
-    def may(self, more: Reach) -> None:
-        """Let a confined child use more files; not while another thread calls.
+    def allow_files(self, more: Reach) -> None:
+        """Extend the files that a confined child may use; not while another thread calls.
 
-        One that runs and may not is replaced: a kernel lets nothing out that it has confined.
+        A running child without that access is replaced: the kernel cannot loosen a confinement.
         """
         if self._reach is not None and not self._reach.covers(more):
             self._reach = self._reach.with_all_of(more)
@@ -155,19 +156,19 @@ class IsolatedChild:
 
     def _launch_and_set_up(self) -> None:
         self._stop()
-        self._process, self._connection = _launched(self._limits)
+        self._process, self._connection = _launch(self._limits)
         try:
             files = loaded_files()
-            if self._is_confined:  # while it has one thread
-                own = {Path(path).parent for path, _ in files} | code_of(self._setup[0])
-                self._exchange(confine, (self._reach, self._code | own), _START_UP_S)
-            if files:  # first: what follows may be made of what they define
+            if self._is_confined:  # before it starts threads
+                setup_code = {Path(path).parent for path, _ in files} | code_of(self._setup[0])
+                self._exchange(confine, (self._reach, self._code | setup_code), _START_UP_S)
+            if files:  # first: the setup may use their definitions
                 self._exchange(load_same, (files,), _START_UP_S)
             self._exchange(_set_up, self._setup, _START_UP_S)
         except ChildFailed as failure:
             if self._closed:
                 raise ChildClosed from failure
-            if failure.reason == "exception":  # of another child too; no item is to blame
+            if failure.reason == "exception":  # setup itself failed: no item is to blame
                 raise _cannot_be_set_up(failure) from failure
             raise
         self._calls_left = self._limits.calls_per_child
@@ -175,11 +176,12 @@ class IsolatedChild:
     def _exchange(
         self, function: Callable[..., Result], args: tuple[Any, ...], wall_s: float
     ) -> Result:
-        from pipeline.isolation.declared import result_reader  # children do without
+        from pipeline.isolation.result_schema import result_reader  # children do without
 
         assert self._connection is not None
-        result_reader(function)  # before anything is done, whether the answer could be read
-        file, wait = self._connection.fileno(), patient(CallTime(self._process.pid, wall_s))
+        result_reader(function)  # raises first if the declared result type cannot be checked
+        file = self._connection.fileno()
+        wait = wait_within(CallTime(self._process.pid, wall_s))
         try:
             send(file, [ForkingPickler.dumps((function, args))], wait)
             answer = receive(file, wait, min(self._limits.memory_bytes, _MOST_BYTES))
@@ -207,7 +209,7 @@ class IsolatedChild:
 
 
 def _set_up(setup: Callable[..., object], args: tuple[Any, ...]) -> None:
-    """Prepare a new child; what that returns stays there."""
+    """Set up a new child; the result of `setup` is dropped."""
     setup(*args)
 
 
@@ -217,8 +219,8 @@ def _cannot_be_set_up(failure: ChildFailed) -> EnvironmentFailure:
     )
 
 
-def _launched(limits: ChildLimits) -> tuple[Any, Connection]:
-    """Return a new child and the way to it; where the fork server was killed, by a new one.
+def _launch(limits: ChildLimits) -> tuple[Any, Connection]:
+    """Start a child; return it and the connection to it. A killed fork server is replaced.
 
     Raises:
         EnvironmentFailure: no process can be started.
@@ -226,34 +228,34 @@ def _launched(limits: ChildLimits) -> tuple[Any, Connection]:
     context = multiprocessing.get_context("forkserver")
     for tries_left in reversed(range(_LAUNCHES)):
         ours, theirs = context.Pipe()
-        heard, words = context.Pipe(duplex=False)
+        output, output_sink = context.Pipe(duplex=False)
         process = context.Process(
-            target=serve, args=(theirs, words, limits.memory_bytes, limits.cpu_s), daemon=True
+            target=serve, args=(theirs, output_sink, limits.memory_bytes, limits.cpu_s), daemon=True
         )
         try:
-            with _without_main(), _apart_from_working_folder():
+            with _without_main(), _outside_working_folder():
                 process.start()
         except (EOFError, OSError) as error:
             ours.close()
-            heard.close()
+            output.close()
             if not tries_left:
                 raise EnvironmentFailure(
                     f"a child process cannot be started ({error}); see `trilight doctor`."
                 ) from error
         else:
             os.set_blocking(ours.fileno(), False)
-            threading.Thread(target=_print_words, args=(heard,), daemon=True).start()
+            threading.Thread(target=_print_output, args=(output,), daemon=True).start()
             return process, ours
         finally:
             theirs.close()
-            words.close()
+            output_sink.close()
     raise AssertionError("unreachable: the last try returns or raises")
 
 
-def _print_words(heard: Connection) -> None:
-    """Print to standard error what a child prints, without what would command a terminal."""
-    with heard, contextlib.suppress(OSError):
-        while words := os.read(heard.fileno(), 1 << 14):
+def _print_output(output: Connection) -> None:
+    """Copy a child's output to standard error, with control characters escaped."""
+    with output, contextlib.suppress(OSError):
+        while words := os.read(output.fileno(), 1 << 14):
             os.write(2, escape_lines(words.decode(errors="replace")).encode())
 
 
@@ -261,9 +263,9 @@ def _print_words(heard: Connection) -> None:
 def _without_main() -> Iterator[None]:
     """Hide a program that runs from a file: multiprocessing would run it again in the child.
 
-    Children import by name what they are asked to call, and need none of it. A program of a user's
-    that does not guard its last lines by `if __name__ == "__main__"` would start children there.
-    What runs by `python -m` is a module, and may be asked for functions of its own.
+    Children import the functions that they call by name, and do not need the program. A user's
+    program without `if __name__ == "__main__"` would start children there. A program run by
+    `python -m` is a module, whose functions a child may import.
     """
     with _one_start:
         program = sys.modules["__main__"]
@@ -276,13 +278,15 @@ def _without_main() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _apart_from_working_folder() -> Iterator[None]:
-    """Keep what lies in the working folder out of a child, and out of the servers that start it.
+def _outside_working_folder() -> Iterator[None]:
+    """Keep modules of the working folder out of a child, and out of the servers that start it.
 
-    A file of the name of one of Python's modules would be run there, before anything confines it.
-    The socket of the fork server is below /tmp where TMPDIR is too long for one.
+    A file named like one of Python's modules would be run there, before the child is confined. The
+    socket of the fork server is below /tmp if TMPDIR is too long for one.
     """
-    environment, paths, temporary = os.environ.copy(), sys.path, tempfile.tempdir
+    environment = os.environ.copy()
+    paths = sys.path
+    temporary = tempfile.tempdir
     os.environ.update(child_environment())
     sys.path = order_installed_first(paths)
     if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_FOLDER:
@@ -290,7 +294,8 @@ def _apart_from_working_folder() -> Iterator[None]:
     try:
         yield
     finally:
-        sys.path, tempfile.tempdir = paths, temporary
+        sys.path = paths
+        tempfile.tempdir = temporary
         for name in ("PYTHONSAFEPATH", "PYTHONPATH"):
             if name in environment:
                 os.environ[name] = environment[name]
@@ -299,7 +304,7 @@ def _apart_from_working_folder() -> Iterator[None]:
 
 
 def preload(modules: list[str]) -> None:
-    """Import modules once in the fork server, so that every new child has them at once.
+    """Import modules once in the fork server, so that every new child has them loaded.
 
     Only for libraries that start no threads when imported. Call before the first child starts.
     """
@@ -307,9 +312,9 @@ def preload(modules: list[str]) -> None:
 
 
 def call_with_retries(child: IsolatedChild, function: Callable[..., Result], *args: Any) -> Result:
-    """Call in a child, and in a fresh one where it failed, as often as `deaths.ENDS` says.
+    """Call a function in a child; after a failure retry in a fresh one, by `deaths.ENDS`.
 
     Raises:
-        ChildFailed: the last failure; `is_verdict` says whether the call itself is to blame.
+        ChildFailed: the last failure; `is_verdict` is True if the call itself is to blame.
     """
     return with_retries(lambda: child.call(function, *args))

@@ -1,8 +1,8 @@
-"""What a child that reads strangers' files may reach: its inputs, libraries, and nothing else.
+"""Confines children that read untrusted files: to their inputs, libraries, and nothing else.
 
-Limits of memory and time end what goes wrong by accident. A file that is made to take over its
-parser is held by these: no other file, no network, no program, no other process. Each holds where
-the kernel has it. How a file is read changes by none of them, thus no byte that is made of it.
+Limits of memory and time stop accidents. Confinement stops a file that takes over its parser: it
+reaches no other file, no network, no program, no other process. Each restriction applies if the
+kernel supports it. None of them changes how a file is read, or any byte of the output.
 """
 
 import functools
@@ -24,11 +24,11 @@ from storage.installation import FILES_ROOT, IMPORT_ROOT
 log = logging.getLogger("trilight.children")
 
 VARIABLE = "TRILIGHT_CONFINE"
-"""Environment variable: `auto`, `off`, or `required`, which stops where a part is missing."""
-Wanted = Literal["auto", "off", "required"]
+"""Environment variable: `auto`, `off`, or `required`, which fails if a feature is missing."""
+Mode = Literal["auto", "off", "required"]
 
 MOST_FOLDERS = 256
-"""Of inputs that one child knows; more of them are replaced by the folders that hold them."""
+"""Most input folders of one child; if there are more, their parent folders replace them."""
 
 _OWN_PACKAGES = ("storage", "scene_templates", "pipeline", "trilight")
 _SYSTEM = (
@@ -42,90 +42,93 @@ _SINKS = ("/dev/null", "/dev/zero")
 
 @dataclass(frozen=True, kw_only=True)
 class Reach:
-    """Files of a user's that a confined child may use; all paths absolute, without links."""
+    """User files that a confined child may use; all paths are absolute, without links."""
 
     reads: frozenset[Path] = frozenset()
-    """Files and folders that it may read."""
+    """Files and folders that the child may read."""
     writes: frozenset[Path] = frozenset()
-    """Folders that it may read and write."""
+    """Folders that the child may read and write."""
 
     def covers(self, other: "Reach") -> bool:
-        """Return whether all that another one may is in this one too."""
-        return _covered(other.writes, self.writes) and _covered(
+        """Return True if this reach includes all files of another."""
+        return _all_below(other.writes, self.writes) and _all_below(
             other.reads, self.reads | self.writes
         )
 
     def with_all_of(self, other: "Reach") -> "Reach":
-        """Return what both may, with the folders above where there are very many."""
+        """Return the union of two reaches, merged to parent folders if there are very many."""
         writes = self.writes | other.writes
-        return Reach(reads=_few(self.reads | other.reads), writes=writes)
+        return Reach(reads=_merge_folders(self.reads | other.reads), writes=writes)
 
 
 NO_FILES = Reach()
 
 
 def reach(*, files: Iterable[Path] = (), writes: Iterable[Path] = ()) -> Reach:
-    """Return what a child needs to read files, with what lies beside them, and to write.
+    """Return the reach of a child that reads some files with their folders, and writes others.
 
     Args:
-        files: files or folders to read. A file's folder counts too: meshes and scenes name their
-            textures, and nothing above or beside their folder is theirs.
-        writes: folders to write, which exist.
+        files: files or folders to read. A file's folder is included: meshes and scenes refer to
+            their textures, and never to files above or beside their folder.
+        writes: existing folders to write.
     """
-    found: set[Path] = set()
+    folders: set[Path] = set()
     for path in files:
         absolute = Path(os.path.abspath(path))
         if absolute.is_dir():
-            found.add(absolute.resolve())
-        else:  # a link's target too, whose folder counts for USD
-            found |= {absolute.parent.resolve(), absolute.resolve().parent}
-    return Reach(reads=_few(found), writes=frozenset(Path(path).resolve() for path in writes))
+            folders.add(absolute.resolve())
+        else:  # also a link's target: USD resolves paths from its folder
+            folders |= {absolute.parent.resolve(), absolute.resolve().parent}
+    return Reach(
+        reads=_merge_folders(folders), writes=frozenset(Path(path).resolve() for path in writes)
+    )
 
 
-def wanted_confinement() -> Wanted:
-    """Return what TRILIGHT_CONFINE says, `auto` by default; TrilightError where it is no such."""
+def confinement_mode() -> Mode:
+    """Return the value of TRILIGHT_CONFINE, by default `auto`; raises TrilightError for others."""
     text = os.environ.get(VARIABLE, "auto")
-    if text in get_args(Wanted):
-        return cast(Wanted, text)
-    raise TrilightError(f"{VARIABLE} is {text!r}; {expected_one_of(text, get_args(Wanted))}.")
+    if text in get_args(Mode):
+        return cast(Mode, text)
+    raise TrilightError(f"{VARIABLE} is {text!r}; {expected_one_of(text, get_args(Mode))}.")
 
 
-def missing_parts() -> list[str]:
-    """Return what this machine lacks to confine children, in words."""
+def missing_features() -> list[str]:
+    """Return the names of features that this machine lacks to confine children."""
     missing = [] if landlock_version() else ["Landlock (Linux 5.13 or later, switched on)"]
     return missing if seccomp_works() else [*missing, "seccomp (Linux on x86_64 or aarch64)"]
 
 
-def confinement_wanted() -> bool:
-    """Return whether children that read files are to be confined, as TRILIGHT_CONFINE says.
+def should_confine() -> bool:
+    """Return True if TRILIGHT_CONFINE demands that children that read files are confined.
 
-    A part that this machine lacks is a warning, once.
+    A missing feature is logged as a warning, once.
 
     Raises:
-        EnvironmentFailure: it is `required`, and this machine lacks something.
-        TrilightError: it is no word that is known.
+        EnvironmentFailure: the value is `required`, and this machine lacks a feature.
+        TrilightError: the value is unknown.
     """
-    wanted, missing = wanted_confinement(), missing_parts()
-    if missing and wanted == "required":
+    mode = confinement_mode()
+    missing = missing_features()
+    if missing and mode == "required":
         raise EnvironmentFailure(
             f"{VARIABLE} is required, but this machine lacks {' and '.join(missing)}; expected "
             f"both. Run elsewhere, or set {VARIABLE}=auto."
         )
-    if missing and wanted == "auto":
+    if missing and mode == "auto":
         _warn(" and ".join(missing))
-    return wanted != "off"
+    return mode != "off"
 
 
 @functools.cache
 def _warn(missing: str) -> None:
     log.warning(
-        "what reads strangers' files is not wholly confined: this machine lacks %s. Run "
+        "children that read untrusted files are not fully confined: this machine lacks %s. Run "
         "`trilight doctor`, or set %s=off to accept that.", missing, VARIABLE,
     )  # fmt: skip
 
 
 def code_of(*functions: Callable[..., object]) -> frozenset[Path]:
-    """Return the top packages, or files, that a child imports to call these functions."""
+    """Return the top-level packages or files that a child imports to call these functions."""
     tops = (sys.modules.get(function.__module__.partition(".")[0]) for function in functions)
     files = (getattr(top, "__file__", None) for top in tops)
     paths = (Path(file).resolve() for file in files if file is not None)
@@ -133,23 +136,23 @@ def code_of(*functions: Callable[..., object]) -> frozenset[Path]:
 
 
 def confine(allowed: Reach, code: frozenset[Path]) -> None:
-    """Confine this process, which has one thread, by all that the kernel has.
+    """Confine this process by all features that the kernel supports; it must have one thread.
 
     Args:
-        allowed: the files of a user's.
-        code: Python files and packages that it has to load.
+        allowed: user files that stay accessible.
+        code: Python files and packages that the process has to load.
 
     Raises:
-        EnvironmentFailure: the kernel refuses what it says it has.
+        EnvironmentFailure: the kernel refuses a feature that it reports.
     """
     try:
         os.setsid()
         if sys.platform == "linux":
             give_up_privileges()
         if landlock_version():
-            own = [FILES_ROOT / name for name in _OWN_PACKAGES]
+            packages = [FILES_ROOT / name for name in _OWN_PACKAGES]
             restrict_files(
-                reads=[*_libraries(), *own, *code, *allowed.reads],
+                reads=[*_libraries(), *packages, *code, *allowed.reads],
                 writes=[*(Path(sink) for sink in _SINKS), *allowed.writes],
                 lists=[FILES_ROOT, IMPORT_ROOT, *(path.parent for path in code)],
             )
@@ -158,33 +161,33 @@ def confine(allowed: Reach, code: frozenset[Path]) -> None:
     except OSError as error:
         raise EnvironmentFailure(
             f"a child that reads files cannot be confined ({error.strerror}); expected what "
-            f"`trilight doctor` says is there. Set {VARIABLE}=off to go on without."
+            f"`trilight doctor` says is there. Set {VARIABLE}=off to continue without."
         ) from error
 
 
 def _libraries() -> list[Path]:
-    """Return where Python and its packages lie, and what they look at of the system."""
+    """Return the folders of Python and its packages, and the system files that they read."""
     python = {sys.prefix, sys.base_prefix, sys.exec_prefix, *site.getsitepackages()}
     if site.ENABLE_USER_SITE and site.USER_SITE:
         python.add(site.USER_SITE)
-    # of PYTHONPATH, as clusters' modules set it: but not all of it, which may hold anything
+    # from PYTHONPATH, as modules of clusters set it, only package folders: others may hold anything
     python |= {name for name in sys.path if Path(name).name in ("site-packages", "dist-packages")}
     more = [name for name in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep) if name]
     return [Path(name) for name in (*python, *_SYSTEM, *more, *mimetypes.knownfiles)]
 
 
-def _covered(paths: frozenset[Path], by: frozenset[Path]) -> bool:
+def _all_below(paths: frozenset[Path], by: frozenset[Path]) -> bool:
     return all(path in by or not by.isdisjoint(path.parents) for path in paths)
 
 
-def _few(paths: Iterable[Path]) -> frozenset[Path]:
-    """Return at most MOST_FOLDERS paths that hold all of these, never the root of the system."""
-    found = frozenset(paths)
-    while len(found) > MOST_FOLDERS:
+def _merge_folders(paths: Iterable[Path]) -> frozenset[Path]:
+    """Return at most MOST_FOLDERS folders that contain all paths, never the file system's root."""
+    folders = frozenset(paths)
+    while len(folders) > MOST_FOLDERS:
         above = frozenset(
-            path if path.parent == path.parent.parent else path.parent for path in found
+            path if path.parent == path.parent.parent else path.parent for path in folders
         )
-        if above == found:
+        if above == folders:
             break
-        found = above
-    return frozenset(path for path in found if found.isdisjoint(path.parents))
+        folders = above
+    return frozenset(path for path in folders if folders.isdisjoint(path.parents))

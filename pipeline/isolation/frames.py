@@ -1,7 +1,7 @@
-"""Messages between a child and its owner: parts, whose number and lengths stand before them.
+"""Sends and receives messages between a child and its owner: parts, after their number and lengths.
 
-The owner waits for each piece within the time of one call, so that a child that says half a
-message, or reads none, holds it no longer than one that says nothing.
+The owner waits for each piece within the time limit of one call, so that a child that sends half a
+message, or reads none, blocks it no longer than a silent one.
 """
 
 import os
@@ -17,7 +17,7 @@ _LENGTH = np.dtype("<u8")
 MOST_PARTS = 1 << 17
 
 Wait = Callable[[int, int], None]
-"""Returns when a file can be read or written: its number and the event of `select.poll`."""
+"""Waits until a file can be read or written: takes its number and an event of `select.poll`."""
 
 
 class TooLong(Exception):
@@ -25,11 +25,11 @@ class TooLong(Exception):
 
 
 def wait_forever(file: int, event: int) -> None:
-    """Return at once: reading and writing a file that blocks waits by itself."""
+    """Return at once: reads and writes of a blocking file wait by themselves."""
 
 
-def patient(patience: CallTime) -> Wait:
-    """Return how an owner waits, whose files do not block; raises as `CallTime.until`."""
+def wait_within(patience: CallTime) -> Wait:
+    """Return a wait function for files that do not block; raises as `CallTime.until`."""
 
     def wait(file: int, event: int) -> None:
         poll = select.poll()
@@ -40,7 +40,7 @@ def patient(patience: CallTime) -> Wait:
 
 
 def send(file: int, parts: Sequence[bytes | memoryview], wait: Wait) -> None:
-    """Write one message; OSError where nobody reads it any more."""
+    """Write one message; raises OSError if the other side has ended."""
     table = np.array([len(parts), *map(len, parts)], _LENGTH).tobytes()
     for part in (table, *parts):
         view = memoryview(part)
@@ -54,30 +54,30 @@ def receive(file: int, wait: Wait, most: int) -> list[NDArray[np.uint8]]:
 
     Args:
         file: number of the open file.
-        wait: how to.
-        most: bytes that all parts may have.
+        wait: waits until the file can be read.
+        most: most bytes of all parts together.
 
     Raises:
         EOFError: the other side has ended.
-        TooLong: it claims to have more bytes, or more than `MOST_PARTS`.
-        MemoryError: this process has no room for it.
+        TooLong: the message claims more bytes, or more parts than `MOST_PARTS`.
+        MemoryError: this process has no memory for it.
     """
-    (count,) = _exactly(file, _LENGTH.itemsize, wait).view(_LENGTH).tolist()
+    (count,) = _receive_bytes(file, _LENGTH.itemsize, wait).view(_LENGTH).tolist()
     if count > MOST_PARTS:
         raise TooLong(f"{count} parts; expected at most {MOST_PARTS}")
-    lengths = _exactly(file, count * _LENGTH.itemsize, wait).view(_LENGTH).tolist()
+    lengths = _receive_bytes(file, count * _LENGTH.itemsize, wait).view(_LENGTH).tolist()
     if sum(lengths) > most:
         raise TooLong(f"{sum(lengths)} bytes; expected at most {most}")
-    return [_exactly(file, length, wait) for length in lengths]
+    return [_receive_bytes(file, length, wait) for length in lengths]
 
 
-def _exactly(file: int, count: int, wait: Wait) -> NDArray[np.uint8]:
-    whole = np.zeros(count, np.uint8)  # which takes memory only as it is filled
-    rest = whole.data
+def _receive_bytes(file: int, count: int, wait: Wait) -> NDArray[np.uint8]:
+    data = np.zeros(count, np.uint8)  # lazy: memory is used only as it is filled
+    rest = data.data
     while rest:
         wait(file, select.POLLIN)
         read = os.readv(file, [rest])
         if not read:
             raise EOFError
         rest = rest[read:]
-    return whole
+    return data

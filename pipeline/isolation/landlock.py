@@ -1,7 +1,7 @@
-"""Landlock: a process gives up the files that it does not need, by three calls of Linux.
+"""Landlock: restricts a process to the files that it needs, by three system calls of Linux.
 
-The calls are made through ctypes, since their numbers and structures are fixed for good, and the
-packages that wrap them are young and kept by one person each: a wall is not where to trust those.
+The calls are made through ctypes, since their numbers and structures never change, and the packages
+that wrap them are young and have one maintainer each: too little for a security boundary.
 """
 
 import ctypes
@@ -13,42 +13,47 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-_CREATE, _ADD_RULE, _RESTRICT = 444, 445, 446  # on every architecture
+_CREATE = 444
+_ADD_RULE = 445
+_RESTRICT = 446  # on every architecture
 _ASK_VERSION = 1
 _PATH_BENEATH = 1
 _NO_NEW_PRIVILEGES = 38
 _CAPABILITIES = 0x20080522
-"""Version of the structures of `capget`: two times what is effective, permitted, inherited."""
+"""Version of `capget`'s structures: two triples of effective, permitted and inherited bits."""
 _OF_FILES = 1 << 1 | 1 << 2
-"""Capabilities to read and write what another account owns, where Landlock lets one."""
+"""Capabilities to read and write files of other accounts, as far as Landlock allows."""
 
 _EXECUTE, _WRITE_FILE, READ_FILE, LIST = (1 << bit for bit in range(4))
-_TRUNCATE, _DEVICE_CALLS = 1 << 14, 1 << 15
+_TRUNCATE = 1 << 14
+_DEVICE_CALLS = 1 << 15
 _ABOUT_FILES = _EXECUTE | _WRITE_FILE | READ_FILE | _TRUNCATE | _DEVICE_CALLS
 _SPECIAL = 1 << 6 | 1 << 9 | 1 << 10 | 1 << 11  # make devices, sockets and pipes with names
 _NUM_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15}
-"""Rights over files that a version knows; 16 from the fifth on."""
+"""Number of file rights by Landlock version; 16 from the fifth on."""
 _BIND_AND_CONNECT = 3
-_NET_SINCE, _SCOPES_SINCE = 4, 6
+_NET_SINCE = 4
+_SCOPES_SINCE = 6
 _SCOPES = 3  # no abstract socket and no signal to a process outside
 
 
 @functools.cache
 def landlock_version() -> int:
-    """Return the version of the kernel's Landlock; 0 where there is none, or it is switched off."""
+    """Return the version of the kernel's Landlock; 0 if it is missing or switched off."""
     if sys.platform != "linux":
         return 0
     return max(0, int(_libc().syscall(_CREATE, None, 0, _ASK_VERSION)))
 
 
 def give_up_privileges() -> None:
-    """Give up what root may more than others, but for files, and all ways to get that back.
+    """Drop all capabilities of root except those for files, and all ways to regain them.
 
     Raises:
         OSError: the kernel refuses.
     """
     _require(_libc().prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0))
-    head, sets = struct.pack("=Ii", _CAPABILITIES, 0), ctypes.create_string_buffer(24)
+    head = struct.pack("=Ii", _CAPABILITIES, 0)
+    sets = ctypes.create_string_buffer(24)
     _require(_libc().capget(head, sets))
     effective, permitted, *_ = (held & _OF_FILES for held in struct.unpack("=6I", sets.raw))
     _require(_libc().capset(head, struct.pack("=6I", effective, permitted, 0, 0, 0, 0)))
@@ -57,15 +62,15 @@ def give_up_privileges() -> None:
 def restrict_files(
     *, reads: Iterable[Path], writes: Iterable[Path], lists: Iterable[Path] = ()
 ) -> None:
-    """Leave this thread, and those that it starts, with these paths and what is below them.
+    """Restrict this thread, and those that it starts, to some paths and everything below them.
 
-    Paths that do not exist are left out. There is no way back. Where the kernel can, TCP, signals
-    and abstract sockets to processes outside end too.
+    Missing paths are left out. The restriction is permanent. If the kernel supports it, TCP, and
+    signals and abstract sockets to processes outside, are blocked too.
 
     Args:
         reads: files and folders to read.
         writes: files and folders to read and write; no device can be made there.
-        lists: folders to list, with nothing in them to be read.
+        lists: folders that may be listed, without read access to their files.
 
     Raises:
         OSError: the kernel refuses, or `landlock_version` is 0.
@@ -73,13 +78,13 @@ def restrict_files(
     rights = (1 << _NUM_RIGHTS.get(landlock_version(), 16)) - 1
     ruleset = _new_ruleset(rights)
     try:
-        for paths, wanted in (
+        for paths, access in (
             (lists, LIST),
             (reads, READ_FILE | LIST | _EXECUTE),
             (writes, rights & ~_SPECIAL & ~_EXECUTE),
         ):
             for path in paths:
-                _allow(ruleset, path, wanted & rights)
+                _allow(ruleset, path, access & rights)
         _require(_libc().syscall(_RESTRICT, ruleset, 0))
     finally:
         os.close(ruleset)
@@ -92,21 +97,21 @@ def _new_ruleset(rights: int) -> int:
         fields.append(_BIND_AND_CONNECT)
     if version >= _SCOPES_SINCE:
         fields.append(_SCOPES)
-    given = struct.pack(f"={len(fields)}Q", *fields)
-    return _require(_libc().syscall(_CREATE, given, ctypes.c_size_t(len(given)), 0))
+    attributes = struct.pack(f"={len(fields)}Q", *fields)
+    return _require(_libc().syscall(_CREATE, attributes, ctypes.c_size_t(len(attributes)), 0))
 
 
 def _allow(ruleset: int, path: Path, rights: int) -> None:
     try:
         opened = os.open(path, os.O_PATH | os.O_CLOEXEC)
     except OSError:
-        return  # what cannot be reached needs no right
+        return  # a missing path needs no rule
     try:
         if not stat.S_ISDIR(os.fstat(opened).st_mode):
             rights &= _ABOUT_FILES
         if rights:
-            given = struct.pack("=Qi", rights, opened)
-            _require(_libc().syscall(_ADD_RULE, ruleset, _PATH_BENEATH, given, 0))
+            rule = struct.pack("=Qi", rights, opened)
+            _require(_libc().syscall(_ADD_RULE, ruleset, _PATH_BENEATH, rule, 0))
     finally:
         os.close(opened)
 

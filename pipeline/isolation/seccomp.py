@@ -1,8 +1,8 @@
-"""Seccomp: a process gives up calls of Linux that reading a file never needs.
+"""Seccomp: blocks system calls of Linux that reading a file never needs.
 
-Refused are sockets, new processes and programs, whatever reaches other processes, rights and times
-of files, and parts of the kernel that were a way out before. A refused call returns EPERM, so that
-a library can go on without it.
+Blocked are sockets, new processes and programs, access to other processes, changes of permissions
+and times of files, and kernel features that were exploited before. A blocked call returns EPERM, so
+that a library can continue without it.
 """
 
 import ctypes
@@ -46,7 +46,7 @@ _NUMBERS: Mapping[str, tuple[int | None, int | None]] = {
     "reboot": (169, 142), "clock_settime": (227, 112), "sethostname": (170, 161),
     "setdomainname": (171, 162),
 }  # fmt: skip
-"""What is refused, with its number on x86_64 and on aarch64, where there is one."""
+"""Blocked calls with their numbers on x86_64 and on aarch64; None if there is none."""
 
 _OWN = -1
 """Stands for the number of this process."""
@@ -62,50 +62,59 @@ _BY_ARGUMENT: Mapping[str, tuple[int, int, int, _Test, tuple[int, ...]]] = {
     "tgkill": (234, 131, 0, "one of", (_OWN,)),
     "clone": (56, 220, 0, "has", (0x10000,)),  # CLONE_THREAD: threads, and no new process
 }  # fmt: skip
-"""What is allowed by the low 32 bits, which the kernel looks at, of an argument: numbers of the
-call, place of the argument, and what that must be."""
+"""Calls that are allowed by the low 32 bits of one argument: numbers of the call, index of the
+argument, test, and values."""
 
 _CLONE3 = 435
-"""As if it were unknown, since its arguments lie in memory: libraries call `clone` instead."""
+"""Answered with ENOSYS, since its arguments lie in memory: libraries then call `clone` instead."""
 _MACHINES = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}
-"""Column of numbers, and how the kernel calls the architecture."""
+"""Column of the call numbers, and the kernel's number of the architecture."""
 _OTHER_NUMBERS = 0x40000000  # x86_64's second set of calls, for 32-bit pointers
 
-_LOAD, _EQUAL, _AT_LEAST, _HAS, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
-_CALL_NUMBER_AT, _ARCHITECTURE_AT, _ARGUMENTS_AT = 0, 4, 16
-_ALLOW, _REFUSE, _UNKNOWN = 0x7FFF0000, 0x00050000 | 1, 0x00050000 | 38  # EPERM, ENOSYS
+_LOAD = 0x20
+_EQUAL = 0x15
+_AT_LEAST = 0x35
+_HAS = 0x45
+_RETURN = 0x06
+_CALL_NUMBER_AT = 0
+_ARCHITECTURE_AT = 4
+_ARGUMENTS_AT = 16
+_ALLOW = 0x7FFF0000
+_REFUSE = 0x00050000 | 1
+_UNKNOWN = 0x00050000 | 38  # EPERM, ENOSYS
 
-_SET_SECCOMP, _FILTER = 22, 2
+_SET_SECCOMP = 22
+_FILTER = 2
 _Step = tuple[int, int, int, int]
 
 
 @functools.cache
 def seccomp_works() -> bool:
-    """Return whether calls can be given up here: the kernel can, and the machine's are known."""
+    """Return True if the kernel supports seccomp and the machine's call numbers are known."""
     if sys.platform != "linux" or platform.machine() not in _MACHINES:
         return False
     libc = ctypes.CDLL(None, use_errno=True)
-    # with no program it fails: by EFAULT where the kernel would look at one
+    # a call without a program fails with EFAULT if the kernel supports filters
     return libc.prctl(_SET_SECCOMP, _FILTER, None, 0, 0) < 0 and ctypes.get_errno() == 14
 
 
 def refuse_calls() -> None:
-    """Give up the calls for this thread and those that it starts; there is no way back.
+    """Block the calls for this thread and those that it starts, permanently.
 
     Raises:
-        OSError: the kernel refuses; privileges must have been given up before.
+        OSError: the kernel refuses; `give_up_privileges` must have been called before.
     """
     steps = _program(platform.machine(), os.getpid())
     packed = b"".join(struct.pack("=HBBI", *step) for step in steps)
     program = ctypes.create_string_buffer(packed, len(packed))
-    given = struct.pack("HxxxxxxP", len(steps), ctypes.addressof(program))
-    if ctypes.CDLL(None, use_errno=True).prctl(_SET_SECCOMP, _FILTER, given, 0, 0) < 0:
+    header = struct.pack("HxxxxxxP", len(steps), ctypes.addressof(program))
+    if ctypes.CDLL(None, use_errno=True).prctl(_SET_SECCOMP, _FILTER, header, 0, 0) < 0:
         code = ctypes.get_errno()
         raise OSError(code, os.strerror(code))
 
 
 def _program(machine: str, process_id: int) -> list[_Step]:
-    """Return the kernel's steps: by another architecture's number nothing may be called at all."""
+    """Return the filter program; it blocks every call of another architecture."""
     column, architecture = _MACHINES[machine]
     steps = [
         (_LOAD, 0, 0, _ARCHITECTURE_AT),
@@ -118,16 +127,16 @@ def _program(machine: str, process_id: int) -> list[_Step]:
     for row in _NUMBERS.values():
         if (number := row[column]) is not None:
             steps += _where(_EQUAL, number, (_RETURN, 0, 0, _REFUSE))
-    for *numbers, place, test, values in _BY_ARGUMENT.values():
+    for *numbers, position, test, values in _BY_ARGUMENT.values():
         held, other = (_REFUSE, _ALLOW) if test == "none of" else (_ALLOW, _REFUSE)
-        by_value = [(_LOAD, 0, 0, _ARGUMENTS_AT + 8 * place)]
+        by_value = [(_LOAD, 0, 0, _ARGUMENTS_AT + 8 * position)]
         for value in values:
-            asked = process_id if value == _OWN else value
-            by_value += _where(_HAS if test == "has" else _EQUAL, asked, (_RETURN, 0, 0, held))
+            operand = process_id if value == _OWN else value
+            by_value += _where(_HAS if test == "has" else _EQUAL, operand, (_RETURN, 0, 0, held))
         steps += _where(_EQUAL, numbers[column], *by_value, (_RETURN, 0, 0, other))
     return [*steps, (_RETURN, 0, 0, _ALLOW)]
 
 
 def _where(test: int, value: int, *then: _Step) -> list[_Step]:
-    """Return steps that are made where what was loaded passes a test, and are passed over else."""
+    """Return steps that run only if the loaded value passes a test."""
     return [(test, 0, len(then), value), *then]

@@ -1,8 +1,7 @@
-"""Waits for the answer of a child, within a time limit that does not run while it is stopped.
+"""Waits for the answer of a child; the time limit does not run while the command is stopped.
 
-Time is counted in polls, not by a clock, and this process does not poll while it stands still.
-So Ctrl-Z, which stops a command and all of its children together, and a laptop that sleeps take
-nothing of a child's time, however long they last.
+Time is counted in polls, not by a clock, and a stopped process does not poll. So Ctrl-Z, which
+stops a command and all its children together, and a sleeping laptop take none of a child's time.
 """
 
 import logging
@@ -10,37 +9,39 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pipeline.isolation.deaths import ChildFailed
+from pipeline.isolation.call_failures import ChildFailed
 
 log = logging.getLogger("trilight.children")
 
 LOOK_S = 1.0
 """Pause between two polls of a child that has not answered."""
 LOOKS_BEFORE_WORDS = 3
-"""Looks at which a child was stopped before that is said. One may see a child that is about to
-continue together with this process."""
+"""Polls that find a child stopped before a warning is logged. A single one may see a child that is
+about to continue together with this process."""
 LOOKS_BEFORE_KILL = 60
 """Polls that may find a child stopped before it is given up: time to continue it by hand."""
 
 
 class CallTime:
-    """The time of one call, of which each wait takes its part."""
+    """Time limit of one call, shared by all its waits."""
 
     def __init__(self, process_id: int, wall_s: float) -> None:
         """Begin a call.
 
         Args:
-            process_id: of the child.
-            wall_s: most seconds to wait, in all.
+            process_id: process id of the child.
+            wall_s: most seconds to wait in total.
         """
-        self._process_id, self._wall_s = process_id, wall_s
-        self._waited_s, self._stopped = 0.0, 0
+        self._process_id = process_id
+        self._wall_s = wall_s
+        self._waited_s = 0.0
+        self._stopped = 0
 
     def until(self, happens: Callable[[float], bool]) -> None:
-        """Return as soon as something happens.
+        """Wait until an event happens.
 
         Args:
-            happens: waits at most so many seconds, and returns whether it has happened.
+            happens: waits at most the given seconds, and returns True if the event has happened.
 
         Raises:
             ChildFailed: `timeout_wall`, or `stopped` where the child was stopped and not continued.
@@ -48,14 +49,14 @@ class CallTime:
         while self._waited_s < self._wall_s:
             pause_s = min(LOOK_S, self._wall_s - self._waited_s)
             began_s = time.monotonic()
-            if happens(pause_s):  # in pieces, however small, the time runs on
+            if happens(pause_s):  # many short waits count too
                 self._waited_s += min(pause_s, time.monotonic() - began_s)
                 return
             self._waited_s += pause_s
-            self._look()
+            self._check_stopped()
         raise ChildFailed("timeout_wall", f"no answer within {self._wall_s:.0f} s")
 
-    def _look(self) -> None:
+    def _check_stopped(self) -> None:
         self._stopped = self._stopped + 1 if _is_stopped(self._process_id) else 0
         if self._stopped == LOOKS_BEFORE_WORDS:
             log.warning(

@@ -25,7 +25,7 @@ from pipeline.objects.builtin.tree import tree_rand
 from pipeline.objects.builtin.vase import vase_rand
 from pipeline.objects.ply import encode_ply
 from storage.atomic import write_atomically
-from storage.dataset.layout import numbered
+from storage.dataset.layout import numbered_path
 from storage.errors import TrilightError, expected_one_of
 from storage.records.objects import ObjectRecord
 from storage.seeds import rng_for
@@ -67,7 +67,7 @@ def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
     records = []
     for index in range(num_builtin(source)):
         family, number = names[index % len(names)], index // len(names)
-        path = work_dir / group / numbered(index, f"{family}-{number:05d}.ply")
+        path = work_dir / group / numbered_path(index, f"{family}-{number:05d}.ply")
         data = encode_ply(*builtin_mesh(family, number, group))
         if not path.is_file() or path.read_bytes() != data:
             write_atomically(path, data)

@@ -1,4 +1,4 @@
-"""Composes scenes: real meshes within the triangle budget, in a layout, with cameras that see them.
+"""Composes scenes: meshes within the triangle budget, in a layout, with cameras that see them.
 
 Scene k is a pure function of (settings, pool, seed, k, attempt).
 """
@@ -11,30 +11,30 @@ import numpy as np
 
 from pipeline.scenes.budget import levels_within
 from pipeline.scenes.drawn_columns import with_drawn_columns
-from pipeline.scenes.fitting import drawn_rows
-from pipeline.scenes.laws import require_laws
-from pipeline.scenes.own_light import with_own_light
-from pipeline.scenes.own_materials import own_skins
+from pipeline.scenes.fitting import draw_rows
 from pipeline.scenes.pieces import (
     ScenePiece,
     Skin,
-    dressed,
+    apply_skin,
+    concatenate_pieces,
     emitter_piece,
-    joined,
     object_piece,
     shell_piece,
 )
 from pipeline.scenes.pool import PooledAsset, fits_of
-from pipeline.scenes.posing import posed
+from pipeline.scenes.posing import pose_points
+from pipeline.scenes.scene_checks import require_valid
 from pipeline.scenes.shapes import MeshShape
-from pipeline.scenes.subdivision import filled
+from pipeline.scenes.source_emission import with_source_emission
+from pipeline.scenes.source_materials import source_skins
+from pipeline.scenes.subdivision import fill_triangles
 from pipeline.scenes.textured_pieces import with_drawn_textures
 from pipeline.scenes.views import with_first_cameras
 from scene_templates.layout import Layout
 from scene_templates.layout_rand import ScenePlan, layout_rand, scene_plan
-from scene_templates.own_maps import NO_OWN_MAPS, OwnMaps
 from scene_templates.settings import SceneSettings
 from scene_templates.skies.drawn_scene import scene_sky
+from scene_templates.user_maps import NO_OWN_MAPS, OwnMaps
 from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.retextured import without_constant_textures
@@ -49,28 +49,28 @@ def compose_scene(
     seed: int,
     scene_index: int,
     attempt: int,
-    own: OwnMaps = NO_OWN_MAPS,
+    user_maps: OwnMaps = NO_OWN_MAPS,
 ) -> Scene:
     """Compose one scene.
 
     Args:
         settings: the ranges to draw from.
         pool: the objects of the scene's split, sorted by uid.
-        seed: of the dataset, from 0.
-        scene_index: which scene, from 0.
-        attempt: how many times this scene was rejected before.
-        own: a user's own textures and maps of the scene's split.
+        seed: seed of the dataset, from 0.
+        scene_index: index of the scene, from 0.
+        attempt: number of earlier rejections of this scene.
+        user_maps: the user's textures and maps of the scene's split.
 
     Returns:
         A checked scene with `settings.num_views` cameras. Its provenance holds template, family,
-        scene_index, attempt, seed and camera_attempts (per view, the proposal that passed), and
-        where the scene is an excursion its axis and value, and where it has a sky, what was drawn;
-        "maps" are the uids of a user's own textures and map, where it has any.
+        scene_index, attempt, seed and camera_attempts (per view, the accepted proposal); for an
+        excursion its axis and value; for a scene with a sky its drawn parameters; "maps" are the
+        uids of the user's textures and map, if it has any.
 
     Raises:
         Rejected: no_room, over_budget, no_faces, no_camera, emitter_inside or law_broken; equal
-            arguments always give the same answer.
-        TrilightError: where the pool is empty.
+            arguments always give the same result.
+        TrilightError: the pool is empty.
     """
     if not pool:
         raise TrilightError("scenes: the pool holds 0 objects; expected at least 1: add objects.")
@@ -87,40 +87,49 @@ def compose_scene(
     ]
     layout = layout_rand(rng, settings, plan, shapes)
     name = {"seed": seed, "scene_index": scene_index, "attempt": attempt}
-    skins = own_skins(chosen, levels, settings.materials, **name)
+    skins = source_skins(chosen, levels, settings.materials, **name)
     pieces = scene_pieces(layout, chosen, shapes, settings, rng, skins)
-    pieces = with_drawn_textures(pieces, layout, settings.textures, **name, own=own.textures)
-    arrays = joined(pieces)
+    pieces = with_drawn_textures(
+        pieces, layout, settings.textures, **name, user_textures=user_maps.textures
+    )
+    scene = _scene_of(pieces, provenance, name)
+    uids = {piece.skin.uid for piece in pieces if piece.skin and piece.skin.uid}
+    scene = _with_sky(scene, settings, name, user_maps, uids)
+    scene = with_first_cameras(without_constant_textures(scene), settings)
+    require_valid(scene, settings)
+    return scene
+
+
+def _scene_of(
+    pieces: Sequence[ScenePiece], provenance: dict[str, Any], name: Mapping[str, int]
+) -> Scene:
+    """Return the scene of some pieces, still without cameras."""
+    arrays = concatenate_pieces(pieces)
     arrays["materials"] = with_drawn_columns(arrays["materials"], **name)
-    scene = Scene(
+    return Scene(
         **arrays,
         c2w=np.zeros((0, 4, 4), np.float32),
         fov_deg=np.zeros(0, np.float32),
         objects=tuple(piece.entry for piece in pieces),
         provenance=provenance,
     )
-    uids = {piece.skin.uid for piece in pieces if piece.skin and piece.skin.uid}
-    scene = _with_sky(scene, settings, name, own, uids)
-    scene = with_first_cameras(without_constant_textures(scene), settings)
-    require_laws(scene, settings)
-    return scene
 
 
 def _with_sky(
     scene: Scene,
     settings: SceneSettings,
     name: Mapping[str, int],
-    own: OwnMaps,
+    user_maps: OwnMaps,
     uids: set[str],
 ) -> Scene:
-    """Return a scene with its sky, if any, and the uids of the user's own that it has."""
+    """Return a scene with its sky, if any, and with the uids of the user's maps in it."""
     emits = scene.triangle_emits
     sky = scene_sky(
         settings.skies,
         scene.vertex_positions[scene.faces[emits]].astype(np.float64),
         scene.materials[scene.material_index[emits], EMISSION].astype(np.float64),
         **name,
-        own=own.skies,
+        user_skies=user_maps.skies,
         licences=scene.licences,
     )
     provenance = dict(scene.provenance)
@@ -157,7 +166,7 @@ def _objects_rand(
     pool: Sequence[PooledAsset],
 ) -> list[PooledAsset]:
     budget = _object_budget(settings, plan)
-    return [pool[row] for row in drawn_rows(rng, fits_of(pool), plan.num_objects, budget)]
+    return [pool[row] for row in draw_rows(rng, fits_of(pool), plan.num_objects, budget)]
 
 
 def _object_budget(settings: SceneSettings, plan: ScenePlan) -> int:
@@ -174,11 +183,11 @@ def scene_pieces(
 ) -> list[ScenePiece]:
     """Return floor and walls, objects and emitters of a layout, the objects as `shapes`.
 
-    Where an object has one of `skins`, that is what it looks like; its parts that emit become
-    emitters at the end, where that is asked for.
+    An object with one of `skins` gets its textures; its emitting components become emitters at the
+    end, if the settings say so.
 
     Raises:
-        Rejected: "no_faces" where no triangle of an object has an area.
+        Rejected: "no_faces" if no triangle of an object has an area.
     """
     angle_deg = settings.materials.smooth_angle_deg
     shell = [shell_piece(part, rng, angle_deg) for part in layout.shell]
@@ -189,17 +198,17 @@ def scene_pieces(
     for pooled, shape, placement, skin in zip(chosen, shapes, layout.objects, looks, strict=True):
         entry = _entry(pooled, taken)
         taken.append(entry.name)
-        positions = posed(shape.points, placement.pose)
+        positions = pose_points(shape.points, placement.pose)
         surface = placement.surface
         piece = object_piece(entry, positions, shape.faces, surface, rng, angle_deg)
-        objects.append(piece if skin is None else dressed(piece, positions, shape.faces, skin))
-    objects, lights = with_own_light(objects, emitters, settings.materials.own_emission)
+        objects.append(piece if skin is None else apply_skin(piece, positions, shape.faces, skin))
+    objects, lights = with_source_emission(objects, emitters, settings.materials.own_emission)
     pieces = [*shell, *objects, *emitters, *lights]
-    return pieces if settings.fill_to is None else filled(pieces, settings.fill_to)
+    return pieces if settings.fill_to is None else fill_triangles(pieces, settings.fill_to)
 
 
 def _entry(pooled: PooledAsset, taken: Sequence[str]) -> SceneObject:
-    """Return the row of an object, under the end of its uid or the first free variant of it."""
+    """Return the row of an object, named by the end of its uid or its first free variant."""
     locked = pooled.locked
     stem = locked.uid.rsplit("/", 1)[-1]
     variants = [stem, *(f"{stem}_{number}" for number in range(2, len(taken) + 3))]

@@ -1,4 +1,4 @@
-"""Random values of material columns that were declared with a draw (storage.records.material)."""
+"""Draws values of material columns that declare a draw (storage.records.material)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,9 @@ def with_drawn_columns(
 
     Args:
         materials: rows with all declared columns, which stay unchanged.
-        seed: of the dataset.
-        scene_index: which scene.
-        attempt: how many times this scene was rejected before.
+        seed: seed of the dataset.
+        scene_index: index of the scene.
+        attempt: number of earlier rejections of this scene.
 
     Raises:
         TrilightError: a draw returns another shape, or a value outside of its column's range.
@@ -32,11 +32,11 @@ def with_drawn_columns(
             continue
         rng = rng_for(seed, f"material column {column.name}", scene_index, attempt)
         values = np.asarray(column.draw(rng, int(reflects.sum())), np.float32)
-        wanted = (int(reflects.sum()), column.width)
-        if values.shape != wanted or not np.all(column.within.holds(values)):
+        shape = (int(reflects.sum()), column.width)
+        if values.shape != shape or not np.all(column.within.holds(values)):
             raise TrilightError(
                 f"material column {column.name!r}: its draw returned shape {values.shape}; "
-                f"expected {wanted}, with every number {column.within}."
+                f"expected {shape}, with every number {column.within}."
             )
         drawn[reflects, part] = values
     return drawn

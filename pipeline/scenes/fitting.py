@@ -1,7 +1,7 @@
-"""Which objects of a split still fit into a scene, and the draw among them.
+"""Draws objects of a split among those that still fit into a scene.
 
-All of a split may be millions. What a draw has to know of each is its triangles and the camp of its
-licence, two columns that are looked at in parts; where all fit, which is the rule, at none.
+A split may have millions of objects. A draw needs the triangles of each and the camp of its
+licence: two columns that are read in chunks, and not at all if every object fits, as usual.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from storage.errors import Rejected
 from storage.records.object_index import CampSizes
 
-_PART = 1 << 16
-"""Rows that are looked at together: half a megabyte."""
+_CHUNK = 1 << 16
+"""Rows of a column that are read together: half a megabyte."""
 
 
 class Column(Protocol):
@@ -31,21 +31,22 @@ class FitTable:
     def __init__(
         self, least: Column, camp: Column, camps: Sequence[str], sizes: Mapping[str, CampSizes]
     ) -> None:
-        """Remember the columns.
+        """Make a table of columns.
 
         Args:
             least: triangles of the coarsest level of each row.
             camp: number of each row's camp.
-            camps: name of each number; "" is for objects that have no camp.
-            sizes: of the camps that occur.
+            camps: name of each camp by number; "" is for objects without a camp.
+            sizes: number and sizes of the objects of each camp that occurs.
         """
-        self._least, self._camp = least, camp
+        self._least = least
+        self._camp = camp
         self._camps = tuple(camps)
         self.sizes = sizes
 
     @classmethod
     def of(cls, least: Sequence[int], camps: Sequence[str] = ()) -> "FitTable":
-        """Return the table of some entries; without `camps` none has one."""
+        """Return the table of some objects; without `camps` none has a camp."""
         names = sorted({*camps}) or [""]
         sizes = np.array(least, np.int64)
         numbers = np.array([names.index(camp) for camp in camps] or [0] * len(least), np.int64)
@@ -68,11 +69,11 @@ class FitTable:
         """Return the camp of a row."""
         return self._camps[int(self._camp[row : row + 1][0])]
 
-    def drawn(self, rng: np.random.Generator, rooms: Mapping[str, int]) -> int | None:
-        """Draw a row evenly among those that fit; None where none does.
+    def draw_row(self, rng: np.random.Generator, rooms: Mapping[str, int]) -> int | None:
+        """Draw a row uniformly among those that fit; None if none does.
 
         Args:
-            rng: where the number comes from.
+            rng: source of the random number.
             rooms: most triangles by camp; rows of other camps do not fit.
         """
         if rooms.keys() == self.sizes.keys() and all(
@@ -82,46 +83,48 @@ class FitTable:
         limits = np.full(len(self._camps), -1, np.int64)
         for camp, room in rooms.items():
             limits[self._camps.index(camp)] = room
-        starts = range(0, len(self._least), _PART)
+        starts = range(0, len(self._least), _CHUNK)
         counts = np.cumsum([np.count_nonzero(self._fits(start, limits)) for start in starts])
         if not counts[-1]:
             return None
         number = int(rng.integers(counts[-1]))
-        part = int(np.searchsorted(counts, number, side="right"))
-        before = int(counts[part - 1]) if part else 0
-        fitting = np.flatnonzero(self._fits(starts[part], limits))
-        return starts[part] + int(fitting[number - before])
+        chunk = int(np.searchsorted(counts, number, side="right"))
+        before = int(counts[chunk - 1]) if chunk else 0
+        fitting = np.flatnonzero(self._fits(starts[chunk], limits))
+        return starts[chunk] + int(fitting[number - before])
 
     def _fits(self, start: int, limits: NDArray[np.int64]) -> NDArray[np.bool_]:
-        part = slice(start, start + _PART)
-        fits: NDArray[np.bool_] = self._least[part] <= limits[self._camp[part]]
+        chunk = slice(start, start + _CHUNK)
+        fits: NDArray[np.bool_] = self._least[chunk] <= limits[self._camp[chunk]]
         return fits
 
 
-def drawn_rows(
+def draw_rows(
     rng: np.random.Generator, table: FitTable, count: int, num_triangles: int
 ) -> list[int]:
-    """Draw rows with replacement, evenly among those that fit beside the ones before.
+    """Draw rows with replacement, uniformly among those that fit beside the earlier ones.
 
     If all fit, this is a uniform draw. Otherwise simple objects are drawn more often beside
-    demanding ones, as they would be if whole scenes were drawn until one fits.
-    Objects of two different camps never fit beside each other.
+    demanding ones, as they would be if whole scenes were drawn until one fits. Objects of two
+    different camps never fit beside each other.
 
     Args:
-        rng: where the numbers come from.
-        table: what to draw from, at least one row.
-        count: how many.
-        num_triangles: for all together.
+        rng: source of the random numbers.
+        table: table to draw from, with at least one row.
+        count: number of rows to draw.
+        num_triangles: most triangles of all rows together.
 
     Raises:
-        Rejected: "over_budget" where not even the simplest fit.
+        Rejected: "over_budget" if not even the simplest objects fit.
     """
-    allowed, left, drawn = set(table.sizes), num_triangles, list[int]()
+    allowed = set(table.sizes)
+    remaining = num_triangles
+    rows = list[int]()
     for following in range(count - 1, -1, -1):
         rooms = {
-            camp: left - following * _simplest_beside(table, camp, allowed) for camp in allowed
+            camp: remaining - following * _simplest_after(table, camp, allowed) for camp in allowed
         }
-        row = table.drawn(rng, rooms)
+        row = table.draw_row(rng, rooms)
         if row is None:
             least = min(sizes.least for sizes in table.sizes.values())
             raise Rejected(
@@ -129,14 +132,14 @@ def drawn_rows(
                 f"{count} objects of at least {least} triangles each do not fit into the "
                 f"{num_triangles} that the scene has for them",
             )
-        drawn.append(row)
-        left -= table.size(row)
+        rows.append(row)
+        remaining -= table.size(row)
         if camp := table.camp(row):
             allowed &= {"", camp}
-    return drawn
+    return rows
 
 
-def _simplest_beside(table: FitTable, camp: str, allowed: set[str]) -> int:
-    """Return the triangles of the simplest object that may still come after one of a camp."""
-    beside = allowed & {"", camp} if camp else allowed
-    return min(table.sizes[other].least for other in beside)
+def _simplest_after(table: FitTable, camp: str, allowed: set[str]) -> int:
+    """Return the triangles of the simplest object that is allowed after one of a camp."""
+    camps = allowed & {"", camp} if camp else allowed
+    return min(table.sizes[other].least for other in camps)

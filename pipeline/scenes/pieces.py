@@ -1,4 +1,4 @@
-"""Pieces of a scene - floor, walls, objects, emitters - and how they join into its arrays."""
+"""Pieces of a scene (floor, walls, objects, emitters), and their concatenation into its arrays."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -22,13 +22,13 @@ class Skin:
     """The textures of a piece, whose material is one row."""
 
     uv: NDArray[np.float32]
-    """[3T, 2] of each corner of each triangle."""
+    """[3T, 2] texture coordinates of each corner of each triangle."""
     textures: tuple[Texture, Texture, Texture]
-    """Diffuse, specular and roughness."""
+    """Textures of the diffuse, specular and roughness columns."""
     uid: str = ""
-    """Of a user's own texture, as objects.lock.jsonl names it."""
+    """uid of a user's texture, as objects.lock.jsonl names it; empty for others."""
     emission: NDArray[np.float32] | None = None
-    """[T, 3] what the triangles of an object are said to emit, until that is made light."""
+    """[T, 3] stated radiance of an object's triangles, until they become emitters."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,22 +36,22 @@ class ScenePiece:
     """One row of `Scene.objects` with its triangles and materials."""
 
     entry: SceneObject
-    """Identity and rights."""
+    """Name, kind and rights of the piece."""
     mesh: ShadedMesh
-    """In world space."""
+    """Mesh of the piece in world space."""
     materials: NDArray[np.float32]
     """[M, 10 or more], every declared column (storage.records.material)."""
     material_index: NDArray[np.int64]
-    """[T] row of `materials`."""
+    """[T] row of `materials` of each triangle."""
     skin: Skin | None = None
-    """Textures that stand for columns of the material; by default none."""
+    """Textures that replace columns of the material; by default none."""
 
 
 def shell_piece(part: ShellPart, rng: np.random.Generator, smooth_angle_deg: float) -> ScenePiece:
-    """Return a floor or wall; where it has many colours, one per triangle drawn from `rng`."""
+    """Return a floor or wall; if it has many colors, `rng` draws one per triangle."""
     positions = part.positions.astype(np.float32)
-    mesh = _shaded(positions, part.faces, part.surface, smooth_angle_deg)
-    return _surfaced(SceneObject(name=part.name, kind="shell"), mesh, part.surface, rng)
+    mesh = _shade_mesh(positions, part.faces, part.surface, smooth_angle_deg)
+    return _apply_surface(SceneObject(name=part.name, kind="shell"), mesh, part.surface, rng)
 
 
 def object_piece(
@@ -62,29 +62,31 @@ def object_piece(
     rng: np.random.Generator,
     smooth_angle_deg: float,
 ) -> ScenePiece:
-    """Return an object in its place: vertices [V, 3] in world space, and faces [F, 3].
+    """Return an object of posed vertices [V, 3] in world space, and faces [F, 3].
 
     Raises:
-        Rejected: "no_faces" where no triangle is left.
+        Rejected: "no_faces" if no triangle has an area.
     """
     faces = without_slivers(positions, faces)
     if len(faces) == 0:
         raise Rejected("no_faces", f"{entry.uid}: no triangle of the level has an area")
-    return _surfaced(entry, _shaded(positions, faces, surface, smooth_angle_deg), surface, rng)
+    return _apply_surface(
+        entry, _shade_mesh(positions, faces, surface, smooth_angle_deg), surface, rng
+    )
 
 
-def dressed(
+def apply_skin(
     piece: ScenePiece, positions: NDArray[np.float32], faces: NDArray[np.uint32], skin: Skin
 ) -> ScenePiece:
-    """Return the piece of `object_piece` in a skin of all its faces, slivers included."""
-    kept = not_slivers(positions, faces)
-    uv = skin.uv.reshape(-1, 3, 2)[kept].reshape(-1, 2)
-    emission = None if skin.emission is None else skin.emission[kept]
+    """Return the piece of `object_piece` with a skin that covers all faces, slivers included."""
+    has_area = not_slivers(positions, faces)
+    uv = skin.uv.reshape(-1, 3, 2)[has_area].reshape(-1, 2)
+    emission = None if skin.emission is None else skin.emission[has_area]
     return with_skin(piece, dataclasses.replace(skin, uv=uv, emission=emission))
 
 
 def with_skin(piece: ScenePiece, skin: Skin) -> ScenePiece:
-    """Return a piece with textures in the place of its material; its row has their means."""
+    """Return a piece whose material is replaced by textures; its row has their means."""
     materials = default_rows(1)
     for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), skin.textures, strict=True):
         materials[:, part] = texture.mean if part != ROUGHNESS else texture.mean[0]
@@ -109,7 +111,7 @@ def emitter_piece(emitter: Emitter, row: int) -> ScenePiece:
     )
 
 
-def _shaded(
+def _shade_mesh(
     positions: NDArray[np.float32],
     faces: NDArray[np.uint32],
     surface: SurfaceLook,
@@ -120,10 +122,10 @@ def _shaded(
     return flat_shaded(positions, faces)
 
 
-def _surfaced(
+def _apply_surface(
     entry: SceneObject, mesh: ShadedMesh, surface: SurfaceLook, rng: np.random.Generator
 ) -> ScenePiece:
-    """Give a mesh its materials: one row, or one per shading group or triangle."""
+    """Return the piece of a mesh with materials: one row, or one per shading group or triangle."""
     rows = {
         "one": np.zeros(len(mesh.faces), np.int64),
         "groups": mesh.groups,
@@ -139,7 +141,7 @@ def _surfaced(
     return ScenePiece(entry=entry, mesh=mesh, materials=materials, material_index=rows)
 
 
-def joined(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
+def concatenate_pieces(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
     """Return the geometry, materials and textures of a Scene, in the order of the pieces."""
     vertex_start = _starts([len(piece.mesh.positions) for piece in pieces])
     material_start = _starts([len(piece.materials) for piece in pieces])
@@ -161,10 +163,12 @@ def joined(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
 
 
 def _skins(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
-    """Return the fields that textures take in a Scene: none where no piece has any."""
+    """Return the texture fields of a Scene; empty if no piece has textures."""
     if all(piece.skin is None for piece in pieces):
         return {}
-    textures, rows, corners = dict[str, Texture](), [], []
+    textures = dict[str, Texture]()
+    rows = []
+    corners = []
     for piece in pieces:
         index = np.full((len(piece.materials), len(TEXTURED)), CONSTANT, np.int32)
         uv = np.zeros((3 * len(piece.mesh.faces), 2), np.float32)

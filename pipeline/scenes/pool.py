@@ -1,4 +1,4 @@
-"""What scenes are made of: the accepted objects of one split, with their meshes."""
+"""The pool that scenes draw from: the accepted objects of one split, with their meshes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,9 +15,9 @@ class PooledAsset:
     """An object as the lock file names it, and its meshes."""
 
     locked: LockedObject
-    """Identity, split and rights."""
+    """The object's row of the lock: uid, split and rights."""
     asset: Asset
-    """Meshes at falling budgets."""
+    """Meshes of the object at several levels of detail."""
 
     @property
     def camp(self) -> str:
@@ -26,14 +26,14 @@ class PooledAsset:
 
 
 class IndexedPool(Sequence[PooledAsset]):
-    """Objects of which each is opened when it is taken, and that are drawn without opening any."""
+    """A pool that opens an object on access, and draws without opening any."""
 
     fits: FitTable
-    """What a draw asks of them."""
+    """Triangles and licence camp of every object, for the draw."""
 
 
 def fits_of(pool: Sequence[PooledAsset]) -> FitTable:
-    """Return what a draw asks of the objects of a pool."""
+    """Return the table from which objects of a pool are drawn."""
     if isinstance(pool, IndexedPool):
         return pool.fits
     return FitTable.of([least_triangles(entry.asset) for entry in pool], [e.camp for e in pool])

@@ -1,8 +1,7 @@
-"""Finished scenes with new materials or lights, drawn as composition would draw them.
+"""Draws new materials or lights for finished scenes, as composition draws them.
 
-Geometry stays: the triangles of surfaces keep their order, their normals, and which of them share a
-colour. All lamps are the scene's emitters that are part of no object; new ones take their place at
-the end.
+Geometry stays: the triangles of surfaces keep their order, normals, and groups of equal color. The
+lamps are all emitters that belong to no object; new ones are appended in their place.
 """
 
 import dataclasses
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scenes.drawn_columns import with_drawn_columns
-from pipeline.scenes.pieces import emitter_piece, joined
+from pipeline.scenes.pieces import concatenate_pieces, emitter_piece
 from scene_templates.lights import LightSettings, emitters_rand
 from scene_templates.materials import MaterialSettings, surface_rand
 from scene_templates.templates import TEMPLATES
@@ -26,21 +25,20 @@ from storage.seeds import rng_for
 def with_new_materials(
     scene: Scene, settings: MaterialSettings, *, seed: int, index: int, attempt: int
 ) -> Scene:
-    """Return the scene with materials drawn anew for each object, floor and wall; emitters stay.
+    """Return the scene with new materials for each object, floor and wall; emitters stay.
 
-    New materials have no textures.
-
-    Faces that shared a row of materials within an object share one still, and where there were many
-    rows there are as many colours.
+    New materials have no textures. Faces that shared a row of materials within an object still
+    share one, and the number of colors stays.
 
     Args:
-        scene: lawful.
+        scene: a valid scene.
         settings: the ranges to draw from.
         seed, index, attempt: a random stream belongs to each of these.
     """
     scene = without_maps(scene, environment=False)
     rng = rng_for(seed, "new materials", index, attempt)
-    rows, material_index = [scene.materials[:0]], scene.material_index.astype(np.int64)
+    rows = [scene.materials[:0]]
+    material_index = scene.material_index.astype(np.int64)
     lit = {row for row, entry in enumerate(scene.objects) if entry.kind == "emitter"}
     facts = {surface.row: surface for surface in surfaces(scene)}
     for row in range(len(scene.objects)):
@@ -79,18 +77,18 @@ def with_new_lights(
     index: int,
     attempt: int,
 ) -> Scene:
-    """Return the scene with its lamps replaced by ones drawn as its layout is lit.
+    """Return the scene with its lamps replaced by new ones, drawn by its layout.
 
-    Parts of objects that emit stay as bright as they are.
+    Emitting components of objects keep their radiance.
 
     Args:
-        scene: lawful.
+        scene: a valid scene.
         settings: the ranges to draw from; its count is not used.
-        num_lights: how many; None for as many as there are.
+        num_lights: number of new lamps; None for as many as there are.
         seed, index, attempt: a random stream belongs to each of these.
 
     Raises:
-        Rejected: "no_layout" where the template of the scene is no layout of ours.
+        Rejected: "no_layout" if the template of the scene is no known layout.
     """
     name = scene.provenance["template"]
     if name not in TEMPLATES:
@@ -101,8 +99,10 @@ def with_new_lights(
     rng = rng_for(seed, "new lights", index, attempt)
     emitters = emitters_rand(rng, settings, TEMPLATES[name].lights, count, _centres(scene, kinds))
     lamps = [emitter_piece(emitter, row) for row, emitter in enumerate(emitters)]
-    dark, new = _without(scene, lit), joined(lamps)
-    vertices, rows = len(dark.vertex_positions), len(dark.materials)
+    dark = _without(scene, lit)
+    new = concatenate_pieces(lamps)
+    vertices = len(dark.vertex_positions)
+    rows = len(dark.materials)
     triangles, materials = (
         np.append(np.arange(count), np.full(len(more), NEW))
         for count, more in ((len(dark.faces), new["faces"]), (rows, new["materials"]))
@@ -134,7 +134,7 @@ def _centres(scene: Scene, kinds: NDArray[np.str_]) -> list[NDArray[np.float64]]
 
 
 def _without(scene: Scene, gone: NDArray[np.bool_]) -> Scene:
-    """Return the scene without some objects, and without vertices and materials of theirs alone."""
+    """Return the scene without some objects, and without vertices and materials only they use."""
     stays = ~gone[scene.object_index]
     faces = scene.faces[stays]
     vertices, faces_of = np.unique(faces, return_inverse=True)

@@ -24,11 +24,11 @@ class ShadedMesh:
     """A mesh with one normal per vertex."""
 
     positions: NDArray[np.float32]
-    """[V, 3]."""
+    """[V, 3] vertices in the space of the input."""
     normals: NDArray[np.float32]
-    """[V, 3] unit."""
+    """[V, 3] unit vectors, one for each vertex."""
     faces: NDArray[np.uint32]
-    """[T, 3]."""
+    """[T, 3] rows of the three vertices."""
     groups: NDArray[np.int64]
     """[T] shading group, numbered from 0; all 0 where the mesh is flat."""
 
@@ -52,7 +52,7 @@ def smooth_shaded(
     groups = shading_groups(faces, normals, angle_deg)
     corner_key = groups[:, None] * len(positions) + faces
     angles = _corner_angles(positions, faces)
-    corner_normals = _summed(corner_key, normals[:, None] * angles[..., None])
+    corner_normals = _sum_by_key(corner_key, normals[:, None] * angles[..., None])
     length = np.sqrt(np.sum(np.square(corner_normals), axis=-1))
     facing = np.einsum("tci,ti->tc", corner_normals, normals)
     turned_away = facing <= LEAST_FACING * length
@@ -83,7 +83,7 @@ def shading_groups(
 ) -> NDArray[np.int64]:
     """Return the group [T] of each face: connected through shared edges of at most `angle_deg`.
 
-    An edge of more than two faces, or of two that disagree on what is outside, is always sharp.
+    An edge of more than two faces, or of two faces with opposite orientation, is always sharp.
     """
     directed = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
     ends = np.sort(directed.astype(np.int64), axis=1)
@@ -93,8 +93,8 @@ def shading_groups(
     order = np.argsort(edge, kind="stable")
     pairs = (order[count[edge[order]] == 2] // 3).reshape(-1, 2)
     cosine = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1)
-    joined = pairs[cosine >= math.cos(math.radians(angle_deg))]
-    graph = coo_matrix((np.ones(len(joined)), joined.T), shape=(len(faces), len(faces)))
+    smooth_pairs = pairs[cosine >= math.cos(math.radians(angle_deg))]
+    graph = coo_matrix((np.ones(len(smooth_pairs)), smooth_pairs.T), shape=(len(faces), len(faces)))
     _, groups = connected_components(graph, directed=False)
     return groups.astype(np.int64)
 
@@ -110,7 +110,7 @@ def _corner_angles(
     return np.arctan2(across, np.sum(forward * backward, axis=-1))
 
 
-def _summed(keys: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sum_by_key(keys: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return, for every corner, the sum of `values` [T, 3, 3] over all corners of the same key."""
     _, row = np.unique(keys.ravel(), return_inverse=True)
     flat = values.reshape(-1, 3)

@@ -1,8 +1,9 @@
-"""`MeshShape`: an object's mesh as the templates ask for it, with collisions by FCL.
+"""`MeshShape`: an object's mesh for the layouts, with collision tests by FCL.
 
 FCL (Pan, Chitta, Manocha 2012) tests triangle against triangle in float64 over bounding volume
-trees; two objects far apart are told by their spheres alone. A mesh inside another one does not
-touch it, so a mesh also meets every mesh whose box holds its own. This refuses a ball in a bowl.
+trees; distant objects are separated by their bounding spheres alone. A mesh inside another one does
+not touch it, so a mesh also meets every mesh whose box contains its own. This rejects a ball in a
+bowl.
 """
 
 from typing import Any, Literal
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.posing import in_unit_sphere
 from scene_templates.layout import Pose
-from scene_templates.rotations import rotated
+from scene_templates.rotations import rotate_points
 from storage.errors import Rejected
 from storage.records.asset import Level
 
@@ -22,10 +23,10 @@ class MeshShape:
     """One level of an asset in the unit sphere; see scene_templates.placement.Shape."""
 
     def __init__(self, uid: str, level: Level, centring: Literal["vertex_mean", "box"]) -> None:
-        """Bring a level of the object `uid` into the unit sphere.
+        """Scale a level of the object `uid` to the unit sphere.
 
         Raises:
-            Rejected: "no_faces" where it is a single point or not finite.
+            Rejected: "no_faces" if it is a single point or not finite.
         """
         self.points = in_unit_sphere(level.positions, centring)
         if not np.isfinite(self.points).all():
@@ -34,9 +35,9 @@ class MeshShape:
         self._tree: tuple[float, Any] | None = None
 
     def meets(self, pose: Pose, other: "MeshShape", its_pose: Pose) -> bool:
-        """Return whether two posed meshes share a point, or the box of one holds the other's."""
-        apart = pose.centre - its_pose.centre
-        if np.sum(np.square(apart)) > (pose.radius + its_pose.radius) ** 2:
+        """Return True if two posed meshes share a point, or one's box contains the other's."""
+        offset = pose.centre - its_pose.centre
+        if np.sum(np.square(offset)) > (pose.radius + its_pose.radius) ** 2:
             return False
         low, high = self._box(pose)
         its_low, its_high = other._box(its_pose)
@@ -52,7 +53,7 @@ class MeshShape:
         return bool(result.is_collision)
 
     def _body(self, pose: Pose) -> Any:
-        """Return FCL's object; its tree is kept, since places change more often than sizes."""
+        """Return FCL's object; its tree is cached, since poses change more often than sizes."""
         if self._tree is None or self._tree[0] != pose.radius:
             tree = fcl.BVHModel()
             tree.beginModel(len(self.points), len(self.faces))
@@ -62,5 +63,5 @@ class MeshShape:
         return fcl.CollisionObject(self._tree[1], fcl.Transform(pose.rotation, pose.centre))
 
     def _box(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        points = pose.radius * rotated(self.points, pose.rotation) + pose.centre
+        points = pose.radius * rotate_points(self.points, pose.rotation) + pose.centre
         return points.min(axis=0), points.max(axis=0)

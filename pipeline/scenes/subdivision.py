@@ -1,8 +1,8 @@
-"""More triangles of the same surface: the longest edges are halved until there are enough.
+"""Subdivides meshes: halves the longest edges until a scene has a given number of triangles.
 
-With it a test set measures what the number of triangles alone does. Triangles are flat, so new
-vertices stay on the surface to the rounding of float32; each part keeps the material of the whole,
-and new vertices get the mean of their neighbours' normals.
+A test set uses it to measure the effect of the number of triangles alone. Triangles are flat, so
+new vertices stay on the surface up to the rounding of float32; each new triangle keeps its
+material, and new vertices get the mean of their neighbors' normals.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from pipeline.scenes.shading import ShadedMesh
 Edge = tuple[int, int]
 
 
-def filled(pieces: Sequence[ScenePiece], fill_to: int) -> list[ScenePiece]:
+def fill_triangles(pieces: Sequence[ScenePiece], fill_to: int) -> list[ScenePiece]:
     """Return the pieces with the objects subdivided until the scene has `fill_to` triangles.
 
     Objects grow in proportion to their triangles. The sum falls short of `fill_to` by a few; pieces
@@ -27,14 +27,14 @@ def filled(pieces: Sequence[ScenePiece], fill_to: int) -> list[ScenePiece]:
     counts = [len(piece.mesh.faces) for piece in pieces]
     is_object = [piece.entry.kind == "object" for piece in pieces]
     of_objects = sum(count for count, yes in zip(counts, is_object, strict=True) if yes)
-    left = fill_to - (sum(counts) - of_objects)
+    remaining = fill_to - (sum(counts) - of_objects)
     return [
-        subdivided(piece, left * count // of_objects) if yes else piece
+        subdivide(piece, remaining * count // of_objects) if yes else piece
         for piece, count, yes in zip(pieces, counts, is_object, strict=True)
     ]
 
 
-def subdivided(piece: ScenePiece, num_faces: int) -> ScenePiece:
+def subdivide(piece: ScenePiece, num_faces: int) -> ScenePiece:
     """Return a piece with at most `num_faces` faces, short of it by less than one edge's faces.
 
     The longest edge is halved in every face that has it, so that no gap opens. A piece that has as
@@ -43,25 +43,26 @@ def subdivided(piece: ScenePiece, num_faces: int) -> ScenePiece:
     work = _Work(piece.mesh)
     while work.halve_longest(num_faces):
         pass
-    mesh, origin = work.mesh(), np.array(work.origin)
+    mesh = work.mesh()
+    origin = np.array(work.origin)
     skin = piece.skin
     if skin is not None:
-        whole = skin.uv.reshape(-1, 3, 2)
-        uv = _carried(piece.mesh, mesh, origin, whole).astype(np.float32)
+        corner_uv = skin.uv.reshape(-1, 3, 2)
+        uv = _interpolate_uv(piece.mesh, mesh, origin, corner_uv).astype(np.float32)
         skin = dataclasses.replace(skin, uv=uv.reshape(-1, 2))
     return dataclasses.replace(
         piece, mesh=mesh, material_index=piece.material_index[origin], skin=skin
     )
 
 
-def _carried(
+def _interpolate_uv(
     before: ShadedMesh, after: ShadedMesh, origin: NDArray[np.int64], uv: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Return coordinates [T, 3, 2] of parts of flat triangles whose corners had `uv` [F, 3, 2]."""
-    whole = before.positions[before.faces].astype(np.float64)[origin]
+    """Return uv [T, 3, 2] of subdivided triangles, interpolated from `uv` [F, 3, 2]."""
+    triangles = before.positions[before.faces].astype(np.float64)[origin]
     parts = after.positions[after.faces].astype(np.float64)
-    sides = whole[:, 1:] - whole[:, :1]  # [T, 2, 3]
-    steps = np.einsum("tpx,tsx->tps", parts - whole[:, :1], sides)
+    sides = triangles[:, 1:] - triangles[:, :1]  # [T, 2, 3]
+    steps = np.einsum("tpx,tsx->tps", parts - triangles[:, :1], sides)
     gram = np.einsum("tax,tbx->tab", sides, sides)
     across = np.linalg.solve(gram, steps.transpose(0, 2, 1)).transpose(0, 2, 1)  # [T, 3, 2]
     weights = np.concatenate([1 - across.sum(axis=2, keepdims=True), across], axis=2)
@@ -69,14 +70,14 @@ def _carried(
 
 
 class _Work:
-    """A mesh in the making. Edges are identified by position: flat faces share no vertices."""
+    """A mesh while it is subdivided. Positions identify edges: flat faces share no vertices."""
 
     def __init__(self, mesh: ShadedMesh) -> None:
         self._points = list(mesh.positions.astype(np.float64))
         self._normals = list(mesh.normals.astype(np.float64))
-        _, places = np.unique(mesh.positions, axis=0, return_inverse=True)
-        self._place: list[int] = places.ravel().tolist()
-        self._num_places = 1 + max(self._place)
+        _, ids = np.unique(mesh.positions, axis=0, return_inverse=True)
+        self._position_ids: list[int] = ids.ravel().tolist()
+        self._num_positions = 1 + max(self._position_ids)
         self._groups = mesh.groups
         self._faces: list[list[int]] = mesh.faces.tolist()
         self.origin = list(range(len(self._faces)))
@@ -103,20 +104,21 @@ class _Work:
         if len(self._faces) + len(self._rows[edge]) > num_faces:
             return False
         heapq.heappop(self._longest)
-        middle, self._num_places = self._num_places, self._num_places + 1
+        middle = self._num_positions
+        self._num_positions = self._num_positions + 1
         made: dict[Edge, int] = {}
         for row in sorted(self._rows.pop(edge)):
             self._halve(row, edge, middle, made)
         return True
 
-    def _halve(self, row: int, edge: Edge, place: int, made: dict[Edge, int]) -> None:
+    def _halve(self, row: int, edge: Edge, position_id: int, made: dict[Edge, int]) -> None:
         face = self._faces[row]
-        first, second = sorted(v for v in face if self._place[v] in edge)
+        first, second = sorted(v for v in face if self._position_ids[v] in edge)
         if (first, second) not in made:
             made[first, second] = len(self._points)
             self._points.append((self._points[first] + self._points[second]) / 2)
             self._normals.append((self._normals[first] + self._normals[second]) / 2)
-            self._place.append(place)
+            self._position_ids.append(position_id)
         middle = made[first, second]
         for _, other in self._edges(row):
             if other != edge:
@@ -137,6 +139,6 @@ class _Work:
     def _edges(self, row: int) -> Iterator[tuple[float, Edge]]:
         face = self._faces[row]
         for a, b in zip(face, (*face[1:], face[0]), strict=True):
-            apart = self._points[a] - self._points[b]
-            pair = self._place[a], self._place[b]
-            yield float(np.sum(apart * apart)), (min(pair), max(pair))
+            offset = self._points[a] - self._points[b]
+            pair = self._position_ids[a], self._position_ids[b]
+            yield float(np.sum(offset * offset)), (min(pair), max(pair))

@@ -1,9 +1,9 @@
-"""Textures for the pieces of a scene: 8-bit maps, and texture coordinates by projection.
+"""Draws textures for the pieces of a scene: 8-bit maps, and uv by projection.
 
-A piece gets one material in the place of those that were drawn for it. Its texture is projected
-along the six directions of a cube: each triangle gets it from the side that it faces most, not
-mirrored, at its stated width, with v up on the sides. Floors and walls stand in the axes of the
-world, so that each is one flat chart; the cube of an object turns with it.
+A piece gets one material that replaces its drawn ones. Its texture is projected along the six
+directions of a cube: each triangle uses the side that it faces most, not mirrored, at the stated
+width, with v up on the sides. The cube of floors and walls has the axes of the world, so that each
+is one flat chart; the cube of an object rotates with it.
 """
 
 import dataclasses
@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import ScenePiece, Skin, with_skin
 from scene_templates.layout import Layout
-from scene_templates.own_maps import OwnMap, OwnTexture
 from scene_templates.surfaces.maps import SurfaceMaps
 from scene_templates.textures import MOST_TEXTURED, TexturedLook, TextureSettings, draw_look
+from scene_templates.user_maps import UserMap, UserTexture
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.records.texture import Texture
 from storage.seeds import rng_for
 
 _RIGHT = np.array([[0, 1, 0], [0, -1, 0], [-1, 0, 0], [1, 0, 0], [1, 0, 0], [-1, 0, 0]], np.float64)
 _UP = np.array([[0, 0, 1]] * 4 + [[0, 1, 0]] * 2, np.float64)
-"""[6, 3] where u and v go on the sides +x, -x, +y, -y, +z and -z: right x up is the side's normal.
-"""
+"""[6, 3] directions of u and v on the sides +x, -x, +y, -y, +z and -z: right x up is the normal."""
 
 
 def with_drawn_textures(
@@ -35,20 +34,20 @@ def with_drawn_textures(
     seed: int,
     scene_index: int,
     attempt: int,
-    own: Sequence[OwnMap[OwnTexture]] = (),
+    user_textures: Sequence[UserMap[UserTexture]] = (),
 ) -> list[ScenePiece]:
-    """Return the pieces with textures where they are drawn; emitters have none.
+    """Return the pieces, some with drawn textures; emitters have none.
 
     Each piece has a random stream of its own, so that textures change no other draw of the scene.
 
     Args:
-        pieces: floor and walls, objects and emitters, as those of `layout`.
-        layout: how objects are turned.
-        settings: the share and the ranges.
-        seed: of the dataset.
-        scene_index: which scene.
-        attempt: how many times this scene was rejected before.
-        own: a user's own textures.
+        pieces: floor and walls, objects and emitters, in the order of `layout`.
+        layout: poses of the objects.
+        settings: fraction of textured pieces, and ranges.
+        seed: seed of the dataset.
+        scene_index: index of the scene.
+        attempt: number of earlier rejections of this scene.
+        user_textures: the user's textures.
     """
     if settings.share == 0:
         return list(pieces)
@@ -57,33 +56,36 @@ def with_drawn_textures(
     frames += [placement.pose.rotation for placement in layout.objects]
     origins = [np.zeros(3)] * len(layout.shell)
     origins += [placement.pose.centre for placement in layout.objects]
-    found, textured = list(pieces), 0
+    result = list(pieces)
+    textured = 0
     for row, (frame, origin) in enumerate(zip(frames, origins, strict=True)):
         rng = rng_for(seed, "texture", scene_index, attempt, row)
-        look = draw_look(rng, settings, own, licences) if textured < MOST_TEXTURED else None
-        piece = pieces[row]  # whose own materials come first
+        look = (
+            draw_look(rng, settings, user_textures, licences) if textured < MOST_TEXTURED else None
+        )
+        piece = pieces[row]  # materials of its source come first
         if look is not None and piece.skin is None and piece.entry.kind != "emitter":
             licences.append(look.maps.source.licence)
-            found[row] = _textured(piece, look, frame, origin)
+            result[row] = _apply_texture(piece, look, frame, origin)
             textured += 1
-    return found
+    return result
 
 
-def _textured(
+def _apply_texture(
     piece: ScenePiece, look: TexturedLook, frame: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> ScenePiece:
     corners = piece.mesh.positions[piece.mesh.faces].astype(np.float64)
-    uv = look.uv(cube_places(_turned_back(corners - origin, frame)))
+    uv = look.uv(cube_coordinates(_to_object_axes(corners - origin, frame)))
     skin = Skin(
         uv=uv.astype(np.float32).reshape(-1, 2), textures=_textures(look.maps), uid=look.uid
     )
     return with_skin(piece, skin)
 
 
-def cube_places(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return where a cube's sides show the corners [T, 3, 3] of triangles: right and up, [T, 3, 2].
+def cube_coordinates(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return cube-projected coordinates [T, 3, 2], right and up, of triangle corners [T, 3, 3].
 
-    A triangle as steep to two sides belongs to the first of x, y and z.
+    A triangle that faces two sides equally belongs to the first of x, y and z.
     """
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     axis = np.abs(normal).argmax(axis=1)
@@ -92,7 +94,7 @@ def cube_places(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray((corners[:, :, None] * axes).sum(axis=-1))
 
 
-def _turned_back(points: NDArray[np.float64], frame: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_object_axes(points: NDArray[np.float64], frame: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points [T, 3, 3] in the axes of an object, whose rotation is `frame`."""
     x, y, z = (points[..., row, None] * frame[row] for row in range(3))
     return x + y + z
@@ -105,7 +107,7 @@ def _textures(maps: SurfaceMaps) -> tuple[Texture, Texture, Texture]:
         np.round(values.astype(np.float64) * 255).astype(np.uint8)
         for values in (maps.specular_rgb, maps.roughness)
     )
-    # Both are rounded: where they would add up to more than 1, the specular one gives way.
+    # Both are rounded: if they would add up to more than 1, the specular one is reduced.
     over = linear_from_srgb8()[diffuse] + specular / 255 > 1
     specular = np.where(over, specular - 1, specular).astype(np.uint8)
 

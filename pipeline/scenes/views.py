@@ -1,8 +1,8 @@
-"""Chooses cameras: of sixteen proposals per view, those that see enough, one after the other.
+"""Chooses cameras: tries up to sixteen proposals per view until one sees enough.
 
 Proposals are numbered, and each is a pure function of (seed, scene, attempt, view, number). A view
-whose picture turns out black can therefore go on to the next one, long after composition and in
-another process.
+whose picture turns out black can therefore continue with the next one, long after composition and
+in another process.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scenes.sight import Sight, ViewFacts
+from pipeline.scenes.visibility import ViewFacts, Visibility
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
@@ -20,7 +20,7 @@ from storage.records.scene import Scene
 from storage.seeds import rng_for
 
 CAMERA_ATTEMPTS = 16
-"""Proposals per view."""
+"""Number of proposals per view."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,31 +32,32 @@ class ViewCamera:
     fov_deg: np.float32
     """Full field of view in degrees."""
     attempt: int
-    """Number of the proposal."""
+    """Number of the camera's proposal, from 0."""
 
 
 def with_first_cameras(
-    scene: Scene, settings: SceneSettings, given: Sequence[ViewCamera] = ()
+    scene: Scene, settings: SceneSettings, first_cameras: Sequence[ViewCamera] = ()
 ) -> Scene:
-    """Return the scene with `settings.num_views` cameras, of which the first may be given.
+    """Return the scene with `settings.num_views` cameras: `first_cameras`, then drawn ones.
 
     Raises:
-        Rejected: "no_camera", or "no_layout" where its template draws none.
+        Rejected: "no_camera", or "no_layout" if its template draws none.
     """
-    sight, views = Sight(scene), range(len(given), settings.num_views)
-    drawn = [next(_that_see(scene, sight, settings, view, 0)) for view in views]
-    return with_cameras(scene, [*given, *drawn])
+    visibility = Visibility(scene)
+    views = range(len(first_cameras), settings.num_views)
+    drawn = [next(_accepted_proposals(scene, visibility, settings, view, 0)) for view in views]
+    return with_cameras(scene, [*first_cameras, *drawn])
 
 
 def cameras_of_view(
-    scene: Scene, sight: Sight, settings: SceneSettings, view: int
+    scene: Scene, visibility: Visibility, settings: SceneSettings, view: int
 ) -> Iterator[ViewCamera]:
-    """Yield the camera that a view has, and then each following proposal that sees enough.
+    """Yield the camera of a view, and then each following proposal that sees enough.
 
     Args:
-        scene: as compose_scene returned it.
-        sight: of this scene.
-        settings: those that the scene was composed with.
+        scene: scene as `compose_scene` returned it.
+        visibility: visibility of this scene.
+        settings: settings that the scene was composed with.
         view: row of `scene.c2w`.
 
     Raises:
@@ -65,18 +66,18 @@ def cameras_of_view(
     attempt = int(scene.provenance["camera_attempts"][view])
     yield ViewCamera(c2w=scene.c2w[view], fov_deg=scene.fov_deg[view], attempt=attempt)
     of_scene = settings.of_scene(scene.provenance["scene_index"])
-    yield from _that_see(scene, sight, of_scene, view, attempt + 1)
+    yield from _accepted_proposals(scene, visibility, of_scene, view, attempt + 1)
 
 
 def cameras_of(scene: Scene) -> list[ViewCamera]:
-    """Return the cameras that a scene has."""
+    """Return the cameras of a scene."""
     attempts = scene.provenance.get("camera_attempts", [0] * scene.num_views)
     rows = zip(scene.c2w, scene.fov_deg, attempts, strict=True)
     return [ViewCamera(c2w=c2w, fov_deg=fov, attempt=attempt) for c2w, fov, attempt in rows]
 
 
 def with_cameras(scene: Scene, cameras: Sequence[ViewCamera]) -> Scene:
-    """Return the scene seen by these cameras, whose attempts it remembers."""
+    """Return the scene with these cameras; its provenance records their attempts."""
     posed = scene.with_cameras(
         np.stack([camera.c2w for camera in cameras]),
         np.array([camera.fov_deg for camera in cameras]),
@@ -86,8 +87,8 @@ def with_cameras(scene: Scene, cameras: Sequence[ViewCamera]) -> Scene:
     return dataclasses.replace(posed, provenance=provenance)
 
 
-def complaint(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str | None:
-    """Return what is wrong with a view, or None."""
+def view_problem(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str | None:
+    """Return why a view is rejected, or None."""
     if facts.depth < settings.min_depth:
         return "too near"
     if has_objects and facts.coverage < settings.min_coverage:
@@ -99,22 +100,23 @@ def complaint(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str
     return None
 
 
-def _that_see(
-    scene: Scene, sight: Sight, settings: SceneSettings, view: int, first: int
+def _accepted_proposals(
+    scene: Scene, sight: Visibility, settings: SceneSettings, view: int, first: int
 ) -> Iterator[ViewCamera]:
-    """Yield proposals from `first` on that see enough; raises Rejected when they are used up."""
+    """Yield proposals from `first` on that see enough; raises Rejected after the last one."""
     has_objects = any(entry.kind == "object" for entry in scene.objects)
-    complaints: list[str] = []
+    problems: list[str] = []
     for attempt in range(first, CAMERA_ATTEMPTS):
         camera = _proposal(scene, settings, view, attempt)
         facts = sight.facts(camera.c2w, float(camera.fov_deg), settings.views.coverage_grid)
-        found = complaint(facts, settings.views, has_objects=has_objects)
-        if found is None:
+        problem = view_problem(facts, settings.views, has_objects=has_objects)
+        if problem is None:
             yield camera
-            first, complaints = attempt + 1, []
+            first = attempt + 1
+            problems = []
         else:
-            complaints.append(found)
-    counts = ", ".join(f"{text} x{complaints.count(text)}" for text in sorted(set(complaints)))
+            problems.append(problem)
+    counts = ", ".join(f"{text} x{problems.count(text)}" for text in sorted(set(problems)))
     raise Rejected(
         "no_camera", f"view {view}: none of attempts {first} to {CAMERA_ATTEMPTS - 1}: {counts}"
     )
@@ -122,11 +124,13 @@ def _that_see(
 
 def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) -> ViewCamera:
     origin = scene.provenance
-    template, names = origin["template"], (origin["scene_index"], origin["attempt"], view, attempt)
+    template = origin["template"]
+    names = (origin["scene_index"], origin["attempt"], view, attempt)
     if (new := origin.get("new_cameras")) is None:
         rng = rng_for(origin["seed"], "camera", *names)
     else:
-        template, rng = new["layout"], rng_for(new["seed"], "new camera", *names)
+        template = new["layout"]
+        rng = rng_for(new["seed"], "new camera", *names)
     if template not in TEMPLATES:
         raise Rejected(
             "no_layout", f"{template!r} is no layout that draws cameras; name one, or give cameras"

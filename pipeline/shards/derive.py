@@ -1,4 +1,4 @@
-"""Stage "shards", on finished datasets: merge, select and reshard.
+"""Stage "shards" on finished datasets: merges, selects and reshards.
 
 Members are copied byte for byte under their new keys, one sample at a time. The result depends on
 the sources, their order and the arguments alone; it is written into a folder of its own.
@@ -11,15 +11,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pipeline.shards.finished import FinishedDataset, SampleReader
+from pipeline.shards.finished_dataset import FinishedDataset, SampleReader
 from pipeline.shards.plans import (
+    SelectedScene,
     Selection,
-    Taken,
     even_shards,
     kept_shards,
     key_offsets,
-    raised_key,
-    taken_scenes,
+    offset_key,
+    select_scenes,
     used_objects,
 )
 from storage.conventions import MANIFEST_VERSION
@@ -52,8 +52,8 @@ _SAME = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Derive:
-    """What to make of finished datasets."""
+class DeriveOptions:
+    """Operation on finished datasets, with its arguments."""
 
     operation: Operation  # what it is called
     selection: Selection = dataclasses.field(default_factory=Selection)  # which scenes are taken
@@ -62,14 +62,17 @@ class Derive:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """What the user asked for, as the manifest states it."""
-        asked = {**dataclasses.asdict(self.selection), "scenes_per_shard": self.scenes_per_shard}
-        return {name: value for name, value in asked.items() if value is not None}
+        """The user's arguments, as the manifest states them."""
+        arguments = {
+            **dataclasses.asdict(self.selection),
+            "scenes_per_shard": self.scenes_per_shard,
+        }
+        return {name: value for name, value in arguments.items() if value is not None}
 
 
 def derive_shards(
     sources: Sequence[FinishedDataset],
-    derive: Derive,
+    derive: DeriveOptions,
     out: DatasetFolder,
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -78,26 +81,29 @@ def derive_shards(
 
     Args:
         sources: finished datasets; `select` and `reshard` take one.
-        derive: what to make of them.
+        derive: operation and arguments.
         out: an empty folder.
-        progress: called with the shards that are read or written so far, and with their number.
+        progress: called with the number of shards read or written so far, and the total.
 
     Raises:
         TrilightError: the sources do not fit together, one is damaged, nothing is selected, an
             object would be in two splits, or the disk is full.
     """
     _require_alike(sources)
-    total, done = sum(len(source.manifest.shards) for source in sources), itertools.count(1)
-    taken = taken_scenes(sources, derive.selection, shard_done=lambda: progress(next(done), total))
-    if not taken:
-        found = sum(source.manifest.num_samples for source in sources)
-        raise TrilightError(f"none of the {found} scenes is selected; expected at least one.")
-    objects = sorted(
-        used_objects(sources, taken), key=lambda row: canonical_json(dataclasses.asdict(row))
+    total = sum(len(source.manifest.shards) for source in sources)
+    done = itertools.count(1)
+    selected = select_scenes(
+        sources, derive.selection, shard_done=lambda: progress(next(done), total)
     )
-    groups, scenes_per_shard = _grouped(sources, derive, taken)
+    if not selected:
+        num_scenes = sum(source.manifest.num_samples for source in sources)
+        raise TrilightError(f"none of the {num_scenes} scenes is selected; expected at least one.")
+    objects = sorted(
+        used_objects(sources, selected), key=lambda row: canonical_json(dataclasses.asdict(row))
+    )
+    groups, scenes_per_shard = _group_scenes(sources, derive, selected)
     write_objects_lock(out.objects_lock, objects)
-    write_failures(out.failures, _failures(sources, taken))
+    write_failures(out.failures, _failures(sources, selected))
     shards = []
     for number, group in enumerate(groups):
         name = named_shard(number, group[0].facts.shard.split)
@@ -109,20 +115,20 @@ def derive_shards(
     )
 
 
-def _grouped(
-    sources: Sequence[FinishedDataset], derive: Derive, taken: Sequence[Taken]
-) -> tuple[list[list[Taken]], int | None]:
-    """Return the scenes of each new shard, and their number where it is not the sources'."""
+def _group_scenes(
+    sources: Sequence[FinishedDataset], derive: DeriveOptions, selected: Sequence[SelectedScene]
+) -> tuple[list[list[SelectedScene]], int | None]:
+    """Return the scenes of each new shard, and the shard size if it is not the sources'."""
     if derive.operation == "merge":
-        return kept_shards(taken), None
+        return kept_shards(selected), None
     size = derive.scenes_per_shard
     if size is None:
         size = max(shard.num_samples for shard in sources[0].manifest.shards)
-    return even_shards(taken, size), size
+    return even_shards(selected, size), size
 
 
 def _samples(
-    sources: Sequence[FinishedDataset], group: Sequence[Taken]
+    sources: Sequence[FinishedDataset], group: Sequence[SelectedScene]
 ) -> Iterator[tuple[str, Mapping[str, bytes]]]:
     with contextlib.ExitStack() as opened:
         readers = [
@@ -135,7 +141,7 @@ def _samples(
 
 def _manifest(
     sources: Sequence[FinishedDataset],
-    derive: Derive,
+    derive: DeriveOptions,
     objects: Sequence[LockedObject],
     shards: tuple[ShardEntry, ...],
     scenes_per_shard: int | None,
@@ -164,7 +170,7 @@ def _manifest(
 
 
 def _environment(manifests: Sequence[Manifest]) -> Mapping[str, Any]:
-    """Return what all sources were made with; where they differ, also what each was made with."""
+    """Return the common environment of all sources; if they differ, also that of each."""
     environments = [dict(manifest.environment) for manifest in manifests]
     if all(environment == environments[0] for environment in environments):
         return environments[0]
@@ -172,21 +178,23 @@ def _environment(manifests: Sequence[Manifest]) -> Mapping[str, Any]:
 
 
 def _extensions(manifests: Sequence[Manifest]) -> Mapping[str, str]:
-    """Return every file that had part in a source; one name may stand for several files."""
-    found: dict[str, set[str]] = {}
+    """Return the extensions of all sources; one name may have several digests."""
+    digests: dict[str, set[str]] = {}
     for manifest in manifests:
         for name, sha256 in manifest.extensions.items():
-            found.setdefault(name, set()).update(sha256.split(" "))
-    return {name: " ".join(sorted(several)) for name, several in sorted(found.items())}
+            digests.setdefault(name, set()).update(sha256.split(" "))
+    return {name: " ".join(sorted(several)) for name, several in sorted(digests.items())}
 
 
-def _failures(sources: Sequence[FinishedDataset], taken: Sequence[Taken]) -> list[Failure]:
-    """Return the rejections of the scenes that are taken, and of objects.
+def _failures(
+    sources: Sequence[FinishedDataset], selected: Sequence[SelectedScene]
+) -> list[Failure]:
+    """Return the rejections of the selected scenes, and of objects.
 
-    A scene that no attempt could save is not among those taken, so `merge` and `reshard`, which
-    take all, say so too where its number is that of no other scene.
+    A given-up scene is never selected. `merge` and `reshard`, which select all scenes, keep its
+    rejections too.
     """
-    keys = {(entry.source, entry.facts.key) for entry in taken}
+    keys = {(entry.source, entry.facts.key) for entry in selected}
     held = sum(source.manifest.num_samples for source in sources)
     rows = []
     for row, (source, offset) in enumerate(zip(sources, key_offsets(sources), strict=True)):
@@ -194,8 +202,8 @@ def _failures(sources: Sequence[FinishedDataset], taken: Sequence[Taken]) -> lis
             key, dot, view = failure.item.partition(".")
             if failure.stage not in ("scenes", "renders"):
                 rows.append(failure)
-            elif (row, key) in keys or held == len(taken):
-                item = f"{raised_key(key, offset)}{dot}{view}"
+            elif (row, key) in keys or held == len(selected):
+                item = f"{offset_key(key, offset)}{dot}{view}"
                 rows.append(dataclasses.replace(failure, item=item))
     return rows
 
@@ -211,7 +219,7 @@ def _require_alike(sources: Sequence[FinishedDataset]) -> None:
             if before != now:
                 raise TrilightError(
                     f"{other.folder.root}: its {name} is {now}; expected {before}, as "
-                    f"{first.folder.root} has it. Generate one of them anew."
+                    f"{first.folder.root} has it. Generate one of them again."
                 )
 
 

@@ -1,4 +1,4 @@
-"""Stage "shards": the staged scenes of a shard become its tar file."""
+"""Stage "shards": packs the staged scenes of a shard into its tar file."""
 
 import contextlib
 import dataclasses
@@ -39,13 +39,13 @@ def pack_shard(
     The rejections are written before the shard, so that every reader of the shard finds them, and
     the staged scenes are deleted after it: a kill in between loses nothing and repeats little.
 
-    Where the shard is there already, it stays: the first writer wins. One that grows is replaced.
+    An existing shard stays: the first writer wins. A growing one is replaced.
 
     Args:
         folder: the dataset.
         name: file name of the shard.
-        scene_indices: its scenes, all of which are staged.
-        grows: whether the manifest says so; call in its turn then.
+        scene_indices: indices of its scenes, all of which are staged.
+        grows: True if the manifest lists the shard as growing; then call while holding its mutex.
 
     Raises:
         TrilightError: the disk is full or the folder cannot be written.
@@ -63,10 +63,11 @@ def pack_shard(
             raise
         failures.extend(staged.failures)
         if staged.members:
-            for member in filter(MAP_NAME.fullmatch, staged.members):  # in memory once
+            for member in filter(MAP_NAME.fullmatch, staged.members):  # equal maps share memory
                 staged.members[member] = maps.setdefault(member, staged.members[member])
             samples.append((sample_key(index), staged.members))
-    path, rejections = folder.shard(name), rejections_of_shard(folder, name)
+    path = folder.shard(name)
+    rejections = rejections_of_shard(folder, name)
     write_failures(rejections, failures)
     if not grows:
         write_shard(path, samples)
@@ -87,8 +88,9 @@ def pack_shard(
 def unpack_here(folder: DatasetFolder, name: str, scenes: range, manifest: Manifest) -> None:
     """Stage the scenes of a shard of the folder as `unpack_shard`, unless it is damaged."""
     with contextlib.suppress(TrilightError), folder.shard(name).open("rb") as stream:
-        note, known = noted_shard(folder, name), {each.name: each for each in manifest.shards}
-        if not note_of(folder, name).exists():  # it is listed, or as it is on the disk
+        note = noted_shard(folder, name)
+        known = {each.name: each for each in manifest.shards}
+        if not note_of(folder, name).exists():  # the manifest's entry, or the file's
             note = dataclasses.replace(note, shard=known.get(name, note.shard))
         if index_shard(folder.shard(name)) == note.shard:
             unpack_shard(folder, note, scenes, stream)
@@ -99,9 +101,9 @@ def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: 
 
     Args:
         folder: the dataset.
-        note: what is known of the shard.
-        scenes: those for which it stands; one that it does not hold was given up.
-        stream: the shard.
+        note: note on the shard.
+        scenes: indices of its scenes; one that the file lacks was given up.
+        stream: bytes of the shard.
     """
     name = note.shard.name
     samples = dict(samples_of(stream, name))

@@ -1,7 +1,7 @@
-"""Which scenes of finished datasets go into which shard of a new one, and under which key.
+"""Plans a derived dataset: which scenes of its sources go into which shard, under which key.
 
-The keys of the first source stay; each following source's are raised by one number, which the
-manifest states: `key_offset`. So every scene can be found in its source, and no two share a key.
+The keys of the first source stay; each following source's keys are raised by one number, which the
+manifest states as `key_offset`. So every scene can be found in its source, and keys are unique.
 """
 
 import contextlib
@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from pipeline.shards.expression import Condition, condition
-from pipeline.shards.finished import FinishedDataset, SampleReader, SceneFacts, read_facts
+from pipeline.shards.finished_dataset import FinishedDataset, SampleReader, SceneFacts, read_facts
 from storage.conventions import SPLITS
 from storage.dataset.derived import derivation_of
 from storage.errors import TrilightError
@@ -19,7 +19,7 @@ from storage.records.sample import sample_key
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Which scenes are taken; by default all."""
+    """Conditions that a selected scene must meet; by default none."""
 
     split: str | None = None  # take only scenes of this split
     template: str | None = None  # take only scenes of this layout
@@ -35,7 +35,7 @@ class Selection:
             self.condition()
 
     def condition(self) -> Condition | None:
-        """Return what `where` says; raises TrilightError where it says nothing."""
+        """Return the parsed `where`, or None; raises TrilightError if it is malformed."""
         return None if self.where is None else condition(self.where)
 
     def takes(self, facts: SceneFacts) -> bool:
@@ -47,41 +47,42 @@ class Selection:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Taken:
+class SelectedScene:
     """One scene of the new dataset."""
 
-    source: int  # which of the sources it is from
-    facts: SceneFacts  # its place in the source
+    source: int  # number of its source, from 0
+    facts: SceneFacts  # its facts in the source
     key: str  # its new key
 
 
-def taken_scenes(
+def select_scenes(
     sources: Sequence[FinishedDataset],
     selection: Selection,
     *,
-    asked: Sequence[str] = (),
+    value_names: Sequence[str] = (),
     shard_done: Callable[[], None],
-) -> list[Taken]:
-    """Return the scenes to take, in the order of the sources and of their shards.
+) -> list[SelectedScene]:
+    """Return the selected scenes, in the order of the sources and of their shards.
 
     Args:
         sources: finished datasets.
-        selection: which scenes are taken.
-        asked: names of values that the facts of the scenes shall hold beside those of its `where`.
+        selection: conditions on the scenes.
+        value_names: names of values to read for each scene beside those of the condition.
         shard_done: called after each shard.
 
     Raises:
-        TrilightError: the same scene is there twice, or a source is damaged.
+        TrilightError: two sources hold the same scene, or a source is damaged.
     """
-    offsets, where = key_offsets(sources), selection.condition()
-    names = {*asked, *(where.names if where else ())}
-    taken: list[Taken] = []
-    seen: dict[str, Taken] = {}
+    offsets = key_offsets(sources)
+    where = selection.condition()
+    names = {*value_names, *(where.names if where else ())}
+    selected: list[SelectedScene] = []
+    seen: dict[str, SelectedScene] = {}
     for row, source in enumerate(sources):
-        for facts in read_facts(source, asked=names, shard_done=shard_done):
+        for facts in read_facts(source, names=names, shard_done=shard_done):
             if not selection.takes(facts) or not (where is None or where.holds(facts.values)):
                 continue
-            entry = Taken(source=row, facts=facts, key=raised_key(facts.key, offsets[row]))
+            entry = SelectedScene(source=row, facts=facts, key=offset_key(facts.key, offsets[row]))
             first = seen.setdefault(facts.arrays_sha256, entry)
             if first.source != row:
                 raise TrilightError(
@@ -89,16 +90,17 @@ def taken_scenes(
                     f"{sources[first.source].folder.root}; expected each scene once. Leave one of "
                     "the datasets out, or generate it with another --seed."
                 )
-            taken.append(entry)
-    return taken
+            selected.append(entry)
+    return selected
 
 
 def key_offsets(sources: Sequence[FinishedDataset]) -> list[int]:
-    """Return what is added to the keys of each source: 0, then beyond all keys before.
+    """Return the offset of the keys of each source: 0, then beyond all keys before.
 
     Scenes that could not be made count too: `failures.jsonl` names them.
     """
-    offsets, following = [], 0
+    offsets = []
+    following = 0
     for source in sources:
         offsets.append(following)
         following += max(_last_key(source) + 1, source.manifest.num_scenes)
@@ -106,7 +108,7 @@ def key_offsets(sources: Sequence[FinishedDataset]) -> list[int]:
 
 
 def _last_key(source: FinishedDataset) -> int:
-    """Return the largest key of a dataset that was made of others; else -1: keys number scenes."""
+    """Return the largest key of a derived dataset; -1 for a generated one (keys are indices)."""
     if not derivation_of(source.manifest.settings):
         return -1
     with contextlib.closing(SampleReader(source)) as reader:
@@ -114,8 +116,8 @@ def _last_key(source: FinishedDataset) -> int:
         return max((int(key) for key in keys if key.isdecimal()), default=-1)
 
 
-def raised_key(key: str, offset: int) -> str:
-    """Return a key raised by a number; raises TrilightError where it is not a number."""
+def offset_key(key: str, offset: int) -> str:
+    """Return a key raised by an offset; raises TrilightError if it is not a number."""
     if not offset:
         return key
     if not (key.isascii() and key.isdecimal()):
@@ -123,16 +125,18 @@ def raised_key(key: str, offset: int) -> str:
     return sample_key(int(key) + offset)
 
 
-def used_objects(sources: Sequence[FinishedDataset], taken: Sequence[Taken]) -> list[LockedObject]:
-    """Return the locked objects that stand in scenes.
+def used_objects(
+    sources: Sequence[FinishedDataset], selected: Sequence[SelectedScene]
+) -> list[LockedObject]:
+    """Return the locked objects that the selected scenes use.
 
     Raises:
         TrilightError: an object is in scenes of two splits, known by its uid or by its asset: what
             is learnt from one would be judged on the other. Or an object is in no lock.
     """
-    splits: dict[str, tuple[str, Taken]] = {}
+    splits: dict[str, tuple[str, SelectedScene]] = {}
     used: dict[LockedObject, None] = {}
-    for entry in taken:
+    for entry in selected:
         source = sources[entry.source]
         for uid in entry.facts.uids:
             if uid not in source.objects:
@@ -149,7 +153,9 @@ def used_objects(sources: Sequence[FinishedDataset], taken: Sequence[Taken]) -> 
     return list(used)
 
 
-def _leak(uid: str, sources: Sequence[FinishedDataset], first: Taken, second: Taken) -> str:
+def _leak(
+    uid: str, sources: Sequence[FinishedDataset], first: SelectedScene, second: SelectedScene
+) -> str:
     places = " and in ".join(
         f"{entry.facts.shard.split} of {sources[entry.source].folder.root} (scene "
         f"{entry.facts.key})"
@@ -162,16 +168,18 @@ def _leak(uid: str, sources: Sequence[FinishedDataset], first: Taken, second: Ta
     )
 
 
-def kept_shards(taken: Sequence[Taken]) -> list[list[Taken]]:
-    """Return the scenes shard by shard, as the sources have them."""
-    groups: dict[tuple[int, str], list[Taken]] = {}
-    for entry in taken:
+def kept_shards(selected: Sequence[SelectedScene]) -> list[list[SelectedScene]]:
+    """Return the scenes grouped by the shards of their sources."""
+    groups: dict[tuple[int, str], list[SelectedScene]] = {}
+    for entry in selected:
         groups.setdefault((entry.source, entry.facts.shard.name), []).append(entry)
     return list(groups.values())
 
 
-def even_shards(taken: Sequence[Taken], scenes_per_shard: int) -> list[list[Taken]]:
-    """Return the scenes of each split in shards of a size, all but the last of a split full.
+def even_shards(
+    selected: Sequence[SelectedScene], scenes_per_shard: int
+) -> list[list[SelectedScene]]:
+    """Return the scenes of each split in shards of one size; the last of a split may be smaller.
 
     Shards are ordered by their first scene, so that numbers follow keys.
 
@@ -180,8 +188,8 @@ def even_shards(taken: Sequence[Taken], scenes_per_shard: int) -> list[list[Take
     """
     if scenes_per_shard < 1:
         raise TrilightError(f"--scenes-per-shard is {scenes_per_shard}; expected at least 1.")
-    of_split: Mapping[str, list[Taken]] = {
-        split: [entry for entry in taken if entry.facts.shard.split == split] for split in SPLITS
+    of_split: Mapping[str, list[SelectedScene]] = {
+        split: [entry for entry in selected if entry.facts.shard.split == split] for split in SPLITS
     }
     shards = [
         entries[start : start + scenes_per_shard]

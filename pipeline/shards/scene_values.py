@@ -1,4 +1,4 @@
-"""What a condition can ask of a scene: the quantities of reports, and what is text or truth."""
+"""Values of a scene that a condition can refer to: the quantities of reports, texts and truths."""
 
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -8,9 +8,10 @@ from storage.records.sample import SceneRecord
 from storage.records.scene_facts import scene_values
 
 
-def asked_values(record: SceneRecord, split: str, names: Collection[str]) -> Mapping[str, Any]:
-    """Return the values of a scene by name (pipeline.shards.expression): those of `names` alone."""
-    scene, of_scene = record.scene, dict[str, Any]()
+def condition_values(record: SceneRecord, split: str, names: Collection[str]) -> Mapping[str, Any]:
+    """Return the values of a scene for some names (pipeline.shards.expression)."""
+    scene = record.scene
+    of_scene = dict[str, Any]()
     if not QUANTITIES.keys().isdisjoint(names):
         for name, values in scene_values(record).items():
             plain = [float(value) for value in values]

@@ -4,7 +4,8 @@ import numpy as np
 
 from scene_templates.exact import Numbers
 
-WARMEST_MIRED, COOLEST_MIRED = 500.0, 40.0
+WARMEST_MIRED = 500.0
+COOLEST_MIRED = 40.0
 """2,000 and 25,000 kelvin: colours of the Planckian locus that Rec.709 can show, by its fit."""
 
 _TO_REC709 = (
@@ -34,8 +35,8 @@ def planckian_rgb(mired: float) -> Numbers:
         y = ((-0.9549476 * x - 1.37418593) * x + 2.09137015) * x - 0.16748867
     else:
         y = ((3.0817580 * x - 5.87338670) * x + 3.75112997) * x - 0.37001483
-    whole = (x / y, 1.0, (1 - x - y) / y)
-    linear = [row[0] * whole[0] + row[1] * whole[1] + row[2] * whole[2] for row in _TO_REC709]
+    xyz = (x / y, 1.0, (1 - x - y) / y)
+    linear = [row[0] * xyz[0] + row[1] * xyz[1] + row[2] * xyz[2] for row in _TO_REC709]
     rgb = np.array([max(0.0, channel) for channel in linear])
     result: Numbers = rgb / ((rgb[0] + rgb[1] + rgb[2]) / 3)
     return result

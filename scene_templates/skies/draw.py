@@ -24,7 +24,7 @@ class SkyMap:
     radiance_rgb: NDArray[np.float32]
     """[H, 2H, 3], the top row first, the middle of the picture +X, a quarter from the left +Y."""
     parameters: Mapping[str, tuple[Any, ...]]
-    """What was drawn, by the names of the reference page of surfaces and skies."""
+    """Drawn values; the names are those of the reference page of surfaces and skies."""
 
 
 @checked("sky settings")

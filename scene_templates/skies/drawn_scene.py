@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.exact import cosine, sine
-from scene_templates.own_maps import OwnMap, drawn_own
 from scene_templates.skies.draw import draw_sky
 from scene_templates.skies.settings import SkySettings
+from scene_templates.user_maps import UserMap, draw_user_map
 from storage.records.environment import Environment
 from storage.records.texture import MapSource
 from storage.seeds import rng_for
@@ -30,9 +30,9 @@ class SceneSky:
 
     environment: Environment
     origin: dict[str, Any]
-    """For the provenance of the scene: family, over_lamps and azimuth_deg."""
+    """Provenance entries: family, over_lamps and azimuth_deg."""
     uid: str = ""
-    """Of a user's own map, as objects.lock.jsonl names it."""
+    """Identifier of a user's map in objects.lock.jsonl; empty for a procedural one."""
 
 
 def scene_sky(
@@ -43,7 +43,7 @@ def scene_sky(
     seed: int,
     scene_index: int,
     attempt: int,
-    own: Sequence[OwnMap[NDArray[np.float32]]] = (),
+    user_skies: Sequence[UserMap[NDArray[np.float32]]] = (),
     licences: Sequence[str] = (),
 ) -> SceneSky | None:
     """Return the sky of a scene, or None where it has none.
@@ -61,28 +61,32 @@ def scene_sky(
         return None
     rng = rng_for(seed, "sky", scene_index, attempt)
     place = rng_for(seed, "own sky", scene_index, attempt)
-    chosen = drawn_own(place, own, settings.own_share, licences)
+    chosen = draw_user_map(place, user_skies, settings.own_share, licences)
     if chosen is None:
         drawn = draw_sky(rng, settings.maps)
-        family, radiance, source = drawn.family, drawn.radiance_rgb, MapSource(name=drawn.family)
+        family = drawn.family
+        radiance = drawn.radiance_rgb
+        source = MapSource(name=drawn.family)
     else:
-        family, radiance, source = "own", chosen.load(), chosen.source
+        family = "own"
+        radiance = chosen.load()
+        source = chosen.source
     low, high = (math.log(bound) for bound in settings.over_lamps_log)
     over_lamps = math.exp(rng.uniform(low, high))
-    turn = float(rng.uniform(0, 2 * math.pi))
+    azimuth_rad = float(rng.uniform(0, 2 * math.pi))
     is_seen = bool(rng.random() < settings.seen_share)
     mean = _mean_radiance(radiance)
-    wanted = over_lamps * lamp_irradiance(emitters, radiance_rgb) / math.pi
+    target_radiance = over_lamps * lamp_irradiance(emitters, radiance_rgb) / math.pi
     environment = Environment(
-        radiance_rgb=(radiance * np.float32(wanted / mean)).astype(np.float32),
-        rotation=_about_z(turn),
+        radiance_rgb=(radiance * np.float32(target_radiance / mean)).astype(np.float32),
+        rotation=_about_z(azimuth_rad),
         is_seen=is_seen,
         source=source,
     )
     origin = {
         "family": family,
         "over_lamps": over_lamps,
-        "azimuth_deg": math.degrees(turn),
+        "azimuth_deg": math.degrees(azimuth_rad),
     }
     uid = chosen.uid if chosen else ""
     return SceneSky(environment=environment, origin=origin, uid=uid)
@@ -104,6 +108,7 @@ def _mean_radiance(radiance_rgb: NDArray[np.float32]) -> float:
     return float((grey * (edges[:-1] - edges[1:])).sum() / 2)
 
 
-def _about_z(turn: float) -> NDArray[np.float32]:
-    c, s = float(cosine(turn)), float(sine(turn))
+def _about_z(angle_rad: float) -> NDArray[np.float32]:
+    c = float(cosine(angle_rad))
+    s = float(sine(angle_rad))
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.float32)

@@ -3,18 +3,19 @@
 import numpy as np
 
 from scene_templates.exact import Numbers
+from scene_templates.recorded_sampler import RecordedSampler
 from scene_templates.skies.colour import planckian_rgb
-from scene_templates.stated_draws import StatedDraws
 
 PALEST = 0.1
 """Least channel of a coloured light before its mean is made 1: no light is quite monochrome."""
 
 
-DEEP_BLUE, PALE_BLUE = (0.3, 0.75, 1.95), (0.75, 0.97, 1.28)
+DEEP_BLUE = (0.3, 0.75, 1.95)
+PALE_BLUE = (0.75, 0.97, 1.28)
 """Colours, of mean 1, of a clean and of a hazy sky: bluer than any black body is."""
 
 
-class SkyDraws(StatedDraws):
+class SkyDraws(RecordedSampler):
     """Draws by name, and colours of lights that follow the sky's own choice."""
 
     def __init__(

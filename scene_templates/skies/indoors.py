@@ -6,7 +6,7 @@ factor, which `draw_sky` chooses.
 
 import numpy as np
 
-from scene_templates.exact import Numbers, dot, eased, mixed
+from scene_templates.exact import Numbers, dot, lerp, smoothstep
 from scene_templates.skies.draws import SkyDraws
 from scene_templates.skies.outdoors import shared_flux
 from scene_templates.skies.texels import SkyTexels
@@ -25,8 +25,8 @@ def gradient(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     dark = draws.uniform("dark side over bright side", 0.0, 0.6)
     bright = draws.light("bright side", mired=(60, 400))
     other = draws.light("dark side", mired=(60, 400))
-    share = eased(0.5 + dot(texels.directions, towards) / (2 * width))
-    return mixed(dark * other, bright, share[..., None])
+    share = smoothstep(0.5 + dot(texels.directions, towards) / (2 * width))
+    return lerp(dark * other, bright, share[..., None])
 
 
 def lobes(draws: SkyDraws, texels: SkyTexels) -> Numbers:
@@ -83,7 +83,7 @@ def window_wall(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     panes = texels.of_unit_flux(
         texels.pane(towards, half, panes=(columns, rows), bars=bars), towards
     )
-    outside = mixed(ground, 1.0, eased(0.5 + 4 * texels.z))
+    outside = lerp(ground, 1.0, smoothstep(0.5 + 4 * texels.z))
     lit = 0.55 - 0.25 * dot(texels.directions, towards) - 0.2 * np.minimum(texels.z, 0)
     room = lit[..., None] * paint
     return shared_flux(texels, room, (panes * outside)[..., None] * sky, inside)

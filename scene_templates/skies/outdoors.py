@@ -7,12 +7,13 @@ factor, which `draw_sky` chooses.
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.exact import Numbers, eased, mixed
+from scene_templates.exact import Numbers, lerp, smoothstep
 from scene_templates.skies.colour import planckian_rgb
 from scene_templates.skies.draws import SkyDraws
 from scene_templates.skies.texels import SkyTexels
 
-LOW_SUN_MIRED, HIGH_SUN_MIRED = 420.0, 172.0
+LOW_SUN_MIRED = 420.0
+HIGH_SUN_MIRED = 172.0
 """2,400 K on the horizon and 5,800 K above: the light of a low sun has crossed more air."""
 
 
@@ -33,9 +34,7 @@ def sun_and_sky(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     sun = planckian_rgb(_sun_mired(float(towards[2])))
     low = 1 - np.clip(texels.z, 0, 1)
     near = low * low * low
-    sky = mixed(zenith, brightening * horizon, near[..., None]) + np.zeros(
-        (1, 2 * texels.height, 1)
-    )
+    sky = lerp(zenith, brightening * horizon, near[..., None]) + np.zeros((1, 2 * texels.height, 1))
     glow = texels.lobe(towards, sharpness)[..., None] * sun
     sky = sky * (1 - haze) + glow * (haze * _mean(texels.flux(sky)))
     from_sky = _mean(texels.irradiance(_above(sky, texels)))
@@ -71,10 +70,10 @@ def clouds(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     towards = draws.direction("brightest place", 10, 80)
     shape = texels.noise(draws.stream(), cells, octaves=5)
     thickness = texels.noise(draws.stream(), 2 * cells, octaves=4)
-    share = eased(0.5 + (shape + cover) / softness)
-    lit = 1 - shading * eased(0.5 + thickness)
+    share = smoothstep(0.5 + (shape + cover) / softness)
+    lit = 1 - shading * smoothstep(0.5 + thickness)
     overcast = (1 + 2 * np.clip(texels.z, 0, 1)) / 3
-    sky = mixed(blue, bright * cloud * lit[..., None], share[..., None]) * overcast[..., None]
+    sky = lerp(blue, bright * cloud * lit[..., None], share[..., None]) * overcast[..., None]
     glow = texels.lobe(towards, 3.0)[..., None] * np.pi
     return _with_ground(draws, texels, sky * (0.6 + glow))
 
@@ -92,7 +91,7 @@ def night(draws: SkyDraws, texels: SkyTexels) -> Numbers:
         power = draws.uniform("power of a lamp", 0.1, 1.0)
         colour = draws.light("lamp", mired=(220, 480))
         halo = draws.uniform("share of its glow", 0.02, 0.3)
-        shape = mixed(texels.spot(towards), texels.lobe(towards, 200.0), halo)
+        shape = lerp(texels.spot(towards), texels.lobe(towards, 200.0), halo)
         lamps = lamps + (power * shape)[..., None] * colour
     return shared_flux(texels, sky, lamps, dark)
 
@@ -102,7 +101,7 @@ def _with_ground(draws: SkyDraws, texels: SkyTexels, sky: Numbers) -> Numbers:
     albedo = draws.uniform("albedo of the ground", 0.05, 0.5)
     tint = draws.colour("tint of the ground", (0.75, 0.7, 0.5), (1.0, 1.0, 0.9))
     ground = albedo * tint * texels.irradiance(_above(sky, texels)) / np.pi
-    return mixed(ground, sky, _above_share(texels)[..., None])
+    return lerp(ground, sky, _above_share(texels)[..., None])
 
 
 def _above(sky: Numbers, texels: SkyTexels) -> Numbers:
@@ -121,6 +120,7 @@ def _mean(rgb: Numbers) -> float:
 
 def shared_flux(texels: SkyTexels, one: Numbers, other: Numbers, share: float) -> Numbers:
     """Return the sum of two maps of which the first has `share` of the flux."""
-    first, second = _mean(texels.flux(one)), _mean(texels.flux(other))
+    first = _mean(texels.flux(one))
+    second = _mean(texels.flux(other))
     result: Numbers = one * (share / first) + other * ((1 - share) / second)
     return result

@@ -72,8 +72,8 @@ class SkyTexels:
         """Return a spot of unit flux [H, 2H], brightest in the middle, 0 beyond its radius."""
         reach = 1 - float(cosine(min(1.0, SPOT_RADIUS / self.height) * np.pi))
         inside = 1 - (1 - dot(self.directions, towards)) / reach
-        found = np.maximum(inside, 0)
-        return found / self.flux(found)
+        falloff = np.maximum(inside, 0)
+        return falloff / self.flux(falloff)
 
     def pane(
         self,
@@ -114,7 +114,8 @@ class SkyTexels:
             cells: of the first octave along a radius.
             octaves: how many, as far as texels can show them.
         """
-        total, gain = np.zeros((self.height, 2 * self.height)), NOISE_SCALE
+        total = np.zeros((self.height, 2 * self.height))
+        gain = NOISE_SCALE
         for _ in range(octaves):
             if TEXELS_PER_CELL * np.pi * cells > self.height:
                 break
@@ -134,19 +135,19 @@ def _directions(height: int) -> Numbers:
     azimuth = (0.5 - (np.arange(2 * height)[None, :] + 0.5) / (2 * height)) * 2 * np.pi
     flat = np.zeros((height, 2 * height))
     across = cosine(elevation)
-    found = np.stack(
+    directions = np.stack(
         [across * cosine(azimuth), across * sine(azimuth), sine(elevation) + flat], axis=-1
     )
-    found.setflags(write=False)
-    return found
+    directions.setflags(write=False)
+    return directions
 
 
 @functools.lru_cache(maxsize=2)
 def _solid_angle(height: int) -> Numbers:
     edges = sine((0.5 - np.arange(height + 1) / height) * np.pi)
-    found: Numbers = ((edges[:-1] - edges[1:]) * np.pi / height)[:, None]
-    found.setflags(write=False)
-    return found
+    solid_angle_sr: Numbers = ((edges[:-1] - edges[1:]) * np.pi / height)[:, None]
+    solid_angle_sr.setflags(write=False)
+    return solid_angle_sr
 
 
 def _sum(values: NDArray) -> Numbers:
@@ -167,7 +168,8 @@ def _axes(towards: NDArray, roll_rad: float) -> tuple[Numbers, Numbers]:
         ]
     )
     level, upright = (axis / np.sqrt(dot(axis, axis)) for axis in (level, upright))
-    turn_cos, turn_sin = float(cosine(roll_rad)), float(sine(roll_rad))
+    turn_cos = float(cosine(roll_rad))
+    turn_sin = float(sine(roll_rad))
     return turn_cos * level + turn_sin * upright, turn_cos * upright - turn_sin * level
 
 
@@ -181,7 +183,8 @@ def _noise_in_space(points: NDArray, rng: np.random.Generator) -> Numbers:
     total = np.zeros(points.shape[:-1])
     for steps in itertools.product((0, 1), repeat=3):
         place = np.zeros(total.shape, np.int64)
-        weight, height = np.ones_like(total), np.zeros_like(total)
+        weight = np.ones_like(total)
+        height = np.zeros_like(total)
         for corner, step, fade in zip(corners, steps, fades, strict=True):
             place = place * LATTICE + (corner.astype(np.int64) + step) % LATTICE
             weight = weight * (fade if step else 1 - fade)

@@ -5,7 +5,7 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.stated_draws import StatedDraws
+from scene_templates.recorded_sampler import RecordedSampler
 from scene_templates.surfaces.maps import Finish, finish
 
 RGB = tuple[float, float, float]
@@ -16,16 +16,16 @@ class GlossRanges(TypedDict):
     """Ranges that several finishes share."""
 
     specular: tuple[float, float]
-    """Of the specular share."""
+    """Range of the specular albedo, from low to high."""
     roughness: tuple[float, float]
-    """Of the roughness."""
+    """Range of the roughness, from low to high."""
 
 
 LEAST_TINT = 0.88
 """A natural colour is one between two, each channel times a number from this to 1."""
 
 
-class SurfaceDraws(StatedDraws):
+class SurfaceDraws(RecordedSampler):
     """Draws by name, and finishes whose colours follow the surface's own choice."""
 
     def __init__(

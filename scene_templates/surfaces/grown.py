@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.exact import Numbers, eased, ramp
+from scene_templates.exact import Numbers, ramp, smoothstep
 from scene_templates.surfaces.draws import GlossRanges, SurfaceDraws
-from scene_templates.surfaces.laid import laid
+from scene_templates.surfaces.laid import lay_rows
 from scene_templates.surfaces.maps import Finish
 from scene_templates.surfaces.texels import Texels, stones
 
@@ -21,7 +21,7 @@ def planks(draws: SurfaceDraws, texels: Texels) -> Finish:
     spread = draws.uniform("darkening of the darkest board", 0.1, 0.5)
     light, dark = _woods(draws)
     random = draws.stream()
-    pieces = laid(texels, rows, columns, random.random(rows))
+    pieces = lay_rows(texels, rows, columns, random.random(rows))
     tones = pieces.of_each(random.random((rows, columns)))
     moved = tuple(pieces.of_each(random.random((rows, columns))) for _ in "uv")
     board = light.covered(dark, _grain(draws, texels, (moved[0], moved[1])))
@@ -54,8 +54,8 @@ def _grain(draws: SurfaceDraws, texels: Texels, moved: tuple[NDArray, NDArray] |
     place = phase - np.floor(phase)
     ring = np.where(
         place < LATE_WOOD,
-        eased(place / LATE_WOOD),
-        1 - eased((place - LATE_WOOD) / (1 - LATE_WOOD)),
+        smoothstep(place / LATE_WOOD),
+        1 - smoothstep((place - LATE_WOOD) / (1 - LATE_WOOD)),
     )
     return np.clip(0.1 + 0.6 * ring + 0.3 * fibres, 0, 1)
 
@@ -73,9 +73,9 @@ def marble(draws: SurfaceDraws, texels: Texels) -> Finish:
     broad = texels.noise(draws.stream(), (cells, cells), octaves=2, moved=bent)
     fine = texels.noise(draws.stream(), (2 * cells, 2 * cells), octaves=2, moved=bent)
     clouds = texels.noise(draws.stream(), (2, 2), octaves=5, moved=bent)
-    veins = eased(1 - np.abs(broad) / width)
-    thin = 0.5 * eased(1 - np.abs(fine) / (0.4 * width))
-    share = 1 - (1 - veins) * (1 - thin) * (1 - 0.25 * eased(0.5 + clouds))
+    veins = smoothstep(1 - np.abs(broad) / width)
+    thin = 0.5 * smoothstep(1 - np.abs(fine) / (0.4 * width))
+    share = 1 - (1 - veins) * (1 - thin) * (1 - 0.25 * smoothstep(0.5 + clouds))
     return stone.covered(vein, share)
 
 
@@ -89,13 +89,13 @@ def terrazzo(draws: SurfaceDraws, texels: Texels) -> Finish:
         draws.finish(f"{name} chip", low=(0.05, 0.04, 0.04), high=(0.85, 0.7, 0.6), **polish)
         for name in ("first", "second", "third")
     ]
-    found = stones(texels, draws.stream(), cells)
+    stone_cells = stones(texels, draws.stream(), cells)
     random = draws.stream()
-    kind = random.integers(len(chips), size=cells * cells)[found.index]
-    size = 0.6 + 0.8 * random.random(cells * cells)[found.index]
+    kind = random.integers(len(chips), size=cells * cells)[stone_cells.index]
+    size = 0.6 + 0.8 * random.random(cells * cells)[stone_cells.index]
     made = cement.toned(0.92 + 0.1 * texels.noise(draws.stream(), (16, 16), octaves=3))
     for number, chip in enumerate(chips):
-        inside = ramp((found.gap - gap * size) / 2 / cells * texels.size)
+        inside = ramp((stone_cells.gap - gap * size) / 2 / cells * texels.size)
         made = made.covered(chip, inside * (kind == number))
     return made
 
@@ -116,12 +116,12 @@ def cobbles(draws: SurfaceDraws, texels: Texels) -> Finish:
         "earth", low=(0.08, 0.06, 0.04), high=(0.5, 0.42, 0.3), roughness=(0.85, 1.0)
     )
     bent = texels.noise(draws.stream(), (8, 8), octaves=3) * 0.02
-    found = stones(texels, draws.stream(), cells, jitter=jitter, moved=(bent, -bent))
-    tones = draws.stream().random(cells * cells)[found.index]
+    stone_cells = stones(texels, draws.stream(), cells, jitter=jitter, moved=(bent, -bent))
+    tones = draws.stream().random(cells * cells)[stone_cells.index]
     grit = texels.noise(draws.stream(), (24, 24), octaves=2)
-    round_off = 0.35 + 0.65 * eased((found.gap - gap) / 0.35)
+    round_off = 0.35 + 0.65 * smoothstep((stone_cells.gap - gap) / 0.35)
     top = stone.toned(1 - 0.5 * tones).toned(round_off).toned(0.9 + 0.2 * grit)
-    inside = ramp((found.gap - gap) / 2 / cells * texels.size)
+    inside = ramp((stone_cells.gap - gap) / 2 / cells * texels.size)
     return earth.toned(0.8 + 0.4 * grit).covered(top, inside)
 
 
@@ -138,10 +138,10 @@ def concrete(draws: SurfaceDraws, texels: Texels) -> Finish:
         specular=(0.02, 0.08),
         roughness=(0.6, 1.0),
     )
-    broad = eased(0.5 + 0.8 * texels.noise(draws.stream(), (2, 2), octaves=5))
+    broad = smoothstep(0.5 + 0.8 * texels.noise(draws.stream(), (2, 2), octaves=5))
     fine = texels.noise(draws.stream(), (32, 32), octaves=2)
-    found = stones(texels, draws.stream(), cells)
-    radius = pits * draws.stream().random(cells * cells)[found.index]
-    pitted = ramp((radius - found.nearest) / cells * texels.size)
+    pit_cells = stones(texels, draws.stream(), cells)
+    radius = pits * draws.stream().random(cells * cells)[pit_cells.index]
+    pitted = ramp((radius - pit_cells.nearest) / cells * texels.size)
     toned = body.toned(1 - stains * broad).toned(1 - grain * (0.5 + 0.8 * fine))
     return toned.rougher(0.1 * (broad - 0.5)).covered(body.toned(0.2), pitted)

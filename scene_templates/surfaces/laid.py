@@ -38,10 +38,10 @@ def checker(draws: SurfaceDraws, texels: Texels) -> Finish:
 
 def _square_wave(place: Numbers, squares: int, texels: Texels) -> Numbers:
     """Return 1 in even squares, -1 in odd ones, and the mean within the texels on an edge."""
-    whole = np.floor(place * squares)
-    inside = place * squares - whole
+    square_index = np.floor(place * squares)
+    inside = place * squares - square_index
     edge_px = np.minimum(inside, 1 - inside) / squares * texels.size
-    return (1 - 2 * (whole % 2)) * (2 * ramp(edge_px) - 1)
+    return (1 - 2 * (square_index % 2)) * (2 * ramp(edge_px) - 1)
 
 
 def stripes(draws: SurfaceDraws, texels: Texels) -> Finish:
@@ -73,7 +73,7 @@ def stripes(draws: SurfaceDraws, texels: Texels) -> Finish:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Which brick, tile or board a texel belongs to."""
+    """Index of the brick, tile or board of each texel."""
 
     row: NDArray[np.int64]
     """[size, size] from the bottom."""
@@ -87,15 +87,17 @@ class Pieces:
         return values[self.row, self.column]
 
 
-def laid(texels: Texels, rows: int, columns: int, shifts: NDArray) -> Pieces:
+def lay_rows(texels: Texels, rows: int, columns: int, shifts: NDArray) -> Pieces:
     """Return rows of equal pieces, each row shifted by a share [rows] of a piece to the left."""
     y = texels.v * rows
     below = np.floor(y)
     row = below.astype(np.int64) % rows
     x = texels.u * columns + shifts[row]
     column = np.floor(x)
-    beside, above = x - column, y - below
-    edge_u, edge_v = np.minimum(beside, 1 - beside) / columns, np.minimum(above, 1 - above) / rows
+    offset_u = x - column
+    offset_v = y - below
+    edge_u = np.minimum(offset_u, 1 - offset_u) / columns
+    edge_v = np.minimum(offset_v, 1 - offset_v) / rows
     everywhere = np.zeros((texels.size, texels.size), np.int64)
     return Pieces(
         row=row + everywhere,
@@ -118,10 +120,11 @@ def bricks(draws: SurfaceDraws, texels: Texels) -> Finish:
         "mortar", low=(0.3, 0.28, 0.25), high=(0.7, 0.68, 0.62), roughness=(0.8, 1.0)
     )
     random = draws.stream()
-    tones, loose = random.random((rows, columns)), random.random(rows)
+    tones = random.random((rows, columns))
+    loose = random.random(rows)
     running = 0.5 * (np.arange(rows) % 2)
     shifts = {"running": running, "stacked": np.zeros(rows), "random": loose}[bond]
-    pieces = laid(texels, rows, columns, shifts)
+    pieces = lay_rows(texels, rows, columns, shifts)
     clay = texels.noise(draws.stream(), (16, 16), octaves=3)
     worn = texels.noise(draws.stream(), (12, 12), octaves=3) * 0.05 / rows
     baked = brick.toned(1 - spread * pieces.of_each(tones)).toned(0.85 + 0.25 * clay)
@@ -140,8 +143,9 @@ def tiles(draws: SurfaceDraws, texels: Texels) -> Finish:
     second = draws.finish("second tile", low=(0.02, 0.05, 0.1), high=(0.5, 0.5, 0.6), **glaze)
     grout = draws.finish("grout", low=(0.15, 0.15, 0.14), high=(0.7, 0.7, 0.68), roughness=(0.8, 1))
     random = draws.stream()
-    tones, picks = random.random((side, side)), random.random((side, side)) < 0.3
-    pieces = laid(texels, side, side, np.zeros(side))
+    tones = random.random((side, side))
+    picks = random.random((side, side)) < 0.3
+    pieces = lay_rows(texels, side, side, np.zeros(side))
     chequered = (np.arange(side)[:, None] + np.arange(side)) % 2 == 1
     which = {"plain": np.zeros_like(picks), "scattered": picks, "chequered": chequered}[pattern]
     tile = first.covered(second, pieces.of_each(which)).toned(1 - 0.12 * pieces.of_each(tones))
@@ -162,7 +166,8 @@ def hexagons(draws: SurfaceDraws, texels: Texels) -> Finish:
     second = draws.finish("second tile", low=(0.02, 0.05, 0.05), high=(0.6, 0.4, 0.4), **glaze)
     grout = draws.finish("grout", low=(0.1, 0.1, 0.1), high=(0.6, 0.6, 0.58), roughness=(0.8, 1))
     random = draws.stream()
-    tones, picks = random.random((rows, columns)), random.random((rows, columns)) < share
+    tones = random.random((rows, columns))
+    picks = random.random((rows, columns)) < share
     index, edge = _hexagon_of(texels, columns, rows)
     tile = first.covered(second, picks.ravel()[index]).toned(1 - 0.2 * tones.ravel()[index])
     return grout.covered(tile, ramp((edge - joint / 2) / columns * texels.size))
@@ -175,16 +180,17 @@ def _hexagon_of(texels: Texels, columns: int, rows: int) -> tuple[NDArray[np.int
     """
     pitch = math.sqrt(0.75)
     best = np.full((texels.size, texels.size), np.inf)
-    index, edge = np.zeros(best.shape, np.int64), best.copy()
-    for odd in (0, 1):
-        column = np.floor(texels.u * columns - odd / 2 + 0.5)
-        row = 2 * np.floor((texels.v * rows - odd) / 2 + 0.5) + odd
-        x = np.abs(texels.u * columns - odd / 2 - column)
+    index = np.zeros(best.shape, np.int64)
+    edge = best.copy()
+    for row_parity in (0, 1):
+        column = np.floor(texels.u * columns - row_parity / 2 + 0.5)
+        row = 2 * np.floor((texels.v * rows - row_parity) / 2 + 0.5) + row_parity
+        x = np.abs(texels.u * columns - row_parity / 2 - column)
         y = np.abs(texels.v * rows - row) * pitch
-        away = x * x + y * y
-        nearer = away < best
+        distance_squared = x * x + y * y
+        nearer = distance_squared < best
         number = (row % rows) * columns + column % columns
-        best = np.where(nearer, away, best)
+        best = np.where(nearer, distance_squared, best)
         index = np.where(nearer, number.astype(np.int64), index)
         edge = np.where(nearer, 0.5 - np.maximum(x, x / 2 + y * pitch), edge)
     return index, edge

@@ -3,12 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.exact import Numbers, eased
+from scene_templates.exact import Numbers, smoothstep
 from scene_templates.surfaces.draws import RGB, GlossRanges, SurfaceDraws
 from scene_templates.surfaces.maps import Finish
 from scene_templates.surfaces.texels import TEXELS_PER_CELL, Texels
 
-DARK_METAL, BRIGHT_METAL = (0.5, 0.42, 0.3), (0.95, 0.92, 0.9)
+DARK_METAL = (0.5, 0.42, 0.3)
+BRIGHT_METAL = (0.95, 0.92, 0.9)
 """From bronze to silver, roughly."""
 
 
@@ -42,9 +43,9 @@ def rust(draws: SurfaceDraws, texels: Texels) -> Finish:
     eaten = texels.noise(draws.stream(), (cells, cells), octaves=6)
     tone = texels.noise(draws.stream(), (2 * cells, 2 * cells), octaves=5)
     scratched = texels.noise(draws.stream(), (4, 4), octaves=4)
-    covered = eased(0.5 + (eaten - exceeded_by(eaten, share)) / 0.12)
-    return under.rougher(0.15 * eased(0.5 + scratched)).covered(
-        fresh.covered(old, eased(0.5 + 0.9 * tone)), covered
+    covered = smoothstep(0.5 + (eaten - exceeded_by(eaten, share)) / 0.12)
+    return under.rougher(0.15 * smoothstep(0.5 + scratched)).covered(
+        fresh.covered(old, smoothstep(0.5 + 0.9 * tone)), covered
     )
 
 
@@ -70,8 +71,8 @@ def brushed_metal(draws: SurfaceDraws, texels: Texels) -> Finish:
     coarse, fine = ((1, 16), (2, 64)) if along == "u" else ((16, 1), (64, 2))
     lines = texels.noise(draws.stream(), coarse, octaves=2) + texels.noise(draws.stream(), fine)
     smudges = texels.noise(draws.stream(), (3, 3), octaves=4)
-    scratched = metal.dimmed(1 - depth * eased(0.5 + lines))
-    return scratched.rougher(0.1 * depth * lines + uneven * eased(0.5 + smudges))
+    scratched = metal.dimmed(1 - depth * smoothstep(0.5 + lines))
+    return scratched.rougher(0.1 * depth * lines + uneven * smoothstep(0.5 + smudges))
 
 
 def fabric(draws: SurfaceDraws, texels: Texels) -> Finish:
@@ -82,14 +83,16 @@ def fabric(draws: SurfaceDraws, texels: Texels) -> Finish:
     cloth = GlossRanges(specular=(0.0, 0.06), roughness=(0.6, 1.0))
     along = draws.finish("warp", low=(0.05, 0.05, 0.06), high=(0.85, 0.75, 0.65), **cloth)
     across = draws.finish("weft", low=(0.05, 0.05, 0.06), high=(0.85, 0.8, 0.75), **cloth)
-    column, row = np.floor(texels.u * threads), np.floor(texels.v * threads)
+    column = np.floor(texels.u * threads)
+    row = np.floor(texels.v * threads)
     over = (column + row) % 2 < 1 if weave == "plain" else (column + row) % 4 < 2
     in_u = 2 * (texels.u * threads - column) - 1 + np.zeros((texels.size, 1))
     in_v = 2 * (texels.v * threads - row) - 1 + np.zeros((1, texels.size))
-    rim, crown = np.where(over, in_u, in_v), np.where(over, in_v, in_u)
-    shown = min(1.0, texels.size / (TEXELS_PER_CELL * threads))
+    rim = np.where(over, in_u, in_v)
+    crown = np.where(over, in_v, in_u)
+    visible_fraction = min(1.0, texels.size / (TEXELS_PER_CELL * threads))
     # 0.3 is the mean of what is taken off: where threads are too fine to show, it alone is left
-    shade = 0.7 - shown * (0.7 * rim * rim + 0.2 * crown * crown - 0.3)
+    shade = 0.7 - visible_fraction * (0.7 * rim * rim + 0.2 * crown * crown - 0.3)
     random = draws.stream()
     uneven = np.where(over, *_of_threads(random, threads, column, row))
     fluff = texels.noise(draws.stream(), (32, 32), octaves=2)
@@ -101,7 +104,8 @@ def _of_threads(
     random: np.random.Generator, threads: int, column: NDArray, row: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Return a number in [0, 1] for the thread of each column and for that of each row."""
-    warp, weft = random.random(threads), random.random(threads)
+    warp = random.random(threads)
+    weft = random.random(threads)
     return warp[column.astype(np.int64) % threads], weft[row.astype(np.int64) % threads]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scene_templates.exact import Numbers, mixed
+from scene_templates.exact import Numbers, lerp
 from storage.records.texture import MapSource
 
 MOST_ALBEDO = 0.95
@@ -31,7 +31,7 @@ class SurfaceMaps:
     roughness: NDArray[np.float32]
     """[H, W, 1] roughness; the GGX width is its square."""
     parameters: Mapping[str, tuple[Any, ...]]
-    """What was drawn, by the names of the reference page of surfaces and skies."""
+    """Drawn values; the names are those of the reference page of surfaces and skies."""
     source: MapSource = field(default_factory=MapSource)
     """Whose it is; what is drawn is ours."""
 
@@ -45,7 +45,7 @@ class Finish:
     specular_rgb: Numbers
     """[3] or [N, N, 3]."""
     roughness: Numbers
-    """[] or [N, N]."""
+    """One roughness [] or one per texel [N, N]."""
 
     def toned(self, tone: ArrayLike) -> "Finish":
         """Return it with its diffuse albedo times a number in [0, 1], one or [N, N]."""
@@ -79,11 +79,14 @@ class Finish:
         Albedos are area means; of the roughness, it is the mean of the GGX widths that counts.
         """
         part = np.asarray(share, np.float64)
-        own, others = np.clip(self.roughness, 0, 1), np.clip(other.roughness, 0, 1)
+        base_roughness = np.clip(self.roughness, 0, 1)
+        cover_roughness = np.clip(other.roughness, 0, 1)
         return Finish(
-            diffuse_rgb=mixed(self.diffuse_rgb, other.diffuse_rgb, part[..., None]),
-            specular_rgb=mixed(self.specular_rgb, other.specular_rgb, part[..., None]),
-            roughness=np.sqrt(mixed(own * own, others * others, part)),
+            diffuse_rgb=lerp(self.diffuse_rgb, other.diffuse_rgb, part[..., None]),
+            specular_rgb=lerp(self.specular_rgb, other.specular_rgb, part[..., None]),
+            roughness=np.sqrt(
+                lerp(base_roughness * base_roughness, cover_roughness * cover_roughness, part)
+            ),
         )
 
 
@@ -114,12 +117,12 @@ def surface_maps(
     parameters: Mapping[str, tuple[Any, ...]],
 ) -> SurfaceMaps:
     """Return the maps of a finish, rounded once."""
-    whole = np.zeros((size, size, 1))
-    roughness = np.clip(made_of.roughness[..., None] + whole, *roughness_clip)
+    full_size = np.zeros((size, size, 1))
+    roughness = np.clip(made_of.roughness[..., None] + full_size, *roughness_clip)
     return SurfaceMaps(
         family=family,
-        diffuse_rgb=(made_of.diffuse_rgb + whole).astype(np.float32),
-        specular_rgb=(made_of.specular_rgb + whole).astype(np.float32),
+        diffuse_rgb=(made_of.diffuse_rgb + full_size).astype(np.float32),
+        specular_rgb=(made_of.specular_rgb + full_size).astype(np.float32),
         roughness=roughness.astype(np.float32),
         parameters=parameters,
     )

@@ -26,7 +26,7 @@ class Texels:
     """A square map's texels."""
 
     size: int
-    """Width and height."""
+    """Width and height in texels."""
 
     @property
     def u(self) -> Numbers:
@@ -55,7 +55,8 @@ class Texels:
             moved: what is added to u and v before the look-up.
         """
         u, v = (self.u, self.v) if moved is None else (self.u + moved[0], self.v + moved[1])
-        total, gain = np.zeros((self.size, self.size)), NOISE_SCALE
+        total = np.zeros((self.size, self.size))
+        gain = NOISE_SCALE
         for _ in range(octaves):
             if TEXELS_PER_CELL * max(cells) > self.size:
                 break
@@ -73,11 +74,16 @@ def _gradient_noise(
     prefers no direction, decides its spectrum as that of unit vectors would.
     """
     slopes = 2 * rng.random((cells[1], cells[0], 2)) - 1
-    x, y = u * cells[0], v * cells[1]
-    left, below = np.floor(x), np.floor(y)
-    x, y = x - left, y - below
-    column, row = left.astype(np.int64), below.astype(np.int64)
-    across, up = _fade(x), _fade(y)
+    x = u * cells[0]
+    y = v * cells[1]
+    floor_x = np.floor(x)
+    floor_y = np.floor(y)
+    x = x - floor_x
+    y = y - floor_y
+    column = floor_x.astype(np.int64)
+    row = floor_y.astype(np.int64)
+    across = _fade(x)
+    up = _fade(y)
 
     def corner(dx: int, dy: int) -> Numbers:
         slope = slopes[(row + dy) % cells[1], (column + dx) % cells[0]]
@@ -97,7 +103,7 @@ def _fade(x: NDArray) -> Numbers:
 
 @dataclass(frozen=True, eq=False)
 class Stones:
-    """Which of many scattered points is nearest to each texel, on the torus."""
+    """Nearest of many scattered points to each texel, on the torus."""
 
     index: NDArray[np.int64]
     """[size, size] of the nearest point."""
@@ -128,14 +134,17 @@ def stones(
     du, dv = moved if moved is not None else (0.0, 0.0)
     x = (texels.u + du + np.zeros((texels.size, 1))) * cells
     y = (texels.v + dv + np.zeros((1, texels.size))) * cells
-    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    column = np.floor(x).astype(np.int64)
+    row = np.floor(y).astype(np.int64)
     first = np.full(x.shape, np.inf)
-    second, index = first.copy(), np.zeros(x.shape, np.int64)
+    second = first.copy()
+    index = np.zeros(x.shape, np.int64)
     for dy in (-1, 0, 1):
         for dx in (-1, 0, 1):
             at = (row + dy) % cells, (column + dx) % cells
             point = offsets[at]
-            away_x, away_y = column + dx + point[..., 0] - x, row + dy + point[..., 1] - y
+            away_x = column + dx + point[..., 0] - x
+            away_y = row + dy + point[..., 1] - y
             square = away_x * away_x + away_y * away_y
             nearer = square < first
             second = np.where(nearer, first, np.minimum(second, square))

@@ -27,7 +27,7 @@ from storage.remote.tries import TransferFailed, is_missing
 from storage.remote.url import RemoteUrl, parse_url
 
 
-def _unopened(path: Path, error: OSError) -> TrilightError:
+def _open_error(path: Path, error: OSError) -> TrilightError:
     if isinstance(error, FileNotFoundError | NotADirectoryError):
         return ShardMissing(
             f"{path}: the shard is missing; run `trilight generate` again to make it."
@@ -36,14 +36,14 @@ def _unopened(path: Path, error: OSError) -> TrilightError:
 
 
 class _Files(ABC):
-    """The files beside the shards."""
+    """The files next to the shards."""
 
     @abstractmethod
     def open_beside(self, name: str) -> BinaryIO | None:
-        """Open a file beside the shards, or return None where there is none."""
+        """Open a file next to the shards, or return None where there is none."""
 
     def read(self, name: str) -> bytes | None:
-        """Return a file beside the shards, or None where there is none."""
+        """Return a file next to the shards, or None where there is none."""
         stream = self.open_beside(name)
         if stream is None:
             return None
@@ -75,7 +75,7 @@ class LocalFiles(_Files):
         try:
             return path.stat().st_size
         except OSError as error:
-            raise _unopened(path, error) from error
+            raise _open_error(path, error) from error
 
     def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
         """Open a shard for reading.
@@ -91,7 +91,7 @@ class LocalFiles(_Files):
         try:
             stream = open_plain(path)
         except OSError as error:
-            raise _unopened(path, error) from error
+            raise _open_error(path, error) from error
         if checked:
             self._check(path, stream, shard)
         return stream
@@ -105,7 +105,7 @@ class LocalFiles(_Files):
             stream.close()
             raise TrilightError(
                 f"{path}: the bytes are not those of the manifest (sha256 differs). Delete the "
-                "file and run `trilight generate` again to make it anew."
+                "file and run `trilight generate` again to make it."
             )
         stream.seek(0)
         self._checked[shard.name] = seen
@@ -116,7 +116,7 @@ class RemoteDatasetFiles(_Files):
 
     def __init__(self, url: RemoteUrl) -> None:
         self.url = url
-        self.shown = url.shown
+        self.shown = url.display_url
 
     def open_beside(self, name: str) -> BinaryIO | None:
         url = self.url.child(name)
@@ -145,7 +145,7 @@ class RemoteDatasetFiles(_Files):
             return facts_of(url).num_bytes
         except TransferFailed as error:
             if error.__cause__ is not None and is_missing(error.__cause__):
-                raise ShardMissing(f"{url.shown}: the shard is missing.") from error
+                raise ShardMissing(f"{url.display_url}: the shard is missing.") from error
             raise unreadable(url, error) from error
 
     def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
@@ -222,7 +222,7 @@ class Dataset:
         self._noted = noted
 
     @property
-    def shown(self) -> str:
+    def display_name(self) -> str:
         """The place of the dataset for messages, without secrets."""
         return self.files.shown
 
@@ -230,7 +230,9 @@ class Dataset:
     def folder(self) -> DatasetFolder:
         """The dataset's folder; raises TrilightError where it is on a server."""
         if isinstance(self.files, RemoteDatasetFiles):
-            raise TrilightError(f"dataset {self.shown!r} is on a server; expected a local folder.")
+            raise TrilightError(
+                f"dataset {self.display_name!r} is on a server; expected a local folder."
+            )
         return DatasetFolder(self.files.root)
 
     @property
@@ -288,9 +290,9 @@ class Dataset:
         with self.files.open(shard, checked=False) as stream:
             contents = self._contents(stream, shard)
             for key in contents.samples:
-                with reading(self.shown, shard.name):
-                    found = contents.read(stream, key, lambda name: not name.endswith("exr"))
-                    record = decode_scene(key, found, held)
+                with reading(self.display_name, shard.name):
+                    members = contents.read(stream, key, lambda name: not name.endswith("exr"))
+                    record = decode_scene(key, members, held)
                     _require_lawful(record)
                 yield record
 
@@ -300,7 +302,7 @@ class Dataset:
         with self.files.open(shard, checked=False) as stream:
             contents = self._contents(stream, shard)
             for key in keys:
-                with reading(self.shown, shard.name):
+                with reading(self.display_name, shard.name):
                     sample = decode_sample(key, contents.read(stream, key), held)
                     _require_lawful(sample)
                 yield sample
@@ -312,7 +314,7 @@ class Dataset:
         if len(keys) != shard.num_samples:
             raise TrilightError(
                 f"{shard.name}: {len(keys)} samples; expected {shard.num_samples}, as the manifest "
-                f"says. Run `trilight verify {shlex.quote(self.shown)} --repair`."
+                f"says. Run `trilight verify {shlex.quote(self.display_name)} --repair`."
             )
         return keys
 
@@ -323,7 +325,7 @@ class Dataset:
         return {suffix for members in samples.values() for suffix in members}
 
     def _contents(self, stream: BinaryIO, shard: ShardEntry) -> ShardContents:
-        with reading(self.shown, shard.name):
+        with reading(self.display_name, shard.name):
             return contents_of(stream, shard.name)
 
     def lock_bytes(self) -> bytes | None:
@@ -366,7 +368,7 @@ def open_dataset(url: str) -> Dataset:
     if not _may_be_growing(dataset.files):
         return dataset
     from storage.dataset.unlisted import (
-        with_unlisted,  # slow: whoever streams a whole set needs none
+        with_unlisted,  # slow, and not needed to stream a whole set
     )
 
     return with_unlisted(dataset)

@@ -17,12 +17,12 @@ _SOURCE_FIELDS = {"build", "digest", "key_offset", "num_scenes", "settings"}
 
 @dataclass(frozen=True, kw_only=True)
 class Derivation:
-    """How a dataset was made of others."""
+    """Operation and sources of a dataset that was made of others."""
 
     operation: str
-    """merge, select or reshard."""
+    """One of merge, select and reshard."""
     arguments: Mapping[str, Any]
-    """What the user asked for."""
+    """Options of the command, by name."""
     sources: Sequence[Mapping[str, Any]]
     """Per source: build, num_scenes, digest, key_offset, settings."""
 
@@ -36,13 +36,13 @@ def derivation_of(settings: Mapping[str, Any]) -> Derivation | None:
     if _GROUP not in settings:
         return None
     try:
-        found = Derivation(**settings[_GROUP])
-        for source in found.sources:
+        derivation = Derivation(**settings[_GROUP])
+        for source in derivation.sources:
             if set(source) != _SOURCE_FIELDS or not isinstance(source["settings"], Mapping):
                 raise ValueError(f"a source with {sorted(source)}")
     except (TypeError, ValueError) as error:
         raise TrilightError(f"manifest: settings.derived is not readable ({error}).") from error
-    return found
+    return derivation
 
 
 def source_record(manifest: Manifest, *, key_offset: int) -> dict[str, Any]:
@@ -73,12 +73,12 @@ def derived_settings(derivation: Derivation, *, scenes_per_shard: int | None) ->
 
 def common(mappings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the entries that all mappings agree on, group by group."""
-    first, *others = mappings
+    first, *rest = mappings
     agreed: dict[str, Any] = {}
     for name, value in first.items():
-        values = [value, *(other.get(name) for other in others)]
+        values = [value, *(other.get(name) for other in rest)]
         if all(isinstance(entry, Mapping) for entry in values):
             agreed[name] = common(values)
-        elif all(name in other for other in others) and all(entry == value for entry in values):
+        elif all(name in other for other in rest) and all(entry == value for entry in values):
             agreed[name] = value
     return agreed

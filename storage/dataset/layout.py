@@ -20,7 +20,7 @@ from pathlib import Path
 
 from storage.atomic import remove_leftovers
 from storage.cache import cache_folder
-from storage.claims import claimed, open_lock, take_lock
+from storage.claims import hold_claim, open_lock, take_lock
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.remote.bucket import WRITABLE
@@ -37,7 +37,7 @@ FILES_PER_FOLDER = 4096
 _PART = re.compile(r"part-(\d{4,6})")
 
 
-def numbered(number: int, name: str) -> str:
+def numbered_path(number: int, name: str) -> str:
     """Return the relative path of the file `name`, which is the `number`-th of its folder."""
     part = number // FILES_PER_FOLDER
     return f"part-{part:04d}/{name}" if part else name
@@ -79,13 +79,13 @@ def in_parts(numbers: range) -> Iterator[range]:
 
 def place_of_part(part: int) -> str:
     """Return the relative path of a part of a folder, with its slash; empty for the first."""
-    return numbered(part * FILES_PER_FOLDER, "")
+    return numbered_path(part * FILES_PER_FOLDER, "")
 
 
 def _parts_in(root: Path) -> list[int]:
     with contextlib.suppress(FileNotFoundError):
-        found = (_PART.fullmatch(name) for name in os.listdir(root))
-        return [0, *sorted(int(match[1]) for match in found if match)]
+        matches = (_PART.fullmatch(name) for name in os.listdir(root))
+        return [0, *sorted(int(match[1]) for match in matches if match)]
     return []
 
 
@@ -150,8 +150,8 @@ class DatasetFolder:
     _lock = _Below(".staging/lock")
 
     @property
-    def shown(self) -> str:
-        """What people call the dataset."""
+    def display_name(self) -> str:
+        """The dataset's folder or URL, as messages show it."""
         return self.bucket or str(self.root)
 
     def staged_shard(self, name: str) -> Path:
@@ -175,13 +175,13 @@ class DatasetFolder:
         return sorted(self.root / name for name in shard_names_in(self.root))
 
     @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
+    def hold_exclusively(self) -> Iterator[None]:
         """Hold the folder exclusively; the lock ends with the process that holds it.
 
         Raises:
             TrilightError: the folder cannot be written, or another process is at work in it.
         """
-        with claimed(self._lock) as ours:
+        with hold_claim(self._lock) as ours:
             if not ours:
                 raise TrilightError(
                     f"{self.root}: another process is making this dataset. Wait for it, or choose "
@@ -190,7 +190,7 @@ class DatasetFolder:
             yield
 
     @contextlib.contextmanager
-    def joined(self, when_alone: Callable[[], None] = lambda: None) -> Iterator[None]:
+    def hold_membership(self, when_alone: Callable[[], None] = lambda: None) -> Iterator[None]:
         """Join the workers that make the dataset.
 
         A worker that is alone at first removes what killed writers left more than an hour ago,
@@ -207,6 +207,8 @@ class DatasetFolder:
             if take_lock(descriptor):
                 self._clean()
                 when_alone()
+            # flock converts a lock by releasing it first, so another worker may hold it exclusively
+            # in between and clean too. That is harmless: this worker has not begun its work yet.
             take_lock(descriptor, shared=True, wait=True)
             yield
         finally:
@@ -214,8 +216,8 @@ class DatasetFolder:
 
     def clear(self) -> None:
         """Delete everything except the locks of workers."""
-        kept = {self.staging, self.staging / "lock", self.staging / "turns"}
-        for path in {*self.root.iterdir(), *self.staging.iterdir()} - kept:
+        lock_paths = {self.staging, self.staging / "lock", self.staging / "turns"}
+        for path in {*self.root.iterdir(), *self.staging.iterdir()} - lock_paths:
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             else:
@@ -229,9 +231,9 @@ class DatasetFolder:
         remove_leftovers(self.root, older_than_s=_LEFT_S)
         looked.touch()
 
-    def turn(self, what: str) -> "contextlib.AbstractContextManager[bool]":
+    def mutex(self, what: str) -> "contextlib.AbstractContextManager[bool]":
         """Hold the lock of a step that one worker does at a time, such as `manifest`."""
-        return claimed(self.staging / "turns" / what, wait=True)
+        return hold_claim(self.staging / "turns" / what, wait=True)
 
 
 _ADMITTED = f"expected a folder, or a URL of {' or '.join(WRITABLE)}"
@@ -241,7 +243,7 @@ def dataset_folder(out: str) -> DatasetFolder:
     """Return the folder of a dataset that is to be made.
 
     For a bucket that is a folder of the cache, the same one whenever the same URL is named, with
-    the scenes that are not in a shard yet and a copy of the files beside the shards.
+    the scenes that are not in a shard yet and a copy of the files next to the shards.
 
     Args:
         out: a folder, or a URL of WRITABLE.
@@ -253,10 +255,10 @@ def dataset_folder(out: str) -> DatasetFolder:
     place = parse_url(out, what="out")
     if isinstance(place, Path):
         return DatasetFolder(place)
-    shown = printable(safe_url(out))
+    url_text = printable(safe_url(out))
     if place.scheme not in WRITABLE:
-        raise TrilightError(f"out {shown!r} has the scheme {place.scheme!r}; {_ADMITTED}.")
+        raise TrilightError(f"out {url_text!r} has the scheme {place.scheme!r}; {_ADMITTED}.")
     if "?" in place.root or "#" in place.root:
-        raise TrilightError(f"out {shown!r} has a query or fragment; {_ADMITTED}, without one.")
-    name = sha256_hex(place.shown.encode())[:16]
-    return DatasetFolder(cache_folder("outputs") / name, place.shown)
+        raise TrilightError(f"out {url_text!r} has a query or fragment; {_ADMITTED}, without one.")
+    name = sha256_hex(place.display_url.encode())[:16]
+    return DatasetFolder(cache_folder("outputs") / name, place.display_url)

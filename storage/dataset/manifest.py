@@ -22,7 +22,7 @@ from typing import Annotated, Any, BinaryIO, Literal
 
 from storage.atomic import atomic_writer
 from storage.conventions import MANIFEST_VERSION, READABLE_MANIFESTS, SPLITS, require_readable
-from storage.dataset.layout import numbered
+from storage.dataset.layout import numbered_path
 from storage.dataset.shard import scan_samples
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError
@@ -40,8 +40,9 @@ DocumentName = Annotated[
 """Document that a manifest vouches for: rights hang on it."""
 
 MAX_BESIDE_BYTES = 1 << 30
-"""Largest file beside the shards: a manifest takes 220 bytes a shard, a lock 400 an object."""
-_HEAD_BYTES, _ROW_BYTES = 1 << 22, 1 << 17
+"""Largest file next to the shards: a manifest takes 220 bytes a shard, a lock 400 an object."""
+_HEAD_BYTES = 1 << 22
+_ROW_BYTES = 1 << 17
 """Maximum sizes of a manifest without its shards, and of a shard in it."""
 
 Scenes = Annotated[int, Within(0, 1_000_000_000, unit="scenes")]
@@ -53,16 +54,15 @@ class ShardEntry:
     """One shard as the manifest describes it."""
 
     name: ShardName
-    """File name beside the manifest, or in one of the parts of its folder
+    """File name next to the manifest, or in one of the parts of its folder
     (storage.dataset.layout)."""
     split: Annotated[str, Spelled("|".join(SPLITS), "train, validation or test")]
     """train, validation or test."""
     num_samples: Scenes
-    """Scenes in it."""
     num_bytes: Bytes
-    """Size of the file."""
+    """Size of the file in bytes."""
     sha256: Sha256
-    """Digest of the file."""
+    """Hexadecimal digest of the file's bytes."""
     members: Annotated[None, DROPPED] = dataclasses.field(default=None, compare=False, repr=False)
     """An index of its members in rows of before version 5, which is not kept."""
 
@@ -72,15 +72,15 @@ class _Fields:
     """Fields of a manifest, and of its file."""
 
     build: ShortText
-    """Name of the build."""
+    """Name of the dataset preset."""
     settings: Annotated[Mapping[str, Any], FINITE]
     """All settings of the build; a dataset keeps them for life."""
     environment: Annotated[Mapping[str, Any], FINITE]
-    """What the bytes depend on besides the settings: variant, processor, library versions."""
+    """Inputs of the bytes other than settings: variant, processor, library versions."""
     num_scenes: Scenes
-    """How many scenes were asked for so far; more extend the dataset."""
+    """Requested number of scenes so far; a larger one extends the dataset."""
     num_views: Annotated[int, Within(1, 1_000_000, unit="pictures")]
-    """Pictures per scene."""
+    """Pictures per scene, one per camera."""
     objects_lock_sha256: Sha256 | Literal[""]
     """Digest of `objects.lock.jsonl`; empty until the objects are prepared."""
     schema_version: int = MANIFEST_VERSION
@@ -101,9 +101,7 @@ class Totals:
     """Sums over the shards of a manifest."""
 
     samples: int
-    """Scenes in the shards."""
     bytes: int
-    """Sizes of the shards."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +121,7 @@ class Manifest(_Fields):
     """Content of `manifest.json`."""
 
     stored: StoredManifest | None = dataclasses.field(default=None, compare=False, repr=False)
-    """What the file says that was read, for `trilight verify`."""
+    """Digests and totals as the file states them, for `trilight verify`."""
 
     @property
     def num_samples(self) -> int:
@@ -135,14 +133,14 @@ class Manifest(_Fields):
 
     @property
     def passes(self) -> tuple[str, ...]:
-        """Names of the passes beside each picture; none where the settings do not name them."""
+        """Names of the passes of each picture; none where the settings do not name them."""
         storage = self.settings.get("storage")
         names = storage.get("passes") if isinstance(storage, Mapping) else None
         return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
 
     @property
     def identity(self) -> object:
-        """What scenes that are not in a shard yet depend on."""
+        """Inputs on which scenes depend that are not in a shard yet."""
         return (self.settings, self.environment, self.objects_lock_sha256, self.extensions)
 
     def with_grown(self, shard: ShardEntry) -> "Manifest":
@@ -182,7 +180,7 @@ def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
     num_bytes = stream.seek(0, 2)
     stream.seek(0)
     return ShardEntry(
-        name=numbered(int(match[2]), PurePosixPath(name).name),
+        name=numbered_path(int(match[2]), PurePosixPath(name).name),
         split=match[1],
         num_samples=num_samples,
         num_bytes=num_bytes,
@@ -193,14 +191,14 @@ def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
 def write_manifest(path: Path, manifest: Manifest) -> None:
     """Write the manifest atomically, a shard a line; equal manifests give equal bytes."""
     seal = hashlib.sha256()
-    for piece in _encoded(manifest, ""):
+    for piece in _encode_rows(manifest, ""):
         seal.update(piece)
     with atomic_writer(path) as stream:
-        for piece in _encoded(manifest, seal.hexdigest()):
+        for piece in _encode_rows(manifest, seal.hexdigest()):
             stream.write(piece)
 
 
-def _encoded(manifest: Manifest, seal: str) -> Iterator[bytes]:
+def _encode_rows(manifest: Manifest, seal: str) -> Iterator[bytes]:
     """Yield the pieces of a manifest's file row by row: there may be a million."""
     record = {field.name: getattr(manifest, field.name) for field in dataclasses.fields(_Fields)}
     record |= {"schema_version": MANIFEST_VERSION, "manifest_sha256": seal, "shards": []}

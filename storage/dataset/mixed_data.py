@@ -22,7 +22,8 @@ class MixedShards(ShardSet):
     def __init__(self, sets: Mapping[str, ShardSet]) -> None:
         """Take the shards by what each dataset is called in messages."""
         self._at: list[tuple[ShardSet, int]] = []
-        names, parts = list[str](), list[range]()
+        names = list[str]()
+        parts = list[range]()
         for called, shards in sets.items():
             parts.append(range(len(names), len(names) + len(shards.names)))
             names += [f"{called}: {name}" for name in shards.names]
@@ -61,14 +62,15 @@ def open_mixture(data: Sequence[str]) -> TrainingData:
         before = next((other for other in opened[:row] if other.digest == each.digest), None)
         if before is not None:
             raise TrilightError(
-                f"data: {each.shown} holds the same dataset as {before.shown}; expected each once. "
+                f"data: {each.display_name} holds the same dataset as {before.display_name}; "
+                "expected each once. "
                 "How often its scenes are drawn, data_weights says."
             )
         each.split("train")
     return TrainingData(
-        shown=" and ".join(each.shown for each in opened),
+        display_name=" and ".join(each.display_name for each in opened),
         digest=MIXED + sha256_hex(canonical_json([each.digest for each in opened])),
-        splits={split: shards for split in SPLITS if (shards := _mixed(opened, split))},
+        splits={split: shards for split in SPLITS if (shards := _mix_split(opened, split))},
         num_views=_of_all([each.num_views for each in opened], min),
         max_triangles=_of_all([each.max_triangles for each in opened], max),
         notes=tuple(dict.fromkeys(note for each in opened for note in each.notes)),
@@ -76,7 +78,7 @@ def open_mixture(data: Sequence[str]) -> TrainingData:
     )
 
 
-def _mixed(opened: Sequence[TrainingData], split: str) -> MixedShards | None:
+def _mix_split(opened: Sequence[TrainingData], split: str) -> MixedShards | None:
     having = [row for row, each in enumerate(opened) if split in each.splits]
     if not having:
         return None

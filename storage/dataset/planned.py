@@ -1,4 +1,4 @@
-"""Which shards a dataset will have, from its manifest alone."""
+"""Planned shards of a dataset, from its manifest alone."""
 
 from storage.dataset.derived import derivation_of
 from storage.dataset.manifest import Manifest, ShardEntry, number_of_shard
@@ -33,13 +33,16 @@ def expected_scenes(manifest: Manifest) -> dict[str, int]:
 def listed_scenes(manifest: Manifest) -> set[int]:
     """Return the scenes of the shards that are listed and do not grow, made or given up."""
     splits = cut_splits(manifest.num_scenes, _splits(manifest))
-    whole = (entry for entry in manifest.shards if entry.name not in manifest.growing)
-    return {scene for entry in whole for scene in scenes_of_shard(number_of_shard(entry), splits)}
+    full_shards = (entry for entry in manifest.shards if entry.name not in manifest.growing)
+    return {
+        scene for entry in full_shards for scene in scenes_of_shard(number_of_shard(entry), splits)
+    }
 
 
 def planned_scenes_of(manifest: Manifest, shard: ShardEntry) -> int | None:
     """Return how many scenes a shard is to hold; None for as many as fit into it."""
-    splits, number = _splits(manifest), number_of_shard(shard)
+    splits = _splits(manifest)
+    number = number_of_shard(shard)
     cut = scenes_of_shard(number, cut_splits(manifest.num_scenes, splits))
     return len(cut) if cut != scenes_of_shard(number, splits) else None
 

@@ -16,15 +16,15 @@ from pathlib import Path
 from storage.atomic import write_atomically, write_error
 from storage.dataset.asked import read_asked
 from storage.dataset.dataset import Dataset, LocalFiles, open_listed
-from storage.dataset.layout import DatasetFolder, numbered, shard_names_in
+from storage.dataset.layout import DatasetFolder, numbered_path, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
 from storage.dataset.planned import expected_scenes, is_whole, listed_scenes, planned_shards
 from storage.dataset.scene_logs import (
-    LookedAt,
+    LogSample,
     SceneLog,
     decode_scene_log,
     log_name,
-    look_at_logs,
+    sample_logs,
 )
 from storage.dataset.shard_notes import note_of, noted_names, noted_shard
 from storage.errors import TrilightError
@@ -48,15 +48,12 @@ class Progress:
     objects_done: int
     """Objects that are prepared or rejected."""
     objects_planned: int
-    """Objects to prepare."""
     scenes_done: int
     """Scenes in shards or waiting for their shard."""
     scenes_given_up: int
     """Scenes that no attempt could save."""
     scenes_planned: int
-    """Scenes to make."""
     num_views: int
-    """Views of a scene."""
     views_done: float
     """Views of the finished scenes, and how far those of the scenes at work are."""
 
@@ -102,15 +99,15 @@ def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
     The note only shows progress, so failing to write it is no error.
     """
     with contextlib.suppress(OSError):
-        path = folder.staged_at_work / numbered(scene_index, f"{scene_index:09d}")
+        path = folder.staged_at_work / numbered_path(scene_index, f"{scene_index:09d}")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f"{views:.3f}")
 
 
 def forget_views(folder: DatasetFolder, scene_index: int) -> None:
-    """Delete the note of `tell_views`: the scene is finished, or begun anew."""
+    """Delete the note of `tell_views`: the scene is finished, or starts again."""
     with contextlib.suppress(OSError):
-        (folder.staged_at_work / numbered(scene_index, f"{scene_index:09d}")).unlink()
+        (folder.staged_at_work / numbered_path(scene_index, f"{scene_index:09d}")).unlink()
 
 
 def read_progress(folder: DatasetFolder) -> Progress:
@@ -118,7 +115,8 @@ def read_progress(folder: DatasetFolder) -> Progress:
     try:
         facts = folder.manifest.stat()
         manifest, expected = _plan_of(folder.manifest, facts.st_mtime_ns, facts.st_size)
-        scenes_planned, num_views = manifest.num_scenes, manifest.num_views
+        scenes_planned = manifest.num_scenes
+        num_views = manifest.num_views
         given_up = _scenes_given_up(folder, manifest)
         packed = {name: each for name, each in expected.items() if name not in manifest.growing}
         scenes_done = num_scenes_done(folder, packed) - given_up
@@ -166,28 +164,31 @@ def _plan_of(path: Path, mtime_ns: int, num_bytes: int) -> tuple[Manifest, Mappi
     return manifest, expected_scenes(manifest)
 
 
-def shards_there(folder: DatasetFolder) -> set[str]:
+def existing_shards(folder: DatasetFolder) -> set[str]:
     """Return the names of the shards that are there under their final names, listed or not."""
-    here = set(shard_names_in(folder.root))
-    return here | set(shard_names_in(folder.staged_sent)) if folder.bucket else here
+    local_names = set(shard_names_in(folder.root))
+    return local_names | set(shard_names_in(folder.staged_sent)) if folder.bucket else local_names
 
 
 def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
     """Return the names of the planned shards that are there, listed or not, and do not grow.
 
     A bucket is asked what it holds, where it may be asked and something is not listed yet: a shard
-    is finished there when it and the note on it have come (pipeline.shards.mirror).
+    is finished there when it and the note on it have come (pipeline.shards.bucket_mirror).
     """
     if isinstance(dataset.files, LocalFiles):
-        there = shards_there(DatasetFolder(dataset.files.root)) & set(planned)
-        return there - set(dataset.manifest.growing)
+        existing = existing_shards(DatasetFolder(dataset.files.root)) & set(planned)
+        return existing - set(dataset.manifest.growing)
     listed = {entry.name for entry in dataset.manifest.shards} & set(planned)
     unlisted = set(planned) - listed
     if not unlisted or dataset.files.url.scheme not in WRITABLE:
         return listed
     with contextlib.suppress(TrilightError):  # it may be read and not listed
-        names, here = Bucket(dataset.files.url).names(), DatasetFolder(Path())
-        listed |= {name for name in unlisted & names if note_of(here, name).as_posix() in names}
+        names = Bucket(dataset.files.url).names()
+        bucket_root = DatasetFolder(Path())
+        listed |= {
+            name for name in unlisted & names if note_of(bucket_root, name).as_posix() in names
+        }
     return listed
 
 
@@ -197,16 +198,18 @@ def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
     Of more scenes than were planned so far, also what those need.
 
     Where all are there and the dataset is still not finished, its first shard counts as missing:
-    whoever makes it finishes the dataset.
+    the worker that makes it finishes the dataset.
 
     Raises:
         TrilightError: there is no readable manifest, or the URL is refused.
     """
     dataset = open_listed(url)
-    own, more = dataset.manifest, max(num_scenes, dataset.manifest.num_scenes)
-    planned, before = planned_shards(dataclasses.replace(own, num_scenes=more)), planned_shards(own)
-    there = {(name, before.get(name)) for name in _finished_names(dataset, planned)}
-    missing = [index for index, shard in enumerate(planned.items()) if shard not in there]
+    manifest = dataset.manifest
+    total_scenes = max(num_scenes, dataset.manifest.num_scenes)
+    planned = planned_shards(dataclasses.replace(manifest, num_scenes=total_scenes))
+    before = planned_shards(manifest)
+    finished = {(name, before.get(name)) for name in _finished_names(dataset, planned)}
+    missing = [index for index, shard in enumerate(planned.items()) if shard not in finished]
     return missing or ([] if _is_finished(dataset) else [0])
 
 
@@ -223,8 +226,8 @@ def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
         folder: of the dataset.
         planned: its expected scenes, without the shards that grow.
     """
-    there = shards_there(folder) & planned.keys()
-    return sum(planned[name] for name in there) + _num_waiting(folder)
+    finished = existing_shards(folder) & planned.keys()
+    return sum(planned[name] for name in finished) + _num_waiting(folder)
 
 
 def _num_waiting(folder: DatasetFolder) -> int:
@@ -240,12 +243,12 @@ _LOGS_READ = 64
 class DatasetStatus:
     """Status of a dataset, finished or not."""
 
-    shown: str
-    """Its place, without secrets."""
+    display_name: str
+    """Path or URL without secrets."""
     build: str
-    """Name of its build."""
+    """Name of the dataset preset."""
     shards_done: int
-    """Shards that are there."""
+    """Finished shards, listed in the manifest or not."""
     shards_planned: int
     """Shards of the finished dataset."""
     scenes_done: int
@@ -255,7 +258,6 @@ class DatasetStatus:
     scenes_planned: int
     """Scenes of the finished dataset."""
     num_views: int
-    """Views of a scene."""
     finished: bool
     """Every shard is listed, and the documents are there."""
     views_per_hour: float | None
@@ -283,8 +285,8 @@ class DatasetStatus:
     def next_words(self) -> Sequence[str] | None:
         """The words of the command to run next, if it is known."""
         if self.finished:
-            return ("verify", self.shown)
-        return None if self.asked is None else (*self.asked, "--out", self.shown)
+            return ("verify", self.display_name)
+        return None if self.asked is None else (*self.asked, "--out", self.display_name)
 
 
 def read_status(url: str) -> DatasetStatus:
@@ -302,12 +304,13 @@ def read_status(url: str) -> DatasetStatus:
     given_up = _scenes_given_up(local, manifest) if local else 0
     done -= given_up
     given_up += max(manifest.num_scenes - sum(planned.values()), 0)
-    looked, share = (look_at_logs(local), 1.0) if local else _sampled_logs(dataset)
-    last, core_s = looked.last, looked.core_s
-    left = manifest.num_scenes - done - given_up
-    views_per_hour, remaining_s = _rate(last, share, manifest, left)
+    looked, share = (sample_logs(local), 1.0) if local else _sampled_logs(dataset)
+    last = looked.last
+    core_s = looked.core_s
+    scenes_left = manifest.num_scenes - done - given_up
+    views_per_hour, remaining_s = _rate(last, share, manifest, scenes_left)
     return DatasetStatus(
-        shown=dataset.shown,
+        display_name=dataset.display_name,
         build=manifest.build,
         shards_done=len(names),
         shards_planned=len(planned),
@@ -338,7 +341,7 @@ def _noted_failures(folder: DatasetFolder) -> list[Failure]:
     return [failure for note in notes for failure in note.failures]
 
 
-def _sampled_logs(dataset: Dataset) -> tuple[LookedAt, float]:
+def _sampled_logs(dataset: Dataset) -> tuple[LogSample, float]:
     """Return what logs on a server say, and of what share of the listed scenes they are.
 
     A sample of the logs stands for all; where the first is missing, the dataset has none.
@@ -356,16 +359,16 @@ def _sampled_logs(dataset: Dataset) -> tuple[LookedAt, float]:
     share = scenes / max(dataset.manifest.num_samples, 1)
     core_s = sum(row.seconds * row.cores for row in rows) / share if share else None
     rows.sort(key=lambda row: row.finished_unix_s)
-    return LookedAt(last=rows, core_s=core_s), share
+    return LogSample(last=rows, core_s=core_s), share
 
 
 def _rate(
-    last: Sequence[SceneLog], share: float, manifest: Manifest, left: int
+    last: Sequence[SceneLog], fraction: float, manifest: Manifest, scenes_left: int
 ) -> tuple[float | None, float | None]:
     """Return views per hour and seconds left, from rows by time that are a share of the scenes."""
-    if left <= 0 or len(last) < 2:
-        return None, 0.0 if left <= 0 else None
+    if scenes_left <= 0 or len(last) < 2:
+        return None, 0.0 if scenes_left <= 0 else None
     # from the start of the first to the end of the last, over all who worked at the same time
     span_s = last[-1].finished_unix_s - (last[0].finished_unix_s - last[0].seconds)
-    per_s = len(last) / share / max(span_s, 1e-3)
-    return 3600 * per_s * manifest.num_views, left / per_s
+    per_s = len(last) / fraction / max(span_s, 1e-3)
+    return 3600 * per_s * manifest.num_views, scenes_left / per_s

@@ -1,4 +1,4 @@
-"""Which shards of a huge dataset are read to describe it: evenly spaced ones of each split."""
+"""Sample of a huge dataset's shards: evenly spaced ones of each split."""
 
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
@@ -24,5 +24,5 @@ def described_shards(dataset: Dataset, most_scenes: int | None = None) -> list[S
 
 
 def of_how_many(num_read: int, num_scenes: int) -> str:
-    """Return what people are told where a sample of the scenes stands for all; else nothing."""
+    """Return the remark that a sample of the scenes stands for all; else an empty text."""
     return "" if num_read >= num_scenes else f"of a sample of {num_read} of {num_scenes} scenes"

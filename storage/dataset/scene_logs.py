@@ -37,9 +37,8 @@ class SceneLog:
     """Log row of one finished scene."""
 
     scene: str = ""
-    """Key of the scene."""
     seconds: Seconds
-    """Wall time."""
+    """Wall time of the scene."""
     cores: Annotated[int, Within(0, 10**6, unit="cores")] = 1
     """Cores that the worker used for it; earlier versions did not say."""
     rejected_attempts: int = 0
@@ -97,8 +96,8 @@ def decode_scene_log(text: str) -> Iterator[SceneLog]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LookedAt:
-    """What a look at the logs of a folder has found."""
+class LogSample:
+    """Rows and CPU time from a sample of a folder's logs."""
 
     last: Sequence[SceneLog]
     """The LAST_SCENES that were made last, by time."""
@@ -107,17 +106,17 @@ class LookedAt:
     spaced. None without a log."""
 
 
-def look_at_logs(folder: DatasetFolder) -> LookedAt:
+def sample_logs(folder: DatasetFolder) -> LogSample:
     """Return what the logs say, reading few of them however many there are."""
-    found = sorted(_logs(folder.logs))
-    if not found:
-        return LookedAt(last=(), core_s=None)
+    logs = sorted(_logs(folder.logs))
+    if not logs:
+        return LogSample(last=(), core_s=None)
     # a log that was written before LAST_SCENES others has none of the last scenes
-    newest = heapq.nlargest(LAST_SCENES, found, key=lambda log: log[1])
+    newest = heapq.nlargest(LAST_SCENES, logs, key=lambda log: log[1])
     rows = sorted(_rows_of(path for path, _ in newest), key=lambda row: row.finished_unix_s)
-    spaced = found[:: -(-len(found) // MOST_LOGS)]
+    spaced = logs[:: -(-len(logs) // MOST_LOGS)]
     core_s = sum(row.seconds * row.cores for row in _rows_of(path for path, _ in spaced))
-    return LookedAt(last=rows[-LAST_SCENES:], core_s=core_s * len(found) / len(spaced))
+    return LogSample(last=rows[-LAST_SCENES:], core_s=core_s * len(logs) / len(spaced))
 
 
 def _rows_of(paths: Iterator[str]) -> Iterator[SceneLog]:

@@ -5,8 +5,8 @@ bytes at a time: anything that is not a plain file is refused before it is read,
 header decides how much memory is taken.
 
 Textures and environment maps are no members of a sample: each stands once, between two samples,
-before the first one that uses it (storage.records.packed_maps). Whoever asks for the members of a
-sample gets with them those of its maps; writers take them in the same form.
+before the first one that uses it (storage.records.packed_maps). Readers
+return the members of a sample together with those of its maps; writers take the same form.
 """
 
 import io
@@ -40,24 +40,25 @@ def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) 
 
 
 def write_tar(stream: BinaryIO, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
-    """Write samples to an open file with WebDataset's own writer, and with fixed metadata."""
-    from webdataset.writer import TarWriter  # not at the top: it is slow to import
-
+    """Write samples to an open file as WebDataset reads them, and with fixed metadata."""
     written = set[str]()
-    with TarWriter(stream, encoder=False, mtime=0, user="trilight", group="trilight") as writer:
+    with tarfile.open(fileobj=stream, mode="w|") as archive:
         for key, members in samples:
             for name in sorted(name for name in members if MAP_NAME.fullmatch(name)):
                 if name not in written:
-                    _add(writer.tarstream, name, members[name])
+                    _add(archive, name, members[name])
                     written.add(name)
-            of_sample = {name: data for name, data in members.items() if name not in written}
-            writer.write({"__key__": key, **of_sample})
+            for suffix in sorted(set(members) - written):
+                _add(archive, f"{key}.{suffix}", members[suffix])
 
 
 def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
     """Add a member under its whole name, with the metadata that all members have."""
     info = tarfile.TarInfo(name)
-    info.size, info.mode, info.uname, info.gname = len(data), 0o444, "trilight", "trilight"
+    info.size = len(data)
+    info.mode = 0o444
+    info.uname = "trilight"
+    info.gname = "trilight"
     archive.addfile(info, io.BytesIO(data))
 
 
@@ -96,7 +97,8 @@ def scan_members(stream: BinaryIO, name: str) -> Iterator[Member]:
         TrilightError: the file is no complete tar, or holds a link, a folder, a path, an extended
             header, or a member that is larger than MAX_MEMBER_BYTES.
     """
-    end, position = stream.seek(0, 2), 0
+    end = stream.seek(0, 2)
+    position = 0
     while True:
         stream.seek(position)
         block = stream.read(tarfile.BLOCKSIZE)
@@ -104,11 +106,11 @@ def scan_members(stream: BinaryIO, name: str) -> Iterator[Member]:
             if block + stream.read(tarfile.BLOCKSIZE) == bytes(2 * tarfile.BLOCKSIZE):
                 return
             raise TrilightError(f"{name}: the end of the shard is missing; it is cut short.")
-        found = _checked(name, block, position + tarfile.BLOCKSIZE)
-        position = found.offset + -(-found.num_bytes // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
+        member = _parse_header(name, block, position + tarfile.BLOCKSIZE)
+        position = member.offset + -(-member.num_bytes // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
         if position > end:
-            raise TrilightError(f"{name}: member {found.name} is cut short.")
-        yield found
+            raise TrilightError(f"{name}: member {member.name} is cut short.")
+        yield member
 
 
 def scan_samples(
@@ -137,7 +139,8 @@ def scan_samples(
                 yield current, members
             if member.key in seen:
                 raise TrilightError(f"{name}: sample {member.key} occurs twice.")
-            current, members = member.key, {}
+            current = member.key
+            members = {}
             if current:
                 seen.add(current)
         known = members if current else maps
@@ -150,7 +153,7 @@ def scan_samples(
 
 @dataclass(frozen=True, kw_only=True)
 class ShardContents:
-    """Where everything in a shard stands, as its headers say."""
+    """Positions of all members of a shard, from its headers."""
 
     samples: Mapping[str, Mapping[str, Member]]
     """Members by suffix of each sample by key, in the order of the file."""
@@ -158,7 +161,7 @@ class ShardContents:
     """Textures and environment maps by the names of their members."""
 
     def read(
-        self, stream: BinaryIO, key: str, wanted: Callable[[str], bool] = lambda suffix: True
+        self, stream: BinaryIO, key: str, accepts: Callable[[str], bool] = lambda suffix: True
     ) -> dict[str, bytes]:
         """Return members of a sample by suffix, and the maps that its record names.
 
@@ -170,12 +173,12 @@ class ShardContents:
         Raises:
             TrilightError: the shard has become shorter.
         """
-        own = {
+        members = {
             suffix: read_member(stream, member)
             for suffix, member in self.samples[key].items()
-            if wanted(suffix)
+            if accepts(suffix)
         }
-        return with_maps(own, self.maps, lambda member: read_member(stream, member))
+        return with_maps(members, self.maps, lambda member: read_member(stream, member))
 
 
 def contents_of(stream: BinaryIO, name: str) -> ShardContents:
@@ -193,8 +196,8 @@ def samples_of(stream: BinaryIO, name: str) -> Iterator[tuple[str, dict[str, byt
     """
     maps: dict[str, Member] = {}
     for key, members in scan_samples(stream, name, maps):
-        own = {suffix: read_member(stream, member) for suffix, member in members.items()}
-        yield key, with_maps(own, maps, lambda member: read_member(stream, member))
+        contents = {suffix: read_member(stream, member) for suffix, member in members.items()}
+        yield key, with_maps(contents, maps, lambda member: read_member(stream, member))
 
 
 def with_maps(
@@ -223,7 +226,7 @@ def iterate_samples(path: Path) -> Iterator[tuple[str, dict[str, bytes]]]:
     Raises:
         TrilightError: as `scan_samples`, or the file cannot be read.
     """
-    with _opened(path) as stream:
+    with _open_shard(path) as stream:
         yield from samples_of(stream, path.name)
 
 
@@ -233,7 +236,7 @@ def read_members(path: Path, key: str, suffixes: Collection[str]) -> dict[str, b
     Raises:
         TrilightError: as `scan_samples`, the file cannot be read, or there is no such sample.
     """
-    with _opened(path) as stream:
+    with _open_shard(path) as stream:
         contents = contents_of(stream, path.name)
         if key in contents.samples:
             return contents.read(stream, key, lambda suffix: suffix in suffixes)
@@ -242,7 +245,7 @@ def read_members(path: Path, key: str, suffixes: Collection[str]) -> dict[str, b
     raise TrilightError(f"{path.name}: no sample {key}; expected one of its {len(keys)}: {held}.")
 
 
-def _opened(path: Path) -> BinaryIO:
+def _open_shard(path: Path) -> BinaryIO:
     try:
         return open_plain(path)
     except OSError as error:
@@ -258,26 +261,28 @@ def read_member(stream: BinaryIO, member: Member) -> bytes:
     return data
 
 
-def _checked(name: str, block: bytes, offset: int) -> Member:
+def _parse_header(name: str, block: bytes, offset: int) -> Member:
     """Return the member that a header describes; `tarfile` would take six times as long."""
     block = block.ljust(tarfile.BLOCKSIZE, b"\xff")  # one that is cut has no right sum
-    num_bytes, stated = _number(block[124:136]), _number(block[148:156])
+    num_bytes = _number(block[124:136])
+    stated = _number(block[148:156])
     if num_bytes is None or stated != sum(block) - sum(block[148:156]) + 8 * ord(" "):
         raise TrilightError(f"{name}: not a readable shard (a header at byte {offset - 512}).")
     text = b"/".join(filter(None, map(_text, (block[345:500], block[:100]))))
-    shown = text.decode("utf-8", "replace")
-    match = MEMBER_NAME.fullmatch(shown)
-    is_map = MAP_NAME.fullmatch(shown) is not None
+    member_name = text.decode("utf-8", "replace")
+    match = MEMBER_NAME.fullmatch(member_name)
+    is_map = MAP_NAME.fullmatch(member_name) is not None
     is_plain = block[156:157] in (tarfile.REGTYPE, tarfile.AREGTYPE)
     if not is_plain or (match is None and not is_map):
         raise TrilightError(
-            f"{name}: member {shown!r} is refused; expected a plain file named KEY.SUFFIX."
+            f"{name}: member {member_name!r} is refused; expected a plain file named KEY.SUFFIX."
         )
     if num_bytes > MAX_MEMBER_BYTES:
         raise TrilightError(
-            f"{name}: member {shown} claims {num_bytes} bytes; expected at most {MAX_MEMBER_BYTES}."
+            f"{name}: member {member_name} claims {num_bytes} bytes; expected at most "
+            f"{MAX_MEMBER_BYTES}."
         )
-    key, suffix = ("", shown) if match is None else match.groups()
+    key, suffix = ("", member_name) if match is None else match.groups()
     return Member(key, suffix, offset, num_bytes)
 
 

@@ -1,7 +1,7 @@
 """Notes on finished shards that the manifest does not list yet: one small file for each.
 
-Whoever packs a shard writes its note, once, beside the staged scenes: what the manifest will say of
-the shard, and what was rejected on the way. So nobody's work grows with what others have made.
+The worker that packs a shard writes its note once, next to the staged scenes: the shard's row of
+the manifest, and the rejections. The work of one worker does not grow with that of the others.
 """
 
 import contextlib
@@ -26,14 +26,14 @@ _AT_ONCE = 32
 
 @dataclass(frozen=True, kw_only=True)
 class ShardNote:
-    """What is known of a finished shard."""
+    """Contents of the note on a finished shard."""
 
     shard: ShardEntry
-    """What the manifest says of it."""
+    """The shard's row of the manifest."""
     failures: tuple[Failure, ...]
-    """Its scenes that were given up, and attempts that were rejected."""
+    """Scenes that were given up, and rejected attempts."""
     scenes: int | None = None
-    """In a bucket, for how many scenes it stands where that is not a whole shard."""
+    """Scenes so far of a shard in a bucket that still grows; None for a full shard."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,9 +43,9 @@ class _Note:
     shard: ShardEntry
     """The shard's row of the manifest."""
     failures: str = ""
-    """Lines of failures.jsonl."""
+    """Lines as in failures.jsonl."""
     scenes: Scenes | None = None
-    """As in ShardNote."""
+    """Same as `ShardNote.scenes`."""
 
 
 def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:
@@ -87,7 +87,8 @@ def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:
     Raises:
         TrilightError: the file is not a whole shard.
     """
-    path, shard = note_of(folder, name), folder.shard(name)
+    path = note_of(folder, name)
+    shard = folder.shard(name)
     # a kill before the note leaves none; then, and where it is no note, the shard itself is read
     with contextlib.suppress(OSError, TrilightError):
         note = decode_note(read_plain(path), str(path))
@@ -105,8 +106,8 @@ def noted_names(folder: DatasetFolder) -> Iterator[str]:
     return shard_names_in(folder.staged_entries, _SUFFIX)
 
 
-def fetched_notes(
-    read: Callable[[str], bytes | None], names: Iterable[str], shown: str
+def fetch_notes(
+    read: Callable[[str], bytes | None], names: Iterable[str], dataset_name: str
 ) -> list[ShardNote]:
     """Return notes that are on a server, many at a time.
 
@@ -119,17 +120,17 @@ def fetched_notes(
         TrilightError: one of them is no note, or as `read`.
     """
 
-    def fetched(name: str) -> ShardNote:
+    def fetch_note(name: str) -> ShardNote:
         try:
             note = decode_note(read(name) or b"", name)
             if not name.endswith(f"/{note.shard.name}{_SUFFIX}"):
                 raise TrilightError(note.shard.name)
         except TrilightError as error:
             raise TrilightError(
-                f"{shown}/{name}: not a note on its shard ({error}); delete both, and the shard is "
-                "made again."
+                f"{dataset_name}/{name}: not a note on its shard ({error}); delete both, and the "
+                "shard is made again."
             ) from error
         return note
 
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        return list(pool.map(fetched, names))
+        return list(pool.map(fetch_note, names))

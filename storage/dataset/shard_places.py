@@ -31,14 +31,18 @@ class ShardPlace:
     """A file of this machine, or one on a server."""
 
     @property
-    def shown(self) -> str:
-        """The place for people, without secrets."""
-        return self.place.shown if isinstance(self.place, RemoteUrl) else printable(str(self.place))
+    def display_name(self) -> str:
+        """The path or URL without secrets, for messages."""
+        return (
+            self.place.display_url
+            if isinstance(self.place, RemoteUrl)
+            else printable(str(self.place))
+        )
 
     @property
     def split(self) -> str:
         """What its name begins with, if that is a split, and else train."""
-        name = self.shown.rpartition("/")[2]
+        name = self.display_name.rpartition("/")[2]
         return next((split for split in SPLITS if name.startswith(f"{split}-")), "train")
 
     def open(self) -> BinaryIO:
@@ -49,8 +53,8 @@ class ShardPlace:
             return open_plain(self.place)
         except OSError as error:
             raise TrilightError(
-                f"shard {self.shown!r}: cannot be read ({error.strerror}); expected a file. Check "
-                "the list."
+                f"shard {self.display_name!r}: cannot be read ({error.strerror}); expected a file. "
+                "Check the list."
             ) from error
 
 
@@ -65,26 +69,26 @@ def listed_shards(patterns: Sequence[str]) -> list[ShardPlace]:
         TrilightError: a URL is refused (storage.remote.url), a pattern is not closed or names more
             than MAX_SHARDS, a range runs backwards, or a shard is named twice.
     """
-    texts = list(itertools.chain.from_iterable(expanded(pattern) for pattern in patterns))
+    texts = list(itertools.chain.from_iterable(expand_pattern(pattern) for pattern in patterns))
     places = [ShardPlace(place=parse_url(text, what=_WHAT)) for text in texts]
     if len(places) > MAX_SHARDS:
         raise TrilightError(f"the list names {len(places)} shards; expected at most {MAX_SHARDS}.")
     seen: set[Path | RemoteUrl] = set()
     for place in places:
         if place.place in seen:
-            raise TrilightError(f"shard {place.shown!r} is named twice; expected each once.")
+            raise TrilightError(f"shard {place.display_name!r} is named twice; expected each once.")
         seen.add(place.place)
     return places
 
 
-def expanded(pattern: str, what: str = "shards") -> list[str]:
+def expand_pattern(pattern: str, what: str = "shards") -> list[str]:
     """Return what a brace pattern of `what` stands for; raises as `listed_shards`.
 
     A file or folder of that very name is no pattern.
     """
     if "://" not in pattern and os.path.exists(parse_local_path(pattern)):
         return [pattern]
-    named = f"{what} {_shown(pattern)}"
+    named = f"{what} {_quote_safe(pattern)}"
     groups = [_alternatives(group[1], named) for group in _GROUP.finditer(pattern)]
     fixed = _GROUP.split(pattern)[::2]
     if any("{" in text or "}" in text for text in fixed):
@@ -99,10 +103,10 @@ def expanded(pattern: str, what: str = "shards") -> list[str]:
             raise TrilightError(
                 f"{named}: stands for more than {MAX_SHARDS} names; expected at most that many."
             )
-    return [_joined(fixed, chosen) for chosen in itertools.product(*groups)]
+    return [_join_groups(fixed, chosen) for chosen in itertools.product(*groups)]
 
 
-def _joined(fixed: Sequence[str], chosen: Sequence[str]) -> str:
+def _join_groups(fixed: Sequence[str], chosen: Sequence[str]) -> str:
     return "".join(text for pair in zip(fixed, [*chosen, ""], strict=True) for text in pair)
 
 
@@ -110,7 +114,8 @@ def _alternatives(group: str, named: str) -> Sequence[str]:
     match = _RANGE.fullmatch(group)
     if match is None:
         return group.split(",")
-    first, last = int(match[1]), int(match[2])
+    first = int(match[1])
+    last = int(match[2])
     if not first <= last <= first + MAX_SHARDS:
         raise TrilightError(
             f"{named}: the range {group} is backwards or longer than {MAX_SHARDS}; expected such "
@@ -123,5 +128,5 @@ def _numbers(first: int, last: int, width: int) -> Iterator[str]:
     return (f"{number:0{width}d}" for number in range(first, last + 1))
 
 
-def _shown(pattern: str) -> str:
+def _quote_safe(pattern: str) -> str:
     return repr(printable(safe_text(pattern)))

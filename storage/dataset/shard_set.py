@@ -38,7 +38,8 @@ class OpenShard:
             held: maps of this shard and others that were unpacked already.
         """
         self.name = name
-        self._stream, self._held = stream, held
+        self._stream = stream
+        self._held = held
         self._maps: dict[str, Member] = {}
         self._samples: list[tuple[str, Mapping[str, Member]]] = list(
             scan_samples(stream, name, self._maps)
@@ -55,18 +56,18 @@ class OpenShard:
         first = min(member.offset for member in members.values())
         end = max(member.offset + member.num_bytes for member in members.values())
         data = self._read(first, end - first)
-        own = {
+        contents = {
             suffix: data[member.offset - first : member.offset - first + member.num_bytes]
             for suffix, member in members.items()
         }
         return with_maps(
-            own, self._maps, lambda member: self._read(member.offset, member.num_bytes)
+            contents, self._maps, lambda member: self._read(member.offset, member.num_bytes)
         )
 
     def _read(self, offset: int, num_bytes: int) -> bytes:
         data = os.pread(self._stream.fileno(), num_bytes, offset)
         if len(data) != num_bytes:
-            raise TrilightError(f"{self.name}: became shorter while it was read. Copy it anew.")
+            raise TrilightError(f"{self.name}: became shorter while it was read. Copy it again.")
         return data
 
     def sample(self, row: int) -> Sample:
@@ -75,7 +76,7 @@ class OpenShard:
         Raises:
             TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
         """
-        with self._named():
+        with self._name_errors():
             sample = decode_sample(self._samples[row][0], self.members(row), self._held)
             sample.check()
             return sample
@@ -86,11 +87,11 @@ class OpenShard:
         Raises:
             TrilightError: its scene is not readable or breaks a law; names shard and sample.
         """
-        with self._named():
+        with self._name_errors():
             return stored_sample(self._samples[row][0], self.members(row), self._held)
 
     @contextlib.contextmanager
-    def _named(self) -> Iterator[None]:
+    def _name_errors(self) -> Iterator[None]:
         try:
             yield
         except TrilightError as error:
@@ -105,7 +106,7 @@ class ShardSet(ABC):
     """Shards by number."""
 
     names: Sequence[str]
-    """Their names for people."""
+    """Shard names as messages show them."""
 
     @property
     def parts(self) -> Sequence[range]:
@@ -139,7 +140,7 @@ class ManifestShards(ShardSet):
 
     def open(self, number: int) -> OpenShard:
         entry = self._entries[number]
-        shard = _opened(entry.name, self._files.open(entry, checked=True), self._held)
+        shard = _open_or_close(entry.name, self._files.open(entry, checked=True), self._held)
         if len(shard.keys) != entry.num_samples:
             shard.close()
             raise TrilightError(
@@ -185,7 +186,7 @@ def key_twice(shard: str, key: str) -> TrilightError:
     )
 
 
-def _opened(name: str, stream: BinaryIO, held: HeldMaps) -> OpenShard:
+def _open_or_close(name: str, stream: BinaryIO, held: HeldMaps) -> OpenShard:
     try:
         return OpenShard(name, stream, held)
     except BaseException:
@@ -197,7 +198,7 @@ class ListedShards(ShardSet):
     """Shards of a list: nothing is known of one before it was opened, and nothing is checked."""
 
     def __init__(self, places: Sequence[ShardPlace], seen: KeysSeen) -> None:
-        self.names = [place.shown for place in places]
+        self.names = [place.display_name for place in places]
         self._places = places
         self._seen = seen
         self._counts: dict[int, int] = {}
@@ -210,9 +211,9 @@ class ListedShards(ShardSet):
 
     def open(self, number: int) -> OpenShard:
         place = self._places[number]
-        shard = _opened(place.shown, place.open(), self._held)
+        shard = _open_or_close(place.display_name, place.open(), self._held)
         try:
-            self._seen.add(place.shown, shard.keys)
+            self._seen.add(place.display_name, shard.keys)
         except TrilightError:
             shard.close()
             raise

@@ -1,4 +1,4 @@
-"""Which split an object and a scene belong to, from nothing but themselves.
+"""Splits of objects and scenes, each from its own identity alone.
 
 An object's split is a hash of its cleaned geometry: copies under other names stay together, and
 adding objects moves none. A scene's split is that of its shard, by the shard's number, so a longer
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from storage.conventions import SPLITS
-from storage.dataset.layout import numbered
+from storage.dataset.layout import numbered_path
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 JUDGED_SPLIT = "test"
 """Split of whole sets that are judged by, never learnt from."""
 
-VALIDATION_SLOT, TEST_SLOT = 2, 5
+VALIDATION_SLOT = 2
+TEST_SLOT = 5
 """Places in a cycle of shards: early, so that a small dataset has all three splits."""
 
 
@@ -51,7 +52,7 @@ def shard_name(shard_index: int, settings: "SplitSettings") -> str:
 
 def named_shard(shard_index: int, split: str) -> str:
     """Return the name of a shard of a split, relative to the dataset."""
-    return numbered(shard_index, f"{split}-{shard_index:06d}.tar")
+    return numbered_path(shard_index, f"{split}-{shard_index:06d}.tar")
 
 
 def scenes_of_shard(shard_index: int, settings: "SplitSettings") -> range:
@@ -108,9 +109,9 @@ def lacks_validation(num_scenes: int, settings: "SplitSettings") -> str:
     return "" if num_scenes >= least else f"no shard is for validation before --scenes {least}"
 
 
-def require_objects(num_by_split: Mapping[str, int], needed: set[str]) -> None:
+def require_objects(num_by_split: Mapping[str, int], required_splits: set[str]) -> None:
     """Raise TrilightError where a split that is needed has no object to draw from."""
-    empty = [split for split in SPLITS if split in needed and not num_by_split.get(split)]
+    empty = [split for split in SPLITS if split in required_splits and not num_by_split.get(split)]
     if empty:
         total = sum(num_by_split.values())
         raise TrilightError(

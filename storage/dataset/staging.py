@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from storage.atomic import write_atomically
-from storage.dataset.layout import numbered
+from storage.dataset.layout import numbered_path
 from storage.dataset.shard import iterate_samples, write_tar
 from storage.records.objects import Failure, decode_failures, encode_failures
 from storage.records.profiles import Profile
@@ -20,12 +20,11 @@ _FAILURES = "failures"
 
 @dataclass(frozen=True, kw_only=True)
 class StagedScene:
-    """What became of one scene."""
+    """Result of one scene: its sample, or its failures."""
 
     members: dict[str, bytes]
     """The members of its sample; empty where the scene was given up."""
     failures: list[Failure]
-    """The rejected attempts."""
 
 
 def stage_scene(
@@ -63,4 +62,4 @@ def read_staged_scene(folder: Path, scene_index: int) -> StagedScene:
 
 
 def _path(folder: Path, scene_index: int) -> Path:
-    return folder / numbered(scene_index, f"{sample_key(scene_index)}.tar")
+    return folder / numbered_path(scene_index, f"{sample_key(scene_index)}.tar")

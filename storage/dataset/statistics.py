@@ -1,4 +1,4 @@
-"""What a dataset holds, without its pictures."""
+"""Statistics of a dataset, read without its pictures."""
 
 import json
 from array import array
@@ -24,9 +24,7 @@ class Statistics:
     """Counts and distributions of a dataset."""
 
     num_scenes: int
-    """Scenes in all shards."""
     scenes_by_split: Mapping[str, int]
-    """Scenes per split."""
     scenes_by_template: Mapping[str, int]
     """Scenes that were read per layout template."""
     scenes_by_excursion: Mapping[str, int]
@@ -37,15 +35,14 @@ class Statistics:
     """sha256 over the keys and arrays of all scenes, without pictures: equal for equal scenes,
     whatever they were rendered and packed with; empty where a sample was read."""
     num_bytes: int
-    """Bytes of all shards."""
     spp: NDArray[np.int64]
-    """[views] samples per pixel."""
+    """Samples per pixel of each view [views]."""
     noise_floor_db: NDArray[np.float64]
-    """[views] psnr_log_db."""
+    """Stated error of each view [views] as psnr_log_db."""
     noise_floor_linear_db: NDArray[np.float64]
-    """[views] psnr_linear_db."""
+    """Stated error of each view [views] as psnr_linear_db."""
     object_noise_floor_db: NDArray[np.float64]
-    """[views] object_psnr_log_db."""
+    """Stated error of each view [views] as object_psnr_log_db."""
     at_cap: NDArray[np.bool_]
     """[views] whether sampling ended at the cap."""
     part_noise_floor_db: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
@@ -56,7 +53,7 @@ class Statistics:
         return len(self.spp)
 
     def lines(self) -> Sequence[tuple[str, str]]:
-        """Return (name, value) rows for people."""
+        """Return (name, value) rows to print."""
         if not self.num_views:
             return [("scenes", "0")]
         excursions = _counts(self.scenes_by_excursion)
@@ -94,17 +91,20 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
     """
     tally = _Tally()
     for shard in (read := described_shards(dataset)):
-        with dataset.files.open(shard, checked=False) as stream, reading(dataset.shown, shard.name):
+        with (
+            dataset.files.open(shard, checked=False) as stream,
+            reading(dataset.display_name, shard.name),
+        ):
             _require_whole(dataset, shard)
             _count_shard(stream, shard, tally)
-    whole = len(read) == len(dataset.manifest.shards)
+    is_complete = len(read) == len(dataset.manifest.shards)
     return Statistics(
         num_scenes=dataset.manifest.num_samples,
         scenes_by_split=_by_split(dataset),
         num_scenes_read=sum(shard.num_samples for shard in read),
         scenes_by_template=tally.templates,
         scenes_by_excursion=tally.excursions,
-        scene_digest=digest_of_scenes(tally.scene_members) if whole else "",
+        scene_digest=digest_of_scenes(tally.scene_members) if is_complete else "",
         num_bytes=dataset.manifest.num_bytes,
         spp=np.asarray(tally.views["spp"], np.int64),
         noise_floor_db=np.asarray(tally.views["noise_floor_db"]),

@@ -1,4 +1,4 @@
-"""What `--data` means: a dataset by its root, or shards by a list."""
+"""Data that `--data` names: a dataset by its root, or shards by a list."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -24,9 +24,9 @@ class DataSource:
     """One dataset, as records name it."""
 
     name: str
-    """Its build; what it is called else."""
+    """Name of the dataset preset, or the display name of a list of shards."""
     digest: str
-    """As `TrainingData.digest`."""
+    """Same as `TrainingData.digest`."""
     num_views: int | None
     """Pictures per scene, where a manifest says it."""
 
@@ -35,10 +35,11 @@ class DataSource:
 class TrainingData:
     """The shards of every split that holds a sample, of one dataset or several."""
 
-    shown: str
-    """Their place, for messages."""
+    display_name: str
+    """Paths or URLs as messages show them."""
     digest: str
-    """What a checkpoint remembers: the dataset digest; of a list, a digest of its names only."""
+    """Identity that a checkpoint stores: the dataset digest; for a list, a digest of its names
+    only."""
     splits: Mapping[str, ShardSet]
     """Shards by split; splits without a shard are left out."""
     num_views: int | None
@@ -48,17 +49,18 @@ class TrainingData:
     max_triangles: int | None = None
     """Most triangles of a scene, where a manifest says it."""
     notes: tuple[str, ...] = ()
-    """What the user should know, once."""
+    """Messages for the user, each printed once."""
     sources: tuple[DataSource, ...] = ()
     """The datasets, in the order of the parts of their splits (ShardSet.parts)."""
 
     def split(self, name: str) -> ShardSet:
         """Return the shards of a split; raises TrilightError where it holds no scene."""
         if name not in self.splits:
-            there = ", ".join(self.splits) or "no split"
+            names = ", ".join(self.splits) or "no split"
             raise TrilightError(
-                f"{self.shown}: the {name} split holds no scene; expected at least one. There is "
-                f"{there}: choose it, or generate the dataset with more scenes; in a list, name "
+                f"{self.display_name}: the {name} split holds no scene; expected at least one. "
+                "There is "
+                f"{names}: choose it, or generate the dataset with more scenes; in a list, name "
                 f"shards {name}-....tar too."
             )
         return self.splits[name]
@@ -99,9 +101,10 @@ def _of_dataset(root: str) -> TrainingData:
         entries = [shard for shard in dataset.shards_of(split) if shard.num_samples]
         if entries:
             splits[split] = ManifestShards(dataset, entries)
-    build, num_views = dataset.manifest.build, dataset.manifest.num_views
+    build = dataset.manifest.build
+    num_views = dataset.manifest.num_views
     return TrainingData(
-        shown=dataset.shown,
+        display_name=dataset.display_name,
         digest=dataset.digest,
         splits=splits,
         num_views=num_views,
@@ -113,25 +116,26 @@ def _of_dataset(root: str) -> TrainingData:
 
 def _max_triangles(manifest: Manifest) -> int | None:
     scenes = manifest.settings.get("scenes")
-    found = scenes.get("max_triangles") if isinstance(scenes, Mapping) else None
-    return found if isinstance(found, int) else None
+    limit = scenes.get("max_triangles") if isinstance(scenes, Mapping) else None
+    return limit if isinstance(limit, int) else None
 
 
 def _of_list(patterns: Sequence[str]) -> TrainingData:
-    places, seen = listed_shards(patterns), KeysSeen()
+    places = listed_shards(patterns)
+    seen = KeysSeen()
     splits: dict[str, ShardSet] = {}
     for split in SPLITS:
         chosen = [place for place in places if place.split == split]
         if chosen:
             splits[split] = ListedShards(chosen, seen)
-    names = sorted(place.shown for place in places)
+    names = sorted(place.display_name for place in places)
     digest = f"list:{sha256_hex(canonical_json(names))}"
-    shown = f"the list of {len(places)} shards"
+    display_name = f"the list of {len(places)} shards"
     return TrainingData(
-        shown=shown,
+        display_name=display_name,
         digest=digest,
         splits=splits,
         num_views=None,
-        sources=(DataSource(name=shown, digest=digest, num_views=None),),
+        sources=(DataSource(name=display_name, digest=digest, num_views=None),),
         notes=(NO_MANIFEST,),
     )

@@ -10,7 +10,7 @@ from storage.dataset.manifest import SHARD_NAME, number_of_shard
 from storage.dataset.planned import num_planned
 from storage.dataset.shard_notes import (
     ShardNote,
-    fetched_notes,
+    fetch_notes,
     note_of,
     noted_names,
     noted_shard,
@@ -25,10 +25,10 @@ def with_unlisted(dataset: Dataset) -> Dataset:
     Raises:
         TrilightError: a note is none.
     """
-    found = _notes(dataset)
-    if not found:
+    unlisted = _notes(dataset)
+    if not unlisted:
         return dataset
-    notes = {note.shard.name: note for note in found}
+    notes = {note.shard.name: note for note in unlisted}
     shards = {shard.name: shard for shard in dataset.manifest.shards}
     shards |= {name: note.shard for name, note in notes.items()}
     every = tuple(sorted(shards.values(), key=number_of_shard))
@@ -38,7 +38,8 @@ def with_unlisted(dataset: Dataset) -> Dataset:
 
 
 def _notes(dataset: Dataset) -> list[ShardNote]:
-    files, manifest = dataset.files, dataset.manifest
+    files = dataset.files
+    manifest = dataset.manifest
     if isinstance(files, LocalFiles):
         folder = DatasetFolder(files.root)
         noted = filter(SHARD_NAME.fullmatch, noted_names(folder))
@@ -46,9 +47,10 @@ def _notes(dataset: Dataset) -> list[ShardNote]:
     if files.url.scheme not in WRITABLE or len(manifest.shards) >= num_planned(manifest):
         return []
     with contextlib.suppress(TrilightError):  # it may be read and not listed
-        names, here = Bucket(files.url).names(), DatasetFolder(Path())
+        names = Bucket(files.url).names()
+        bucket_root = DatasetFolder(Path())
         listed = {shard.name for shard in manifest.shards}
-        there = sorted(filter(SHARD_NAME.fullmatch, names - listed))
-        notes = (note_of(here, name).as_posix() for name in there)
-        return fetched_notes(files.read, [name for name in notes if name in names], files.shown)
+        unlisted = sorted(filter(SHARD_NAME.fullmatch, names - listed))
+        notes = (note_of(bucket_root, name).as_posix() for name in unlisted)
+        return fetch_notes(files.read, [name for name in notes if name in names], files.shown)
     return []

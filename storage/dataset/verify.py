@@ -44,25 +44,25 @@ everywhere."""
 
 @dataclass(frozen=True, kw_only=True)
 class Verification:
-    """What a check of a dataset found."""
+    """Result of a check of a dataset."""
 
     manifest: Manifest
     """The manifest that was checked."""
     problems: Sequence[str]
     """One line per fault, naming shard and sample; empty where the dataset is whole."""
     num_samples: int
-    """Samples that were checked."""
+    """Number of samples that were checked."""
     bad_shards: Sequence[str]
     """Names of the shards that are missing, or were read and are not what they should be."""
     num_shards_planned: int
     """Shards of the finished dataset."""
     is_finished: bool
-    """Whether the manifest lists every shard."""
+    """True: the manifest lists every shard."""
 
 
 @dataclass(kw_only=True)
-class _Found:
-    """What was found in one shard."""
+class _ShardFindings:
+    """Keys and faults of one shard."""
 
     faults: list[str] = field(default_factory=list)
     unread: list[str] = field(default_factory=list)
@@ -78,7 +78,7 @@ def verify_dataset(
     """Check a dataset, in a folder or on a server, against its manifest.
 
     Several shards are checked at once in threads: hashing and unpacking release Python's lock.
-    Shards of a server are fetched anew, past the cache, and not kept.
+    Shards of a server are fetched again, past the cache, and not kept.
 
     Args:
         root: the dataset, opened, or its path or URL.
@@ -96,7 +96,7 @@ def verify_dataset(
     problems = list(_check_lock(lock, dataset))
     locked = None if problems else _by_uid(lock or b"")
     problems += _check_manifest(dataset)
-    problems += [f"{name}: not in the manifest" for name in _unlisted(dataset)]
+    problems += [f"{name}: not in the manifest" for name in _list_unlisted(dataset)]
     where: dict[str, str] = {}
     bad: list[str] = []
     threads = os.cpu_count() or 1 if isinstance(dataset.files, LocalFiles) else REMOTE_THREADS
@@ -105,12 +105,12 @@ def verify_dataset(
             pool, lambda shard: _check_shard(dataset, shard, locked, fast=fast), manifest.shards
         )
         try:
-            for shard, found in checks:
-                faults = [*found.faults, *_twice(found.keys, shard, where)]
+            for shard, findings in checks:
+                faults = [*findings.faults, *_twice(findings.keys, shard, where)]
                 bad += [shard.name] if faults else []
                 problems += [
                     f"{shard.name}: {fault.removeprefix(f'{shard.name}: ')}"
-                    for fault in (*faults, *found.unread)
+                    for fault in (*faults, *findings.unread)
                 ]
                 shard_done(shard.name)
         except BaseException:
@@ -128,25 +128,27 @@ def verify_dataset(
 
 def _ahead(
     pool: ThreadPoolExecutor,
-    check: Callable[[ShardEntry], _Found],
+    check: Callable[[ShardEntry], _ShardFindings],
     shards: Sequence[ShardEntry],
-) -> Iterator[tuple[ShardEntry, _Found]]:
+) -> Iterator[tuple[ShardEntry, _ShardFindings]]:
     """Yield shards in order with what was found, a few of them being checked ahead."""
-    running: deque[Future[_Found]] = deque(pool.submit(check, shard) for shard in shards[:_AHEAD])
+    running: deque[Future[_ShardFindings]] = deque(
+        pool.submit(check, shard) for shard in shards[:_AHEAD]
+    )
     for row, shard in enumerate(shards):
         yield shard, running.popleft().result()
         if row + _AHEAD < len(shards):
             running.append(pool.submit(check, shards[row + _AHEAD]))
 
 
-def _unlisted(dataset: Dataset) -> list[str]:
+def _list_unlisted(dataset: Dataset) -> list[str]:
     """Return shard files that the manifest does not list; of a remote dataset, none."""
     if isinstance(dataset.files, RemoteDatasetFiles):
         return []
     listed = {shard.name for shard in dataset.manifest.shards}
     root = dataset.files.root
-    found = [path.relative_to(root).as_posix() for path in DatasetFolder(root).shard_files()]
-    return [name for name in found if name not in listed]
+    names = [path.relative_to(root).as_posix() for path in DatasetFolder(root).shard_files()]
+    return [name for name in names if name not in listed]
 
 
 def _by_uid(lock: bytes) -> dict[str, LockedObject]:
@@ -186,9 +188,9 @@ def _check_manifest(dataset: Dataset) -> Iterator[str]:
         if count > 1:
             yield f"{name}: {shard} is listed {count} times"
     for document, sha256 in listed.documents.items():
-        if (found := dataset.files.read(document)) is None:
+        if (content := dataset.files.read(document)) is None:
             yield f"{document}: missing"
-        elif sha256_hex(found) != sha256:
+        elif sha256_hex(content) != sha256:
             yield f"{document}: sha256 differs from the manifest"
 
 
@@ -200,34 +202,34 @@ def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Ite
 
 def _check_shard(
     dataset: Dataset, shard: ShardEntry, locked: Mapping[str, LockedObject] | None, *, fast: bool
-) -> _Found:
-    found = _Found()
+) -> _ShardFindings:
+    findings = _ShardFindings()
     try:
         num_bytes = dataset.files.num_bytes(shard)
         if num_bytes not in (None, shard.num_bytes):
-            found.faults.append(f"{num_bytes} bytes; expected {shard.num_bytes}")
-        if found.faults or (fast and isinstance(dataset.files, RemoteDatasetFiles)):
-            found.unread += ["its server states no size"] * (num_bytes is None)
-            return found
-        with _opened(dataset, shard) as stream:
+            findings.faults.append(f"{num_bytes} bytes; expected {shard.num_bytes}")
+        if findings.faults or (fast and isinstance(dataset.files, RemoteDatasetFiles)):
+            findings.unread += ["its server states no size"] * (num_bytes is None)
+            return findings
+        with _open_shard(dataset, shard) as stream:
             if fast:
-                _check_members(stream, shard, found)
+                _check_members(stream, shard, findings)
             else:
-                _check_content(stream, shard, dataset.manifest, locked, found)
+                _check_content(stream, shard, dataset.manifest, locked, findings)
     except EnvironmentFailure:
         raise
     except ShardMissing:
-        found.faults.append("missing")
+        findings.faults.append("missing")
     except Unreadable as error:
-        found.unread.append(str(error))
+        findings.unread.append(str(error))
     except TransferFailed as error:
-        found.unread.append(f"cannot be read ({error.message})")
+        findings.unread.append(f"cannot be read ({error.message})")
     except TrilightError as error:
-        found.faults.append(str(error))
-    return found
+        findings.faults.append(str(error))
+    return findings
 
 
-def _opened(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
+def _open_shard(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
     if isinstance(dataset.files, LocalFiles):
         return dataset.files.open(shard, checked=False)
     stream: BinaryIO = TemporaryFile()
@@ -240,10 +242,10 @@ def _opened(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
     return stream
 
 
-def _check_members(stream: BinaryIO, shard: ShardEntry, found: _Found) -> None:
-    found.keys += contents_of(stream, shard.name).samples
-    if len(found.keys) != shard.num_samples:
-        found.faults.append(f"{len(found.keys)} samples; expected {shard.num_samples}")
+def _check_members(stream: BinaryIO, shard: ShardEntry, findings: _ShardFindings) -> None:
+    findings.keys += contents_of(stream, shard.name).samples
+    if len(findings.keys) != shard.num_samples:
+        findings.faults.append(f"{len(findings.keys)} samples; expected {shard.num_samples}")
 
 
 def _check_content(
@@ -251,21 +253,22 @@ def _check_content(
     shard: ShardEntry,
     manifest: Manifest,
     locked: Mapping[str, LockedObject] | None,
-    found: _Found,
+    findings: _ShardFindings,
 ) -> None:
     if index_stream(stream, shard.name) != shard:
-        found.faults.append("sha256 or number of samples differs from the manifest")
-    unused, held = set(contents_of(stream, shard.name).maps), HeldMaps()
+        findings.faults.append("sha256 or number of samples differs from the manifest")
+    unused = set(contents_of(stream, shard.name).maps)
+    held = HeldMaps()
     for key, members in samples_of(stream, shard.name):
-        found.keys.append(key)
+        findings.keys.append(key)
         unused -= members.keys()
         try:
             sample = decode_sample(key, members, held)
         except TrilightError as error:
-            found.faults.append(str(error))
+            findings.faults.append(str(error))
             continue
-        found.faults += check_sample(sample, shard.split, manifest, locked)
-    found.faults += [f"map {name} is used by no sample" for name in sorted(unused)]
+        findings.faults += check_sample(sample, shard.split, manifest, locked)
+    findings.faults += [f"map {name} is used by no sample" for name in sorted(unused)]
 
 
 def check_sample(
@@ -284,7 +287,7 @@ def check_sample(
         yield f"sample {sample.key}: pictures {sample.radiance_rgb.shape}; expected {expected}"
     if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
         yield f"sample {sample.key}: a picture holds a value that is not finite or negative"
-    yield from _check_lights(sample, apart=bool(renders.get("per_light")))
+    yield from _check_lights(sample, per_light=bool(renders.get("per_light")))
     bounces, lobes = (bool(renders.get(name)) for name in ("split", "split_lobes"))
     yield from _check_parts(sample, part_names(bounces=bounces, lobes=lobes))
     yield from _check_passes(sample, manifest.passes)
@@ -301,11 +304,11 @@ def check_sample(
             yield f"sample {sample.key}: object {uid!r} belongs to split {lock.split}"
 
 
-def _check_lights(sample: Sample, *, apart: bool) -> Iterator[str]:
+def _check_lights(sample: Sample, *, per_light: bool) -> Iterator[str]:
     """Yield the faults of the pictures of single lights; older manifests know no such setting."""
-    if (sample.lights_rgb is not None) != apart:
-        found = "lacks" if apart else "has"
-        yield f"sample {sample.key}: {found} pictures by light; renders.per_light is {apart}"
+    if (sample.lights_rgb is not None) != per_light:
+        verb = "lacks" if per_light else "has"
+        yield f"sample {sample.key}: {verb} pictures by light; renders.per_light is {per_light}"
     if sample.lights_rgb is None:
         return
     for view, lights in enumerate(sample.lights_rgb):
@@ -320,18 +323,24 @@ def _check_parts(sample: Sample, names: tuple[str, ...]) -> Iterator[str]:
     stored = tuple(sample.parts_rgb or ())
     floors = {tuple(view.parts or ()) for view in sample.views}
     if stored != names or floors != {names}:
-        found, wanted = ", ".join(stored) or "none", ", ".join(names) or "none"
-        yield f"sample {sample.key}: parts are {found}; the settings and every view expect {wanted}"
+        stored_text = ", ".join(stored) or "none"
+        expected_text = ", ".join(names) or "none"
+        yield (
+            f"sample {sample.key}: parts are {stored_text}; the settings and every view expect "
+            f"{expected_text}"
+        )
         return
     if sample.parts_rgb is None:
         return
-    apart = sample.lights_rgb
-    differs = sum_of_parts(sample.parts_rgb) != (sample.radiance_rgb if apart is None else apart)
-    of_what = "picture" if apart is None else "light"
+    lights_rgb = sample.lights_rgb
+    differs = sum_of_parts(sample.parts_rgb) != (
+        sample.radiance_rgb if lights_rgb is None else lights_rgb
+    )
+    of_what = "picture" if lights_rgb is None else "light"
     for view, wrong in enumerate(differs):
         yield from _differing(
             f"sample {sample.key}: view {view} has a {of_what} that is not the sum of its parts",
-            wrong.any(axis=0) if apart is not None else wrong,
+            wrong.any(axis=0) if lights_rgb is not None else wrong,
         )
 
 
@@ -353,24 +362,24 @@ def _check_passes(sample: Sample, names: Sequence[str]) -> Iterator[str]:
     resolution = sample.radiance_rgb.shape[2]
     for view, packed in enumerate(sample.passes_exr):
         try:
-            found = decode_passes_exr(packed, resolution)
-            expected = picture_passes(sample.scene, [*found], view=view, resolution=resolution)
+            stored = decode_passes_exr(packed, resolution)
+            expected = picture_passes(sample.scene, [*stored], view=view, resolution=resolution)
         except TrilightError as error:
             yield f"sample {sample.key}: view {view}: {error}"
             continue
-        if set(found) != (wanted := set(passes_in_file(sample.scene, names))):
+        if set(stored) != (expected_names := set(passes_in_file(sample.scene, names))):
             yield (
-                f"sample {sample.key}: view {view} has the passes {', '.join(sorted(found))}; "
-                f"expected {', '.join(sorted(wanted))}"
+                f"sample {sample.key}: view {view} has the passes {', '.join(sorted(stored))}; "
+                f"expected {', '.join(sorted(expected_names))}"
             )
-        for name, picture in found.items():
-            if (share := _share_that_differs(picture, expected[name])) > MOST_DIFFERENT:
+        for name, picture in stored.items():
+            if (share := _fraction_that_differs(picture, expected[name])) > MOST_DIFFERENT:
                 yield (
                     f"sample {sample.key}: view {view}: pass {name} is not what the scene says in "
                     f"{share:.1%} of the pixels"
                 )
 
 
-def _share_that_differs(found: NDArray, expected: NDArray) -> float:
-    same = np.isclose(found, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
+def _fraction_that_differs(stored: NDArray, expected: NDArray) -> float:
+    same = np.isclose(stored, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
     return 1 - float(np.mean(same if same.ndim == 2 else same.all(axis=-1)))

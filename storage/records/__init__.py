@@ -1,1 +1,1 @@
-"""What is on disk, one record a file: scenes, materials, samples, assets, objects, pictures."""
+"""Records on disk, one a file: scenes, materials, samples, assets, objects, pictures."""

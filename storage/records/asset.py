@@ -40,7 +40,7 @@ from storage.records.skin import (
 
 @dataclass(frozen=True, kw_only=True)
 class SourceFacts:
-    """What was found in the source file, and what cleaning did to it."""
+    """Measures of the source file, and the effects of cleaning."""
 
     num_faces_read: int
     """Triangles as the file has them, instances counted."""
@@ -49,7 +49,7 @@ class SourceFacts:
     num_faces_turned: int
     """Triangles whose winding was reversed to face outward."""
     num_parts: int
-    """Connected pieces."""
+    """Number of connected mesh components."""
     open_edges: int
     """Edges with one face; 0 for a surface without border."""
     nonmanifold_edges: int
@@ -59,18 +59,18 @@ class SourceFacts:
 
     @property
     def watertight(self) -> bool:
-        """Whether every edge has exactly two faces."""
+        """True: every edge has exactly two faces."""
         return self.open_edges == 0 and self.nonmanifold_edges == 0
 
     @property
     def repaired(self) -> bool:
-        """Whether triangles had to be dropped or turned around."""
+        """True: triangles were dropped or flipped."""
         return self.num_faces < self.num_faces_read or self.num_faces_turned > 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class LevelQuality:
-    """How a level compares with the cleaned source, and how good its triangles are.
+    """Distances of a level from the cleaned source, and the quality of its triangles.
 
     Distances are shares of the diagonal of the source's bounding box, and the larger of the two
     directions.
@@ -95,19 +95,18 @@ class LevelQuality:
     min_angle_p5_deg: float
     """5th percentile of the triangles' smallest angles."""
     open_edges: int
-    """Edges with one face."""
+    """Number of edges with only one face."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LevelRecord:
-    """How one level was made, and how far it is from the source."""
+    """Method of one level, and its distance from the source."""
 
     budget: int
     """The most triangles that the level was allowed."""
     method: str
     """`source` (within budget as it was), or the name of the decimation."""
     quality: LevelQuality
-    """Its measures."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,13 +114,12 @@ class Level:
     """One mesh of an asset."""
 
     record: LevelRecord
-    """How it was made."""
     positions: NDArray[np.float32]
     """[V, 3] in the unit box."""
     faces: NDArray[np.uint32]
     """[F, 3], counter-clockwise from outside where the source has an outside."""
     skin: LevelSkin | None = None
-    """Its look in the source's own materials; None where they are not kept."""
+    """Textures of the source's materials; None where they are not kept."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -135,11 +133,10 @@ class Asset:
     recipe: str
     """Name and version of the recipe and of the libraries that made it."""
     source: SourceFacts
-    """What the file held."""
     levels: tuple[Level, ...]
-    """From the largest budget to the smallest."""
+    """Levels of detail, the largest triangle budget first."""
     materials: OwnMaterials | None = None
-    """What became of the source's own materials; None where nobody asked for them."""
+    """Result of reading the source's materials; None where they were not requested."""
 
 
 def encode_asset(asset: Asset) -> bytes:
@@ -180,7 +177,7 @@ def decode_asset(data: bytes) -> Asset:
         raise TrilightError(
             f"asset: a safetensors file with arrays {', '.join(arrays) or 'none'} does not hold "
             f"one ({type(error).__name__}: {error}); expected a file of the asset store. Delete "
-            "it, and it is made anew."
+            "it, and it is made again."
         ) from error
 
 
@@ -199,7 +196,7 @@ def least_triangles_in(path: Path) -> int:
     except (OSError, LookupError, TypeError, ValueError, RecursionError) as error:
         raise TrilightError(
             f"{path}: is no asset ({error}); expected a file of the asset store. Delete it, and it "
-            "is made anew."
+            "is made again."
         ) from error
 
 
@@ -235,17 +232,15 @@ class AssetRow(NamedObject):
     """An accepted object."""
 
     path: str
-    """Its mesh, below the folder."""
+    """Path of the mesh, relative to the folder."""
     num_faces: int
-    """Triangles of the mesh."""
     method: str
     """How it was made; `source` where nothing had to be left out."""
     quality: LevelQuality
     """How it compares with the source."""
     source: SourceFacts
-    """What the file held."""
     materials: OwnMaterials | None = None
-    """What became of its own materials; None where nobody asked for them."""
+    """Result of reading the source's materials; None where they were not requested."""
     colours: SkinQuality | None = None
     """How the colours of the mesh compare with the source's; None where it has none of its own."""
 

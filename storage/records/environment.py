@@ -20,7 +20,7 @@ ROTATION_TOLERANCE = 1e-4
 """How far a float32 rotation may be from orthonormal, as that of a camera."""
 
 
-def _unturned() -> NDArray[np.float32]:
+def _identity_rotation() -> NDArray[np.float32]:
     return np.eye(3, dtype=np.float32)
 
 
@@ -30,12 +30,12 @@ class Environment:
 
     radiance_rgb: NDArray[np.float32]
     """[H, 2H, 3] linear radiance; row 0 is the top (+Z of the map)."""
-    rotation: NDArray[np.float32] = field(default_factory=_unturned)
+    rotation: NDArray[np.float32] = field(default_factory=_identity_rotation)
     """[3, 3] from the axes of the map to those of the world."""
     is_seen: bool = False
-    """Whether cameras see it; it lights the scene in any case."""
+    """True: cameras see the map. It lights the scene in any case."""
     source: MapSource = field(default_factory=MapSource)
-    """What the map is called, and whose it is."""
+    """Name, URL and rights of the map."""
 
     @cached_property
     def sha256(self) -> str:
@@ -49,7 +49,8 @@ class Environment:
 
     def check(self) -> None:
         """Raise TrilightError at the first broken law."""
-        radiance, name = self.radiance_rgb, "environment.radiance_rgb"
+        radiance = self.radiance_rgb
+        name = "environment.radiance_rgb"
         if radiance.dtype != np.float32:
             broken_law(f"{name} has dtype {radiance.dtype}", "float32")
         if radiance.ndim != 3 or radiance.shape[1:] != (2 * radiance.shape[0], 3):
@@ -64,9 +65,9 @@ class Environment:
             broken_law(
                 f"environment.rotation is {rotation.dtype} {rotation.shape}", "float32 (3, 3)"
             )
-        turn = rotation.astype(np.float64)
-        apart = abs(turn @ turn.T - np.eye(3)).max()
-        if not (apart <= ROTATION_TOLERANCE and np.linalg.det(turn) > 0):
+        rotation64 = rotation.astype(np.float64)
+        deviation = abs(rotation64 @ rotation64.T - np.eye(3)).max()
+        if not (deviation <= ROTATION_TOLERANCE and np.linalg.det(rotation64) > 0):
             broken_law(
                 f"environment.rotation is {rotation.tolist()}",
                 "an orthonormal rotation without mirroring",

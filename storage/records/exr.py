@@ -29,7 +29,7 @@ at 4 bytes a value."""
 
 @dataclass(frozen=True, kw_only=True)
 class ExrCodec:
-    """How an OpenEXR file is packed."""
+    """Compression and number type of an OpenEXR file."""
 
     compression: str
     """OpenEXR's name, such as ZIP or DWAB; of what the library offers, this is all that can be
@@ -164,10 +164,10 @@ def decode_exr(data: bytes) -> NDArray[np.float32]:
         TrilightError: not an EXR file, truncated, larger than MAX_RESOLUTION, or with other
             channels than R, G and B.
     """
-    return unpacked(decode_stored(data))
+    return to_float32(decode_stored(data))
 
 
-def unpacked(stored: Stored) -> NDArray[np.float32]:
+def to_float32(stored: Stored) -> NDArray[np.float32]:
     """Return the numbers of pictures that may be bits of half floats, of any shape."""
     if stored.dtype == np.float32:
         return np.asarray(stored, np.float32)
@@ -177,7 +177,7 @@ def unpacked(stored: Stored) -> NDArray[np.float32]:
 def decode_stored(data: bytes) -> Stored:
     """Return the picture [H, W, 3] of `decode_exr` as the file holds it.
 
-    Whoever wants a function of half floats, such as their logarithm, may look it up by their bits.
+    A function of half floats, such as their logarithm, can be looked up by these bits.
 
     Raises:
         TrilightError: as `decode_exr`.
@@ -241,7 +241,9 @@ def find_header_end(data: bytes) -> int:
         TrilightError: they have more attributes, channels or bytes than are read.
     """
     is_many = int.from_bytes(data[4:8], "little") & MANY_PARTS
-    at, attributes, channel_bytes = 8, 0, 0
+    at = 8
+    attributes = 0
+    channel_bytes = 0
     while data.startswith(MAGIC):
         while data[at : at + 1] not in (b"", b"\0"):  # name, type, size, value
             kind = data.find(0, at) + 1
@@ -279,15 +281,18 @@ def _readable() -> Iterator[None]:
 
 def window_size(header: Header) -> tuple[int, int]:
     """Return height and width of the data window of a header."""
-    (left, top), (right, bottom) = np.asarray(header["dataWindow"]).tolist()
-    return bottom - top + 1, right - left + 1
+    (x_min, y_min), (x_max, y_max) = np.asarray(header["dataWindow"]).tolist()
+    return y_max - y_min + 1, x_max - x_min + 1
 
 
 def _check_pixels(header: Header, names: Collection[str]) -> None:
     """Refuse pixels that are not expected, or that take too much memory."""
-    found, wanted = sorted(channel.name for channel in header["channels"]), sorted(names)
-    if found != wanted:
-        raise TrilightError(f"picture: channels are {_listed(found)}; expected {_listed(wanted)}.")
+    stored = sorted(channel.name for channel in header["channels"])
+    expected = sorted(names)
+    if stored != expected:
+        raise TrilightError(
+            f"picture: channels are {_list_names(stored)}; expected {_list_names(expected)}."
+        )
     if header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
         raise TrilightError(f"picture: its storage is {header['type']}; expected lines or tiles.")
     size = window_size(header)
@@ -296,15 +301,15 @@ def _check_pixels(header: Header, names: Collection[str]) -> None:
             f"picture: the data window spans {list(size)} pixels; expected at most "
             f"{MAX_RESOLUTION} each way."
         )
-    most_bytes = 4 * len(found) * math.prod(size)
+    most_bytes = 4 * len(stored) * math.prod(size)
     if most_bytes > _MAX_BYTES:
         raise TrilightError(
-            f"picture: {len(found)} channels of {list(size)} pixels may take {most_bytes} bytes; "
+            f"picture: {len(stored)} channels of {list(size)} pixels may take {most_bytes} bytes; "
             f"expected at most {_MAX_BYTES}."
         )
 
 
-def _listed(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     if len(names) <= _MOST_LISTED:
         return ", ".join(names) or "none"
     return f"{', '.join(names[:_MOST_LISTED])} and {len(names) - _MOST_LISTED} more"

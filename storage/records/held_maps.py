@@ -1,6 +1,6 @@
 """`HeldMaps`: maps that were unpacked and checked, for the next sample that uses them.
 
-They go by the very bytes that they were unpacked from, so that whoever asks again gets what
+They go by the very bytes that they were unpacked from, so that the next call returns what
 unpacking would give, in any order of samples and of shards: bytes that are refused once are refused
 again. Arrays may not be written to, since several samples share them.
 """
@@ -40,7 +40,9 @@ class HeldMaps:
         self.num_bytes = 0
         """Of the arrays that are held."""
 
-    def found(self, kind: type[Map], sha256: str, packed: bytes, unpack: Callable[[], Map]) -> Map:
+    def get_or_unpack(
+        self, kind: type[Map], sha256: str, packed: bytes, unpack: Callable[[], Map]
+    ) -> Map:
         """Return the map of some bytes: the held one, or what `unpack` returns, then held.
 
         Two threads that miss the same map both unpack it.

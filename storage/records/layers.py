@@ -32,7 +32,7 @@ def encode_picture(
     layers_rgb: Mapping[str, NDArray[np.float32]],
     attributes: Attributes,
 ) -> bytes:
-    """Return the OpenEXR file of a picture [R, R, 3], with layers beside it.
+    """Return the OpenEXR file of a picture [R, R, 3] and of its layers.
 
     Raises:
         TrilightError: as `storage.records.exr.encode_exr`.
@@ -44,7 +44,7 @@ def encode_picture(
 
 
 def decode_picture(data: bytes, layers: Collection[str]) -> NDArray[np.float32]:
-    """Return the picture [H, W, 3] of a file, without the layers of these names beside it.
+    """Return the picture [H, W, 3] of a file, without its layers of these names.
 
     Raises:
         TrilightError: as `storage.records.exr.decode_exr`.
@@ -52,8 +52,8 @@ def decode_picture(data: bytes, layers: Collection[str]) -> NDArray[np.float32]:
     if not layers:
         return decode_exr(data)
     names = ["R", "G", "B", *(f"{layer}.{channel}" for layer in layers for channel in "RGB")]
-    found = decode_channels(data, names, lambda header: None, separate=True)
-    return np.stack([found[channel] for channel in "RGB"], axis=-1).astype(np.float32)
+    by_channel = decode_channels(data, names, lambda header: None, separate=True)
+    return np.stack([by_channel[channel] for channel in "RGB"], axis=-1).astype(np.float32)
 
 
 def _channels(
@@ -84,11 +84,11 @@ def decode_layers(
 
     def check(header: Header) -> None:
         if window_size(header) != size:
-            found = list(window_size(header))
-            raise TrilightError(f"{what}: {found} pixels; expected {list(size)}.")
+            stored_size = list(window_size(header))
+            raise TrilightError(f"{what}: {stored_size} pixels; expected {list(size)}.")
 
-    found = decode_channels(data, channels, check, separate=True)
-    if any(channel.shape != size for channel in found.values()):
+    by_channel = decode_channels(data, channels, check, separate=True)
+    if any(channel.shape != size for channel in by_channel.values()):
         raise TrilightError(f"{what}: a channel has other pixels than {list(size)}; expected none.")
-    planes = np.stack([np.asarray(found[name], np.float32) for name in channels])
+    planes = np.stack([np.asarray(by_channel[name], np.float32) for name in channels])
     return np.moveaxis(planes.reshape(len(names), 3, *size), 1, -1).copy()

@@ -25,9 +25,9 @@ class Lobes:
     """Materials of T triangles, ready for a renderer."""
 
     diffuse: NDArray[np.float64]
-    """[T, 3] diffuse albedo."""
+    """Diffuse albedo of each triangle [T, 3]."""
     specular: NDArray[np.float64]
-    """[T, 3] specular albedo."""
+    """Specular albedo of each triangle [T, 3]."""
     alpha: NDArray[np.float64]
     """[T] GGX width, at least MIN_ALPHA."""
     weight: NDArray[np.float64]
@@ -37,8 +37,10 @@ class Lobes:
 def lobes_of(materials: NDArray[np.float32]) -> Lobes:
     """Return the lobes of material rows [T, 10 or more]; other columns are not read."""
     rows = materials.astype(np.float64)
-    diffuse, specular = rows[:, DIFFUSE], rows[:, SPECULAR]
-    d, s = diffuse.max(axis=1), specular.max(axis=1)
+    diffuse = rows[:, DIFFUSE]
+    specular = rows[:, SPECULAR]
+    d = diffuse.max(axis=1)
+    s = specular.max(axis=1)
     weight = np.divide(s, s + d, out=np.zeros_like(s), where=s + d > 0)
     alpha = np.maximum(alpha_ggx(rows[:, ROUGHNESS]), MIN_ALPHA)
     return Lobes(diffuse=diffuse, specular=specular, alpha=alpha, weight=weight)

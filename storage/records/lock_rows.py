@@ -37,7 +37,8 @@ class LockRows:
 
     def find(self, uid: str) -> LockedObject | None:
         """Return the row of a uid, or None: rows are sorted, so about 20 of a million are read."""
-        low, high = 0, self.num_bytes
+        low = 0
+        high = self.num_bytes
         while low < high:
             start = self._start_of_row((low + high) // 2, low)
             self._stream.seek(start)
@@ -69,7 +70,8 @@ class LockRows:
             cut = self._stream.read(position - start).rfind(b"\n")
             if cut >= 0:
                 return start + cut + 1
-            step, position = 2 * step, start
+            step = 2 * step
+            position = start
         return low
 
     def _row(self, line: bytes, offset: int) -> LockedObject:

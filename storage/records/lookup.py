@@ -1,4 +1,4 @@
-"""What textures and environment maps say at a place: the definition that kernels are tested by.
+"""Values of textures and environment maps at a point: the definition that kernels are tested by.
 
 Both are interpolated bilinearly between the centres of their texels, in double precision. Textures
 repeat along u and v; maps go round along u, and at the poles their last rows stand.
@@ -25,7 +25,9 @@ def texture_values(texture: Texture, uv: ArrayLike) -> NDArray[np.float64]:
     """Return the linear values [..., C] of a texture at finite coordinates [..., 2]."""
     height, width = texture.texels.shape[:2]
     u, v = np.moveaxis(np.asarray(uv, np.float64), -1, 0)
-    u, v = u - np.floor(u), v - np.floor(v)  # first, so that far coordinates lose no digits
+    # first, so that far coordinates lose no digits
+    u = u - np.floor(u)
+    v = v - np.floor(v)
 
     def texels(row: NDArray[np.int64], column: NDArray[np.int64]) -> NDArray:
         return texture.linear(texture.texels[row % height, column % width])
@@ -70,8 +72,10 @@ def _bilinear(
     texels: Texels, x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return values at x and y, counted in texels from the centre of the first."""
-    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    along, across = (x - column)[..., None], (y - row)[..., None]
+    column = np.floor(x).astype(np.int64)
+    row = np.floor(y).astype(np.int64)
+    along = (x - column)[..., None]
+    across = (y - row)[..., None]
     low = (1 - along) * texels(row, column) + along * texels(row, column + 1)
     high = (1 - along) * texels(row + 1, column) + along * texels(row + 1, column + 1)
     values: NDArray[np.float64] = (1 - across) * low + across * high

@@ -12,7 +12,7 @@ from storage.records.texture import CONSTANT, TEXTURED
 
 @dataclass(frozen=True, kw_only=True)
 class SkyFacts:
-    """How bright an environment map is, and how much of its light comes from one place."""
+    """Brightness of an environment map, and how concentrated its light is."""
 
     mean_radiance: float
     """Over the sphere and the three channels."""
@@ -34,7 +34,8 @@ def sky_facts(sky: Environment) -> SkyFacts:
     if not total > 0:
         return SkyFacts(mean_radiance=0.0, peak=0.0, half_light_deg=0.0)
     order = np.argsort(-grey, axis=None, kind="stable")
-    reached, solid = np.cumsum(light[order]), np.cumsum(angle[order])
+    reached = np.cumsum(light[order])
+    solid = np.cumsum(angle[order])
     half = np.interp(total / 2, np.append(0.0, reached), np.append(0.0, solid))
     return SkyFacts(
         mean_radiance=total / (4 * np.pi),

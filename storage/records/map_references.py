@@ -1,4 +1,4 @@
-"""How a scene's record names the textures and maps that it uses: by their content.
+"""References of a scene's record to its textures and maps, by their content.
 
 The record has one entry `maps`: the sha256 of each, with its name and rights, and how the
 environment is turned. Bytes are elsewhere (storage.records.packed_maps).
@@ -54,7 +54,7 @@ def maps_digest(record: Mapping[str, Any]) -> NDArray[np.uint8]:
 
     It stands among the arrays of the scene, whose digest so covers what its surfaces look like.
     """
-    kept = {
+    identity = {
         "textures": [entry["sha256"] for entry in record.get("textures", ())],
         "environment": {
             name: value
@@ -62,7 +62,7 @@ def maps_digest(record: Mapping[str, Any]) -> NDArray[np.uint8]:
             if name not in _SOURCE_FIELDS
         },
     }
-    return np.frombuffer(bytes.fromhex(sha256_hex(canonical_json(kept))), np.uint8)
+    return np.frombuffer(bytes.fromhex(sha256_hex(canonical_json(identity))), np.uint8)
 
 
 def referenced_maps(record: Any) -> list[str]:
@@ -133,7 +133,8 @@ def environment_entries(maps: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
         return ()
     entry = maps["environment"]
     _check_entry(entry, "maps.environment", ("rotation", "is_seen"))
-    rotation, is_seen = entry["rotation"], entry["is_seen"]
+    rotation = entry["rotation"]
+    is_seen = entry["is_seen"]
     if type(is_seen) is not bool:
         wrong_map("maps.environment.is_seen", is_seen, "true or false")
     rows = rotation if isinstance(rotation, list) else []
@@ -146,9 +147,9 @@ def environment_entries(maps: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
 
 
 def _check_entry(entry: Any, name: str, more: Sequence[str]) -> None:
-    wanted = {"sha256", *_SOURCE_FIELDS, *more}
-    if not isinstance(entry, Mapping) or set(entry) != wanted:
-        wrong_map(name, entry, f"exactly the fields {', '.join(sorted(wanted))}")
+    fields = {"sha256", *_SOURCE_FIELDS, *more}
+    if not isinstance(entry, Mapping) or set(entry) != fields:
+        wrong_map(name, entry, f"exactly the fields {', '.join(sorted(fields))}")
     for field in ("sha256", *_SOURCE_FIELDS):
         if not isinstance(entry[field], str):
             wrong_map(f"{name}.{field}", entry[field], "text")

@@ -36,19 +36,19 @@ class MaterialColumn:
     name: str
     """Lower case letters, digits and underscores; files and networks name the column so."""
     means: str
-    """One sentence for people."""
+    """One sentence that documents the column."""
     width: int
-    """How many numbers the column has."""
+    """Number of values a material has in it."""
     within: Within
     """Range of each number; both ends are finite."""
     default: float = 0.0
-    """What each number is where nothing is said of it."""
+    """Value of every number where a material states none."""
     is_colour: bool = False
-    """Whether the numbers belong to red, green and blue: permuting the channels permutes them."""
+    """True: the numbers are red, green and blue, and permuting the channels permutes them."""
     is_radiance: bool = False
-    """Whether the numbers are radiance: scaling the light of a scene scales them."""
+    """True: the numbers are radiance, and scaling the light of a scene scales them."""
     is_log_encoded: bool = False
-    """Whether networks read log10(1 + x) instead of x."""
+    """True: networks read log10(1 + x) instead of x."""
     draw: Callable[[np.random.Generator, int], NDArray] | None = field(default=None, compare=False)
     """Returns random values [M, width] for the M materials of a composed scene that do not emit;
     None: composed scenes hold the default."""
@@ -223,8 +223,10 @@ def _names_of(stated: str) -> tuple[str, ...]:
             f"scene: its material columns are {stated!r:.80}; expected names and widths."
         ) from error
     for name, width in pairs:
-        if (here := declared_column(name).width) != width:
-            _wrong(name, f"a width of {width} in the file", f"{here}, as it is declared here")
+        if (declared_width := declared_column(name).width) != width:
+            _wrong(
+                name, f"a width of {width} in the file", f"{declared_width}, as it is declared here"
+            )
     names = tuple(name for name, _ in pairs)
     if len(set(names)) != len(names):
         raise TrilightError(f"scene: its material columns are {stated:.80}; expected each once.")

@@ -41,13 +41,12 @@ class IndexedObject:
     """An object of a lock, as it is indexed."""
 
     locked: LockedObject
-    """Its row."""
     offset: int
     """Byte of the lock at which the row begins."""
     asset_name: str
     """32 hexadecimal digits, by which the asset store knows the prepared file."""
     least_triangles: int
-    """Of its coarsest level."""
+    """Triangles of the coarsest level of detail."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +54,6 @@ class CampSizes:
     """The objects of one share-alike camp, or of none."""
 
     count: int
-    """How many."""
     least: int
     """Triangles of the coarsest level of the simplest one."""
     most: int
@@ -67,21 +65,21 @@ class SplitRows:
     """The rows of one split."""
 
     start: int
-    """Of the first one in the index."""
+    """Index of the first row."""
     stop: int
-    """Behind the last one."""
+    """Index after the last row."""
     camps: Mapping[str, CampSizes]
     """Sizes by camp; "" is that of objects without one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class IndexFacts:
-    """What an index is of."""
+    """Identity and contents of an index of objects."""
 
     lock_sha256: str
-    """Digest of the lock."""
+    """Hexadecimal digest of the lock's bytes."""
     lock_bytes: int
-    """Its size."""
+    """Size of the lock in bytes."""
     asked: str
     """Digest of what the source was asked for: another source is looked at again."""
     num_found: int
@@ -91,11 +89,11 @@ class IndexFacts:
     camps: tuple[str, ...]
     """Camps by their number in the column."""
     splits: Mapping[str, SplitRows]
-    """Rows by split."""
+    """Range of index rows of each split."""
 
     @property
     def num_objects(self) -> int:
-        """How many objects are frozen."""
+        """Number of frozen objects."""
         return sum(rows.stop - rows.start for rows in self.splits.values())
 
 
@@ -105,7 +103,7 @@ def write_object_index(
     *,
     lock_sha256: str,
     lock_bytes: int,
-    asked: str,
+    request_digest: str,
     num_found: int,
     num_maps: int = 0,
 ) -> IndexFacts:
@@ -128,7 +126,7 @@ def write_object_index(
     facts = IndexFacts(
         lock_sha256=lock_sha256,
         lock_bytes=lock_bytes,
-        asked=asked,
+        asked=request_digest,
         num_found=num_found,
         num_maps=num_maps,
         camps=tuple(camps),
@@ -145,7 +143,8 @@ def _split_rows(
     camp: NDArray[Any],
     camps: Sequence[str],
 ) -> dict[str, SplitRows]:
-    splits, start = {}, 0
+    splits = {}
+    start = 0
     for split, group in groupby(rows, key=attrgetter("locked.split")):
         stop = start + sum(1 for _ in group)
         sizes = {
@@ -178,12 +177,12 @@ class StoredColumn:
         start, stop, step = rows.indices(self._count)
         assert step == 1
         descriptor, dtype, position = self._place
-        wanted = max(0, stop - start) * dtype.itemsize
-        data = os.pread(descriptor, wanted, position + start * dtype.itemsize)
-        if len(data) != wanted:
+        num_bytes = max(0, stop - start) * dtype.itemsize
+        data = os.pread(descriptor, num_bytes, position + start * dtype.itemsize)
+        if len(data) != num_bytes:
             raise TrilightError(
                 f"objects.index: ends before row {stop}; expected it whole. Delete it, and it is "
-                "made anew."
+                "made again."
             )
         return np.frombuffer(data, dtype)
 
@@ -212,7 +211,7 @@ class ObjectIndex:
             }
         except (OSError, LookupError, TypeError, ValueError, RecursionError) as error:
             raise TrilightError(
-                f"{path}: is no index of objects ({error}); delete it, and it is made anew."
+                f"{path}: is no index of objects ({error}); delete it, and it is made again."
             ) from error
         self._data = 8 + int.from_bytes(head[:8], "little")
 

@@ -20,18 +20,18 @@ from storage.typed_json import read_json_lines
 
 @dataclass(frozen=True, kw_only=True)
 class NamedObject:
-    """What every row about an object says: which one it is, and the rights to it."""
+    """Identity and rights of an object, which every row about it states."""
 
     uid: str
     """Unique in its source, and stable: it names the object in every later record."""
     title: str
-    """For people."""
+    """Name as documents and pages show it."""
     licence: str
-    """SPDX identifier, or `LicenseRef-...`."""
+    """SPDX identifier of the license, or `LicenseRef-...`."""
     licence_source: str
     """Where the licence is stated, and as of when; for the record of rights."""
     attribution: str
-    """Whom to name, as the source states it."""
+    """Author to credit, as the source states it."""
     source_url: str
     """Where the object came from."""
 
@@ -46,7 +46,9 @@ class ObjectRecord(NamedObject):
     """Folder in which its pictures may lie anywhere; its own one where empty. Never published."""
 
 
-OBJECT, TEXTURE, SKY = "object", "texture", "sky"
+OBJECT = "object"
+TEXTURE = "texture"
+SKY = "sky"
 """Kinds of rows of a lock: objects, and what users bring for surfaces and for light."""
 
 
@@ -76,9 +78,11 @@ def locked_uids(objects: Iterable[tuple[str, str]], provenance: Mapping[str, Any
         provenance: of the scene, perhaps from outside; what `maps` says counts where it is text.
     """
     maps = provenance.get("maps", ())
-    own = [uid for uid in maps if isinstance(uid, str)] if isinstance(maps, list | tuple) else []
+    map_uids = (
+        [uid for uid in maps if isinstance(uid, str)] if isinstance(maps, list | tuple) else []
+    )
     parts = (uid for kind, uid in objects if kind == OBJECT or (kind == EMITTER and uid))
-    return sorted({*parts, *own})
+    return sorted({*parts, *map_uids})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,11 +94,11 @@ class Failure:
     item: str
     """uid of the object or key of the scene (with `.view` where a view was rejected)."""
     reason: str
-    """Stable code in snake_case."""
+    """Stable reason code in snake_case."""
     message: str
     """One sentence for a person."""
     attempt: int = 0
-    """Which attempt at the item this was, from 0."""
+    """Number of the attempt at the item, from 0."""
 
 
 def encode_objects_lock(objects: Iterable[LockedObject]) -> bytes:

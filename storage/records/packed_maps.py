@@ -35,7 +35,9 @@ from storage.records.texture import MAX_MAPS_BYTES, Texture
 
 _ARRAY = "values"
 _FORM = "form"
-_SRGB, _LINEAR, _ENVIRONMENT = "srgb", "linear", "environment"
+_SRGB = "srgb"
+_LINEAR = "linear"
+_ENVIRONMENT = "environment"
 _DTYPES = {"U8": np.uint8, "F16": np.float16, "F32": np.float32}
 _MOST_HEADER = 1 << 10
 _GZIP = 31
@@ -51,26 +53,26 @@ def packed_maps(scene: Scene) -> dict[str, bytes]:
 
 def pack_texture(texture: Texture) -> bytes:
     """Return the bytes of a texture."""
-    return _packed(stored_values(texture.texels), _SRGB if texture.is_srgb else _LINEAR)
+    return _pack(stored_values(texture.texels), _SRGB if texture.is_srgb else _LINEAR)
 
 
-def unpacked_texture(data: bytes, name: str) -> Texture:
+def unpack_texture(data: bytes, name: str) -> Texture:
     """Return the texture of `pack_texture`, called `name` in messages.
 
     Raises:
         TrilightError: no texture, damaged, or larger than MAX_MAPS_BYTES.
     """
-    found = _Packed(data, name)
-    if found.form not in (_SRGB, _LINEAR) or found.num_bytes_held > MAX_MAPS_BYTES:
-        wrong_map(name, found.form, f"a texture of at most {MAX_MAPS_BYTES} bytes")
-    texture = Texture(texels=found.values(), is_srgb=found.form == _SRGB)
+    packed_map = _PackedMap(data, name)
+    if packed_map.form not in (_SRGB, _LINEAR) or packed_map.num_bytes_held > MAX_MAPS_BYTES:
+        wrong_map(name, packed_map.form, f"a texture of at most {MAX_MAPS_BYTES} bytes")
+    texture = Texture(texels=packed_map.values(), is_srgb=packed_map.form == _SRGB)
     texture.check(name)
     return texture
 
 
 def pack_environment(environment: Environment) -> bytes:
     """Return the bytes of an environment's map, however it is turned."""
-    return _packed(stored_values(environment.radiance_rgb), _ENVIRONMENT)
+    return _pack(stored_values(environment.radiance_rgb), _ENVIRONMENT)
 
 
 def stored_values(values: NDArray) -> NDArray:
@@ -101,7 +103,8 @@ def unpacked_maps(
         TrilightError: not of that form, a map is missing or damaged, all of them take more than
             MAX_MAPS_BYTES, or one has another content than its name says.
     """
-    entries, skies = texture_entries(maps), environment_entries(maps)
+    entries = texture_entries(maps)
+    skies = environment_entries(maps)
     packed: dict[str, bytes] = {}
     for entry in (*entries, *skies):
         if (name := map_member(entry["sha256"])) not in members:
@@ -110,23 +113,23 @@ def unpacked_maps(
                 "sample. Run `trilight verify`."
             )
         packed[name] = members[name]
-    total = sum(_Packed(data, name).num_bytes_held for name, data in packed.items())
+    total = sum(_PackedMap(data, name).num_bytes_held for name, data in packed.items())
     if total > MAX_MAPS_BYTES:
         wrong_map("maps", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
     held = HeldMaps() if held is None else held
     fields: dict[str, Any] = {}
     if entries:
         fields["textures"] = tuple(
-            described_texture(entry, _held(Texture, entry, packed, held, _texture))
+            described_texture(entry, _load_map(Texture, entry, packed, held, _texture))
             for entry in entries
         )
     for entry in skies:
-        sky = _held(Environment, entry, packed, held, _environment)
+        sky = _load_map(Environment, entry, packed, held, _environment)
         fields["environment"] = described_environment(entry, sky)
     return fields
 
 
-def _held(
+def _load_map(
     kind: type[Map],
     entry: Mapping[str, Any],
     packed: Mapping[str, bytes],
@@ -134,39 +137,42 @@ def _held(
     unpack: Callable[[Mapping[str, Any], bytes], Map],
 ) -> Map:
     data = packed[map_member(entry["sha256"])]
-    return held.found(kind, entry["sha256"], data, lambda: unpack(entry, data))
+    return held.get_or_unpack(kind, entry["sha256"], data, lambda: unpack(entry, data))
 
 
 def _texture(entry: Mapping[str, Any], packed: bytes) -> Texture:
-    found = _Packed(packed, f"map {entry['sha256']}")
-    if found.form not in (_SRGB, _LINEAR):
-        wrong_map(found.name, found.form, "a texture")
-    return checked_texture(entry, found.values(), is_srgb=found.form == _SRGB)
+    packed_map = _PackedMap(packed, f"map {entry['sha256']}")
+    if packed_map.form not in (_SRGB, _LINEAR):
+        wrong_map(packed_map.name, packed_map.form, "a texture")
+    return checked_texture(entry, packed_map.values(), is_srgb=packed_map.form == _SRGB)
 
 
 def _environment(entry: Mapping[str, Any], packed: bytes) -> Environment:
-    found = _Packed(packed, f"map {entry['sha256']}")
-    if found.form != _ENVIRONMENT:
-        wrong_map(found.name, found.form, "an environment map")
-    return checked_environment(entry, found.values())
+    packed_map = _PackedMap(packed, f"map {entry['sha256']}")
+    if packed_map.form != _ENVIRONMENT:
+        wrong_map(packed_map.name, packed_map.form, "an environment map")
+    return checked_environment(entry, packed_map.values())
 
 
-def _packed(values: NDArray, form: str) -> bytes:
+def _pack(values: NDArray, form: str) -> bytes:
     packer = zlib.compressobj(level=6, wbits=_GZIP)
     data = save({_ARRAY: np.ascontiguousarray(values)}, {_FORM: form})
     return packer.compress(data) + packer.flush()
 
 
-class _Packed:
+class _PackedMap:
     """A packed map of which only the header was read: it says how many bytes there will be."""
 
     def __init__(self, data: bytes, name: str) -> None:
-        self.name, self._data = name, data
-        header = safetensors_header(self._unpacked(8 + _MOST_HEADER), _MOST_HEADER, name=name)
-        entry, metadata = header.get(_ARRAY), header.get("__metadata__")
+        self.name = name
+        self._data = data
+        header = safetensors_header(self._unpack(8 + _MOST_HEADER), _MOST_HEADER, name=name)
+        entry = header.get(_ARRAY)
+        metadata = header.get("__metadata__")
         if set(header) != {_ARRAY, "__metadata__"} or not isinstance(entry, Mapping):
             wrong_map(name, sorted(header), f"one array {_ARRAY}")
-        shape, dtype = entry.get("shape"), entry.get("dtype")
+        shape = entry.get("shape")
+        dtype = entry.get("dtype")
         if (
             not isinstance(shape, list)
             or len(shape) != 3
@@ -181,16 +187,16 @@ class _Packed:
 
     def values(self) -> NDArray:
         """Return the array as it is held in memory."""
-        data = self._unpacked(8 + _MOST_HEADER + self._num_bytes, whole=True)
+        data = self._unpack(8 + _MOST_HEADER + self._num_bytes, require_end=True)
         arrays, _ = read_safetensors(data, _MOST_HEADER, name=self.name)
         return held_values(arrays[_ARRAY])
 
-    def _unpacked(self, most: int, *, whole: bool = False) -> bytes:
+    def _unpack(self, most: int, *, require_end: bool = False) -> bytes:
         unpacker = zlib.decompressobj(wbits=_GZIP)
         try:
             data = unpacker.decompress(self._data, most)
         except zlib.error as error:
             raise TrilightError(f"{self.name}: damaged.") from error
-        if whole and (not unpacker.eof or unpacker.unused_data):
+        if require_end and (not unpacker.eof or unpacker.unused_data):
             raise TrilightError(f"{self.name}: cut short, or goes on after its end.")
         return data

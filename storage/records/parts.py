@@ -36,7 +36,7 @@ def part_names(*, bounces: bool, lobes: bool) -> tuple[str, ...]:
         bounces: whether direct and indirect light are apart.
         lobes: whether the diffuse and the specular lobe are.
     """
-    kinds = [names for names, apart in ((_LOBES, lobes), (_BOUNCES, bounces)) if apart]
+    kinds = [names for names, is_separate in ((_LOBES, lobes), (_BOUNCES, bounces)) if is_separate]
     return tuple("_".join(words) for words in itertools.product(*kinds)) if kinds else ()
 
 

@@ -1,4 +1,4 @@
-"""How samples are packed: two named profiles, chosen from measured figures (study S47).
+"""Packing of samples: two named profiles, chosen from measured figures (study S47).
 
 | profile | arrays | pictures |
 |---|---|---|
@@ -34,7 +34,8 @@ DWA_LEVELS = (200.0, 100.0, 45.0, 20.0, 10.0)
 """What `compact` tries, from coarse to fine. Coarser ones flatten what the eye sees, though the law
 would let them."""
 
-PLAIN, PACKED = "scene.safetensors", "scene.safetensors.gz"
+PLAIN = "scene.safetensors"
+PACKED = "scene.safetensors.gz"
 """Suffixes of the member with a scene's arrays. WebDataset undoes `.gz` by itself."""
 
 MAX_ARRAY_BYTES = 1 << 28
@@ -94,14 +95,14 @@ def unpack_arrays(members: Mapping[str, bytes]) -> bytes:
     Raises:
         TrilightError: missing, there in both ways, damaged, or larger than MAX_ARRAY_BYTES.
     """
-    found = [suffix for suffix in (PLAIN, PACKED) if suffix in members]
-    if len(found) != 1:
+    forms = [suffix for suffix in (PLAIN, PACKED) if suffix in members]
+    if len(forms) != 1:
         raise TrilightError(
-            f"member {PLAIN} is {'there in two forms' if found else 'missing'}; expected it "
+            f"member {PLAIN} is {'there in two forms' if forms else 'missing'}; expected it "
             f"or {PACKED}."
         )
-    data = members[found[0]]
-    if found == [PLAIN]:
+    data = members[forms[0]]
+    if forms == [PLAIN]:
         return data
     unpacker = zlib.decompressobj(wbits=_GZIP)
     try:

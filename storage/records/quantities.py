@@ -11,11 +11,11 @@ class Quantity(NamedTuple):
     """Something that is measured once or more in every scene."""
 
     label: str
-    """For people, with the unit."""
+    """Axis label with the unit."""
     digits: int
-    """Decimals that are shown."""
+    """Decimals that documents and pages print."""
     per: Literal["scene", "object", "surface", "texture", "light", "sky", "view"]
-    """Of what a scene has a value each; `surface` is an object, a floor or a wall."""
+    """Thing that has one value each; `surface` is an object, a floor or a wall."""
 
 
 QUANTITIES: Mapping[str, Quantity] = {

@@ -31,7 +31,8 @@ def without_constant_textures(scene: AnyScene) -> AnyScene:
     }
     if not constants or scene.material_textures is None:
         return scene
-    materials, index = scene.materials.copy(), scene.material_textures.copy()
+    materials = scene.materials.copy()
+    index = scene.material_textures.copy()
     places = {column.name: part for column, part in laid_out()}
     for place, name in enumerate(TEXTURED):
         for row, value in constants.items():
@@ -39,7 +40,7 @@ def without_constant_textures(scene: AnyScene) -> AnyScene:
             if len(chosen):  # else it is one of another width
                 materials[chosen, places[name]] = value
                 index[chosen, place] = CONSTANT
-    uv, textures, rows = _used(scene.uv, scene.textures, index)
+    uv, textures, rows = _drop_unused(scene.uv, scene.textures, index)
     return dataclasses.replace(
         scene, materials=materials, uv=uv, textures=textures, material_textures=rows
     )
@@ -83,7 +84,7 @@ def chosen_maps(
     corners = np.append(scene.uv.reshape(-1, 3, 2), np.zeros((1, 3, 2), np.float32), axis=0)
     plain = np.full((1, len(TEXTURED)), CONSTANT, np.int32)
     index = np.append(scene.material_textures, plain, axis=0)
-    uv, textures, index_of = _used(
+    uv, textures, index_of = _drop_unused(
         corners[triangles].reshape(-1, 2), scene.textures, index[materials]
     )
     return {"uv": uv, "textures": textures, "material_textures": index_of}
@@ -92,16 +93,16 @@ def chosen_maps(
 Textured = tuple[NDArray[np.float32] | None, tuple[Texture, ...], NDArray[np.int32] | None]
 
 
-def _used(
+def _drop_unused(
     uv: NDArray[np.float32] | None, textures: tuple[Texture, ...], index: NDArray[np.int32]
 ) -> Textured:
     """Return coordinates, textures and their rows without textures that no material uses."""
-    kept = np.setdiff1d(index, CONSTANT)
-    if not len(kept):
+    used_rows = np.setdiff1d(index, CONSTANT)
+    if not len(used_rows):
         return None, (), None
     renumbered = np.full(len(textures) + 1, CONSTANT, np.int32)  # the last one is that of CONSTANT
-    renumbered[kept] = np.arange(len(kept))
-    return uv, tuple(textures[row] for row in kept), renumbered[index]
+    renumbered[used_rows] = np.arange(len(used_rows))
+    return uv, tuple(textures[row] for row in used_rows), renumbered[index]
 
 
 def _with_means(
@@ -109,7 +110,8 @@ def _with_means(
     textures: tuple[Texture, ...],
     material_textures: NDArray[np.int32],
 ) -> NDArray[np.float32]:
-    rows, places = materials.copy(), {column.name: part for column, part in laid_out()}
+    rows = materials.copy()
+    places = {column.name: part for column, part in laid_out()}
     for place, name in enumerate(TEXTURED):
         for row in np.flatnonzero(material_textures[:, place] != CONSTANT):
             rows[row, places[name]] = textures[material_textures[row, place]].mean

@@ -57,10 +57,10 @@ _EXPECTED: Mapping[Any, str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class PartFloor:
-    """How far to trust one part of a picture, of all lights together."""
+    """Stated errors of one layer of a picture, for all lights together."""
 
     noise_floor_db: float
-    """Measured error as psnr_log_db."""
+    """Stated error in dB, as psnr_log_db."""
     noise_floor_linear_db: float
     """The same error as psnr_linear_db."""
     object_noise_floor_db: float
@@ -69,7 +69,7 @@ class PartFloor:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewRecord:
-    """How one picture was made, and how far to trust it."""
+    """Sampling and stated errors of one picture."""
 
     spp: int
     """Samples per pixel that were spent; on each light where they are apart."""
@@ -83,11 +83,11 @@ class ViewRecord:
     coverage: float
     """Share of the picture in which an object is seen first, from a coarse grid of rays."""
     at_cap: bool
-    """Whether sampling ended at the cap before the target was reached."""
+    """True: sampling hit the sample limit before the target error."""
     seed: int
     """Seed of the view's samples."""
     camera_attempt: int
-    """How many cameras were rejected before this one."""
+    """Number of cameras that were rejected before this one."""
     parts: Mapping[str, PartFloor] | None = None
     """Floors of the parts that are stored, by name (storage.records.parts); a record that has none
     is written without this field."""
@@ -100,9 +100,8 @@ class SceneRecord:
     key: str
     """The scene's index, nine digits."""
     scene: Scene
-    """What the pictures show."""
     views: tuple[ViewRecord, ...]
-    """One record per camera."""
+    """One record per camera, in their order."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,11 +111,10 @@ class Sample:
     key: str
     """The scene's index, nine digits."""
     scene: Scene
-    """What the pictures show."""
     radiance_rgb: NDArray[np.float32]
     """[C, R, R, 3] linear radiance, one picture per camera of the scene."""
     views: tuple[ViewRecord, ...]
-    """One record per camera."""
+    """One record per camera, in their order."""
     lights_rgb: NDArray[np.float32] | None = None
     """[C, L, R, R, 3] radiance of each emitter object alone, in the order of `scene.objects`; their
     sum is the picture (storage.records.lights). None where the build keeps lights together."""
@@ -177,8 +175,8 @@ class Sample:
                 f"{len(self.views)} records; expected {views} of both, as many as cameras, square."
             )
         check_radiance(self.key, "", self.radiance_rgb)
-        apart = () if self.lights_rgb is None else np.moveaxis(self.lights_rgb, 1, 0)
-        for light, radiance_rgb in enumerate(apart):
+        light_pictures = () if self.lights_rgb is None else np.moveaxis(self.lights_rgb, 1, 0)
+        for light, radiance_rgb in enumerate(light_pictures):
             check_radiance(self.key, f" light {light}", radiance_rgb)
         for part, pictures in (self.parts_rgb or {}).items():
             for radiance_rgb in np.moveaxis(pictures, 1, 0) if pictures.ndim == 5 else [pictures]:
@@ -279,11 +277,11 @@ def _decode_parts(
     num = num_lights(record.scene) if lights_apart else None
     names = list(record.views[0].parts or ())
     size = radiance_rgb.shape[1], radiance_rgb.shape[2]
-    found = [
+    by_view = [
         decode_parts_exr(members[f"{view}.parts.exr"], names, size, num)
         for view in range(len(radiance_rgb))
     ]
-    return {name: np.stack([of_view[name] for of_view in found]) for name in names}
+    return {name: np.stack([of_view[name] for of_view in by_view]) for name in names}
 
 
 def decode_scene(

@@ -56,7 +56,7 @@ COMPONENT = Within(-1 - UNIT_NORMAL_TOLERANCE, 1 + UNIT_NORMAL_TOLERANCE)
 
 @dataclass(frozen=True, kw_only=True)
 class SceneObject:
-    """What one row of `object_index` points to: identity and rights, no geometry."""
+    """Identity and rights of an object that `object_index` points to; no geometry."""
 
     name: str
     """Unique within the scene, for people and for exported files."""
@@ -67,13 +67,13 @@ class SceneObject:
     licence: str = "CC0-1.0"
     """SPDX identifier, or `LicenseRef-...`; shells and lamps are ours, hence CC0."""
     attribution: str = ""
-    """Whom to name, as the source states it."""
+    """Author to credit, as the source states it."""
     source_url: str = ""
     """Where the object came from."""
 
     @property
     def is_lamp(self) -> bool:
-        """Whether it is an emitter of the layout, and no part of an object that emits."""
+        """True: an emitter of the layout, not a component of an object that emits."""
         return self.kind == "emitter" and not self.uid
 
 
@@ -88,7 +88,7 @@ class Scene:
     faces: Annotated[NDArray[np.uint32], Within(0, 2**32 - 1)]
     """[T, 3] rows of `vertex_positions`, counter-clockwise seen from outside."""
     material_index: Annotated[NDArray[np.uint16], Within(0, 2**16 - 1)]
-    """[T] row of `materials`."""
+    """Row of `materials` of each triangle [T]."""
     materials: Annotated[
         NDArray[np.float32],
         *(Columns(each.name, part, each.within) for each, part in laid_out(PUBLISHED_COLUMNS)),
@@ -96,7 +96,7 @@ class Scene:
     """[M, 10 or more] the declared columns: diffuse rgb, specular rgb, roughness, emission rgb, and
     those that were added (storage.records.material)."""
     object_index: Annotated[NDArray[np.uint16], Within(0, 2**16 - 1)]
-    """[T] row of `objects`."""
+    """Row of `objects` of each triangle [T]."""
     c2w: Annotated[NDArray[np.float32], FINITE]
     """[C, 4, 4] camera to world."""
     fov_deg: Annotated[
@@ -111,7 +111,7 @@ class Scene:
     """[3T, 2] texture coordinates of each corner of each triangle; None where nothing is textured.
     """
     textures: tuple[Texture, ...] = ()
-    """What materials are textured with; each is used, and each content is there once."""
+    """Textures of the materials; each is used, and each content is there once."""
     material_textures: Annotated[NDArray[np.int32], Within(CONSTANT, MAX_TEXTURES - 1)] | None = (
         None
     )
@@ -184,7 +184,7 @@ def _check_arrays(scene: Scene) -> None:
         if array.dtype != dtype:
             broken_law(f"{name} has dtype {array.dtype}", f"{np.dtype(dtype)}")
         fits = array.ndim == len(shape) and all(
-            wanted in (None, got) for wanted, got in zip(shape, array.shape, strict=True)
+            expected in (None, got) for expected, got in zip(shape, array.shape, strict=True)
         )
         if not fits:
             broken_law(f"{name} has shape {array.shape}", f"{shape} with None for any length")
@@ -207,10 +207,13 @@ def _check_arrays(scene: Scene) -> None:
 
 def _check_columns(scene: Scene) -> None:
     """Check the width of a material row, and the ranges of the columns that were added to four."""
-    got, wanted = scene.materials.shape, material_width()
-    if got[1] != wanted:
+    got = scene.materials.shape
+    expected = material_width()
+    if got[1] != expected:
         names = ", ".join(column.name for column in material_columns())
-        broken_law(f"materials has shape {got}", f"(None, {wanted}), since its columns are {names}")
+        broken_law(
+            f"materials has shape {got}", f"(None, {expected}), since its columns are {names}"
+        )
     for column, part in laid_out():
         if column.name not in PUBLISHED_COLUMNS:
             holds = np.ones(got, np.bool_)
@@ -268,6 +271,7 @@ def _check_cameras(scene: Scene) -> None:
 
 
 def _same_length(scene: Scene, name: str, other: str) -> None:
-    got, wanted = len(getattr(scene, name)), len(getattr(scene, other))
-    if got != wanted:
-        broken_law(f"{name} has {got} rows", f"{wanted}, as {other} has")
+    got = len(getattr(scene, name))
+    expected = len(getattr(scene, other))
+    if got != expected:
+        broken_law(f"{name} has {got} rows", f"{expected}, as {other} has")

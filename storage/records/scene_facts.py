@@ -19,17 +19,16 @@ class SurfaceFacts:
     """One row of `Scene.objects` that reflects: an object, the floor or a wall."""
 
     row: int
-    """Row of `Scene.objects`."""
+    """Row index in `Scene.objects`."""
     kind: str
-    """object or shell."""
+    """Either `object` or `shell`."""
     num_triangles: int
-    """Number of its triangles."""
     smooth: bool
-    """Whether triangles share vertices, and with them normals; a flat face has its own three."""
+    """True: triangles share vertices and normals; a flat face has three of its own."""
     num_colours: int
     """Rows of the palette that it uses."""
     textured: bool
-    """Whether any of its triangles has a texture; the numbers below are then of the means."""
+    """True: a triangle has a texture, and the numbers below are its means."""
     diffuse: float
     """Largest channel of the diffuse albedo, mean over the triangles."""
     specular: float
@@ -37,7 +36,7 @@ class SurfaceFacts:
     albedo_sum: float
     """The same of both together."""
     roughness: float
-    """Mean over the triangles."""
+    """Mean roughness over the triangles."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +44,9 @@ class Light:
     """One emitter."""
 
     row: int
-    """Row of `Scene.objects`."""
+    """Row index in `Scene.objects`."""
     radiance_rgb: tuple[float, float, float]
-    """Mean over its triangles."""
+    """Mean radiance over the triangles, linear Rec.709."""
     centre: tuple[float, float, float]
     """Mean of its triangles' middles, weighted by area, world units."""
     area: float
@@ -61,32 +60,34 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraFacts:
-    """Where one camera stands, seen from the origin."""
+    """Position and angles of one camera, seen from the origin."""
 
     position: tuple[float, float, float]
-    """World units."""
+    """Camera position [3] in world units."""
     distance: float
-    """From the origin, world units."""
+    """Distance from the origin in world units."""
     elevation_deg: float
-    """Above the horizon."""
+    """Angle above the horizon in degrees."""
     azimuth_deg: float
-    """From +X towards +Y, in [0, 360)."""
+    """Angle from +X towards +Y in degrees, in [0, 360)."""
     fov_deg: float
-    """Full angle."""
+    """Full field of view in degrees."""
 
 
 def surfaces(scene: Scene) -> list[SurfaceFacts]:
     """Return the objects and shell parts of a lawful scene that have triangles."""
-    found, textured = [], textured_objects(scene)
+    facts = []
+    textured = textured_objects(scene)
     for row, entry in enumerate(scene.objects):
         mine = scene.object_index == row
         if entry.kind == "emitter" or not mine.any():
             continue
         rows = scene.material_index[mine]
         materials = scene.materials[rows].astype(np.float64)
-        diffuse, specular = materials[:, DIFFUSE], materials[:, SPECULAR]
+        diffuse = materials[:, DIFFUSE]
+        specular = materials[:, SPECULAR]
         faces = scene.faces[mine]
-        found.append(
+        facts.append(
             SurfaceFacts(
                 row=row,
                 kind=entry.kind,
@@ -100,12 +101,12 @@ def surfaces(scene: Scene) -> list[SurfaceFacts]:
                 roughness=float(materials[:, ROUGHNESS].mean()),
             )
         )
-    return found
+    return facts
 
 
 def lights(scene: Scene) -> list[Light]:
     """Return the emitters of a lawful scene that have triangles."""
-    found = []
+    facts = []
     for row, entry in enumerate(scene.objects):
         mine = scene.object_index == row
         if entry.kind != "emitter" or not mine.any():
@@ -117,18 +118,18 @@ def lights(scene: Scene) -> list[Light]:
         centre = np.average(corners.mean(axis=1), axis=0, weights=weights)
         radiance = scene.materials[scene.material_index[mine], EMISSION].mean(axis=0)
         area = float(areas.sum())
-        found.append(
+        facts.append(
             Light(row=row, radiance_rgb=_three(radiance), centre=_three(centre), area=area)
         )
-    return found
+    return facts
 
 
 def cameras(scene: Scene) -> list[CameraFacts]:
     """Return where the cameras of a scene stand; at the origin itself all angles are 0."""
-    found = []
+    facts = []
     for c2w, fov_deg in zip(scene.c2w, scene.fov_deg, strict=True):
         x, y, z = (float(value) for value in c2w[:3, 3])
-        found.append(
+        facts.append(
             CameraFacts(
                 position=(x, y, z),
                 distance=float(np.sqrt(x * x + y * y + z * z)),
@@ -137,7 +138,7 @@ def cameras(scene: Scene) -> list[CameraFacts]:
                 fov_deg=float(fov_deg),
             )
         )
-    return found
+    return facts
 
 
 def scene_values(record: SceneRecord) -> Mapping[str, Values]:
@@ -147,7 +148,9 @@ def scene_values(record: SceneRecord) -> Mapping[str, Values]:
         TypeError, ValueError: a view's record holds something that is not a number.
     """
     scene = record.scene
-    reflecting, emitting, seen_from = surfaces(scene), lights(scene), cameras(scene)
+    reflecting = surfaces(scene)
+    emitting = lights(scene)
+    seen_from = cameras(scene)
     objects = [surface for surface in reflecting if surface.kind == "object"]
     skies = [] if scene.environment is None else [sky_facts(scene.environment)]
     values: Mapping[str, Sequence[float]] = {

@@ -52,9 +52,12 @@ MAX_HEADER_BYTES = 8 << 20
 CARRIED = frozenset({*ARRAY_FIELDS, "objects", "provenance", "textures", "environment"})
 """What the form holds of a scene (pipeline.exchange.formats): all of it, added columns too."""
 
-_METADATA, _COLUMNS = "trilight_scene", "material_columns"
-_MAPS, _MAPS_DIGEST = "maps", "maps_sha256"
-_TEXTURE, _ENVIRONMENT = "texture.", "environment"
+_METADATA = "trilight_scene"
+_COLUMNS = "material_columns"
+_MAPS = "maps"
+_MAPS_DIGEST = "maps_sha256"
+_TEXTURE = "texture."
+_ENVIRONMENT = "environment"
 _IS_SRGB = "is_srgb"
 _DTYPE_NAMES: Mapping[type, str] = {
     np.float32: "F32",
@@ -94,8 +97,8 @@ def decode_arrays(data: bytes, maps: Any = None) -> dict[str, NDArray]:
     if missing := set(ARRAY_FIELDS) - set(arrays):
         raise TrilightError(f"scene: the array {min(missing)} is missing.")
     arrays["materials"] = completed_rows(arrays["materials"], metadata.get(_COLUMNS))
-    found = arrays[_MAPS_DIGEST].tobytes() if _MAPS_DIGEST in arrays else None
-    if found != (None if maps is None else maps_digest(maps).tobytes()):
+    stored_digest = arrays[_MAPS_DIGEST].tobytes() if _MAPS_DIGEST in arrays else None
+    if stored_digest != (None if maps is None else maps_digest(maps).tobytes()):
         raise TrilightError(
             "scene: its record and its arrays do not speak of the same textures and environment. "
             "Run `trilight verify`."
@@ -255,7 +258,8 @@ def _maps(record: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> dict[str,
     """Return the fields `textures` and `environment` of what a file says, where it has any."""
     if _MAPS not in record:
         return {}
-    entries, fields = texture_entries(record[_MAPS]), dict[str, Any]()
+    entries = texture_entries(record[_MAPS])
+    fields = dict[str, Any]()
     is_srgb = record.get(_IS_SRGB, [])
     if not isinstance(is_srgb, list) or [type(each) for each in is_srgb] != [bool] * len(entries):
         _broken(_IS_SRGB, is_srgb, "true or false for each texture")
@@ -282,33 +286,38 @@ def _check_header(header: Mapping[str, Any]) -> None:
     """Refuse arrays that are not a scene's, before any of them is made."""
     names = set(header) - {"__metadata__"}
     maps = {name for name in names if name == _ENVIRONMENT or name.startswith(_TEXTURE)}
-    others = names - maps - set(MAP_ARRAYS)
-    if others != set(ARRAY_FIELDS) or len(maps) > MAX_TEXTURES + 1:
-        odd = ", ".join(f"{name!r:.60}" for name in sorted(others ^ set(ARRAY_FIELDS))[:3])
-        raise TrilightError(f"scene: arrays missing or not expected: {odd}.")
-    for name, (dtype, wanted) in {**ARRAY_FIELDS, **MAP_ARRAYS}.items():
+    array_names = names - maps - set(MAP_ARRAYS)
+    if array_names != set(ARRAY_FIELDS) or len(maps) > MAX_TEXTURES + 1:
+        unexpected = ", ".join(
+            f"{name!r:.60}" for name in sorted(array_names ^ set(ARRAY_FIELDS))[:3]
+        )
+        raise TrilightError(f"scene: arrays missing or not expected: {unexpected}.")
+    for name, (dtype, expected_shape) in {**ARRAY_FIELDS, **MAP_ARRAYS}.items():
         if name in names:
-            _check_entry(header, name, (_DTYPE_NAMES[dtype],), wanted)
+            _check_entry(header, name, (_DTYPE_NAMES[dtype],), expected_shape)
     for name in maps:
         _check_entry(header, name, _MAP_DTYPES, (None, None, None))
     _check_total(header, maps)
 
 
 def _check_entry(
-    header: Mapping[str, Any], name: str, dtypes: Sequence[str], wanted: tuple[int | None, ...]
+    header: Mapping[str, Any],
+    name: str,
+    dtypes: Sequence[str],
+    expected_shape: tuple[int | None, ...],
 ) -> None:
     entry = header[name] if isinstance(header[name], dict) else {}
     shape = entry.get("shape")
     fits = (
         entry.get("dtype") in dtypes
         and isinstance(shape, list)
-        and len(shape) == len(wanted)
+        and len(shape) == len(expected_shape)
         and all(type(got) is int and got >= 0 for got in shape)
-        and all(want in (None, got) for want, got in zip(wanted, shape, strict=True))
+        and all(want in (None, got) for want, got in zip(expected_shape, shape, strict=True))
         and math.prod(shape) <= MAX_FILE_BYTES
     )
     if not fits:
-        expected = f"{' or '.join(dtypes)} of shape {wanted}"
+        expected = f"{' or '.join(dtypes)} of shape {expected_shape}"
         _broken(name, [entry.get("dtype"), shape], expected)
 
 

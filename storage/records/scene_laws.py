@@ -1,4 +1,4 @@
-"""How a broken law of a scene is told: the field, the value found, what was expected, where."""
+"""Errors of unlawful scenes: the field, its value, the expected value, the index."""
 
 from typing import NoReturn
 
@@ -13,10 +13,10 @@ def require_law(law: NDArray[np.bool_], name: str, values: NDArray, expected: st
     if law.all():
         return
     index = tuple(int(i) for i in np.argwhere(~law)[0])
-    found = " ".join(np.array2string(values[index], threshold=16).split())
-    broken_law(f"{name}{list(index)} is {found}", expected)
+    value = " ".join(np.array2string(values[index], threshold=16).split())
+    broken_law(f"{name}{list(index)} is {value}", expected)
 
 
-def broken_law(found: str, expected: str) -> NoReturn:
+def broken_law(observed: str, expected: str) -> NoReturn:
     """Raise TrilightError for what was found."""
-    raise TrilightError(f"scene: {found}; expected {expected}.")
+    raise TrilightError(f"scene: {observed}; expected {expected}.")

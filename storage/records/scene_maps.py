@@ -117,14 +117,14 @@ def _albedos(scene: "Scene") -> Iterator[tuple[int, Reflecting, Reflecting]]:
 
 def _check_sum(row: int, diffuse: Reflecting, specular: Reflecting) -> None:
     """Raise TrilightError where albedos add up to more than 1 at any texture coordinate."""
-    found = _greatest(diffuse) + _greatest(specular)
+    albedo_sum = _greatest(diffuse) + _greatest(specular)
     bound = 1 + SUM_TOLERANCE
-    if (found <= bound).all():
+    if (albedo_sum <= bound).all():
         return  # whatever meets what
     if isinstance(diffuse, Texture) and isinstance(specular, Texture):
-        found = _greatest_sum(diffuse, specular)
+        albedo_sum = _greatest_sum(diffuse, specular)
     name = f"materials[{row}] with its textures: diffuse + specular"
-    require_law(found <= bound, name, found, "at most 1 at every texture coordinate")
+    require_law(albedo_sum <= bound, name, albedo_sum, "at most 1 at every texture coordinate")
 
 
 def _greatest(albedo: Reflecting) -> NDArray[np.float32]:
@@ -144,12 +144,12 @@ def _greatest_sum(one: Texture, other: Texture) -> NDArray[np.float64]:
             (one.texels.shape[0], other.texels.shape[0]),
         )
     )
-    found = np.zeros(3)
+    greatest = np.zeros(3)
     for first in range(0, len(v), _BLOCK):
         uv = np.stack(np.meshgrid(u, v[first : first + _BLOCK]), axis=-1)
         total = texture_values(one, uv) + texture_values(other, uv)
-        found = np.maximum(found, total.max(axis=(0, 1)))
-    return found
+        greatest = np.maximum(greatest, total.max(axis=(0, 1)))
+    return greatest
 
 
 def _widths() -> dict[str, int]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.records.packed_maps import unpacked_texture
+from storage.records.packed_maps import unpack_texture
 from storage.records.texture import TEXTURED, Texture
 
 SkinTextures = tuple[Texture, Texture, Texture]
@@ -24,13 +24,13 @@ SkinTextures = tuple[Texture, Texture, Texture]
 
 @dataclass(frozen=True, kw_only=True)
 class SkinQuality:
-    """How far the colours of a level are from those of its source."""
+    """Color errors of a level against its source."""
 
     colour_error: float
     """Mean difference of the linear diffuse colour between points spread evenly over the source and
     the nearest points of the level, over all channels."""
     colour_error_p95: float
-    """95th percentile of it."""
+    """95th percentile of the same error."""
     missed_cells: float
     """Share of the texels for which the source has no surface nearby that faces the same way: they
     show its nearest point."""
@@ -43,14 +43,14 @@ class SkinQuality:
 
 @dataclass(frozen=True, kw_only=True)
 class OwnMaterials:
-    """What became of the materials of a source."""
+    """Result of reading a source's materials."""
 
     reason: str = ""
     """Stable code of why the object goes without them; empty where it has them."""
     message: str = ""
     """One sentence for a person."""
     lost: tuple[str, ...] = ()
-    """What the source says of its surfaces and nothing here can show, such as `emission`."""
+    """Properties of the source that this renderer cannot show, such as `emission`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,17 +60,17 @@ class LevelSkin:
     uv: NDArray[np.float32]
     """[F, 3, 2] texture coordinates of each corner of each face, within [0, 1], v up."""
     packed: tuple[bytes, bytes, bytes]
-    """Bytes of the textures."""
+    """Encoded bytes of the three textures."""
     quality: SkinQuality
-    """Measured against the source."""
+    """Errors measured against the source."""
     emission: NDArray[np.float32] | None = None
-    """[F, 3] what each face emits, in the units of the source; None where nothing does, or where
-    nobody asked."""
+    """[F, 3] what each face emits, in the units of the source; None where nothing does, or
+    where it was not requested."""
 
     @cached_property
     def textures(self) -> SkinTextures:
         """Diffuse, specular and roughness, unpacked."""
-        first, second, third = map(unpacked_texture, self.packed, TEXTURED)
+        first, second, third = map(unpack_texture, self.packed, TEXTURED)
         return first, second, third
 
     @property
@@ -102,7 +102,7 @@ def read_skin(arrays: Mapping[str, NDArray], quality: Mapping[str, Any], name: s
     )
 
 
-def as_record(found: SkinQuality | OwnMaterials) -> dict[str, Any]:
+def as_record(quality: SkinQuality | OwnMaterials) -> dict[str, Any]:
     """Return it as JSON values."""
-    record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(found)))
+    record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(quality)))
     return record

@@ -1,4 +1,4 @@
-"""How much light comes through each texel of an environment map."""
+"""Light through each texel of an environment map."""
 
 import numpy as np
 from numpy.typing import NDArray

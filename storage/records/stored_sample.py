@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import TrilightError
-from storage.records.exr import FIRST_ILLEGAL, Stored, decode_stored, unpacked
+from storage.records.exr import FIRST_ILLEGAL, Stored, decode_stored, to_float32
 from storage.records.held_maps import HeldMaps
 from storage.records.lights import decode_lights_exr, num_lights
 from storage.records.sample import ViewRecord, check_radiance, decode_scene
@@ -29,11 +29,10 @@ class StoredSample:
     key: str
     """The scene's index, nine digits."""
     scene: Scene
-    """What the pictures show."""
     views: tuple[ViewRecord, ...]
-    """One record per camera."""
+    """One record per camera, in their order."""
     members: Mapping[str, bytes]
-    """What the shard holds of it, by suffix."""
+    """Bytes of the sample's members in the shard, by suffix."""
 
     def pictures(self, views: Sequence[int]) -> Stored:
         """Return the pictures of some views [V, R, R, 3], at least one, as they are stored.
@@ -44,19 +43,19 @@ class StoredSample:
             TrilightError: one is missing, unreadable, not square, of another size than the others,
                 or holds a radiance that is not finite or below 0.
         """
-        found: list[Stored] = [self._read(f"{view}.exr", decode_stored) for view in views]
-        if any(picture.dtype == np.float32 for picture in found):
-            found = [unpacked(picture) for picture in found]
-        shapes = {picture.shape for picture in found}
+        pictures: list[Stored] = [self._read(f"{view}.exr", decode_stored) for view in views]
+        if any(picture.dtype == np.float32 for picture in pictures):
+            pictures = [to_float32(picture) for picture in pictures]
+        shapes = {picture.shape for picture in pictures}
         if len(shapes) > 1 or any(height != width for height, width, _ in shapes):
-            shown = ", ".join(sorted(f"{height} x {width}" for height, width, _ in shapes))
+            sizes = ", ".join(sorted(f"{height} x {width}" for height, width, _ in shapes))
             raise TrilightError(
-                f"sample {self.key}: pictures of {shown} pixels; expected squares of one size."
+                f"sample {self.key}: pictures of {sizes} pixels; expected squares of one size."
             )
-        for view, picture in zip(views, found, strict=True):
+        for view, picture in zip(views, pictures, strict=True):
             if picture.dtype == np.float32 or picture.max() >= FIRST_ILLEGAL:
-                check_radiance(self.key, "", unpacked(picture)[None], first_view=view)
-        stacked: NDArray = np.stack(found)
+                check_radiance(self.key, "", to_float32(picture)[None], first_view=view)
+        stacked: NDArray = np.stack(pictures)
         if stacked.dtype == np.uint16:  # the only legal one that is not below it is -0
             stacked[stacked >= FIRST_ILLEGAL] = 0
         return stacked
@@ -74,15 +73,15 @@ class StoredSample:
         if not any(suffix.endswith(".lights.exr") for suffix in self.members):
             return None
         shape = (num_lights(self.scene), resolution, resolution)
-        found = []
+        by_view = []
         for view in views:
             suffix = f"{view}.lights.exr"
             lights = self._read(suffix, lambda data: decode_lights_exr(data, shape))
             for light, radiance_rgb in enumerate(lights):
                 which = f" light {light}"
                 check_radiance(self.key, which, radiance_rgb[None], first_view=view)
-            found.append(lights)
-        return np.stack(found)
+            by_view.append(lights)
+        return np.stack(by_view)
 
     def _read(self, suffix: str, decode: Callable[[bytes], Picture]) -> Picture:
         if suffix not in self.members:

@@ -34,13 +34,13 @@ class MapSource:
     """Identity and rights of a texture or a map."""
 
     name: str = ""
-    """For people."""
+    """Name as documents and pages show it."""
     licence: str = "CC0-1.0"
     """SPDX identifier, or `LicenseRef-...`; what is drawn from a seed is ours, hence CC0."""
     attribution: str = ""
-    """Whom to name, as the source states it."""
+    """Author to credit, as the source states it."""
     source_url: str = ""
-    """Where it came from."""
+    """URL of the page or file it came from."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,9 +51,9 @@ class Texture:
     """[H, W, C] with C of 3 for a colour and 1 for a number, row 0 at the bottom; uint8 stands for
     [0, 1]."""
     is_srgb: bool = False
-    """Whether the 8-bit values are sRGB-encoded; float32 is always linear."""
+    """True: the 8-bit values are sRGB-encoded. float32 is always linear."""
     source: MapSource = field(default_factory=MapSource)
-    """What it is called, and whose it is."""
+    """Name, URL and rights of the texture."""
 
     @property
     def channels(self) -> int:
@@ -69,7 +69,7 @@ class Texture:
         """Return the linear values of texels of this texture, of any shape."""
         if texels.dtype == np.float32:
             return texels
-        return _decoded(self.is_srgb)[texels]
+        return _decode_table(self.is_srgb)[texels]
 
     @cached_property
     def greatest(self) -> NDArray[np.float32]:
@@ -83,7 +83,7 @@ class Texture:
             return self.texels.mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
         planes = np.moveaxis(self.texels, -1, 0)
         counts = np.stack([np.bincount(plane.ravel(), minlength=256) for plane in planes])
-        table = _decoded(self.is_srgb).astype(np.float64)
+        table = _decode_table(self.is_srgb).astype(np.float64)
         means: NDArray[np.float64] = counts @ table / planes[0].size
         return means.astype(np.float32)
 
@@ -115,6 +115,6 @@ def content_digest(form: str, values: NDArray) -> str:
 
 
 @cache
-def _decoded(is_srgb: bool) -> NDArray[np.float32]:
+def _decode_table(is_srgb: bool) -> NDArray[np.float32]:
     """Return the linear value [256] of every 8-bit value."""
     return linear_from_srgb8() if is_srgb else (np.arange(256) / 255).astype(np.float32)

@@ -38,30 +38,30 @@ class Bucket:
             TrilightError: the bucket does not exist or may not be listed, or the server gives no
                 answer (an EnvironmentFailure where that may pass).
         """
-        return self._listed(below, lambda driver, place: driver.find(place))
+        return self._list_paths(below, lambda driver, place: driver.find(place))
 
     def names_in(self, folder: str = "") -> set[str]:
         """Return the names of the files in one folder alone, relative to the bucket's folder."""
 
-        def listed(driver: Any, place: str) -> list[str]:
+        def list_files(driver: Any, place: str) -> list[str]:
             with contextlib.suppress(FileNotFoundError):
                 rows = driver.ls(place, detail=True)
                 return [row["name"] for row in rows if row["type"] == "file"]
             return []
 
-        return self._listed(folder, listed)
+        return self._list_paths(folder, list_files)
 
-    def _listed(self, folder: str, find: Callable[[Any, str], list[str]]) -> set[str]:
+    def _list_paths(self, folder: str, find: Callable[[Any, str], list[str]]) -> set[str]:
         root = self.url.root
         place = f"{root}/{folder}".rstrip("/")
 
-        def listed() -> list[str]:
+        def find_paths() -> list[str]:
             driver = shared_driver(self.url)
             driver.invalidate_cache()
             return list(find(driver, place))
 
-        found = self._tried(listed, "listed")
-        return {path.removeprefix(f"{root}/") for path in found if path.startswith(f"{root}/")}
+        paths = self._retry(find_paths, "listed")
+        return {path.removeprefix(f"{root}/") for path in paths if path.startswith(f"{root}/")}
 
     def read_start(self, name: str, num_bytes: int) -> bytes | None:
         """Return the first bytes of a file, or None where there is none; raises as `names`."""
@@ -69,12 +69,12 @@ class Bucket:
 
         def read() -> bytes | None:
             try:
-                found: bytes = shared_driver(self.url).cat_file(target, start=0, end=num_bytes)
+                content: bytes = shared_driver(self.url).cat_file(target, start=0, end=num_bytes)
             except FileNotFoundError:
                 return None
-            return found
+            return content
 
-        start: bytes | None = self._tried(read, "read")
+        start: bytes | None = self._retry(read, "read")
         return start
 
     def write(self, name: str, content: Path | bytes) -> None:
@@ -87,7 +87,7 @@ class Bucket:
         Raises:
             TrilightError: as `names`, or the folder may not be written.
         """
-        self._tried(lambda: self._put(name, content, mode="overwrite"), "written")
+        self._retry(lambda: self._upload(name, content, mode="overwrite"), "written")
 
     def create(self, name: str, content: Path | bytes) -> bool:
         """Write a file unless it exists, and return whether it was written; otherwise as `write`.
@@ -95,29 +95,31 @@ class Bucket:
         Where the answer to a successful write is lost, another worker counts as its writer.
         """
 
-        def put() -> bool:
+        def create_file() -> bool:
             try:
-                self._put(name, content, mode="create")
+                self._upload(name, content, mode="create")
             except Exception as error:  # drivers raise what they like
                 if not is_taken(error):
                     raise
                 return False
             return True
 
-        return self._tried(put, "written")
+        return self._retry(create_file, "written")
 
     def require_create(self) -> None:
         """Raise TrilightError where the server writes a file again that it was to create once."""
         if self.create(_PROBE, b"\n") and self.create(_PROBE, b"\n"):
             raise TrilightError(
-                f"{self.url.what} {self.url.shown!r}: the server does not know conditional writes "
+                f"{self.url.what} {self.url.display_url!r}: the server does not know conditional "
+                "writes "
                 "(If-None-Match, or ifGenerationMatch), so two workers could replace each other's "
                 "files; expected one that refuses to create a file twice. Use another server, or "
                 "a folder."
             )
 
-    def _put(self, name: str, content: Path | bytes, *, mode: str) -> None:
-        driver, target = shared_driver(self.url), self.url.child(name).root
+    def _upload(self, name: str, content: Path | bytes, *, mode: str) -> None:
+        driver = shared_driver(self.url)
+        target = self.url.child(name).root
         if isinstance(content, bytes):
             driver.pipe_file(target, content, mode=mode)
             return
@@ -129,7 +131,7 @@ class Bucket:
             max_concurrency=_PARTS_AT_ONCE,
         )
 
-    def _tried(self, function: Callable[[], Any], what: str) -> Any:
+    def _retry(self, function: Callable[[], Any], what: str) -> Any:
         try:
             return with_tries(function)
         except TransferFailed as error:
@@ -137,7 +139,8 @@ class Bucket:
             lasting = cause is None or is_missing(cause) or not may_pass(cause)
             kind = TrilightError if lasting else EnvironmentFailure
             raise kind(
-                f"{self.url.what} {self.url.shown!r}: cannot be {what} ({error.message}); expected "
+                f"{self.url.what} {self.url.display_url!r}: cannot be {what} ({error.message}); "
+                "expected "
                 "a bucket that exists, and access that lets you list, read and write there. What "
-                "was finished is safe: mend it and run the same command again."
+                "was finished is safe: fix it and run the same command again."
             ) from error

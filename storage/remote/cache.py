@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from storage.atomic import TEMPORARY_SUFFIX, atomic_writer
 from storage.cache import cache_folder
-from storage.claims import claimed, take_lock
+from storage.claims import hold_claim, take_lock
 from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.remote.fetch import download, facts_of, unreadable
@@ -62,7 +62,7 @@ class ShardCache:
             while True:
                 if (stream := _open_shared(path)) is not None:
                     return stream
-                with claimed(self._lock_of(path), wait=True):
+                with hold_claim(self._lock_of(path), wait=True):
                     if not path.exists():
                         self._fetch(url, path, num_bytes, sha256)
         except TransferFailed as error:
@@ -97,22 +97,23 @@ class ShardCache:
                     raise _WrongBytes
                 return
         raise TrilightError(
-            f"{url.what} {url.shown!r}: the bytes are not those of the manifest (sha256 differs, "
+            f"{url.what} {url.display_url!r}: the bytes are not those of the manifest (sha256 "
+            "differs, "
             f"{_ARRIVALS} times); expected {sha256}. Mend the file on the server."
         )
 
     def _make_room(self, num_bytes: int) -> None:
         """Remove the least recently read shards, until `num_bytes` more fit within the limit."""
-        found = []
+        shards = []
         for path in self.root.glob("*"):
             with contextlib.suppress(OSError):
                 stat = path.stat()
                 if path.suffix != TEMPORARY_SUFFIX:
-                    found.append((stat.st_mtime_ns, path, stat.st_size))
+                    shards.append((stat.st_mtime_ns, path, stat.st_size))
                 elif time.time() - stat.st_mtime > _STALE_S:  # a killed process left it
                     path.unlink()
-        taken = num_bytes + sum(size for _, _, size in found)
-        for _, path, size in sorted(found):
+        taken = num_bytes + sum(size for _, _, size in shards)
+        for _, path, size in sorted(shards):
             if taken <= self.max_bytes:
                 return
             if _remove_unread(path):
@@ -144,10 +145,10 @@ def shard_cache() -> ShardCache:
 def _name(url: RemoteUrl, sha256: str | None) -> str:
     """Return the name of a shard in the cache: nothing but hexadecimal digits and a dash."""
     if sha256 is not None:
-        return f"{sha256_hex(url.shown.encode())[:16]}-{sha256}"
+        return f"{sha256_hex(url.display_url.encode())[:16]}-{sha256}"
     facts = facts_of(url)
     # without a digest, a query may be what tells two files apart
-    place = canonical_json([url.shown, url.query])
+    place = canonical_json([url.display_url, url.query])
     version = canonical_json([facts.num_bytes, facts.version])
     return f"{sha256_hex(place)[:16]}-{sha256_hex(version)}"
 

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from storage.atomic import write_atomically
-from storage.claims import claimed
+from storage.claims import hold_claim
 from storage.errors import TrilightError
 from storage.remote.bucket import Bucket
 
@@ -39,7 +39,7 @@ class BucketClaims:
         self._first_seen: dict[str, float] = {}
 
     @contextlib.contextmanager
-    def claimed(self, name: str) -> Iterator[bool]:
+    def hold_claim(self, name: str) -> Iterator[bool]:
         """Hold the claim on a file for the block; yield whether it is ours.
 
         Only one process of a machine may ask for the same claim at a time.
@@ -75,7 +75,9 @@ class BucketClaims:
     @functools.cached_property
     def _worker(self) -> bytes:
         path = self._worker_file
-        with claimed(path.with_suffix(".claim"), wait=True):  # other processes are the same worker
+        with hold_claim(
+            path.with_suffix(".claim"), wait=True
+        ):  # other processes are the same worker
             if not path.exists():
                 write_atomically(path, uuid.uuid4().hex.encode())
         return path.read_bytes()

@@ -24,12 +24,12 @@ _VERSION_FIELDS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What a server says about a file."""
+    """Size and version of a file, as its server states them."""
 
     num_bytes: int | None
     """Size; None where it is not said."""
     version: Mapping[str, str]
-    """What changes when the file does; may be empty."""
+    """Header values that change when the file does; may be empty."""
 
 
 def facts_of(url: RemoteUrl) -> Facts:
@@ -40,14 +40,14 @@ def facts_of(url: RemoteUrl) -> Facts:
         TrilightError: the driver's package is missing.
     """
     driver = shared_driver(url)
-    found = with_tries(lambda: _fresh_info(driver, url))
-    if found.get("type") == "directory":
+    info = with_tries(lambda: _fresh_info(driver, url))
+    if info.get("type") == "directory":
         raise TransferFailed("download_failed", "is a folder, not a file")
-    return Facts(num_bytes=found.get("size"), version=version_of(found))
+    return Facts(num_bytes=info.get("size"), version=version_of(info))
 
 
 def _fresh_info(driver: Any, url: RemoteUrl) -> dict[str, Any]:
-    """Ask the server itself: one of the drivers keeps listings though it is told not to."""
+    """Ask the server itself: one driver caches listings although that is turned off."""
     driver.invalidate_cache()
     return dict(driver.info(url.root))
 
@@ -79,7 +79,7 @@ def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_byt
 
 
 class _Expected:
-    """What is known of a file before it has come, and how fast it comes."""
+    """Limits of a download: size, version and pace."""
 
     def __init__(self, exact: int | None, most: int, pace: Pace) -> None:
         self.exact = exact
@@ -87,13 +87,13 @@ class _Expected:
         self.pace = pace
         self.version: dict[str, str] | None = None
 
-    def require(self, found: int) -> None:
+    def require(self, num_bytes: int) -> None:
         """Refuse a file that is announced with another size."""
-        if self.exact is not None and found != self.exact:
-            raise TransferFailed("download_failed", f"has {found} bytes; expected {self.exact}")
-        self.bound(found)
+        if self.exact is not None and num_bytes != self.exact:
+            raise TransferFailed("download_failed", f"has {num_bytes} bytes; expected {self.exact}")
+        self.require_limit(num_bytes)
 
-    def bound(self, reached: int) -> None:
+    def require_limit(self, reached: int) -> None:
         """Refuse to go on with a file that is longer than it may be."""
         if reached > self.most:
             message = f"is longer than {self.most} bytes"
@@ -101,12 +101,13 @@ class _Expected:
 
     def is_same(self, version: Mapping[str, str]) -> bool:
         """Return whether the file is still the one that the bytes so far came from."""
-        before, self.version = self.version, dict(version)
+        before = self.version
+        self.version = dict(version)
         return before in (None, self.version)
 
-    def came(self, reached: int, whole: int | None) -> None:
+    def require_pace(self, reached: int, total: int | None) -> None:
         """Give up a file that comes too slowly; one that has come whole is not given up."""
-        if reached != whole:
+        if reached != total:
             self.pace.require()
 
     def require_all(self, reached: int) -> None:
@@ -132,7 +133,7 @@ def _fill_bucket(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expec
         if len(piece) != end - start:
             raise Interrupted from EOFError(f"got {len(piece)} of {end - start} bytes")
         stream.write(piece)
-        expected.came(stream.tell(), num_bytes)
+        expected.require_pace(stream.tell(), num_bytes)
     if num_bytes > PIECE_BYTES and not expected.is_same(version_of(_fresh_info(driver, url))):
         _start_over(stream)
         raise Interrupted from EOFError("the file changed while it was read")
@@ -155,7 +156,7 @@ async def _stream_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: 
             _start_over(stream)
             raise Interrupted from EOFError("the file changed while it was read")
         if answer.status == 404:
-            raise FileNotFoundError(url.shown)
+            raise FileNotFoundError(url.display_url)
         answer.raise_for_status()
         if answer.status != 206:
             _start_over(stream)
@@ -165,13 +166,13 @@ async def _stream_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: 
         if not expected.is_same(version_of(answer.headers)) and stream.tell():
             _start_over(stream)
             raise Interrupted from EOFError("the file changed while it was read")
-        whole = None
+        total = None
         if answer.content_length is not None:
-            expected.require(whole := stream.tell() + answer.content_length)
+            expected.require(total := stream.tell() + answer.content_length)
         async for chunk in answer.content.iter_chunked(_CHUNK_BYTES):
-            expected.bound(stream.tell() + len(chunk))
+            expected.require_limit(stream.tell() + len(chunk))
             stream.write(chunk)
-            expected.came(stream.tell(), whole)
+            expected.require_pace(stream.tell(), total)
     expected.require_all(stream.tell())
 
 
@@ -184,6 +185,7 @@ def unreadable(url: RemoteUrl, error: TransferFailed) -> Unreadable:
     """Return the user's view of a file that cannot be read."""
     hint = " Public buckets need FSSPEC_S3_ANON=true." if url.scheme == "s3" else ""
     return Unreadable(
-        f"{url.what} {url.shown!r}: cannot be read ({error.message}); expected a file that can be "
+        f"{url.what} {url.display_url!r}: cannot be read ({error.message}); expected a file that "
+        "can be "
         f"reached. Check the URL and your access to it.{hint}"
     )

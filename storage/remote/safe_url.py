@@ -45,7 +45,8 @@ def public_text(text: str) -> str:
 
 
 def _public_url(url: str) -> str:
-    parts, safe = _PARTS.match(url), safe_url(url)
+    parts = _PARTS.match(url)
+    safe = safe_url(url)
     rest = url[parts.end() :] if parts else ""
     return safe if safe.endswith(f"://{HIDDEN}") or _SECRET_QUERY.search(rest) else safe + rest
 

@@ -51,7 +51,7 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
     Args:
         function: what to try.
         pace: of the file that is on its way; where it came at the least rate since the last error,
-            the tries are counted anew.
+            the tries are counted again from 1.
 
     Raises:
         TransferFailed: as the function raised it, or `download_failed` for any other exception, or
@@ -146,7 +146,7 @@ def _chance() -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Patience:
-    """How long a file is waited for."""
+    """Time limits of a download."""
 
     least_bytes_per_s: float = 10_000.0
     """Mean rate below which a transfer ends: a shard of 100 MB would take three hours. The slowest
@@ -154,7 +154,7 @@ class Patience:
     window_s: float = 300.0
     """Seconds over which the mean is taken; a link may be gone for nearly as long."""
     file_s: float = 86_400.0
-    """Seconds for all of one file, tries and beginnings anew included: a day, in which the least
+    """Seconds for all of one file, tries and restarts included: a day, in which the least
     rate brings 864 MB."""
 
 
@@ -170,7 +170,7 @@ class Pace:
         """Begin to watch.
 
         Args:
-            position: how many bytes have come; falls where a transfer begins anew.
+            position: how many bytes have come; falls where a transfer starts over.
             clock: seconds.
         """
         self._position = position
@@ -183,11 +183,13 @@ class Pace:
 
         To be called at every arrival and after every try: what is slow ends within two windows.
         """
-        now_s, reached = self._clock(), self._position()
+        now_s = self._clock()
+        reached = self._position()
         if now_s - self._begun[0] > self._patience.file_s:
             message = f"it did not come within {self._patience.file_s:.0f} s"
             raise TransferFailed("download_failed", message)
-        passed_s, moved = now_s - self._window[0], reached - self._window[1]
+        passed_s = now_s - self._window[0]
+        moved = reached - self._window[1]
         if passed_s < self._patience.window_s:
             return
         if moved < self._patience.least_bytes_per_s * passed_s:

@@ -38,11 +38,11 @@ class RemoteUrl:
     """A folder or file on a server."""
 
     what: str = field(compare=False)
-    """What it is in messages, such as `objects`."""
+    """Name of the resource in messages, such as `objects`."""
     scheme: str
-    """A key of PACKAGES."""
+    """URL scheme, a key of PACKAGES."""
     root: str
-    """What the driver calls it: without secrets, query and final slash."""
+    """Path as the driver takes it: no secrets, query or final slash."""
     query: tuple[tuple[str, str], ...] = field(default=(), repr=False)
     """Sent with every request, since it may hold the key; http and https only."""
     user: str = field(default="", repr=False)
@@ -52,12 +52,12 @@ class RemoteUrl:
 
     @property
     def is_http(self) -> bool:
-        """Whether the scheme is http or https; file names in such URLs are quoted."""
+        """True: the scheme is http or https; file names in such URLs are quoted."""
         return self.scheme in ("http", "https")
 
     @property
-    def shown(self) -> str:
-        """The URL for people, and for naming what is kept of it."""
+    def display_url(self) -> str:
+        """The URL without secrets, for messages and for the names of cached files."""
         return printable(self.root if self.is_http else f"{self.scheme}://{self.root}")
 
     def child(self, name: str) -> "RemoteUrl":
@@ -78,24 +78,27 @@ def parse_url(source: str, *, what: str) -> RemoteUrl | Path:
         TrilightError: the URL is chained (`::`), runs a program (`pipe:`), has a scheme that is not
             admitted, names no host or bucket, or holds a password where none is read.
     """
-    shown = printable(safe_text(source))
+    url_text = printable(safe_text(source))
     if source.startswith("pipe:"):
         raise TrilightError(f"{what} is a pipe: command; {_ADMITTED}. Programs are not run.")
     if "://" in source and "::" in _BRACKETED_HOST.sub("", source):
-        raise TrilightError(f"{what} {shown!r} is chained with '::'; {_ADMITTED}, on its own.")
+        raise TrilightError(f"{what} {url_text!r} is chained with '::'; {_ADMITTED}, on its own.")
     match = _SCHEME.match(source)
     if match is None:
         return parse_local_path(source)
-    scheme, rest = match[1].lower(), match[2]
+    scheme = match[1].lower()
+    rest = match[2]
     if scheme == "file":
-        return _local(rest, what, shown)
+        return _local(rest, what, url_text)
     if scheme not in PACKAGES:
-        raise TrilightError(f"{what} {shown!r} has the scheme {printable(scheme)!r}; {_ADMITTED}.")
+        raise TrilightError(
+            f"{what} {url_text!r} has the scheme {printable(scheme)!r}; {_ADMITTED}."
+        )
     if not rest.partition("/")[0].rpartition("@")[2]:
-        raise TrilightError(f"{what} {shown!r} names no host or bucket; {_ADMITTED}.")
+        raise TrilightError(f"{what} {url_text!r} names no host or bucket; {_ADMITTED}.")
     if scheme in ("http", "https"):
         return _http(scheme, rest, what)
-    return _bucket(scheme, rest, what, shown)
+    return _bucket(scheme, rest, what, url_text)
 
 
 def parse_local_path(text: str) -> Path:
@@ -119,7 +122,8 @@ def open_driver(url: RemoteUrl) -> Any:
         import fsspec
     except ImportError as error:
         raise TrilightError(
-            f"{url.what} {url.shown!r}: {url.scheme}:// needs the package {package}; expected it "
+            f"{url.what} {url.display_url!r}: {url.scheme}:// needs the package {package}; "
+            "expected it "
             f"to be installed. Run pip install {package}."
         ) from error
     # Drivers log whole requests, with their secrets, on the way to an error that we report anyway.
@@ -193,17 +197,17 @@ def _http(scheme: str, rest: str, what: str) -> RemoteUrl:
     )
 
 
-def _bucket(scheme: str, rest: str, what: str, shown: str) -> RemoteUrl:
+def _bucket(scheme: str, rest: str, what: str, url_text: str) -> RemoteUrl:
     if "@" in rest.partition("/")[0]:
         raise TrilightError(
-            f"{what} {shown!r} came with a user or password; expected none in URLs of {scheme}. "
+            f"{what} {url_text!r} came with a user or password; expected none in URLs of {scheme}. "
             f"Give them in the way of {PACKAGES[scheme]}, such as by its environment variables."
         )
     return RemoteUrl(what=what, scheme=scheme, root=rest.strip("/"))
 
 
-def _local(rest: str, what: str, shown: str) -> Path:
+def _local(rest: str, what: str, url_text: str) -> Path:
     host, slash, path = rest.partition("/")
     if host not in ("", "localhost") or not slash:
-        raise TrilightError(f"{what} {shown!r}; expected file:///FOLDER, with three slashes.")
+        raise TrilightError(f"{what} {url_text!r}; expected file:///FOLDER, with three slashes.")
     return Path("/" + unquote(path))

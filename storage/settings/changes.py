@@ -54,8 +54,8 @@ def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
         TrilightError: a name that does not exist, a value of another kind, or one that the
             settings themselves refuse; a name that is nearly right is asked back.
     """
-    found: Settings = _changed(settings, [(n.split("."), v, n) for n, v in changes.items()])
-    return found
+    result: Settings = _replace_fields(settings, [(n.split("."), v, n) for n, v in changes.items()])
+    return result
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
@@ -65,19 +65,22 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, 
         before: a record (storage.settings.described.settings_record), or part of one.
         now: that whose values are returned; what it lacks does not differ.
     """
-    found: dict[str, Any] = {}
+    differing: dict[str, Any] = {}
     for name, value in now.items():
         old = before.get(name)
         if isinstance(old, Mapping) and isinstance(value, Mapping) and old.keys() == value.keys():
-            found |= {f"{name}.{below}": each for below, each in differences(old, value).items()}
+            differing |= {
+                f"{name}.{below}": each for below, each in differences(old, value).items()
+            }
         elif old != value:
-            found[name] = value
-    return found
+            differing[name] = value
+    return differing
 
 
-def _changed(group: Any, changes: Sequence[Change]) -> Any:
+def _replace_fields(group: Any, changes: Sequence[Change]) -> Any:
     values = {
-        field: _changed_field(group, field, own) for field, own in _by_field(group, changes).items()
+        field: _new_field_value(group, field, field_changes)
+        for field, field_changes in _by_field(group, changes).items()
     }
     try:
         return dataclasses.replace(group, **values)
@@ -85,14 +88,14 @@ def _changed(group: Any, changes: Sequence[Change]) -> Any:
         names = [name for _, _, name in changes]
         if any(name in str(error) for name in names):
             raise
-        shown = ", ".join(map(repr, names))
-        raise TrilightError(f"setting{'s' * (len(names) > 1)} {shown}: {error}") from error
+        quoted = ", ".join(map(repr, names))
+        raise TrilightError(f"setting{'s' * (len(names) > 1)} {quoted}: {error}") from error
 
 
 def _by_field(group: Any, changes: Sequence[Change]) -> Mapping[str, Sequence[Change]]:
     """Return the changes by the field of the group that they lead through."""
     fields = [field.name for field in dataclasses.fields(group)]
-    found: dict[str, list[Change]] = {}
+    by_field: dict[str, list[Change]] = {}
     for path, value, name in changes:
         if path[0] in removed_fields(type(group)):
             raise TrilightError(removal_message(f"setting {name!r}"))
@@ -101,17 +104,17 @@ def _by_field(group: Any, changes: Sequence[Change]) -> Mapping[str, Sequence[Ch
                 f"setting {name!r} does not exist: {path[0]!r} is unknown there; "
                 f"{expected_one_of(path[0], fields)}."
             )
-        found.setdefault(path[0], []).append((path[1:], value, name))
-    return found
+        by_field.setdefault(path[0], []).append((path[1:], value, name))
+    return by_field
 
 
-def _changed_field(group: Any, field: str, changes: Sequence[Change]) -> Any:
+def _new_field_value(group: Any, field: str, changes: Sequence[Change]) -> Any:
     """Return a field's new value: first as a whole, then single settings within it."""
     value = getattr(group, field)
     for path, new, name in changes:
         if not path:
             value = field_value(type(group), field, _without_names(new, value, name), name)
-    return _within(value, [change for change in changes if change[0]])
+    return _change_within(value, [change for change in changes if change[0]])
 
 
 def _without_names(new: Any, old: Any, name: str) -> Any:
@@ -136,7 +139,7 @@ def _without_names(new: Any, old: Any, name: str) -> Any:
     return records if many else records[0]
 
 
-def _within(value: Any, changes: Sequence[Change]) -> Any:
+def _change_within(value: Any, changes: Sequence[Change]) -> Any:
     """Return a group, or a list of groups, with single settings of it changed."""
     if not changes:
         return value
@@ -147,17 +150,17 @@ def _within(value: Any, changes: Sequence[Change]) -> Any:
                     f"setting {name!r} is {new!r}; expected one of its settings by name, such as "
                     f"{name}.{dataclasses.fields(value)[0].name}."
                 )
-        return _changed(value, changes)
+        return _replace_fields(value, changes)
     if not isinstance(value, tuple) or not all(map(dataclasses.is_dataclass, value)):
         path, _, name = changes[0]
         plain = ".".join(name.split(".")[: -len(path)])
         raise TrilightError(f"setting {name!r} does not exist: {plain!r} has no settings within.")
-    own: list[list[Change]] = [[] for _ in value]
+    by_entry: list[list[Change]] = [[] for _ in value]
     for path, new, name in changes:
         for index in _entries(path[0], len(value), name):
             inner = path[1:] if path[0].isdigit() else path
-            own[index].append((inner, new, name))
-    return tuple(map(_within, value, own))
+            by_entry[index].append((inner, new, name))
+    return tuple(map(_change_within, value, by_entry))
 
 
 def _entries(step: str, count: int, name: str) -> Sequence[int]:

@@ -64,51 +64,50 @@ def checked(
     its range: the field, the value, and what was expected.
     """
 
-    def made(cls: type[Settings]) -> type[Settings]:
+    def decorate(cls: type[Settings]) -> type[Settings]:
         group: Any = dataclass(cls, frozen=True, kw_only=True, config=_RULES)
         plain = group.__init__
 
         @functools.wraps(plain)
-        def complaining(self: Any, **values: Any) -> None:
+        def init_or_complain(self: Any, **values: Any) -> None:
             try:
                 plain(self, **values)
             except pydantic.ValidationError as error:
                 raise _complaint(error, type(self), called=called, option=option) from None
 
-        group.__init__ = complaining
+        group.__init__ = init_or_complain
         return typing.cast(type[Settings], group)
 
-    return made
+    return decorate
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Described:
-    """What is said of one field."""
+class FieldDescription:
+    """Description of one field of a class of settings."""
 
     name: str
-    """Its name."""
     hint: Any
-    """Its type, with its notes."""
+    """Type annotation, with its notes."""
     default: Any
-    """Its default; dataclasses.MISSING where a value must be given."""
+    """Default value; dataclasses.MISSING where a value must be given."""
     sentence: str
     """The sentence under it, in one line."""
     within: Within | None
     """The range of its numbers."""
     expected: str
-    """What to write, for a person."""
+    """Description of valid values, for error messages."""
     is_execution: bool
-    """Whether it says how something is executed, and not what it means."""
+    """True: the field changes how something is executed, and not its meaning."""
 
 
 @functools.cache
-def described(kind: type) -> tuple[Described, ...]:
+def describe_fields(kind: type) -> tuple[FieldDescription, ...]:
     """Return what is said of the fields of a class of settings, in their order."""
     hints = _hints(kind)
     ranges = {field.name: field for field in declared_ranges(kind)}
     sentences = field_sentences(kind)
     return tuple(
-        Described(
+        FieldDescription(
             name=field.name,
             hint=hints[field.name],
             default=_default(field),
@@ -157,13 +156,14 @@ def option_of(field: str) -> str:
 
 def expected_of(hint: Any) -> str:
     """Return what a value of a type without a range looks like, for a person."""
-    origin, args = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    args = get_args(hint)
     if origin is Annotated:
         stated = (getattr(note, "expected", "") for note in args[1:])
         return next(filter(None, stated), "") or expected_of(args[0])
     if origin is Literal:
-        *others, last = map(str, args)
-        return f"{', '.join(others)} or {last}" if others else last
+        *choices, last = map(str, args)
+        return f"{', '.join(choices)} or {last}" if choices else last
     if origin in (typing.Union, types.UnionType):
         return " or ".join("none" if arg is types.NoneType else expected_of(arg) for arg in args)
     if origin is tuple:
@@ -203,7 +203,7 @@ def from_record(kind: type[Settings], record: Any) -> Settings:
         raise _complaint(error, kind, option="setting {!r}".format) from None
 
 
-def field_value(kind: type, name: str, value: Any, shown: str) -> Any:
+def field_value(kind: type, name: str, value: Any, display_name: str) -> Any:
     """Return a JSON value as the value of a field.
 
     Args:
@@ -218,7 +218,9 @@ def field_value(kind: type, name: str, value: Any, shown: str) -> Any:
     try:
         return _read(_hints(kind)[name], value)
     except pydantic.ValidationError as error:
-        raise _complaint(error, kind, option="setting {!r}".format, within=(name, shown)) from None
+        raise _complaint(
+            error, kind, option="setting {!r}".format, within=(name, display_name)
+        ) from None
 
 
 def _read(hint: Any, value: Any) -> Any:
@@ -235,8 +237,8 @@ def read_error(error: ValueError, kind: Any, source: str) -> TrilightError:
     """Return the complaint of a value of JSON that was read; `source` begins it."""
     assert isinstance(error, pydantic.ValidationError)
     complaint = _complaint(error, kind, called=source, option=str)
-    told = str(complaint)
-    return complaint if told.startswith(source) else TrilightError(f"{source}: {told}")
+    message = str(complaint)
+    return complaint if message.startswith(source) else TrilightError(f"{source}: {message}")
 
 
 @functools.cache
@@ -283,14 +285,14 @@ def _complaint(
         why = first["ctx"]["error"]
         return TrilightError(f"{where}{what} not JSON ({why}); expected it as it was written.")
     steps = [str(step) for step in first["loc"]]
-    shown, holder, field = _place([within[0], *steps] if within else steps, kind)
+    known_steps, holder, field = _place([within[0], *steps] if within else steps, kind)
     if within:
-        shown[0] = within[1]
-    place = option(".".join(shown)) if shown else "all of it"
+        known_steps[0] = within[1]
+    place = option(".".join(known_steps)) if known_steps else "all of it"
     if first["type"] in ("unexpected_keyword_argument", "unexpected_property"):
         if steps[-1] in removed_fields(holder):
             return TrilightError(removal_message(f"{where}{place}"))
-        known = [each.name for each in described(holder)]
+        known = [each.name for each in describe_fields(holder)]
         return TrilightError(f"{where}{place} does not exist; {expected_one_of(steps[-1], known)}.")
     expected = field.expected if field else expected_of(holder)
     if first["type"].startswith("missing"):
@@ -298,20 +300,23 @@ def _complaint(
     return TrilightError(f"{where}{place} is {_SHORT.repr(first['input'])}; expected {expected}.")
 
 
-def _place(steps: Sequence[str], kind: type) -> tuple[list[str], type, Described | None]:
+def _place(steps: Sequence[str], kind: type) -> tuple[list[str], type, FieldDescription | None]:
     """Return the steps that a person knows, the class that holds the last, and its field."""
-    shown, holder, field = list[str](), kind, None
+    known_steps = list[str]()
+    holder = kind
+    field = None
     for step in steps:
         groups = {group.__name__: group for group in _groups(field.hint if field else None)}
         if step in groups:  # of a union of groups, the one that was tried
-            holder, field = groups[step], None
+            holder = groups[step]
+            field = None
             continue
         if len(groups) == 1 and not step.isdigit():
             (holder,) = groups.values()
-        fields = described(holder) if group_of(holder) else ()
+        fields = describe_fields(holder) if group_of(holder) else ()
         field = {each.name: each for each in fields}.get(step, field)
-        shown.append(step)
-    return shown, holder, field
+        known_steps.append(step)
+    return known_steps, holder, field
 
 
 def _groups(hint: Any) -> Iterator[type]:
@@ -332,7 +337,7 @@ def option_words(settings: Any, *, leave_out: tuple[str, ...] = ()) -> list[str]
     kind: Any = type(settings)
     return [
         word
-        for field in described(kind)
+        for field in describe_fields(kind)
         if field.name not in leave_out and getattr(settings, field.name) != field.default
         for word in _words(option_of(field.name), getattr(settings, field.name))
     ]

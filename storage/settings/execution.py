@@ -1,4 +1,4 @@
-"""What a setting may change: how something is executed, or what it means.
+"""Marks of settings that change how something is executed, and not its meaning.
 
     scenes_per_pass: Annotated[int, Within(1, 65_536, unit="scenes"), EXECUTION] = 16
 

@@ -24,15 +24,15 @@ class Within:
     """Lowest and highest value; both are admitted unless that end is open."""
 
     low: float
-    """The least value."""
+    """Least value; see `low_open`."""
     high: float
-    """The greatest value."""
+    """Greatest value; see `high_open`."""
     low_open: bool = False
-    """Whether `low` itself is refused."""
+    """True: `low` itself is refused."""
     high_open: bool = False
-    """Whether `high` itself is refused."""
+    """True: `high` itself is refused."""
     unit: str = ""
-    """What is counted or measured, in the plural; empty for pure numbers."""
+    """Plural noun that is counted or measured; empty for pure numbers."""
 
     def holds(self, value: Any) -> Any:
         """Return whether a number is in the range, or of each number of an array; NaN is not."""
@@ -44,15 +44,16 @@ class Within:
         """Let pydantic check the range after the type: of a number, or of each in a tuple."""
         from pydantic_core import core_schema  # readers of scenes do without pydantic
 
-        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+        return core_schema.no_info_after_validator_function(self._check, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         """Let forms show the range, at the number or at the entries of a list."""
-        return self._bounded(handler(schema))
+        return self._add_bounds(handler(schema))
 
     def __str__(self) -> str:
         """Return the range as the end of a sentence, such as `from 1 to 170 degrees`."""
-        low, high = shown_number(self.low), shown_number(self.high)
+        low = shown_number(self.low)
+        high = shown_number(self.high)
         start = f"above {low}" if self.low_open else f"from {low}"
         if self.high_open:
             end = f" and below {high}" if self.low_open else f" to below {high}"
@@ -60,7 +61,7 @@ class Within:
             end = f", up to {high}" if self.low_open else f" to {high}"
         return start + end + (f" {self.unit}" if self.unit else "")
 
-    def _checked(self, value: Any) -> Any:
+    def _check(self, value: Any) -> Any:
         from pydantic_core import PydanticCustomError
 
         numbers = value if isinstance(value, tuple) else (value,)
@@ -70,13 +71,13 @@ class Within:
             )
         return value
 
-    def _bounded(self, form: dict[str, Any]) -> dict[str, Any]:
+    def _add_bounds(self, form: dict[str, Any]) -> dict[str, Any]:
         """Return a JSON schema with the ends of the range, but for those that are no limit."""
         if "anyOf" in form:
-            return form | {"anyOf": [self._bounded(option) for option in form["anyOf"]]}
+            return form | {"anyOf": [self._add_bounds(option) for option in form["anyOf"]]}
         if form.get("type") == "array":  # pairs as lists too: forms know no tuples
             rest = {name: part for name, part in form.items() if name != "prefixItems"}
-            return rest | {"items": self._bounded(form.get("items") or form["prefixItems"][0])}
+            return rest | {"items": self._add_bounds(form.get("items") or form["prefixItems"][0])}
         if form.get("type") not in ("integer", "number"):
             return form
         bounds: dict[str, Any] = {}
@@ -99,9 +100,9 @@ class LowFirst:
         """Let pydantic check the order after the type."""
         from pydantic_core import core_schema
 
-        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+        return core_schema.no_info_after_validator_function(self._check, handler(source))
 
-    def _checked(self, pair: tuple[float, float]) -> tuple[float, float]:
+    def _check(self, pair: tuple[float, float]) -> tuple[float, float]:
         from pydantic_core import PydanticCustomError
 
         if pair[0] > pair[1]:
@@ -114,11 +115,11 @@ class Columns:
     """A range of some columns of an array."""
 
     name: str
-    """What the columns hold."""
+    """Noun for the columns in messages."""
     columns: slice
     """The columns, as a slice of the last axis."""
     within: Within
-    """Range of every value."""
+    """Range that holds for every value."""
 
 
 Share = Annotated[float, Within(0, 1)]
@@ -144,26 +145,25 @@ _EXPECTED: dict[tuple[Shape, type], str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Declared:
-    """What a field, or some columns of one, may hold."""
+    """Declared range of a field, or of some of its columns."""
 
     name: str
-    """Name of the field."""
     kind: type
     """int or float; a float may be given as an int."""
     shape: Shape
     """One number, a pair, a tuple of any length, or an array of numpy."""
     optional: bool
-    """Whether None is admitted."""
+    """True: None is allowed."""
     within: Within
-    """Range of every value."""
+    """Range that holds for every value."""
     ordered: bool = False
-    """Whether the lower number of a pair must come first."""
+    """True: the lower number of a pair comes first."""
     part: Columns | None = None
     """The columns that are meant, where it is not the whole array."""
 
     @property
     def expected(self) -> str:
-        """What to write, for a person; not of arrays."""
+        """Description of valid values, for messages; not for arrays."""
         order = ", the lower one first" if self.ordered else ""
         return f"{_EXPECTED[self.shape, self.kind]} {self.within}{order}"
 
@@ -195,18 +195,20 @@ def shown_number(number: float) -> str:
 
 
 def _declarations_of(name: str, hint: Any) -> Iterator[Declared]:
-    optional, ordered, found = False, False, list[Within | Columns]()
+    optional = False
+    ordered = False
+    declarations = list[Within | Columns]()
     while True:
         if get_origin(hint) is Annotated:
             hint, *notes = get_args(hint)
-            found += [note for note in notes if isinstance(note, Within | Columns)]
+            declarations += [note for note in notes if isinstance(note, Within | Columns)]
             ordered = any(isinstance(note, LowFirst) for note in notes)
         elif get_origin(hint) in (typing.Union, types.UnionType) and type(None) in get_args(hint):
             optional = True
             hint = next(arg for arg in get_args(hint) if arg is not type(None))
         else:
             break
-    for note in found:
+    for note in declarations:
         kind, shape = _kind_and_shape(hint)
         yield Declared(
             name=name,

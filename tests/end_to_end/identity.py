@@ -24,9 +24,9 @@ from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.usd.write import write_usd
-from pipeline.making.attempt_scene import MAX_ATTEMPTS
-from pipeline.making.environment import vector_extension
-from pipeline.making.prepare_isolated import prepare_isolated
+from pipeline.generation.attempt_scene import MAX_ATTEMPTS
+from pipeline.generation.environment import vector_extension
+from pipeline.generation.prepare_isolated import prepare_isolated
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.local.folder import list_folder
 from pipeline.scenes.compose import compose_scene

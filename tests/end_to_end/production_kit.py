@@ -24,6 +24,10 @@ import pytest
 from tests.conftest import ROOT
 
 SERVERS = (ROOT / "docs/how-to/servers-and-clusters.md").read_text()
+FEW_SAMPLES_CHANGES = {"scenes": {"num_views": 1}, "renders": {"min_spp": 16, "max_spp": 16}}
+"""Of scenes whose light nobody looks at: 16 of them take 8 processor seconds, and not 25."""
+SIXTEEN_SAMPLES = ("--set", "renders.min_spp=16", "--set", "renders.max_spp=16")
+FEW_SAMPLES = (*SIXTEEN_SAMPLES, "--set", "scenes.num_views=1")
 START, STOP = (["-m", "infra.serving.local", action] for action in ("start", "stop"))
 """What `make serve` and `make stop` run, as arguments of Python."""
 START_S = 300
@@ -157,6 +161,9 @@ def served(
         "PREFECT_API_DATABASE_CONNECTION_URL": database_url,
         "PATH": f"{Path(sys.executable).parent}:{base['PATH']}",
         "PYTHONPATH": str(ROOT),
+        # only their forms on the page need them
+        "PREFECT_SERVER_REGISTER_BLOCKS_ON_START": "false",
+        "PREFECT_SERVER_MEMOIZE_BLOCK_AUTO_REGISTRATION": "false",
     }
     try:
         start_served(environment)

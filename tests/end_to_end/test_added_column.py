@@ -19,8 +19,8 @@ from model.open import open_network, save_published
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import load_source, scene_source
-from pipeline.making.inspect_scene import _facts
-from pipeline.making.path_tracer import PathTracer
+from pipeline.generation.inspect_scene import _facts
+from pipeline.generation.path_tracer import PathTracer
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.dataset.dataset import Dataset
@@ -36,11 +36,11 @@ from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import FLOOR, tiny_scene
 from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import toy_sample, write_toy_dataset
-from train.data.augment import with_channels, with_light_scaled
-from train.data.order import RankShare
+from train.data.augment import permute_channels, scale_light
+from train.data.bad_samples import BadSampleCounter
+from train.data.order import RankSlice
 from train.data.scenes import training_scene
 from train.data.stream import stream_batches
-from train.data.unusable import Unusable
 from train.loop.checkpoints import network_of_run
 from train.loop.state import new_state
 from train.run import stream_settings
@@ -115,9 +115,9 @@ def test_the_stream_shows_what_was_composed(data: Dataset) -> None:
         open_training_data([str(data.folder.root)]).split("train"),
         settings,
         0,
-        share=RankShare(rank=0, world_size=1),
+        rank_slice=RankSlice(rank=0, world_size=1),
         workers=1,
-        unusable=Unusable(0),
+        unusable=BadSampleCounter(0),
     )
     with contextlib.closing(batches):
         (batch,) = itertools.islice(batches, 1)
@@ -134,10 +134,10 @@ def test_symmetries_permute_and_scale_an_added_colour_and_leave_a_scalar() -> No
         sample.scene.materials[:, -4:] = rng.random((len(sample.scene.materials), 4))
         scene = training_scene(sample, 16)
         before = scene.tensors.material_TM[:, -4:]
-        turned = with_channels(scene, np.array([2, 0, 1])).tensors.material_TM[:, -4:]
+        turned = permute_channels(scene, np.array([2, 0, 1])).tensors.material_TM[:, -4:]
         assert torch.equal(turned[:, 0], before[:, 0])
         assert torch.equal(turned[:, 1:], before[:, [3, 1, 2]])
-        scaled = with_light_scaled(scene, 2.0).tensors.material_TM[:, -4:]
+        scaled = scale_light(scene, 2.0).tensors.material_TM[:, -4:]
         assert torch.equal(scaled[:, 0], before[:, 0])
         assert torch.equal(scaled[:, 1:], 2 * before[:, 1:])
 

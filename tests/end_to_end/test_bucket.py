@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from tests.conftest import ROOT
-from tests.end_to_end.production_kit import call
+from tests.end_to_end.production_kit import FEW_SAMPLES, FEW_SAMPLES_CHANGES, call
 from tests.http_server import serve
 from tests.pipeline.assets.meshes_by_hand import knot, write_obj
-from tests.pipeline.making.bucket_kit import empty_bucket
+from tests.pipeline.generation.bucket_kit import empty_bucket
 from tests.s3_server import control, s3_server
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
@@ -27,19 +27,19 @@ SECRETS = (
 )  # fmt: skip
 OPTIONS = (
     "--objects", "env:TRILIGHT_SOURCE_TEST", "--scenes", "12", "--resolution", "32",
-    "--noise-floor", "20",
+    *FEW_SAMPLES,
 )  # fmt: skip
 """Three shards of four tiny scenes."""
 RUN_S = 900
 """A run takes half a minute; on busy machines many times that."""
-FLOW = """
+FLOW = f"""
 from pipeline.flows import prefect_server as private
 private._START_UP_S = 600.0  # on two busy cores 120 s were not enough
 private.quiet_prefect()
 with private.prefect_server():
     from pipeline.flows.dataset_flows import generate_scenes
     generate_scenes(objects="env:TRILIGHT_SOURCE_TEST", scenes=12, resolution=32,
-                    noise_floor_db=20.0, out="s3://shards/flow")
+                    changes={FEW_SAMPLES_CHANGES!r}, out="s3://shards/flow")
 """
 
 

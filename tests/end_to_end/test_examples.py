@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from infra.cli.extending import extended
+from infra.cli.extend_option import load_extensions
 from model.config import SIZES, ModelConfig
 from pipeline.builds.named import BUILDS, named_build, typed_build
 from pipeline.exchange.convert import write_scene
@@ -26,6 +26,7 @@ from storage.records.scene_file import decode_scene_file, encode_scene
 from storage.seeds import rng_for
 from storage.settings.changes import changed
 from tests.end_to_end.conftest import Trilight
+from tests.end_to_end.production_kit import FEW_SAMPLES
 from tests.extensions_kit import EXAMPLES, loaded, room_for_extensions
 from tests.for_each import for_each
 from tests.scene_templates.balls import one_drawn
@@ -168,19 +169,18 @@ def test_a_size_is_a_setting(copied: Callable[[str], Path]) -> None:
 def test_an_executor_is_a_runner(copied: Callable[[str], Path]) -> None:
     path = copied("executor.py")
     with room_for_extensions():
-        words = extended(["generate", "smoke", f"--extend={path}", "--runner", "commands"])
+        words = load_extensions(["generate", "smoke", f"--extend={path}", "--runner", "commands"])
         assert words == ["generate", "smoke", "--runner", "commands"]
         assert "commands" in EXECUTORS
-        again = extended(["--extend", str(path), "doctor", "--", "--extend"])
+        again = load_extensions(["--extend", str(path), "doctor", "--", "--extend"])
         assert again == ["doctor", "--", "--extend"]
         for nothing in (["--extend"], ["--extend="]):
             with pytest.raises(TrilightError, match=r"--extend: names no file; expected"):
-                extended(nothing)
+                load_extensions(nothing)
 
 
 TINY = (
-    "--resolution", "32", "--noise-floor", "20", "--set", "renders.max_spp=64",
-    "--set", "scenes.num_views=1", "--set", "splits.scenes_per_shard=1",
+    "--resolution", "32", *FEW_SAMPLES, "--set", "splits.scenes_per_shard=1",
 )  # fmt: skip
 
 

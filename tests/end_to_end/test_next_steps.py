@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from infra.cli.leaving import temporary_folder
+from infra.cli.process_exit import temporary_folder
 from storage.dataset.manifest import read_manifest
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import Trilight, command
+from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
 from tests.for_each import for_each
 
 SCENE = "{}"
@@ -106,7 +107,7 @@ def test_an_error_is_one_line_without_a_bar_before_it(tmp_path: Path) -> None:
     assert output == "Verifying nowhere ...\n"
 
 
-SMALL = ("--resolution", "64", "--noise-floor", "15")
+SMALL = ("--resolution", "64", "--noise-floor", "15", *SIXTEEN_SAMPLES)
 MINE = "data/my set's"
 
 

@@ -12,9 +12,9 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.staging import stage_scene
 from storage.records.objects import read_failures
 from tests.end_to_end.conftest import Trilight
-from tests.end_to_end.production_kit import copy_objects
+from tests.end_to_end.production_kit import SIXTEEN_SAMPLES, copy_objects
 
-SMALL = ("--resolution", "32", "--noise-floor", "20", "--scenes", "4")
+SMALL = ("--resolution", "32", "--noise-floor", "20", "--scenes", "4", *SIXTEEN_SAMPLES)
 
 
 @pytest.mark.slow("commands")
@@ -70,7 +70,7 @@ def test_bad_input_is_one_clear_line(refused: Callable[..., str], tmp_path: Path
 
 
 TWO_SHARDS = (
-    "--scenes", "8", "--seed", "3", "--resolution", "32", "--noise-floor", "20",
+    "--scenes", "8", "--seed", "3", "--resolution", "32", "--noise-floor", "20", *SIXTEEN_SAMPLES,
     "--set", "scenes.num_views=2", "--set", "scenes.families.0.weight=2",
 )  # fmt: skip
 
@@ -105,7 +105,7 @@ def test_bad_and_missing_shards_are_made_anew(
 
 
 EXACT = (
-    *("--resolution", "64", "--noise-floor", "20", "--json"),
+    *("--resolution", "64", "--noise-floor", "20", "--json", *SIXTEEN_SAMPLES),
     *("--set", 'storage.profile="lossless"'),  # so that a sample that was read is staged as it was
 )
 

@@ -16,6 +16,8 @@ from storage.dataset.verify import verify_dataset
 from tests.conftest import ROOT
 from tests.end_to_end.array_kit import require_an_array_outlives_its_flow, with_a_cluster
 from tests.end_to_end.production_kit import (
+    FEW_SAMPLES,
+    FEW_SAMPLES_CHANGES,
     START,
     STOP,
     Postgres,
@@ -31,10 +33,11 @@ MANY, FEW = 16, 8
 """Scenes, four to a shard: so many that a second worker, which looks for work every ten seconds and
 then starts a process, comes before the first has made them all; and two shards."""
 SMALL: dict[str, Any] = {
-    "objects": "builtin:24", "scenes": MANY, "resolution": 64, "noise_floor_db": 20,
+    "objects": "builtin:24", "scenes": MANY, "resolution": 64,
+    "changes": json.dumps(FEW_SAMPLES_CHANGES),
 }  # fmt: skip
 """Tiny scenes, as wide as the smoke run's pictures."""
-OPTIONS = ("--objects", "builtin:24", "--resolution", "64", "--noise-floor", "20")
+OPTIONS = ("--objects", "builtin:24", "--resolution", "64", *FEW_SAMPLES)
 CANARY = "CANARY-51b2"
 RUN_S = 900
 """A run takes a minute; on busy machines many times that."""

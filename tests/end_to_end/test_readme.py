@@ -16,6 +16,7 @@ from storage.extensions import is_reference
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.end_to_end.production_kit import (
+    SIXTEEN_SAMPLES,
     answer_of,
     copy_objects,
     copy_of_the_project,
@@ -152,11 +153,12 @@ def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
         command = command.replace("FOLDER", shlex.quote(str(objects)))
         # one scene a shard: eight have all three splits
         fewer = "--scenes 8 --resolution 64 --set splits.scenes_per_shard=1"
+        fewer += f" {' '.join(SIXTEEN_SAMPLES)}"
         command = command.replace("--scenes 64", fewer)
         command = command.replace("/mine", "/readme")
         # set-up would lead the environment, which is lent, to the copy
         lent = "--old-file .venv/.dataset-ready"
-        command = command.replace("make dataset", f"make {lent} dataset SCENES=4")
+        command = command.replace("make dataset", f"make {lent} dataset SCENES=3")
         if command.startswith("trilight view"):
             _view(command, tmp_path)
         else:
@@ -201,7 +203,7 @@ def test_the_tutorials_run(tmp_path: Path) -> None:
 @pytest.mark.timeout(1800)
 def test_the_whole_line_runs(tmp_path: Path) -> None:
     copy_of_the_project(tmp_path)
-    _run("OBJECTS=builtin:24 SCENES=6 NOISE_FLOOR=20 sh examples/whole_line.sh", tmp_path)
+    _run("OBJECTS=builtin:12 SCENES=6 NOISE_FLOOR=5 sh examples/whole_line.sh", tmp_path)
     assert (tmp_path / "data" / "whole-line" / "both.png").stat().st_size > 1_000
     assert (tmp_path / "runs" / "whole-line" / "evaluation" / "evaluation.md").exists()
 

@@ -16,9 +16,12 @@ from typing import Any
 
 import pytest
 
+from infra.serving.deployments import read_deployments
+from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from storage.dataset.verify import verify_dataset
 from tests.end_to_end.browser_kit import Browser, browser
 from tests.end_to_end.production_kit import (
+    FEW_SAMPLES_CHANGES,
     START,
     START_S,
     STOP,
@@ -106,6 +109,16 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     finally:
         call(STOP, bare, START_S, checkout)
         assert not (checkout / "prefect.toml").is_symlink()
+
+
+def test_pool_limits_and_deployments_are_made(server: Server) -> None:
+    """Without its limit a flow takes as many graphics cards as there are runs."""
+    _, limits = server.ask("POST", "/api/v2/concurrency_limits/filter", {})
+    assert {DISK_LIMIT, GPU_LIMIT} <= {row["name"] for row in limits}
+    _, deployed = server.ask("POST", "/api/deployments/filter", {})
+    rows = [row for row in read_deployments() if row["name"] == "local"]
+    assert {row["entrypoint"] for row in deployed} == {row["entrypoint"] for row in rows}
+    assert {row["work_pool_name"] for row in deployed} == {"local"}
 
 
 WISHES: tuple[dict[str, Any], ...] = (
@@ -276,7 +289,11 @@ def test_the_lines_of_the_readme_need_nothing_exported(server: Server, tmp_path:
     """The server has started; a run ends as its documents say."""
     checkout = server.folder.parent
     run = documented_run(
-        objects="builtin:24", scenes=4, resolution=64, noise_floor_db=20, out=tmp_path / "mine"
+        objects="builtin:24",
+        scenes=4,
+        resolution=64,
+        changes=json.dumps(FEW_SAMPLES_CHANGES),
+        out=tmp_path / "mine",
     )
     call(run, server.environment, 900, checkout)
     assert verify_dataset(tmp_path / "mine").problems == []

@@ -20,8 +20,8 @@ import pytest
 
 from infra.leaderboard.contestants import TRACER
 from infra.release.__main__ import main as release
-from infra.viewer.later import page_of
-from infra.viewer.open_source import opened_room
+from infra.viewer.deferred_handlers import page_of
+from infra.viewer.open_source import open_handlers
 from pipeline.builds.named import named_build
 from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_of_file
@@ -118,7 +118,7 @@ def run(words: list[str]) -> None:
 def look(source: str) -> None:
     """Ask what a page asks first."""
     page = page_of(source)
-    with served(opened_room(source, checkpoint=None, threads=1), page) as asker:
+    with served(open_handlers(source, checkpoint=None, threads=1), page) as asker:
         status, told, _ = asker.ask(f"api/{ASKED[page]}")
         assert status == 200 and told, source
 

@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.making.pipeline import make_dataset
-from pipeline.making.run import ShardJob, TaskOutcome
-from pipeline.making.tasks import Piece
+from pipeline.generation.pipeline import make_dataset
+from pipeline.generation.run import ShardJob, TaskResult
+from pipeline.generation.tasks import Piece
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.scene_logs import decode_scene_log
@@ -33,10 +33,10 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.sample import sample_key
 from tests.for_each import case
-from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
+from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 from tests.train.kit import keys_of, take
 from tests.train.toy import write_toy_dataset
-from train.data.order import OrderSettings, batched, places_from, windows_from
+from train.data.order import OrderSettings, batch_visits, visits_from, windows_from
 from train.data.stream import StreamSettings
 
 
@@ -72,7 +72,7 @@ class _Counting(Undocumented):
         super().__init__()
         self.num_tasks = 0
 
-    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
+    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
         for outcome in super().run(tasks, job):
             self.num_tasks += 1
             yield outcome
@@ -178,7 +178,7 @@ def test_batches_may_exceed_the_split_and_stand_in_distant_epochs(tmp_path: Path
     assert keys(five, 5, 2, first=first) == [[*map(sample_key, range(5))]] * 2
     order = OrderSettings(seed=2**63, window=2)
     windows = windows_from(3, lambda shard: 7, order, 3 * first)
-    far = next(batched(places_from(windows, 3 * first), 64))
+    far = next(batch_visits(visits_from(windows, 3 * first), 64))
     assert [place.position for place in far] == list(range(3 * first, 3 * first + 64))
 
 

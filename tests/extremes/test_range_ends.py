@@ -40,7 +40,7 @@ from tests.model.kit import awake, random_scene, tiny_config
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.train.kit import stepper, tiny_run
 from tests.train.toy import toy_sample
-from train.data.augment import augmented
+from train.data.augment import augment_scene
 from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
 from train.loop.schedule import learning_rate
@@ -272,7 +272,7 @@ STRONGEST = AugmentationSettings(
 def test_the_strongest_augmentation_leaves_scenes_finite() -> None:
     scene = training_scene(toy_sample(0), 16)
     for seed in range(20):
-        shown = augmented(scene, STRONGEST, np.random.default_rng(seed))
+        shown = augment_scene(scene, STRONGEST, np.random.default_rng(seed))
         assert torch.isfinite(shown.target_VRR3).all()
         for tensor in tensors_of(shown.tensors).values():
             assert torch.isfinite(tensor).all()

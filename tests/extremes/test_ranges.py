@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.leaderboard.order import LeaderboardOrder
-from infra.rendering.request import Asked
-from infra.serving.train_model import TrainOrder
+from infra.leaderboard.options import LeaderboardOptions
+from infra.rendering.options import RenderOptions
+from infra.serving.train_model import TrainOptions
 from infra.setup.settings_page import ROOTS, reachable
 from model.base_widths import BaseWidths
 from model.config import ModelConfig, smoke, tiny
@@ -27,8 +27,8 @@ from pipeline.builds.named import named_build
 from pipeline.builds.revisit import GivenCamera, RevisitSettings
 from pipeline.builds.settings import BuildSettings
 from pipeline.flows.orders import DatasetInRuns
-from pipeline.making.price import CorePrice
-from pipeline.making.revisit_order import Revisit
+from pipeline.generation.price import CorePrice
+from pipeline.generation.revisit_options import RevisitOptions
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from scene_templates.cameras import CameraSettings
 from scene_templates.families import Family
@@ -48,20 +48,20 @@ from storage.errors import TrilightError
 from storage.records.scene import Scene
 from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
 from storage.records.texture import CONSTANT
-from storage.settings.described import checked, described
+from storage.settings.described import checked, describe_fields
 from storage.settings.ranges import Columns, Declared, Within, declared_ranges
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import textured_scene
-from train.evaluation.order import EvaluationOrder
+from train.evaluation.options import EvaluationOptions
+from train.monitoring.settings import WatchSettings
 from train.runs import named_run
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
-from train.watching.settings import WatchSettings
 
 End = Literal["low", "high"]
 
-ASKED = Asked(
+ASKED = RenderOptions(
     source="a.json", out=Path("a.exr"), engine="mitsuba", checkpoint=None, resolution=64,
     noise_floor_db=40.0, max_spp=64, view=0, orbit=None, arc_deg=360.0, cameras=None, fps=24,
     tone_map="plain", exposure_ev=0.0, precision="float32", lights_per_pass=8,
@@ -93,19 +93,19 @@ EXAMPLES: dict[type, Any] = {
     RenderSettings: SMOKE.renders,
     SplitSettings: SMOKE.splits,
     ListedShard: ListedShard(split="train", scenes=4),
-    Revisit: Revisit(dataset="a", out="b"),
+    RevisitOptions: RevisitOptions(dataset="a", out="b"),
     RevisitSettings: RevisitSettings(source_digest="", kept_cameras=4, lights="new", num_lights=2),
     GivenCamera: GivenCamera(c2w=(0.0,) * 16, fov_deg=40.0),
-    Asked: ASKED,
+    RenderOptions: ASKED,
     CorePrice: CorePrice(),
-    TrainOrder: TrainOrder(),
+    TrainOptions: TrainOptions(),
     TrainSettings: RUN,
     ModelConfig: tiny(),
     LossSettings: RUN.loss,
     AugmentationSettings: RUN.augmentation,
     BaseWidths: RUN.base_widths,
-    EvaluationOrder: EvaluationOrder(checkpoint="a", data=("b",)),
-    LeaderboardOrder: LeaderboardOrder(source="a", width=(64,)),
+    EvaluationOptions: EvaluationOptions(checkpoint="a", data=("b",)),
+    LeaderboardOptions: LeaderboardOptions(source="a", width=(64,)),
     WatchSettings: WatchSettings(),
 }  # fmt: skip
 """A valid value of every class that declares a range, but for `Scene`."""
@@ -127,7 +127,7 @@ BESIDE: dict[tuple[type, str, End], dict[str, Any]] = {
     (MaterialSettings, "roughness_bias", "high"): {"roughness_log": (1.0, 2.0)},
     (RevisitSettings, "kept_cameras", "low"): {"new_cameras": 1},
     (RevisitSettings, "new_cameras", "high"): {"kept_cameras": 0},
-    **{(Asked, name, end): {"noise_floor_db": None}
+    **{(RenderOptions, name, end): {"noise_floor_db": None}
        for name in ("seconds", "error_db", "spp") for end in ("low", "high")},
     (RenderSettings, "min_spp", "high"): {"max_spp": MAX_SPP},
     (RenderSettings, "max_spp", "low"): {"min_spp": 8},
@@ -227,7 +227,7 @@ def test_other_kinds_of_values_are_refused(settings: type, field: Declared) -> N
         with pytest.raises(TrilightError, match="expected"):
             at_end(settings, field, "low", value)
     if field.shape != "one":
-        (default,) = (each.default for each in described(settings) if each.name == field.name)
+        (default,) = (each.default for each in describe_fields(settings) if each.name == field.name)
         for value in ((), 1.0, [1.0, 2.0], None):
             if value == default:  # none at all, where that means what comes by itself
                 continue

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.exchange.renderformer_json import read_description
-from pipeline.isolation.deaths import ChildFailed
+from pipeline.isolation.call_failures import ChildFailed
 from pipeline.objects.maps.prepared import MapFiles, prepare_map
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import SKY, TEXTURE

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from pipeline.exchange import reader
+from pipeline.generation import path_tracer, progressive_tracer
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Reach, Result
 from pipeline.isolation.answers import decode_answer, encode_result
-from pipeline.making import path_tracer, progressive_tracer
 from storage.errors import Rejected, TrilightError
 
 

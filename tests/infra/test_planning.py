@@ -8,16 +8,16 @@ import pytest
 from infra import doctor
 from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict
 from pipeline.executors.threads import ThreadRunner
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.machine import available_cores
+from pipeline.generation.pipeline import make_dataset
+from pipeline.generation.tasks import MAX_TASKS
 from pipeline.isolation import confinement
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.machine import cores_owned
-from pipeline.making.pipeline import make_dataset
-from pipeline.making.tasks import MOST_TASKS
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.shard import scan_members
 from tests.for_each import case
-from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
+from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
 def _measured(core_s: tuple[float, ...], num_bytes: int = 150_000) -> MeasuredScenes:
@@ -34,7 +34,7 @@ def test_equal_scenes_add_up_exactly() -> None:
     assert found.hours.value == pytest.approx(1.6)
     assert found.usd.value == pytest.approx(12.8)
     assert found.gigabytes.value == pytest.approx(0.384)
-    assert found.num_tasks <= MOST_TASKS
+    assert found.num_tasks <= MAX_TASKS
     assert found.notes == ()
 
 
@@ -59,7 +59,7 @@ def test_two_million_scenes_come_with_warnings() -> None:
     order = DatasetOrder(build="pretrain-256", scenes=2_000_000)
     measured = _measured((400.0, 400.0))
     found = predict(measured, order, cores=4096, usd_per_core_hour=0.04)
-    assert found.num_tasks == MOST_TASKS
+    assert found.num_tasks == MAX_TASKS
     assert found.manifest_mb < 2  # it lists 7,813 shards, however many views they hold
     assert any("flow runs" in note for note in found.notes)
     fewer = predict(measured, dataclasses.replace(order, scenes=500), cores=1, usd_per_core_hour=1)
@@ -81,7 +81,7 @@ def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
     """Ten scenes reach the third shard, which is for validation. The clock moves on by 1000 s for
     the first scene, which a prediction leaves out, and by its number for each other one."""
     clock = _Clock()
-    monkeypatch.setattr("pipeline.making.pipeline.time", clock)
+    monkeypatch.setattr("pipeline.generation.pipeline.time", clock)
 
     def work(scene: int) -> None:
         clock.now += scene or 1000
@@ -90,7 +90,7 @@ def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
     order = tiny_order(out=str(tmp_path / "set"), scenes=24)
     measured = measure_scenes(order, 10, tmp_path / "measured", lambda: None)
     assert not (tmp_path / "set").exists()
-    cores = cores_owned()
+    cores = available_cores()
     assert measured.core_s == tuple(cores * seconds for seconds in (1000, *range(1, 10)))
     sampled = list(scenes)
     scenes.clear()

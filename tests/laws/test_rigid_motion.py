@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.scenes.sight import Sight
+from pipeline.scenes.visibility import Visibility
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.rotations import uniform_rotation
 from scene_templates.settings import SceneSettings
@@ -100,7 +100,7 @@ def test_rendering_commutes_with_motion() -> None:
 def test_what_a_camera_sees_commutes_with_motion() -> None:
     scene = _scene(0)
     there = moved(scene, uniform_rotation(np.random.default_rng(5)), [1.0, 2.0, -3.0])
-    before, after = (Sight(s).facts(s.c2w[0], float(s.fov_deg[0]), 64) for s in (scene, there))
+    before, after = (Visibility(s).facts(s.c2w[0], float(s.fov_deg[0]), 64) for s in (scene, there))
     # 4096 rays: a few graze an edge and fall on the other side after rounding.
     for name in ("coverage", "shell_back", "lit"):
         assert abs(getattr(before, name) - getattr(after, name)) < 0.005, name

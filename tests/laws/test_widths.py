@@ -22,7 +22,7 @@ from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
-from train.loop.crew import Crew
+from train.loop.distributed import DistributedContext
 from train.loop.state import new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective
@@ -71,7 +71,7 @@ def changes(config: ModelConfig, muon_rate: float, base: BaseWidths, seed: int) 
     )
     state, batch = new_state(settings, muon_precision="float32"), batch_for(config)
     before = outputs(state.model, batch)
-    crew = Crew(device=torch.device("cpu"))
+    crew = DistributedContext(device=torch.device("cpu"))
     stepper = Stepper(state, settings, Objective(settings.loss, None), crew)
     for _ in range(STEPS):
         assert stepper.step([batch], RATE).applied

@@ -41,7 +41,7 @@ def awake(config: ModelConfig, dtype: torch.dtype = torch.float64, seed: int = 0
     """Return a network none of whose parts is zero or one: it stands for a trained one."""
     generator = torch.Generator().manual_seed(seed)
     model = RenderFormer(config)
-    model.initialise(generator)
+    model.initialize(generator)
     for module in model.modules():
         if isinstance(module, nn.RMSNorm):
             assert module.weight is not None

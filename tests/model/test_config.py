@@ -195,7 +195,7 @@ def test_widths_of_pixels_and_filters_count_for_themselves() -> None:
 
 def test_weights_start_as_large_as_their_rule_says() -> None:
     model = RenderFormer(wider(smoke(), 2))
-    model.initialise(torch.Generator().manual_seed(0))
+    model.initialize(torch.Generator().manual_seed(0))
     scale_start(model, width_scales(model, BASE))
     weights = dict(model.named_parameters())
 

@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from model.config import ModelConfig
-from model.demodulated import composed, with_albedo
-from model.image_head import DptHead, Enlarged, Fusion
+from model.demodulated import compose_radiance, with_albedo
+from model.image_head import BilinearUpsample, DptHead, Fusion
 from model.neural_renderer import NeuralRenderer
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
@@ -83,7 +83,7 @@ def test_pictures_are_in_proportion_to_albedo_and_add_up() -> None:
     diffuse[..., 3:], specular[..., :3] = 0, 0
 
     def linear(albedo: torch.Tensor) -> torch.Tensor:
-        return radiance(composed(light, albedo))
+        return radiance(compose_radiance(light, albedo))
 
     # numbers of size 1 through a logarithm and back, in float64
     torch.testing.assert_close(linear(0.25 * albedo), 0.25 * linear(albedo), rtol=1e-12, atol=0)
@@ -97,7 +97,7 @@ def test_gradients_are_finite_whatever_a_head_says(size: float) -> None:
     light = torch.full((1, 1, 2, 2, 6), size, requires_grad=True)
     albedo = torch.zeros(1, 1, 2, 2, 6)
     albedo[..., 0, :] = 0.5
-    shown = composed(light, albedo)
+    shown = compose_radiance(light, albedo)
     shown.sum().backward()
     assert torch.isfinite(shown).all() and (shown >= 0).all()
     assert light.grad is not None and torch.isfinite(light.grad).all()
@@ -129,7 +129,7 @@ def test_every_weight_learns() -> None:
 
 def test_it_begins_with_equal_light_everywhere() -> None:
     model = RenderFormer(DEMODULATED)
-    model.initialise(torch.Generator().manual_seed(0))
+    model.initialize(torch.Generator().manual_seed(0))
     shown, half = picture(model, corner()), picture(model, with_albedos(corner(), 0.5, 0.5))
     assert shown.max() > 0.1
     # float32 through a logarithm and back
@@ -151,9 +151,9 @@ def test_the_way_back_of_an_enlargement_is_that_of_torch(small: tuple[int, int])
     size = (2 * small[0] + 1, 2 * small[1])
     twin = interpolate(x, size=size, mode="bilinear", align_corners=True)
     gradient = torch.randn(twin.shape, generator=generator, dtype=torch.float64)
-    assert torch.equal(twin, Enlarged.apply(x, size))
+    assert torch.equal(twin, BilinearUpsample.apply(x, size))
     (expected,) = torch.autograd.grad(twin, x, gradient)
-    (found,) = torch.autograd.grad(Enlarged.apply(x, size), x, gradient)
+    (found,) = torch.autograd.grad(BilinearUpsample.apply(x, size), x, gradient)
     # float64 sums of tens of numbers around 1
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-13)
 

@@ -45,7 +45,7 @@ def test_a_scene_within_limits_is_rendered_as_it_is(count: int) -> None:
     scene = join([FLOOR, CUBE, *row_of_lamps(count)])
     (group,) = light_groups(scene, 8)
     assert group.scene is scene
-    assert group.share == 1
+    assert group.fraction == 1
 
 
 @given(count=st.integers(9, 64), most=st.integers(1, 8))
@@ -55,7 +55,7 @@ def test_the_light_of_the_groups_is_that_of_the_scene(count: int, most: int) -> 
     assert max(counts(groups)) <= most
     assert len(groups) == -(-count // most)
     found = [
-        (place, group.share * radiance)
+        (place, group.fraction * radiance)
         for group in groups
         for place, radiance in emission_of(group.scene).items()
     ]
@@ -64,7 +64,7 @@ def test_the_light_of_the_groups_is_that_of_the_scene(count: int, most: int) -> 
     # the division by a share and the product with it round to float32 twice
     for place, radiance in found:
         np.testing.assert_allclose(radiance, whole[place], rtol=3e-7)
-    assert sum(group.share for group in groups) == pytest.approx(1, abs=1e-12)  # float64 sums
+    assert sum(group.fraction for group in groups) == pytest.approx(1, abs=1e-12)  # float64 sums
 
 
 def test_a_group_is_as_bright_as_the_scene_and_otherwise_the_same() -> None:
@@ -110,4 +110,4 @@ def test_lamps_without_area_give_no_light() -> None:
     scene = join([FLOOR, *row_of_lamps(3)])
     assert counts(light_groups(without_area(scene, 1), 1)) == [1, 1]
     (group,) = light_groups(without_area(scene, 0, 1, 2), 1)
-    assert group.share == 1
+    assert group.fraction == 1

@@ -15,7 +15,7 @@ from model.open import (
     CONFIG_NAME,
     PUBLISHED,
     WEIGHTS_NAME,
-    FoundNetwork,
+    NetworkFile,
     find_network,
     open_network,
     save_published,
@@ -124,7 +124,7 @@ def _unopened() -> RenderFormer:
 
 
 def test_finders_are_asked_before_any_file_is() -> None:
-    mine = FoundNetwork(path=Path("mine"), trained=TrainedRange(), any_width=True, open=_unopened)
+    mine = NetworkFile(path=Path("mine"), trained=TrainedRange(), any_width=True, open=_unopened)
     asked: list[Path] = []
 
     def nothing(path: Path) -> None:

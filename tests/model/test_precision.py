@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from model import encoded_scene, rounding
-from model.packing import pack_lengths, packed
+from model.packing import pack_lengths, pack_tokens
 from model.precision import rounded_parts, set_precision, tf32
-from model.scene_tensors import SceneBatch, batch_scenes, converted, scene_tensors, tensors_of
+from model.scene_tensors import SceneBatch, batch_scenes, map_tensors, scene_tensors, tensors_of
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import EMISSION, material_width
@@ -67,7 +67,7 @@ def test_positions_are_never_rounded() -> None:
     far = copy.deepcopy(near)
     far.triangles_T33.add_(100.0)
     far.c2w_V44[:, :3, 3].add_(100.0)
-    pictures = [render(model, converted(scene, torch.Tensor.float)) for scene in (near, far)]
+    pictures = [render(model, map_tensors(scene, torch.Tensor.float)) for scene in (near, far)]
     # the angles move by 100 x 5 / 2^24; what they turn is rounded to 8 bits, so some ulps of that
     assert (pictures[0] - pictures[1]).abs().max() < 0.1 * pictures[0].std()
 
@@ -128,7 +128,7 @@ def test_rounding_together_changes_no_bit(
     model.recompute_activations(recompute)
     batch = batch_of(3, 5, dtype=torch.float32)
     rounded: list[int] = []
-    together = rounding._copies
+    together = rounding._copy_as
 
     def counted(tensors: tuple[Tensor, ...], to: torch.dtype) -> tuple[Tensor, ...]:
         rounded.append(len(tensors))
@@ -138,11 +138,11 @@ def test_rounding_together_changes_no_bit(
     def results() -> dict[str, Tensor]:
         return picture_and_gradients(model, batch)
 
-    monkeypatch.setattr(rounding, "_copies", counted)
+    monkeypatch.setattr(rounding, "_copy_as", counted)
     found = results()
     layers = len(model.encoder.layers) + len(model.decoder.layers) + (family == "dpt")
     assert len(rounded) == 2 * layers, "once forth and once back for each layer, and the head"
-    monkeypatch.setattr(rounding, "_rounded", lambda *_: {})
+    monkeypatch.setattr(rounding, "_round_weights", lambda *_: {})
     alone = results()
     assert found.keys() == alone.keys()
     for name, value in found.items():
@@ -217,7 +217,7 @@ def test_a_packed_batch_is_the_padded_one(family: str, monkeypatch: pytest.Monke
     """On a card the kernel is torch's; here its slow twin, sequence after sequence."""
     model, batch = awake(tiny_config(family)), batch_of(*LENGTHS)
     padded = picture_and_gradients(model, batch)
-    monkeypatch.setattr(encoded_scene, "takes_packed", lambda *_: True)
+    monkeypatch.setattr(encoded_scene, "supports_packed", lambda *_: True)
     monkeypatch.setattr("model.attention.scaled_dot_product_attention", _forbid_masks)
     for name, found in picture_and_gradients(model, batch).items():
         wanted = padded[name]
@@ -233,7 +233,7 @@ def test_packing_keeps_what_exists_and_gradients_go_back_there() -> None:
     packing = pack_lengths(LENGTHS, 9, torch.device("cpu"))
     x = torch.arange(27.0).reshape(3, 9, 1).requires_grad_()
     exists = torch.arange(9) < torch.tensor(LENGTHS)[:, None]
-    there = packed(x, packing)
+    there = pack_tokens(x, packing)
     assert torch.equal(there.detach(), x.detach()[exists])
     starts_S1, longest = packing.sequences
     assert starts_S1.tolist() == [0, 5, 14, 15] and longest >= 9

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from model.layers import CrossAttention, merge_heads, split_heads
-from model.positions import Rotation, camera_rotation, rotate, token_places, world_rotation
+from model.positions import Rotation, camera_rotation, rotate, token_positions, world_rotation
 from model.renderformer import RenderFormer, radiance
-from model.scene_tensors import SceneTensors, batch_scenes, converted
+from model.scene_tensors import SceneTensors, batch_scenes, map_tensors
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.model.attention_reference import attend_reference
@@ -104,7 +104,7 @@ def translated(scene: SceneTensors, offset: Tensor) -> SceneTensors:
 def test_float32_stays_near_float64() -> None:
     scene = random_scene(9)
     precise = render(awake(tiny_config(), torch.float64), scene)
-    single = converted(scene, Tensor.float)
+    single = map_tensors(scene, Tensor.float)
     rounded = render(awake(tiny_config(), torch.float32), single).double()
     # float32 through twenty layers; positions of size 3 at frequency 5 cost another digit
     torch.testing.assert_close(rounded, precise, rtol=0, atol=2e-5)
@@ -148,7 +148,7 @@ def test_every_parameter_reaches_the_picture(family: str) -> None:
 
 def test_a_fresh_network_is_black_and_learns_from_every_picture() -> None:
     model = RenderFormer(tiny_config()).double()
-    model.initialise(torch.Generator().manual_seed(0))
+    model.initialize(torch.Generator().manual_seed(0))
     output = model(batch_scenes([random_scene(4)]), RESOLUTION)
     assert torch.all(output == 0)
     (output - 0.1).abs().mean().backward()
@@ -277,7 +277,7 @@ def test_registers_stand_where_the_published_divisor_puts_them(eps: float) -> No
     mask = torch.tensor([[True, True, False, False]])
     c2w = torch.eye(4, dtype=torch.float64)[None, None].clone()
     c2w[..., :3, 3] = torch.tensor([3.0, -2.0, 5.0])
-    places = token_places(padded, mask, num_registers=2, eps=eps)
+    places = token_positions(padded, mask, num_registers=2, eps=eps)
     expected_world = triangles.mean(dim=2).sum(dim=1) / (2 + eps)
     expected_camera = (triangles.mean(dim=2) - c2w[0, 0, :3, 3]).sum(dim=1) / (2 + eps)
     seen: list[Tensor] = []

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from scene_templates.stated_draws import StatedDraw
+from scene_templates.recorded_sampler import RecordedDraw
 
 FALSE_ALARM = 1e-6
 """Probability that any p-value of the whole suite falls below LEVEL although all is as stated."""
@@ -84,18 +84,18 @@ def require_plausible(table: Table) -> None:
     assert not implausible(table)
 
 
-def merged(many: Iterable[Mapping[str, StatedDraw]]) -> dict[str, StatedDraw]:
+def merged(many: Iterable[Mapping[str, RecordedDraw]]) -> dict[str, RecordedDraw]:
     """Return the draws of many surfaces or skies as if one had made them all."""
-    found: dict[str, StatedDraw] = {}
+    found: dict[str, RecordedDraw] = {}
     for made in many:
         for name, draw in made.items():
-            whole = found.setdefault(name, StatedDraw(kind=draw.kind, stated=draw.stated))
+            whole = found.setdefault(name, RecordedDraw(kind=draw.kind, stated=draw.stated))
             assert (whole.kind, whole.stated) == (draw.kind, draw.stated), name
             whole.values.extend(draw.values)
     return found
 
 
-def stated_table(made: Mapping[str, StatedDraw]) -> Table:
+def stated_table(made: Mapping[str, RecordedDraw]) -> Table:
     """Return a p-value for each number that was drawn, of names with at least 60 values."""
     table: dict[str, float] = {}
     for name, draw in made.items():

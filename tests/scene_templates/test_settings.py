@@ -21,7 +21,7 @@ from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
 from storage.settings.changes import changed
-from storage.settings.described import described, from_record, settings_record
+from storage.settings.described import describe_fields, from_record, settings_record
 from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS, template_settings
 
@@ -80,7 +80,7 @@ def test_a_contradiction_is_one_line_that_names_its_field() -> None:
 def test_a_family_of_maps_that_is_unknown_is_named(kind: type, name: str) -> None:
     with pytest.raises(TrilightError, match=f"^[^\n]*'{name}' is unknown"):
         kind(families=(name,))
-    for field in described(kind):
+    for field in describe_fields(kind):
         assert field.sentence.endswith(".")
         assert field.expected
 

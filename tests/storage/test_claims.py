@@ -20,7 +20,7 @@ import torch
 from pipeline.assets.store import AssetStore
 from storage import claims
 from storage.atomic import atomic_writer, write_error
-from storage.claims import claimed, describe_holder, is_claimed
+from storage.claims import describe_holder, hold_claim, is_claimed
 from storage.dataset.layout import DatasetFolder
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.remote.cache import ShardCache
@@ -28,7 +28,7 @@ from storage.remote.url import RemoteUrl, parse_url
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from train.folder import RunFolder, claim_run
-from train.loop.crew import Crew
+from train.loop.distributed import DistributedContext
 
 HOLD = """
 import sys, time
@@ -42,10 +42,10 @@ with claimed(Path(sys.argv[1])) as ours:
 
 def test_a_claim_has_one_holder(tmp_path: Path) -> None:
     path = tmp_path / "folder" / "a.claim"
-    with claimed(path) as first, claimed(path) as second:
+    with hold_claim(path) as first, hold_claim(path) as second:
         assert first
         assert not second
-    with claimed(path) as third:
+    with hold_claim(path) as third:
         assert third
 
 
@@ -55,10 +55,10 @@ def test_a_claim_ends_with_its_process(tmp_path: Path) -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "True\n"
-        with claimed(path) as ours:
+        with hold_claim(path) as ours:
             assert not ours
         holder.send_signal(signal.SIGKILL)
-    with claimed(path, wait=True) as ours:
+    with hold_claim(path, wait=True) as ours:
         assert ours
 
 
@@ -68,11 +68,11 @@ def test_a_claim_that_its_holder_deleted_is_not_shared(tmp_path: Path) -> None:
     held_together: list[bool] = []
 
     def wait() -> None:
-        with claimed(path, wait=True), claimed(path) as again:
+        with hold_claim(path, wait=True), hold_claim(path) as again:
             held_together.append(again)
         waited.set()
 
-    with claimed(path):
+    with hold_claim(path):
         waiter = threading.Thread(target=wait)
         waiter.start()
         shutil.rmtree(path.parent)
@@ -92,18 +92,18 @@ def test_the_first_writer_wins_where_asked(tmp_path: Path) -> None:
 
 def test_leftovers_are_cleared_only_where_nobody_works(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path)
-    with folder.joined():
+    with folder.hold_membership():
         leftover, young = tmp_path / "a.tar.1-00.part", tmp_path / "b.tar.1-00.part"
         for path in (leftover, young):
             path.write_bytes(b"")
         hours_ago = time.time() - 7200
         os.utime(leftover, (hours_ago, hours_ago))
-        with folder.joined():
+        with folder.hold_membership():
             assert leftover.exists()
-    with folder.joined():
+    with folder.hold_membership():
         assert leftover.exists(), "somebody has looked within the hour"
     os.utime(folder.staging / "cleaned", (hours_ago, hours_ago))
-    with folder.joined():
+    with folder.hold_membership():
         assert not leftover.exists()
         assert young.exists()  # of another machine, perhaps, that our locks do not reach
 
@@ -126,7 +126,10 @@ def test_what_may_pass_is_told_from_what_will_not(number: int, passes: bool, mes
 
 def test_a_folder_that_can_never_be_made_is_said_at_once() -> None:
     """Where /proc says of a folder that it does not exist, as a deleted one would, waiting ends."""
-    with pytest.raises(TrilightError, match="/proc/nowhere"), claimed(Path("/proc/nowhere/lock")):
+    with (
+        pytest.raises(TrilightError, match="/proc/nowhere"),
+        hold_claim(Path("/proc/nowhere/lock")),
+    ):
         pass
 
 
@@ -144,12 +147,12 @@ def test_without_locks_everything_goes_on_after_one_warning(
     monkeypatch.setattr(fcntl, "flock", refuse)
     monkeypatch.setattr(claims, "_unlocked", itertools.count())
     folder, cache = DatasetFolder(tmp_path / "set"), ShardCache(tmp_path / "cache", 1 << 20)
-    with folder.joined(), folder.turn("manifest") as ours, folder.locked():
-        with claimed(tmp_path / "a") as first, claimed(tmp_path / "a", wait=True) as second:
+    with folder.hold_membership(), folder.mutex("manifest") as ours, folder.hold_exclusively():
+        with hold_claim(tmp_path / "a") as first, hold_claim(tmp_path / "a", wait=True) as second:
             assert ours and first and second and not is_claimed(tmp_path / "a")
     with AssetStore(tmp_path / "store").making("abc"):
         pass
-    with claim_run(RunFolder(tmp_path / "run"), Crew(device=torch.device("cpu"))):
+    with claim_run(RunFolder(tmp_path / "run"), DistributedContext(device=torch.device("cpu"))):
         pass
     shard = tmp_path / "shard"
     shard.write_bytes(b"bytes")
@@ -181,8 +184,8 @@ def test_who_waits_says_for_whom_and_since_when(
     with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as holder:
         assert holder.stdout is not None and holder.stdout.readline()
         assert is_claimed(path)
-        with claimed(path, wait=True):
-            waiter = threading.Thread(target=lambda: claimed(path, wait=True).__enter__())
+        with hold_claim(path, wait=True):
+            waiter = threading.Thread(target=lambda: hold_claim(path, wait=True).__enter__())
             waiter.start()
             said = len(caplog.messages)
             time.sleep(0.5)

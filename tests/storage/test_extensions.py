@@ -12,12 +12,12 @@ from storage import extensions
 from storage.errors import TrilightError
 from storage.extensions import (
     VARIABLE,
+    extension_digests,
     is_reference,
     load_extension,
     load_named_extensions,
     load_same,
     loaded_files,
-    recorded,
     require_same_extensions,
     short_name,
 )
@@ -117,13 +117,13 @@ def test_what_decides_nothing_is_not_recorded(tmp_path: Path) -> None:
     """How a run is executed, or judged, changes nothing of what it means (DESIGN, 11)."""
     free = "from tests.storage.test_extensions import FREE\nFREE.register('w', '')\n"
     load_extension(written(tmp_path, free, "free.py"))
-    assert recorded("data") == recorded("weights") == {}
+    assert extension_digests("data") == extension_digests("weights") == {}
     data = load_extension(written(tmp_path, ADDS, "data.py"))
-    assert recorded("data") == {"data.py": data.sha256}
-    assert recorded("weights") == {}
+    assert extension_digests("data") == {"data.py": data.sha256}
+    assert extension_digests("weights") == {}
     load_extension(written(tmp_path, "import numpy\n", "silent.py"))  # may have done anything
-    assert set(recorded("data")) == {"data.py", "silent.py"}
-    assert set(recorded("weights")) == {"silent.py"}
+    assert set(extension_digests("data")) == {"data.py", "silent.py"}
+    assert set(extension_digests("weights")) == {"silent.py"}
 
 
 @for_each(
@@ -153,15 +153,15 @@ def test_functions_of_a_file_are_named_by_both(tmp_path: Path) -> None:
     path = written(tmp_path, "def seven():\n    return '7'\n\ndef bad():\n    return 1 / 0\n")
     assert is_reference(f"{path}:seven")
     assert not any(map(is_reference, ("smoke", "a.py", "a.py:", "s3://b/a.py", "a.py:b-c")))
-    name = WORDS.typed(f"{path}:seven", str)
+    name = WORDS.resolve(f"{path}:seven", str)
     assert (name, WORDS[name]) == ("own.py:seven", "7")
     assert short_name(f"{path}:seven") == "own.py:seven"
-    assert WORDS.typed("own.py:seven", str) == name  # as it is recorded, once it is loaded
-    assert WORDS.typed("one", str) == "one"
+    assert WORDS.resolve("own.py:seven", str) == name  # as it is recorded, once it is loaded
+    assert WORDS.resolve("one", str) == "one"
     with pytest.raises(TrilightError, match=r"own\.py does not define eleven; did you mean seven"):
-        WORDS.typed(f"{path}:eleven", str)
+        WORDS.resolve(f"{path}:eleven", str)
     with pytest.raises(TrilightError, match=r"own\.py, line 5: ZeroDivisionError"):
-        WORDS.typed(f"{path}:bad", str)
+        WORDS.resolve(f"{path}:bad", str)
 
 
 def test_a_name_from_elsewhere_never_runs_a_file(tmp_path: Path) -> None:

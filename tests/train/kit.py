@@ -12,12 +12,12 @@ import torch
 from model.config import ModelConfig
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import TrainingData, open_training_data
+from train.data.bad_samples import BadSampleCounter
 from train.data.mixture import Mixture
-from train.data.order import RankShare
+from train.data.order import RankSlice
 from train.data.scenes import TrainingScene
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import Unusable
-from train.loop.crew import Crew
+from train.loop.distributed import DistributedContext
 from train.loop.state import TrainState
 from train.loop.step import Stepper
 from train.loss.objective import Objective
@@ -25,10 +25,10 @@ from train.progress import TrainProgress
 from train.result import TrainResult
 from train.run import train_run
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
-from train.start import Start
+from train.start_options import StartOptions
 
 CPU = torch.device("cpu")
-ALONE = Crew(device=CPU)
+ALONE = DistributedContext(device=CPU)
 
 TINY_MODEL = ModelConfig(
     width=36,
@@ -73,7 +73,7 @@ class Heard(TrainProgress):
         self.killed_at = killed_at
         self.notes: list[str] = []
 
-    def noted(self, text: str) -> None:
+    def note(self, text: str) -> None:
         self.notes.append(text)
 
     def advance(self, *, step: int, **_: Any) -> None:
@@ -87,12 +87,12 @@ def trained(
     out: Path,
     *,
     resume: bool = False,
-    start: Start | None = None,
+    start: StartOptions | None = None,
     **rest: Any,
 ) -> TrainResult:
     """Run to the end in this process."""
     places = [str(data.folder.root)] if isinstance(data, Dataset) else data
-    begun = start or Start(resume=resume)
+    begun = start or StartOptions(resume=resume)
     result = train_run(settings, data=places, out=out, start=begun, **rest)
     assert result is not None
     return result
@@ -111,7 +111,7 @@ def take(
     rank: int = 0,
     world_size: int = 1,
     workers: int = 1,
-    unusable: Unusable | None = None,
+    unusable: BadSampleCounter | None = None,
     mixture: Mixture | None = None,
 ) -> list[list[TrainingScene]]:
     """Return the batches first, first + 1, ... of the training split."""
@@ -120,9 +120,9 @@ def take(
         opened.split("train"),
         settings,
         first,
-        share=RankShare(rank=rank, world_size=world_size),
+        rank_slice=RankSlice(rank=rank, world_size=world_size),
         workers=workers,
-        unusable=unusable or Unusable(0),
+        unusable=unusable or BadSampleCounter(0),
         mixture=mixture,
     )
     with closing(batches):

@@ -49,19 +49,19 @@ from tests.train.toy import (
 )
 from train.data.buckets import make_batch
 from train.data.scenes import TrainingScene, training_scene
-from train.evaluation.evaluate import Contest, judged_views, make_rivals
+from train.evaluation.baselines import MEDIAN, NEAREST
+from train.evaluation.evaluate import EvalConfig, judge_views, make_baselines
 from train.evaluation.judge import predict
-from train.evaluation.judged_view import NETWORK, summary
-from train.evaluation.rivals import MEDIAN, NEAREST
+from train.evaluation.judged_view import NETWORK, summarize_views
 from train.loop.checkpoints import network_of_run, path_of_step
-from train.loop.crew import Crew
+from train.loop.distributed import DistributedContext
 from train.loop.schedule import learning_rate
 from train.loop.state import TrainState, new_state
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE, load_lpips
 from train.run import stream_settings, train_run
 from train.runs import changed_run
 from train.settings import AugmentationSettings, TrainSettings
-from train.start import Start
+from train.start_options import StartOptions
 
 SMALL = dataclasses.replace(
     smoke_model(), width=64, num_heads=1, hidden_width=192, encoder_layers=2, decoder_layers=2
@@ -90,7 +90,7 @@ def memorised(scenes: list[TrainingScene], model: ModelConfig, steps: int) -> Tr
 def score(state: TrainState, scene: TrainingScene, target: TrainingScene) -> float:
     """Return the psnr_log_db of one scene's picture against another's."""
     wanted = 10 ** target.target_VRR3[0].double().numpy() - 1
-    return psnr_log_db(predict(state.shown, scene)[0], wanted)
+    return psnr_log_db(predict(state.eval_model, scene)[0], wanted)
 
 
 @pytest.mark.slow("training")
@@ -139,16 +139,18 @@ def test_unseen_scenes_look_better_than_any_stored_picture(tmp_path: Path) -> No
     )
     trained(settings, [str(folder.root)], tmp_path / "out")
     data = open_training_data([str(folder.root)])
-    contest = Contest(
+    contest = EvalConfig(
         network=open_network(tmp_path / "out", network_of_run),
         shards=data.split("validation"),
         resolution=16,
-        rivals=make_rivals(data.split("train"), 16),
+        baselines=make_baselines(data.split("train"), 16),
         lpips=None,
         most_scenes=99,
     )
-    views = judged_views(contest, lambda: None)
-    means = {name: summary(views, name)["log_l1"]["mean"] for name in (NETWORK, MEDIAN, NEAREST)}
+    views = judge_views(contest, lambda: None)
+    means = {
+        name: summarize_views(views, name)["log_l1"]["mean"] for name in (NETWORK, MEDIAN, NEAREST)
+    }
     # measured: 0.0292 against 0.0395 and 0.0313
     assert means[NETWORK] < 0.9 * means[MEDIAN]
     assert means[NETWORK] < means[NEAREST]
@@ -327,21 +329,21 @@ def train_and_judge(run: str, size: str, data: str, lpips: str, out: Path) -> No
     """Train by train_run, evaluate and render."""
     settings = one_step_of(run, size)
     with fake_card():
-        start, crew = Start(lpips=lpips), Crew(device=CARD)
-        result = train_run(settings, data=[data], out=out, start=start, crew=crew)
+        start, crew = StartOptions(lpips=lpips), DistributedContext(device=CARD)
+        result = train_run(settings, data=[data], out=out, start=start, dist_context=crew)
         assert result is not None and result.skipped_steps == 0
         network = RenderFormer(settings.model).to(CARD)
         distance = load_lpips(lpips)
         assert distance is not None
-        contest = Contest(
+        contest = EvalConfig(
             network=network,
             shards=open_training_data([data]).split("validation"),
             resolution=RESOLUTION,
-            rivals=None,
+            baselines=None,
             lpips=distance.to(CARD),
             most_scenes=1,
         )
-        (view, *_) = judged_views(contest, lambda: None)
+        (view, *_) = judge_views(contest, lambda: None)
         assert view.scores["network"]["lpips"] is not None
         assert NeuralRenderer(network).render(toy_scene(0), RESOLUTION).shape[1:] == (64, 64, 3)
 
@@ -355,13 +357,19 @@ def resume(data: str, lpips: str, out: Path) -> None:
     second = dataclasses.replace(one_step_of("finetune", "smoke"), from_weights=True)
     with pytest.MonkeyPatch.context() as patch, fake_card():
         patch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
-        crew = Crew(device=CARD)
-        train_run(first, data=[data], out=out / "first", crew=crew)
+        crew = DistributedContext(device=CARD)
+        train_run(first, data=[data], out=out / "first", dist_context=crew)
         checkpoint = out / "first" / "checkpoints" / "step-000000002.safetensors"
         checkpoint.unlink()
-        train_run(first, data=[data], out=out / "first", start=Start(resume=True), crew=crew)
-        start = Start(begin_with=str(checkpoint), lpips=lpips)
-        train_run(second, data=[data], out=out / "second", start=start, crew=crew)
+        train_run(
+            first,
+            data=[data],
+            out=out / "first",
+            start=StartOptions(resume=True),
+            dist_context=crew,
+        )
+        start = StartOptions(begin_with=str(checkpoint), lpips=lpips)
+        train_run(second, data=[data], out=out / "second", start=start, dist_context=crew)
     for name in ("first", "second"):
         record = json.loads((out / name / "settings.json").read_text())
         assert record["muon_precision"] == "bfloat16"

@@ -24,10 +24,10 @@ from tests.train.toy import write_toy_dataset
 from train.evaluation import judge
 from train.loop import trainer
 from train.loop.interrupts import Stopped
+from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
 from train.result import TrainResult
-from train.start import Start
-from train.watching.rows import read_rows
+from train.start_options import StartOptions
 
 TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share", "time_s", "memory_mb"}
 
@@ -45,7 +45,7 @@ class Listener(Heard):
     def advance(self, *, step: int, **_: Any) -> None:
         self.heard.append(f"step {step}")
 
-    def validated(self, *, step: int, **_: Any) -> None:
+    def report_validation(self, *, step: int, **_: Any) -> None:
         self.heard.append(f"validated {step}")
 
 
@@ -120,7 +120,7 @@ def test_a_signal_in_a_validation_or_while_saving_loses_nothing(
 ) -> None:
     """A validation that was left is not finished first; the resumed run makes up for it."""
     for number, (module, name, call, step) in enumerate((
-        (trainer, "keep_checkpoint", 1, 4),
+        (trainer, "save_checkpoint", 1, 4),
         # one call for the median picture, and one for each of two scenes
         (judge, "score_pictures", 2, 8),
         # two scenes of step 8 that are made up for, and the first of the last step
@@ -135,7 +135,7 @@ def test_a_signal_in_a_validation_or_while_saving_loses_nothing(
         assert (asked.calls, stopped.value.exit_status) == (call, 75), number
         rows = read_rows(tmp_path / "metrics.jsonl")
         left = [row["step"] for row in rows if "validation" in row]
-        assert (step in left) == (name == "keep_checkpoint"), number
+        assert (step in left) == (name == "save_checkpoint"), number
     trained(tiny_run(), dataset, tmp_path, resume=True)
     same_as_uninterrupted(tmp_path, whole)
     assert curve(tmp_path) == curve(whole.folder.root)
@@ -145,7 +145,7 @@ def test_the_same_command_begins_begins_again_and_goes_on(
     dataset: Dataset, whole: TrainResult, tmp_path: Path
 ) -> None:
     """As a scheduler starts it: killed before the first checkpoint, and after one."""
-    start = Start(restartable=True)
+    start = StartOptions(restartable=True)
     for step in (3, 7):
         with pytest.raises(Killed):
             trained(tiny_run(), dataset, tmp_path, start=start, progress=Heard(killed_at=step))

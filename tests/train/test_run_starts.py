@@ -33,7 +33,7 @@ from train.loop.checkpoints import (
 )
 from train.progress import TrainProgress
 from train.settings import LossSettings
-from train.start import Start
+from train.start_options import StartOptions
 
 
 def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) -> None:
@@ -42,7 +42,7 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
     trained(tiny_run(model=first, num_steps=4), dataset, tmp_path / "first")
     second = tiny_run(from_weights=True, learning_rate=1e-12, warmup_steps=0, num_steps=4)
     place = str(tmp_path / "first")
-    trained(second, dataset, tmp_path / "second", start=Start(begin_with=place))
+    trained(second, dataset, tmp_path / "second", start=StartOptions(begin_with=place))
     before, after = (open_network(tmp_path / name, network_of_run) for name in ("first", "second"))
     assert after.config == first
     for name, weight in after.state_dict().items():
@@ -52,9 +52,14 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
     with pytest.raises(TrilightError, match="weights, and none are named; expected begin_with"):
         trained(second, dataset, tmp_path / "third")
     with pytest.raises(TrilightError, match="or --set from_weights=true to begin with those"):
-        trained(tiny_run(), dataset, tmp_path / "third", start=Start(begin_with=place))
+        trained(tiny_run(), dataset, tmp_path / "third", start=StartOptions(begin_with=place))
     with pytest.raises(TrilightError, match="no such file or folder"):
-        trained(second, dataset, tmp_path / "third", start=Start(begin_with=str(tmp_path / "none")))
+        trained(
+            second,
+            dataset,
+            tmp_path / "third",
+            start=StartOptions(begin_with=str(tmp_path / "none")),
+        )
 
 
 def test_a_run_without_the_weights_it_asks_for_does_not_begin(
@@ -265,10 +270,10 @@ def test_a_second_trainer_is_refused_and_changes_nothing(dataset: Dataset, tmp_p
             if step == 6:
                 before = files()
                 for start in (
-                    Start(),
-                    Start(resume=True),
-                    Start(restartable=True),
-                    Start(resume=True, decisions={"learning_rate": 1e-5}),
+                    StartOptions(),
+                    StartOptions(resume=True),
+                    StartOptions(restartable=True),
+                    StartOptions(resume=True, decisions={"learning_rate": 1e-5}),
                 ):
                     with pytest.raises(TrilightError) as refused:
                         trained(tiny_run(), dataset, out, start=start)

@@ -15,7 +15,7 @@ from model.open import open_network
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.train.data.test_unusable import BAD_KEY, spoil_sample
+from tests.train.data.test_bad_samples import BAD_KEY, spoil_sample
 from tests.train.kit import Heard, Killed, tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train import run as run_module
@@ -24,11 +24,11 @@ from train.folder import RunFolder
 from train.loop import step as step_module
 from train.loop.checkpoints import network_of_run, path_of_step, read_checkpoint, saved_steps
 from train.loop.recorder import read_rows
-from train.loop.step import Stepper, Unread
+from train.loop.step import PendingStats, Stepper
 from train.progress import TrainProgress
 from train.result import TrainResult
 from train.settings import TrainSettings
-from train.start import Start
+from train.start_options import StartOptions
 
 
 def run(
@@ -39,7 +39,7 @@ def run(
     progress: TrainProgress | None = None,
     **start: Any,
 ) -> TrainResult:
-    return trained(settings, data, out, start=Start(**start), progress=progress)
+    return trained(settings, data, out, start=StartOptions(**start), progress=progress)
 
 
 def wsd(**changes: Any) -> TrainSettings:
@@ -149,7 +149,7 @@ def test_too_little_memory_goes_on_with_fewer_scenes_a_pass(
 ) -> None:
     settings = wsd(num_steps=6, scenes_per_step=4, checkpoint_every=2, checkpoints_kept=9)
     run(settings, dataset, tmp_path / "whole")
-    original, steps = step_module.predicted, [0]
+    original, steps = step_module.predict_log10, [0]
 
     def small_card(net: Any, batch: TrainingBatch, *rest: Any) -> Tensor:
         steps[0] += 1
@@ -157,7 +157,7 @@ def test_too_little_memory_goes_on_with_fewer_scenes_a_pass(
             raise torch.OutOfMemoryError("CUDA out of memory")
         return original(net, batch, *rest)
 
-    monkeypatch.setattr(step_module, "predicted", small_card)
+    monkeypatch.setattr(step_module, "predict_log10", small_card)
     with pytest.raises(TrilightError, match=r"too little memory in step \d+.*scenes_per_pass=2"):
         run(settings, dataset, tmp_path / "small")
     notes, step = Heard(), saved_steps(tmp_path / "small/checkpoints")[-1]
@@ -209,15 +209,15 @@ def test_ten_skipped_steps_go_on_by_a_decision(
     """
     settings = wsd(num_steps=16, keep_every=2, checkpoint_every=2)
 
-    original = Stepper.take
+    original = Stepper.launch
 
-    def diverging(self: Stepper, *given: Any, **rest: Any) -> Unread:
+    def diverging(self: Stepper, *given: Any, **rest: Any) -> PendingStats:
         now = self._settings
         if self._state.step >= 4 and (now.learning_rate, now.seed) == (2e-3, 0):
             return torch.tensor([math.nan, math.nan, 0.0, 0.0, math.nan, 0.0, 0.0]).double()
         return original(self, *given, **rest)
 
-    monkeypatch.setattr(Stepper, "take", diverging)
+    monkeypatch.setattr(Stepper, "launch", diverging)
     ways = r"10 steps in a row up to step 14.*--change learning_rate=0\.001.*seed=1.*--branch"
     for again in (False, True):
         with pytest.raises(TrilightError, match=ways):

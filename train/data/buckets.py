@@ -1,8 +1,8 @@
-"""Scenes of one step -> batches of similar length, so that little work is spent on padding.
+"""Batches of scenes of similar length within a step, to reduce padding.
 
-A step's scenes are drawn at random, whatever their size; only then are they cut by length. Every
-gradient is therefore of a fair mixture, and the loss is a mean over all views of the step, not over
-its batches.
+A step's scenes are drawn at random, independent of their size, and only then grouped by length.
+Every gradient is therefore an unbiased mixture, and the loss is a mean over all views of the step,
+not over its batches.
 """
 
 import dataclasses
@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from model.scene_tensors import SceneBatch, batch_scenes, converted
+from model.scene_tensors import SceneBatch, batch_scenes, map_tensors
 from train.data.scenes import TrainingScene, with_target
 
 MOST_WASTE = 0.05
-"""Most extra cost by padding, as a share of what the batch's scenes cost without it."""
+"""Maximum extra cost by padding, as a fraction of the cost of the scenes without it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -24,40 +24,41 @@ class TrainingBatch:
     """Scenes of similar length that are computed together."""
 
     scenes: SceneBatch
-    """What the network reads."""
+    """Input of the network, padded to the longest scene."""
     target_BVRR3: Tensor
     """log10(1 + radiance); with `levels_BL`, int16 rows of it."""
     noise_BV: Tensor
-    """Root mean square noise of the targets."""
+    """Root mean square noise of the targets in log10(1 + radiance)."""
     levels_BL: Tensor | None = None
-    """As in TrainingScene, of each scene or [1, L] of all; None where targets are looked up."""
+    """Lookup table of each scene, or [1, L] of all, as in TrainingScene; None if targets are
+    looked up already."""
     arrived: torch.cuda.Event | None = None
-    """When its copy to the card is there; None where it has not been sent ahead."""
+    """Event at the end of the copy to the GPU; None if no copy was started."""
 
-    def converted(self, convert: Callable[[Tensor], Tensor]) -> "TrainingBatch":
+    def map_tensors(self, convert: Callable[[Tensor], Tensor]) -> "TrainingBatch":
         """Return the batch with each tensor converted."""
         return dataclasses.replace(
             self,
-            scenes=converted(self.scenes, convert),
+            scenes=map_tensors(self.scenes, convert),
             target_BVRR3=convert(self.target_BVRR3),
             noise_BV=convert(self.noise_BV),
             levels_BL=None if self.levels_BL is None else convert(self.levels_BL),
         )
 
     def to(self, device: torch.device) -> "TrainingBatch":
-        """Return the batch on a device, with its targets, when its copy is there."""
+        """Return the batch on a device, with its targets; waits for a copy that was started."""
         if self.arrived is not None:
             stream = torch.cuda.current_stream(device)
             stream.wait_event(self.arrived)
-            # their memory belongs to another stream, which must not take it back too early
-            self.converted(lambda tensor: _kept_for(tensor, stream))
+            # the memory belongs to another stream, which must not reuse it too early
+            self.map_tensors(lambda tensor: _record_use(tensor, stream))
             return dataclasses.replace(self, arrived=None)._with_targets()
         if device.type == "cpu":
             return self._with_targets()
-        return self.converted(lambda tensor: tensor.to(device, non_blocking=True))._with_targets()
+        return self.map_tensors(lambda tensor: tensor.to(device, non_blocking=True))._with_targets()
 
     def _with_targets(self) -> "TrainingBatch":
-        """Look targets up where that is left to do: the same numbers as `with_target` gives."""
+        """Look targets up if not done yet; the numbers equal those of `with_target`."""
         if self.levels_BL is None:
             return self
         rows_BN = self.target_BVRR3.flatten(1).long()
@@ -66,42 +67,43 @@ class TrainingBatch:
         return dataclasses.replace(self, target_BVRR3=target_BVRR3, levels_BL=None)
 
 
-def _kept_for(tensor: Tensor, stream: torch.cuda.Stream) -> Tensor:
+def _record_use(tensor: Tensor, stream: torch.cuda.Stream) -> Tensor:
     tensor.record_stream(stream)
     return tensor
 
 
 def bucket_scenes(
-    scenes: Sequence[TrainingScene], cost: Callable[[int], float], most: int
+    scenes: Sequence[TrainingScene], cost: Callable[[int], float], max_scenes: int
 ) -> list[TrainingBatch]:
     """Return batches, shortest first, that hold each scene once.
 
     Args:
-        scenes: of equal view count.
-        cost: what a scene of so many triangles costs (model.costs); it grows with them.
-        most: scenes of a batch.
+        scenes: scenes of equal view count.
+        cost: cost of a scene by its number of triangles (model.costs), increasing.
+        max_scenes: maximum number of scenes in a batch.
     """
     by_length = sorted(scenes, key=lambda scene: scene.tensors.num_triangles)
     buckets: list[list[TrainingScene]] = []
-    alone = 0.0
+    unpadded_cost = 0.0
     for scene in by_length:
-        of_scene = cost(scene.tensors.num_triangles)
-        if buckets and len(buckets[-1]) < most:
-            together = (len(buckets[-1]) + 1) * of_scene
-            if together <= (1 + MOST_WASTE) * (alone + of_scene):
+        scene_cost = cost(scene.tensors.num_triangles)
+        if buckets and len(buckets[-1]) < max_scenes:
+            padded_cost = (len(buckets[-1]) + 1) * scene_cost
+            if padded_cost <= (1 + MOST_WASTE) * (unpadded_cost + scene_cost):
                 buckets[-1].append(scene)
-                alone += of_scene
+                unpadded_cost += scene_cost
                 continue
         buckets.append([scene])
-        alone = of_scene
+        unpadded_cost = scene_cost
     return [make_batch(bucket) for bucket in buckets]
 
 
 def make_batch(scenes: Sequence[TrainingScene]) -> TrainingBatch:
-    """Stack scenes of equal view count; targets stay rows where all of them are."""
+    """Stack scenes of equal view count; targets stay lookup rows if all of them are."""
     levels = [scene.levels_L for scene in scenes if scene.levels_L is not None]
     if len(levels) < len(scenes):
-        scenes, levels = [with_target(scene) for scene in scenes], []
+        scenes = [with_target(scene) for scene in scenes]
+        levels = []
     if levels and all(each is levels[0] for each in levels):
         levels = levels[:1]
     return TrainingBatch(

@@ -1,10 +1,10 @@
-"""Several datasets in one stream: which of them the scene at each position comes from.
+"""Mixture of several datasets in one stream: the dataset of the scene at each position.
 
-Each dataset keeps the order that it would have alone (train.data.order), begins it again when it
-is through, and moves on only when its turn comes. Turns are taken as evenly as weights allow: the
+Each dataset keeps the order that it would have alone (train.data.order), repeats it after its last
+scene, and advances only when it is chosen. Datasets alternate as evenly as the weights allow: the
 k-th scene of a dataset is due at time (k + 1/2) / weight, and the earliest is next, so that every
-stretch of the stream holds each dataset's share to within a scene or two. How many scenes of each
-came before a position follows from the weights alone: a run resumes by the number of its step.
+section of the stream holds each dataset's fraction to within a scene or two. The number of scenes
+of each before a position follows from the weights alone: a run resumes by the number of its step.
 """
 
 import dataclasses
@@ -17,62 +17,64 @@ from typing import TYPE_CHECKING, Annotated, Any
 from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
 from storage.settings.ranges import FLOAT32_MAX, Within
-from train.data.order import Place
+from train.data.order import Visit
 
 if TYPE_CHECKING:
     from train.settings import TrainSettings
 
 RECORD = "mixture"
-"""Entry of a checkpoint's header, and of settings.json."""
+"""Name of the entry in a checkpoint's header and in settings.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mixture:
-    """Shares of datasets in a stream from some position on."""
+    """Weights of datasets in a stream from some position on."""
 
     digests: tuple[str, ...]
-    """Of the datasets, in their order."""
+    """Digest of each dataset, in their order."""
     names: tuple[str, ...]
-    """What they are called."""
+    """Display name of each dataset."""
     weights: Annotated[tuple[float, ...], Within(0, FLOAT32_MAX, low_open=True)]
-    """Scenes of each, in proportion."""
+    """Relative number of scenes of each dataset."""
     first: Annotated[int, Within(0, 2**63 - 1, unit="scenes")] = 0
-    """Position of the stream from which this holds: 0, or where the run's data, weights or batch
-    were changed."""
+    """First position of the stream with this mixture: 0, or where the run's data, weights or batch
+    size changed."""
     before: Annotated[tuple[int, ...], Within(0, 2**63 - 1, unit="scenes")]
-    """Scenes of each that the run had been shown until then."""
+    """Number of scenes of each dataset before that position."""
     scenes_per_step: Annotated[int, Within(1, 10**9, unit="scenes")]
-    """Scenes of a global batch."""
+    """Number of scenes of a global batch."""
 
     def __post_init__(self) -> None:
         if len({len(self.digests), len(self.names), len(self.weights), len(self.before)}) > 1:
             raise TrilightError("mixture: expected as many names, weights and counts as digests.")
 
-    def taken(self, position: int) -> tuple[int, ...]:
-        """Return how many scenes of each the stream has shown before a position, `first` or later.
+    def counts_before(self, position: int) -> tuple[int, ...]:
+        """Return the number of scenes of each dataset before a position, `first` or later.
 
-        In a time that does not depend on the position.
+        The time does not depend on the position.
         """
-        counts, left = self._settled(position - self.first)
-        for source, _ in zip(self._turns(counts), range(left), strict=False):
+        counts, remaining = self._lower_counts(position - self.first)
+        for source, _ in zip(self._source_order(counts), range(remaining), strict=False):
             counts[source] += 1
         return tuple(now + then for now, then in zip(counts, self.before, strict=True))
 
     def sources_from(self, position: int) -> Iterator[int]:
-        """Yield the number of the dataset at each position from one on, without end."""
-        counts = [now - then for now, then in zip(self.taken(position), self.before, strict=True)]
-        return self._turns(counts)
+        """Yield the number of the dataset at each position, from one on without end."""
+        counts = [
+            now - then for now, then in zip(self.counts_before(position), self.before, strict=True)
+        ]
+        return self._source_order(counts)
 
-    def _settled(self, number: int) -> tuple[list[int], int]:
-        """Return counts of each that are surely among the first so many, and how many are left."""
-        exact = self._exact
+    def _lower_counts(self, number: int) -> tuple[list[int], int]:
+        """Return lower bounds of the counts among the first `number`, and the remainder."""
+        exact = self._exact_weights
         time = max(number - len(exact), 0) / sum(exact)
         counts = [int(time * weight + Fraction(1, 2)) for weight in exact]
         return counts, number - sum(counts)
 
-    def _turns(self, counts: Sequence[int]) -> Iterator[int]:
-        """Yield who is next, without end, after so many of each."""
-        waits = [1 / weight for weight in self._exact]
+    def _source_order(self, counts: Sequence[int]) -> Iterator[int]:
+        """Yield the number of the next dataset, without end, after `counts` scenes of each."""
+        waits = [1 / weight for weight in self._exact_weights]
         due = [
             ((count + Fraction(1, 2)) * wait, source)
             for source, (count, wait) in enumerate(zip(counts, waits, strict=True))
@@ -84,12 +86,12 @@ class Mixture:
             heapq.heapreplace(due, (time + waits[source], source))
 
     @property
-    def _exact(self) -> list[Fraction]:
-        """The weights as they were written, in fractions: rounding would pile up."""
+    def _exact_weights(self) -> list[Fraction]:
+        """Exact decimal weights as fractions, so that rounding does not accumulate."""
         return [Fraction(repr(weight)) for weight in self.weights]
 
     def __str__(self) -> str:
-        """Say the shares, for a note."""
+        """Return percentages and names, for a note."""
         total = sum(self.weights)
         shares = zip(self.names, self.digests, self.weights, strict=True)
         return ", ".join(
@@ -98,42 +100,43 @@ class Mixture:
         )
 
     def record(self) -> dict[str, Any]:
-        """Return it as JSON values."""
+        """Return the mixture as JSON values."""
         return dataclasses.asdict(self)
 
 
-def mixed_places(
-    mixture: Mixture, places: Sequence[Iterator[Place]], parts: Sequence[range], first: int
-) -> Iterator[Place]:
-    """Yield the places of the stream without end, from position `first` on.
+def mix_visits(
+    mixture: Mixture, visits: Sequence[Iterator[Visit]], parts: Sequence[range], first: int
+) -> Iterator[Visit]:
+    """Yield the visits of the stream without end, from position `first` on.
 
     Args:
-        mixture: whose turn it is.
-        places: of each dataset without end, from what `mixture.taken` says on.
-        parts: numbers of each dataset's shards among all.
+        mixture: order of the datasets.
+        visits: endless visits of each dataset, after the scenes of `mixture.counts_before`.
+        parts: shard numbers of each dataset among all.
         first: position of the stream.
     """
     for position, source in enumerate(mixture.sources_from(first), first):
-        place = next(places[source])
-        shard = parts[source].start + place.shard
-        yield dataclasses.replace(place, position=position, shard=shard, source=source)
+        visit = next(visits[source])
+        shard = parts[source].start + visit.shard
+        yield dataclasses.replace(visit, position=position, shard=shard, source=source)
 
 
-def mixture_of(
+def plan_mixture(
     data: TrainingData, settings: "TrainSettings", header: Mapping[str, Any] | None
 ) -> Mixture | None:
-    """Return how a run's datasets are mixed from here on; None of a run that has only had one.
+    """Return the mixture of a run from here on; None if it has only had one dataset.
 
     Args:
-        data: of the run.
-        settings: of the next step.
-        header: of the checkpoint that it goes on from; None where it begins. A dataset that the run
-            knows goes on where it was.
+        data: data of the run.
+        settings: settings of the next step.
+        header: header of the checkpoint that is resumed; None for a new run. A dataset that the run
+            has used before continues at its position.
 
     Raises:
-        TrilightError: not as many weights as datasets.
+        TrilightError: the number of weights is not that of the datasets.
     """
-    sources, old = data.sources, None if header is None else _recorded(header)
+    sources = data.sources
+    old = None if header is None else _mixture_of_header(header)
     if settings.data_weights and len(settings.data_weights) != len(sources):
         raise TrilightError(
             f"data_weights holds {len(settings.data_weights)} numbers, but --data names "
@@ -144,28 +147,34 @@ def mixture_of(
         if header is None or RECORD not in header:
             return None
     position = 0 if header is None else header["step"] * settings.scenes_per_step
-    shown = dict[str, int]() if old is None or header is None else _shown(old, header["step"])
+    seen_counts = (
+        dict[str, int]()
+        if old is None or header is None
+        else _count_seen_scenes(old, header["step"])
+    )
     new = Mixture(
         digests=tuple(source.digest for source in sources),
         names=tuple(source.name for source in sources),
         weights=tuple(float(w) for w in settings.data_weights) or _sizes(data),
         first=position,
-        before=tuple(shown.get(source.digest, 0) for source in sources),
+        before=tuple(seen_counts.get(source.digest, 0) for source in sources),
         scenes_per_step=settings.scenes_per_step,
     )
-    kept = ("digests", "weights", "scenes_per_step")
-    unchanged = old is not None and all(getattr(old, name) == getattr(new, name) for name in kept)
+    identity_fields = ("digests", "weights", "scenes_per_step")
+    unchanged = old is not None and all(
+        getattr(old, name) == getattr(new, name) for name in identity_fields
+    )
     return old if unchanged else new
 
 
-def _shown(old: Mixture, step: int) -> dict[str, int]:
-    """Return by digest how many scenes a run has been shown."""
-    taken = old.taken(step * old.scenes_per_step)
-    return dict(zip(old.digests, taken, strict=True))
+def _count_seen_scenes(old: Mixture, step: int) -> dict[str, int]:
+    """Return the number of scenes that a run has used, by digest of the dataset."""
+    counts = old.counts_before(step * old.scenes_per_step)
+    return dict(zip(old.digests, counts, strict=True))
 
 
-def _recorded(header: Mapping[str, Any]) -> Mixture:
-    """Return the mixture of a checkpoint; of one dataset alone where it says none."""
+def _mixture_of_header(header: Mapping[str, Any]) -> Mixture:
+    """Return the mixture of a checkpoint, or that of its single dataset."""
     if RECORD in header:
         record: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value
@@ -182,6 +191,6 @@ def _recorded(header: Mapping[str, Any]) -> Mixture:
 
 
 def _sizes(data: TrainingData) -> tuple[float, ...]:
-    """Return how many scenes of each dataset are for training."""
+    """Return the number of training scenes of each dataset."""
     shards = data.split("train")
     return tuple(float(sum(map(shards.num_samples, part))) for part in shards.parts)

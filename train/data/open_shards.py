@@ -1,4 +1,4 @@
-"""Shards that are open because samples of them are planned: opened ahead, closed after the last."""
+"""Shards of planned samples: opened ahead of their first read, closed after the last."""
 
 import threading
 from collections import Counter
@@ -9,11 +9,11 @@ from types import TracebackType
 from storage.dataset.shard_set import OpenShard, ShardSet
 
 OPENED_AT_ONCE = 4
-"""Shards that are fetched and checked at the same time."""
+"""Maximum number of shards that are fetched and checked at the same time."""
 
 
 class OpenShards:
-    """The open ones of a set, by number. Safe to use from several threads."""
+    """Open shards of a set, by number. Safe to use from several threads."""
 
     def __init__(self, shards: ShardSet) -> None:
         self._shards = shards
@@ -39,7 +39,7 @@ class OpenShards:
             self._open.clear()
 
     def plan(self, numbers: Iterable[int]) -> None:
-        """Begin to open the shards of planned samples: one shard number for each sample."""
+        """Start to open the shards of planned samples: one shard number for each sample."""
         with self._lock:
             for number in numbers:
                 self._planned[number] += 1
@@ -47,16 +47,16 @@ class OpenShards:
                     self._open[number] = self._opening.submit(self._shards.open, number)
 
     def read(self, number: int) -> OpenShard:
-        """Return a planned shard, when it is open; raises what opening it raised."""
+        """Return a planned shard after it is open; raises the error of opening it."""
         with self._lock:
             future = self._open[number]
         return future.result()
 
-    def done(self, numbers: Iterable[int]) -> None:
+    def mark_read(self, numbers: Iterable[int]) -> None:
         """Mark samples as read: one shard number for each, as planned."""
         with self._lock:
             self._planned.subtract(numbers)
-            for number in [number for number, left in self._planned.items() if not left]:
+            for number in [number for number, count in self._planned.items() if not count]:
                 del self._planned[number]
                 self._open.pop(number).add_done_callback(_close)
 

@@ -1,11 +1,11 @@
-"""The order in which a run sees its scenes: a pure function of (seed, epoch, sizes of the shards).
+"""Order of a run's scenes: a pure function of seed, epoch and sizes of the shards.
 
-Shards are permuted; then the samples of a window, a few shards in a row, are permuted among each
-other. Epochs follow one another without a seam, and global batch i is the samples at positions
-i B to (i + 1) B - 1 of that endless order, whatever the number of ranks and workers. Nothing has to
-be stored to resume: the number of the batch says it all.
+Shards are permuted; then the samples of each window of a few consecutive shards are permuted.
+Epochs follow one another without a gap, and global batch i is the samples at positions i B to
+(i + 1) B - 1 of that endless order, for any number of ranks and workers. A resume needs only the
+number of the batch.
 
-The ranks share out a batch by shard, so that each reads few shards of a window and not all.
+A batch is split over the ranks by shard, so that each rank reads few shards of a window.
 """
 
 import itertools
@@ -17,49 +17,49 @@ from storage.seeds import rng_for
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Place:
-    """One sample, at one point of the order."""
+class Visit:
+    """One sample at one position of the order."""
 
     position: int
     """Position in the endless order; it seeds the augmentation of the visit."""
     shard: int
-    """Number of the shard."""
+    """Number of the shard in its set, from 0."""
     row: int
     """Row of the sample in the shard."""
     arrival: int
-    """Number of the shard in the order of its epoch."""
+    """Position of the shard in the order of its epoch."""
     source: int = 0
-    """Number of the dataset, where several are mixed."""
+    """Number of the dataset if several are mixed, from 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShardWindow:
-    """Shards that are open at the same time, and the order of their samples."""
+    """Shards that are open at the same time, and the shuffled order of their samples."""
 
     shards: tuple[int, ...]
     """Numbers of the shards, in the order of the epoch."""
-    places: tuple[Place, ...]
-    """Every sample of theirs exactly once."""
+    visits: tuple[Visit, ...]
+    """Every sample of these shards exactly once, shuffled."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OrderSettings:
-    """What the order depends on, beside the shards."""
+    """Settings that determine the order, besides the shards."""
 
     seed: int
-    """Seed of the run."""
+    """Seed of the run's order."""
     window: int
-    """Shards among whose samples is shuffled, at least 1."""
+    """Number of shards whose samples are shuffled together, at least 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RankShare:
-    """Which part of every global batch a process takes."""
+class RankSlice:
+    """Slice of every global batch that one process takes."""
 
     rank: int = 0
     """Number of the process, from 0."""
     world_size: int = 1
-    """How many processes train together."""
+    """Number of processes that train together."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.rank < self.world_size:
@@ -69,23 +69,23 @@ class RankShare:
             )
 
     def require_equal(self, batch_size: int) -> None:
-        """Raise TrilightError where the ranks cannot all take the same number of samples."""
+        """Raise TrilightError if a batch cannot be split equally over the ranks."""
         if batch_size % self.world_size:
             raise TrilightError(
                 f"a batch of {batch_size} scenes is not divisible by {self.world_size} ranks; "
                 "expected a multiple, so that each takes the same number."
             )
 
-    def of_batch(self, places: Sequence[Place]) -> list[Place]:
-        """Return this process's part of a global batch, in the order of positions."""
-        size = len(places) // self.world_size
-        by_shard = sorted(places, key=lambda place: (place.source, place.arrival, place.position))
+    def of_batch(self, visits: Sequence[Visit]) -> list[Visit]:
+        """Return this process's slice of a global batch, in the order of positions."""
+        size = len(visits) // self.world_size
+        by_shard = sorted(visits, key=lambda visit: (visit.source, visit.arrival, visit.position))
         mine = by_shard[self.rank * size : (self.rank + 1) * size]
-        return sorted(mine, key=lambda place: place.position)
+        return sorted(mine, key=lambda visit: visit.position)
 
 
 def shard_order(num_shards: int, settings: OrderSettings, epoch: int) -> list[int]:
-    """Return the numbers of the shards in the order of an epoch."""
+    """Return the shard numbers in the order of an epoch."""
     rng = rng_for(settings.seed, "shards", epoch)
     return [int(shard) for shard in rng.permutation(num_shards)]
 
@@ -93,13 +93,13 @@ def shard_order(num_shards: int, settings: OrderSettings, epoch: int) -> list[in
 def windows_from(
     num_shards: int, num_samples: Callable[[int], int], settings: OrderSettings, first: int
 ) -> Iterator[ShardWindow]:
-    """Yield windows without end, from the one that holds position `first` on.
+    """Yield endless windows, beginning with the one that holds position `first`.
 
     Args:
-        num_shards: how many shards there are.
-        num_samples: size of a shard by number; asked only for shards that have been reached.
+        num_shards: number of shards.
+        num_samples: returns the size of a shard; called only for shards that are reached.
         settings: seed and window.
-        first: a position.
+        first: position in the endless order.
 
     Raises:
         TrilightError: all shards are empty.
@@ -107,7 +107,7 @@ def windows_from(
     total = sum(num_samples(shard) for shard in range(num_shards)) if first else 0
     epoch, start = (first // total, first // total * total) if total else (0, 0)
     while True:
-        begun = start
+        epoch_start = start
         order = shard_order(num_shards, settings, epoch)
         for number, at in enumerate(range(0, num_shards, settings.window)):
             shards = order[at : at + settings.window]
@@ -115,23 +115,23 @@ def windows_from(
             if any(sizes) and start + sum(sizes) > first:
                 rng = rng_for(settings.seed, "samples", epoch, number)
                 arrivals = [(a, row) for a, size in enumerate(sizes) for row in range(size)]
-                places = (
-                    Place(position=start + p, shard=shards[a], row=row, arrival=at + a)
+                visits = (
+                    Visit(position=start + p, shard=shards[a], row=row, arrival=at + a)
                     for p, (a, row) in enumerate(arrivals[i] for i in rng.permutation(sum(sizes)))
                 )
-                yield ShardWindow(shards=tuple(shards), places=tuple(places))
+                yield ShardWindow(shards=tuple(shards), visits=tuple(visits))
             start += sum(sizes)
-        if start == begun:
+        if start == epoch_start:
             raise TrilightError(f"all {num_shards} shards are empty; expected a sample.")
         epoch += 1
 
 
-def places_from(windows: Iterator[ShardWindow], first: int) -> Iterator[Place]:
-    """Yield places without end, from position `first` on."""
-    return (place for window in windows for place in window.places if place.position >= first)
+def visits_from(windows: Iterator[ShardWindow], first: int) -> Iterator[Visit]:
+    """Yield endless visits, from position `first` on."""
+    return (visit for window in windows for visit in window.visits if visit.position >= first)
 
 
-def batched(places: Iterator[Place], batch_size: int) -> Iterator[tuple[Place, ...]]:
-    """Yield so many places at a time, without end."""
+def batch_visits(visits: Iterator[Visit], batch_size: int) -> Iterator[tuple[Visit, ...]]:
+    """Yield endless batches of visits."""
     while True:
-        yield tuple(itertools.islice(places, batch_size))
+        yield tuple(itertools.islice(visits, batch_size))

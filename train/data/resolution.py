@@ -1,4 +1,4 @@
-"""Smaller pictures for nothing: block means of linear radiance.
+"""Downsampling of pictures by block means of linear radiance.
 
 Targets are box-filtered over each pixel, so the mean of a block of pixels is what a camera with
 fewer pixels would have measured, with less noise and without another render.
@@ -11,7 +11,7 @@ from storage.errors import TrilightError
 
 
 def block_mean(radiance_rgb: NDArray[np.float32], resolution: int) -> NDArray[np.float32]:
-    """Return pictures [V, R, R, 3] as [V, resolution, resolution, 3], exact but for rounding.
+    """Return pictures [V, R, R, 3] as [V, resolution, resolution, 3], exact up to rounding.
 
     Raises:
         TrilightError: `resolution` does not divide the pictures' own.

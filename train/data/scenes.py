@@ -1,8 +1,8 @@
-"""A sample -> `TrainingScene`: the tensors that one scene contributes to a step.
+"""Training scenes: the tensors of a sample for one step.
 
-Most targets are half floats at the resolution of the run, of which there are 31,744. What is done
-to their values (log10(1 + x), stronger light) is done to these once and looked up for each pixel,
-in a decoding thread or on the card: the same numbers for a tenth of the work.
+Most targets are half floats at the resolution of the run, with 31,744 possible values. Functions of
+a value (log10(1 + x), scaled light) are computed once for each of these and looked up per pixel, in
+a decoding thread or on the GPU: the same numbers for a tenth of the work.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from torch import Tensor
 from model.scene_tensors import SceneTensors, scene_tensors
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
-from storage.records.exr import FIRST_ILLEGAL, HALF_FLOATS, Stored, unpacked
+from storage.records.exr import FIRST_ILLEGAL, HALF_FLOATS, Stored, to_float32
 from storage.records.lights import light_rows
 from storage.records.sample import Sample, ViewRecord
 from storage.records.scene import Scene
@@ -28,26 +28,25 @@ from train.data.resolution import block_mean, require_divisor
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainingScene:
-    """One scene and the pictures that the network should make of it."""
+    """One scene and the target pictures of its cameras."""
 
     key: str
-    """Key of the sample."""
+    """Key of the sample in its shard."""
     tensors: SceneTensors
-    """What the network reads."""
+    """Input of the network for this scene."""
     target_VRR3: Tensor
     """float32 log10(1 + radiance), one picture per camera in `tensors`; with `levels_L`, int16 rows
     of it."""
     noise_V: Tensor
-    """float32 root mean square noise of the stored pictures in the same space; fewer pixels have
-    less."""
+    """float32 root mean square noise of the stored pictures in log10(1 + radiance); downsampled
+    pictures have less."""
     light_T: Tensor
-    """int64: which light a triangle belongs to (storage.records.lights), -1 for none."""
+    """int64 index of each triangle's light (storage.records.lights), -1 for none."""
     lights_VLRR3: Tensor | None = None
-    """float32 linear radiance of each light alone, where it was asked for; their sum is the
-    picture."""
+    """float32 linear radiance of each light alone, if requested; their sum is the picture."""
     levels_L: Tensor | None = None
-    """float32 log10(1 + radiance) of every half float that a picture may hold, where the target is
-    yet to be looked up (`with_target`)."""
+    """float32 log10(1 + radiance) of every valid half float, if the target is not looked up yet
+    (`with_target`); None otherwise."""
 
 
 def training_scene(
@@ -56,14 +55,14 @@ def training_scene(
     """Return a sample at the resolution of the run.
 
     Args:
-        sample: what to return; it passes `Sample.check`.
-        resolution: pixels across the pictures.
-        most_triangles: scenes with more are refused; 0: none is.
-        lights_apart: whether each light's own pictures are wanted.
+        sample: sample that passes `Sample.check`.
+        resolution: width of the pictures in pixels.
+        most_triangles: maximum number of triangles; 0 sets no limit.
+        lights_apart: True to include the pictures of each light.
 
     Raises:
-        TrilightError: the resolution is no divisor of the sample's, or the scene has too many
-            triangles or keeps its lights together.
+        TrilightError: the resolution does not divide the sample's, or the scene has too many
+            triangles or no pictures of single lights.
     """
     require_few_triangles(sample.key, sample.scene, most_triangles)
     scene = _scene_of(sample.key, sample.scene, sample.views, sample.radiance_rgb, resolution)
@@ -72,45 +71,46 @@ def training_scene(
     return _with_lights(scene, sample.lights_rgb, resolution)
 
 
-def drawn_scene(
-    sample: StoredSample, views: Sequence[int], resolution: int, *, lights_apart: bool = False
+def scene_of_views(
+    sample: StoredSample, views: Sequence[int], resolution: int, *, per_light: bool = False
 ) -> TrainingScene:
-    """Return some views of a sample, whose other pictures are not unpacked.
+    """Return some views of a sample; its other pictures are not unpacked.
 
-    Where pictures are half floats of the wanted resolution, the target is yet to be looked up.
+    If pictures are half floats of the right resolution, the target is not looked up yet.
 
     Args:
-        sample: what to return.
-        views: rows of its cameras, at least one.
+        sample: stored sample.
+        views: indices of its cameras, at least one.
         resolution: as in `training_scene`.
-        lights_apart: as in `training_scene`.
+        per_light: as in `training_scene`.
 
     Raises:
-        TrilightError: a picture that is damaged or breaks a law; and as `training_scene`.
+        TrilightError: a picture is damaged or invalid; otherwise as `training_scene`.
     """
-    pictures, rows = sample.pictures(views), list(views)
+    pictures = sample.pictures(views)
+    rows = list(views)
     scene = dataclasses.replace(
         sample.scene, c2w=sample.scene.c2w[rows], fov_deg=sample.scene.fov_deg[rows]
     )
     records = [sample.views[row] for row in rows]
-    drawn = _scene_of(sample.key, scene, records, pictures, resolution)
-    if not lights_apart:
-        return drawn
+    training = _scene_of(sample.key, scene, records, pictures, resolution)
+    if not per_light:
+        return training
     lights_rgb = sample.lights_rgb(views, pictures.shape[1])
-    return _with_lights(drawn, lights_rgb, resolution)
+    return _with_lights(training, lights_rgb, resolution)
 
 
 def with_target(scene: TrainingScene) -> TrainingScene:
-    """Return a scene whose target is log10(1 + radiance), looked up where it has not been."""
+    """Return a scene whose target is log10(1 + radiance), looked up if necessary."""
     if scene.levels_L is None:
         return scene
-    # legal bits need no check of their range, which would take a copy
+    # the bits were validated: mode "clip" avoids another range check, which would copy
     target = np.take(scene.levels_L.numpy(), scene.target_VRR3.numpy(), mode="clip")
     return dataclasses.replace(scene, target_VRR3=torch.from_numpy(target), levels_L=None)
 
 
 def require_few_triangles(key: str, scene: Scene, most: int) -> None:
-    """Raise TrilightError where a scene has more than `most` triangles; at 0 there is no limit."""
+    """Raise TrilightError if a scene has more than `most` triangles; 0 sets no limit."""
     if 0 < most < scene.num_triangles:
         raise TrilightError(
             f"sample {key}: {scene.num_triangles} triangles; the run takes at most {most}. Set "
@@ -120,7 +120,7 @@ def require_few_triangles(key: str, scene: Scene, most: int) -> None:
 
 @cache
 def stored_levels() -> Tensor:
-    """Return float32 [31744]: log10(1 + x) of every half float x from 0 on, by its bits."""
+    """Return the table float32 [31744] of log10(1 + x) by the bits of a half float x."""
     return torch.from_numpy(log10_radiance(HALF_FLOATS[:FIRST_ILLEGAL]).astype(np.float32))
 
 
@@ -131,9 +131,10 @@ def _scene_of(
     require_divisor(resolution, pictures.shape[1])
     levels_L = None
     if pictures.dtype == np.uint16 and pictures.shape[1] == resolution:
-        target_VRR3, levels_L = torch.from_numpy(pictures.view(np.int16)), stored_levels()
+        target_VRR3 = torch.from_numpy(pictures.view(np.int16))
+        levels_L = stored_levels()
     else:
-        radiance_VRR3 = block_mean(unpacked(pictures), resolution)
+        radiance_VRR3 = block_mean(to_float32(pictures), resolution)
         target_VRR3 = torch.from_numpy(log10_radiance(radiance_VRR3).astype(np.float32))
     floors_db = np.array([view.noise_floor_db for view in views], np.float32)
     return TrainingScene(

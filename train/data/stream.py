@@ -1,7 +1,7 @@
-"""Shards -> an endless stream of batches of training scenes, fetched and decoded ahead in threads.
+"""Endless stream of batches of training scenes, fetched and decoded ahead in threads.
 
-Batch i holds the same scenes with the same augmentation wherever the stream was entered, for any
-number of ranks and threads: a run resumes by the number of its step.
+Batch i holds the same scenes with the same augmentation wherever the stream starts, for any number
+of ranks and threads: a run resumes by the number of its step.
 """
 
 import dataclasses
@@ -17,63 +17,63 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from model.sky.known import require_known, shining
+from model.sky.known import lit_sky, require_known_sky
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
 from storage.records.stored_sample import StoredSample
 from storage.seeds import rng_for
-from train.data.augment import augmented, with_inputs_withheld
-from train.data.mixture import Mixture, mixed_places
+from train.data.augment import augment_scene, withhold_inputs
+from train.data.bad_samples import BadSampleCounter, count_lost_samples
+from train.data.mixture import Mixture, mix_visits
 from train.data.open_shards import OpenShards
 from train.data.order import (
     OrderSettings,
-    Place,
-    RankShare,
-    batched,
-    places_from,
+    RankSlice,
+    Visit,
+    batch_visits,
     shard_order,
+    visits_from,
     windows_from,
 )
 from train.data.scenes import (
     TrainingScene,
-    drawn_scene,
     require_few_triangles,
+    scene_of_views,
     with_target,
 )
-from train.data.unusable import Unusable, lost_with
 
 if TYPE_CHECKING:
     from model.config import ModelConfig
     from train.settings import AugmentationSettings
 
 PREFETCHED_SCENES = 16
-"""Scenes decoded ahead of the network, at least one batch."""
+"""Number of scenes decoded ahead of the network; at least one batch is."""
 
 Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, kw_only=True)
 class StreamSettings:
-    """What the stream depends on."""
+    """Settings that determine the stream."""
 
     seed: int
-    """Seed of the order and of what is drawn at each visit."""
+    """Seed of the order, and of the views and augmentation of each visit."""
     window: int
-    """Shards among whose samples is shuffled."""
+    """Number of shards whose samples are shuffled together."""
     batch_size: int
-    """Scenes of a global batch, over all ranks."""
+    """Number of scenes of a global batch, over all ranks."""
     resolution: int
-    """Pixels across the pictures."""
+    """Width of the pictures in pixels."""
     views_per_scene: int
-    """Views that are drawn of each scene."""
+    """Number of views that are drawn of each scene."""
     most_triangles: int = 0
-    """Samples with more are unusable; 0: none is."""
+    """Maximum number of triangles; samples with more are unusable; 0 sets no limit."""
     augmentation: "AugmentationSettings | None" = None
-    """Symmetries that are drawn at each visit; none by default."""
-    looked_up: bool = True
-    """Whether targets are looked up in the decoding threads, and not where batches arrive."""
+    """Random symmetries of each visit; by default none."""
+    lookup_in_threads: bool = True
+    """True to look targets up in the decoding threads, False to do it on the device."""
     network: "ModelConfig | None" = None
-    """The network that is trained: what it wants traced of its views, is traced here."""
+    """Configuration of the network, whose traced inputs are computed here; None traces none."""
 
     @property
     def order(self) -> OrderSettings:
@@ -85,53 +85,55 @@ def stream_batches(
     settings: StreamSettings,
     first: int,
     *,
-    share: RankShare,
+    rank_slice: RankSlice,
     workers: int,
-    unusable: Unusable,
+    unusable: BadSampleCounter,
     mixture: Mixture | None = None,
 ) -> Generator[list[TrainingScene], None, None]:
-    """Yield this process's part of the global batches first, first + 1, ... without end.
+    """Yield this process's slice of the global batches first, first + 1, ... without end.
 
     Closing the returned iterator ends its threads.
 
     Args:
-        shards: of the train split.
-        settings: what decides the order and the scenes.
+        shards: shards of the train split.
+        settings: settings that determine order and scenes.
         first: number of a global batch.
-        share: which part of each batch; the ranks' parts are equally large and make up the batch.
-        workers: threads that read and decode, 0: the caller's own; what comes out does not depend
-            on them.
-        mixture: how the parts of the shards are mixed, where these are several datasets.
+        share: slice of each batch for this process; all slices have equal size.
+        workers: threads that read and decode; with 0 the caller's thread. The result does not
+            depend on them.
+        mixture: mixture of the datasets, if there are several.
         unusable: counts damaged data, or stops at it. An unusable sample is replaced by the next
             usable one of its shard, a shard that cannot be opened by the one of the next number.
 
     Raises:
-        TrilightError: the ranks cannot share a batch equally, or data is unusable beyond the limit;
-            when it is reached.
+        TrilightError: a batch cannot be split equally, or too much data is unusable; the latter
+            when the stream reaches it.
     """
-    share.require_equal(settings.batch_size)
-    pool = ThreadPoolExecutor(workers, "decode") if workers else _CallersThread()
+    rank_slice.require_equal(settings.batch_size)
+    pool = ThreadPoolExecutor(workers, "decode") if workers else _InlineExecutor()
     with OpenShards(shards) as opened, pool as decoders:
         maker = _SceneMaker(shards, opened, settings, unusable)
-        counted = _Counted(shards, unusable)
-        plan = _planned(counted, settings, mixture, first, share, opened)
-        waiting: deque[tuple[list[Place], list[Future[TrainingScene]]]] = deque()
-        depth = -(-PREFETCHED_SCENES * share.world_size // settings.batch_size) if workers else 0
+        counted = _SampleCounts(shards, unusable)
+        plan = _plan_batches(counted, settings, mixture, first, rank_slice, opened)
+        waiting: deque[tuple[list[Visit], list[Future[TrainingScene]]]] = deque()
+        depth = (
+            -(-PREFETCHED_SCENES * rank_slice.world_size // settings.batch_size) if workers else 0
+        )
         try:
-            with closing(prefetched(plan, _plan_ahead(counted, settings, mixture))) as batches:
+            with closing(prefetch(plan, _plan_ahead(counted, settings, mixture))) as batches:
                 for mine in batches:
                     waiting.append((mine, [decoders.submit(maker.scene, p) for p in mine]))
                     if len(waiting) > depth:
-                        places, scenes = waiting.popleft()
+                        visits, scenes = waiting.popleft()
                         ready = [scene.result() for scene in scenes]
-                        opened.done(place.shard for place in places)
+                        opened.mark_read(visit.shard for visit in visits)
                         yield ready
         finally:
             decoders.shutdown(wait=True, cancel_futures=True)
 
 
-class _CallersThread(Executor):
-    """Does at once what it is asked."""
+class _InlineExecutor(Executor):
+    """Executor that runs each function at once in the caller's thread."""
 
     def submit(
         self, function: Callable[..., Item], /, *arguments: Any, **named: Any
@@ -144,16 +146,16 @@ class _CallersThread(Executor):
         return done
 
 
-class _Counted:
-    """The parts of a set, with the sizes of their shards; an unusable one has no sample."""
+class _SampleCounts:
+    """Sizes of the shards of each dataset; an unusable shard counts as empty."""
 
-    def __init__(self, shards: ShardSet, unusable: Unusable) -> None:
+    def __init__(self, shards: ShardSet, unusable: BadSampleCounter) -> None:
         self._shards = shards
         self._unusable = unusable
         self.parts = shards.parts
 
     def in_part(self, part: range) -> Callable[[int], int]:
-        """Return a function that counts the samples of a shard by its number in a part."""
+        """Return a function from a shard's number in its dataset to its number of samples."""
         return lambda number: self._count(part.start + number)
 
     def _count(self, number: int) -> int:
@@ -164,35 +166,35 @@ class _Counted:
             return 0
 
 
-def _planned(
-    counted: _Counted,
+def _plan_batches(
+    counted: _SampleCounts,
     settings: StreamSettings,
     mixture: Mixture | None,
     first: int,
-    share: RankShare,
+    rank_slice: RankSlice,
     opened: OpenShards,
-) -> Iterator[list[Place]]:
-    """Yield this process's places batch by batch, and have their shards opened."""
+) -> Iterator[list[Visit]]:
+    """Yield this process's visits batch by batch, and start to open their shards."""
     position = first * settings.batch_size
-    begin = (position,) if mixture is None else mixture.taken(position)
+    begin = (position,) if mixture is None else mixture.counts_before(position)
     streams = [
-        places_from(windows_from(len(part), counted.in_part(part), settings.order, start), start)
+        visits_from(windows_from(len(part), counted.in_part(part), settings.order, start), start)
         for part, start in zip(counted.parts, begin, strict=True)
     ]
     if mixture is None:
-        places = streams[0]
+        visits = streams[0]
     else:
-        places = mixed_places(mixture, streams, counted.parts, position)
-    for batch in batched(places, settings.batch_size):
-        mine = share.of_batch(batch)
-        opened.plan(place.shard for place in mine)
+        visits = mix_visits(mixture, streams, counted.parts, position)
+    for batch in batch_visits(visits, settings.batch_size):
+        mine = rank_slice.of_batch(batch)
+        opened.plan(visit.shard for visit in mine)
         yield mine
 
 
-def _plan_ahead(counted: _Counted, settings: StreamSettings, mixture: Mixture | None) -> int:
-    """Return how many batches to plan ahead: about a window, so that the next shards are opened.
+def _plan_ahead(counted: _SampleCounts, settings: StreamSettings, mixture: Mixture | None) -> int:
+    """Return the number of batches to plan ahead: about a window, to open its shards in time.
 
-    Of several datasets, the window that is through first.
+    With several datasets it is the window that ends first.
     """
     weights = (1.0,) if mixture is None else mixture.weights
     ahead = []
@@ -204,10 +206,14 @@ def _plan_ahead(counted: _Counted, settings: StreamSettings, mixture: Mixture | 
 
 
 class _SceneMaker:
-    """Makes the scene of a place; called in several threads."""
+    """Makes the scene of a visit; called in several threads."""
 
     def __init__(
-        self, shards: ShardSet, opened: OpenShards, settings: StreamSettings, unusable: Unusable
+        self,
+        shards: ShardSet,
+        opened: OpenShards,
+        settings: StreamSettings,
+        unusable: BadSampleCounter,
     ) -> None:
         self._shards = shards
         self._opened = opened
@@ -215,50 +221,52 @@ class _SceneMaker:
         self._unusable = unusable
         self._given_up: set[int] = set()
 
-    def scene(self, place: Place) -> TrainingScene:
-        """Return the scene that is seen at a place of the order."""
+    def scene(self, visit: Visit) -> TrainingScene:
+        """Return the augmented scene of a visit."""
         settings = self._settings
-        seen, rng = self._usable(place)
+        seen, rng = self._usable_scene(visit)
         if settings.augmentation:
-            seen = augmented(seen, settings.augmentation, rng)
-        return self._prepared(with_target(seen) if settings.looked_up else seen, rng)
+            seen = augment_scene(seen, settings.augmentation, rng)
+        return self._with_traced_inputs(
+            with_target(seen) if settings.lookup_in_threads else seen, rng
+        )
 
-    def _prepared(self, seen: TrainingScene, rng: np.random.Generator) -> TrainingScene:
-        """Return a scene with all that its network wants to be told."""
+    def _with_traced_inputs(self, seen: TrainingScene, rng: np.random.Generator) -> TrainingScene:
+        """Return a scene with the traced inputs of its network, if it has any."""
         settings = self._settings
         if settings.network is None or not settings.network.hit_rays:
             return seen
-        # these bring the checker of settings along
+        # imported here since they load pydantic
         from model.demodulated import with_albedo
         from model.hits.tracing import with_traced
 
-        # after the symmetries, which therefore need not know what is traced
+        # after the augmentation, which therefore need not transform traced inputs
         if settings.network.demodulated:
             tensors = with_albedo(seen.tensors, settings.resolution, settings.network.hit_rays)
             return dataclasses.replace(seen, tensors=tensors)
         noise = int(rng.integers(2**31))
         tensors = with_traced(seen.tensors, settings.resolution, settings.network, noise)
         withheld = settings.augmentation.withheld_inputs if settings.augmentation else 0.0
-        return dataclasses.replace(seen, tensors=with_inputs_withheld(tensors, withheld, rng))
+        return dataclasses.replace(seen, tensors=withhold_inputs(tensors, withheld, rng))
 
-    def _usable(self, place: Place) -> tuple[TrainingScene, np.random.Generator]:
-        """Return the drawn views of a usable sample, and what else of its visit is drawn from."""
-        part = self._shards.parts[place.source]
-        after = range(place.shard, part.stop), range(part.start, place.shard)
+    def _usable_scene(self, visit: Visit) -> tuple[TrainingScene, np.random.Generator]:
+        """Return the drawn views of a usable sample, and the random generator of the visit."""
+        part = self._shards.parts[visit.source]
+        after = range(visit.shard, part.stop), range(part.start, visit.shard)
         for number in itertools.chain(*after):
             if number in self._given_up:
                 continue
-            planned = number == place.shard
+            planned = number == visit.shard
             try:
                 shard = self._opened.read(number) if planned else self._shards.open(number)
             except TrilightError as error:
-                lost = lost_with(self._shards, number)
+                lost = count_lost_samples(self._shards, number)
                 self._unusable.add(self._shards.names[number], lost, error)
                 continue
             with nullcontext() if planned else closing(shard):
-                found = self._first_usable(shard, place)
-            if found is not None:
-                return found
+                usable = self._first_usable(shard, visit)
+            if usable is not None:
+                return usable
             self._given_up.add(number)
         raise TrilightError(
             f"data: no sample of {len(part)} shards is usable. The last that was tried: "
@@ -266,21 +274,22 @@ class _SceneMaker:
         )
 
     def _first_usable(
-        self, shard: OpenShard, place: Place
+        self, shard: OpenShard, visit: Visit
     ) -> tuple[TrainingScene, np.random.Generator] | None:
-        """Return the first scene of a shard that is usable, from a row on and around; or None."""
+        """Return the first usable scene of a shard, from the visit's row on cyclically, or None."""
         keys = shard.keys
-        for at in ((place.row + step) % len(keys) for step in range(len(keys))):
-            rng = rng_for(self._settings.seed, "visit", place.position)
+        for at in ((visit.row + step) % len(keys) for step in range(len(keys))):
+            rng = rng_for(self._settings.seed, "visit", visit.position)
             try:
-                return self._drawn(shard.stored_sample(at), rng), rng
+                return self._draw_views(shard.stored_sample(at), rng), rng
             except TrilightError as error:
-                named = _named(shard.name, error)
-                self._unusable.add(f"{shard.name}: sample {keys[at]}", 1, named)
+                shard_error = _with_shard_name(shard.name, error)
+                self._unusable.add(f"{shard.name}: sample {keys[at]}", 1, shard_error)
         return None
 
-    def _drawn(self, sample: StoredSample, rng: np.random.Generator) -> TrainingScene:
-        settings, num_views = self._settings, sample.scene.num_views
+    def _draw_views(self, sample: StoredSample, rng: np.random.Generator) -> TrainingScene:
+        settings = self._settings
+        num_views = sample.scene.num_views
         if num_views < settings.views_per_scene:
             raise TrilightError(
                 f"sample {sample.key}: {num_views} views; the run draws "
@@ -288,25 +297,25 @@ class _SceneMaker:
             )
         require_few_triangles(sample.key, sample.scene, settings.most_triangles)
         if settings.network is not None:
-            require_known(shining(sample.scene.environment), settings.network)
+            require_known_sky(lit_sky(sample.scene.environment), settings.network)
         views = np.sort(rng.permutation(num_views)[: settings.views_per_scene])
-        lights_apart = settings.augmentation is not None and settings.augmentation.light_mix > 1
-        return drawn_scene(sample, views.tolist(), settings.resolution, lights_apart=lights_apart)
+        per_light = settings.augmentation is not None and settings.augmentation.light_mix > 1
+        return scene_of_views(sample, views.tolist(), settings.resolution, per_light=per_light)
 
 
-def _named(shard: str, error: TrilightError) -> TrilightError:
+def _with_shard_name(shard: str, error: TrilightError) -> TrilightError:
     text = str(error)
     return error if text.startswith(shard) else TrilightError(f"{shard}: {text}")
 
 
-def prefetched(items: Iterator[Item], depth: int) -> Generator[Item, None, None]:
-    """Yield the same items, made ahead in a thread; an error arrives at its place in the stream.
+def prefetch(items: Iterator[Item], depth: int) -> Generator[Item, None, None]:
+    """Yield the same items, computed ahead in a thread; errors keep their position.
 
     Closing the returned iterator ends the thread.
 
     Args:
-        items: what to take them from.
-        depth: how many to make ahead.
+        items: source of the items.
+        depth: maximum number of items to compute ahead.
     """
     ready: queue.Queue[tuple[Item] | BaseException | None] = queue.Queue(depth)
     closed = threading.Event()

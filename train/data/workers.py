@@ -1,6 +1,6 @@
-"""How many threads decode samples, where nobody says it: what the machine has to spare.
+"""Default number of decoding threads, from the free cores and memory of the machine.
 
-Execution, not meaning: batches are the same with any number, so every start decides anew.
+Batches do not depend on it, so that every start decides again.
 """
 
 import os
@@ -12,42 +12,42 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from train.settings import TrainSettings
 
-MOST_THREADS = 8
-"""More threads of one process wait for Python's lock. Where they only decode, two to three fill it
-(study S56); tracing for the view stage `hits` lets it go."""
+MAX_THREADS = 8
+"""Maximum number of threads; more would wait for Python's lock. When threads only decode, two to
+three saturate it (study S56); tracing for the view stage `hits` releases it."""
 
 SCENES_AT_WORK = 4
-"""Memory that a thread takes, in scenes as a batch holds them: what it decodes, and what waits."""
+"""Memory of a thread, in scenes as a batch holds them: decoded and waiting ones."""
 
 _BYTES_OF_PIXEL = 12
 _NO_LIMIT = 1 << 60
-"""Old control groups write a limit beyond any memory where there is none."""
+"""Threshold of memory limits: old control groups store a larger number for no limit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Machine:
-    """What the processes of a run may use on this node."""
+    """Resources of this node that the processes of a run share."""
 
     cores: float
-    """Cores that they may run on, or their control group's share of time where that is less."""
+    """Number of allowed cores, or the smaller CPU quota of their control group."""
     free_bytes: int | None = None
-    """Memory that is free; None where nothing says it."""
+    """Free memory in bytes; None if unknown."""
     processes: int = 1
-    """How many of them share it."""
+    """Number of the run's processes on this node."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Workers:
-    """A number of threads, and what it comes from."""
+class WorkerResult:
+    """Number of decoding threads, with its reason."""
 
     threads: int
-    """Threads that decode samples."""
-    because: str
-    """One line."""
+    """Number of threads that decode samples, 1 or more."""
+    reason: str
+    """Sentence for the user, without a full stop."""
 
 
-def this_machine(root: Path = Path("/")) -> Machine:
-    """Return what the system and the launcher of processes say; `root` is of the file system."""
+def detect_machine(root: Path = Path("/")) -> Machine:
+    """Detect cores, memory and processes of this node; `root` is that of the file system."""
     allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(_all_cores())
     groups = list(_control_groups(root))
     quotas = [quota for folder in groups for quota in _quotas(folder)]
@@ -61,31 +61,31 @@ def this_machine(root: Path = Path("/")) -> Machine:
     )
 
 
-def fitting_workers(
-    machine: Machine, settings: "TrainSettings", *, on_card: bool, busy_threads: int
-) -> Workers:
-    """Return how many threads should decode.
+def choose_workers(
+    machine: Machine, settings: "TrainSettings", *, on_gpu: bool, busy_threads: int
+) -> WorkerResult:
+    """Return the number of decoding threads.
 
     Args:
-        machine: what there is.
-        settings: of the run: its scenes take memory.
-        on_card: whether the network is on a card, which the main thread has to drive from a core.
-        busy_threads: with which the network computes where it is on none.
+        machine: resources of the node.
+        settings: settings of the run, which determine the memory of its scenes.
+        on_gpu: True if the network is on a GPU, for which the main thread needs a core.
+        busy_threads: CPU threads of a network that is not on a GPU.
     """
-    share = machine.cores / machine.processes
-    spare = share - (1 if on_card else busy_threads)
-    threads = min(max(int(spare), 1), MOST_THREADS)
-    shown = f"{machine.cores:g} cores"
+    cores = machine.cores / machine.processes
+    spare = cores - (1 if on_gpu else busy_threads)
+    threads = min(max(int(spare), 1), MAX_THREADS)
+    reason = f"{machine.cores:g} cores"
     if machine.processes > 1:
-        shown += f" for {machine.processes} processes"
+        reason += f" for {machine.processes} processes"
     if machine.free_bytes is not None:
         scene = _BYTES_OF_PIXEL * settings.views_per_scene * settings.resolution**2
         fits = machine.free_bytes // 2 // machine.processes // (SCENES_AT_WORK * scene)
         if fits < threads:
             threads = max(fits, 1)
-            shown += f" and {machine.free_bytes / 2**30:.1f} GiB of free memory"
-    said = "1 thread decodes" if threads == 1 else f"{threads} threads decode"
-    return Workers(threads=threads, because=f"{said} samples, by {shown}")
+            reason += f" and {machine.free_bytes / 2**30:.1f} GiB of free memory"
+    decision = "1 thread decodes" if threads == 1 else f"{threads} threads decode"
+    return WorkerResult(threads=threads, reason=f"{decision} samples, by {reason}")
 
 
 def _all_cores() -> int:
@@ -93,7 +93,7 @@ def _all_cores() -> int:
 
 
 def _control_groups(root: Path) -> Iterator[Path]:
-    """Yield the folders that limit this process: its group and those around it, old and new."""
+    """Yield the folders of this process's control group and its parents, versions 1 and 2."""
     base = root / "sys/fs/cgroup"
     yield from (base, base / "cpu", base / "memory")
     for line in _lines(root / "proc/self/cgroup"):
@@ -104,7 +104,7 @@ def _control_groups(root: Path) -> Iterator[Path]:
 
 
 def _quotas(folder: Path) -> Iterator[float]:
-    """Yield cores' worth of time that a control group has, where it is limited."""
+    """Yield the CPU quotas of a control group, in cores."""
     for line in _lines(folder / "cpu.max"):
         quota, period = line.split()
         if quota != "max":
@@ -115,7 +115,7 @@ def _quotas(folder: Path) -> Iterator[float]:
 
 
 def _free_in(folder: Path) -> Iterator[int]:
-    """Yield the memory that a control group has left or can take back, where it is limited."""
+    """Yield the free and reclaimable bytes of a control group that has a memory limit."""
     old = ("memory.limit_in_bytes", "memory.usage_in_bytes")
     for limit, used in (("memory.max", "memory.current"), old):
         lines = [_lines(folder / name) for name in (limit, used)]
@@ -125,9 +125,9 @@ def _free_in(folder: Path) -> Iterator[int]:
 
 
 def _files_held(folder: Path) -> int:
-    """Return the bytes of files that a control group holds until somebody wants the memory.
+    """Return the reclaimable bytes of cached files in a control group.
 
-    They count as used: after an epoch, the shards that were read fill every group.
+    The kernel counts them as used: after an epoch, cached shards fill every group.
     """
     words = (line.split() for line in _lines(folder / "memory.stat"))
     counts = {name: int(value) for name, value in words}

@@ -1,4 +1,4 @@
-"""A network judged on every view of a split, beside baselines that ignore the scene."""
+"""Evaluation of a network on every view of a split, with baselines that ignore the scene."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,125 +24,125 @@ from storage.records.sample import Sample
 from storage.records.scene import Scene
 from storage.seeds import rng_for
 from storage.settings.described import checked
+from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.scenes import TrainingScene, training_scene
-from train.data.unusable import Unusable, first_samples
-from train.evaluation.judge import JudgedScene, judged_scene, predict
-from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, facts_of
+from train.evaluation.baselines import Baselines
+from train.evaluation.judge import ValidationScene, predict, validation_scene
+from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, scene_facts
 from train.evaluation.metrics import noise_floors, picture_scores
-from train.evaluation.order import SceneCount, Width
-from train.evaluation.rivals import Rivals
+from train.evaluation.options import SceneCount, Width
 from train.evaluation.same_time import CAPTION, TRACER, TracedBeside
 from train.evaluation.sheet import SheetView
 from train.loss.lpips import Lpips
 
-RIVAL_SCENES = 256
-"""Training scenes that rivals are taken from."""
+BASELINE_SCENES = 256
+"""Number of training scenes for the baselines."""
 
 SHEET_VIEWS = 8
-"""Views on a sheet."""
+"""Maximum number of views on a sheet."""
 
 
 @checked("evaluate")
-class Contest:
-    """Who is judged, on what, and by what."""
+class EvalConfig:
+    """Network, data, baselines and metrics of an evaluation."""
 
     network: SkipValidation[RenderFormer]
-    """On the device where it is to run."""
+    """Network to evaluate, on the device where it runs."""
     shards: SkipValidation[ShardSet]
-    """The split."""
+    """Shards of the split to evaluate on."""
     resolution: Width
-    """Pixels across, a divisor of the data's."""
-    rivals: SkipValidation[Rivals | None]
-    """None where no training data is at hand."""
+    """Width of the pictures in pixels, a divisor of the data's."""
+    baselines: SkipValidation[Baselines | None]
+    """Baselines from training data; None without such data."""
     lpips: SkipValidation[Lpips | None]
-    """Likewise. None where its weights are not at hand: LPIPS is then n/a."""
+    """The LPIPS network; None without its weights: LPIPS is then n/a."""
     most_scenes: SceneCount
-    """Maximum number of scenes that are judged, from the start of the split."""
+    """Maximum number of scenes, from the start of the split."""
     traced: SkipValidation[TracedBeside | None] = None
-    """Who traces pictures in the network's own time, if somebody does."""
+    """Path tracer at equal time; None leaves it out."""
 
     def samples(self) -> Iterator[Sample]:
-        """Yield the samples; one that is damaged ends it, since it would be another set."""
-        return first_samples(self.shards, self.most_scenes, Unusable(0))
+        """Yield the samples; a damaged one raises, since the scores would be of another set."""
+        return first_samples(self.shards, self.most_scenes, BadSampleCounter(0))
 
 
-def make_rivals(shards: ShardSet, resolution: int) -> Rivals:
-    """Return the rivals that the first scenes of a training split make."""
-    samples = first_samples(shards, RIVAL_SCENES, Unusable(0))
-    return Rivals(training_scene(sample, resolution) for sample in samples)
+def make_baselines(shards: ShardSet, resolution: int) -> Baselines:
+    """Return the baselines from the first scenes of a training split."""
+    samples = first_samples(shards, BASELINE_SCENES, BadSampleCounter(0))
+    return Baselines(training_scene(sample, resolution) for sample in samples)
 
 
 def stored_resolution(shards: ShardSet) -> int:
-    """Return the pixels across of the first sample."""
-    (sample,) = first_samples(shards, 1, Unusable(0))
+    """Return the width in pixels of the first sample's pictures."""
+    (sample,) = first_samples(shards, 1, BadSampleCounter(0))
     return int(sample.radiance_rgb.shape[1])
 
 
-def judged_views(contest: Contest, scene_done: Callable[[], None]) -> list[JudgedView]:
-    """Return a row for every view, in the order of the shards.
+def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[JudgedView]:
+    """Score every view, in the order of the shards.
 
     Raises:
-        TrilightError: damaged data, a resolution that the data or the network do not have, or no
-            scene at all.
+        TrilightError: damaged data, a resolution that data or network do not support, or no scene.
     """
     rows: list[JudgedView] = []
     before: SceneTensors | None = None
-    for sample in contest.samples():
-        judged = judged_scene(sample, contest.resolution)
-        if contest.network.config.view_stage == "hits":
-            judged = with_traced_views(judged, contest.network.config, contest.resolution)
-        contestants = {NETWORK: predict(contest.network, judged.scene)}
-        contestants |= withheld_pictures(contest.network, judged.scene)
-        grouped = grouped_pictures(contest.network, sample.scene, contest.resolution)
-        if grouped is not None:
-            contestants[GROUPED] = grouped
-        found = [
-            _judged(contest, sample, judged, view, contestants)
-            for view in range(len(judged.target_VRR3))
+    for sample in config.samples():
+        scene = validation_scene(sample, config.resolution)
+        if config.network.config.view_stage == "hits":
+            scene = with_traced_views(scene, config.network.config, config.resolution)
+        contestants = {NETWORK: predict(config.network, scene.scene)}
+        contestants |= withheld_pictures(config.network, scene.scene)
+        grouped_VRR3 = grouped_pictures(config.network, sample.scene, config.resolution)
+        if grouped_VRR3 is not None:
+            contestants[GROUPED] = grouped_VRR3
+        scene_rows = [
+            _judge_view(config, sample, scene, view, contestants)
+            for view in range(len(scene.target_VRR3))
         ]
-        if before is not None and contest.network.config.scene_tokens:
-            found = _with_swapped(found, contest.network, judged, before)
-        rows += found
-        before = judged.scene.tensors
+        if before is not None and config.network.config.scene_tokens:
+            scene_rows = _add_swapped_scores(scene_rows, config.network, scene, before)
+        rows += scene_rows
+        before = scene.scene.tensors
         scene_done()
     if not rows:
         raise TrilightError("evaluate: the split holds no scene; expected at least one.")
     return rows
 
 
-def _judged(
-    contest: Contest,
+def _judge_view(
+    config: EvalConfig,
     sample: Sample,
-    judged: JudgedScene,
+    judged: ValidationScene,
     view: int,
     contestants: Mapping[str, NDArray[np.float64]],
 ) -> JudgedView:
-    target, hits = judged.target_VRR3[view], judged.hits_VRR[view]
+    target = judged.target_VRR3[view]
+    hits = judged.hits_VRR[view]
     pictures = {name: pictures_VRR3[view] for name, pictures_VRR3 in contestants.items()}
-    if contest.rivals is not None:
-        pictures |= contest.rivals.pictures(target)
-    if contest.traced is not None:
-        traced = contest.traced.judged(sample, view)
+    if config.baselines is not None:
+        pictures |= config.baselines.pictures(target)
+    if config.traced is not None:
+        traced = config.traced.judged(sample, view)
         pictures |= {} if traced is None else {TRACER: traced}
     return JudgedView(
-        **facts_of(sample),
+        **scene_facts(sample),
         view=view,
         floors=noise_floors(
             sample.views[view],
             target,
             hits,
-            contest.lpips,
+            config.lpips,
             rng_for(0, f"noise of {sample.key}", view),
         ),
         scores={
-            name: picture_scores(shown, target, hits, contest.lpips)
-            for name, shown in pictures.items()
+            name: picture_scores(picture, target, hits, config.lpips)
+            for name, picture in pictures.items()
         },
     )
 
 
-def _with_swapped(
-    rows: Sequence[JudgedView], network: RenderFormer, judged: JudgedScene, other: SceneTensors
+def _add_swapped_scores(
+    rows: Sequence[JudgedView], network: RenderFormer, judged: ValidationScene, other: SceneTensors
 ) -> list[JudgedView]:
     pictures_VRR3 = swapped_pictures(network, judged.scene, other)
     return [
@@ -151,36 +151,36 @@ def _with_swapped(
     ]
 
 
-def sheet_views(contest: Contest, chosen: Sequence[JudgedView]) -> list[SheetView]:
-    """Return pictures of some rows, in their order; the scenes are read and computed again."""
+def sheet_views(config: EvalConfig, chosen: Sequence[JudgedView]) -> list[SheetView]:
+    """Render some views again for a sheet, in the order of their rows."""
     rows_of: dict[str, list[JudgedView]] = {}
     for row in chosen:
         rows_of.setdefault(row.key, []).append(row)
-    found: dict[tuple[str, int], SheetView] = {}
-    for sample in contest.samples():
+    sheet_of_view: dict[tuple[str, int], SheetView] = {}
+    for sample in config.samples():
         if rows := rows_of.get(sample.key):
-            scene = training_scene(sample, contest.resolution)
-            pictures = predict(contest.network, scene)
+            scene = training_scene(sample, config.resolution)
+            pictures = predict(config.network, scene)
             for row in rows:
-                shown = _sheet_view(row, scene, pictures[row.view])
-                if contest.traced is not None:
-                    traced = contest.traced.shown(sample, row.view)
-                    black = np.zeros_like(shown.target_rgb)
-                    beside = {CAPTION: black if traced is None else traced}
-                    shown = dataclasses.replace(shown, beside_rgb=beside)
-                found[row.key, row.view] = shown
-    return [found[row.key, row.view] for row in chosen]
+                sheet_view = _sheet_view(row, scene, pictures[row.view])
+                if config.traced is not None:
+                    traced = config.traced.shown(sample, row.view)
+                    black = np.zeros_like(sheet_view.target_rgb)
+                    extra_pictures = {CAPTION: black if traced is None else traced}
+                    sheet_view = dataclasses.replace(sheet_view, extra_rgb=extra_pictures)
+                sheet_of_view[row.key, row.view] = sheet_view
+    return [sheet_of_view[row.key, row.view] for row in chosen]
 
 
 def worst_and_median(rows: Sequence[JudgedView]) -> dict[str, list[JudgedView]]:
-    """Return the rows of the lowest psnr_log_db and those around the middle, worse ones first."""
+    """Return the rows with the lowest and with the median psnr_log_db, worst first."""
     ranked = sorted(rows, key=lambda row: row.scores[NETWORK]["psnr_log_db"] or 0.0)
     start = max((len(ranked) - SHEET_VIEWS) // 2, 0)
     return {"worst": ranked[:SHEET_VIEWS], "median": ranked[start : start + SHEET_VIEWS]}
 
 
 def worst_of_each_excursion(rows: Sequence[JudgedView]) -> list[JudgedView]:
-    """Return the worst row of each axis that leaves the usual range, by the name of the axis."""
+    """Return the worst row of each axis outside the usual range, sorted by axis."""
     worst: dict[str, JudgedView] = {}
     for row in sorted(rows, key=lambda row: row.scores[NETWORK]["psnr_log_db"] or 0.0):
         if row.excursion is not None:
@@ -205,10 +205,10 @@ def _sheet_view(row: JudgedView, scene: TrainingScene, picture: NDArray[np.float
 def grouped_pictures(
     network: RenderFormer, scene: Scene, resolution: int
 ) -> NDArray[np.float64] | None:
-    """Return what `trilight render` shows of a scene, its groups of lights added up.
+    """Render a scene as `trilight render` does, as the sum over groups of lights.
 
     Returns:
-        Linear radiance [V, R, R, 3] of at least 0, or None where one pass takes every light.
+        Linear radiance [V, R, R, 3] of at least 0, or None if one pass takes every light.
     """
     by_hits = network.config.view_stage == "hits"
     if by_hits or len(light_groups(scene, MAX_LIGHTS)) == 1:
@@ -222,8 +222,10 @@ def grouped_pictures(
     return np.stack(pictures).astype(np.float64)
 
 
-def with_traced_views(judged: JudgedScene, config: ModelConfig, resolution: int) -> JudgedScene:
-    """Return a scene with what is traced of it, once for all that a network of hits is asked."""
+def with_traced_views(
+    judged: ValidationScene, config: ModelConfig, resolution: int
+) -> ValidationScene:
+    """Return a scene with traced inputs, so that later predictions share them."""
     tensors = with_traced(judged.scene.tensors, resolution, config)
     return dataclasses.replace(judged, scene=dataclasses.replace(judged.scene, tensors=tensors))
 
@@ -231,34 +233,34 @@ def with_traced_views(judged: JudgedScene, config: ModelConfig, resolution: int)
 def withheld_pictures(
     network: RenderFormer, scene: TrainingScene
 ) -> dict[str, NDArray[np.float64]]:
-    """Return what a network of hits makes without each of its inputs, by the contestant's name.
+    """Predict a traced scene without each of the inputs, by the method's name.
 
-    Of a traced scene; of any other, nothing is returned.
+    Scenes without traced inputs return an empty dict.
     """
     traced = scene.tensors.traced
     if traced is None:
         return {}
-    found = {}
+    pictures = {}
     for index, name in enumerate(INPUTS):
         if name == "tokens" and not network.config.scene_tokens:
             continue
         kept_VI = torch.ones_like(traced.given_VI)
         kept_VI[:, index] = 0
         tensors = dataclasses.replace(scene.tensors, traced=traced.without(kept_VI))
-        found[f"{NETWORK} without {name}"] = predict(
+        pictures[f"{NETWORK} without {name}"] = predict(
             network, dataclasses.replace(scene, tensors=tensors)
         )
-    return found
+    return pictures
 
 
 def swapped_pictures(
     network: RenderFormer, scene: TrainingScene, other: SceneTensors
 ) -> NDArray[np.float64]:
-    """Return what a network makes with another scene's triangles [V, R, R, 3], linear radiance.
+    """Predict with another scene's triangles [V, R, R, 3], linear radiance.
 
-    Does the network look at the scene at all? One that has only learned what pictures look like on
-    average is no worse with the triangles of another scene. A network of hits keeps its own hits:
-    the other scene's tokens alone are put in place of its own.
+    This tests whether the network uses the scene: one that has only learned an average picture is
+    no worse with other triangles. A network of hits keeps its own hits; only the scene's tokens are
+    replaced.
     """
     cameras = scene.tensors
     seen = dataclasses.replace(other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V)

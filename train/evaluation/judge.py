@@ -1,4 +1,4 @@
-"""The validation split, its simplest rival, and how a network stands between the two."""
+"""Validation of a network against the targets and the median picture."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,74 +14,82 @@ from storage.records.sample import Sample
 from storage.records.scene import Scene
 from train.data.buckets import make_batch
 from train.data.scenes import TrainingScene, training_scene
-from train.evaluation.scores import Lead, ViewScore, lead, score_view, share_better, summarise
+from train.evaluation.scores import (
+    Lead,
+    ViewScore,
+    fraction_better,
+    lead,
+    score_view,
+    summarize_scores,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class JudgedScene:
-    """One scene of the validation split, with what its pictures are judged by."""
+class ValidationScene:
+    """Scene of the validation split, with the targets and masks of its scores."""
 
     scene: TrainingScene
-    """Tensors and targets."""
+    """Tensors of the scene, with targets as log10(1 + radiance)."""
     target_VRR3: NDArray[np.float64]
-    """Linear radiance."""
+    """Linear radiance of the targets."""
     hits_VRR: NDArray[np.bool_]
-    """Which pixels see geometry (`hit_masks`)."""
+    """True for pixels that see geometry (`hit_masks`)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ValidationJudgement:
-    """How a network did on the validation split."""
+class ValidationResult:
+    """Pictures and scores of a network on the validation split."""
 
     pictures: tuple[NDArray[np.float64], ...]
     """[V, R, R, 3] linear radiance of each scene."""
     views: tuple[ViewScore, ...]
-    """Scene by scene, view by view."""
+    """Scores of all views, scene after scene."""
     scores: dict[str, float]
-    """evaluation.scores.summarise, and `better_than_median`: the share of views won."""
+    """Summary (evaluation.scores), and `better_than_median`: the fraction of views won."""
     lead: Lead
     """Advantage of the network over the median picture."""
 
 
 class Judge:
-    """Holds the validation scenes and the median picture's scores on them."""
+    """Validation scenes, and the scores of the median picture on them."""
 
     def __init__(self, samples: Sequence[Sample], resolution: int, median_RR3: NDArray) -> None:
-        self.scenes = [judged_scene(sample, resolution) for sample in samples]
+        self.scenes = [validation_scene(sample, resolution) for sample in samples]
         stills = [np.broadcast_to(median_RR3, scene.target_VRR3.shape) for scene in self.scenes]
         self.median_views = score_pictures(stills, self.scenes)
-        self.median_scores = summarise(self.median_views)
+        self.median_scores = summarize_scores(self.median_views)
 
     def judge(
         self, model: RenderFormer, between: Callable[[], None] = lambda: None
-    ) -> ValidationJudgement:
-        """Judge a network on all scenes.
+    ) -> ValidationResult:
+        """Score a network on all scenes.
 
         Args:
             model: the network.
-            between: called before each scene is rendered and before it is judged; what it raises
-                ends the judging.
+            between: called before each scene is rendered and before it is scored; an exception
+                ends the validation.
         """
-        pictures, views = [], []
+        pictures = []
+        views = []
         for judged in self.scenes:
             between()
             pictures.append(predict(model, judged.scene))
         for picture, judged in zip(pictures, self.scenes, strict=True):
             between()
             views += score_pictures([picture], [judged])
-        scores = summarise(views)
-        scores["better_than_median"] = share_better(views, self.median_views)
+        scores = summarize_scores(views)
+        scores["better_than_median"] = fraction_better(views, self.median_views)
         sizes = [len(scene.target_VRR3) for scene in self.scenes]
-        ahead = lead(views, self.median_views, sizes)
-        return ValidationJudgement(
-            pictures=tuple(pictures), views=tuple(views), scores=scores, lead=ahead
+        validation_lead = lead(views, self.median_views, sizes)
+        return ValidationResult(
+            pictures=tuple(pictures), views=tuple(views), scores=scores, lead=validation_lead
         )
 
 
-def judged_scene(sample: Sample, resolution: int) -> JudgedScene:
-    """Return a sample with what its pictures are judged by, at the resolution of the run."""
+def validation_scene(sample: Sample, resolution: int) -> ValidationScene:
+    """Return a sample with targets and hit masks, at the resolution of the run."""
     scene = training_scene(sample, resolution)
-    return JudgedScene(
+    return ValidationScene(
         scene=scene,
         target_VRR3=radiance_from_log10(scene.target_VRR3.double().numpy()),
         hits_VRR=hit_masks(sample.scene, resolution),
@@ -90,9 +98,9 @@ def judged_scene(sample: Sample, resolution: int) -> JudgedScene:
 
 @torch.no_grad()
 def predict(model: RenderFormer, scene: TrainingScene) -> NDArray[np.float64]:
-    """Return the finished pictures of one scene, linear radiance [V, R, R, 3] of at least 0.
+    """Return the pictures of one scene, linear radiance [V, R, R, 3] of at least 0.
 
-    In float32, wherever the network is.
+    The network computes in float32, on its own device.
     """
     device = next(model.parameters()).device
     batch = make_batch([scene]).to(device)
@@ -100,8 +108,10 @@ def predict(model: RenderFormer, scene: TrainingScene) -> NDArray[np.float64]:
     return np.maximum(radiance(log10_VRR3.double()).cpu().numpy(), 0)
 
 
-def score_pictures(pictures: Sequence[NDArray], judged: Sequence[JudgedScene]) -> list[ViewScore]:
-    """Judge [V, R, R, 3] of each scene, view by view."""
+def score_pictures(
+    pictures: Sequence[NDArray], judged: Sequence[ValidationScene]
+) -> list[ViewScore]:
+    """Score the pictures [V, R, R, 3] of each scene, view by view."""
     return [
         score_view(picture, target, hits)
         for pictures_VRR3, entry in zip(pictures, judged, strict=True)
@@ -112,9 +122,9 @@ def score_pictures(pictures: Sequence[NDArray], judged: Sequence[JudgedScene]) -
 
 
 def hit_masks(scene: Scene, resolution: int) -> NDArray[np.bool_]:
-    """Return [V, R, R]: whether the ray through the pixel's centre hits a triangle.
+    """Return masks [V, R, R] of pixels whose central ray hits a triangle.
 
-    Emitters do not count, as they are hidden from the camera.
+    Emitters do not count, since they are hidden from the camera.
     """
     views = range(scene.num_views)
     return np.stack([first_hits(scene, view=view, resolution=resolution).met for view in views])

@@ -1,4 +1,4 @@
-"""The rows of an evaluation: one for each view, and their summaries by what the views show."""
+"""Rows of an evaluation, one per view, and their summaries by groups of views."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,48 +13,47 @@ from storage.records.sample import Sample
 from train.evaluation.metrics import METRICS
 
 NETWORK = "network"
-"""Name of the contestant that is judged; the others are train.evaluation.rivals."""
+"""Name of the evaluated network among all methods; others are train.evaluation.baselines."""
 
 GROUPED = f"network, {MAX_LIGHTS} lights at a time"
-"""The same network with few lights at a time: do groups or one pass make the better picture? Only
-scenes with more lights, or lights inside objects, have this contestant."""
+"""Name of the same network with lights rendered in groups, to compare groups with one pass. Only
+scenes with more lights, or with lights inside objects, have this method."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class JudgedView:
-    """A row of the evaluation."""
+    """Scores of one view of a stored sample."""
 
     key: str
-    """Key of the sample."""
+    """Key of the sample in its shard."""
     view: int
-    """Which of its cameras."""
+    """Index of the camera, from 0."""
     template: str
-    """Layout of the scene."""
+    """Name of the scene's layout, or `unknown`."""
     num_triangles: int
-    """Triangles of the scene."""
     num_lights: int
-    """Lights of the scene."""
     roughness: float
     """Roughness of the scene's smoothest surface, emitters excluded."""
     excursion: tuple[str, float] | None
-    """Axis and value by which the scene leaves the usual range, if it does."""
+    """Axis and value of a scene outside the usual range; None within it."""
     floors: dict[str, float]
-    """What the target's noise alone would score (metrics.noise_floors)."""
+    """Score of the target's noise by metric (metrics.noise_floors)."""
     scores: dict[str, dict[str, float | None]]
-    """Score by contestant and metric; None is n/a. Not every view has every contestant."""
+    """Score by method and metric; None is n/a. Not every view has every method."""
     swapped_psnr_log_db: float | None = None
     """Score of the network given the previous scene's triangles; None for the first scene."""
 
     def gap(self, metric: str, contestant: str = NETWORK) -> float | None:
-        """Return how much worse the picture is than the noise of its target; below 0: not worse."""
-        score, floor = self.scores[contestant][metric], self.floors.get(metric)
+        """Return how much worse a score is than the target's noise; below 0 it is better."""
+        score = self.scores[contestant][metric]
+        floor = self.floors.get(metric)
         if score is None or floor is None:
             return None
         return floor - score if METRICS[metric].higher_is_better else score - floor
 
 
-def facts_of(sample: Sample) -> dict[str, Any]:
-    """Return what is known of a sample's scene, by the names of JudgedView."""
+def scene_facts(sample: Sample) -> dict[str, Any]:
+    """Return the facts about a sample's scene, as fields of JudgedView."""
     scene = sample.scene
     reflecting = np.unique(scene.material_index[~scene.triangle_emits])
     excursion = scene.provenance.get("excursion")
@@ -71,12 +70,12 @@ def facts_of(sample: Sample) -> dict[str, Any]:
 
 
 NEAR_DB = 3.0
-"""Views whose psnr_log_db is within so much of their floor count as `near_floor`."""
+"""Maximum distance in dB of psnr_log_db from its floor that counts as `near_floor`."""
 
 TRIANGLES = (256, 512, 1024, 1536, 4096)
 LIGHTS = (1, 2, 4, 8)
 ROUGHNESSES = (0.1, 0.25, 0.5)
-"""Upper ends of the parts; one more holds what is above."""
+"""Upper ends of the roughness groups; one more group holds larger values."""
 
 SPLITS: Mapping[str, Callable[[JudgedView], str]] = {
     "template": lambda view: view.template,
@@ -84,38 +83,38 @@ SPLITS: Mapping[str, Callable[[JudgedView], str]] = {
     "lights": lambda view: _part(view.num_lights, LIGHTS),
     "smoothest roughness": lambda view: _part(view.roughness, ROUGHNESSES),
 }
-"""What is split by, and which part a view belongs to."""
+"""Groupings of views by name: each returns the group of a view."""
 
 
 def by_group(views: Sequence[JudgedView]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return the network's summary of every part of every split, in the order of the parts."""
+    """Return the network's summary by grouping and group, in the order of the groups."""
     groups: dict[str, dict[str, dict[str, Any]]] = {}
     for name, part_of in SPLITS.items():
         parts: dict[str, list[JudgedView]] = {}
         for view in views:
             parts.setdefault(part_of(view), []).append(view)
         ordered = sorted(parts.items(), key=lambda part: _order(part[0]))
-        groups[name] = {part: summary(members) for part, members in ordered}
+        groups[name] = {part: summarize_views(members) for part, members in ordered}
     return groups
 
 
-def summary(views: Sequence[JudgedView], contestant: str = NETWORK) -> dict[str, Any]:
-    """Return median, mean and worse 5th percentile of every metric, and how far the noise is off.
+def summarize_views(views: Sequence[JudgedView], contestant: str = NETWORK) -> dict[str, Any]:
+    """Return median, mean and worse 5th percentile of every metric, and the gap to the noise.
 
-    A metric that is n/a for any view is None as a whole: a mean over the others would be of another
-    set. `near_floor` is the share of views within NEAR_DB of their floor.
+    A metric that is n/a for any view is None: a mean over the other views would be of another set.
+    `near_floor` is the fraction of views within NEAR_DB of their floor.
     """
     result: dict[str, Any] = {"views": len(views)}
     for name, metric in METRICS.items():
         values = [view.scores[contestant][name] for view in views]
         known = [value for value in values if value is not None]
         gaps = [gap for view in views if (gap := view.gap(name, contestant)) is not None]
-        whole = len(known) == len(values)
+        is_complete = len(known) == len(values)
         worse = 5 if metric.higher_is_better else 95
         result[name] = {
-            "median": float(np.median(known)) if whole else None,
-            "mean": float(np.mean(known)) if whole else None,
-            "worse_5_percent": float(np.percentile(known, worse)) if whole else None,
+            "median": float(np.median(known)) if is_complete else None,
+            "mean": float(np.mean(known)) if is_complete else None,
+            "worse_5_percent": float(np.percentile(known, worse)) if is_complete else None,
             "median_worse_than_noise": float(np.median(gaps)) if gaps else None,
         }
     log_gaps = [view.gap("psnr_log_db", contestant) for view in views]
@@ -131,6 +130,6 @@ def _part(value: float, ends: Sequence[float]) -> str:
 
 
 def _order(part: str) -> tuple[float, str]:
-    """Sort parts by where they begin, and names by themselves."""
+    """Return the sort key of a group: ranges by their start, names alphabetically."""
     word, _, rest = part.partition(" ")
     return (float(rest.split(",")[0]), part) if word == "over" else (-1.0, part)

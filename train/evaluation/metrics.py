@@ -1,4 +1,4 @@
-"""Every figure that a picture is judged by: what it is, which way is better, how it is printed."""
+"""Metrics of a picture: score, direction, description and format of each."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,48 +16,48 @@ from storage.registry import Registry
 from train.evaluation.scores import ViewScore, score_view
 from train.loss.lpips import Lpips
 from train.loss.ms_ssim import ssim
-from train.loss.objective import tone_mapped
+from train.loss.objective import tone_map
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JudgedPicture:
-    """A picture beside its target; what several metrics need of both is computed once."""
+    """A picture and its target, with cached values that several metrics need."""
 
     radiance_rgb: NDArray
     """[R, R, 3] linear radiance of the picture."""
     target_rgb: NDArray
-    """[R, R, 3] of the target."""
+    """[R, R, 3] linear radiance of the target."""
     hits: NDArray[np.bool_]
-    """[R, R] which pixels see geometry."""
+    """[R, R] True for pixels that see geometry."""
     lpips: Lpips | None
-    """None where its weights are not at hand."""
+    """The LPIPS network; None without its weights."""
 
     @cached_property
     def tone_mapped_13RR(self) -> tuple[Tensor, Tensor]:
-        """Picture and target as clamp(log2(1 + radiance), 0, 1), float64."""
-        return _tone_mapped(self.radiance_rgb), _tone_mapped(self.target_rgb)
+        """Picture and target [1, 3, R, R] as clamp(log2(1 + radiance), 0, 1), float64."""
+        return _tone_map(self.radiance_rgb), _tone_map(self.target_rgb)
 
     @cached_property
     def score(self) -> ViewScore:
-        """What validations of a training run judge by."""
+        """Scores that validations of a training run use."""
         return score_view(self.radiance_rgb, self.target_rgb, self.hits)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """One figure."""
+    """Definition of one metric."""
 
     score: Callable[[JudgedPicture], float | None]
-    """Computes it; None stands for n/a, such as where the metric's weights are not at hand."""
+    """Computes the score; returns None for n/a, such as without the metric's weights."""
     higher_is_better: bool
-    """Which way is better."""
+    """True if a larger score is better."""
     meaning: str
-    """Unit, tone map, range and library, for whoever reads the figure."""
+    """Description for reports: unit, tone map, range and library."""
     decimals: int = 4
-    """Decimals with which it is printed."""
+    """Number of decimals in reports."""
     floor: Callable[[ViewRecord], float] | None = None
-    """What the measured noise of a target alone scores; where it is None, noise of the measured
-    size is drawn onto the target and judged (`noise_floors`)."""
+    """Returns the score of the target's measured noise; None scores noise of the measured size that
+    is added to the target (`noise_floors`)."""
 
 
 def hdr_flip(radiance_rgb: NDArray, target_rgb: NDArray) -> float | None:
@@ -73,7 +73,7 @@ def hdr_flip(radiance_rgb: NDArray, target_rgb: NDArray) -> float | None:
 
 @torch.no_grad()
 def _lpips(picture: JudgedPicture) -> float | None:
-    """Return LPIPS, computed where its weights are; in all bits of float32, as it was published."""
+    """Return LPIPS on the device of its weights, in full float32, as published."""
     if picture.lpips is None:
         return None
     device = picture.lpips.shift_311.device
@@ -82,9 +82,9 @@ def _lpips(picture: JudgedPicture) -> float | None:
         return float(picture.lpips(ours, target))
 
 
-def _tone_mapped(radiance_rgb: NDArray) -> Tensor:
+def _tone_map(radiance_rgb: NDArray) -> Tensor:
     log10 = torch.from_numpy(np.ascontiguousarray(log10_radiance(radiance_rgb), np.float64))
-    return tone_mapped(log10).movedim(-1, 0)[None]
+    return tone_map(log10).movedim(-1, 0)[None]
 
 
 def noise_rms(view: ViewRecord) -> float:
@@ -141,7 +141,7 @@ METRICS: Registry[Metric] = Registry(
         ),
     },
 )
-"""Every metric, in the order of reports."""
+"""All metrics, in the order of reports."""
 
 
 def picture_scores(
@@ -149,8 +149,7 @@ def picture_scores(
 ) -> dict[str, float | None]:
     """Return every metric of one picture [R, R, 3] of linear radiance; None stands for n/a.
 
-    LPIPS is n/a without its weights, HDR-FLIP where the target is black all over, since it takes
-    its exposures from there.
+    LPIPS is n/a without its weights, HDR-FLIP for a black target, which defines its exposures.
     """
     picture = JudgedPicture(
         radiance_rgb=radiance_rgb, target_rgb=target_rgb, hits=hits, lpips=lpips
@@ -165,22 +164,22 @@ def noise_floors(
     lpips: Lpips | None,
     rng: np.random.Generator,
 ) -> dict[str, float]:
-    """Return what the noise of a target alone would score: no picture can be asked for more.
+    """Return the score of the target's noise by metric: no picture can be expected to be better.
 
     LPIPS has no floor without its weights. The stored floors were measured at the stored
-    resolution; fewer pixels have less noise, so that at a lower resolution these floors ask for a
-    little less than could be asked. For metrics in which no noise was measured, the target is
-    judged with noise of the stored size drawn onto it. What a denoiser leaves is smoother than
-    such independent noise: these floors are a model.
+    resolution; larger pixels have less noise, so that at a lower resolution these floors are
+    slightly too lenient. For metrics without a measured floor, noise of the stored size is added to
+    the target and scored. A denoiser leaves smoother noise than this independent one: these floors
+    are a model.
 
     For log_l1 it is an upper bound, since a mean absolute error is at most the root mean square.
 
     Args:
-        view: what is stored of the view.
-        target_rgb: [R, R, 3] linear radiance, as it is judged.
-        hits: [R, R] which pixels see geometry.
+        view: stored record of the view.
+        target_rgb: [R, R, 3] linear radiance at the resolution of the evaluation.
+        hits: [R, R] True for pixels that see geometry.
         lpips: as in `picture_scores`.
-        rng: draws the noise.
+        rng: source of the noise.
     """
     noisy = log10_radiance(target_rgb) + rng.normal(0, noise_rms(view), target_rgb.shape)
     twin = JudgedPicture(
@@ -189,8 +188,8 @@ def noise_floors(
         hits=hits,
         lpips=lpips,
     )
-    found = {
+    floors = {
         name: metric.floor(view) if metric.floor else metric.score(twin)
         for name, metric in METRICS.items()
     }
-    return {name: floor for name, floor in found.items() if floor is not None}
+    return {name: floor for name, floor in floors.items() if floor is not None}

@@ -1,4 +1,4 @@
-"""Two contestants view by view: what one has more than the other, and how sure that is."""
+"""Paired comparison of two methods over the same views, with a confidence interval."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,26 +9,25 @@ from storage.intervals import mean_interval
 from train.evaluation.judged_view import JudgedView
 
 METRIC = "psnr_log_db"
-"""What pairs are compared by."""
+"""Metric of paired comparisons, in dB."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairedLead:
-    """The difference of METRIC over the views that have both."""
+    """Difference of METRIC between two methods over the same views."""
 
     mean: float
     """Mean of the differences, in dB; above 0 the first one is better."""
     low: float | None
-    """Lower end of its 95 % interval, bootstrapped over whole scenes; None of a single scene, which
-    says nothing of others."""
+    """Lower end of the 95 % interval, bootstrapped over whole scenes; None for a single scene."""
     high: float | None
-    """Upper end."""
+    """Upper end of the same interval; None for a single scene."""
     share_better: float
-    """Share of the views in which the first one is better."""
+    """Fraction of the views in which the first method is better."""
 
 
-def pair(views: Sequence[JudgedView], first: str, second: str) -> PairedLead:
-    """Return what the contestant `first` has more than `second`, on views that have both."""
+def paired_lead(views: Sequence[JudgedView], first: str, second: str) -> PairedLead:
+    """Return the lead of method `first` over `second`, on views that have both."""
     leads_db = [
         (view.scores[first][METRIC] or 0.0) - (view.scores[second][METRIC] or 0.0) for view in views
     ]

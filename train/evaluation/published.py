@@ -1,12 +1,12 @@
-"""What the paper measured, on scenes of its own: printed beside our figures as what it is."""
+"""Scores from the RenderFormer paper, measured on its own unreleased scenes."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from train.evaluation.judged_view import JudgedView, summary
+from train.evaluation.judged_view import JudgedView, summarize_views
 
 BENCHMARK = "benchmark-v1"
-"""The public test set (pipeline.builds.judging)."""
+"""Name of our public test set (pipeline.builds.judging)."""
 
 _METRICS = ("psnr_linear_db", "ssim", "lpips", "hdr_flip")
 
@@ -26,7 +26,7 @@ PUBLISHED_ROWS: Mapping[str, Mapping[str, float]] = {
 """Zeng et al. 2025, Table 1: means over 400 scenes of four views each, 256 x 256."""
 
 PUBLISHED = next(iter(PUBLISHED_ROWS.values()))
-"""Those of the network that was published."""
+"""Scores of the network whose weights were published."""
 
 PUBLISHED_WHERE = (
     "The paper's figures (Zeng et al. 2025, Table 1) are of 400 scenes of its own with four views "
@@ -35,13 +35,13 @@ PUBLISHED_WHERE = (
 )
 
 
-def published_beside(
+def compare_with_published(
     views: Sequence[JudgedView], about: Mapping[str, Any]
 ) -> dict[str, dict[str, float | None]] | None:
-    """Return the published figures and the network's means, if `about` says it is BENCHMARK."""
+    """Return published scores and the network's means; None if the data is not BENCHMARK."""
     if about.get("build") != BENCHMARK:
         return None
-    ours = summary(views)
+    ours = summarize_views(views)
     return {
         metric: {"published": figure, "ours": ours[metric]["mean"]}
         for metric, figure in PUBLISHED.items()

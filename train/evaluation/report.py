@@ -1,4 +1,4 @@
-"""An evaluation as JSON for programs and as Markdown for people."""
+"""Report of an evaluation, as JSON and as Markdown."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -12,10 +12,10 @@ from train.evaluation.judged_view import (
     NETWORK,
     JudgedView,
     by_group,
-    summary,
+    summarize_views,
 )
 from train.evaluation.metrics import METRICS
-from train.evaluation.published import PUBLISHED_WHERE, published_beside
+from train.evaluation.published import PUBLISHED_WHERE, compare_with_published
 from train.evaluation.same_time import TRACER, sentences
 
 NOT_AVAILABLE = "n/a"
@@ -26,49 +26,51 @@ def record(
     about: Mapping[str, Any],
     traced: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return everything that was measured, as JSON values.
+    """Return all measurements of an evaluation as JSON values.
 
     Args:
-        views: the rows.
-        about: network, data, split, resolution, as they are to be told.
-        traced: the path tracer in the network's time (evaluation.same_time), if that was measured.
+        views: rows of the evaluation.
+        about: network, data, split and resolution, as the report shows them.
+        traced: comparison at equal time (evaluation.same_time); None if it was not measured.
     """
     return {
         "about": dict(about),
         "metrics": {name: metric.meaning for name, metric in METRICS.items()},
         "contestants": {
-            name: summary(views, name)
+            name: summarize_views(views, name)
             for name in views[0].scores
             if all(name in view.scores for view in views)
         },
         "path tracer": traced,
         "swapped scenes": loss_by_swapping(views),
         "light passes": passes_compared(views),
-        "published": published_beside(views, about),
+        "published": compare_with_published(views, about),
         "groups": by_group(views),
         "views": [dataclasses.asdict(view) for view in views],
     }
 
 
-def markdown(found: Mapping[str, Any]) -> str:
-    """Return a record as a page: one table of contestants, one for each split."""
+def markdown(report: Mapping[str, Any]) -> str:
+    """Return a report as Markdown: a table of all methods, and one for each grouping."""
     lines = ["# Evaluation", ""]
-    lines += [f"- {name}: {_escaped(str(value))}" for name, value in found["about"].items()]
+    lines += [
+        f"- {name}: {_escape_markdown(str(value))}" for name, value in report["about"].items()
+    ]
     lines += ["", "Median over all views; in brackets the worse 5 %.", ""]
-    lines += _contestants(found["contestants"])
-    network = found["contestants"][NETWORK]
-    lines += ["", *_against_noise(network)]
-    lines += _same_time(found["path tracer"])
-    lines += _swapped(found["swapped scenes"])
-    lines += _published(found["published"]) + _light_passes(found["light passes"])
-    for split, parts in found["groups"].items():
-        lines += ["", f"## By {split}", "", *_parts(parts)]
+    lines += _contestant_table(report["contestants"])
+    network = report["contestants"][NETWORK]
+    lines += ["", *_noise_lines(network)]
+    lines += _same_time_lines(report["path tracer"])
+    lines += _swapped_lines(report["swapped scenes"])
+    lines += _published_lines(report["published"]) + _light_pass_lines(report["light passes"])
+    for split, parts in report["groups"].items():
+        lines += ["", f"## By {split}", "", *_group_table(parts)]
     lines += ["", "## What the figures are", ""]
-    lines += [f"- `{name}`: {meaning}" for name, meaning in found["metrics"].items()]
+    lines += [f"- `{name}`: {meaning}" for name, meaning in report["metrics"].items()]
     return "\n".join(lines) + "\n"
 
 
-def _contestants(contestants: Mapping[str, Any]) -> list[str]:
+def _contestant_table(contestants: Mapping[str, Any]) -> list[str]:
     names = list(contestants)
     rows = []
     for name, metric in METRICS.items():
@@ -78,11 +80,11 @@ def _contestants(contestants: Mapping[str, Any]) -> list[str]:
     return _table(["metric", *names], rows)
 
 
-def _against_noise(network: Mapping[str, Any]) -> list[str]:
+def _noise_lines(network: Mapping[str, Any]) -> list[str]:
     rows = []
     for metric in METRICS:
         gap = network[metric]["median_worse_than_noise"]
-        rows.append([metric, _shown(metric, gap)])
+        rows.append([metric, _format_score(metric, gap)])
     drawn = ", ".join(name for name, metric in METRICS.items() if metric.floor is None)
     return [
         "Median of how much worse the network's picture is than the noise of its own target. The "
@@ -96,18 +98,18 @@ def _against_noise(network: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _same_time(traced: Mapping[str, Any] | None) -> list[str]:
+def _same_time_lines(traced: Mapping[str, Any] | None) -> list[str]:
     if traced is None:
         return []
     lines = ["", "## Beside the path tracer, in the network's own time", ""]
-    lines += [_escaped(" ".join(sentences(traced)))]
+    lines += [_escape_markdown(" ".join(sentences(traced)))]
     if "tracer" not in traced:
         return lines
     both = {name: traced[part] for name, part in ((NETWORK, "network"), (TRACER, "tracer"))}
-    return [*lines, "", *_contestants(both)]
+    return [*lines, "", *_contestant_table(both)]
 
 
-def _swapped(loss: Mapping[str, Any] | None) -> list[str]:
+def _swapped_lines(loss: Mapping[str, Any] | None) -> list[str]:
     if loss is None:
         return []
     return [
@@ -118,12 +120,12 @@ def _swapped(loss: Mapping[str, Any] | None) -> list[str]:
     ]
 
 
-def _published(beside: Mapping[str, Any] | None) -> list[str]:
-    if beside is None:
+def _published_lines(comparison: Mapping[str, Any] | None) -> list[str]:
+    if comparison is None:
         return []
     rows = [
-        [metric, f"{figures['published']:g}", _shown(metric, figures["ours"])]
-        for metric, figures in beside.items()
+        [metric, f"{figures['published']:g}", _format_score(metric, figures["ours"])]
+        for metric, figures in comparison.items()
     ]
     return [
         "",
@@ -135,11 +137,12 @@ def _published(beside: Mapping[str, Any] | None) -> list[str]:
     ]
 
 
-def _light_passes(passes: Mapping[str, Any] | None) -> list[str]:
+def _light_pass_lines(passes: Mapping[str, Any] | None) -> list[str]:
     if passes is None:
         return []
     rows = [
-        [name, str(part["views"])] + [_shown(metric, part[metric]["median"]) for metric in METRICS]
+        [name, str(part["views"])]
+        + [_format_score(metric, part[metric]["median"]) for metric in METRICS]
         for name, part in passes.items()
     ]
     return [
@@ -150,11 +153,11 @@ def _light_passes(passes: Mapping[str, Any] | None) -> list[str]:
     ]
 
 
-def _parts(parts: Mapping[str, Any]) -> list[str]:
+def _group_table(parts: Mapping[str, Any]) -> list[str]:
     rows = [
-        [_escaped(name), str(part["views"])]
-        + [_shown(metric, part[metric]["median"]) for metric in METRICS]
-        + [_shown("psnr_log_db", part["psnr_log_db"]["median_worse_than_noise"])]
+        [_escape_markdown(name), str(part["views"])]
+        + [_format_score(metric, part[metric]["median"]) for metric in METRICS]
+        + [_format_score("psnr_log_db", part["psnr_log_db"]["median_worse_than_noise"])]
         for name, part in parts.items()
     ]
     return _table(["part", "views", *METRICS, "dB below noise floor"], rows)
@@ -163,11 +166,11 @@ def _parts(parts: Mapping[str, Any]) -> list[str]:
 def _with_tail(metric: str, figures: Mapping[str, Any]) -> str:
     if figures["median"] is None:
         return NOT_AVAILABLE
-    tail = _shown(metric, figures["worse_5_percent"])
-    return f"{_shown(metric, figures['median'])} ({tail})"
+    tail = _format_score(metric, figures["worse_5_percent"])
+    return f"{_format_score(metric, figures['median'])} ({tail})"
 
 
-def _shown(metric: str, value: float | None) -> str:
+def _format_score(metric: str, value: float | None) -> str:
     return NOT_AVAILABLE if value is None else f"{value:.{METRICS[metric].decimals}f}"
 
 
@@ -179,23 +182,23 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     ]
 
 
-def _escaped(text: str) -> str:
-    """Return text from outside so that Markdown shows it as it is."""
+def _escape_markdown(text: str) -> str:
+    """Escape text so that Markdown shows it literally."""
     for character in "\\|<>[]`*_":
         text = text.replace(character, f"\\{character}")
     return text.replace("\n", " ")
 
 
 def passes_compared(views: Sequence[JudgedView]) -> dict[str, Any] | None:
-    """Return the summaries of one pass and of groups over the views that have both, if any has."""
+    """Return summaries of one pass and of light groups over the views that have both, or None."""
     both = [view for view in views if GROUPED in view.scores]
     if not both:
         return None
-    return {"one pass": summary(both, NETWORK), "groups": summary(both, GROUPED)}
+    return {"one pass": summarize_views(both, NETWORK), "groups": summarize_views(both, GROUPED)}
 
 
 def loss_by_swapping(views: Sequence[JudgedView]) -> dict[str, Any] | None:
-    """Return how much psnr_log_db is lost, view by view; None where there is but one scene."""
+    """Return the loss of psnr_log_db with another scene's triangles; None for a single scene."""
     losses_db = [
         own_db - view.swapped_psnr_log_db
         for view in views

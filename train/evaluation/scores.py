@@ -1,4 +1,4 @@
-"""How good pictures are: each view judged alone, then summed up without hiding the bad ones."""
+"""Scores of single views, and summaries that include the worst views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,20 +12,17 @@ from storage.metrics import object_psnr_log_db, psnr_linear_db, psnr_log_db
 
 @dataclass(frozen=True, kw_only=True)
 class ViewScore:
-    """One picture against its target."""
+    """Scores of one picture against its target; storage.metrics defines those in dB."""
 
     log_l1: float
     """Mean |log10(1 + a) - log10(1 + b)|: the training loss, of the finished picture."""
     psnr_log_db: float
-    """storage.metrics."""
     psnr_linear_db: float
-    """storage.metrics."""
     object_psnr_log_db: float
-    """storage.metrics."""
 
 
 def score_view(radiance_rgb: NDArray, target_rgb: NDArray, hits: NDArray[np.bool_]) -> ViewScore:
-    """Judge one picture [R, R, 3] of linear radiance; `hits` is [R, R] (judge.hit_masks)."""
+    """Score one picture [R, R, 3] of linear radiance; `hits` is [R, R] (judge.hit_masks)."""
     difference = log10_radiance(radiance_rgb) - log10_radiance(target_rgb)
     return ViewScore(
         log_l1=float(np.abs(difference).mean(dtype=np.float64)),
@@ -35,7 +32,7 @@ def score_view(radiance_rgb: NDArray, target_rgb: NDArray, hits: NDArray[np.bool
     )
 
 
-def summarise(views: Sequence[ViewScore]) -> dict[str, float]:
+def summarize_scores(views: Sequence[ViewScore]) -> dict[str, float]:
     """Return mean log_l1, and median and the worse 5th percentile of each dB value."""
     summary = {"log_l1": float(np.mean([view.log_l1 for view in views]))}
     for metric in ("psnr_log_db", "psnr_linear_db", "object_psnr_log_db"):
@@ -45,32 +42,32 @@ def summarise(views: Sequence[ViewScore]) -> dict[str, float]:
     return summary
 
 
-def share_better(views: Sequence[ViewScore], others: Sequence[ViewScore]) -> float:
-    """Return the share of views whose log_l1 is below that of the same view in `others`."""
-    pairs = zip(views, others, strict=True)
+def fraction_better(views: Sequence[ViewScore], baseline: Sequence[ViewScore]) -> float:
+    """Return the fraction of views whose log_l1 is below that of the baseline."""
+    pairs = zip(views, baseline, strict=True)
     return float(np.mean([view.log_l1 < other.log_l1 for view, other in pairs]))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lead:
-    """The mean advantage of some pictures over others, with its standard error."""
+    """Mean advantage of a network over a baseline, with its standard error."""
 
     log_l1: float
     """Mean decrease of log_l1, over scenes."""
     error: float | None
-    """Standard error of that mean over randomly drawn scenes; None for a single scene."""
+    """Standard error of that mean over scenes; None for a single scene."""
 
     @property
     def is_sure(self) -> bool:
-        """Whether the mean is larger than two standard errors."""
+        """True if the mean is larger than two standard errors."""
         return self.error is not None and self.log_l1 > 2 * self.error
 
 
 def lead(
-    views: Sequence[ViewScore], others: Sequence[ViewScore], views_of_scene: Sequence[int]
+    views: Sequence[ViewScore], baseline: Sequence[ViewScore], views_of_scene: Sequence[int]
 ) -> Lead:
-    """Return the lead over `others` on the same views; those of one scene are counted as one."""
-    pairs = zip(views, others, strict=True)
+    """Return the lead over a baseline on the same views; each scene counts once."""
+    pairs = zip(views, baseline, strict=True)
     of_view = np.array([other.log_l1 - view.log_l1 for view, other in pairs])
     of_scene = [part.mean() for part in np.split(of_view, np.cumsum(views_of_scene)[:-1])]
     error = None

@@ -1,4 +1,4 @@
-"""The sheet that a person looks at: target, prediction, error, and error against the noise."""
+"""Contact sheet of an evaluation: target, prediction, error, and error relative to the noise."""
 
 import dataclasses
 import io
@@ -12,17 +12,17 @@ from PIL import Image, ImageDraw, ImageFont
 
 from storage.atomic import write_atomically
 from storage.conventions import preview_srgb8
-from train.evaluation.error_colours import (
+from train.evaluation.error_colors import (
     ERROR_WHITE,
     error_picture,
-    heat_colours,
+    heat_colors,
     mean_error,
 )
-from train.evaluation.judge import Judge, ValidationJudgement
+from train.evaluation.judge import Judge, ValidationResult
 from train.settings import TrainSettings
 
 TILE_PX = 160
-"""Width of a tile, where a whole multiple of the pictures fits."""
+"""Maximum width of a tile, which is a whole multiple of the picture's width."""
 
 CAPTION_PX = 20
 """Height of one line of text."""
@@ -31,34 +31,35 @@ GAP_PX = 8
 BLOCKS_PER_LINE = 2
 
 NOISE_WHITE = 16.0
-"""Multiple of the target's own noise that the last picture shows as white; at the noise it is
-black."""
+"""Multiple of the noise that the last picture shows as white; black is the noise itself."""
 
-INK, PAPER = (30, 30, 30), (250, 250, 248)
+INK = (30, 30, 30)
+PAPER = (250, 250, 248)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SheetView:
-    """One view on the sheet."""
+    """Pictures and captions of one view on a sheet."""
 
     name: str
-    """Scene and view."""
+    """First caption line, with scene and view."""
     scores: str
-    """One line of figures."""
+    """Second caption line, with the scores."""
     target_rgb: NDArray
     """[R, R, 3] linear radiance."""
     predicted_rgb: NDArray
     """[R, R, 3] linear radiance."""
     noise: float
     """Root mean square noise of the target's log10(1 + radiance)."""
-    beside_rgb: Mapping[str, NDArray] = field(default_factory=dict)
-    """[R, R, 3] linear radiance that others show, by name; of the same ones in all of a sheet."""
+    extra_rgb: Mapping[str, NDArray] = field(default_factory=dict)
+    """[R, R, 3] linear radiance of other methods by name; all views of a sheet have the same."""
 
 
-def drawn_sheet(views: Sequence[SheetView], title: Sequence[str]) -> Image.Image:
-    """Return the sheet; `title` is one or more lines."""
+def draw_sheet(views: Sequence[SheetView], title: Sequence[str]) -> Image.Image:
+    """Draw a sheet; `title` has one or more lines."""
     blocks = [_block(view) for view in views]
-    height, width = blocks[0].height + GAP_PX, blocks[0].width + 2 * GAP_PX
+    height = blocks[0].height + GAP_PX
+    width = blocks[0].width + 2 * GAP_PX
     top = len(title) * CAPTION_PX + 2 * GAP_PX
     lines = -(-len(blocks) // BLOCKS_PER_LINE)
     sheet = Image.new("RGB", (BLOCKS_PER_LINE * width, top + lines * height), PAPER)
@@ -78,23 +79,23 @@ def write_picture(path: Path, picture: Image.Image) -> None:
 
 
 def noise_picture(view: SheetView) -> NDArray[np.uint8]:
-    """Return [R, R, 3]: how often the error holds the view's noise, black at once, by doublings.
+    """Return the error relative to the view's noise [R, R, 3], on a log scale, black at the noise.
 
     The noise is one number for the whole view, its noise floor.
     """
     error = mean_error(view.predicted_rgb, view.target_rgb)
     times = np.maximum(error / max(view.noise, 1e-6), 1.0)
-    return heat_colours(np.log(times) / np.log(NOISE_WHITE))
+    return heat_colors(np.log(times) / np.log(NOISE_WHITE))
 
 
 def _block(view: SheetView) -> Image.Image:
-    # a network that is lost predicts NaN: it shows as white, in the error too
+    # a diverged network predicts NaN, which is shown as white
     predicted = np.nan_to_num(view.predicted_rgb, nan=1e6, posinf=1e6)
     view = dataclasses.replace(view, predicted_rgb=predicted)
     pictures = {
         "target": preview_srgb8(view.target_rgb),
         "prediction": preview_srgb8(view.predicted_rgb),
-        **{name: preview_srgb8(picture) for name, picture in view.beside_rgb.items()},
+        **{name: preview_srgb8(picture) for name, picture in view.extra_rgb.items()},
         f"error (white: {ERROR_WHITE})": error_picture(view.predicted_rgb, view.target_rgb),
         f"... / noise (white: {NOISE_WHITE:.0f})": noise_picture(view),
     }
@@ -103,10 +104,10 @@ def _block(view: SheetView) -> Image.Image:
     width = len(pictures) * (tile + GAP_PX) - GAP_PX
     block = Image.new("RGB", (width, tile + 3 * CAPTION_PX), PAPER)
     for column, (caption, pixels) in enumerate(pictures.items()):
-        left = column * (tile + GAP_PX)
+        x_px = column * (tile + GAP_PX)
         enlarged = Image.fromarray(pixels).resize((tile, tile), Image.Resampling.NEAREST)
-        block.paste(enlarged, (left, CAPTION_PX))
-        _write(block, (left, 0), caption)
+        block.paste(enlarged, (x_px, CAPTION_PX))
+        _write(block, (x_px, 0), caption)
     _write(block, (0, CAPTION_PX + tile), view.name)
     _write(block, (0, 2 * CAPTION_PX + tile), view.scores)
     return block
@@ -118,17 +119,19 @@ def _write(image: Image.Image, at: tuple[int, int], text: str) -> None:
 
 
 SHEET_SCENES = 8
-"""Scenes on the sheet, one view each."""
+"""Maximum number of scenes on a validation sheet, one view each."""
 
 
-def drawn_validation_sheet(
-    settings: TrainSettings, judge: Judge, judgement: ValidationJudgement, step: int
+def draw_validation_sheet(
+    settings: TrainSettings, judge: Judge, validation: ValidationResult, step: int
 ) -> Image.Image:
-    """Return the sheet of the first scenes after a step."""
-    views, at = [], 0
-    shown = zip(judge.scenes, judgement.pictures, strict=True)
-    for judged, pictures in list(shown)[:SHEET_SCENES]:
-        score, median = judgement.views[at], judge.median_views[at]
+    """Draw the sheet of the first validation scenes after a step."""
+    views = []
+    at = 0
+    scene_pictures = zip(judge.scenes, validation.pictures, strict=True)
+    for judged, pictures in list(scene_pictures)[:SHEET_SCENES]:
+        score = validation.views[at]
+        median = judge.median_views[at]
         at += len(pictures)
         views.append(
             SheetView(
@@ -145,8 +148,8 @@ def drawn_validation_sheet(
     title = (
         f"run {settings.run}, step {step} of {settings.num_steps}, {settings.resolution} pixels: "
         f"validation scenes, never trained on",
-        f"log L1 {judgement.scores['log_l1']:.4f}, median picture of the training views "
+        f"log L1 {validation.scores['log_l1']:.4f}, median picture of the training views "
         f"{judge.median_scores['log_l1']:.4f}, "
-        f"{judgement.scores['better_than_median']:.0%} of views better than it",
+        f"{validation.scores['better_than_median']:.0%} of views better than it",
     )
-    return drawn_sheet(views, title)
+    return draw_sheet(views, title)

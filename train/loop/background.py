@@ -1,4 +1,4 @@
-"""Files that are written while steps go on: sealing and a slow disk cost no step."""
+"""Background thread that writes checkpoints, so that a slow disk does not delay steps."""
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -7,11 +7,11 @@ from types import TracebackType
 from storage.errors import TrilightError
 
 
-class Background:
-    """A thread that does one piece of work after another; the next begins when the last is done.
+class BackgroundWriter:
+    """Thread that runs one job at a time.
 
-    Its errors are raised at the next call, so that nothing is lost but time. As a context it ends
-    only when all is done.
+    Errors of a job are raised by the next call, so that only time is lost. The context exits when
+    all jobs are done.
     """
 
     def __init__(self) -> None:
@@ -19,17 +19,18 @@ class Background:
         self._last: Future[None] | None = None
 
     def begin(self, work: Callable[[], None]) -> None:
-        """Begin a piece of work, after waiting for the one before; raises what that raised."""
+        """Submit a job after the one before has ended; raises the error of that."""
         self.wait()
         self._last = self._pool.submit(work)
 
     def wait(self) -> None:
-        """Wait until all that was begun is done; raises what it raised."""
-        last, self._last = self._last, None
+        """Wait until the submitted job has ended; raises its error."""
+        last = self._last
+        self._last = None
         if last is not None:
             last.result()
 
-    def __enter__(self) -> "Background":
+    def __enter__(self) -> "BackgroundWriter":
         return self
 
     def __exit__(

@@ -1,9 +1,9 @@
-"""Checkpoints of a run: one safetensors file each, with all that changes while the run goes on.
+"""Checkpoints of a run: one safetensors file each, with the whole mutable state.
 
-It appears by rename, so a kill while saving leaves the previous one whole. It also names the
-settings and the data, with what was decided about them since the run began (train.going_on),
-because going on with others in silence would be neither the old run nor a new one; and it holds the
-sha256 of itself, because safetensors would not notice a weight that a disk changed.
+A checkpoint appears by rename, so that a kill while saving leaves the previous one intact. It also
+holds the settings, the digest of the data and the decisions about them (train.resume), so that a
+resume with others is detected; and its own sha256, because safetensors does not detect a weight
+that a disk changed.
 """
 
 import dataclasses
@@ -19,37 +19,37 @@ from numpy.typing import NDArray
 from safetensors.torch import save
 from torch import Tensor
 
-from model.open import FoundNetwork
+from model.open import NetworkFile
 from model.renderformer import RenderFormer
 from model.weights import TrainedRange, decode_config, encode_config, load_tensors, read_metadata
 from storage.atomic import atomic_writer, remove_leftovers
 from storage.digests import seal_of
 from storage.errors import TrilightError
-from storage.extensions import recorded, require_same_extensions
+from storage.extensions import extension_digests, require_same_extensions
 from storage.records.safe_read import read_plain, read_safetensors
 from storage.settings.described import from_record
 from storage.settings.ranges import Within
 from storage.typed_json import FINITE, Sha256, read_json
 from train.data.mixture import RECORD, Mixture
 from train.folder import RunFolder
-from train.going_on import Event, GoingOn, event_records
-from train.loop.crew import Crew
-from train.loop.schedule import decay_begins
+from train.loop.distributed import DistributedContext
+from train.loop.schedule import decay_start_step
 from train.loop.state import TrainState, new_state
 from train.loop.step import StepReport
+from train.resume import Event, ResumePlan, event_records
 from train.settings import Precision, TrainSettings
 from train.stored_settings import known_settings, stored_settings
 
-PREFIX, SUFFIX = "step-", ".safetensors"
-"""Names of the files, around the number of the step."""
+PREFIX = "step-"
+SUFFIX = ".safetensors"
+"""Suffix of the file names, after the number of the step."""
 
 HEADER_KEY = "trilight_checkpoint"
-"""Metadata entry with counters, damage met, settings, digest of the data, how datasets are mixed,
-the run's history, and how it was executed: number of processes and threads, precision of Muon's
-products."""
+"""Metadata entry with counters, damaged samples, settings, digest of the data, the mixture, the
+history, and the execution: number of processes and threads, precision of Muon's products."""
 
 UNSEALED = "0" * 64
-"""Placeholder for the sha256 while it is computed. Old checkpoints have no sha256."""
+"""Placeholder of the sha256 while it is computed. Old checkpoints have no sha256."""
 
 
 Steps = Annotated[int, Within(0, 10**12, unit="steps")]
@@ -57,7 +57,7 @@ Steps = Annotated[int, Within(0, 10**12, unit="steps")]
 
 @dataclass(frozen=True, kw_only=True)
 class _Header:
-    """Header of a checkpoint, as `_encoded` writes it; older ones lack what has a default."""
+    """Header of a checkpoint, as `_encode_checkpoint` writes it; old ones lack the defaults."""
 
     step: Steps
     skipped_steps: Steps
@@ -82,21 +82,21 @@ class _Header:
             )
 
 
-def _encoded(
+def _encode_checkpoint(
     state: TrainState, settings: TrainSettings, data_digest: str, world_size: int
 ) -> bytes:
-    """Return a copy of all that a checkpoint holds, without its sha256; steps may go on."""
-    tensors = state.updater.memories()
+    """Return the bytes of a checkpoint without its sha256; later steps do not change them."""
+    tensors = state.updater.optimizer_state()
     for name, weight in state.model.named_parameters():
         tensors[f"model/{name}"] = weight.detach()
-    if state.mean_model is not None:
-        for name, weight in state.mean_model.named_parameters():
+    if state.ema_model is not None:
+        for name, weight in state.ema_model.named_parameters():
             tensors[f"mean/{name}"] = weight
     header = {
         "step": state.step,
         "skipped_steps": state.skipped_steps,
         "skipped_in_a_row": state.skipped_in_a_row,
-        "unusable": dict(state.unusable.met),
+        "unusable": dict(state.bad_samples.counts),
         "reports": [dataclasses.asdict(report) for report in state.reports],
         "settings": stored_settings(settings),
         "model": encode_config(settings.model),
@@ -106,7 +106,7 @@ def _encoded(
         "world_size": world_size,
         "threads": torch.get_num_threads(),
         "muon_precision": state.updater.muon_precision,
-        **({"extensions": found} if (found := recorded("weights")) else {}),
+        **({"extensions": extensions} if (extensions := extension_digests("weights")) else {}),
         "sha256": UNSEALED,
     }
     contiguous = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
@@ -114,7 +114,8 @@ def _encoded(
 
 
 def _write_sealed(path: Path, data: bytes) -> None:
-    start, view = data.index(UNSEALED.encode()), memoryview(data)
+    start = data.index(UNSEALED.encode())
+    view = memoryview(data)
     seal = seal_of(data, UNSEALED).encode()
     with atomic_writer(path) as stream:
         for part in (view[:start], seal, view[start + len(seal) :]):
@@ -123,7 +124,7 @@ def _write_sealed(path: Path, data: bytes) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Checkpoint:
-    """A checkpoint as it was read."""
+    """Header and tensors of a checkpoint file."""
 
     header: Mapping[str, Any]
     """Step, settings, digest of the data, history, number of processes."""
@@ -131,19 +132,21 @@ class Checkpoint:
     """Tensors by part and name."""
 
     def network(self) -> RenderFormer:
-        """Return the network that was judged at that step: the running mean where there is one."""
+        """Return the network that was evaluated at that step: the EMA if there is one."""
         model = RenderFormer(decode_config(self.header["model"]))
-        load_tensors(model, _part(self.arrays, "mean") or _part(self.arrays, "model"))
+        load_tensors(
+            model, _tensors_under(self.arrays, "mean") or _tensors_under(self.arrays, "model")
+        )
         return model.eval()
 
 
 def is_checkpoint(metadata: Mapping[str, str]) -> bool:
-    """Return whether a safetensors file with these entries is a checkpoint of a run."""
+    """Return whether the metadata of a safetensors file is that of a checkpoint."""
     return HEADER_KEY in metadata
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint; raises TrilightError, with its path, where it is damaged or none."""
+    """Read and verify a checkpoint; raises TrilightError, with its path, if it is invalid."""
     try:
         data = read_plain(path)
         arrays, metadata = read_safetensors(data)
@@ -163,43 +166,49 @@ def read_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(header=json.loads(metadata[HEADER_KEY]), arrays=arrays)
 
 
-def resumed_state(
+def restore_state(
     checkpoint: Checkpoint,
-    going: GoingOn,
+    plan: ResumePlan,
     device: torch.device | None = None,
     muon_precision: Precision = "bfloat16",
 ) -> TrainState:
-    """Return the state of a run, ready for its next step.
+    """Return the state of a resumed run before its next step.
 
     Args:
-        checkpoint: where it goes on.
-        going: how (train.going_on.going_on). Where only its settings have a running mean, that
-            begins with the weights.
+        checkpoint: checkpoint to restore.
+        plan: settings and history (train.resume). If the checkpoint has no EMA and the settings
+            ask for one, it starts as a copy of the weights.
         device: as in `new_state`.
         muon_precision: as in `new_state`.
 
     Raises:
-        TrilightError: the run has begun with other extensions.
+        TrilightError: the run was started with other extensions.
     """
-    header, settings = checkpoint.header, going.settings
-    require_same_extensions("resume: the run", header.get("extensions", {}), recorded("weights"))
-    state = new_state(settings, device, muon_precision=muon_precision, met=header["unusable"])
-    state.step, state.skipped_steps = header["step"], header["skipped_steps"]
-    if not going.has_decided:
+    header = checkpoint.header
+    settings = plan.settings
+    require_same_extensions(
+        "resume: the run", header.get("extensions", {}), extension_digests("weights")
+    )
+    state = new_state(
+        settings, device, muon_precision=muon_precision, bad_counts=header["unusable"]
+    )
+    state.step = header["step"]
+    state.skipped_steps = header["skipped_steps"]
+    if not plan.changes_meaning:
         state.skipped_in_a_row = header.get("skipped_in_a_row", 0)
-    state.history = going.history
+    state.history = plan.history
     state.reports = [StepReport(**fields) for fields in header.get("reports", ())]
-    weights = _part(checkpoint.arrays, "model")
+    weights = _tensors_under(checkpoint.arrays, "model")
     load_tensors(state.model, weights)
-    if state.mean_model is not None:
-        load_tensors(state.mean_model, _part(checkpoint.arrays, "mean") or weights)
+    if state.ema_model is not None:
+        load_tensors(state.ema_model, _tensors_under(checkpoint.arrays, "mean") or weights)
     if updates := state.step - state.skipped_steps:
         tensors = {name: torch.from_numpy(array) for name, array in checkpoint.arrays.items()}
-        state.updater.remember(tensors, updates)
+        state.updater.load_optimizer_state(tensors, updates)
     return state
 
 
-def _part(arrays: Mapping[str, NDArray], prefix: str) -> dict[str, Tensor]:
+def _tensors_under(arrays: Mapping[str, NDArray], prefix: str) -> dict[str, Tensor]:
     start = f"{prefix}/"
     return {
         name.removeprefix(start): torch.from_numpy(array)
@@ -209,37 +218,39 @@ def _part(arrays: Mapping[str, NDArray], prefix: str) -> dict[str, Tensor]:
 
 
 def saved_steps(folder: Path) -> list[int]:
-    """Return the steps of which there is a checkpoint, oldest first."""
+    """Return the steps of the saved checkpoints, oldest first."""
     names = [path.name for path in folder.glob(f"{PREFIX}*{SUFFIX}")]
     digits = [name.removeprefix(PREFIX).removesuffix(SUFFIX) for name in names]
     return sorted(int(text) for text in digits if text.isdecimal())
 
 
 def path_of_step(folder: Path, step: int) -> Path:
-    """Return where the checkpoint of a step is."""
+    """Return the path of the checkpoint of a step."""
     return folder / f"{PREFIX}{step:09d}{SUFFIX}"
 
 
-def resumed_checkpoint(folder: Path, crew: Crew, noted: Callable[[str], None]) -> Checkpoint:
-    """Return the newest checkpoint that is whole.
+def newest_checkpoint(
+    folder: Path, dist_context: DistributedContext, note: Callable[[str], None]
+) -> Checkpoint:
+    """Return the newest checkpoint that is not damaged.
 
     Args:
-        folder: of the checkpoints.
-        crew: the processes that go on together; all must call it.
-        noted: called with a note where a damaged one was passed over.
+        folder: folder of the checkpoints.
+        dist_context: the processes that resume together; all must call it.
+        note: called with a message if a damaged checkpoint was skipped.
 
     Raises:
-        TrilightError: there is none, none is whole, or a process reads another than this one.
+        TrilightError: there is none, all are damaged, or the processes read different ones.
     """
     steps = saved_steps(folder)
     if not steps:
         raise TrilightError(
             f"{folder.parent}: no checkpoint here to resume from; start the run without --resume."
         )
-    checkpoint = _newest_whole(folder, steps, noted)
+    checkpoint = _newest_readable(folder, steps, note)
     step = checkpoint.header["step"]
-    # bit by bit, since a float32 mean of a large number is rounded, and all must reach one verdict
-    if any(0 < share < 1 for share in crew.mean([step >> bit & 1 for bit in range(32)])):
+    # bit by bit: a float32 mean of large numbers is rounded, and all processes must agree
+    if any(0 < share < 1 for share in dist_context.mean([step >> bit & 1 for bit in range(32)])):
         raise TrilightError(
             f"{folder.parent}: the processes do not read the same checkpoint; this one reads that "
             f"of step {step}. Check that the folder is the same on every machine, and resume "
@@ -248,7 +259,7 @@ def resumed_checkpoint(folder: Path, crew: Crew, noted: Callable[[str], None]) -
     return checkpoint
 
 
-def _newest_whole(folder: Path, steps: list[int], noted: Callable[[str], None]) -> Checkpoint:
+def _newest_readable(folder: Path, steps: list[int], note: Callable[[str], None]) -> Checkpoint:
     damaged = []
     for step in reversed(steps):
         try:
@@ -257,7 +268,7 @@ def _newest_whole(folder: Path, steps: list[int], noted: Callable[[str], None]) 
             damaged.append(str(error))
             continue
         if damaged:
-            noted(f"{' '.join(damaged)} The run goes on from that of step {step}")
+            note(f"{' '.join(damaged)} The run goes on from that of step {step}")
         return checkpoint
     raise TrilightError(
         f"{folder.parent}: none of its checkpoints can be resumed from. {' '.join(damaged)} "
@@ -265,55 +276,55 @@ def _newest_whole(folder: Path, steps: list[int], noted: Callable[[str], None]) 
     )
 
 
-def keep_checkpoint(
+def save_checkpoint(
     folder: Path,
     state: TrainState,
     settings: TrainSettings,
     *,
     data_digest: str,
     world_size: int,
-    begin: Callable[[Callable[[], None]], None] = lambda work: work(),
+    submit: Callable[[Callable[[], None]], None] = lambda work: work(),
 ) -> None:
-    """Save the state, whole or not at all, and only then delete what the run does not keep.
+    """Save the state atomically, then delete checkpoints that the settings do not keep.
 
     Kept are the newest `checkpoints_kept`, every multiple of `keep_every`, and the one where the
-    decay of the learning rate begins, from which a longer run can go on. One of a later step was
-    damaged when the run resumed from an earlier one, and does not count.
+    decay of the learning rate begins, from which a longer run can be resumed. Checkpoints of later
+    steps do not count: they were damaged when the run resumed from an earlier one.
 
     Args:
-        folder: of the checkpoints.
-        state: is copied before this returns.
-        settings: of the run.
-        data_digest: of what it learns from.
+        folder: folder of the checkpoints.
+        state: state to save; it is copied before this returns.
+        settings: settings of the run.
+        data_digest: digest of the training data.
         world_size: number of processes.
-        begin: does the writing, which takes as long as the disk: at once unless said.
+        submit: runs the slow writing; by default at once.
 
     Raises:
-        TrilightError: the folder is full or cannot be written; the older ones are still there.
+        TrilightError: the disk is full or the folder cannot be written; older checkpoints remain.
     """
     step = state.step
-    data = _encoded(state, settings, data_digest, world_size)
-    begin(lambda: _put(folder, step, data, settings))
+    data = _encode_checkpoint(state, settings, data_digest, world_size)
+    submit(lambda: _write_and_prune(folder, step, data, settings))
 
 
-def _put(folder: Path, newest: int, data: bytes, settings: TrainSettings) -> None:
+def _write_and_prune(folder: Path, newest: int, data: bytes, settings: TrainSettings) -> None:
     _write_sealed(path_of_step(folder, newest), data)
     remove_leftovers(folder)
     passed = [step for step in saved_steps(folder) if step <= newest]
     for step in passed[: -settings.checkpoints_kept]:
         milestone = settings.keep_every and step % settings.keep_every == 0
-        if not milestone and step != decay_begins(settings):
+        if not milestone and step != decay_start_step(settings):
             path_of_step(folder, step).unlink(missing_ok=True)
 
 
-def network_of_run(path: Path) -> FoundNetwork | None:
-    """Return the network of a run's checkpoint, or of its folder while it is not finished.
+def network_of_run(path: Path) -> NetworkFile | None:
+    """Return the network of a checkpoint, or of the folder of an unfinished run; else None.
 
-    A checkpoint is read at once, since its header is vouched for by the digest of the whole. The
-    finished network of a run is a file of weights, which `model.open` reads: None.
+    A checkpoint is read as a whole, since the digest of all its bytes verifies its header. The
+    finished network of a run is a file of weights, which `model.open` reads.
 
     Args:
-        path: a file or a folder, of whatever kind.
+        path: any file or folder.
 
     Raises:
         TrilightError: the checkpoint is damaged.
@@ -331,7 +342,7 @@ def network_of_run(path: Path) -> FoundNetwork | None:
     checkpoint = read_checkpoint(path)
     stored = known_settings(checkpoint.header["settings"], f"checkpoint {path}")
     settings = from_record(TrainSettings, stored)
-    return FoundNetwork(
+    return NetworkFile(
         path=path,
         trained=TrainedRange(resolution=settings.resolution),
         any_width=settings.model.view_stage == "hits",

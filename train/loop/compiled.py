@@ -1,9 +1,9 @@
-"""The parts of a step that torch.compile makes fewer and longer kernels of.
+"""Modules of a training step that torch.compile fuses into fewer kernels.
 
-Layer by layer, not the whole network: the layers of a stage share their code, so it is compiled
-once for all of them. Lengths and numbers of scenes are variables in it; what is compiled anew is
-one scene beside several, a mask or none, and judging beside training. CUDA graphs are not used: a
-step's kernels take longer than their launches (study S88).
+Layers are compiled one by one, not the whole network: the layers of a stage share their code, which
+is compiled once for all of them. Lengths and numbers of scenes are dynamic; separate variants are
+compiled for one or several scenes, with or without a mask, and for training and evaluation. CUDA
+graphs are not used: a step's kernels take longer than their launches (study S88).
 """
 
 from collections.abc import Iterator
@@ -18,29 +18,29 @@ from train.loss.lpips import Lpips
 from train.loss.objective import Objective
 from train.settings import Compile
 
-MOST_GRAPHS = 32
-"""Variants of one function that torch keeps before it gives up on it; eight are its default. A few
-are met: see above, twice for windows, which are cut in two ways."""
+MAX_GRAPHS = 32
+"""Maximum number of variants of one function before torch stops compiling it; its default is eight.
+See above for the variants; windows, which are cut in two ways, double them."""
 
 
 def compile_parts(
-    model: RenderFormer, objective: Objective, wanted: Compile, device: torch.device
+    model: RenderFormer, objective: Objective, mode: Compile, device: torch.device
 ) -> bool:
-    """Have the parts compiled, in place, when they are first used; return whether they will be.
+    """Enable compilation in place, at first use; return whether it is enabled.
 
-    Names and values of weights stay, so checkpoints do.
+    Names and values of weights do not change, so that checkpoints stay valid.
 
     Raises:
-        TrilightError: it is wanted and this torch cannot.
+        TrilightError: `mode` is yes and this torch cannot compile.
     """
-    if wanted == "no" or (wanted == "auto" and not _worth_it(device)):
+    if mode == "no" or (mode == "auto" and not _is_worthwhile(device)):
         return False
     if device.type == "cuda" and not _has_triton():
         raise TrilightError(
-            "compile is yes, but torch finds no Triton, which it needs on a card; expected the "
+            "compile is yes, but torch finds no Triton, which it needs on a GPU; expected the "
             "package triton. Install it, or --set compile=no."
         )
-    torch._dynamo.config.recompile_limit = max(MOST_GRAPHS, torch._dynamo.config.recompile_limit)
+    torch._dynamo.config.recompile_limit = max(MAX_GRAPHS, torch._dynamo.config.recompile_limit)
     if device.type == "cuda":
         _without_tiling_analysis()
     for _, module, method in compiled_parts(model, objective):
@@ -52,7 +52,7 @@ def compile_parts(
 
 
 def undo_compiling(model: RenderFormer, objective: Objective) -> None:
-    """Have the parts run as they were before `compile_parts`, kernel by kernel."""
+    """Disable the compilation that `compile_parts` enabled."""
     for _, module, method in compiled_parts(model, objective):
         if method == "forward":
             module._compiled_call_impl = None
@@ -60,8 +60,8 @@ def undo_compiling(model: RenderFormer, objective: Objective) -> None:
             delattr(module, method)
 
 
-def is_of_the_compiler(error: Exception) -> bool:
-    """Return whether an error says that torch could not compile, not that a step went wrong."""
+def is_compiler_error(error: Exception) -> bool:
+    """Return whether an error comes from torch's compiler and not from the step."""
     from torch._dynamo.exc import TorchDynamoException
     from torch._inductor.exc import InductorError
 
@@ -69,10 +69,10 @@ def is_of_the_compiler(error: Exception) -> bool:
 
 
 def _without_tiling_analysis() -> None:
-    """Switch off an analysis that does not know variable lengths, which ours are.
+    """Disable an analysis of torch's compiler that fails on dynamic lengths.
 
-    On an H200, torch 2.11 ended there with an assertion in the way back of `smoke` and `pretrain`
-    (pytorch/pytorch issues 181563 and 197077); the second is open in later versions too.
+    On an H200, torch 2.11 failed there with an assertion in the backward pass of `smoke` and
+    `pretrain` (pytorch/pytorch issues 181563 and 197077); the second is open in later versions too.
     """
     import torch._inductor.config as inductor
 
@@ -82,7 +82,7 @@ def _without_tiling_analysis() -> None:
 def compiled_parts(
     model: RenderFormer, objective: Objective
 ) -> Iterator[tuple[str, nn.Module, str]]:
-    """Yield what is compiled: the name of the part, its module, and the method that is called."""
+    """Yield what is compiled: a display name, the module, and the method that is called."""
     if model.encoder is not None:
         for layer in model.encoder.layers:
             yield "encoder layers", layer, "forward"
@@ -97,7 +97,7 @@ def compiled_parts(
             yield "LPIPS", module, "forward"
 
 
-def _worth_it(device: torch.device) -> bool:
+def _is_worthwhile(device: torch.device) -> bool:
     return device.type == "cuda" and _has_triton()
 
 

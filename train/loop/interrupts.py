@@ -1,6 +1,6 @@
-"""Ctrl-C, SIGTERM and SIGUSR1 take effect between two steps, when the state can be saved whole.
+"""Deferral of Ctrl-C, SIGTERM and SIGUSR1 to the end of a step, when the state can be saved.
 
-A validation that is under way is left, and done again by the run that goes on.
+A validation in progress is interrupted, and repeated by the resumed run.
 """
 
 import os
@@ -15,23 +15,24 @@ from typing import ClassVar
 from storage.errors import TrilightError
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-"""Those that ask to stop; SIGUSR1 is what job files ask Slurm for, ahead of the time limit."""
+"""Signals that stop a run; Slurm sends SIGUSR1 ahead of the time limit, as job files request."""
 
 SAVED_STATUS = 75
-"""What a process ends with whose state is saved: the same command with --resume goes on. (In BSD's
-sysexits.h it is EX_TEMPFAIL: try again.) torchrun does not pass it on."""
+"""Exit status of a process that saved its state: the same command with --resume continues. (In
+BSD's sysexits.h it is EX_TEMPFAIL: try again.) torchrun does not forward it."""
 
-ONE_ASKING_S = 1.0
-"""Signals within this time are one: torchrun forwards a signal that the terminal sent to all."""
+ECHO_S = 1.0
+"""Time in which a second signal counts as an echo: torchrun forwards what the terminal sent to all.
+"""
 
 
 class Stopped(TrilightError):
-    """A run obeyed a signal: its state is saved, and --resume goes on from there."""
+    """A run was stopped by a signal after its state was saved; --resume continues it."""
 
     exit_status: ClassVar[int] = SAVED_STATUS
 
     def __init__(self, step: int, command: str | None = None) -> None:
-        """Take the steps that are done, and the command that goes on, where it is known."""
+        """Create the error from the number of done steps, and the command to resume if known."""
         stopped = f"training: stopped at step {step}"
         super().__init__(
             f"{stopped} by a signal, nothing is lost. Run the same command with --resume to go on."
@@ -41,21 +42,21 @@ class Stopped(TrilightError):
         self.step = step
 
 
-class ValidationLeft(Exception):
-    """A validation was left, because the run was asked to stop."""
+class ValidationInterrupted(Exception):
+    """A validation was interrupted because a signal stops the run."""
 
 
-class Asking:
-    """Counts the requests to stop."""
+class SignalCounter:
+    """Counts the signals to stop, without echoes."""
 
     def __init__(self) -> None:
         self.times = 0
-        self._last_s = -ONE_ASKING_S
+        self._last_s = -ECHO_S
 
-    def again(self) -> bool:
-        """Count a signal unless it is an echo of the one before; return whether it counts."""
+    def count_signal(self) -> bool:
+        """Count a signal unless it is an echo of the last one; return whether it counts."""
         now_s = time.monotonic()
-        new = now_s - self._last_s >= ONE_ASKING_S
+        new = now_s - self._last_s >= ECHO_S
         if new:
             self._last_s = now_s
             self.times += 1
@@ -63,51 +64,51 @@ class Asking:
 
 
 @contextmanager
-def deferred_interrupts(answer: Callable[[int], None]) -> Iterator[Callable[[], bool]]:
-    """Yield a function that says whether the run was asked to stop.
+def deferred_interrupts(on_signal: Callable[[int], None]) -> Iterator[Callable[[], bool]]:
+    """Yield a function that returns whether a signal asked the run to stop.
 
-    The first signal is only noted; a second one acts at once, as it did before. Outside of the main
-    thread Python delivers no signals, and the answer is always no.
+    The first signal is only recorded; a second one has its usual effect at once. Outside of the
+    main thread Python delivers no signals, and the function always returns False.
 
     Args:
-        answer: is called with 1, 2, ... at each asking, in a thread: Python itself hears a signal
-            only when the call at hand returns, which a backward pass on a busy machine does after
-            a minute.
+        on_signal: called in a thread with the number of signals so far: Python's own handlers run
+            only when the current native call returns, such as a backward pass of a minute.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
-    asking, before = Asking(), {number: signal.getsignal(number) for number in SIGNALS}
+    counter = SignalCounter()
+    before = {number: signal.getsignal(number) for number in SIGNALS}
 
     def restore() -> None:
         for number, handler in before.items():
             signal.signal(number, handler)
 
     def note(number: int, frame: FrameType | None) -> None:
-        asking.again()
-        if asking.times > 1:
+        counter.count_signal()
+        if counter.times > 1:
             restore()
             signal.raise_signal(number)
 
     for number in SIGNALS:
         signal.signal(number, note)
     try:
-        with _heard_at_once(answer):
-            yield lambda: asking.times > 0
+        with _listen_in_thread(on_signal):
+            yield lambda: counter.times > 0
     finally:
         restore()
 
 
 @contextmanager
-def _heard_at_once(answer: Callable[[int], None]) -> Iterator[None]:
+def _listen_in_thread(on_signal: Callable[[int], None]) -> Iterator[None]:
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
-    asking = Asking()
+    counter = SignalCounter()
 
     def listen() -> None:
-        while heard := os.read(reading, 1):
-            if heard[0] in SIGNALS and asking.again():
-                answer(asking.times)
+        while received := os.read(reading, 1):
+            if received[0] in SIGNALS and counter.count_signal():
+                on_signal(counter.times)
 
     listener = threading.Thread(target=listen, daemon=True)
     listener.start()

@@ -1,4 +1,4 @@
-"""Muon by stacks of matrices, over all processes; and which products a processor is quick at."""
+"""Muon on stacks of equal matrices, split over all processes, and the precision of its products."""
 
 import math
 from collections import defaultdict
@@ -9,22 +9,22 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from train.loop.crew import Crew
-from train.loop.decision import Decision, decides_late, move_along, move_towards
+from train.loop.decision import Decision, defers_sync, move_along, move_towards
+from train.loop.distributed import DistributedContext
 from train.settings import Precision
 
 
-def fitting_precision(crew: Crew) -> Precision:
-    """Return the precision of Muon's products that all processes of a crew are quick at.
+def choose_muon_precision(dist_context: DistributedContext) -> Precision:
+    """Return the fastest precision of Muon's products that all processes support.
 
-    bfloat16 on a card and where the processor has AVX512_BF16, as all with AMX do. Elsewhere such a
-    product is emulated: with AVX2 alone a step takes 12 times as long as in float32
-    (study S83). torch's own question, `_is_mkldnn_bf16_supported`, also says yes
-    where AVX-512 emulates it. One answer for all, since every process moves its copy of the weights
-    itself, and copies must not drift apart. All processes must call it.
+    bfloat16 on a GPU and on CPUs with AVX512_BF16, as all with AMX have. Elsewhere such a product
+    is emulated: with AVX2 alone a step takes 12 times as long as in float32 (study S83). Torch's
+    own check, `_is_mkldnn_bf16_supported`, is also true where AVX-512 emulates it. The result is
+    equal in all processes, since each updates its own copy of the weights, and copies must not
+    drift apart. All processes must call it.
     """
-    quick = crew.device.type != "cpu" or torch.cpu._is_avx512_bf16_supported()
-    return "float32" if crew.any(not quick) else "bfloat16"
+    quick = dist_context.device.type != "cpu" or torch.cpu._is_avx512_bf16_supported()
+    return "float32" if dist_context.any(not quick) else "bfloat16"
 
 
 def muon(
@@ -33,16 +33,15 @@ def muon(
     precision: Precision,
     thirds: Sequence[Tensor] = (),
 ) -> torch.optim.Muon:
-    """Return the optimizer of matrices [M, N].
+    """Return the Muon optimizer of matrices [M, N].
 
     Args:
-        matrices: what it moves, or groups of that as torch's optimizers take them, each with its
-            own decay.
-        weight_decay: of those without their own.
-        precision: of its products. With bfloat16 on a processor it is torch's own.
-        thirds: those of them that are three matrices, one above the other.
+        matrices: weights, or parameter groups as torch's optimizers take them, each with its decay.
+        weight_decay: decay of weights without a group.
+        precision: precision of its products. With bfloat16 on a CPU it is torch's own class.
+        thirds: those of the weights that are three stacked matrices.
     """
-    if precision == "bfloat16" and not thirds and not decides_late(_device(matrices[0])):
+    if precision == "bfloat16" and not thirds and not defers_sync(_device(matrices[0])):
         return torch.optim.Muon(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
     return StackedMuon(matrices, weight_decay, PRODUCTS[precision], thirds)
 
@@ -53,20 +52,20 @@ def _device(first: Tensor | dict[str, Any]) -> torch.device:
 
 
 PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-"""Types of the products, by precision."""
+"""Types of Muon's products, by precision."""
 
 
 class StackedMuon(torch.optim.Muon):
-    """torch's Muon with the matrices of one shape in one product, shared out over the processes.
+    """torch's Muon with matrices of one shape in one product, split over the processes.
 
-    Settings, state and update are those of torch.optim.Muon with `match_rms_adamw`; what differs is
-    rounding. Stacks cost memory for a moment: five times that of all the matrices of one shape.
-    Each process orthogonalises its part of a stack and is told the others', so a matrix is moved by
-    the same numbers everywhere. Momentum is kept by all of them.
+    Settings, state and update are those of torch.optim.Muon with `match_rms_adamw`, up to rounding.
+    Stacks briefly cost memory: five times that of all the matrices of one shape. Each process
+    orthogonalizes its slice of a stack and gathers the others', so that every process applies the
+    same update. All processes keep the momentum.
     """
 
     decision: Decision | None = None
-    """Whether the next step is taken; None: it is."""
+    """Decision of the next step, set by the caller; None applies it."""
 
     def __init__(
         self,
@@ -75,7 +74,7 @@ class StackedMuon(torch.optim.Muon):
         products: torch.dtype,
         thirds: Sequence[Tensor],
     ) -> None:
-        """Take what `muon` takes."""
+        """Create the optimizer; arguments as in `muon`, with `products` a type."""
         super().__init__(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
         self._products = products
         cut = {id(weight) for weight in thirds}
@@ -84,41 +83,45 @@ class StackedMuon(torch.optim.Muon):
         ]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy needs; torch's optimisers keep their own fields alone."""
-        own = {"_products": self._products, "_thirds": self._thirds, "decision": self.decision}
-        return super().__getstate__() | own
+        """Return the state of a copy; torch's optimizers copy only their own fields."""
+        fields = {"_products": self._products, "_thirds": self._thirds, "decision": self.decision}
+        return super().__getstate__() | fields
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """Move every matrix along the gradient it holds; one without a gradient stays."""
+        """Update every matrix that has a gradient."""
         for group, thirds in zip(self.param_groups, self._thirds, strict=True):
-            given = zip(group["params"], thirds, strict=True)
-            held = [(weight, 3 if cut else 1) for weight, cut in given if weight.grad is not None]
+            weight_cuts = zip(group["params"], thirds, strict=True)
+            held = [
+                (weight, 3 if cut else 1) for weight, cut in weight_cuts if weight.grad is not None
+            ]
             moved = [weight for weight, _ in held]
             by_shape = defaultdict[torch.Size, list[tuple[Tensor, Tensor]]](list)
-            wanted_steps = self._wanted(moved, group["momentum"])
-            for (weight, parts), wanted in zip(held, wanted_steps, strict=True):
-                for pair in zip(weight.chunk(parts), wanted.chunk(parts), strict=True):
+            directions = self._momentum_directions(moved, group["momentum"])
+            for (weight, parts), direction in zip(held, directions, strict=True):
+                for pair in zip(weight.chunk(parts), direction.chunk(parts), strict=True):
                     by_shape[pair[0].shape].append(pair)
             for pairs in by_shape.values():
-                self._move([w for w, _ in pairs], [wanted for _, wanted in pairs], group)
+                self._move([w for w, _ in pairs], [direction for _, direction in pairs], group)
 
-    def _move(self, weights: list[Tensor], wanted: list[Tensor], group: Mapping[str, Any]) -> None:
-        """Move matrices of one shape [M, N]."""
+    def _move(
+        self, weights: list[Tensor], directions: list[Tensor], group: Mapping[str, Any]
+    ) -> None:
+        """Update matrices of one shape [M, N]."""
         constants = group["ns_coefficients"], group["ns_steps"], group["eps"]
 
         def steps(some: Sequence[Tensor]) -> Tensor:
-            return orthogonal(_stacked(some, self._products), *constants)
+            return orthogonal(_stack(some, self._products), *constants)
 
-        steps_SMN = shared_out(wanted, steps, self._products)
+        steps_SMN = split_over_ranks(directions, steps, self._products)
         # Liu et al. 2025: as long as a typical step of AdamW, whatever the shape
         rate = group["lr"] * 0.2 * math.sqrt(max(weights[0].shape))
         steps_SMN = steps_SMN.to(weights[0].dtype, memory_format=torch.contiguous_format)
         decay = group["lr"] * group["weight_decay"]
         move_along(weights, list(steps_SMN), rate, decay, self.decision)
 
-    def _wanted(self, weights: Sequence[Tensor], momentum: float) -> Sequence[Tensor]:
-        """Return the gradients [M, N] with Nesterov's momentum, and remember it."""
+    def _momentum_directions(self, weights: Sequence[Tensor], momentum: float) -> Sequence[Tensor]:
+        """Update the momentum, and return the gradients [M, N] with Nesterov's momentum."""
         if not weights:
             return []
         gradients: list[Tensor] = []
@@ -132,19 +135,19 @@ class StackedMuon(torch.optim.Muon):
         return torch._foreach_lerp(gradients, means, momentum)
 
 
-def _stacked(matrices: Sequence[Tensor], kind: torch.dtype) -> Tensor:
-    """Return [S, M, N] of a type: all are rounded on their way, and read once."""
+def _stack(matrices: Sequence[Tensor], kind: torch.dtype) -> Tensor:
+    """Return matrices stacked to [S, M, N] and cast to a type, in one pass."""
     stack_SMN = matrices[0].new_empty((len(matrices), *matrices[0].shape), dtype=kind)
     torch._foreach_copy_(list(stack_SMN), list(matrices))
     return stack_SMN
 
 
-def shared_out(
+def split_over_ranks(
     matrices: Sequence[Tensor], work: Callable[[Sequence[Tensor]], Tensor], kind: torch.dtype
 ) -> Tensor:
-    """Return work(matrices) [S, M, N], each process doing its part and receiving the others'.
+    """Return work(matrices) [S, M, N], computed in slices by all processes.
 
-    All processes must call it with matrices of the same shapes; the result is alike on each.
+    All processes must call it with matrices of the same shapes; the result is equal on each.
     """
     processes = dist.get_world_size() if dist.is_initialized() else 1
     if processes == 1:
@@ -163,7 +166,7 @@ def shared_out(
 def orthogonal(
     matrices_SMN: Tensor, coefficients: tuple[float, float, float], steps: int, eps: float
 ) -> Tensor:
-    """Return matrices [S, M, N] with the same directions, and singular values about 1.
+    """Return matrices [S, M, N] with the same singular vectors and singular values near 1.
 
     Each of the `steps` turns every singular value s, of a matrix of length 1, into
     a s + b s^3 + c s^5 (Newton and Schulz's iteration with Jordan's coefficients, Jordan et al.

@@ -1,4 +1,4 @@
-"""What moves the weights: AdamW, and Muon for the matrices."""
+"""Optimizers of a run: AdamW, and Muon for the matrices."""
 
 import itertools
 from collections import defaultdict
@@ -10,67 +10,70 @@ from torch import Tensor
 
 from model.renderformer import RenderFormer
 from model.width_scales import width_scales
-from train.loop.decision import Decision, decides_late
+from train.loop.decision import Decision, defers_sync
 from train.loop.muon import StackedMuon, muon
 from train.settings import Precision, TrainSettings
 
 ADAMW_KEEPS = ("exp_avg", "exp_avg_sq")
-"""AdamW's state for each weight, beside its count of updates."""
+"""Names of AdamW's state tensors for each weight, without its count of updates."""
 
 MUON_KEEPS = ("momentum_buffer",)
-"""Muon's state for each weight; it counts no updates."""
+"""Names of Muon's state tensors for each weight; it counts no updates."""
 
 _SCALE = "width_scale"
-"""Name in a group of weights of the factor of their rate."""
+"""Key of an optimizer's parameter group that holds the factor of its rate."""
 
 _Scaled = tuple[Tensor, float]
-"""A weight, and the factor of its rate."""
+"""A weight, and the factor of its learning rate."""
 
 
 class Updater:
-    """Moves the weights of a network along its gradient: AdamW, and Muon for the matrices if asked.
+    """Updates the weights of a network with AdamW, and the matrices with Muon if configured.
 
-    Muon (Jordan et al. 2024) makes the step of a matrix near orthogonal, so that its rare
+    Muon (Jordan et al. 2024) makes the step of a matrix nearly orthogonal, so that its rare
     directions move as far as the frequent ones. Its steps are scaled to the size of AdamW's (Liu et
-    al. 2025), so one learning rate serves both.
+    al. 2025), so that one learning rate serves both.
 
-    How near two trainings come whose gradients differ by 1e-7 of themselves, as sums in another
-    order do: with Muon's products in float32 a weight moves otherwise by up to 1e-5 of a typical
-    step, with products in bfloat16, where such a difference can cross a rounding, by up to a tenth.
+    Gradients that are summed in another order differ by about 1e-7 of themselves. With Muon's
+    products in float32 this changes a weight's step by up to 1e-5 of a typical step; with products
+    in bfloat16, where such a difference can cross a rounding, by up to a tenth.
     """
 
     muon_precision: Precision | None
-    """Precision of Muon's products; None where AdamW moves every weight."""
+    """Precision of Muon's products; None if AdamW updates every weight."""
 
     def __init__(self, model: RenderFormer, settings: TrainSettings, precision: Precision) -> None:
-        """Take the network, the run, and the precision of Muon's products (loop.muon)."""
+        """Create the optimizers; `precision` is that of Muon's products (loop.muon)."""
         device = next(model.parameters()).device
         self._names: dict[Tensor, str] = {weight: name for name, weight in model.named_parameters()}
         scales = width_scales(model, settings.base_widths)
-        matrices, others = list[_Scaled](), list[_Scaled]()
+        muon_weights = list[_Scaled]()
+        adamw_weights = list[_Scaled]()
         for weight, name in self._names.items():
             if settings.muon_rate and _muon_takes(name, weight, settings):
-                matrices.append((weight, scales[name].muon))
+                muon_weights.append((weight, scales[name].muon))
             else:
-                others.append((weight, scales[name].adamw))
+                adamw_weights.append((weight, scales[name].adamw))
         adamw = torch.optim.AdamW(
-            self._groups(others, settings),
+            self._groups(adamw_weights, settings),
             betas=settings.betas,
-            fused=True if decides_late(device) else None,
+            fused=True if defers_sync(device) else None,
         )
         self._optimizers: list[tuple[torch.optim.Optimizer, float]] = [(adamw, 1.0)]
-        self.muon_precision = precision if matrices else None
-        if matrices:
-            thirds = [weight for weight, _ in matrices if _is_qkv(self._names[weight], settings)]
-            groups = self._groups(matrices, settings)
+        self.muon_precision = precision if muon_weights else None
+        if muon_weights:
+            thirds = [
+                weight for weight, _ in muon_weights if _is_qkv(self._names[weight], settings)
+            ]
+            groups = self._groups(muon_weights, settings)
             optimizer = muon(groups, settings.weight_decay, precision, thirds=thirds)
             self._optimizers.append((optimizer, settings.muon_rate))
 
     def _groups(self, weights: Sequence[_Scaled], settings: TrainSettings) -> list[dict[str, Any]]:
-        """Return the groups of weights whose rates have one factor, and which decay or do not.
+        """Return parameter groups of equal rate factor and equal decay.
 
-        A step takes the same share of every weight for decay, whatever that factor: a share that
-        fell with the rate would keep wide networks from forgetting (Wortsman et al. 2023).
+        The decay of a step is independent of the rate factor: decay that shrank with the rate would
+        be too weak for wide networks (Wortsman et al. 2023).
         """
         groups = defaultdict[tuple[float, float], list[Tensor]](list)
         for weight, scale in weights:
@@ -82,55 +85,56 @@ class Updater:
         ]
 
     def zero_grad(self) -> None:
-        """Forget the gradient."""
+        """Clear the gradients."""
         for optimizer, _ in self._optimizers:
             optimizer.zero_grad(set_to_none=True)
 
     def step(self, learning_rate: float, decision: Decision | None = None) -> None:
-        """Move every weight along the gradient it holds, unless it is decided otherwise."""
-        if decision is not None and decision.is_refused:
+        """Update every weight by its gradient, unless the decision skips the step."""
+        if decision is not None and decision.is_skipped:
             return
-        for optimizer, share in self._optimizers:
+        for optimizer, factor in self._optimizers:
             for group in optimizer.param_groups:
-                group["lr"] = learning_rate * share * group[_SCALE]
+                group["lr"] = learning_rate * factor * group[_SCALE]
             if isinstance(optimizer, StackedMuon):
                 optimizer.decision = decision
             else:  # torch's name for it
-                late = decision is not None and decision.is_late
-                optimizer.found_inf = decision.refused if decision and late else None  # type: ignore[attr-defined]
+                deferred = decision is not None and decision.defer_sync
+                optimizer.found_inf = decision.skip_flag if decision and deferred else None  # type: ignore[attr-defined]
             optimizer.step()
 
-    def memories(self) -> dict[str, Tensor]:
-        """Return the optimizers' state, by `kind/weight`; empty before the first update."""
+    def optimizer_state(self) -> dict[str, Tensor]:
+        """Return the state tensors by `kind/weight`; empty before the first update."""
         return {
             f"{kind}/{self._names[weight]}": memory[kind]
             for optimizer, _ in self._optimizers
             for weight, memory in optimizer.state.items()
-            for kind in _kept(optimizer)
+            for kind in _state_names(optimizer)
         }
 
-    def remember(self, memories: Mapping[str, Tensor], updates: int) -> None:
-        """Restore the state by `kind/weight`, saved after `updates` updates (1 or more)."""
+    def load_optimizer_state(self, tensors: Mapping[str, Tensor], updates: int) -> None:
+        """Restore the state tensors, saved after `updates` updates (1 or more)."""
         for optimizer, _ in self._optimizers:
             for weight in itertools.chain(*(group["params"] for group in optimizer.param_groups)):
                 name = self._names[weight]
-                memory = {
-                    kind: memories[f"{kind}/{name}"].to(weight.device, copy=True)
-                    for kind in _kept(optimizer)
+                state = {
+                    kind: tensors[f"{kind}/{name}"].to(weight.device, copy=True)
+                    for kind in _state_names(optimizer)
                 }
                 if isinstance(optimizer, torch.optim.AdamW):
-                    fused = optimizer.defaults["fused"]  # it counts on the card
-                    memory["step"] = torch.tensor(
+                    fused = optimizer.defaults["fused"]  # it counts on the GPU
+                    state["step"] = torch.tensor(
                         float(updates), device=weight.device if fused else None
                     )
-                optimizer.state[weight] = memory
+                optimizer.state[weight] = state
 
 
 _TOKENS = "registers_NW"
-"""End of the name of the learned tokens that come as a matrix, and are none."""
+"""Suffix of the learned tokens, which have the shape of a matrix but are vectors."""
 
-_LAYERS, _QKV = ".layers.", ".qkv.weight"
-"""Parts of the names of the matrices of both stages' layers, and of those that hold three."""
+_LAYERS = ".layers."
+_QKV = ".qkv.weight"
+"""Parts of weight names: all layers, and the stacked query, key and value matrices."""
 
 
 def _is_matrix(name: str, weight: Tensor) -> bool:
@@ -145,5 +149,5 @@ def _is_qkv(name: str, settings: TrainSettings) -> bool:
     return settings.muon_takes == "hidden" and name.endswith(_QKV)
 
 
-def _kept(optimizer: torch.optim.Optimizer) -> tuple[str, ...]:
+def _state_names(optimizer: torch.optim.Optimizer) -> tuple[str, ...]:
     return ADAMW_KEEPS if isinstance(optimizer, torch.optim.AdamW) else MUON_KEEPS

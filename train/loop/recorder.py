@@ -1,4 +1,4 @@
-"""What the first process writes during a run beside checkpoints: its log and notes."""
+"""Log, notes and curves that the first process writes during a run."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -11,21 +11,21 @@ from PIL import Image
 from storage.atomic import write_atomically, write_error
 from storage.settings.described import settings_record
 from train.evaluation.judge import Judge
-from train.evaluation.sheet import drawn_validation_sheet
+from train.evaluation.sheet import draw_validation_sheet
 from train.folder import RunFolder
 from train.loop.state import TrainState
+from train.monitoring.notes import add_note
+from train.monitoring.rows import read_rows
+from train.monitoring.scalars import scalars
+from train.monitoring.weights_and_biases import WandbLogger
 from train.progress import TrainProgress
 from train.settings import TrainSettings
-from train.watching.notes import add_note
-from train.watching.rows import read_rows
-from train.watching.scalars import scalars
-from train.watching.weights_and_biases import BiasesBoard
 
 
-class Board:
-    """TensorBoard: the log's numbers as curves, and the validation sheets.
+class TensorBoardLogger:
+    """Writes the log's numbers and the validation sheets for TensorBoard.
 
-    Rows after the first step of a resumed run are written again.
+    A resumed run writes its rows after the first step again.
     """
 
     def __init__(self, folder: Path, *, first_step: int) -> None:
@@ -44,12 +44,12 @@ class Board:
         self._writer.add_image("validation", np.asarray(sheet), step, dataformats="HWC")
 
     def close(self) -> None:
-        """Write what is still in memory."""
+        """Flush and close the files."""
         self._writer.close()
 
 
 class Recorder:
-    """Writes log, notes and curves, and reports to the progress display."""
+    """Writes log, notes and curves, and reports to the progress display; first process only."""
 
     def __init__(
         self,
@@ -66,9 +66,11 @@ class Recorder:
         self._settings = settings
         self._judge = judge
         self._log = MetricsLog(folder.metrics, first_step=first_step)
-        self._boards: list[Board | BiasesBoard] = [Board(folder.tensorboard, first_step=first_step)]
+        self._boards: list[TensorBoardLogger | WandbLogger] = [
+            TensorBoardLogger(folder.tensorboard, first_step=first_step)
+        ]
         if wandb is not None:
-            self._boards.append(BiasesBoard(wandb, folder.root, settings_record(settings)))
+            self._boards.append(WandbLogger(wandb, folder.root, settings_record(settings)))
 
     def row(self, row: Mapping[str, Any]) -> None:
         """Write one row of the log."""
@@ -77,55 +79,55 @@ class Recorder:
             board.scalars(row)
 
     def note(self, step: int, text: str) -> None:
-        """Tell the user something, and keep it; a sentence without its full stop."""
-        self.progress.noted(text)
+        """Report a sentence without its full stop, and append it to notes.jsonl."""
+        self.progress.note(text)
         add_note(self._folder.notes, step, text)
 
     def has_validated(self, step: int) -> bool:
-        """Return whether the log has a validation of a step, or there is nothing to judge on."""
+        """Return whether the log has a validation of a step, or there is no validation split."""
         rows = read_rows(self._folder.metrics)
         return self._judge is None or any(
             "validation" in row and row["step"] == step for row in rows
         )
 
     def validate(self, state: TrainState, between: Callable[[], None] = lambda: None) -> None:
-        """Judge the network on the validation split, if there is one, and write down how it did.
+        """Evaluate the network on the validation split, if there is one, and write its scores.
 
         Args:
-            state: of the run.
-            between: as `Judge.judge` takes it; where it raises, nothing is written.
+            state: state of the run.
+            between: as in `Judge.judge`; if it raises, nothing is written.
         """
         if self._judge is None:
             return
-        judgement = self._judge.judge(state.shown, between)
-        self.row({"step": state.step, "validation": judgement.scores})
-        sheet = drawn_validation_sheet(self._settings, self._judge, judgement, state.step)
+        validation = self._judge.judge(state.eval_model, between)
+        self.row({"step": state.step, "validation": validation.scores})
+        sheet = draw_validation_sheet(self._settings, self._judge, validation, state.step)
         median = {"median_picture_log_l1": self._judge.median_scores["log_l1"]}
         for board in self._boards:
             board.scalars({"step": state.step, "validation": median})
             board.sheet(state.step, sheet)
-        self.progress.validated(step=state.step, scores=judgement.scores)
+        self.progress.report_validation(step=state.step, scores=validation.scores)
 
     def close(self) -> None:
-        """Write what is still in memory."""
+        """Flush and close all loggers."""
         for board in self._boards:
             board.close()
 
 
 class MetricsLog:
-    """metrics.jsonl: one JSON object per line, each with the step after which it was taken."""
+    """Writer of metrics.jsonl: one JSON object per line, each with its step."""
 
     def __init__(self, path: Path, *, first_step: int) -> None:
-        """Cut the log back to `first_step`, the checkpoint: later rows will be written again.
+        """Drop rows after `first_step`, the step of the checkpoint: they will be written again.
 
-        A line that a kill cut short is dropped with them, since it is the last.
+        An incomplete last line, left by a kill, is dropped too.
         """
         self.path = path
-        kept = [row for row in read_rows(path) if row["step"] <= first_step]
-        write_atomically(path, "".join(_line(row) for row in kept).encode())
+        rows = [row for row in read_rows(path) if row["step"] <= first_step]
+        write_atomically(path, "".join(_line(row) for row in rows).encode())
 
     def append(self, row: Mapping[str, Any]) -> None:
-        """Write one row at once, so that it can be followed while the run goes on."""
+        """Append one row and close the file, so that readers can follow the run."""
         try:
             with self.path.open("a") as stream:
                 stream.write(_line(row))

@@ -1,7 +1,7 @@
-"""The learning rate by the step: a warm-up, then a constant rate and a decay, or one cosine.
+"""Learning rate of each step: a warm-up, then a constant rate and a decay, or one cosine.
 
-A constant rate knows nothing of the end. So until its decay begins, a run is to the bit the first
-part of any longer one, and what goes on from there is that longer run (Hägele et al. 2024).
+A constant rate does not depend on the number of steps. So until its decay begins, a run is exactly
+the first part of any longer run, and can be extended from there (Hägele et al. 2024).
 """
 
 import math
@@ -9,10 +9,10 @@ import math
 from train.settings import TrainSettings
 
 
-def decay_begins(settings: TrainSettings) -> int | None:
-    """Return after how many steps a constant rate begins to fall.
+def decay_start_step(settings: TrainSettings) -> int | None:
+    """Return the number of steps after which a constant rate begins to fall.
 
-    None where no rate is constant, or where it stays so to the end.
+    None if the schedule has no constant rate, or no decay.
     """
     if settings.schedule != "wsd" or not settings.decay_share:
         return None
@@ -25,20 +25,20 @@ def learning_rate(step: int, settings: TrainSettings) -> float:
     if step < settings.warmup_steps:
         return settings.learning_rate * (step + 1) / (settings.warmup_steps + 1)
     if settings.schedule == "cosine":
-        fraction = _part_of(step, settings.warmup_steps, settings)
-        return _fallen(0.5 * (1 + math.cos(math.pi * fraction)), settings)
-    begins = decay_begins(settings)
+        fraction = _decay_fraction(step, settings.warmup_steps, settings)
+        return _rate_above_final(0.5 * (1 + math.cos(math.pi * fraction)), settings)
+    begins = decay_start_step(settings)
     if begins is None or step < begins:
         return settings.learning_rate
-    return _fallen(1 - math.sqrt(_part_of(step, begins, settings)), settings)
+    return _rate_above_final(1 - math.sqrt(_decay_fraction(step, begins, settings)), settings)
 
 
-def _part_of(step: int, begins: int, settings: TrainSettings) -> float:
-    """Return how far a step is from where a decay begins to the last step, from 0 to 1."""
+def _decay_fraction(step: int, begins: int, settings: TrainSettings) -> float:
+    """Return the position of a step between the start of a decay and the last step, 0 to 1."""
     return min((step - begins) / max(settings.num_steps - 1 - begins, 1), 1.0)
 
 
-def _fallen(share: float, settings: TrainSettings) -> float:
-    """Return the rate of which a share is left above the final one."""
+def _rate_above_final(fraction: float, settings: TrainSettings) -> float:
+    """Return the rate at a fraction of the way from the final rate to the peak."""
     final = settings.learning_rate * settings.final_rate_share
-    return final + (settings.learning_rate - final) * share
+    return final + (settings.learning_rate - final) * fraction

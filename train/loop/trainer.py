@@ -1,4 +1,8 @@
-"""The loop: step, log, validate, save, and stop when asked to."""
+"""Training loop: step, log, validate, save, and stop on a signal.
+
+A step is launched, and later synced: until then it is in `Trainer.pending`. Steps are synced at
+once on a CPU, at each row of the log on a GPU, and before every validation and checkpoint.
+"""
 
 import math
 import time
@@ -12,38 +16,38 @@ import torch
 
 from model.costs import Workload, training_flops
 from storage.errors import TrilightError
-from train.data.arrival import CopyStream, StepScenes
+from train.data.device_prefetch import CopyStream, StepScenes
 from train.folder import RunFolder
-from train.loop.background import Background
-from train.loop.checkpoints import keep_checkpoint
-from train.loop.crew import Crew
-from train.loop.enough_memory import enough_memory
-from train.loop.interrupts import Stopped, ValidationLeft, deferred_interrupts
+from train.loop.background import BackgroundWriter
+from train.loop.checkpoints import save_checkpoint
+from train.loop.distributed import DistributedContext
+from train.loop.interrupts import Stopped, ValidationInterrupted, deferred_interrupts
+from train.loop.out_of_memory import explain_out_of_memory
 from train.loop.recorder import Recorder
-from train.loop.schedule import decay_begins, learning_rate
+from train.loop.schedule import decay_start_step, learning_rate
 from train.loop.state import TrainState
-from train.loop.step import Stepper, StepReport, Unread
+from train.loop.step import PendingStats, Stepper, StepReport
 from train.loop.window import Window, device_peak
 from train.loss.objective import Objective
+from train.monitoring.process_monitor import ProcessMonitor
+from train.monitoring.settings import WatchSettings
 from train.progress import TrainProgress
 from train.settings import TrainSettings
-from train.watching.settings import WatchSettings
-from train.watching.watch import Watch
 
 WATCHED_STEPS = 50
-"""Number of steps after the warm-up that are looked at, once."""
+"""Number of steps after the warm-up whose pictures are checked, once."""
 
 DEAD_BRIGHTNESS = 0.01
-"""Pictures with less than this share of the targets' brightness are black in all but name. The L1
-error does not tell: a fast start overshoots, and is then worse than black while it learns."""
+"""Fraction of the targets' brightness below which pictures count as black. The L1 error cannot
+tell: a fast start overshoots, and is then worse than black while it learns."""
 
 
-class StartWatch:
-    """Notices a run whose pictures stay black in the first steps after the warm-up.
+class DeadStartDetector:
+    """Detects a run whose pictures stay black in the first steps after the warm-up.
 
-    An output that is pushed below 0 can lose its gradient for good: with the loss behind the ELU
-    six of nine small runs ended so. Ours is taken before it and none has, but a wrong setting can
-    still do it, and a night later is too late to hear of it.
+    An output that is pushed below 0 can lose its gradient for good: with the loss after the ELU six
+    of nine small runs ended so. Ours is taken before it and none has, but a wrong setting can still
+    cause it, and would waste a night of training.
     """
 
     def __init__(self, settings: TrainSettings) -> None:
@@ -52,15 +56,15 @@ class StartWatch:
         self._is_judged = False
 
     def add(self, step: int, report: StepReport) -> None:
-        """Look at one step, from 1, when it is known what it did."""
+        """Add the report of one step, counted from 1."""
         if step <= self.due:
             self._reports.append(report)
 
     def verdict(self, step: int) -> TrilightError | None:
-        """Return the error if the start is dead, looked at once, after `due` steps; else None.
+        """Return the error of a dead start, checked once after `due` steps; else None.
 
-        A run that is resumed after that step is not looked at again. `step` is the last one of
-        which it is known what it did.
+        A run that is resumed after that step is not checked again. `step` is the last one whose
+        report was added.
         """
         if step < self.due or self._is_judged:
             return None
@@ -78,29 +82,29 @@ class StartWatch:
 
 
 PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-"""Types of the network's products, by `precision`."""
-MOST_SKIPPED_IN_A_ROW = 10
+"""Types of the network's matrix products, by the setting `precision`."""
+MAX_SKIPPED_IN_A_ROW = 10
 """A few steps may overflow; this many in a row mean that the weights themselves are lost."""
 
 
-MOST_UNREAD = 100
-"""Steps after which a card is waited for, however rare the rows of the log are."""
+MAX_PENDING = 100
+"""Maximum number of pending steps before the GPU is synced, however rare rows of the log are."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Taken:
-    """A step that was taken, and of which the host does not know yet what it did."""
+class _PendingStep:
+    """A launched step whose statistics the host has not read yet."""
 
     step: int
-    """Its number, from 1."""
+    """Number of the step, from 1."""
     keys: Sequence[str]
-    """Of this process's scenes."""
-    unread: Unread
-    """What will be read."""
+    """Sample keys of this process's scenes."""
+    stats: PendingStats
+    """Statistics of the step, still on the device."""
 
 
 def scene_flops(settings: TrainSettings, num_triangles: int) -> int:
-    """Return what a scene of so many triangles costs in a step of a run."""
+    """Return the FLOPs of a scene with so many triangles in a training step."""
     workload = Workload(
         triangles=num_triangles,
         views=settings.views_per_scene,
@@ -110,7 +114,15 @@ def scene_flops(settings: TrainSettings, num_triangles: int) -> int:
 
 
 class Trainer:
-    """Drives one run from the state's step to its last one, in step with the other processes."""
+    """Runs all remaining steps, in lockstep with the other processes.
+
+    Attributes:
+        pending: launched steps that are not synced yet, oldest first.
+        asked_to_stop: True once a synced step says that a process received a signal.
+        saved_step: step of the last checkpoint of this call; None before the first.
+        num_reported_bad: messages about damaged data that were already reported.
+        dead_start: checks once, after the warm-up, that pictures are not black.
+    """
 
     def __init__(
         self,
@@ -118,160 +130,163 @@ class Trainer:
         state: TrainState,
         settings: TrainSettings,
         objective: Objective,
-        crew: Crew,
+        dist_context: DistributedContext,
         folder: RunFolder,
         data_digest: str,
         recorder: Recorder | None,
         watched: WatchSettings | None = None,
     ) -> None:
-        """Take the parts; the recorder is the first process's, None in the others."""
+        """Create the trainer; `recorder` is None in all processes but the first."""
         self.state = state
         self.settings = settings
-        self.crew = crew
+        self.dist_context = dist_context
         self.folder = folder
         self.data_digest = data_digest
         self.recorder = recorder
-        self.stepper = Stepper(state, settings, objective, crew)
-        self.copies = CopyStream(crew.device)
-        self.start_watch = StartWatch(settings)
+        self.stepper = Stepper(state, settings, objective, dist_context)
+        self.copies = CopyStream(dist_context.device)
+        self.dead_start = DeadStartDetector(settings)
         self.window = Window(state.reports)
-        self.taken: list[_Taken] = []
+        self.pending: list[_PendingStep] = []
         self.asked_to_stop = False
-        self.num_noted = 0
+        self.num_reported_bad = 0
         self.saved_step: int | None = None
-        self.writing = Background()
+        self.writing = BackgroundWriter()
         progress = TrainProgress() if recorder is None else recorder.progress
         self.progress = progress
-        self.watch = Watch(
+        self.watch = ProcessMonitor(
             settings,
             watched or WatchSettings(),
             self.stepper,
-            crew,
+            dist_context,
             folder,
-            noted=self._note,
-            hung=progress.hung,
+            note=self._note,
+            report_hang=progress.report_hang,
         )
 
     def run(self, steps: Iterator[StepScenes]) -> None:
         """Take all remaining steps; `steps` begins with that of the state's step.
 
         Raises:
-            TrilightError: a signal asked to stop or the start went dead (the state is saved), or
-                the steps keep failing.
+            TrilightError: a signal stops the run or the start is dead (the state is saved), or too
+                many steps in a row fail.
         """
         with (
             self.watch,
             self.writing,
-            deferred_interrupts(self.progress.interrupted) as asked_to_stop,
+            deferred_interrupts(self.progress.report_interrupt) as asked_to_stop,
         ):
             self._catch_up(asked_to_stop)
             while self.state.step < self.settings.num_steps:
                 self._step(steps, asked_to_stop)
                 waited = self._after_step(asked_to_stop)
-                self._leave_if_asked(asked_to_stop, together=waited)
+                self._stop_if_asked(asked_to_stop, together=waited)
                 if self.state.step == self.settings.num_steps:
                     return
-                if not self.taken and (verdict := self.start_watch.verdict(self.state.step)):
-                    self._leave(verdict)
+                if not self.pending and (verdict := self.dead_start.verdict(self.state.step)):
+                    self._save_and_raise(verdict)
 
     def _catch_up(self, asked_to_stop: Callable[[], bool]) -> None:
-        """Make up for the validation that a signal ended, after which the state was saved."""
-        if self.state.step == 0 or not self._validates():
+        """Repeat the validation that a signal interrupted before the state was saved."""
+        if self.state.step == 0 or not self._is_validation_due():
             return
         missing = self.recorder is not None and not self.recorder.has_validated(self.state.step)
-        if self.crew.any(missing):
+        if self.dist_context.any(missing):
             self._validate(asked_to_stop)
-            self._leave_if_asked(asked_to_stop, together=True)
+            self._stop_if_asked(asked_to_stop, together=True)
 
-    def _leave_if_asked(self, asked_to_stop: Callable[[], bool], *, together: bool) -> None:
-        """Leave where a process was asked to; all stop at the same step.
+    def _stop_if_asked(self, asked_to_stop: Callable[[], bool], *, together: bool) -> None:
+        """Save and stop if any process received a signal; all stop at the same step.
 
-        One may be signalled before another. Several are told with what a step did, when that is
-        read; `together` they tell each other now, which waits.
+        One process may be signaled before another. Several processes exchange the flag with the
+        statistics of a step; with `together` they exchange it now, which waits.
         """
         stopping = self.asked_to_stop
-        if together or self.crew.world_size == 1:
+        if together or self.dist_context.world_size == 1:
             with self.watch.exchange():
-                stopping = self.crew.any(asked_to_stop())
+                stopping = self.dist_context.any(asked_to_stop())
         if stopping:
-            self._leave(Stopped(self.state.step))
+            self._save_and_raise(Stopped(self.state.step))
 
-    def _leave(self, reason: TrilightError) -> None:
+    def _save_and_raise(self, reason: TrilightError) -> None:
         with self.watch.pause("saving"):
             if self.saved_step != self.state.step:
                 self._save()
             self.writing.wait()
-            # a barrier: torchrun ends all processes with the first that ends, so wait for the file
-            self.crew.any(False)
+            # torchrun ends all processes with the first that ends, so wait for the file
+            self.dist_context.barrier()
         raise reason
 
     def _step(self, steps: Iterator[StepScenes], asked_to_stop: Callable[[], bool]) -> None:
-        self.watch.begins(self.state.step + 1)
+        self.watch.begin_step(self.state.step + 1)
         self.stepper.activity.begin("data")
-        asked = time.monotonic()
-        drawn = next(steps)
-        waited_s = time.monotonic() - asked
+        wait_began_s = time.monotonic()
+        scenes = next(steps)
+        waited_s = time.monotonic() - wait_began_s
         self.stepper.activity.begin("other")
-        settings, step = self.settings, self.state.step
-        with enough_memory(settings, step):
-            batches, rate = self.copies.send(drawn.batches), learning_rate(step, settings)
-            unread = self.stepper.take(batches, rate, asked_to_stop=asked_to_stop())
+        settings = self.settings
+        step = self.state.step
+        with explain_out_of_memory(settings, step):
+            batches = self.copies.send(scenes.batches)
+            rate = learning_rate(step, settings)
+            stats = self.stepper.launch(batches, rate, asked_to_stop=asked_to_stop())
         self._note_unusable()
         while self.stepper.remarks:
             self._note(self.stepper.remarks.pop(0))
-        self.window.spend(
+        self.window.add_cost(
             views=settings.scenes_per_step * settings.views_per_scene,
             waited_s=waited_s,
-            flops=sum(scene_flops(settings, count) for count in drawn.num_triangles),
+            flops=sum(scene_flops(settings, count) for count in scenes.num_triangles),
         )
         self.state.step += 1
-        self.watch.ends()
-        self.taken.append(_Taken(step=self.state.step, keys=drawn.keys, unread=unread))
-        known = not self.stepper.is_late or self.watch.ends_window(self.state.step)
-        if known or len(self.taken) == MOST_UNREAD:
-            self._read()
+        self.watch.end_step()
+        self.pending.append(_PendingStep(step=self.state.step, keys=scenes.keys, stats=stats))
+        syncs = not self.stepper.defer_sync or self.watch.is_window_end(self.state.step)
+        if syncs or len(self.pending) == MAX_PENDING:
+            self._sync()
 
-    def _read(self) -> None:
-        """Learn what the steps did that were taken since the last time; waits for them."""
-        taken, self.taken = self.taken, []
-        if not taken:
+    def _sync(self) -> None:
+        """Wait for the pending steps, and process their reports."""
+        pending = self.pending
+        self.pending = []
+        if not pending:
             return
-        read = self.stepper.read([each.unread for each in taken])
-        self.asked_to_stop = read.asked_to_stop
-        for each, report in zip(taken, read.reports, strict=True):
+        synced = self.stepper.sync([each.stats for each in pending])
+        self.asked_to_stop = synced.asked_to_stop
+        for each, report in zip(pending, synced.reports, strict=True):
             self.window.add(report)
-            self.start_watch.add(each.step, report)
-            self.watch.read(each.step, report, each.keys)
+            self.dead_start.add(each.step, report)
+            self.watch.add_report(each.step, report, each.keys)
             if report.applied:
                 self.state.skipped_in_a_row = 0
             else:
                 self._skip(each)
         self.progress.advance(
             step=self.state.step,
-            loss=read.reports[-1].loss,
+            loss=synced.reports[-1].loss,
             learning_rate=learning_rate(self.state.step - 1, self.settings),
             views_per_s=self.window.views_per_s,
         )
 
     def _note_unusable(self) -> None:
-        """Name each damaged sample or shard once, when it has been left out."""
-        messages = self.state.unusable.messages
-        for message in messages[self.num_noted :]:
+        """Report each damaged sample or shard once, after it was left out."""
+        messages = self.state.bad_samples.messages
+        for message in messages[self.num_reported_bad :]:
             self._note(f"left out: {message.rstrip('.')}")
-        self.num_noted = len(messages)
+        self.num_reported_bad = len(messages)
 
-    def _skip(self, taken: _Taken) -> None:
-        """Count a skipped step, and name this process's scenes."""
+    def _skip(self, pending: _PendingStep) -> None:
+        """Count a skipped step and report its scenes; raise after too many in a row."""
         self.state.skipped_steps += 1
         self._note(
-            f"step {taken.step} was skipped, since its loss or gradient was not finite; "
-            f"its scenes were {', '.join(taken.keys)}",
-            taken.step,
+            f"step {pending.step} was skipped, since its loss or gradient was not finite; "
+            f"its scenes were {', '.join(pending.keys)}",
+            pending.step,
         )
         self.state.skipped_in_a_row += 1
-        if self.state.skipped_in_a_row == MOST_SKIPPED_IN_A_ROW:
+        if self.state.skipped_in_a_row == MAX_SKIPPED_IN_A_ROW:
             raise TrilightError(
-                f"training: {MOST_SKIPPED_IN_A_ROW} steps in a row up to step {taken.step} "
+                f"training: {MAX_SKIPPED_IN_A_ROW} steps in a row up to step {pending.step} "
                 "had a loss or gradient that was not finite; the weights are unchanged by them. "
                 "Resumed as it is, it would come here again. Go on with --resume --change "
                 f"learning_rate={self.settings.learning_rate / 2:g}, or with another order of the "
@@ -279,30 +294,32 @@ class Trainer:
                 "another folder, --branch."
             )
 
-    def _validates(self) -> bool:
-        """Return whether a validation follows the state's step."""
-        step, settings = self.state.step, self.settings
+    def _is_validation_due(self) -> bool:
+        """Return whether the state's step is followed by a validation."""
+        step = self.state.step
+        settings = self.settings
         return step == settings.num_steps or step % settings.validate_every == 0
 
     def _validate(self, asked_to_stop: Callable[[], bool]) -> None:
         def between() -> None:
             if asked_to_stop():
-                raise ValidationLeft
+                raise ValidationInterrupted
 
-        with self.window.pause(), self.watch.pause("validation"), suppress(ValidationLeft):
+        with self.window.pause(), self.watch.pause("validation"), suppress(ValidationInterrupted):
             if self.recorder is not None:
                 self.recorder.validate(self.state, between)
 
     def _after_step(self, asked_to_stop: Callable[[], bool]) -> bool:
-        """Do what is due after a step; return whether the processes waited for each other."""
-        settings, step = self.settings, self.state.step
-        if self.watch.ends_window(step):
+        """Log, validate and save if due; return whether the processes waited for each other."""
+        settings = self.settings
+        step = self.state.step
+        if self.watch.is_window_end(step):
             self._end_window()
-        validates = self._validates()
+        validates = self._is_validation_due()
         last = step == settings.num_steps
-        saves = last or step % settings.checkpoint_every == 0 or step == decay_begins(settings)
+        saves = last or step % settings.checkpoint_every == 0 or step == decay_start_step(settings)
         if validates or saves:
-            self._read()  # a card's work on steps counts as such, and not as a pause
+            self._sync()  # the GPU's work on steps must not count as a pause
         if validates:
             self._validate(asked_to_stop)
         if saves:
@@ -311,8 +328,8 @@ class Trainer:
         return validates or saves
 
     def _end_window(self) -> None:
-        """Exchange what was seen since the last window, and write the row."""
-        seen, spikes = self.watch.window()
+        """Exchange statistics with the other processes, and write the row of the log."""
+        seen, spikes = self.watch.end_window()
         if self.recorder is not None:
             self._write_window(self.recorder, seen, spikes)
         self.state.reports = []
@@ -323,7 +340,7 @@ class Trainer:
     ) -> None:
         for spike in spikes:
             recorder.row(spike)
-        peak = device_peak(self.crew.device, PRODUCTS[self.settings.precision])
+        peak = device_peak(self.dist_context.device, PRODUCTS[self.settings.precision])
         row = {
             "step": self.state.step,
             "learning_rate": learning_rate(self.state.step - 1, self.settings),
@@ -334,19 +351,19 @@ class Trainer:
         recorder.row({**row, **seen})
 
     def _note(self, text: str, step: int | None = None) -> None:
-        """Tell the user, in the first process; of the last step, unless said."""
+        """Report a note in the first process; by default about the last step."""
         if self.recorder is not None:
             self.recorder.note(self.state.step if step is None else step, text)
 
     def _save(self) -> None:
-        self._read()
+        self._sync()
         self.saved_step = self.state.step
-        if self.crew.is_first:
-            keep_checkpoint(
+        if self.dist_context.is_first:
+            save_checkpoint(
                 self.folder.checkpoints,
                 self.state,
                 self.settings,
                 data_digest=self.data_digest,
-                world_size=self.crew.world_size,
-                begin=self.writing.begin,
+                world_size=self.dist_context.world_size,
+                submit=self.writing.begin,
             )

@@ -1,4 +1,4 @@
-"""Steps since the last row of the log: losses, speed, time spent; and the device's peak."""
+"""Statistics of the steps since the last row of the log, and the device's peak speed."""
 
 import math
 import time
@@ -12,13 +12,13 @@ from train.loop.step import StepReport
 
 
 class Window:
-    """Collects steps until a row is written."""
+    """Accumulates steps until a row of the log is written."""
 
     def __init__(self, reports: list[StepReport]) -> None:
-        """Begin with steps before this call, whose losses count and whose time does not.
+        """Begin with steps of an earlier call, whose losses count and whose time does not.
 
         Args:
-            reports: of those; is kept up to date.
+            reports: reports of those steps; the window appends to this list.
         """
         self._reports = reports
         self._began = time.monotonic()
@@ -27,23 +27,23 @@ class Window:
         self._flops = 0.0
 
     def add(self, report: StepReport) -> None:
-        """Count what one step did, when it is known."""
+        """Append the report of one step."""
         self._reports.append(report)
 
-    def spend(self, *, views: int, waited_s: float, flops: float) -> None:
-        """Count what one step took.
+    def add_cost(self, *, views: int, waited_s: float, flops: float) -> None:
+        """Add the cost of one step.
 
         Args:
-            views: of all processes.
-            waited_s: time in which the network waited for data.
-            flops: what this process's scenes need, without padding.
+            views: number of views over all processes.
+            waited_s: seconds in which the network waited for data.
+            flops: FLOPs of this process's scenes, without padding.
         """
         self._views += views
         self._waited_s += waited_s
         self._flops += flops
 
     def pause(self) -> "Pause":
-        """Return a context whose time does not count, for validation and checkpoints."""
+        """Return a context whose time is excluded, for validation and checkpoints."""
         return Pause(self)
 
     @property
@@ -52,7 +52,7 @@ class Window:
         return self._views / self._seconds()
 
     def row(self, peak_flops_per_s: float) -> dict[str, Any]:
-        """Return what the log says about these steps; None where no step was finite."""
+        """Return the log's values of these steps; a mean is None if no step was finite."""
         return {
             "loss": _finite_mean(report.loss for report in self._reports),
             "l1": _finite_mean(report.l1 for report in self._reports),
@@ -66,13 +66,13 @@ class Window:
     def _seconds(self) -> float:
         return max(time.monotonic() - self._began, 1e-9)
 
-    def leave_out(self, seconds: float) -> None:
-        """Do not count some seconds that have passed."""
+    def exclude(self, seconds: float) -> None:
+        """Exclude some past seconds from the window's time."""
         self._began += seconds
 
 
 class Pause:
-    """Time that a window does not count."""
+    """Context whose time a window excludes."""
 
     def __init__(self, window: Window) -> None:
         self._window = window
@@ -81,7 +81,7 @@ class Pause:
         self._began = time.monotonic()
 
     def __exit__(self, *_: object) -> None:
-        self._window.leave_out(time.monotonic() - self._began)
+        self._window.exclude(time.monotonic() - self._began)
 
 
 def _finite_mean(values: Iterable[float]) -> float | None:
@@ -90,15 +90,15 @@ def _finite_mean(values: Iterable[float]) -> float | None:
 
 
 PEAK_WIDTH = {"cpu": 1024, "cuda": 8192}
-"""Width of the square matrix product whose speed counts as the device's peak."""
+"""Width of the square matrix product that measures a device's peak speed, by device type."""
 
 
 @lru_cache
 def device_peak(device: torch.device, dtype: torch.dtype) -> float:
-    """Return the operations per second of a large square product here: the best of five.
+    """Return the FLOPs per second of a large square matrix product: the best of five.
 
-    It takes some milliseconds and then the measured value is remembered. No program reaches the
-    data sheet's figure.
+    Measuring takes some milliseconds, once. The data sheet's figure is not used, since no program
+    reaches it.
     """
     width = PEAK_WIDTH[device.type]
     matrix = torch.ones(width, width, dtype=dtype, device=device)

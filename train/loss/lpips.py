@@ -1,7 +1,7 @@
-"""LPIPS (Zhang et al. 2018), version 0.1 on VGG16: how different two pictures look.
+"""LPIPS (Zhang et al. 2018), version 0.1 on VGG16: perceptual distance of two pictures.
 
 Written in plain torch from the paper and the published weights' names; torchvision is not needed.
-Only with the published weights are the values LPIPS: without them a run must name another term, and
+Values are LPIPS only with the published weights: without them a run must name another term, and
 reports say n/a.
 
 Trilight does not ship the weights, since VGG16 is 528 MB. They come from a folder or from their
@@ -19,31 +19,31 @@ from torch import Tensor, nn
 from storage.errors import TrilightError
 
 BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
-"""Numbers of the convolutions in torchvision's `features`; a pooling stands between two blocks."""
+"""Indices of the convolutions in torchvision's `features`; a pooling separates two blocks."""
 
 MIN_PX = 16
-"""Four poolings halve the picture; the last block needs a pixel."""
+"""Minimum width of a picture: four poolings halve it, and the last block needs a pixel."""
 
 
 class Vgg16(nn.Module):
     """VGG16 (Simonyan and Zisserman 2015, configuration D) up to relu5_3; never trained.
 
-    Pictures -> the output of the last convolution of each block. The shapes in the state dict,
-    under torchvision's names, say how wide the layers are.
+    Maps pictures to the output of the last convolution of each block. The shapes in the state
+    dict, under torchvision's names, define the widths of the layers.
     """
 
     def __init__(self, state: Mapping[str, Tensor]) -> None:
-        """Take the weights `features.<n>.weight` and `.bias`; others are left alone.
+        """Load the weights `features.<n>.weight` and `.bias`; others are ignored.
 
         Raises:
-            TrilightError: one is missing, or does not fit to the one before it.
+            TrilightError: one is missing, or its shape does not fit the layer before it.
         """
         super().__init__()
         self.convolutions = nn.ModuleList()
         channels = 3
         for number in (number for block in BLOCKS for number in block):
             names = [f"features.{number}.{part}" for part in ("weight", "bias")]
-            weight, bias = (_found(state, name) for name in names)
+            weight, bias = (_get_weight(state, name) for name in names)
             if weight.shape[1:] != (channels, 3, 3) or bias.shape != weight.shape[:1]:
                 raise TrilightError(
                     f"VGG16: {names[0]} has the shape {tuple(weight.shape)}; expected "
@@ -57,7 +57,9 @@ class Vgg16(nn.Module):
 
     def forward(self, picture_M3RR: Tensor) -> list[Tensor]:
         """Return the five tapped grids [M, C, R / 2^k, R / 2^k] of pictures, k = 0 ... 4."""
-        x, taps, layers = picture_M3RR, [], iter(self.convolutions)
+        x = picture_M3RR
+        taps = []
+        layers = iter(self.convolutions)
         for index, block in enumerate(BLOCKS):
             if index:
                 x = nn.functional.max_pool2d(x, 2)
@@ -67,7 +69,7 @@ class Vgg16(nn.Module):
         return taps
 
 
-def _found(state: Mapping[str, Tensor], name: str) -> Tensor:
+def _get_weight(state: Mapping[str, Tensor], name: str) -> Tensor:
     if name not in state:
         raise TrilightError(
             f"VGG16: the file has no {name}; expected the state dict of torchvision's vgg16."
@@ -80,11 +82,11 @@ SCALE = (0.458, 0.448, 0.450)
 """ImageNet's mean and spread per channel, for pictures in [-1, 1]."""
 
 EPS = 1e-10
-"""Keeps the length of a feature vector above 0."""
+"""Minimum length of a feature vector, to avoid a division by 0."""
 
 
 class Lpips(nn.Module):
-    """Pairs of pictures -> one distance each, 0 for equal ones."""
+    """Distance of pairs of pictures, 0 for equal ones."""
 
     shift_311: Tensor
     scale_311: Tensor
@@ -138,21 +140,20 @@ class Lpips(nn.Module):
         return distance_M
 
     def _features(self, picture_M3RR: Tensor) -> list[Tensor]:
-        taps: list[Tensor] = self.vgg16((2 * picture_M3RR - 1 - self.shift_311) / self.scale_311)
-        return taps
+        return self.vgg16((2 * picture_M3RR - 1 - self.shift_311) / self.scale_311)
 
 
 def _unit(x_MCHW: Tensor) -> Tensor:
-    """Return features of unit length per pixel; where all are 0 they stay so, gradient and all."""
+    """Normalize features to unit length per pixel; zeros stay 0, and so does their gradient."""
     length = (x_MCHW.square().sum(dim=1, keepdim=True) + EPS**2).sqrt()
     return x_MCHW / (length + EPS)
 
 
 VGG16_FILE = "vgg16-397923af.pth"
-"""torchvision's file of VGG16; the name holds the beginning of its sha256."""
+"""File name of torchvision's VGG16; it includes the start of its sha256."""
 
 LINEAR_FILE = "vgg.pth"
-"""The linear weights of LPIPS 0.1 on VGG16 (6 KB)."""
+"""File name of the linear weights of LPIPS 0.1 on VGG16 (6 KB)."""
 
 VGG16_URL = f"https://download.pytorch.org/models/{VGG16_FILE}"
 LINEAR_URL = (
@@ -161,27 +162,27 @@ LINEAR_URL = (
 )
 
 HUB = "hub"
-"""What to say in place of a folder to download them into torch's cache."""
+"""Value in place of a folder that downloads the files into torch's cache."""
 
 VARIABLE = "TRILIGHT_LPIPS"
-"""Environment variable with the folder, for those who name it once."""
+"""Environment variable with the default folder."""
 
 
-def load_lpips(place: str | None) -> Lpips | None:
-    """Return LPIPS with its published weights, or None where no place is named at all.
+def load_lpips(source: str | None) -> Lpips | None:
+    """Return LPIPS with its published weights, or None if no source is named.
 
     Args:
-        place: a folder with VGG16_FILE and LINEAR_FILE, or `hub`; None asks TRILIGHT_LPIPS.
+        source: folder with VGG16_FILE and LINEAR_FILE, or `hub`; None reads TRILIGHT_LPIPS.
 
     Raises:
         TrilightError: a file is missing, is no state dict, or cannot be downloaded.
     """
-    place = place or os.environ.get(VARIABLE) or None
-    if place is None:
+    source = source or os.environ.get(VARIABLE) or None
+    if source is None:
         return None
-    if place == HUB:
-        return Lpips(_downloaded(VGG16_URL, check_hash=True), _downloaded(LINEAR_URL))
-    return Lpips(_read(Path(place) / VGG16_FILE), _read(Path(place) / LINEAR_FILE))
+    if source == HUB:
+        return Lpips(_download(VGG16_URL, check_hash=True), _download(LINEAR_URL))
+    return Lpips(_read(Path(source) / VGG16_FILE), _read(Path(source) / LINEAR_FILE))
 
 
 def _read(path: Path) -> dict[str, Tensor]:
@@ -194,10 +195,10 @@ def _read(path: Path) -> dict[str, Tensor]:
         state: Any = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises whatever the damage leads to
         raise TrilightError(f"LPIPS: {path} is not readable ({type(error).__name__}).") from error
-    return _checked(state, str(path))
+    return _check_state(state, str(path))
 
 
-def _downloaded(url: str, *, check_hash: bool = False) -> dict[str, Tensor]:
+def _download(url: str, *, check_hash: bool = False) -> dict[str, Tensor]:
     try:
         state = torch.hub.load_state_dict_from_url(
             url, map_location="cpu", weights_only=True, check_hash=check_hash, progress=False
@@ -207,10 +208,10 @@ def _downloaded(url: str, *, check_hash: bool = False) -> dict[str, Tensor]:
             f"LPIPS: {url} could not be downloaded ({error}); name a folder that holds "
             f"{VGG16_FILE} and {LINEAR_FILE} instead."
         ) from error
-    return _checked(state, url)
+    return _check_state(state, url)
 
 
-def _checked(state: Any, where: str) -> dict[str, Tensor]:
+def _check_state(state: Any, where: str) -> dict[str, Tensor]:
     if not isinstance(state, dict) or not all(isinstance(t, Tensor) for t in state.values()):
         raise TrilightError(f"LPIPS: {where} holds no state dict; expected tensors by name.")
     return state

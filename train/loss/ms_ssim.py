@@ -6,15 +6,17 @@ from torch.nn.functional import avg_pool2d, conv2d
 
 from storage.errors import TrilightError
 
-WINDOW_PX, SIGMA_PX = 11, 1.5
-K1, K2 = 0.01, 0.03
+WINDOW_PX = 11
+SIGMA_PX = 1.5
+K1 = 0.01
+K2 = 0.03
 """Constants of both papers, for pictures in [0, 1]."""
 
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponent of each scale, finest first; with fewer scales they are brought to a sum of 1."""
 
-LEAST = 1e-4
-"""A negative product of structures is raised to this, since a power of it has no gradient."""
+MIN_STRUCTURE = 1e-4
+"""Lower bound of a scale's mean, since a power of a negative number has no gradient."""
 
 
 def ssim(a_M3RR: Tensor, b_M3RR: Tensor) -> Tensor:
@@ -26,14 +28,14 @@ def ssim(a_M3RR: Tensor, b_M3RR: Tensor) -> Tensor:
     Raises:
         TrilightError: pictures below 11 pixels.
     """
-    luminance, structure = _parts(a_M3RR, b_M3RR)
+    luminance, structure = _luminance_and_structure(a_M3RR, b_M3RR)
     return (luminance * structure).mean(dim=(1, 2, 3))
 
 
 def ms_ssim(a_M3RR: Tensor, b_M3RR: Tensor) -> Tensor:
     """Return the multi-scale SSIM [M] of pictures in [0, 1].
 
-    As many of the five scales as keep a window's width: 5 from 176 pixels on, 3 at 64.
+    It uses as many of the five scales as are at least a window wide: 5 from 176 pixels, 3 at 64.
 
     Raises:
         TrilightError: pictures below 11 pixels.
@@ -44,30 +46,32 @@ def ms_ssim(a_M3RR: Tensor, b_M3RR: Tensor) -> Tensor:
     weights = [weight / sum(SCALE_WEIGHTS[:scales]) for weight in SCALE_WEIGHTS[:scales]]
     product_M = a_M3RR.new_ones(len(a_M3RR))
     for scale, weight in enumerate(weights):
-        luminance, structure = _parts(a_M3RR, b_M3RR)
+        luminance, structure = _luminance_and_structure(a_M3RR, b_M3RR)
         part = luminance * structure if scale == scales - 1 else structure
-        product_M = product_M * part.mean(dim=(1, 2, 3)).clamp(min=LEAST) ** weight
-        a_M3RR, b_M3RR = avg_pool2d(a_M3RR, 2), avg_pool2d(b_M3RR, 2)
+        product_M = product_M * part.mean(dim=(1, 2, 3)).clamp(min=MIN_STRUCTURE) ** weight
+        a_M3RR = avg_pool2d(a_M3RR, 2)
+        b_M3RR = avg_pool2d(b_M3RR, 2)
     return product_M
 
 
-def _parts(a_M3RR: Tensor, b_M3RR: Tensor) -> tuple[Tensor, Tensor]:
+def _luminance_and_structure(a_M3RR: Tensor, b_M3RR: Tensor) -> tuple[Tensor, Tensor]:
     """Return luminance and contrast-structure of every window (2004, equations 6 and 13)."""
     if a_M3RR.shape[-1] < WINDOW_PX:
         raise TrilightError(
             f"SSIM: pictures of {a_M3RR.shape[-1]} pixels; expected at least {WINDOW_PX}, the "
             "width of its window."
         )
-    mean_a, mean_b = _blurred(a_M3RR), _blurred(b_M3RR)
-    var_a = _blurred(a_M3RR.square()) - mean_a.square()
-    var_b = _blurred(b_M3RR.square()) - mean_b.square()
-    covariance = _blurred(a_M3RR * b_M3RR) - mean_a * mean_b
+    mean_a = _blur(a_M3RR)
+    mean_b = _blur(b_M3RR)
+    var_a = _blur(a_M3RR.square()) - mean_a.square()
+    var_b = _blur(b_M3RR.square()) - mean_b.square()
+    covariance = _blur(a_M3RR * b_M3RR) - mean_a * mean_b
     luminance = (2 * mean_a * mean_b + K1**2) / (mean_a.square() + mean_b.square() + K1**2)
     structure = (2 * covariance + K2**2) / (var_a + var_b + K2**2)
     return luminance, structure
 
 
-def _blurred(x_M3RR: Tensor) -> Tensor:
+def _blur(x_M3RR: Tensor) -> Tensor:
     """Return the Gaussian means of windows that lie within the picture."""
     offset = torch.arange(WINDOW_PX, dtype=x_M3RR.dtype, device=x_M3RR.device) - WINDOW_PX // 2
     weight = torch.exp(-0.5 * (offset / SIGMA_PX) ** 2)

@@ -1,4 +1,4 @@
-"""The loss of a run: L1 on log10(1 + radiance), a perceptual term, and the weight of each view."""
+"""Loss of a run: L1 on log10(1 + radiance), a perceptual term, and the weight of each view."""
 
 import math
 from collections.abc import Callable
@@ -14,23 +14,23 @@ from train.settings import LossSettings
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ViewLosses:
-    """What the views of a batch cost."""
+    """Losses of the views of a batch."""
 
     total_BV: Tensor
-    """What is minimised, summed over terms and weighed."""
+    """Weighted sum of all terms per view, which training minimizes."""
     l1_BV: Tensor
-    """The first term alone, neither weighed nor part of any gradient."""
+    """L1 term alone, unweighted and detached from the gradient."""
 
 
 class Objective(nn.Module):
-    """Compares pictures as a run's settings say, on the device that it was moved to."""
+    """Loss function of a run's settings."""
 
     def __init__(self, settings: LossSettings, lpips: Lpips | None) -> None:
-        """Take the settings, and LPIPS where they ask for it.
+        """Create the loss; `lpips` is needed only if the settings use it.
 
         Raises:
-            TrilightError: they ask for LPIPS and its weights are not here. No other term takes its
-                place by itself.
+            TrilightError: the settings use LPIPS and its weights are missing; no other term
+                replaces it silently.
         """
         super().__init__()
         self.settings = settings
@@ -51,7 +51,7 @@ class Objective(nn.Module):
         total_BV = l1_BV
         if self._dissimilarity is not None:
             pictures = [
-                tone_mapped(log10_BVRR3).flatten(0, 1).movedim(-1, 1)
+                tone_map(log10_BVRR3).flatten(0, 1).movedim(-1, 1)
                 for log10_BVRR3 in (prediction_BVRR3, target_BVRR3)
             ]
             unlike_BV = self._dissimilarity(*pictures).reshape(l1_BV.shape)
@@ -63,7 +63,7 @@ class Objective(nn.Module):
 
 
 def view_l1(prediction_BVRR3: Tensor, target_BVRR3: Tensor) -> Tensor:
-    """Return the L1 error [B, V] of log10(1 + radiance), taken before the output's ELU.
+    """Return the L1 error [B, V] of log10(1 + radiance), before the output's ELU.
 
     Zeng et al. 2025, section 4, first term. Before the ELU because its slope is a thousandth for
     negative values: a network that once predicts below 0 would hardly come back. Targets are at
@@ -91,7 +91,7 @@ def _dissimilarity(
 LOG10_OF_2 = math.log10(2.0)
 
 
-def tone_mapped(log10_rgb: Tensor) -> Tensor:
+def tone_map(log10_rgb: Tensor) -> Tensor:
     """Return log10(1 + radiance), any shape, as clamp(log2(1 + radiance), 0, 1).
 
     The tone map of everything perceptual (Zeng et al. 2025, section 4). Radiance above

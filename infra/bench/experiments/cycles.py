@@ -1,4 +1,4 @@
-"""Plain, textured and sky-lit scenes: our pictures compared with raw ones of Blender's Cycles."""
+"""Experiment `cycles`: Trilight's pictures compared with raw ones of Blender's Cycles."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -25,13 +25,16 @@ from storage.conventions import log10_radiance
 from storage.metrics import psnr_linear_db
 from storage.records.scene import Scene
 
-PLAIN, TEXTURED, SKY, GIVEN = "plain", "textured", "sky", "given"
+PLAIN = "plain"
+TEXTURED = "textured"
+SKY = "sky"
+GIVEN = "given"
 RESOLUTION = 64
 OUR_SHARE = 4
-"""Samples of ours, in two halves, for each sample of one picture of Cycles: they cost less."""
+"""Samples of Trilight, in two halves, for each sample of Cycles, since they cost less."""
 
 EXPOSED = 0.5
-"""Radiance that nine tenths of the pixels do not exceed where pictures are compared."""
+"""Radiance of the 90th percentile of pixels after exposure, when pictures are compared."""
 
 AIM_DB = 36.0
 """Agreement by pixel that is aimed at, or Cycles' with itself less 1 dB where that is lower."""
@@ -78,7 +81,7 @@ def _measure(
 
 
 def _cycles_samples(scene: Scene, spp: int, folder: Path, *, is_plain: bool) -> CyclesSamples:
-    """Return two raw pictures of Cycles: of the arrays of a plain scene, else of our USD."""
+    """Return two raw pictures of Cycles, from a plain scene's arrays, else from its USD."""
     options = CyclesOptions(
         resolution=RESOLUTION, spp=spp, denoise=False, threads=os.cpu_count() or 1
     )
@@ -94,15 +97,16 @@ def _cycles_samples(scene: Scene, spp: int, folder: Path, *, is_plain: bool) -> 
 
 
 def agreement_figures(ours: RawReference, theirs: CyclesSamples) -> dict[str, float]:
-    """Return how well ours agree with a picture of theirs, in dB, and what of it is not noise.
+    """Return the agreement of Trilight with Cycles in dB, also without the noise of both.
 
-    All pictures are exposed alike, so that nine tenths of the pixels are below EXPOSED: what is
-    brighter than 1 counts as 1.
+    All pictures have one exposure, so that nine tenths of the pixels are below EXPOSED; values
+    above 1 count as 1.
     """
     one, other = (picture.astype(np.float64) for picture in theirs.pictures_rgb)
     level = float(np.quantile((one + other).mean(axis=-1) / 2, 0.9))
     exposure = EXPOSED / level if level > 0 else 1.0
-    one, other = one * exposure, other * exposure
+    one = one * exposure
+    other = other * exposure
     ours = RawReference(a_rgb=ours.a_rgb * exposure, b_rgb=ours.b_rgb * exposure)
     their_halves = RawReference(a_rgb=one, b_rgb=other)
     pixels_db = _linear_db(0.5 * (ours.a_rgb + ours.b_rgb), one)
@@ -126,15 +130,15 @@ def _linear_db(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
 def _stated_figures(
     view: RenderedView, ours: RawReference, theirs: CyclesSamples
 ) -> dict[str, float]:
-    """Return a denoised picture's stated error, and its true one to our and to their samples."""
+    """Return a picture's stated error, and its true errors to Trilight's and Cycles' samples."""
     one, other = (picture.astype(np.float64) for picture in theirs.pictures_rgb)
     references = {"ours": ours, "theirs": RawReference(a_rgb=one, b_rgb=other)}
     everywhere = np.ones_like(view.hits)
-    found = {"stated_db": view.noise_floor_db}
+    figures = {"stated_db": view.noise_floor_db}
     for name, reference in references.items():
         error_db, _ = true_error_db(view.radiance_rgb, reference, log10_radiance, everywhere)
-        found[f"to_{name}_db"] = error_db
-    return found
+        figures[f"to_{name}_db"] = error_db
+    return figures
 
 
 EXPERIMENT = Experiment(

@@ -1,7 +1,7 @@
-"""Our renderer compared with plain Mitsuba at equal true error, and its stated errors judged.
+"""Experiment `frontier`: Trilight and plain Mitsuba at equal true error, and the stated errors.
 
-Errors are true ones, to raw samples of our own tracer in two halves, which no denoiser has seen:
-their noise cancels. The renderers are measured in turn on every scene.
+Errors are true ones, to raw samples of Trilight's path tracer in two independent halves without
+denoising, whose noise cancels. The renderers are measured alternately on every scene.
 """
 
 import dataclasses
@@ -20,8 +20,8 @@ from infra.bench.experiment import (
     Point,
     percent,
 )
+from infra.bench.workloads.cached_references import kept_reference
 from infra.bench.workloads.judged_pictures import figures, shrunk
-from infra.bench.workloads.kept_references import kept_reference
 from infra.bench.workloads.named_scenes import given_scenes, sampled_trials
 from infra.bench.workloads.plain_mitsuba import PlainPicture, render_levels
 from infra.bench.workloads.shots import SEED, shots
@@ -34,11 +34,13 @@ from storage.conventions import log10_radiance
 
 TARGETS_DB = (38.0, 42.0, 46.0, 50.0)
 STATED_PX = (64, 256)
-"""Further widths at which stated errors are judged."""
+"""Further widths at which stated errors are checked."""
 REFERENCE_PX = 256
-"""Width of the references in pixels, the largest that is judged."""
+"""Width of the references in pixels, the largest one of the experiment."""
 
-OURS, STATED, PLAIN = "Trilight, stated errors", "Trilight, other widths", "plain Mitsuba"
+OURS = "Trilight, stated errors"
+STATED = "Trilight, other widths"
+PLAIN = "plain Mitsuba"
 
 
 def adaptive(target_db: float, resolution: int, max_spp: int) -> RenderSettings:
@@ -87,28 +89,29 @@ def _trials(scale: BenchScale, options: BenchOptions) -> list[str]:
 def _measure(
     context: BenchContext, points: Sequence[Point], trial: str
 ) -> list[tuple[str, Figures]]:
-    scale, scene = context.scale, context.scene(trial)
+    scale = context.scale
+    scene = context.scene(trial)
     camera = first_camera(scene, REFERENCE_PX)
-    whole = kept_reference(context.child, scene, camera, scale.reference_spp)
-    reference = shrunk(whole, scale.resolution)
+    full_reference = kept_reference(context.child, scene, camera, scale.reference_spp)
+    reference = shrunk(full_reference, scale.resolution)
     ours = {p.name: p.settings for p in points if isinstance(p.settings, RenderSettings)}
     plain = [point for point in points if point.name not in ours]
     taken = context.child.call(shots, scene, ours)
     spps = tuple(point.settings for point in plain)
     levels = context.child.call(render_levels, scene, scale.resolution, spps, SEED)
     errors = [plain_figures(level, reference) for level in levels]
-    found: dict[str, Figures] = {
+    by_point: dict[str, Figures] = {
         point.name: each for point, each in zip(plain, errors, strict=True)
     }
     steps = [(each["spp"], each["core_s"], each["db"]) for each in errors]
     for name, shot in taken.items():
-        judged = figures(shot.view, shrunk(whole, ours[name].resolution))
-        own = {"core_s": shot.core_s, "db": judged["log_true_db"], **judged}
+        judged = figures(shot.view, shrunk(full_reference, ours[name].resolution))
+        costs_and_errors = {"core_s": shot.core_s, "db": judged["log_true_db"], **judged}
         if ours[name].resolution == scale.resolution:
-            core_s, is_reached = cost_at_error(steps, own["db"])
-            own |= {"times": core_s / shot.core_s, "bound": float(not is_reached)}
-        found[name] = own
-    return [(point.name, found[point.name]) for point in points]
+            core_s, is_reached = cost_at_error(steps, costs_and_errors["db"])
+            costs_and_errors |= {"times": core_s / shot.core_s, "bound": float(not is_reached)}
+        by_point[name] = costs_and_errors
+    return [(point.name, by_point[point.name]) for point in points]
 
 
 def plain_figures(level: PlainPicture, reference: RawReference) -> dict[str, float]:
@@ -126,15 +129,15 @@ def plain_figures(level: PlainPicture, reference: RawReference) -> dict[str, flo
 
 
 def cost_at_error(levels: Sequence[tuple[float, float, float]], db: float) -> tuple[float, bool]:
-    """Return the core-seconds at which a path tracer first has an error, and whether it has it.
+    """Return the CPU seconds at which a path tracer reaches an error, and whether it does.
 
-    Between two levels dB are taken linear in log2 of the samples, and core-seconds linear in the
-    samples. Outside of what was measured the nearest level counts: its cost is a lower bound where
-    no level is good enough, and an upper one where all are better.
+    Between two levels dB are linear in log2 of the samples, and CPU seconds linear in the samples.
+    Outside the measured range the nearest level counts: its cost is a lower bound if no level is
+    good enough, and an upper bound if all are better.
 
     Args:
-        levels: samples per pixel, core-seconds and psnr_log_db, rising in samples; one at least.
-        db: psnr_log_db that is asked for, to the same reference.
+        levels: samples per pixel, CPU seconds and psnr_log_db, rising in samples; at least one.
+        db: psnr_log_db to reach, to the same reference.
     """
     row = next((row for row, (_, _, level_db) in enumerate(levels) if level_db >= db), None)
     if row is None:

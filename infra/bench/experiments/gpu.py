@@ -1,4 +1,4 @@
-"""The GPU here: what it reaches, whether its pictures are right, steps of every training preset."""
+"""Experiment `gpu`: throughput, correct pictures, and steps of every training preset on a GPU."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -64,7 +64,7 @@ def _runs(scale: BenchScale, options: BenchOptions) -> Sequence[str]:
 def _measure(
     context: BenchContext, points: Sequence[Point], trial: str
 ) -> Iterator[tuple[str, Figures]]:
-    """Measure point by point; one that cannot be measured has no figures, and a note says why."""
+    """Measure point by point; a failed point has no figures, and a note with the reason."""
     import torch
 
     from infra.bench.gpu.probe import device_facts
@@ -122,26 +122,26 @@ def _step(run: str, context: BenchContext) -> Figures:
 
 
 def _rendering(context: BenchContext) -> Figures:
-    return _rendered(context)[0]
+    return _render_data(context)[0]
 
 
 def _reading(threads: int, context: BenchContext) -> Figures:
     from infra.bench.gpu.supply import read_figures
 
-    data = context.options.data or _rendered(context)[1]
+    data = context.options.data or _render_data(context)[1]
     seconds = _READ_S[context.scale.name]
     return read_figures(data, threads, context.scale.picture_px, seconds)
 
 
-def _rendered(context: BenchContext) -> tuple[Figures, str]:
-    """Return the figures of rendering here, and a dataset of what was rendered."""
+def _render_data(context: BenchContext) -> tuple[Figures, str]:
+    """Return the figures of rendering here, and a dataset of the rendered scenes."""
     from infra.bench.gpu.supply import rendered_figures
 
-    def made() -> tuple[Figures, str]:
+    def render() -> tuple[Figures, str]:
         figures, data = rendered_figures(context.scale.picture_px, context.folder())
         return figures, str(data)
 
-    return context.kept("rendered", made)
+    return context.get_or_make("rendered", render)
 
 
 EXPERIMENT = Experiment(

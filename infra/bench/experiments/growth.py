@@ -1,4 +1,4 @@
-"""Time and memory against scenes, objects, triangles and shards: real runs of small sizes."""
+"""Experiment `growth`: time and memory against scenes, objects, triangles and shards."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -35,7 +35,7 @@ def _measure(
 
 
 def _keep_sample(context: BenchContext, folder: Path) -> None:
-    """Write the files of one rendered scene, which shards hold under many keys."""
+    """Write the files of one rendered scene, which the shards repeat under many keys."""
     folder.mkdir()
     for name, data in context.members()[0].items():
         (folder / name).write_bytes(data)

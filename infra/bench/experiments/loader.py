@@ -1,6 +1,7 @@
-"""The loader: samples a second and bytes a sample, compared with the published layout.
+"""Experiment `loader`: samples a second and bytes a sample, compared with RenderFormer's layout.
 
-On rendered scenes of `smoke`, each under many keys so that there are enough bytes, or on `--data`.
+It reads rendered scenes of `smoke`, each under many keys so that there are enough bytes, or
+`--data`.
 """
 
 import itertools
@@ -16,15 +17,17 @@ from infra.bench_options import BenchOptions
 from storage.dataset.settings import StorageSettings
 from storage.dataset.training_data import TrainingData, open_training_data
 
-UNPACK, TRAIN = "unpacking, one thread", "batches as training reads them"
+UNPACK = "unpacking, one thread"
+TRAIN = "batches as training reads them"
 THREADS = (0, 1, 2, 4)
-"""Decoding threads; with 0 the thread that asks decodes."""
-BATCH, RESOLUTION = 4, 64
+"""Numbers of decoding threads; with 0 the main thread decodes."""
+BATCH = 4
+RESOLUTION = 64
 """Scenes of a batch, and width of its pictures in pixels, which are reduced from the stored one."""
 _VIEWS = 4
-"""Most views of a scene that are drawn."""
+"""Maximum number of views of a scene."""
 _SAMPLES = 32
-"""Least samples of a pass over the training data."""
+"""Minimum number of samples of a pass over the training data."""
 
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
@@ -47,17 +50,17 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
 def _measure(
     context: BenchContext, points: Sequence[Point], trial: str
 ) -> Iterator[tuple[str, Figures]]:
-    data, count = context.kept("data", lambda: _training_data(context))
+    data, count = context.get_or_make("data", lambda: _training_data(context))
     for point in points:
         if point.group == UNPACK:
-            found = unpacking_figures(context.samples, point.settings, context.folder())
+            figures = unpacking_figures(context.samples, point.settings, context.folder())
         else:
-            found = read_figures(data, count, point.settings)
-        yield point.name, found
+            figures = read_figures(data, count, point.settings)
+        yield point.name, figures
 
 
 def _training_data(context: BenchContext) -> tuple[TrainingData, int]:
-    """Return the data that is read, and how many of its samples."""
+    """Return the data to read, and the number of samples to read."""
     if context.options.data:
         data = open_training_data([context.options.data])
         shards = data.split("train")
@@ -69,10 +72,10 @@ def _training_data(context: BenchContext) -> tuple[TrainingData, int]:
 
 
 def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
-    """Read samples as training does, but for the network."""
-    from train.data.order import RankShare
+    """Read samples as training does, without the network."""
+    from train.data.bad_samples import BadSampleCounter
+    from train.data.order import RankSlice
     from train.data.stream import StreamSettings, stream_batches
-    from train.data.unusable import Unusable
 
     settings = StreamSettings(
         seed=0,
@@ -81,9 +84,15 @@ def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
         resolution=RESOLUTION,
         views_per_scene=min(_VIEWS, data.num_views or _VIEWS),
     )
-    began, core_began = time.perf_counter(), time.process_time()
+    began = time.perf_counter()
+    core_began = time.process_time()
     stream = stream_batches(
-        data.split("train"), settings, 0, share=RankShare(), workers=threads, unusable=Unusable(0)
+        data.split("train"),
+        settings,
+        0,
+        rank_slice=RankSlice(),
+        workers=threads,
+        unusable=BadSampleCounter(0),
     )
     with closing(stream) as batches:
         for _ in itertools.islice(batches, count // BATCH):

@@ -1,4 +1,4 @@
-"""Coarser meshes: our methods and the reference recipe, and every budget of triangles."""
+"""Experiment `meshes`: decimation methods, RenderFormer's recipe, and every budget of triangles."""
 
 from collections.abc import Iterator, Sequence
 
@@ -12,13 +12,14 @@ from pipeline.assets.settings import AssetSettings
 from storage.errors import Rejected
 
 BUDGET = 512
-"""Triangles at which methods are compared."""
+"""Number of triangles at which methods are compared."""
 CURVE = (64, 128, 256, 512, 1024)
 PICTURED = 3
-"""Objects that are path traced at every budget: some seconds each."""
+"""Number of objects that are path traced at every budget, which takes some seconds each."""
 LARGE = 1100
-"""Least clean triangles of an object, so that every budget takes something away."""
-METHOD_GROUP, BUDGET_GROUP = f"methods, {BUDGET} triangles", "faithful, by budget"
+"""Minimum number of clean triangles of an object, so that every budget removes some."""
+METHOD_GROUP = f"methods, {BUDGET} triangles"
+BUDGET_GROUP = "faithful, by budget"
 
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
@@ -47,12 +48,14 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
 def _measure(
     context: BenchContext, points: Sequence[Point], trial: str
 ) -> Iterator[tuple[str, Figures]]:
-    """Measure one object every way, and the pictures of the few that are path traced."""
-    number, scale = int(trial.split()[-1]), context.scale
+    """Measure one object with every method, and its pictures if it is path traced."""
+    number = int(trial.split()[-1])
+    scale = context.scale
     large = [path for path, faces in context.mesh_files if faces >= LARGE]
     if number > len(large):
         raise Rejected("no_object", f"only {len(large)} objects have {LARGE} triangles")
-    path, pictures = large[number - 1], list[float]()
+    path = large[number - 1]
+    pictures = list[float]()
     if number <= PICTURED:
         method = remeshing.METHODS["faithful"]
         meshes = context.mesh_child.call(coarser, path, CURVE, method)

@@ -1,4 +1,4 @@
-"""All methods to a picture, from pure networks to the path tracer: cost against true error."""
+"""Experiment `methods`: cost against true error, from pure networks to the path tracer."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -7,7 +7,7 @@ import numpy as np
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
-from infra.bench.workloads.kept_references import kept_reference
+from infra.bench.workloads.cached_references import kept_reference
 from infra.bench_options import BenchOptions
 from infra.rendering.held_out_scenes import TRIANGLES, held_out_build, held_out_scene
 from infra.rendering.methods import (
@@ -65,7 +65,7 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
 def _measure(
     context: BenchContext, points: Sequence[Point], trial: str
 ) -> Iterator[tuple[str, Figures]]:
-    methods, child = context.kept("methods", lambda: _set_up(context))
+    methods, child = context.get_or_make("methods", lambda: _set_up(context))
     scene = child.call(held_out_scene, int(trial.split()[-1]))
     for px in WIDTHS:
         camera = first_camera(scene, px)
@@ -78,7 +78,7 @@ def _measure(
 
 
 def _set_up(context: BenchContext) -> tuple[Mapping[int, Mapping[str, Method]], IsolatedChild]:
-    """Return the methods that need no render child, and a child for the others."""
+    """Return the methods of this process, and a render child for the others."""
     import torch
 
     from model.neural_renderer import NeuralRenderer
@@ -86,9 +86,11 @@ def _set_up(context: BenchContext) -> tuple[Mapping[int, Mapping[str, Method]], 
 
     torch.set_num_threads(1)  # core-seconds of waiting threads are not the network's
     paths = context.options.checkpoint
-    given = dict(zip(network_labels(paths), paths, strict=True))
+    paths_by_label = dict(zip(network_labels(paths), paths, strict=True))
     renderers = {}
-    for label, path in (dict(zip(BUILTIN_NETWORKS, BUILTIN_NETWORKS, strict=True)) | given).items():
+    for label, path in (
+        dict(zip(BUILTIN_NETWORKS, BUILTIN_NETWORKS, strict=True)) | paths_by_label
+    ).items():
         renderer = NeuralRenderer.load(path, device="cpu", finders=[network_of_run])
         renderers[network_name(label)] = renderer
         context.note(f"{network_name(label)} is {renderer.digest[:8]}")
@@ -105,7 +107,7 @@ def _set_up(context: BenchContext) -> tuple[Mapping[int, Mapping[str, Method]], 
 
 
 def timed_method(method: Method, scene: Scene) -> TimedViews:
-    """Return a scene's first view with its times."""
+    """Return the first view of a scene with its times."""
     camera = scene.c2w[0], float(scene.fov_deg[0])
     return timed_views(lambda: partial(method(scene), *camera))
 
@@ -117,20 +119,22 @@ def timed_samples(scene: Scene, px: int) -> list[TimedViews]:
 
 
 def judged_figures(picture: TimedViews, scene: Scene, reference: RawReference) -> Figures:
-    """Return the figures of a picture; references' noise is in none of the decibels."""
+    """Return the figures of a picture; its decibels exclude the noise of the reference."""
     from train.evaluation.metrics import picture_scores
 
-    shown = picture.radiance_rgb
-    hits = first_hits(scene, resolution=len(shown)).met
+    radiance_rgb = picture.radiance_rgb
+    hits = first_hits(scene, resolution=len(radiance_rgb)).met
     everywhere = np.ones_like(hits)
     mean = 0.5 * (reference.a_rgb + reference.b_rgb)
     return {
         "core_s": picture.first_s,
         "view_s": picture.further_s,
-        "db": true_error_db(shown, reference, log10_radiance, everywhere)[0],
-        "object_db": true_error_db(shown, reference, log10_radiance, hits)[0],
-        "linear_db": true_error_db(shown, reference, clamped_radiance, everywhere)[0],
-        "ssim": float(picture_scores(shown, mean.astype(np.float32), hits, None)["ssim"] or 0.0),
+        "db": true_error_db(radiance_rgb, reference, log10_radiance, everywhere)[0],
+        "object_db": true_error_db(radiance_rgb, reference, log10_radiance, hits)[0],
+        "linear_db": true_error_db(radiance_rgb, reference, clamped_radiance, everywhere)[0],
+        "ssim": float(
+            picture_scores(radiance_rgb, mean.astype(np.float32), hits, None)["ssim"] or 0.0
+        ),
     }
 
 

@@ -1,4 +1,4 @@
-"""Two trainings that differ in any settings, with equal seeds, judged on the same scenes."""
+"""Experiment `paired-training`: two trainings with different settings and equal seeds."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from infra.bench.workloads.trainings import TrainingScenes
     from train.settings import TrainSettings
 
-SIDE_A, SIDE_B = "a", "b"
+SIDE_A = "a"
+SIDE_B = "b"
 PRESET = "smoke"
 
 
@@ -27,7 +28,7 @@ def settings_of(side: str, seed: int, scale: BenchScale, options: BenchOptions) 
     """Return the settings of one side's training.
 
     Raises:
-        TrilightError: several presets are named, or a change is none of their settings.
+        TrilightError: several presets are named, or a change names no setting.
     """
     from train.runs import changed_run
 
@@ -36,8 +37,8 @@ def settings_of(side: str, seed: int, scale: BenchScale, options: BenchOptions) 
             f"bench paired-training: --run names {len(options.run)} presets; expected one. Say "
             "what differs by --set-a and --set-b."
         )
-    own = options.set_a if side == SIDE_A else options.set_b
-    changes = {"seed": seed, **options.changes, **own}
+    side_changes = options.set_a if side == SIDE_A else options.set_b
+    changes = {"seed": seed, **options.changes, **side_changes}
     steps = changes.pop("num_steps", scale.steps)  # warm-up and decay are in proportion
     return changed_run((options.run or (PRESET,))[0], changes, steps=steps)
 
@@ -58,7 +59,7 @@ def _trials(scale: BenchScale, options: BenchOptions) -> list[str]:
 
 
 def scene_of(trial: str) -> str:
-    """Return the scene of a trial: its errors with all seeds are one cluster."""
+    """Return the scene of a trial, since its errors with all seeds form one cluster."""
     return trial.partition(", ")[2]
 
 
@@ -68,24 +69,26 @@ def _measure(
     seed, scene = (int(part.split()[1]) for part in trial.split(", "))
     for point in points:
         key = (point.name, seed)
-        found = context.kept(key, lambda key=key: _train(context, *key))  # type: ignore[misc]
-        if scene >= len(found):
-            raise Rejected("no_scene", f"the validation split has {len(found)} scenes")
-        yield point.name, found[scene]
+        scenes = context.get_or_make(key, lambda key=key: _train(context, *key))  # type: ignore[misc]
+        if scene >= len(scenes):
+            raise Rejected("no_scene", f"the validation split has {len(scenes)} scenes")
+        yield point.name, scenes[scene]
 
 
 def _train(context: BenchContext, side: str, seed: int) -> Sequence[Mapping[str, float]]:
     import torch
 
     from infra.bench.workloads.trainings import training_figures
-    from train.loop.crew import choose_device
+    from train.loop.distributed import choose_device
 
     options = context.options
     settings = settings_of(side, seed, context.scale, options)
-    scenes = context.kept(("scenes", settings.resolution), lambda: _scenes(context, settings))
+    scenes = context.get_or_make(
+        ("scenes", settings.resolution), lambda: _scenes(context, settings)
+    )
     context.note(scenes.about)
-    own = options.set_a if side == SIDE_A else options.set_b
-    changed = ", ".join(f"{name}={value}" for name, value in own.items()) or "as it is"
+    side_changes = options.set_a if side == SIDE_A else options.set_b
+    changed = ", ".join(f"{name}={value}" for name, value in side_changes.items()) or "as it is"
     context.note(f"{side}: {settings.run}, {settings.num_steps} steps, {changed}")
     if device_of(options) == "cpu":
         torch.set_num_threads(context.cores)

@@ -1,4 +1,4 @@
-"""A batch of a training preset's size without a dataset: its content changes no time."""
+"""Synthetic batch of a training preset's size, since the content does not change the time."""
 
 import math
 from typing import TYPE_CHECKING
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 _LIGHTS = 4
 UNSTATED_TRIANGLES = 1024
-"""Triangles of the longest scene where a preset sets no limit."""
+"""Triangles of the longest scene if a preset sets no limit."""
 
 SPREAD = 0.06
-"""The shortest scene of a pass is shorter than the longest by this fraction, as in the buckets of
-`pretrain`: half of it is padding, and attention has a mask."""
+"""Fraction by which the shortest scene of a pass is shorter than the longest, as in the buckets of
+`pretrain`. Half of it is padding on average, so that attention has a mask."""
 
 VGG16_WIDTHS = (64, 128, 256, 512, 512)
-"""Channels of the published network's blocks."""
+"""Channels of VGG16's blocks, as in the published LPIPS."""
 
 
 def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:
@@ -43,46 +43,47 @@ def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:
 
 
 def scene_of(workload: Workload) -> SceneTensors:
-    """Return two objects in a room, of exactly so many triangles, and cameras around them."""
+    """Return two objects in a room with an exact number of triangles, and cameras around them."""
     scene = cost_scene(math.ceil(1.3 * workload.triangles) + 32, _LIGHTS)
     poses = [
         look_at_c2w(
-            eye=(1.4 + math.cos(6 * turn), math.sin(6 * turn) - 2.2, 1.3),
+            eye=(1.4 + math.cos(6 * angle), math.sin(6 * angle) - 2.2, 1.3),
             target=(0, 0, 0.35),
             up=(0, 0, 1),
         )
-        for turn in np.linspace(0, 1, workload.views, endpoint=False)
+        for angle in np.linspace(0, 1, workload.views, endpoint=False)
     ]
-    whole = scene_tensors(
+    tensors = scene_tensors(
         scene.with_cameras(
             np.stack(poses).astype(np.float32), np.full(workload.views, 40.0, np.float32)
         )
     )
     # rows spread over the scene, the room first and the lights last
-    rows = torch.linspace(0, whole.num_triangles - 1, workload.triangles).round().long()
+    rows = torch.linspace(0, tensors.num_triangles - 1, workload.triangles).round().long()
     return SceneTensors(
-        triangles_T33=whole.triangles_T33[rows],
-        normals_T33=whole.normals_T33[rows],
-        material_TM=whole.material_TM[rows],
-        c2w_V44=whole.c2w_V44,
-        fov_deg_V=whole.fov_deg_V,
+        triangles_T33=tensors.triangles_T33[rows],
+        normals_T33=tensors.normals_T33[rows],
+        material_TM=tensors.material_TM[rows],
+        c2w_V44=tensors.c2w_V44,
+        fov_deg_V=tensors.fov_deg_V,
     )
 
 
 def drawn_batch(settings: TrainSettings, scenes: int) -> TrainingBatch:
-    """Return a batch on the processor: real scenes, with targets that are noise."""
+    """Return a batch on the processor: scenes of real geometry, with noise as targets."""
     generator = torch.Generator().manual_seed(0)
-    views, px = settings.views_per_scene, settings.resolution
+    views = settings.views_per_scene
+    px = settings.resolution
     return TrainingBatch(
         scenes=batch_scenes(
-            [_prepared(scene_of(each), settings.model, px) for each in workloads(settings, scenes)]
+            [_prepare(scene_of(each), settings.model, px) for each in workloads(settings, scenes)]
         ),
         target_BVRR3=0.3 * torch.rand(scenes, views, px, px, 3, generator=generator),
         noise_BV=torch.full((scenes, views), 1e-3),
     )
 
 
-def _prepared(tensors: SceneTensors, model: "ModelConfig", px: int) -> SceneTensors:
+def _prepare(tensors: SceneTensors, model: "ModelConfig", px: int) -> SceneTensors:
     """Return a scene with the inputs of its network, as the stream does."""
     if not model.hit_rays:
         return tensors
@@ -95,10 +96,12 @@ def _prepared(tensors: SceneTensors, model: "ModelConfig", px: int) -> SceneTens
 
 
 def drawn_lpips(settings: TrainSettings, widths: tuple[int, ...] = VGG16_WIDTHS) -> Lpips | None:
-    """Return LPIPS with random weights of the published sizes, where a preset asks for LPIPS."""
+    """Return LPIPS with random weights of the published sizes; None if a preset has no LPIPS."""
     if settings.loss.perceptual != "lpips":
         return None
-    vgg16, linear, channels = {}, {}, 3
+    vgg16 = {}
+    linear = {}
+    channels = 3
     generator = torch.Generator().manual_seed(0)
     for block, (numbers, width) in enumerate(zip(BLOCKS, widths, strict=True)):
         for number in numbers:

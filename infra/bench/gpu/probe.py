@@ -1,4 +1,4 @@
-"""What a device is, and what it reaches: products by type, copies within it and to it."""
+"""Description and throughput of a device: matrix products by type, and memory copies."""
 
 import shutil
 import subprocess
@@ -7,20 +7,20 @@ from collections.abc import Callable
 
 import torch
 
-from model.precision import quick_products
+from model.precision import fast_float32_products
 
 _ANSWER_S = 60
 REPEATS = 5
 
 
 def device_facts(device: torch.device) -> str:
-    """Return a sentence on a device: memory, libraries, driver; no serial number."""
+    """Return a line on a device: memory, libraries, driver, without a serial number."""
     if device.type != "cuda":
         return f"no GPU: torch {torch.__version__} with {torch.get_num_threads()} threads"
-    found = torch.cuda.get_device_properties(device)
+    properties = torch.cuda.get_device_properties(device)
     return (
-        f"{found.name}, {found.total_memory / 2**30:.0f} GiB, torch {torch.__version__}, CUDA "
-        f"{torch.version.cuda}, driver {_driver(device.index or 0)}"
+        f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, torch {torch.__version__}, "
+        f"CUDA {torch.version.cuda}, driver {_driver(device.index or 0)}"
     )
 
 
@@ -38,27 +38,27 @@ def _driver(index: int) -> str:
 
 
 def product_figures(device: torch.device, kind: str, width: int) -> dict[str, float]:
-    """Return the time and FLOPs a second of a large square product: the best of five.
+    """Return the seconds and FLOP/s of a large square matrix product: the best of five.
 
     Args:
-        device: where.
+        device: device of the product.
         kind: float32, tf32, bfloat16 or float16.
-        width: of the matrix.
+        width: width of the matrices.
     """
     dtype = torch.float32 if kind == "tf32" else getattr(torch, kind)
     matrix = torch.randn(width, width, device=device).to(dtype)
-    with quick_products(device, wanted=kind == "tf32"):
+    with fast_float32_products(device, enabled=kind == "tf32"):
         seconds = best_s(lambda: matrix @ matrix, device)
     return {"ms": 1e3 * seconds, "teraflop_per_s": 2 * width**3 / seconds / 1e12}
 
 
 def copy_figures(device: torch.device, kind: str, size: int) -> dict[str, float]:
-    """Return the time and bytes a second of a copy.
+    """Return the seconds and bytes a second of a copy.
 
     Args:
-        device: where.
-        kind: within (what is read and written counts), to_pageable or to_pinned.
-        size: bytes that are copied.
+        device: device of the copy.
+        kind: within (bytes read and written count), to_pageable or to_pinned.
+        size: number of bytes to copy.
     """
     target = torch.zeros(size, dtype=torch.uint8, device=device)
     if kind == "within":
@@ -72,7 +72,7 @@ def copy_figures(device: torch.device, kind: str, size: int) -> dict[str, float]
 
 
 def best_s(work: Callable[[], object], device: torch.device, repeats: int = REPEATS) -> float:
-    """Return the seconds of the quickest of some calls, after one that is not counted."""
+    """Return the seconds of the fastest of several calls, after a warm-up call."""
     work()
     wait_for(device)
     times = []
@@ -85,6 +85,6 @@ def best_s(work: Callable[[], object], device: torch.device, repeats: int = REPE
 
 
 def wait_for(device: torch.device) -> None:
-    """Wait until a device has done all that it was given."""
+    """Wait until a device has finished its queue."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -12,21 +12,21 @@ from train.loss.lpips import Lpips
 from train.loss.objective import Objective
 
 MARK = "trilight: "
-"""Before the names of parts in a trace."""
+"""Prefix of the names of parts in a trace."""
 REST = "backward and rest"
 
 
 @contextmanager
 def marked_parts(model: nn.Module, objective: Objective, updater: Any) -> Iterator[None]:
-    """Have the parts of a step stand in a trace; the optimiser is what `updater.step` does."""
+    """Mark the parts of a step in a trace; the optimizer is the call of `updater.step`."""
     with ExitStack() as stack:
         for name, module in _parts(model, objective):
-            stack.enter_context(_marked(name, module))
+            stack.enter_context(_mark_calls(name, module))
         step = updater.step
 
-        def marked_step(*given: Any) -> Any:
+        def marked_step(*args: Any) -> Any:
             with torch.profiler.record_function(f"{MARK}optimiser"):
-                return step(*given)
+                return step(*args)
 
         updater.step = marked_step
         stack.callback(vars(updater).pop, "step")
@@ -46,14 +46,14 @@ def _parts(model: Any, objective: Objective) -> Iterator[tuple[str, nn.Module]]:
 
 
 @contextmanager
-def _marked(name: str, module: Any) -> Iterator[None]:
-    """Mark every call of a module, from outside: hooks would be a part of what is compiled."""
+def _mark_calls(name: str, module: Any) -> Iterator[None]:
+    """Mark every call of a module from outside, because hooks would be compiled with it."""
     before = module._compiled_call_impl  # what a call of a compiled module calls
     call = before or module._call_impl
 
-    def marked_call(*given: Any, **named: Any) -> Any:
+    def marked_call(*args: Any, **named: Any) -> Any:
         with torch.profiler.record_function(MARK + name):
-            return call(*given, **named)
+            return call(*args, **named)
 
     module._compiled_call_impl = marked_call
     try:
@@ -62,10 +62,10 @@ def _marked(name: str, module: Any) -> Iterator[None]:
         module._compiled_call_impl = before
 
 
-def profiled(work: Callable[[], object], device: torch.device) -> tuple[int, dict[str, float]]:
+def profile_call(work: Callable[[], object], device: torch.device) -> tuple[int, dict[str, float]]:
     """Return the number of kernels of a call, and its milliseconds by part.
 
-    On a processor operators stand for kernels.
+    On a processor operators are counted instead of kernels.
     """
     from torch.profiler import ProfilerActivity, profile
 
@@ -86,12 +86,15 @@ def profiled(work: Callable[[], object], device: torch.device) -> tuple[int, dic
 
 
 def parts_ms(total_us: float, parts: Mapping[str, float]) -> dict[str, float]:
-    """Return milliseconds by part, the dearest first, with the REST; LPIPS is within the loss."""
-    found = dict(parts)
-    if "LPIPS" in found:
-        found["loss"] -= found["LPIPS"]
-    found[REST] = max(total_us - sum(found.values()), 0)
-    return {name: found[name] / 1e3 for name in sorted(found, key=lambda name: -found[name])}
+    """Return milliseconds by part, largest first, with the REST; LPIPS is part of the loss."""
+    microseconds = dict(parts)
+    if "LPIPS" in microseconds:
+        microseconds["loss"] -= microseconds["LPIPS"]
+    microseconds[REST] = max(total_us - sum(microseconds.values()), 0)
+    return {
+        name: microseconds[name] / 1e3
+        for name in sorted(microseconds, key=lambda name: -microseconds[name])
+    }
 
 
 def _is_on_gpu(event: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Steps of a training preset on a device, with fewer scenes where memory lacks."""
+"""Steps of a training preset on a device, with fewer scenes if memory is too small."""
 
 import dataclasses
 import gc
@@ -11,24 +11,26 @@ import torch
 
 from infra.bench.gpu.drawn_batch import drawn_batch, drawn_lpips, workloads
 from infra.bench.gpu.probe import wait_for
-from infra.bench.gpu.step_profile import marked_parts, profiled
+from infra.bench.gpu.step_profile import marked_parts, profile_call
 from model.config import ModelConfig, hits_smoke, smoke, tiny
 from model.costs import training_flops
-from train.loop.crew import Crew
+from train.loop.distributed import DistributedContext
 from train.loop.state import new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective
 from train.runs import named_run
 from train.settings import TrainSettings
 
-SHRUNK_PX, SHRUNK_TRIANGLES, SHRUNK_SCENES = 32, 64, 2
+SHRUNK_PX = 32
+SHRUNK_TRIANGLES = 64
+SHRUNK_SCENES = 2
 THIN = (4, 8, 16, 16, 16)
-"""Channels of LPIPS where presets are shrunk."""
+"""Channels of LPIPS for shrunk presets."""
 _WARM_STEPS = 3
 
 
 def step_settings(run: str, device: torch.device) -> TrainSettings:
-    """Return a preset that begins with random weights; without a GPU a small one of its form."""
+    """Return a preset with random initial weights; without a GPU a small one of its form."""
     settings = dataclasses.replace(named_run(run), from_weights=False)
     if device.type == "cuda":
         return settings
@@ -54,17 +56,17 @@ def step_figures(
 ) -> tuple[dict[str, float], Mapping[str, float]]:
     """Return figures of a step of one pass, and its milliseconds by part of the network.
 
-    A pass has as many scenes as the preset's, or as memory holds. A preset that fails has no
-    `ms`: the others are measured all the same.
+    A pass has as many scenes as in the preset, or as fit into memory. A preset that fails has no
+    `ms`, so that the others are still measured.
     """
     settings = step_settings(run, device)
     scenes = min(settings.scenes_per_pass, settings.scenes_per_step)
     while scenes:
         try:
-            figures, parts = _measured(settings, scenes, steps, device)
+            figures, parts = _measure_steps(settings, scenes, steps, device)
             if device.type == "cuda" and settings.compile == "auto":
                 _free_memory(device)
-                plain, _ = _measured(
+                plain, _ = _measure_steps(
                     dataclasses.replace(settings, compile="no"), scenes, steps, device
                 )
                 figures["plain_ms"] = plain["ms"]
@@ -82,13 +84,13 @@ def _free_memory(device: torch.device) -> None:
         torch.cuda.empty_cache()
 
 
-def _measured(
+def _measure_steps(
     settings: TrainSettings, scenes: int, steps: int, device: torch.device
 ) -> tuple[dict[str, float], Mapping[str, float]]:
     state = new_state(settings, device)
     lpips = drawn_lpips(settings) if device.type == "cuda" else drawn_lpips(settings, THIN)
     objective = Objective(settings.loss, lpips).to(device)
-    stepper = Stepper(state, settings, objective, Crew(device=device))
+    stepper = Stepper(state, settings, objective, DistributedContext(device=device))
     batch = drawn_batch(settings, scenes).to(device)  # a run sends the next while one is computed
 
     def step() -> None:
@@ -111,12 +113,12 @@ def _measured(
     if device.type == "cuda":
         figures["peak_gib"] = torch.cuda.max_memory_allocated(device) / 2**30
     with marked_parts(state.model, objective, state.updater):
-        kernels, parts = profiled(step, device)
+        kernels, parts = profile_call(step, device)
     return {**figures, "kernels": float(kernels)}, parts
 
 
 def _step_s(step: Any, steps: int, device: torch.device) -> float:
-    """Return the median seconds of a step after some that are not counted."""
+    """Return the median seconds of a step, after warm-up steps."""
     times = []
     for _ in range(_WARM_STEPS + steps):
         began = time.perf_counter()

@@ -1,8 +1,8 @@
-"""Pictures by the built-in networks on a GPU, against those that a processor made and we stored.
+"""Pictures by the built-in networks on a GPU, compared with stored ones of a processor.
 
-A GPU that computes something else shows here, before any time is believed. What is stored is of
-certain weights, named by their digest: after another training of a built-in network
-`python -m infra.bench.gpu.twin` makes it again.
+The comparison finds a GPU with wrong results before any time is trusted. The stored pictures belong
+to certain weights, named by their digest: after another training of a built-in network, `python -m
+infra.bench.gpu.twin` renders them again.
 """
 
 import time
@@ -25,7 +25,9 @@ from storage.metrics import psnr_log_db
 NETWORKS = ("builtin:tokens", "builtin:hits")
 STORED = Path(__file__).with_name("twin.npz")
 """float16 log10(1 + radiance) [64, 64, 3] by network, and the digest of its weights."""
-TRIANGLES, LIGHTS, PX = 400, 4, 64
+TRIANGLES = 400
+LIGHTS = 4
+PX = 64
 MORE_VIEWS = 5
 
 
@@ -33,10 +35,10 @@ def twin_figures(network: str, precision: str, device: torch.device) -> dict[str
     """Return psnr_log_db of a network's picture to the stored one, and milliseconds of a view.
 
     Raises:
-        TrilightError: what is stored is of other weights than those of this Trilight.
+        TrilightError: the stored picture belongs to other weights than the built-in network's.
     """
     twin = stored_twin(network)
-    picture, seconds = _rendered(network, device, precision)
+    picture, seconds = _render(network, device, precision)
     return {"ms": 1e3 * seconds, "db": psnr_log_db(picture, twin)}
 
 
@@ -44,10 +46,11 @@ def stored_twin(network: str) -> NDArray[np.float64]:
     """Return the stored picture [64, 64, 3] of a network, linear radiance.
 
     Raises:
-        TrilightError: it is of other weights.
+        TrilightError: the picture belongs to other weights.
     """
     with np.load(STORED, allow_pickle=False) as stored:
-        digest, picture = str(stored[f"{network} sha256"]), stored[network]
+        digest = str(stored[f"{network} sha256"])
+        picture = stored[network]
     if digest != (now := _digest(network)):
         raise TrilightError(
             f"bench gpu: the stored picture of {network} is by weights of sha256 {digest[:8]}, "
@@ -61,14 +64,15 @@ def _digest(network: str) -> str:
     return sha256_hex(BUILTIN_NETWORKS[network].read_bytes())
 
 
-def _rendered(
+def _render(
     network: str, device: torch.device, precision: str
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the first view of the scene, and the seconds of one more where all is warm."""
+    """Return the first view of the scene, and the seconds of one more after the warm-up."""
     renderer = NeuralRenderer.load(network, device=str(device), precision=precision)
     scene = cost_scene(TRIANGLES, LIGHTS)
     prepared = renderer.prepare(scene)
-    pose, fov = scene.c2w[0], float(scene.fov_deg[0])
+    pose = scene.c2w[0]
+    fov = float(scene.fov_deg[0])
     picture = renderer.view(prepared, pose, fov, PX)
     times = []
     for _ in range(MORE_VIEWS):
@@ -80,12 +84,12 @@ def _rendered(
 
 def store(path: Path = STORED) -> None:
     """Render the scene by each network on the processor, and write the pictures."""
-    found: dict[str, Any] = {}
+    stored_values: dict[str, Any] = {}
     for network in NETWORKS:
-        picture, _ = _rendered(network, torch.device("cpu"), "float32")
-        found[network] = log10_radiance(picture).astype(np.float16)
-        found[f"{network} sha256"] = _digest(network)
-    np.savez_compressed(path, **found)
+        picture, _ = _render(network, torch.device("cpu"), "float32")
+        stored_values[network] = log10_radiance(picture).astype(np.float16)
+        stored_values[f"{network} sha256"] = _digest(network)
+    np.savez_compressed(path, **stored_values)
 
 
 if __name__ == "__main__":

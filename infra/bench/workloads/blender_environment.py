@@ -1,8 +1,8 @@
-"""Blender as a Python module, in an environment of its own.
+"""Installation of Blender as a Python module, in a separate environment.
 
 Blender is under the GPL, large, and exists for one version of Python. So it is never a dependency:
-it is installed from the package index into the user's cache when a comparison asks for it, and only
-a process of its own imports it (infra.bench.workloads.blender_process).
+a comparison installs it from the package index into the user's cache, and only a separate process
+imports it (infra.bench.workloads.blender_process).
 """
 
 import shutil
@@ -14,13 +14,13 @@ from storage.cache import cache_folder
 from storage.errors import TrilightError
 
 BLENDER = "4.5.15"
-"""The version of Blender, and of its wheel; the reference pictures were made with it."""
+"""Version of Blender and of its wheel, with which the reference pictures were made."""
 
 LOCK = Path(__file__).with_name("blender.txt")
-"""What is installed, with the digests of all files (infra/setup/lock.sh)."""
+"""Lock file of the environment, with the digests of all files (infra/setup/lock.sh)."""
 
 PYTHON = "3.11"
-"""The one version of Python that this wheel exists for."""
+"""Only version of Python that the wheel supports."""
 
 _INSTALL_S = 1800
 _PROBE = f"import bpy; assert bpy.app.version_string.startswith({BLENDER!r})"
@@ -28,20 +28,20 @@ _READY = "ready"
 
 
 def installed_python() -> Path | None:
-    """Return the Python that can import Blender, or None where it has not been set up."""
+    """Return the Python that can import Blender, or None if it is not installed."""
     folder = _folder()
     return _python_of(folder) if (folder / _READY).is_file() else None
 
 
 def blender_python() -> Path:
-    """Return the Python that can import Blender, after installing it (380 MB) where need be.
+    """Return the Python that can import Blender, after installing it (380 MB) if necessary.
 
     Raises:
-        TrilightError: there is no Python of that version, the package index does not give the
-            wheel, or what it gave cannot be loaded here.
+        TrilightError: there is no Python of that version, the package index lacks the wheel, or the
+            wheel cannot be loaded here.
     """
-    if found := installed_python():
-        return found
+    if installed := installed_python():
+        return installed
     folder = _folder()
     _run("make its environment", [_base_python(), "-m", "venv", "--clear", str(folder)])
     python = _python_of(folder)
@@ -64,10 +64,10 @@ def _base_python() -> str:
     """Return a Python of the wheel's version: this one, or one on the path."""
     if f"{sys.version_info.major}.{sys.version_info.minor}" == PYTHON:
         return sys.executable
-    found = shutil.which(f"python{PYTHON}")
-    if found is None:
+    python = shutil.which(f"python{PYTHON}")
+    if python is None:
         raise _unavailable(f"python{PYTHON} is not on the path; install that version of Python")
-    return found
+    return python
 
 
 def _run(step: str, command: list[str]) -> None:

@@ -1,6 +1,6 @@
-"""The process that imports Blender: reads a scene, renders one view with Cycles, writes it raw.
+"""Process that imports Blender: reads a scene, renders one view with Cycles, writes it raw.
 
-Run by path with the Python of blender_environment.py, which has nothing of Trilight:
+Run by path with the Python of blender_environment.py, which has no module of Trilight:
 
     python -I blender_process.py FOLDER
 
@@ -25,11 +25,12 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-_CLIP_START, _CLIP_END = 1e-4, 1e4
+_CLIP_START = 1e-4
+_CLIP_END = 1e4
 
 
 def main(folder: Path) -> None:
-    """Render what the folder asks for."""
+    """Render the request in the folder."""
     started = time.perf_counter()
     request = json.loads((folder / "request.json").read_text())
     with np.load(folder / "scene.npz", allow_pickle=False) as arrays:
@@ -49,7 +50,7 @@ def main(folder: Path) -> None:
 
 
 def add_meshes(scene: dict[str, NDArray]) -> None:
-    """Add what reflects as one object, and what emits as another, hidden from the camera."""
+    """Add the reflecting triangles as an object, and the emitting ones as a hidden object."""
     emits = np.any(scene["materials"][:, 7:10] > 0, axis=1)
     materials = [
         _emission(row[7:10]) if emitting else _surface(row)
@@ -110,7 +111,7 @@ def _surface(row: NDArray[np.float32]) -> Any:
 
 
 def _emission(radiance_rgb: NDArray[np.float32]) -> Any:
-    """Return a material that emits to both sides and reflects nothing."""
+    """Return a material that emits on both sides and reflects nothing."""
     material, nodes, output = _material("emitter")
     emission = nodes.new("ShaderNodeEmission")
     emission.inputs["Color"].default_value = (*map(float, radiance_rgb), 1.0)
@@ -129,11 +130,12 @@ def _material(name: str) -> tuple[Any, Any, Any]:
 
 
 def add_camera(c2w: NDArray[np.float64], fov_deg: float) -> None:
-    """Add the camera: Blender's axes are those of `c2w`."""
+    """Add the camera; Blender's axes are those of `c2w`."""
     camera = bpy.data.cameras.new("camera")
     camera.sensor_fit = "HORIZONTAL"
     camera.angle = np.radians(fov_deg)
-    camera.clip_start, camera.clip_end = _CLIP_START, _CLIP_END
+    camera.clip_start = _CLIP_START
+    camera.clip_end = _CLIP_END
     added = bpy.data.objects.new("camera", camera)
     added.matrix_world = Matrix(c2w.tolist())  # a plain list would be taken column by column
     bpy.context.scene.collection.objects.link(added)
@@ -141,19 +143,24 @@ def add_camera(c2w: NDArray[np.float64], fov_deg: float) -> None:
 
 
 def set_up_cycles(request: dict[str, Any], target: Path) -> None:
-    """Set what the reference pictures were made with; the rest is as Blender ships it."""
+    """Set the options of the reference pictures; all others keep Blender's defaults."""
     scene = bpy.context.scene
-    render, cycles = scene.render, scene.cycles
+    render = scene.render
+    cycles = scene.cycles
     render.engine = "CYCLES"
     render.resolution_x = render.resolution_y = request["resolution"]
     render.resolution_percentage = 100
     render.film_transparent = False
     render.use_persistent_data = True
     render.use_compositing = render.use_sequencer = False
-    render.threads_mode, render.threads = "FIXED", request["threads"]
-    render.filepath, render.use_file_extension = str(target), False
+    render.threads_mode = "FIXED"
+    render.threads = request["threads"]
+    render.filepath = str(target)
+    render.use_file_extension = False
     image = render.image_settings
-    image.file_format, image.color_mode, image.color_depth = "OPEN_EXR", "RGB", "32"
+    image.file_format = "OPEN_EXR"
+    image.color_mode = "RGB"
+    image.color_depth = "32"
     image.exr_codec = "NONE"
     settings = {
         "device": "CPU",
@@ -178,16 +185,17 @@ def set_up_cycles(request: dict[str, Any], target: Path) -> None:
 
 
 def render(samples: int) -> dict[str, float]:
-    """Render, and return the seconds on the clock and of all cores for the whole call."""
+    """Render, and return the wall-clock and CPU seconds of the whole call."""
     bpy.context.scene.cycles.samples = samples
     bpy.context.scene.update_tag()  # or the data that stayed keep the number of samples too
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall = time.perf_counter()
+    cpu = time.process_time()
     bpy.ops.render.render(write_still=True)
     return {"wall_s": time.perf_counter() - wall, "core_s": time.process_time() - cpu}
 
 
 def pixels(path: Path) -> NDArray[np.float32]:
-    """Return the colours of an EXR file, float32 [R, R, 3], the top row first."""
+    """Return the colors of an EXR file, float32 [R, R, 3], the top row first."""
     image = bpy.data.images.load(str(path))
     image.colorspace_settings.name = "Non-Color"
     width, height = image.size
@@ -198,21 +206,23 @@ def pixels(path: Path) -> NDArray[np.float32]:
 
 
 def exr_text_attributes(path: Path) -> dict[str, str]:
-    """Return the strings in the header of an EXR file: Cycles states its own times there."""
-    data, at, found = path.read_bytes(), 8, {}
+    """Return the strings in the header of an EXR file, in which Cycles states its times."""
+    data = path.read_bytes()
+    at = 8
+    attributes = {}
     while data[at]:  # a name without letters ends the header
         name_end = data.index(0, at)
         type_end = data.index(0, name_end + 1)
         (size,) = struct.unpack_from("<i", data, type_end + 1)
         value = data[type_end + 5 : type_end + 5 + size]
         if data[name_end + 1 : type_end] == b"string":
-            found[data[at:name_end].decode()] = value.decode()
+            attributes[data[at:name_end].decode()] = value.decode()
         at = type_end + 5 + size
-    return found
+    return attributes
 
 
 def _seconds(clock: str) -> float:
-    """Return the seconds of Blender's "minutes:seconds", with hours before where there are any."""
+    """Return the seconds of Blender's "minutes:seconds" or "hours:minutes:seconds"."""
     seconds = 0.0
     for part in clock.split(":"):
         seconds = 60 * seconds + float(part)

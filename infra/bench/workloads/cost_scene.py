@@ -1,8 +1,8 @@
-"""A scene of which one quantity at a time can be changed, with all the others fixed.
+"""Scene for measuring costs, in which one quantity at a time can be changed.
 
-Two built-in objects, a mirror and a rough body, in an open room of three quads under small lights.
-The objects are drawn again with more or fewer triangles from the same formula; of the lights on a
-ring the first few are there, and share one power. So surfaces, materials and camera always agree.
+Two built-in objects, a mirror and a rough body, are in an open room of three quads under small
+lights. More or fewer triangles of the objects come from the same formula; the lights are the first
+ones on a ring, and share one power. So surfaces, materials and camera always agree.
 """
 
 import math
@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
-from pipeline.scenes.pieces import ScenePiece, emitter_piece, joined, object_piece, shell_piece
+from pipeline.scenes.pieces import (
+    ScenePiece,
+    concatenate_pieces,
+    emitter_piece,
+    object_piece,
+    shell_piece,
+)
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from storage.conventions import look_at_c2w
 from storage.records.scene import Scene, SceneObject
@@ -19,7 +25,7 @@ from storage.seeds import rng_for
 
 MAX_LIGHTS = 32
 _TOTAL_EMISSION = 3750.0
-"""Radiance summed over the lights: the middle of what builds draw."""
+"""Radiance summed over the lights, in the middle of the range of dataset presets."""
 
 _SMOOTH_ANGLE_DEG = 60.0
 _ROOM: dict[str, ArrayLike] = {
@@ -33,7 +39,7 @@ def cost_scene(num_triangles: int, num_lights: int) -> Scene:
     """Return the scene with one camera.
 
     Args:
-        num_triangles: about how many in all; the objects' grids come within a tenth from 100 on.
+        num_triangles: approximate number of all triangles, within a tenth from 100 on.
         num_lights: 1 to MAX_LIGHTS emitting triangles.
     """
     rng = rng_for(0, "cost scene")
@@ -49,7 +55,7 @@ def cost_scene(num_triangles: int, num_lights: int) -> Scene:
     pieces = [*shell, *objects, *emitters]
     pose = look_at_c2w(eye=(1.4, -2.2, 1.3), target=(0, 0, 0.35), up=(0, 0, 1))
     scene = Scene(
-        **joined(pieces),
+        **concatenate_pieces(pieces),
         c2w=pose[None].astype(np.float32),
         fov_deg=np.array([40.0], np.float32),
         objects=tuple(piece.entry for piece in pieces),
@@ -106,7 +112,7 @@ def _object(
 
 
 def _light(row: int, num_lights: int) -> Emitter:
-    """Return one of MAX_LIGHTS places on a ring, spread so that the first few are far apart."""
+    """Return one of MAX_LIGHTS positions on a ring, in an order that spreads the first ones."""
     angle = 2 * math.pi * ((row * 0.6180339887) % 1.0)
     centre = np.array([0.8 * math.cos(angle), 0.8 * math.sin(angle) - 0.6, 2.2])
     corners = 0.08 * np.array([[1.0, 0.0, 0.0], [-0.5, -0.866, 0.0], [-0.5, 0.866, 0.0]])

@@ -1,4 +1,4 @@
-"""A view of a `Scene` as Blender's Cycles renders it, from its arrays or our USD; with its cost."""
+"""Renders a view of a `Scene` with Blender's Cycles, from its arrays or its USD, with the cost."""
 
 import dataclasses
 import json
@@ -23,60 +23,61 @@ _TIMEOUT_S = 4 * 3600
 
 @dataclass(frozen=True, kw_only=True)
 class CyclesOptions:
-    """How Cycles shall render a view."""
+    """Options of a render by Cycles."""
 
     resolution: int
     """Width and height in pixels."""
     spp: int
     """Samples per pixel; adaptive sampling is off."""
     denoise: bool
-    """Whether Open Image Denoise cleans the picture, with Cycles' own albedo and normals."""
+    """True to denoise by Open Image Denoise, with Cycles' albedo and normals."""
     bounces: int = 8
-    """Most bounces, of each kind and in sum: 8 is Mitsuba's max_depth 10, 0 is direct light."""
+    """Maximum number of bounces, in sum and of each kind; 8 is Mitsuba's max_depth of 10, and 0
+    direct light."""
     seed: int = 0
-    """Seed of the samples."""
+    """Seed of the samples, for Cycles' random numbers."""
     threads: int = 1
-    """Threads of Cycles; the denoiser takes all that the process may use."""
+    """Threads of Cycles; the denoiser uses all cores of the process."""
 
     def with_seed(self, seed: int) -> "CyclesOptions":
-        """Return the same with another seed."""
+        """Return these options with another seed."""
         return dataclasses.replace(self, seed=seed)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CyclesPicture:
-    """One finished picture and its cost."""
+    """Finished picture and its cost."""
 
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance."""
     render_s: float
-    """What Cycles itself states, to 10 ms: sampling and denoising, on the clock. Starting Blender,
-    reading the scene and building its tree of triangles came before."""
+    """Wall-clock seconds of sampling and denoising that Cycles states, to 10 ms, without starting
+    Blender, reading the scene and building its BVH."""
     core_s: float
-    """Core-seconds of that call, with what little Blender does around it; other work on the
-    machine moves them less than the clock."""
+    """CPU seconds of that call; other work on the machine changes them less than wall-clock
+    seconds."""
     prepare_s: float
-    """Wall time before that: filling Blender's scene, and a picture of one sample."""
+    """Wall-clock seconds of the preparation: Blender's scene, and a picture of one sample."""
 
 
 def cycles_picture(scene: Scene, view: int, options: CyclesOptions) -> CyclesPicture:
-    """Render one view in a process of its own.
+    """Render one view in a separate process.
 
     Args:
-        scene: that passes `Scene.check`.
-        view: row of its cameras.
-        options: how.
+        scene: scene that passes `Scene.check`.
+        view: row of the camera in the scene.
+        options: options of the render.
 
     Raises:
-        TrilightError: Blender cannot be had (blender_environment), or it failed.
+        TrilightError: Blender cannot be installed (blender_environment), or it failed.
     """
     python = blender_python()
     camera = {"c2w": scene.c2w[view].tolist(), "fov_deg": float(scene.fov_deg[view])}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         np.savez(folder / "scene.npz", **{field: getattr(scene, field) for field in ARRAY_FIELDS})
-        asked = {**dataclasses.asdict(options), **camera}
-        (folder / "request.json").write_text(json.dumps(asked))
+        request = {**dataclasses.asdict(options), **camera}
+        (folder / "request.json").write_text(json.dumps(request))
         _run_blender(_SCRIPT, folder, python)
         timing = json.loads((folder / "timing.json").read_text())
         return CyclesPicture(
@@ -89,40 +90,40 @@ def cycles_picture(scene: Scene, view: int, options: CyclesOptions) -> CyclesPic
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CyclesSamples:
-    """Pictures of one view that share no samples, and their cost."""
+    """Independent pictures of one view, and their cost."""
 
     pictures_rgb: tuple[NDArray[np.float32], ...]
-    """[R, R, 3] linear radiance, a picture a seed."""
+    """[R, R, 3] linear radiance, a picture for each seed."""
     core_s: float
-    """Core-seconds of all renders; reading the file came before."""
+    """CPU seconds of all renders, without reading the file."""
 
 
 def cycles_of_usd(usd: Path, options: CyclesOptions, seeds: Sequence[int]) -> CyclesSamples:
-    """Render the first view of a USD file of ours as Blender shows it after our script.
+    """Render the first view of a Trilight USD file in Blender, after exact_materials.py.
 
     Args:
-        usd: the file, with what it names beside it.
-        options: how; its seed counts for nothing.
-        seeds: of the samples of each picture.
+        usd: USD file, with its textures in place.
+        options: options of the render; the seed is ignored.
+        seeds: seed of each picture's samples.
 
     Raises:
         TrilightError: as `cycles_picture`.
     """
     python = blender_python()
-    asked = {**dataclasses.asdict(options), "usd": str(usd.resolve()), "seeds": list(seeds)}
+    request = {**dataclasses.asdict(options), "usd": str(usd.resolve()), "seeds": list(seeds)}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "request.json").write_text(json.dumps(asked))
+        (folder / "request.json").write_text(json.dumps(request))
         _run_blender(_USD_SCRIPT, folder, python)
-        found = [folder / f"picture{number}.npy" for number in range(len(seeds))]
+        picture_files = [folder / f"picture{number}.npy" for number in range(len(seeds))]
         return CyclesSamples(
-            pictures_rgb=tuple(np.load(path, allow_pickle=False) for path in found),
+            pictures_rgb=tuple(np.load(path, allow_pickle=False) for path in picture_files),
             core_s=json.loads((folder / "timing.json").read_text())["core_s"],
         )
 
 
 def _run_blender(script: Path, folder: Path, python: Path) -> None:
-    """Run the script; what Blender writes of its own accord stays in the folder."""
+    """Run the script; files that Blender writes by itself stay in the folder."""
     surroundings = {**os.environ, "HOME": str(folder), "BLENDER_USER_RESOURCES": str(folder)}
     try:
         result = subprocess.run(

@@ -1,4 +1,4 @@
-"""Pictures with their stated errors, held against raw references (infra.rendering)."""
+"""Stated errors of pictures, compared with true errors to raw references (infra.rendering)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +12,14 @@ _CURVES = {"log": log10_radiance, "linear": clamped_radiance, "object": log10_ra
 
 
 def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
-    """Return stated and true errors of a picture, in dB, with what the reference leaves open."""
+    """Return stated and true errors of a picture in dB, with the reference's uncertainty."""
     mean = 0.5 * (reference.a_rgb + reference.b_rgb)
     stated_db = {
         "log": view.noise_floor_db,
         "linear": view.noise_floor_linear_db,
         "object": view.object_noise_floor_db,
     }
-    found = {
+    values = {
         "spp": float(view.spp),
         "at_cap": float(view.at_cap),
         "brightness": 100 * float(view.radiance_rgb.mean() / mean.mean() - 1),
@@ -28,7 +28,7 @@ def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
         pixels = view.hits if name == "object" else np.ones_like(view.hits)
         true_db, open_db = true_error_db(view.radiance_rgb, reference, curve, pixels)
         excess_db = stated_db[name] - true_db
-        found |= {
+        values |= {
             f"{name}_stated_db": stated_db[name],
             f"{name}_true_db": true_db,
             f"{name}_open_db": open_db,
@@ -36,13 +36,13 @@ def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
             f"{name}_over_1": float(excess_db > 1),
             f"{name}_over_3": float(excess_db > 3),
         }
-    return found
+    return values
 
 
 def difference_db(ours: RawReference, theirs: RawReference, curve: Curve) -> float:
-    """Return by how much two renderers differ where the noise of both is left out, in dB.
+    """Return the difference of two renderers in dB, without the noise of both.
 
-    The squared difference is the mean of (A - C) (B - D), of halves A and B of one and C and D of
+    The squared difference is the mean of (A - C) (B - D), with halves A and B of one and C and D of
     the other. It may be below 0 by chance, which counts as no difference.
     """
     means = (0.5 * (one.a_rgb + one.b_rgb) for one in (ours, theirs))
@@ -52,7 +52,7 @@ def difference_db(ours: RawReference, theirs: RawReference, curve: Curve) -> flo
 
 
 def shrunk(reference: RawReference, resolution: int) -> RawReference:
-    """Return a reference of a smaller width, which divides the first."""
+    """Return a reference of a smaller width, which divides the reference's."""
     return RawReference(
         a_rgb=_block_means(reference.a_rgb, resolution),
         b_rgb=_block_means(reference.b_rgb, resolution),

@@ -1,4 +1,4 @@
-"""Datasets to measure reading on: copies of a few samples."""
+"""Writes datasets for measuring reading: copies of a few samples."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,13 +12,13 @@ from storage.records.sample import sample_key
 def write_copies(
     root: Path, members: Sequence[Mapping[str, bytes]], *, copies: int = 16, per_shard: int = 16
 ) -> int:
-    """Write a dataset that holds each sample under many keys; return how many samples there are.
+    """Write a dataset that holds each sample under many keys; return the number of samples.
 
     Args:
-        root: where; it may be missing.
+        root: folder of the dataset; it may be missing.
         members: files of each sample by name.
-        copies: keys of each sample.
-        per_shard: samples of a shard.
+        copies: number of keys of each sample.
+        per_shard: number of samples of a shard.
     """
     folder = DatasetFolder(root)
     every = [(sample_key(k), members[k % len(members)]) for k in range(copies * len(members))]

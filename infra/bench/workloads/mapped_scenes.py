@@ -1,4 +1,4 @@
-"""Scenes with textures and skies that are compared with another renderer, always the same ones."""
+"""Fixed scenes with textures and skies for the comparison with another renderer."""
 
 from infra.rendering.held_out_scenes import first_composed
 from pipeline.builds.training import textured_256
@@ -8,10 +8,10 @@ from storage.records.scene import Scene
 from storage.settings.changes import changed
 
 SKIES = ("sun_and_sky", "clouds", "softboxes", "night")
-"""Families of the skies: the first has a sharp sun."""
+"""Families of skies; the first has a sharp sun."""
 
 _SEEN = ("sun_and_sky", "softboxes")
-"""Those that cameras see too."""
+"""Families of skies that are visible to cameras."""
 
 _SEED = 20_261_125
 _SKY_ROWS = 128
@@ -23,7 +23,7 @@ _CALM = {
     "textures.surfaces.roughness_clip": _ROUGH,
     "materials.roughness_clip": _ROUGH,
 }
-"""Changes that leave out mirrors, whose caustics would drown in noise what is compared here."""
+"""Changes that leave out mirrors, whose caustics would be too noisy for a comparison."""
 
 
 def mapped_scene(name: str) -> Scene:

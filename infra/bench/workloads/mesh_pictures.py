@@ -1,7 +1,7 @@
-"""What making an object coarser does to its picture: path traced beside its cleaned source.
+"""Effect of decimation on pictures: path traced meshes compared with their cleaned source.
 
-One object on a floor under one lamp, the same for every mesh of it: camera, material, random
-numbers. Making meshes runs in a mesh child, rendering them in a render child.
+One object is on a floor under one lamp; camera, material and random numbers are equal for all of
+its meshes. Meshes are made in a mesh child, and rendered in a render child.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.bench.workloads.remeshing import cleaned, raw_mesh
+from infra.bench.workloads.remeshing import clean_mesh, raw_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.renders.settings import RenderSettings
 from storage.conventions import look_at_c2w
@@ -19,18 +19,19 @@ from storage.metrics import psnr_log_db
 from storage.records.scene import Scene, SceneObject
 
 _SMOOTH_ANGLE_DEG = 30.0
-_EYE, _FOV_DEG = (1.6, -1.6, 1.0), 35.0
+_EYE = (1.6, -1.6, 1.0)
+_FOV_DEG = 35.0
 _LAMP = ((0.8, -1.2, 2.0), (1.3, -0.9, 2.0), (0.9, -0.7, 2.2))
 _RADIANCE = 200.0
-"""Pictures are then as bright on average as the median one of `smoke`, 0.23: dB depend on it."""
+"""Radiance that gives pictures the median brightness of `smoke`, 0.23, on which dB depend."""
 
 
 def coarser(path: Path, budgets: Sequence[int], method: str) -> list[TriangleMesh]:
-    """Return the cleaned source of a file, then one mesh for each budget; raises Rejected."""
+    """Return the cleaned source of a file, and one mesh for each budget; raises Rejected."""
     from pipeline.assets.cleaning.clean import clean
     from pipeline.assets.decimation.by_name import decimate
 
-    source = cleaned(raw_mesh(path))
+    source = clean_mesh(raw_mesh(path))
     meshes = [source, *(clean(decimate(source, budget, method)) for budget in budgets)]
     return [
         TriangleMesh(  # of the declared types: a mesh leaves its child with no other
@@ -42,9 +43,9 @@ def coarser(path: Path, budgets: Sequence[int], method: str) -> list[TriangleMes
 
 
 def picture_db(meshes: Sequence[TriangleMesh], renders: RenderSettings) -> list[float]:
-    """Return psnr_log_db to the picture of the first mesh: of each other one, and of itself again.
+    """Return psnr_log_db of each further mesh, and of the first again, to the first's picture.
 
-    The last is the first with other random numbers: nothing can be told above it.
+    The last value is the first mesh with other random numbers, which bounds the others.
     """
     from pipeline.renders.renderer import SceneRenderer
 
@@ -58,7 +59,7 @@ def picture_db(meshes: Sequence[TriangleMesh], renders: RenderSettings) -> list[
 
 
 def _scene(mesh: TriangleMesh, *, floor_z: float) -> Scene:
-    from pipeline.scenes.pieces import emitter_piece, joined, object_piece, shell_piece
+    from pipeline.scenes.pieces import concatenate_pieces, emitter_piece, object_piece, shell_piece
     from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 
     rng = np.random.default_rng(0)  # for materials of many colours, which these are not
@@ -76,7 +77,8 @@ def _scene(mesh: TriangleMesh, *, floor_z: float) -> Scene:
     )  # fmt: skip
     lamp = Emitter(triangle=np.array(_LAMP), radiance_rgb=(_RADIANCE,) * 3, reflectance=0.0)
     entry = SceneObject(name="object", kind="object")
-    positions, faces = mesh.positions.astype(np.float32), mesh.faces.astype(np.uint32)
+    positions = mesh.positions.astype(np.float32)
+    faces = mesh.faces.astype(np.uint32)
     pieces = [
         shell_piece(floor, rng, _SMOOTH_ANGLE_DEG),
         object_piece(entry, positions, faces, glossy, rng, _SMOOTH_ANGLE_DEG),
@@ -84,7 +86,7 @@ def _scene(mesh: TriangleMesh, *, floor_z: float) -> Scene:
     ]
     c2w = look_at_c2w(eye=_EYE, target=(0, 0, 0), up=(0, 0, 1))
     return Scene(
-        **joined(pieces),
+        **concatenate_pieces(pieces),
         c2w=c2w.astype(np.float32)[None],
         fov_deg=np.array([_FOV_DEG], np.float32),
         objects=tuple(piece.entry for piece in pieces),

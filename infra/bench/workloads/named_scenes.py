@@ -1,4 +1,4 @@
-"""The scenes that pictures are judged on: sampled ones, always the same, and the user's."""
+"""Scenes of the experiments on pictures: fixed sampled ones, and those of the user."""
 
 import dataclasses
 import json
@@ -12,15 +12,15 @@ from pipeline.builds.training import smoke
 from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
 from pipeline.exchange.gltf.read import read_gltf
 from pipeline.exchange.scene_files import build_scene
+from pipeline.generation.attempt_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.isolation import IsolatedChild
-from pipeline.making.attempt_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.objects.licences import USER_PROVIDED
 from storage.errors import Rejected, TrilightError
 from storage.records.sample import Sample
 from storage.records.scene import Scene
 
 MakeScene = Callable[[IsolatedChild], Scene]
-"""Makes a scene in a render child."""
+"""Function that makes a scene in a render child."""
 
 
 def sampled_trials(count: int) -> list[str]:
@@ -29,10 +29,10 @@ def sampled_trials(count: int) -> list[str]:
 
 
 def given_scenes(folder: Path | None) -> Mapping[str, MakeScene]:
-    """Return the scenes of a folder of RenderFormer and glTF files by name; none without a folder.
+    """Return the scenes of a folder of RenderFormer and glTF files by name; empty for no folder.
 
     Raises:
-        TrilightError: no file of the folder is glTF, or JSON that holds a scene's objects.
+        TrilightError: the folder holds neither a glTF file nor a JSON file of a scene.
     """
     if folder is None:
         return {}
@@ -43,14 +43,14 @@ def given_scenes(folder: Path | None) -> Mapping[str, MakeScene]:
         raise TrilightError(
             f"--scenes {folder}: it holds no scene; expected RenderFormer scenes (*.json) or glTF."
         )
-    found: dict[str, MakeScene] = {path.name: partial(_call, _gltf_scene, path) for path in trees}
-    return found | {Path(name).stem: partial(_call, _described_scene, root, name) for name in names}
+    scenes: dict[str, MakeScene] = {path.name: partial(_call, _gltf_scene, path) for path in trees}
+    return scenes | {
+        Path(name).stem: partial(_call, _described_scene, root, name) for name in names
+    }
 
 
 def sampled_scene(scene_index: int) -> Scene:
-    """Return a scene of the preset `smoke` with one camera, as a dataset would have it.
-
-    Runs in a render child.
+    """Return a scene of the preset `smoke` with one camera; runs in a render child.
 
     Raises:
         Rejected: every attempt at it was rejected.
@@ -62,10 +62,10 @@ def sampled_scene(scene_index: int) -> Scene:
 
 
 def first_sample(scene_index: int) -> Sample:
-    """Return the sample of a training scene's first attempt that passes; runs in a render child.
+    """Return the sample of a training scene's first accepted attempt; runs in a render child.
 
     Raises:
-        TrilightError: none does.
+        TrilightError: every attempt was rejected.
     """
     for attempt in range(MAX_ATTEMPTS):
         sample = attempt_scene("train", scene_index, attempt).sample
@@ -75,7 +75,7 @@ def first_sample(scene_index: int) -> Sample:
 
 
 def _call(function: Callable[..., Scene], *arguments: object) -> Scene:
-    """Call a function in the render child that comes last."""
+    """Call a function in the render child, which is the last argument."""
     *known, child = arguments
     assert isinstance(child, IsolatedChild)
     return child.call(function, *known)
@@ -94,9 +94,9 @@ def _described_scene(root: Path, name: str) -> Scene:
 
 
 def _holds_a_scene(path: Path) -> bool:
-    """Return whether a file has objects and a camera, as templates have not."""
+    """Return whether a file has objects and a camera, which templates lack."""
     try:
-        found = json.loads(path.read_bytes())
+        record = json.loads(path.read_bytes())
     except ValueError:
         return False
-    return isinstance(found, dict) and bool(found.get("objects")) and bool(found.get("cameras"))
+    return isinstance(record, dict) and bool(record.get("objects")) and bool(record.get("cameras"))

@@ -1,4 +1,4 @@
-"""Whole samples in our profiles and in the published HDF5 layout: bytes, and time to unpack."""
+"""Bytes and unpacking time of samples in Trilight's profiles and in RenderFormer's HDF5 layout."""
 
 import io
 import time
@@ -24,14 +24,14 @@ def unpacking_figures(samples: Sequence[Sample], layout: str, work: Path) -> Map
     """Unpack samples of one of LAYOUTS in memory, in one thread.
 
     Returns:
-        Means of the bytes a sample before and after, and of the processor's milliseconds.
+        Mean bytes of a sample before and after, and mean CPU milliseconds.
     """
     if layout in TEXTURES:
         files = [_h5_bytes(sample, work, TEXTURES[layout]) for sample in samples]
-        return _timed(files, _unpacked_h5, len)
+        return _time_unpacking(files, _unpacked_h5, len)
     profile: Profile = "lossless" if layout == "lossless" else "compact"
     members = [encode_sample(sample, profile) for sample in samples]
-    return _timed(members, _unpacked_sample, lambda packed: sum(map(len, packed.values())))
+    return _time_unpacking(members, _unpacked_sample, lambda packed: sum(map(len, packed.values())))
 
 
 def _unpacked_sample(members: Mapping[str, bytes]) -> int:
@@ -47,12 +47,12 @@ def _h5_bytes(sample: Sample, work: Path, texture_type: TextureType) -> bytes:
 
 
 def _unpacked_h5(data: bytes) -> int:
-    """Read every array as it is, as a loader that trusts its files does."""
+    """Read every array without checks, as a loader that trusts its files does."""
     with h5py.File(io.BytesIO(data)) as file:
         return sum(file[name][()].nbytes for name in file)
 
 
-def _timed(
+def _time_unpacking(
     packed: Sequence[Packed], unpack: Callable[[Packed], int], size: Callable[[Packed], int]
 ) -> Mapping[str, float]:
     began = time.process_time()

@@ -1,11 +1,11 @@
-"""Plain Mitsuba's pictures of a view at rising numbers of samples, with their price.
+"""Pictures of plain Mitsuba at rising numbers of samples, with their cost.
 
-This is what a user of plain Mitsuba would run: stock `path` with its defaults and the
+The setup is that of a user of plain Mitsuba: the stock `path` integrator with its defaults, the
 `independent` sampler, and Open Image Denoise once. Material and emitters are those of
-tests/oracle/plugin_scene.py, which a checkout alone has: without its one texture rough metals would
-lose light, and no number of samples would give the right picture. Its emitters are chosen by their
-power, which is more than a user gets without asking, and the denoiser reads our own guide pictures:
-both favour this side.
+tests/oracle/plugin_scene.py, which only a checkout has: without its one texture rough metals would
+lose light, and no number of samples would give the right picture. Emitters are sampled by their
+power, which is not Mitsuba's default, and the denoiser reads Trilight's guide pictures: both favor
+plain Mitsuba.
 """
 
 import importlib
@@ -32,18 +32,18 @@ from storage.seeds import seed_for
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlainPicture:
-    """One view with a fixed number of samples."""
+    """View with a fixed number of samples."""
 
     spp: int
-    """Samples per pixel."""
+    """Number of samples per pixel."""
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance."""
     core_s: float
-    """Core-seconds of this picture alone, kernels warm and scene loaded."""
+    """CPU seconds of the picture, with warm kernels and a loaded scene."""
 
 
 _RR_DEPTH = 5
-"""Mitsuba's default."""
+"""Default of Mitsuba."""
 
 
 def render_levels(
@@ -51,21 +51,23 @@ def render_levels(
 ) -> list[PlainPicture]:
     """Render a scene's first view with each number of samples; no sample is traced twice.
 
-    Core-seconds are those of the samples, the guide pictures, and one denoise.
+    CPU seconds are those of the samples, the guide pictures, and one denoise.
 
     Args:
-        scene: that passes `Scene.check`.
-        resolution: pixels each way.
-        levels_spp: rising. Mitsuba is called once for what each adds to the one before, in steps
-            as large as a user's, since few samples a call cost it up to a tenth.
-        seed: of the view.
+        scene: scene that passes `Scene.check`.
+        resolution: width in pixels.
+        levels_spp: ascending samples per pixel. Mitsuba is called once for the samples that each
+            level adds, since calls with few samples are up to a tenth slower.
+        seed: seed of the samples.
     """
     camera = first_camera(scene, resolution)
     _Plain(scene).radiance(camera, seed_for(seed, "plain warm-up"), levels_spp[0])
     warm_up_denoiser(resolution)
     plain = _Plain(scene)
     features, core_s = _features(scene, camera)
-    total, before, levels = np.zeros((resolution, resolution, 3)), 0, []
+    total = np.zeros((resolution, resolution, 3))
+    before = 0
+    levels = []
     for spp in levels_spp:
         started = time.process_time()
         total += (spp - before) * plain.radiance(camera, seed_for(seed, "plain", spp), spp - before)
@@ -102,7 +104,7 @@ def _oracle(name: str) -> Any:
 
 
 class _Plain:
-    """A scene with its integrator."""
+    """Mitsuba scene with its integrator."""
 
     def __init__(self, scene: Scene) -> None:
         import mitsuba  # not before `activate`, which says where compiled kernels are kept

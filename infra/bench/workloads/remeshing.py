@@ -1,4 +1,4 @@
-"""One object remeshed one way, measured: runs in the children of `trilight bench meshes`."""
+"""Measures the decimation of one object; runs in the children of `trilight bench meshes`."""
 
 import time
 from collections.abc import Mapping
@@ -9,15 +9,15 @@ if TYPE_CHECKING:
     from pipeline.foreign.mesh import TriangleMesh
 
 REFERENCE = "reference recipe"
-"""Isotropic remeshing at 0.5 % of the diagonal, then quadric collapse, of the file as it is: the
-public tool of RenderFormer's first version."""
+"""Method: isotropic remeshing at 0.5 % of the diagonal, then quadric collapse, without cleaning;
+the public tool of RenderFormer's first version."""
 
 METHODS: Mapping[str, str] = {
     "faithful": "pymeshlab_collapse",
     "faithful, GPL-free": "meshoptimizer",
     "uniform": "pymeshlab_uniform",
 }
-"""Our sides by the name of their decimation; cleaning and orientation count as theirs."""
+"""Trilight's methods by the name of their decimation; cleaning and orientation are included."""
 
 
 def raw_mesh(path: Path) -> "TriangleMesh":
@@ -30,7 +30,7 @@ def raw_mesh(path: Path) -> "TriangleMesh":
     return normalise(load_mesh(read_source(path, ReadLimits())))
 
 
-def cleaned(raw: "TriangleMesh") -> "TriangleMesh":
+def clean_mesh(raw: "TriangleMesh") -> "TriangleMesh":
     """Return a raw mesh as the mesh stage decimates it; raises Rejected."""
     from pipeline.assets.cleaning.clean import clean
     from pipeline.assets.cleaning.orient import orient_outward
@@ -39,28 +39,28 @@ def cleaned(raw: "TriangleMesh") -> "TriangleMesh":
 
 
 def count_faces(path: Path) -> int:
-    """Return how many triangles a source has after cleaning; raises Rejected."""
+    """Return the number of triangles of a source after cleaning; raises Rejected."""
     from pipeline.assets.cleaning.clean import clean
 
     return len(clean(raw_mesh(path)).faces)
 
 
 def remesh(path: Path, side: str, budget: int) -> dict[str, float]:
-    """Return processor seconds and quality of one object at one budget; raises Rejected.
+    """Return CPU seconds and quality of one object at one budget; raises Rejected.
 
-    Loading the file and measuring the result are not counted, since every side needs the same.
+    Loading the file and measuring the result are not counted, since every method needs them.
     """
     from pipeline.assets.cleaning.clean import clean
     from pipeline.assets.decimation.by_name import decimate
     from pipeline.assets.quality.measure import MeasuredSource
 
     raw = raw_mesh(path)
-    source = cleaned(raw)
+    source = clean_mesh(raw)
     started = time.process_time()
     if side == REFERENCE:
         result = _reference(raw.positions, raw.faces, budget)
     else:
-        result = decimate(cleaned(raw), budget, METHODS[side])
+        result = decimate(clean_mesh(raw), budget, METHODS[side])
     cpu_s = time.process_time() - started
     mesh = clean(result)
     quality = MeasuredSource(source).quality(mesh)

@@ -1,7 +1,7 @@
-"""One view by the product's renderer under several settings, each with its price.
+"""Renders one view by Trilight's path tracer under several settings, with the cost of each.
 
-Core-seconds are those of the process: sampling, guide pictures, measuring the stated error, and the
-one denoise that makes the picture. Loading the scene is not counted; kernels are warm.
+CPU seconds are those of the process: sampling, guide pictures, measuring the stated error, and one
+denoise. Loading the scene is not counted; kernels are warm.
 """
 
 import dataclasses
@@ -20,24 +20,24 @@ SEED = 20_261_122
 """Seed of these pictures; no dataset preset and no run uses it."""
 
 _SMALL = 32
-"""Width of what only compiles, in pixels."""
+"""Width in pixels of the picture that compiles the kernels."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shot:
-    """One view under one setting."""
+    """View under one setting."""
 
     view: RenderedView
-    """The picture with its stated errors and its samples."""
+    """Picture with its stated errors and its samples."""
     core_s: float
-    """Core-seconds without loading the scene."""
+    """CPU seconds without loading the scene."""
 
 
 def fixed_samples(resolution: int, spp: int) -> RenderSettings:
-    """Return settings that no stated error stops early.
+    """Return settings of a fixed number of samples, which no stated error stops early.
 
     Args:
-        resolution: pixels each way.
+        resolution: width in pixels.
         spp: samples per pixel; a multiple of 128 for the best sampling.
     """
     return RenderSettings(
@@ -56,7 +56,8 @@ def shots(scene: Scene, variants: Mapping[str, RenderSettings]) -> dict[str, Sho
 
 def _shot(scene: Scene, settings: RenderSettings) -> Shot:
     small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
-    pose, fov_deg = scene.c2w[0], float(scene.fov_deg[0])
+    pose = scene.c2w[0]
+    fov_deg = float(scene.fov_deg[0])
     SceneRenderer(scene, small).render_view(pose, fov_deg, seed=0)  # compiles
     if settings.denoiser != "off":
         warm_up_denoiser(settings.resolution, settings.denoiser)

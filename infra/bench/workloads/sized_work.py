@@ -1,7 +1,7 @@
-"""Work of any size, done for real in a fresh process, with its time and its memory.
+"""Measures time and memory of real work of any size, in a fresh process.
 
 The process first does the work at the smallest size, so that imports and compiled kernels do not
-count. Memory is that of the process and of its children, sampled from outside.
+count. The memory is that of the process and its children, sampled from outside.
 """
 
 import json
@@ -19,23 +19,24 @@ from infra.bench.workloads.manifests import write_copies
 from storage.errors import TrilightError
 from storage.installation import IMPORT_ROOT, child_environment
 
-_PX, _LIGHTS = 64, 4
+_PX = 64
+_LIGHTS = 4
 _SAMPLING_S = 0.05
 _CODE = "import sys; from importlib import import_module as i; i(sys.argv[1]).main(sys.argv[2:])"
 
 
 @dataclass(frozen=True, kw_only=True)
 class SizedWork:
-    """One kind of work."""
+    """Kind of work."""
 
     unit: str
-    """Plural of what is counted."""
+    """Plural of the counted unit."""
     least: int
-    """The smallest size; each further one is four times as large."""
+    """Smallest size; each further one is four times as large."""
     most: int
-    """Sizes above this are left out: a network's memory grows with the square of triangles."""
+    """Maximum size, since a network's memory grows with the square of triangles."""
     do: Callable[[int, Path], None]
-    """Does the work at a size, in an empty folder, beside those of other sizes."""
+    """Function that does the work at a size, in an empty folder next to those of other sizes."""
 
 
 def sizes_of(work: SizedWork, count: int) -> list[int]:
@@ -45,12 +46,12 @@ def sizes_of(work: SizedWork, count: int) -> list[int]:
 
 
 def measure_work(name: str, size: int, folder: Path) -> dict[str, float]:
-    """Return seconds and most bytes of a kind of WORK at a size, in a fresh process.
+    """Return seconds and peak bytes of a kind of WORK at a size, in a fresh process.
 
     Args:
-        name: one of WORK.
-        size: how much of it.
-        folder: empty.
+        name: key of WORK.
+        size: size of the work.
+        folder: empty folder.
 
     Raises:
         TrilightError: the process failed.
@@ -60,7 +61,8 @@ def measure_work(name: str, size: int, folder: Path) -> dict[str, float]:
         words, cwd=IMPORT_ROOT, env=child_environment(), stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT, text=True, start_new_session=True,
     ) as process:  # fmt: skip
-        peak, done = [0], threading.Event()
+        peak = [0]
+        done = threading.Event()
         watch = threading.Thread(target=_watch_memory, args=(process.pid, peak, done))
         watch.start()
         output, _ = process.communicate()
@@ -77,7 +79,9 @@ def measure_work(name: str, size: int, folder: Path) -> dict[str, float]:
 
 def main(words: list[str]) -> None:
     """Do the work in this process and print its seconds as the last line."""
-    work, size, folder = WORK[words[0]], int(words[1]), Path(words[2])
+    work = WORK[words[0]]
+    size = int(words[1])
+    folder = Path(words[2])
     for number, count in enumerate((work.least, size)):
         place = folder / f"{number}"
         place.mkdir()
@@ -92,7 +96,7 @@ def _watch_memory(session: int, peak: list[int], done: threading.Event) -> None:
 
 
 def session_bytes(session: int) -> int:
-    """Return the memory of all processes of a session; what they share counts once."""
+    """Return the memory of all processes of a session; shared memory counts once."""
     total = 0
     for folder in Path("/proc").iterdir():
         if not folder.name.isdigit():
@@ -146,7 +150,7 @@ def _show_by_network(num_triangles: int, folder: Path) -> None:
 
 
 def _write_shards(num_shards: int, folder: Path) -> Path:
-    """Write shards of one sample each: the one that lies beside the folders of all sizes."""
+    """Write shards of one sample each, copies of the file next to the folders of all sizes."""
     stored = folder.parents[1] / "sample"
     members = {path.name: path.read_bytes() for path in sorted(stored.iterdir())}
     write_copies(folder / "set", [members], copies=num_shards, per_shard=1)

@@ -1,4 +1,4 @@
-"""Short trainings of any settings, judged scene by scene on what no network has seen."""
+"""Short trainings of any settings, evaluated scene by scene on held-out scenes."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -13,12 +13,12 @@ from model.renderformer import RenderFormer
 from storage.dataset.shard_set import ShardSet
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
+from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.buckets import bucket_scenes
 from train.data.stream import stream_batches
-from train.data.unusable import Unusable, first_samples
 from train.evaluation.judge import Judge
-from train.loop.crew import Crew
-from train.loop.muon import fitting_precision
+from train.loop.distributed import DistributedContext
+from train.loop.muon import choose_muon_precision
 from train.loop.schedule import learning_rate
 from train.loop.state import new_state
 from train.loop.step import Stepper
@@ -29,7 +29,7 @@ from train.settings import TrainSettings
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainingScenes:
-    """The scenes of all trainings of an experiment: those they see, and those they do not."""
+    """Training scenes and held-out scenes of all trainings of an experiment."""
 
     train: ShardSet
     judge: Judge
@@ -38,16 +38,17 @@ class TrainingScenes:
 
 
 def scenes_of(data: str, held_out: int, resolution: int) -> TrainingScenes:
-    """Return the scenes of a dataset, judged on the first ones of its validation split.
+    """Return the scenes of a dataset, with the first ones of its validation split held out.
 
     Raises:
         TrilightError: the validation split is empty.
     """
     opened = open_training_data([data])
-    samples = list(first_samples(opened.split("validation"), held_out, Unusable(0)))
+    samples = list(first_samples(opened.split("validation"), held_out, BadSampleCounter(0)))
     if not samples:
         raise TrilightError(
-            f"--data {opened.shown}: its validation split is empty; expected scenes to judge on."
+            f"--data {opened.display_name}: its validation split is empty; expected scenes to "
+            "judge on."
         )
     train = opened.split("train")
     count = sum(train.num_samples(number) for number in range(len(train.names)))
@@ -68,7 +69,8 @@ def training_figures(
     began = time.perf_counter()
     model = _trained_network(scenes.train, settings, device)
     seconds = time.perf_counter() - began
-    views, found = iter(scenes.judge.judge(model).views), []
+    views = iter(scenes.judge.judge(model).views)
+    scores_by_view = []
     for judged in scenes.judge.scenes:
         mine = [next(views) for _ in judged.target_VRR3]
         l1 = float(np.mean([view.log_l1 for view in mine]))
@@ -76,28 +78,34 @@ def training_figures(
         if np.isfinite(l1) and l1 > 0:
             db = float(np.mean([view.psnr_log_db for view in mine]))
             figures |= {"log_l1": l1, "percent": 100 * float(np.log(l1)), "db": db}
-        found.append(figures)
-    return found
+        scores_by_view.append(figures)
+    return scores_by_view
 
 
 def _trained_network(
     shards: ShardSet, settings: TrainSettings, device: torch.device
 ) -> RenderFormer:
-    crew = Crew(device=device)
-    state = new_state(settings, device, muon_precision=fitting_precision(crew))
+    crew = DistributedContext(device=device)
+    state = new_state(settings, device, muon_precision=choose_muon_precision(crew))
     stepper = Stepper(state, settings, Objective(settings.loss, None), crew)
 
     def flops(triangles: int) -> int:
-        views, resolution = settings.views_per_scene, settings.resolution
+        views = settings.views_per_scene
+        resolution = settings.resolution
         workload = Workload(triangles=triangles, views=views, resolution=resolution)
         return training_flops(settings.model, workload)
 
     stream = stream_batches(
-        shards, stream_settings(settings), 0, share=crew.share, workers=1, unusable=state.unusable
+        shards,
+        stream_settings(settings),
+        0,
+        rank_slice=crew.rank_slice,
+        workers=1,
+        unusable=state.bad_samples,
     )
     with closing(stream) as batches:
         for step in range(settings.num_steps):
             buckets = bucket_scenes(next(batches), flops, settings.scenes_per_pass)
-            stepper.take(buckets, learning_rate(step, settings))  # no step waits for its figures
+            stepper.launch(buckets, learning_rate(step, settings))  # no step waits for its figures
             state.step += 1
     return state.model.eval()

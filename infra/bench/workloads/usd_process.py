@@ -1,6 +1,6 @@
-"""The process that opens our USD in Blender, runs our script, and renders a view with Cycles.
+"""Process that opens a Trilight USD file in Blender, runs exact_materials.py, and renders a view.
 
-Run by path with the Python of blender_environment.py, which has nothing of Trilight:
+Run by path with the Python of blender_environment.py, which has no module of Trilight:
 
     python -I usd_process.py FOLDER
 
@@ -22,7 +22,7 @@ _INFRA = Path(__file__).parents[2]
 
 
 def main(folder: Path) -> None:
-    """Render what the folder asks for."""
+    """Render the request in the folder."""
     request = json.loads((folder / "request.json").read_text())
     cycles = _module("bench/workloads/blender_process.py")
     bpy.ops.wm.read_factory_settings(use_empty=True)

@@ -57,7 +57,8 @@ class RemoteFolder:
             return with_tries(ask)
         except TransferFailed as error:
             raise TrilightError(
-                f"objects {self.url.shown!r}: cannot be read ({error.message}); expected a folder "
+                f"objects {self.url.display_url!r}: cannot be read ({error.message}); expected a "
+                "folder "
                 "that can be reached. Check the URL and your access to it."
             ) from error
 
@@ -72,7 +73,7 @@ class RemoteFolder:
         except TransferFailed as error:
             hint = " Public buckets need FSSPEC_S3_ANON=true." if self.url.scheme == "s3" else ""
             raise TrilightError(
-                f"objects {self.url.shown!r}: cannot be listed ({error.message}); expected a "
+                f"objects {self.url.display_url!r}: cannot be listed ({error.message}); expected a "
                 "folder with a page that lists its files, or with objects.jsonl or objects.csv. "
                 f"Check the URL and your access to it.{hint}"
             ) from error
@@ -106,7 +107,7 @@ class RemoteFolder:
                     names[inner] = address
             if len(folders) > _MAX_FOLDERS or place.count("/") > deepest:
                 raise TrilightError(
-                    f"objects {self.url.shown!r}: the listing has no end; expected at most "
+                    f"objects {self.url.display_url!r}: the listing has no end; expected at most "
                     f"{_MAX_FOLDERS} folders, {_MAX_DEPTH} deep. Give it objects.jsonl."
                 )
         self._addresses = names

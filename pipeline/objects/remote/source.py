@@ -48,7 +48,7 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
             its catalogue is wrong, or has a licence stated from outside.
     """
     folder = RemoteFolder(url)
-    place = cache_folder("objects") / sha256_hex(url.shown.encode())[:32]
+    place = cache_folder("objects") / sha256_hex(url.display_url.encode())[:32]
     files = RemoteFiles(folder, place, MAX_BYTES)
     catalogue = only_catalogue(folder.has)
     failures: list[Failure] = []
@@ -65,7 +65,8 @@ def _catalogued(folder: RemoteFolder, files: RemoteFiles, catalogue: str) -> lis
         records = read_catalogue(files.fetch(catalogue))
     except TransferFailed as error:
         raise TrilightError(
-            f"objects {folder.url.shown!r}: {catalogue} cannot be read ({error.message}); expected "
+            f"objects {folder.url.display_url!r}: {catalogue} cannot be read ({error.message}); "
+            "expected "
             "it to be fetched. Try again, or check your access to it."
         ) from error
     return [
@@ -83,7 +84,8 @@ def _uncatalogued(
     for catalogue in set(CATALOGUE_NAMES) & set(names):
         # it would rule, so that going on without it could use what it forbids
         raise TrilightError(
-            f"objects {folder.url.shown!r}: {catalogue} is listed but cannot be fetched; expected "
+            f"objects {folder.url.display_url!r}: {catalogue} is listed but cannot be fetched; "
+            "expected "
             "a readable catalogue. Check your access to it."
         )
     names = drop_outputs(names)

@@ -32,7 +32,7 @@ class Pass:
     name: str
     """Lower case letters and underscores, with the unit where there is one."""
     means: str
-    """One sentence for people."""
+    """One sentence that documents the pass."""
     channels: tuple[str, ...]
     """Names of its numbers; a single number has none, and its picture no last axis."""
     averaging: Averaging
@@ -40,7 +40,7 @@ class Pass:
     frame: Frame = ""
     dtype: type = np.float64
     nothing: float = np.nan
-    """What stands where no surface is met."""
+    """Value of pixels that show no surface."""
     short: str = ""
     """A shorter word for it on the command line and in settings."""
     layer: str = ""
@@ -236,7 +236,7 @@ def pass_names(words: Iterable[str]) -> tuple[str, ...]:
     """
     passes = [each for each in declared_passes() if each.name != MOTION]
     meant = {word: each.name for each in passes for word in (each.short, each.name) if word}
-    wanted = set()
+    selected = set()
     for word in words:
         if word == MOTION:
             raise TrilightError(
@@ -245,8 +245,8 @@ def pass_names(words: Iterable[str]) -> tuple[str, ...]:
             )
         if word not in meant:
             raise TrilightError(f"there is no pass {word!r:.60}; {expected_one_of(word, meant)}.")
-        wanted.add(meant[word])
-    return tuple(each.name for each in passes if each.name in wanted)
+        selected.add(meant[word])
+    return tuple(each.name for each in passes if each.name in selected)
 
 
 def _channels(width: int, *, is_colour: bool) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""How points that are seen move in the picture, between two moments or two cameras."""
+"""Motion of visible points in the picture, between two moments or two cameras."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +18,12 @@ def motion_px(rays: PassRays) -> NDArray[np.float64]:
     """
     if rays.later is None:
         raise TrilightError("motion_px: no other moment is given; expected `then` or `then_view`.")
-    there, view = rays.later.scene, rays.later.view
+    later_scene = rays.later.scene
+    view = rays.later.view
     places = pixel_places(
         rays.hits.interpolated(rays.later.corners),
-        there.c2w[view],
-        float(there.fov_deg[view]),
+        later_scene.c2w[view],
+        float(later_scene.fov_deg[view]),
         rays.resolution,
     )
     return places - pixel_places(rays.hits.position, rays.c2w, rays.fov_deg, rays.resolution)

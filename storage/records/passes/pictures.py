@@ -64,7 +64,7 @@ def view_passes(
     _require_whole("rays_a_side", rays_a_side, MOST_A_SIDE)
     later = _later(scene, view, then, then_view)
     without = {UV: scene.uv is None, MOTION: later is None}
-    chosen = _chosen(names, without={name for name, lacks in without.items() if lacks})
+    chosen = _select_passes(names, without={name for name, lacks in without.items() if lacks})
     if all(each.averaging == "centre ray" for each in chosen):
         rays_a_side = 1
     origin = scene.c2w[view, :3, 3].astype(np.float64)
@@ -79,7 +79,8 @@ def _blocks(
     seen: SeenFrom, view: int, resolution: int, a_side: int, later: Later | None
 ) -> Iterator[tuple[PassRays, PassRays]]:
     """Yield the rays of some rows of pixels at a time: those of the centres, and all."""
-    c2w, fov_deg = seen.scene.c2w[view].astype(np.float64), float(seen.scene.fov_deg[view])
+    c2w = seen.scene.c2w[view].astype(np.float64)
+    fov_deg = float(seen.scene.fov_deg[view])
 
     def rays(first: int, last: int, a_side: int) -> PassRays:
         rows = slice(first * a_side, last * a_side)
@@ -103,14 +104,14 @@ def _block(
     passes: Sequence[Pass], centre: PassRays, spread: PassRays, a_side: int
 ) -> dict[str, NDArray]:
     """Return the pixels of some rows, [rows, R] or [rows, R, channels]."""
-    found: dict[str, NDArray] = {}
+    pixels: dict[str, NDArray] = {}
     for each in passes:
         if each.averaging == "centre ray":
-            found[each.name] = each.of(centre).astype(each.dtype)
+            pixels[each.name] = each.of(centre).astype(each.dtype)
             continue
         values: NDArray = each.of(spread).astype(each.dtype)
-        found[each.name] = _means(values, a_side, each.nothing)
-    return found
+        pixels[each.name] = _means(values, a_side, each.nothing)
+    return pixels
 
 
 def _means(values: NDArray, a_side: int, nothing: float) -> NDArray:
@@ -135,7 +136,7 @@ def _beside(pixels: NDArray, values: NDArray) -> NDArray:
     return pixels if values.ndim == 2 else pixels[..., None]
 
 
-def _chosen(names: Sequence[str] | None, *, without: Collection[str]) -> list[Pass]:
+def _select_passes(names: Sequence[str] | None, *, without: Collection[str]) -> list[Pass]:
     known = {each.name: each for each in declared_passes()}
     if names is None:
         return [each for each in known.values() if each.name not in without]

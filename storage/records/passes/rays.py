@@ -17,7 +17,7 @@ class Later:
     scene: Scene
     """Has the same triangles with their corners in the same order, possibly elsewhere."""
     view: int
-    """Row of its cameras."""
+    """Camera index in the later scene."""
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Passes as OpenEXR: what a sample may hold beside its pictures, and `trilight passes` writes.
+"""Passes as OpenEXR, as a sample may hold them and `trilight passes` writes them.
 
 All channels are float32, packed without loss: ids below 2^24 are exact in it, and Nuke and Blender
 turn every channel into it anyway. Names of channels are `Pass.exr_channels`. The channel A, which
@@ -49,18 +49,18 @@ def passes_exr(
             f"passes: the scene has {scene.num_triangles} triangles; expected at most {MOST_IDS}, "
             "so that ids are exact in a file."
         )
-    found = view_passes(
+    pictures = view_passes(
         scene,
         passes_in_file(scene, names),
         view=view,
         resolution=resolution,
         rays_a_side=rays_a_side,
     )
-    met = found[COVERAGE] > 0
+    is_hit = pictures[COVERAGE] > 0
     channels: dict[str, NDArray[np.float32]] = {}
-    for each in _passes(found):
-        values = np.atleast_3d(found[each.name]).astype(np.float32)
-        unmet = np.isnan(values) & ~met[..., None]
+    for each in _passes(pictures):
+        values = np.atleast_3d(pictures[each.name]).astype(np.float32)
+        unmet = np.isnan(values) & ~is_hit[..., None]
         planes = np.where(unmet, np.float32(0), values)
         for number, channel in enumerate(each.exr_channels):
             channels[channel] = np.ascontiguousarray(planes[..., number])
@@ -74,8 +74,8 @@ def decode_passes_exr(data: bytes, resolution: int) -> dict[str, NDArray]:
         TrilightError: not an EXR file, truncated, of another size, or with channels that are no
             whole passes.
     """
-    there = set(channel_names(data))
-    passes = [each for each in declared_passes() if there >= set(each.exr_channels)]
+    stored_channels = set(channel_names(data))
+    passes = [each for each in declared_passes() if stored_channels >= set(each.exr_channels)]
     names = [channel for each in passes for channel in each.exr_channels]
 
     def check(header: Header) -> None:
@@ -90,7 +90,7 @@ def decode_passes_exr(data: bytes, resolution: int) -> dict[str, NDArray]:
     if any(channel.shape != (resolution, resolution) for channel in channels.values()):
         raise TrilightError(f"passes: a channel has other pixels than {[resolution] * 2}.")
     nowhere = channels["A"] == 0
-    return {each.name: _restored(each, channels, nowhere) for each in passes}
+    return {each.name: _restore(each, channels, nowhere) for each in passes}
 
 
 def picture_passes(
@@ -108,12 +108,14 @@ def picture_passes(
     Raises:
         TrilightError: as `view_passes` and `decode_passes_exr`.
     """
-    found = {} if stored is None else decode_passes_exr(stored, resolution)
-    lacking = [name for name in names if name not in found]
+    pictures = {} if stored is None else decode_passes_exr(stored, resolution)
+    lacking = [name for name in names if name not in pictures]
     if lacking:
-        asked = view_passes(scene, lacking, view=view, resolution=resolution)
-        found |= {each.name: asked[each.name].astype(_kept(each)) for each in _passes(asked)}
-    return {name: found[name] for name in names}
+        computed = view_passes(scene, lacking, view=view, resolution=resolution)
+        pictures |= {
+            each.name: computed[each.name].astype(_stored_dtype(each)) for each in _passes(computed)
+        }
+    return {name: pictures[name] for name in names}
 
 
 def passes_in_file(scene: Scene, names: Sequence[str]) -> list[str]:
@@ -126,19 +128,19 @@ def passes_in_file(scene: Scene, names: Sequence[str]) -> list[str]:
     return known if COVERAGE in known else [*known, COVERAGE]
 
 
-def _passes(found: Mapping[str, NDArray]) -> list[Pass]:
-    return [each for each in declared_passes() if each.name in found]
+def _passes(pictures: Mapping[str, NDArray]) -> list[Pass]:
+    return [each for each in declared_passes() if each.name in pictures]
 
 
-def _kept(each: Pass) -> type:
+def _stored_dtype(each: Pass) -> type:
     """Return the type of a pass that went through a file."""
     return np.float32 if each.dtype is np.float64 else each.dtype
 
 
-def _restored(each: Pass, channels: Mapping[str, NDArray], nowhere: NDArray[np.bool_]) -> NDArray:
+def _restore(each: Pass, channels: Mapping[str, NDArray], nowhere: NDArray[np.bool_]) -> NDArray:
     planes = [np.asarray(channels[channel], np.float32) for channel in each.exr_channels]
     if np.isnan(each.nothing):
         unmet = nowhere & np.all([plane == 0 for plane in planes], axis=0)
         planes = [np.where(unmet, np.float32(np.nan), plane) for plane in planes]
     picture = np.stack(planes, axis=-1) if each.channels else planes[0]
-    return picture.astype(_kept(each))
+    return picture.astype(_stored_dtype(each))

@@ -25,8 +25,8 @@ from infra.bench.gpu.twin import NETWORKS, twin_figures
 from infra.bench.workloads import blender_environment as environment
 from infra.bench.workloads import sized_work
 from infra.bench.workloads.blender_environment import installed_python
+from infra.bench.workloads.cached_references import kept_reference
 from infra.bench.workloads.cycles import CyclesSamples
-from infra.bench.workloads.kept_references import kept_reference
 from infra.bench.workloads.manifests import write_copies
 from infra.bench.workloads.packed_samples import LAYOUTS, unpacking_figures
 from infra.bench.workloads.sized_work import WORK, measure_work, session_bytes, sizes_of

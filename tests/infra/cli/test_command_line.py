@@ -90,7 +90,7 @@ MISTAKES = {
     "evaluat": "command 'evaluat' is unknown; did you mean evaluate? Expected one of doctor,",
     "shards merg": "shards: command 'merg' is unknown; did you mean merge?",
     "generate smoke --objekts x": "option '--objekts' is unknown; did you mean --objects?",
-    "verify": "verify: DATASET is missing; expected: The dataset, a folder",
+    "verify": "verify: DATASET is missing; expected: Dataset, a folder",
     "generate smoke --seed": "generate: --seed has no value; expected: Seed of objects",
     "generate smoke --seed 1 --seed 2": "generate: --seed is given twice; expected it once.",
     "verify here there": "verify: 'there' is one argument too many",
@@ -175,9 +175,9 @@ def _bin(folder: Path) -> Path:
 
 
 def test_an_option_that_two_classes_have_is_refused() -> None:
-    from infra.cli.options import Shown, command
+    from infra.cli.options import OutputOptions, command
 
-    def twice(one: Shown, other: Shown) -> None:
+    def twice(one: OutputOptions, other: OutputOptions) -> None:
         pass
 
     with pytest.raises(AssertionError, match="json"):
@@ -207,7 +207,7 @@ def test_an_optional_field_takes_the_words_that_it_takes_otherwise() -> None:
 
 INTERRUPTED_WRITE = """
 import io, os, signal, sys
-from infra.cli.leaving import leave
+from infra.cli.process_exit import leave
 
 class Interrupted(io.RawIOBase):
     def writable(self):

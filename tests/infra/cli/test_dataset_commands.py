@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from infra.cli.assets_next import generate_from_meshes
-from infra.cli.extending import extended
+from infra.cli.extend_option import load_extensions
 from infra.repair import repair
 from infra.run_record import is_run, run_facts
 from storage.dataset.asked import write_asked
@@ -30,8 +30,8 @@ from tests.pipeline.documents.dataset_by_hand import (
     sample,
     write_dataset,
 )
-from tests.pipeline.making.test_derive_dataset import finished, scenes
-from tests.pipeline.making.test_publication import begin_tiny, make_tiny_shard
+from tests.pipeline.generation.test_dataset_writer import begin_tiny, make_tiny_shard
+from tests.pipeline.generation.test_derive_dataset import finished, scenes
 
 pytestmark = pytest.mark.usefixtures("bare_reports")
 
@@ -230,7 +230,7 @@ def test_what_comes_next_names_the_extensions_that_a_dataset_was_made_with(
     for shown in (trilight(words, env=WIDE).output for words in commands):
         assert begun in shown and "--extend" not in shown
     with room_for_extensions():
-        extended(["--extend", str(own)])
+        load_extensions(["--extend", str(own)])
     for shown in (trilight(words, env=WIDE).output for words in commands):
         assert f"{begun} --extend {own}\n" in shown
 

@@ -14,9 +14,9 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from infra.rendering.request import Asked
+from infra.rendering.options import RenderOptions
 from pipeline.exchange.open_scene import load_source, scene_source
-from pipeline.making import path_tracer
+from pipeline.generation import path_tracer
 from storage.conventions import preview_srgb8
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
@@ -183,7 +183,7 @@ def test_a_linear_target_alone_governs_and_is_said_beside_what_came_of_it(
 
 def test_the_words_of_what_was_asked_give_the_picture_again(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "x.exr"
-    asked = Asked(
+    asked = RenderOptions(
         source=str(source), out=out, resolution=16, max_spp=256, noise_floor_linear_db=22.5,
         noise_floor_objects_db=20.25,
     )  # fmt: skip

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.end_to_end.conftest import command
+from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
 from tests.for_each import case
 from tests.scenes_by_hand import tiny_scene
 from trilight import write_scene
@@ -20,7 +21,7 @@ NAMES = """
 """Modules that Python, libraries or Trilight import somewhere."""
 TRAP = "import os; open(os.path.join(os.path.dirname({file!r}), 'RAN'), 'a').write({name!r} + ' ')"
 MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
-SMALL = ("--objects", "builtin:4", "--scenes", "1", "--resolution", "64", "--noise-floor", "10")
+SMALL = ("--objects", "builtin:4", "--scenes", "1", "--resolution", "64", *SIXTEEN_SAMPLES)
 GENERATE = command("generate", "smoke", *SMALL, "--set", "splits.scenes_per_shard=1", "--out")
 PROGRAM = """
 import multiprocessing.forkserver, sys

@@ -15,13 +15,13 @@ from typing import Any, NoReturn
 
 import pytest
 
-from infra.cli.changes import Shared, all_changes
+from infra.cli.changes import BaseSettings, all_changes
 from infra.cli.console import progress_bars
-from infra.cli.dataset_changes import with_shared
+from infra.cli.dataset_changes import with_base_settings
 from infra.cli.settings_file import read_settings_file
-from infra.cli.train import _BarProgress, _judged, _QuietProgress
+from infra.cli.train import _BarProgress, _QuietProgress, _validation_rows
 from pipeline.builds.named import BUILDS, named_build
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
 from storage.settings.changes import changed
@@ -29,13 +29,13 @@ from storage.settings.described import settings_record
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.for_each import case
-from tests.pipeline.making.test_publication import begin_tiny
+from tests.pipeline.generation.test_dataset_writer import begin_tiny
 from tests.train.toy import write_toy_dataset
 from train.evaluation.scores import Lead
 from train.loop.checkpoints import saved_steps
 from train.loop.interrupts import SAVED_STATUS
+from train.monitoring.rows import read_rows
 from train.runs import RUNS, named_run
-from train.watching.rows import read_rows
 
 TRILIGHT = [sys.executable, "-m", "trilight"]
 TINY = {
@@ -174,7 +174,7 @@ def test_a_second_ctrl_c_ends_a_step_that_does_not(tmp_path: Path) -> None:
         "c, mutex = ctypes.CDLL(None), (ctypes.c_byte * 64)()\n"
         "c.pthread_mutex_lock(mutex)\n"
         "until = (ctypes.c_long * 2)(int(time.time()) + 300, 0)\n"
-        "with progress_bars() as bars, deferred_interrupts(_BarProgress(bars).interrupted):\n"
+        "with progress_bars() as bars, deferred_interrupts(_BarProgress(bars).report_interrupt):\n"
         "    print('in the step', flush=True)\n"
         "    c.pthread_mutex_timedlock(mutex, until)\n"
     )
@@ -203,7 +203,7 @@ def test_a_run_that_hangs_and_is_to_stop_ends_with_status_1(
     ended: list[int] = []
     monkeypatch.setattr(os, "_exit", ended.append)
     with progress_bars() as bars:
-        (_QuietProgress() if quiet else _BarProgress(bars)).hung("training: step 7 hangs")
+        (_QuietProgress() if quiet else _BarProgress(bars)).report_hang("training: step 7 hangs")
     assert ended == [1]
     said = capsys.readouterr().err
     assert "trilight: training: step 7 hangs; --resume goes on from the last checkpoint." in said
@@ -261,31 +261,31 @@ def test_a_build_like_another_is_that_other() -> None:
     for build in BUILDS:
         with case(build):
             other = named_build(build)
-            changes = all_changes(named_build("smoke"), Shared(), other.as_json(), {})
+            changes = all_changes(named_build("smoke"), BaseSettings(), other.as_json(), {})
             assert changed(named_build("smoke"), changes).as_json() == other.as_json()
-            assert all_changes(other, Shared(), other.as_json(), {}) == {}
+            assert all_changes(other, BaseSettings(), other.as_json(), {}) == {}
 
 
 def test_a_run_like_another_is_that_other() -> None:
     for run in RUNS:
         with case(run):
             other = named_run(run)
-            changes = all_changes(named_run("smoke"), Shared(), settings_record(other), {})
+            changes = all_changes(named_run("smoke"), BaseSettings(), settings_record(other), {})
             assert changed(named_run("smoke"), changes) == other
 
 
 def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
     publication = begin_tiny(tmp_path / "set", 12)
     record = read_manifest(publication.folder.manifest).settings
-    shared = Shared(
+    shared = BaseSettings(
         like=str(tmp_path / "set"),
         settings=_file(tmp_path, "renders: {resolution: 96, max_spp: 64}\nseed: 1\n"),
     )
-    alike = with_shared(DatasetOrder(build=FAR), Shared(like=shared.like))
+    alike = with_base_settings(DatasetOrder(build=FAR), BaseSettings(like=shared.like))
     found = named_build(FAR, changes=alike.changes).as_json()
     assert found == {**record, "build": FAR}
     order = DatasetOrder(build=FAR, resolution=32, changes={"renders.max_spp": 128})
-    changes = with_shared(order, shared).changes
+    changes = with_base_settings(order, shared).changes
     settings = named_build(FAR, changes=changes)
     assert (settings.seed, settings.renders.resolution, settings.renders.max_spp) == (1, 32, 128)
     assert settings.scenes.num_views == record["scenes"]["num_views"]
@@ -293,11 +293,13 @@ def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
 
 def test_a_floor_that_is_asked_for_replaces_those_of_a_file(tmp_path: Path) -> None:
     file = _file(tmp_path, "renders: {noise_floor_db: 44, noise_floor_objects_db: 43}\n")
-    order = with_shared(DatasetOrder(noise_floor_linear_db=36.0), Shared(settings=file))
+    order = with_base_settings(
+        DatasetOrder(noise_floor_linear_db=36.0), BaseSettings(settings=file)
+    )
     assert named_build("smoke", changes=order.changes).renders.targets_db == {
         "psnr_linear_db": 36.0
     }
-    as_filed = with_shared(DatasetOrder(), Shared(settings=file)).changes
+    as_filed = with_base_settings(DatasetOrder(), BaseSettings(settings=file)).changes
     assert named_build("smoke", changes=as_filed).renders.targets_db == {
         "psnr_log_db": 44.0,
         "object_psnr_log_db": 43.0,
@@ -306,7 +308,7 @@ def test_a_floor_that_is_asked_for_replaces_those_of_a_file(tmp_path: Path) -> N
 
 def test_a_preset_takes_the_place_of_single_settings(tmp_path: Path) -> None:
     file = _file(tmp_path, "model: {width: 60}\nloss.perceptual: none\n")
-    changes = all_changes(named_run("smoke"), Shared(settings=file), {}, {"model": "tiny"})
+    changes = all_changes(named_run("smoke"), BaseSettings(settings=file), {}, {"model": "tiny"})
     assert changes == {"loss.perceptual": "none", "model": "tiny"}
 
 
@@ -377,7 +379,7 @@ def test_licences_are_allowed_beside_those_of_a_file(tmp_path: Path) -> None:
         ("seed: 1\n", named_build("smoke").allowed_licences),
         ("allowed_licences: [MIT]\n", ("MIT",)),
     ):
-        found = with_shared(order, Shared(settings=_file(tmp_path, text)))
+        found = with_base_settings(order, BaseSettings(settings=_file(tmp_path, text)))
         settings = named_build("smoke", allow_licences=found.allow_licences, changes=found.changes)
         assert settings.allowed_licences == tuple(sorted({*others, "CC-BY-NC-4.0"}))
 
@@ -390,4 +392,4 @@ def test_a_median_picture_without_error_divides_nothing() -> None:
         result: Any = SimpleNamespace(
             scores=scores, median_scores=median, lead=lead, beats_median=False
         )
-        assert says in _judged(result)[0][1]
+        assert says in _validation_rows(result)[0][1]

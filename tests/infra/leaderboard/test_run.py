@@ -16,7 +16,7 @@ from infra.leaderboard import contest as contest_module
 from infra.leaderboard import run as run_module
 from infra.leaderboard.chart import plot_leaderboard
 from infra.leaderboard.contest import NOISE
-from infra.leaderboard.order import LeaderboardOrder
+from infra.leaderboard.options import LeaderboardOptions
 from infra.leaderboard.picture_folder import FolderContestant, folder_contestants
 from infra.leaderboard.rows import UNKNOWN_MACHINE, BoardRow, BoardRows, RowKey
 from infra.leaderboard.run import (
@@ -57,25 +57,25 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def order(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LeaderboardOrder:
+def order(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LeaderboardOptions:
     """Return an order of seconds: no path tracer, which the slow test has."""
     monkeypatch.setattr(run_module, "SAMPLES", ())
     monkeypatch.delenv("TRILIGHT_LPIPS", raising=False)
-    return LeaderboardOrder(
+    return LeaderboardOptions(
         source=str(root / "toy"), split="validation", scenes=2, timed_scenes=1, out=tmp_path / "out"
     )
 
 
 @pytest.fixture
-def short(order: LeaderboardOrder, monkeypatch: pytest.MonkeyPatch) -> LeaderboardOrder:
+def short(order: LeaderboardOptions, monkeypatch: pytest.MonkeyPatch) -> LeaderboardOptions:
     """Return an order of one network beside the nearest picture, without a chart."""
     monkeypatch.setattr(run_module, "BUILTIN_NETWORKS", ("builtin:tokens",))
-    monkeypatch.setattr(run_module, "_never_lacking", lambda stack: [])
+    monkeypatch.setattr(run_module, "_builtin_entries", lambda stack: [])
     monkeypatch.setattr(run_module, "plot_leaderboard", lambda *words: None)
     return order
 
 
-def board_of(order: LeaderboardOrder) -> Leaderboard:
+def board_of(order: LeaderboardOptions) -> Leaderboard:
     return make_leaderboard(order, lambda now, total, what: None)
 
 
@@ -84,7 +84,7 @@ def tables(folder: Path, name: str) -> list[dict[str, str]]:
 
 
 def test_who_is_asked_for_stands_beside_those_who_never_lack(
-    order: LeaderboardOrder, root: Path
+    order: LeaderboardOptions, root: Path
 ) -> None:
     asked = dataclasses.replace(
         order, pictures=(root / "perfect",), checkpoint=(str(root / "renderformer-v1-base"),)
@@ -116,7 +116,7 @@ def test_who_is_asked_for_stands_beside_those_who_never_lack(
 
 
 def test_nothing_is_judged_twice_and_what_changed_is_judged_again(
-    short: LeaderboardOrder, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short: LeaderboardOptions, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mine = shutil.copytree(root / "perfect", tmp_path / "mine")
     asked = dataclasses.replace(short, pictures=(mine,))
@@ -145,7 +145,7 @@ def counted(real: Callable[..., Any], calls: list[Any]) -> Callable[..., Any]:
 
 
 def test_a_set_without_training_split_looks_up_its_other_scenes(
-    short: LeaderboardOrder, root: Path, tmp_path: Path
+    short: LeaderboardOptions, root: Path, tmp_path: Path
 ) -> None:
     write_toy_dataset(tmp_path / "bare", train=0, validation=3, per_shard=3, resolution=PX)
     bare = dataclasses.replace(short, source=str(tmp_path / "bare"))
@@ -161,7 +161,7 @@ def test_a_set_without_training_split_looks_up_its_other_scenes(
 
 
 def test_a_scene_that_somebody_cannot_show_is_left_out_for_all(
-    short: LeaderboardOrder, monkeypatch: pytest.MonkeyPatch
+    short: LeaderboardOptions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(self: Any, sample: Any, width: int, *, timed: bool) -> Any:
         if sample.key.endswith("4"):
@@ -177,7 +177,9 @@ def test_a_scene_that_somebody_cannot_show_is_left_out_for_all(
     assert board_of(short).widths[0].num_scenes == 2, "and asked again"
 
 
-def test_one_scene_has_its_table_without_intervals(short: LeaderboardOrder, tmp_path: Path) -> None:
+def test_one_scene_has_its_table_without_intervals(
+    short: LeaderboardOptions, tmp_path: Path
+) -> None:
     write_toy_dataset(tmp_path / "one", train=0, validation=1, per_shard=1, resolution=PX)
     one = dataclasses.replace(short, source=str(tmp_path / "one"), checkpoint=("builtin:",))
     board = board_of(one)
@@ -200,7 +202,7 @@ def test_one_scene_has_its_table_without_intervals(short: LeaderboardOrder, tmp_
 
 
 def test_prices_of_two_machines_do_not_mix(
-    short: LeaderboardOrder, monkeypatch: pytest.MonkeyPatch
+    short: LeaderboardOptions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def prices(machine: str, measured_s: float) -> tuple[dict[str, str], Leaderboard]:
         def shown(self: Any, sample: Any, width: int, *, timed: bool) -> Any:
@@ -232,7 +234,7 @@ def test_widths_are_those_that_the_set_has() -> None:
         widths_of((512,), 256)
 
 
-def test_mistakes_are_one_line(order: LeaderboardOrder, root: Path) -> None:
+def test_mistakes_are_one_line(order: LeaderboardOptions, root: Path) -> None:
     twice = dataclasses.replace(order, checkpoint=(str(root / "renderformer-v1-base"),) * 2)
     with pytest.raises(TrilightError, match=r"--checkpoint: .*is there twice"):
         board_of(twice)

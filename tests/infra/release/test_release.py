@@ -14,7 +14,7 @@ from infra.release import hub_limits
 from infra.release.__main__ import _sum_and_say, _write_network
 from infra.release.hub_limits import require_within_limits
 from infra.release.page import write_page
-from infra.release.pictures import NETWORK, RIVALS, Beside, chosen_scenes
+from infra.release.pictures import NETWORK, RIVALS, SceneComparison, chosen_scenes
 from infra.release.push import kind_of, planned_upload
 from model.open import open_network
 from pipeline.documents.sums import SUMS, published_files
@@ -35,10 +35,10 @@ from tests.pipeline.documents.dataset_by_hand import (
 from tests.pipeline.documents.pages_read import read
 
 
-def beside(key: str, network_db: float) -> Beside:
+def beside(key: str, network_db: float) -> SceneComparison:
     rng = np.random.default_rng(int(key))
     target, network, sample = (rng.random((8, 8, 3), np.float32) for _ in range(3))
-    return Beside(
+    return SceneComparison(
         key=key,
         caption="test, plane, 12 triangles",
         target_rgb=target,

@@ -24,7 +24,7 @@ from tests.infra.rendering.render_kit import SMALL, mistake, render, write_netwo
 from tests.model.test_neural_renderer import many_lights
 from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene
-from train.evaluation.error_colours import error_picture
+from train.evaluation.error_colors import error_picture
 
 pytestmark = pytest.mark.usefixtures("children_here")
 

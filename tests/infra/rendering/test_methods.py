@@ -226,7 +226,7 @@ def test_without_a_path_tracer_it_says_so_and_the_network_is_timed_all_the_same(
     lacking = TracerRival(16, most_views=4, num_scenes=2).measure(network, samples)
     assert lacking.preview is None and "TRILIGHT_VARIANT is 'none_such'" in lacking.missing
     unasked = TracerRival(16, most_views=0, num_scenes=2).measure(network, samples)
-    assert unasked.preview is None and unasked.missing == "nobody asked for its views"
+    assert unasked.preview is None and unasked.missing == "no views of it were requested"
     for times in (lacking, unasked):
         assert times.scenes == 2 and 0 < times.network_further_s < times.network_first_s
     with pytest.raises(TrilightError, match="resolution is 20"):

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from infra.rendering import plan
-from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, paired
+from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, pair_cameras
 from infra.rendering.engines import MitsubaPlan, NeuralPlan
+from infra.rendering.options import RenderOptions
 from infra.rendering.plan import plan_render
-from infra.rendering.request import Asked
 from infra.rendering.sources import scene_sources
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
@@ -75,13 +75,13 @@ def test_a_camera_that_looks_away_turns_about_itself() -> None:
 
 def test_scenes_and_cameras_go_together() -> None:
     first, second = sources(2)
-    assert paired(sources(2), [7]) == [(first, 7), (second, 7)]
+    assert pair_cameras(sources(2), [7]) == [(first, 7), (second, 7)]
     one, three = sources(1), cameras(3)
-    assert paired(one, three) == [(first, camera) for camera in three]
-    assert paired(sources(3), three) == list(zip(sources(3), three, strict=True))
-    assert [camera for _, camera in paired(sources(3), three[:1])] == [three[0]] * 3
+    assert pair_cameras(one, three) == [(first, camera) for camera in three]
+    assert pair_cameras(sources(3), three) == list(zip(sources(3), three, strict=True))
+    assert [camera for _, camera in pair_cameras(sources(3), three[:1])] == [three[0]] * 3
     with pytest.raises(TrilightError, match="2 scenes and 3 cameras; expected one of either"):
-        paired(sources(2), three)
+        pair_cameras(sources(2), three)
 
 
 def test_a_path_is_a_list_of_cameras_or_any_scene(tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_a_shard_without_a_key_is_all_of_its_scenes(tmp_path: Path) -> None:
 
 
 def test_one_picture_is_of_the_scenes_own_camera(source: Path, tmp_path: Path) -> None:
-    asked = Asked(source=str(source), out=tmp_path / "new/x.exr", view=1, threads=3)
+    asked = RenderOptions(source=str(source), out=tmp_path / "new/x.exr", view=1, threads=3)
     plan = plan_render(asked, HereReader())
     (shot,), (engine,) = plan.shots, plan.engines
     assert isinstance(engine, MitsubaPlan)
@@ -143,7 +143,7 @@ def test_both_engines_share_the_width_and_have_files_of_their_own(
     source: Path, tmp_path: Path
 ) -> None:
     network = str(write_network(tmp_path / "model.safetensors"))
-    asked = Asked(
+    asked = RenderOptions(
         source=str(source),
         out=tmp_path / "turn.webp",
         engine="both",
@@ -156,7 +156,7 @@ def test_both_engines_share_the_width_and_have_files_of_their_own(
     assert isinstance(mitsuba, MitsubaPlan) and isinstance(neural, NeuralPlan)
     assert mitsuba.settings.resolution == neural.resolution == plan.resolution == 16
     assert neural.checkpoint == network
-    assert plan.place.video == tmp_path / "turn.webp"
+    assert plan.output.video == tmp_path / "turn.webp"
     assert len(plan.shots) == 3
     assert all(isinstance(shot.camera, ShotCamera) for shot in plan.shots)
     last, folder = plan.shots[2], tmp_path / "turn"
@@ -177,7 +177,7 @@ def test_the_pictures_of_a_turn_share_the_loading_of_its_scene(
     monkeypatch.setattr(plan, "priced_ways", priced_ways)
     for more in ({"out": tmp_path / "x.exr"}, {"out": tmp_path / "turn", "orbit": 3}):
         with pytest.raises(TrilightError, match="no way"):
-            plan_render(Asked(source=str(source), seconds=1.0, **more), HereReader())
+            plan_render(RenderOptions(source=str(source), seconds=1.0, **more), HereReader())
     assert told == [1, 3]
 
 
@@ -186,7 +186,7 @@ def test_only_the_plan_reads_what_was_asked() -> None:
     readers = {
         path.name
         for path in (ROOT / "infra/rendering").glob("*.py")
-        if re.search(r"\basked\.\w", path.read_text().replace("rendering.asked", ""))
+        if re.search(r"\boptions\.\w", path.read_text().replace("rendering.options", ""))
     }
     assert readers == {"plan.py", "run.py"}, "run.py opens the reader of scenes"
-    assert "asked" not in (ROOT / "infra/cli/rendered.py").read_text()
+    assert "options." not in (ROOT / "infra/cli/rendered.py").read_text()

@@ -9,13 +9,13 @@ import pytest
 from PIL import Image
 
 from infra.rendering import look as look_module
-from infra.rendering.cameras import ShotCamera, orbit, own_camera, paired
+from infra.rendering.cameras import ShotCamera, orbit, own_camera, pair_cameras
 from infra.rendering.comparison import comparison_sheet
 from infra.rendering.engines import Facts, OpenedScene, Rendered
-from infra.rendering.look import Look, enlarged, enlargement, tone_mapped
-from infra.rendering.places import PicturePlaces, place
+from infra.rendering.look import Look, enlarge, enlargement, tone_mapped
+from infra.rendering.output_paths import OutputPaths, output_paths
 from infra.rendering.plan import RenderPlan, shots
-from infra.rendering.run import FinishedShot, carry_out
+from infra.rendering.run import FinishedShot, run_plan
 from infra.rendering.video import write_video
 from infra.rendering.ways import Choice
 from pipeline.exchange.open_scene import SceneSource
@@ -57,16 +57,16 @@ class FlatEngine:
         pass
 
 
-class Nobody:
-    """Hears how far a render is, and says nothing."""
+class SilentProgress:
+    """Progress of a render that prints nothing."""
 
-    def chosen(self, choice: Choice) -> None:
+    def on_choice(self, choice: Choice) -> None:
         pass
 
-    def pictures(self, done: int, total: int) -> None:
+    def on_picture(self, done: int, total: int) -> None:
         pass
 
-    def sampled(self, now: object) -> None:
+    def on_samples(self, now: object) -> None:
         pass
 
 
@@ -78,7 +78,7 @@ def turn(tmp_path: Path) -> Pairs:
     path = tmp_path / "tiny.safetensors"
     path.write_bytes(encode_scene(tiny_scene()))
     cameras = orbit(tiny_scene(), own_camera(tiny_scene(), 0), 4, 360)
-    return paired([SceneSource(path=path, key=None)], cameras)
+    return pair_cameras([SceneSource(path=path, key=None)], cameras)
 
 
 def run(
@@ -87,7 +87,7 @@ def run(
     pairs: Pairs,
     look: Look = Look(),  # noqa: B008
 ) -> tuple[Sequence[FinishedShot], Sequence[str]]:
-    where = place(out)
+    where = output_paths(out)
     plan = RenderPlan(
         source="tiny",
         view=0,
@@ -95,11 +95,11 @@ def run(
         engines=engines,
         resolution=16,
         look=look,
-        place=where,
+        output=where,
         shots=list(shots(pairs, where, [engine.name for engine in engines])),
         fps=24,
     )
-    outcome = carry_out(plan, HereReader(), Nobody())
+    outcome = run_plan(plan, HereReader(), SilentProgress())
     return outcome.shots, outcome.notes
 
 
@@ -176,7 +176,7 @@ def test_small_pictures_are_enlarged_by_whole_numbers() -> None:
     for width, factor in [(8, 32), (64, 4), (96, 3), (248, 2), (256, 1)]:
         with case(width):
             pixels = np.random.default_rng(0).integers(0, 256, (width, width, 3)).astype(np.uint8)
-            found = enlarged(pixels)
+            found = enlarge(pixels)
             assert enlargement(width) == factor
             assert found.shape == (factor * width, factor * width, 3)
             for row in range(factor):
@@ -248,21 +248,21 @@ def test_an_mp4_shows_the_pictures_in_a_row(tmp_path: Path) -> None:
 
 
 def test_out_says_what_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = place(tmp_path / "new/one.exr")
+    one = output_paths(tmp_path / "new/one.exr")
     assert (one.stem_of(7), one.is_sequence) == (tmp_path / "new/one", False)
-    many = place(tmp_path / "turn")
-    assert many == PicturePlaces(stem=None, folder=tmp_path / "turn", video=None)
+    many = output_paths(tmp_path / "turn")
+    assert many == OutputPaths(stem=None, folder=tmp_path / "turn", video=None)
     assert many.stem_of(7) == tmp_path / "turn/000007"
-    shown = place(tmp_path / "turn.webp")
+    shown = output_paths(tmp_path / "turn.webp")
     assert (shown.folder, shown.video) == (tmp_path / "turn", tmp_path / "turn.webp")
     dotted = tmp_path / "run.2"
     dotted.mkdir()
-    assert place(dotted).folder == dotted
+    assert output_paths(dotted).folder == dotted
     with pytest.raises(TrilightError, match=r"--out is .*x.gif; expected picture.exr"):
-        place(tmp_path / "x.gif")
+        output_paths(tmp_path / "x.gif")
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     with pytest.raises(TrilightError, match="needs PyAV, which is not installed: pip install av"):
-        place(tmp_path / "x.mp4")
+        output_paths(tmp_path / "x.mp4")
     monkeypatch.setitem(__import__("sys").modules, "PyOpenColorIO", None)
     look_module._filmic.cache_clear()
     with pytest.raises(TrilightError, match="OpenColorIO is not installed"):

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infra.rendering.machine_costs import PROBED_PX, PROBES, Timed, costs_of
+from infra.rendering.machine_costs import PROBED_PX, PROBES, PartSeconds, costs_of
 from infra.rendering.way_table import (
     MEASURE,
     NETWORK_SCENE,
@@ -282,7 +282,7 @@ def test_damaged_costs_are_not_used() -> None:
 CORES = 8
 
 
-def timed_as_shipped(slower: float, serial: float) -> Timed:
+def timed_as_shipped(slower: float, serial: float) -> PartSeconds:
     """Return what probes take where everything is slower, and a share of it stays serial."""
     table = shipped_table()
     then = {(row.part, row.width): row.serial_s + row.parallel_s for row in table.probe.rows}
@@ -321,8 +321,9 @@ def test_what_threads_seem_to_slow_down_is_serial() -> None:
 
 
 def test_one_core_is_measured_once() -> None:
-    timed: Timed = {(px, 1): each for (px, threads), each in timed_as_shipped(2.0, 0.0).items()
-             if threads == 1}  # fmt: skip
+    timed: PartSeconds = {
+        (px, 1): each for (px, threads), each in timed_as_shipped(2.0, 0.0).items() if threads == 1
+    }
     for row in costs_of(shipped_table(), timed, 1, "here").rows:
         assert row.serial_s == 0 and row.parallel_s > 0
 
@@ -339,7 +340,7 @@ def test_between_the_probed_widths_machines_differ_by_what_lies_between() -> Non
 
 
 def test_a_part_that_was_not_timed_costs_what_is_shipped() -> None:
-    timed: Timed = {
+    timed: PartSeconds = {
         key: {part: s for part, s in each.items() if not part.startswith("network")}
         for key, each in timed_as_shipped(2.0, 0.0).items()
     }

@@ -24,11 +24,11 @@ from infra.serving import access, local
 from infra.serving.access import grant, next_command, revoke, settings_file, state_folder
 from infra.serving.limits import limits
 from infra.serving.local import running, start, stop
-from infra.serving.train_model import RunChanges, TrainOrder, train_model, train_order
+from infra.serving.train_model import RunChanges, TrainOptions, train_model, train_order
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
-from pipeline.flows.prefect_server import TOLD_BY_ITS_STARTER, wait_until_healthy
+from pipeline.flows.prefect_server import STOPPED_BY_PARENT, wait_until_healthy
 from storage.errors import TrilightError
-from storage.settings.described import described
+from storage.settings.described import describe_fields
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.for_each import case
@@ -79,7 +79,7 @@ def test_stop_leaves_it_to_the_starter_to_tell_what_may_save(
     """A second SIGTERM would end training before it has saved; who does not end is killed."""
     monkeypatch.setattr(local, "_END_S", 0.5)
     cache.write_text("ours")
-    environment = {**os.environ, "TRILIGHT_SERVED": "ours", TOLD_BY_ITS_STARTER: "1"}
+    environment = {**os.environ, "TRILIGHT_SERVED": "ours", STOPPED_BY_PARENT: "1"}
     with subprocess.Popen(SLEEP, env=environment, start_new_session=True) as process:
         _until_seen(1)
         assert stop() == 1
@@ -141,14 +141,14 @@ def test_wrong_variables_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_workers_share_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRILIGHT_CORES", "9")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1,2")
-    assert local._share(0, 1) == {}
-    two = [local._share(number, 2) for number in range(2)]
+    assert local._worker_environment(0, 1) == {}
+    two = [local._worker_environment(number, 2) for number in range(2)]
     assert [share["CUDA_VISIBLE_DEVICES"] for share in two] == ["0,2", "1"]
     assert [share["TRILIGHT_CORES"] for share in two] == ["4", "4"]
-    four = [local._share(number, 4)["CUDA_VISIBLE_DEVICES"] for number in range(4)]
+    four = [local._worker_environment(number, 4)["CUDA_VISIBLE_DEVICES"] for number in range(4)]
     assert four == ["0", "1", "2", "0"]
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert local._share(11, 12) == {"TRILIGHT_CORES": "1"}
+    assert local._worker_environment(11, 12) == {"TRILIGHT_CORES": "1"}
 
 
 def test_cards_are_those_of_this_machine_or_of_all_workers(
@@ -267,7 +267,7 @@ def test_the_password_is_no_argument_and_is_not_said(
     monkeypatch.setenv("TRILIGHT_HOST", "my-host")
     local.main(["start"])
     password = tomllib.loads(settings_file().read_text())["api"]["auth_string"]
-    assert [environment[PASSWORDS[1]] for environment in environments] == [password] * 5
+    assert [environment[PASSWORDS[1]] for environment in environments] == [password] * 3
     assert environments[0]["TRILIGHT_HOST_NAMES"].split(",")[0] == "my-host"
     assert len(told) > 10 and not any(password in word for word in told)
     said = capsys.readouterr().out
@@ -280,17 +280,17 @@ SECOND_STAGES = sorted(name for name in RUNS if named_run(name).from_weights)
 
 def _parameters(**given: Any) -> dict[str, Any]:
     """Return what the flow is called with where nothing else is filled in."""
-    plain = {field.name: field.default for field in described(TrainOrder)}
+    plain = {field.name: field.default for field in describe_fields(TrainOptions)}
     return {**plain, "data": ["a"], "changes": None, **given}
 
 
 def test_training_is_launched_by_torchrun_where_there_are_several_processes() -> None:
-    one = TrainOrder(data=("a", "b"), resume=True, steps=5).command()
+    one = TrainOptions(data=("a", "b"), resume=True, steps=5).command()
     assert one[1:] == ("-m trilight train smoke --data a --data b --resume --steps 5").split()
-    two = TrainOrder(processes=2).command()
+    two = TrainOptions(processes=2).command()
     assert two[1:5] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     with pytest.raises(TrilightError, match="processes is 0"):
-        TrainOrder(processes=0)
+        TrainOptions(processes=0)
 
 
 def test_the_form_has_every_run_and_every_setting() -> None:
@@ -353,13 +353,13 @@ def test_a_second_stage_begins_with_the_first() -> None:
             assert (
                 " ".join(command[4:]) == "smoke --data a --resume --decisions learning_rate=1e-05"
             )
-            again = TrainOrder(run=run, resume=True).command()
+            again = TrainOptions(run=run, resume=True).command()
             assert "--resume" in again and "--begin-with" not in again
 
 
 def test_the_command_line_takes_every_option_of_the_command(tmp_path: Path) -> None:
     """It comes as far as the data, which is not there: after its options and the run's settings."""
-    order = TrainOrder(
+    order = TrainOptions(
         run="finetune", data=(str(tmp_path / "none"),), out=str(tmp_path / "run"), steps=9000,
         begin_with="runs/x", lpips="hub", changes={"loss.perceptual": "none"},
     )  # fmt: skip

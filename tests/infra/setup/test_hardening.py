@@ -14,7 +14,7 @@ from prefect.utilities.schema_tools import ValidationError, validate
 
 from tests.conftest import ROOT
 from tests.for_each import case
-from tests.infra.setup.manifests_kit import IMAGES, MANIFESTS, documents, job_template
+from tests.infra.setup.manifests_kit import IMAGES, MANIFESTS, containers, documents, job_template
 
 _SERVES = {"Deployment"}
 
@@ -219,6 +219,16 @@ def test_pools_let_nobody_choose_what_runs(kind: str) -> None:
     assert "{{" not in json.dumps(template)
     plain, asked = (_prepared(kind, template, values) for values in ({}, WISHES))
     assert asked == plain and "EVIL" not in asked
+
+
+def test_prefects_worker_starts_the_container_of_the_manifests() -> None:
+    job = json.loads(_prepared("kubernetes", _template("kubernetes"), {}))["job_manifest"]
+    (container,) = job["spec"]["template"]["spec"]["containers"]
+    ours = containers()[-1][2]
+    kept = ("image", "imagePullPolicy", "envFrom", "workingDir", "resources", "volumeMounts")
+    assert {name: container[name] for name in kept} == {name: ours[name] for name in kept}
+    assert container["args"] == ["prefect", "flow-run", "execute"]
+    assert {"name": "HOME", "value": "/tmp"} in container["env"]
 
 
 def _prepared(kind: str, template: Any, values: dict[str, Any]) -> str:

@@ -7,12 +7,14 @@ import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from infra.serving import deployments
 from infra.setup.locks import LockedPackage, read_lock, write_lock
 from infra.setup.sbom import plain_name
 from pipeline.flows.orders import DatasetInRuns
@@ -75,6 +77,11 @@ def test_every_container_has_a_home_that_it_may_write() -> None:
         assert service["environment"]["HOME"] == "/tmp", name
 
 
+def _deploying() -> dict[str, Any]:
+    (job,) = (part for name, _, part in containers() if name == "trilight-deploy")
+    return job
+
+
 def test_nobody_can_start_a_server_without_a_password_or_a_pool_that_offers_commands() -> None:
     """A worker would make a pool that is not there, and Prefect's own offers everything."""
     compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]
@@ -86,12 +93,9 @@ def test_nobody_can_start_a_server_without_a_password_or_a_pool_that_offers_comm
             assert command[:3] == ["python", "-m", "pipeline.flows.guarded_server"], name
         if "worker" in name:
             assert "--no-create-pool-if-not-found" in command and "--type" not in command, name
-    scripts = [compose["deploy"]["command"][2]]
-    scripts += [container["command"][2] for name, _, container in containers() if "deploy" in name]
-    for script in scripts:
-        created = script.replace("\\\n", " ").splitlines()[0]
-        assert " work-pool create " in created and " --overwrite " in created
-        assert "--base-job-template" in created
+    for words in (compose["deploy"]["command"].split(), _deploying()["command"]):
+        assert words[:3] == ["python", "-m", deployments.__name__]
+        assert len(words) == 5 and words[4].endswith(".json")  # the pool's own template
 
 
 def test_no_password_stands_in_a_file_and_every_port_is_on_loopback() -> None:
@@ -141,8 +145,7 @@ def test_flows_write_to_volumes_whatever_their_form_says() -> None:
     assert DatasetInRuns().place.startswith("data/")
     for path in IMAGES.glob("*.Dockerfile"):
         assert "ln --symbolic /data /opt/trilight/data" in path.read_text(), path.name
-    found = yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]
-    for row in found:
+    for row in deployments.read_deployments():
         function, given = row["entrypoint"].split(":")[1], row.get("parameters", {})
         if function == "build_dataset":  # its ranges go to the pool that it is in
             deployment = given.get("deployment", DatasetInRuns().deployment)
@@ -155,18 +158,11 @@ def test_flows_write_to_volumes_whatever_their_form_says() -> None:
     assert mounts == {"/data", "/cache", "/tmp"}
 
 
-def test_what_deploys_the_flows_makes_their_limits_first() -> None:
-    """Without its limit a flow takes as many graphics cards as there are runs."""
+def test_what_makes_the_limits_is_told_how_many_cards_there_are() -> None:
+    """Where they are made, there is no card."""
     compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]["deploy"]
-    shell = compose["command"]
-    assert shell[:2] == ["sh", "-ec"]
-    (job,) = (part for name, _, part in containers() if name == "trilight-deploy")
-    given = {row["name"] for row in job["env"]}
-    for script, variables in ((shell[2], set(compose["environment"])), (job["command"][2], given)):
-        commands = [line.strip() for line in script.replace("&&", "\n").splitlines()]
-        made = commands.index("python -m infra.serving.limits")
-        assert made < next(at for at, line in enumerate(commands) if " deploy " in line)
-        assert "TRILIGHT_CARDS" in variables  # where they are made, there is no card
+    assert "TRILIGHT_CARDS" in compose["environment"]
+    assert "TRILIGHT_CARDS" in {row["name"] for row in _deploying()["env"]}
 
 
 def test_the_worker_keeps_to_its_namespace_and_jobs_name_the_secret(
@@ -190,7 +186,7 @@ def test_the_worker_keeps_to_its_namespace_and_jobs_name_the_secret(
 
 
 def test_deployments_name_flows_that_are_there() -> None:
-    found = yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]
+    found = deployments.read_deployments()
     assert len(found) == 13  # four flows in three ways, and one beside a scheduler
     assert {row["name"] for row in found} == {"local", "docker", "kubernetes"}
     for row in found:

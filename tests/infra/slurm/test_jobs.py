@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.executors import array_job as arrays
 from pipeline.flows import submission
-from pipeline.flows.submission import SeenRun, Submitted
+from pipeline.flows.submission import RunStatus, SubmittedRun
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.infra.slurm.fake_slurm import commands_in
@@ -208,7 +208,7 @@ def test_status_prints_what_any_scheduler_needs(
     assert "--lines is given; expected it only" in trilight(["status", "set", "--lines"]).mistake
 
 
-RUN = Submitted(
+RUN = SubmittedRun(
     id=UUID(int=1),
     name="a-run",
     deployment="generate-scenes/local",
@@ -217,11 +217,11 @@ RUN = Submitted(
 )
 
 
-def seen(state: str, **more: Any) -> SeenRun:
+def seen(state: str, **more: Any) -> RunStatus:
     plain: dict[str, Any] = {"message": "", "percent": 50.0, "tables": {}}
     ended = state in ("Completed", "Crashed")
     told = {**plain, "is_final": ended, "is_completed": state == "Completed", **more}
-    return SeenRun(state=state, **told)
+    return RunStatus(state=state, **told)
 
 
 @pytest.fixture
@@ -229,7 +229,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """What the server is asked for; its run is seen in `looks`, without any by default."""
     found: list[Any] = []
 
-    def submit(client: object, flow: str, deployment: str | None, given: object) -> Submitted:
+    def submit(client: object, flow: str, deployment: str | None, given: object) -> SubmittedRun:
         found.append((flow, deployment, given))
         return RUN
 
@@ -244,7 +244,7 @@ def test_a_run_is_watched_to_its_end(
 ) -> None:
     looks = [seen("Pending"), seen("Running"), seen("Running")]
     looks.append(seen("Completed", tables={"summary": [("scenes", "2")]}))
-    monkeypatch.setattr(submission, "looks", lambda client, run: iter(looks))
+    monkeypatch.setattr(submission, "poll_run", lambda client, run: iter(looks))
     words = ["submit", "generate-scenes", "smoke", "--scenes", "2", "--out", str(tmp_path)]
     told = trilight(words).stdout
     given = {"build": "smoke", "scenes": 2, "out": str(tmp_path)}
@@ -259,7 +259,7 @@ def test_a_run_that_crashed_is_a_mistake_with_its_reason(
     asked: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ended = seen("Crashed", message="it was killed.")
-    monkeypatch.setattr(submission, "looks", lambda client, run: iter([ended]))
+    monkeypatch.setattr(submission, "poll_run", lambda client, run: iter([ended]))
     failed = trilight(["submit", "generate-scenes", "smoke"])
     assert "ended as Crashed: it was killed. Its log is at http://page" in failed.stderr
 

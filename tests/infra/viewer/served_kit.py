@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-from infra.viewer.later import LaterRoom, PageRoom
+from infra.viewer.deferred_handlers import DeferredHandlers, PageHandlers
 from infra.viewer.server import PageServer
 
 
@@ -15,7 +15,7 @@ class Asker:
     """Sends requests as a browser would, or as a stranger."""
 
     def __init__(self, server: PageServer) -> None:
-        self.port, self.word = server.server_port, server.word
+        self.port, self.word = server.server_port, server.token
         self.here = f"127.0.0.1:{self.port}"
 
     def ask(
@@ -38,9 +38,9 @@ class Asker:
 
 
 @contextlib.contextmanager
-def served(room: PageRoom, page: str = "scene.html") -> Iterator[Asker]:
+def served(room: PageHandlers, page: str = "scene.html") -> Iterator[Asker]:
     """Serve a room for the block."""
-    later = LaterRoom(page)
+    later = DeferredHandlers(page)
     later.opened.set_result(room)
     server = PageServer(later.gets, later.posts)
     thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)

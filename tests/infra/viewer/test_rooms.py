@@ -13,14 +13,14 @@ from PIL import Image
 
 from infra.viewer import scene_list as list_module
 from infra.viewer.dataset_filter import filter_of
-from infra.viewer.dataset_room import DatasetRoom
-from infra.viewer.folder_room import THUMBNAIL_PX, FolderRoom
+from infra.viewer.dataset_handlers import DatasetHandlers
+from infra.viewer.folder_handlers import THUMBNAIL_PX, FolderHandlers
 from infra.viewer.scene_list import scene_list
 from pipeline.exchange.convert import write_scene
-from pipeline.making.progressive_tracer import ProgressiveTracer
+from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders.variant import Variant, choose_variant
-from pipeline.shards.finished import FinishedDataset
-from pipeline.shards.listing import listed_scenes
+from pipeline.shards.finished_dataset import FinishedDataset
+from pipeline.shards.listing import list_scenes
 from pipeline.shards.plans import Selection
 from storage.conventions import preview_srgb8
 from storage.dataset.dataset import Dataset
@@ -54,7 +54,7 @@ def asker(dataset: Dataset) -> Iterator[Asker]:
     tracer = ProgressiveTracer(
         variant=Variant(name="llvm_ad_rgb", libllvm="", note=""), threads=1
     )  # nothing is traced here
-    room = DatasetRoom(dataset, str(dataset.folder.root), tracer, None)
+    room = DatasetHandlers(dataset, str(dataset.folder.root), tracer, None)
     room.index.wait()
     with served(room, "dataset.html") as found:
         yield found
@@ -89,7 +89,7 @@ def test_what_is_shown_is_what_the_printed_command_selects(asker: Asker, dataset
                 where=options.get("--where"),
             )
             whole = FinishedDataset(folder=dataset.folder, manifest=dataset.manifest, objects={})
-            chosen = listed_scenes(whole, selection)
+            chosen = list_scenes(whole, selection)
             assert [row["key"] for row in found["rows"]] == [row["key"] for row in chosen.rows]
             for mine, theirs in zip(found["rows"], chosen.rows, strict=True):
                 for name in ("split", "template", "triangles", "lights", "spp"):
@@ -132,7 +132,7 @@ def test_a_damaged_shard_costs_itself_alone(tmp_path: Path) -> None:
     broken = write_dataset(tmp_path / "broken", samples(), objects=[CUBE, BALL])
     shard = broken.folder.root / "train-000000.tar"
     shard.write_bytes(shard.read_bytes()[:5000])
-    room = DatasetRoom(broken, "broken", cast(Any, ClosedTracer()), None)
+    room = DatasetHandlers(broken, "broken", cast(Any, ClosedTracer()), None)
     room.index.wait()
     assert {row.split for row in room.index.rows} >= {"validation"}
     assert len(room.index.problems) == 1 and "train-000000.tar" in room.index.problems[0]
@@ -174,7 +174,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def folder_asker(root: Path) -> Iterator[Asker]:
     tracer = ProgressiveTracer(variant=choose_variant(), threads=1)
-    with served(FolderRoom(scene_list(root), tracer, None), "folder.html") as found:
+    with served(FolderHandlers(scene_list(root), tracer, None), "folder.html") as found:
         yield found
 
 

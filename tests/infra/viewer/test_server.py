@@ -13,9 +13,9 @@ import pytest
 
 from infra.setup.sbom import THREE_SHA256, THREE_VERSION
 from infra.viewer import server as viewer_server
+from infra.viewer.deferred_handlers import DeferredHandlers, page_of
 from infra.viewer.guard import MAX_BODY_BYTES, MAX_PATH, refusal
-from infra.viewer.later import LaterRoom, page_of
-from infra.viewer.server import Answer, NotThere, PageServer, Question, Route, json_answer
+from infra.viewer.server import NotFound, PageServer, Request, Response, Route, json_response
 from infra.viewer.static_files import STATIC
 from storage.errors import TrilightError
 from tests.for_each import case
@@ -38,12 +38,12 @@ class EchoRoom:
     def close(self) -> None:
         pass
 
-    def _echo(self, question: Question) -> Answer:
+    def _echo(self, question: Request) -> Response:
         if "mistake" in question.query:
             raise TrilightError("that is a mistake.")
         if "bug" in question.query:
             raise ZeroDivisionError
-        return json_answer({"path": question.path, "body": question.body})
+        return json_response({"path": question.path, "body": question.body})
 
 
 @pytest.fixture(scope="module")
@@ -84,12 +84,12 @@ def test_who_may_ask() -> None:
     for passes, method, path, headers in QUESTIONS:
         with case((passes, method, path, headers)):
             asked = {"Host": HERE, **headers}
-            assert (refusal(method, path, asked.items(), port=PORT, word=WORD) is None) == passes
+            assert (refusal(method, path, asked.items(), port=PORT, token=WORD) is None) == passes
             for name, value in asked.items() if passes else ():
                 for twice in ([(name, "x")], [(name.upper(), value)]):
                     pairs = [*asked.items(), *twice], [*twice, *asked.items()]
                     for both in pairs:
-                        assert refusal(method, path, both, port=PORT, word=WORD) is not None
+                        assert refusal(method, path, both, port=PORT, token=WORD) is not None
 
 
 def test_a_stranger_gets_one_sentence_and_no_header_that_lets_others_read(asker: Asker) -> None:
@@ -199,8 +199,8 @@ def test_it_listens_on_this_machine_alone_and_says_which_port_is_taken() -> None
     server = PageServer({}, {})
     try:
         assert server.server_address[0] == "127.0.0.1"
-        assert len(server.word) >= 32
-        assert server.address == f"http://127.0.0.1:{server.server_port}/{server.word}/"
+        assert len(server.token) >= 32
+        assert server.address == f"http://127.0.0.1:{server.server_port}/{server.token}/"
         with pytest.raises(TrilightError, match=f"--port is {server.server_port}"):
             PageServer({}, {}, port=server.server_port)
     finally:
@@ -275,10 +275,10 @@ def test_the_page_of_a_source(tmp_path: Path) -> None:
 
 
 def test_questions_wait_until_the_source_is_open() -> None:
-    later, answers = LaterRoom("scene.html"), list[bytes]()
-    assert later.gets[""](Question(path="", query={})).kind.startswith("text/html")
+    later, answers = DeferredHandlers("scene.html"), list[bytes]()
+    assert later.gets[""](Request(path="", query={})).kind.startswith("text/html")
     asked = threading.Thread(
-        target=lambda: answers.append(later.gets["api/"](Question(path="api/echo", query={})).body)
+        target=lambda: answers.append(later.gets["api/"](Request(path="api/echo", query={})).body)
     )
     asked.start()
     asked.join(0.05)
@@ -286,5 +286,5 @@ def test_questions_wait_until_the_source_is_open() -> None:
     later.opened.set_result(EchoRoom())
     asked.join(10)
     assert b"api/echo" in answers[0]
-    with pytest.raises(NotThere):
-        later.posts["api/"](Question(path="api/none", query={}))
+    with pytest.raises(NotFound):
+        later.posts["api/"](Request(path="api/none", query={}))

@@ -21,7 +21,7 @@ from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, LAMP, corner, direct, traced
 from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
 from tests.rigid_motion import moved
-from train.data.augment import mirrored, with_channels, with_vertices_turned
+from train.data.augment import mirror_scene, permute_channels, rotate_vertex_order
 from train.data.scenes import TrainingScene
 
 LIGHTS = slice(Channel.OPEN_DIFFUSE.start, Channel.MIRRORED.stop)
@@ -241,11 +241,11 @@ def test_textures_go_through_the_symmetries_of_training(symmetry: str) -> None:
     order = np.array([2, 0, 1])
     if symmetry == "turned":
         turn = np.random.default_rng(1).integers(0, 3, tensors.num_triangles)
-        changed = with_vertices_turned(training, turn)
+        changed = rotate_vertex_order(training, turn)
     elif symmetry == "mirrored":
-        changed = mirrored(training)
+        changed = mirror_scene(training)
     else:
-        changed = with_channels(training, order)
+        changed = permute_channels(training, order)
     before, after = (
         _albedo(traced_batch(batch_scenes([each]))[0], each) for each in (tensors, changed.tensors)
     )

@@ -74,7 +74,7 @@ def test_a_pixel_that_differs_is_in_both_differences(base: Path, place: int) -> 
     read = read_reference(base)
     read.expected_BVRR3[(place,) * 5] += 1e-6
     found = differences(read)
-    assert found.padded > TOLERANCE and found.unpadded > TOLERANCE and not found.accepted
+    assert found.padded > TOLERANCE and found.unpadded > TOLERANCE and not found.is_accepted
 
 
 def test_the_command_fails_on_nan(

@@ -16,8 +16,8 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import prepare_assets
 from pipeline.assets.store import AssetStore
 from pipeline.foreign.mesh import TriangleMesh
+from pipeline.generation.prepare_isolated import asset_child
 from pipeline.isolation import IsolatedChild
-from pipeline.making.prepare_isolated import asset_child
 from storage.records.asset import Asset, decode_asset
 from tests.conftest import ROOT
 from tests.pipeline.assets import meshes_by_hand as by_hand

@@ -11,8 +11,8 @@ import pytest
 
 from pipeline.assets.recipe import RECIPE, methods_of
 from pipeline.assets.settings import AssetSettings
-from pipeline.making.environment import vector_extension
-from pipeline.making.prepare_isolated import prepare_isolated
+from pipeline.generation.environment import vector_extension
+from pipeline.generation.prepare_isolated import prepare_isolated
 from pipeline.objects.generated import generate_objects
 from storage.digests import canonical_json, sha256_hex
 from tests.conftest import ROOT

@@ -16,7 +16,7 @@ from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.assets.stage import _rising, attempt_in_child, prepare_assets
 from pipeline.assets.store import AssetStore
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.isolation import is_passing
+from pipeline.isolation import is_transient
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from tests.for_each import for_each
 from tests.pipeline.assets.child_kit import (
@@ -226,7 +226,7 @@ def test_what_the_environment_did_is_not_kept_and_leads_to_no_other_method(
     bench.set(**{FIRST: action})
     prepared, (failure,) = run(hurried(wall_s=0.7) if action == "sleep" else bench, "knot.obj")
     assert (prepared, failure.reason) == ([], reason)
-    assert is_passing(failure.reason)
+    assert is_transient(failure.reason)
     assert [call["method"] for call in bench.calls] == [FIRST] * tries
     assert len({call["pid"] for call in bench.calls}) == tries
     assert not [path for path in (bench.root.parent / "store").rglob("*.*") if path.is_file()]
@@ -263,7 +263,7 @@ def test_a_verdict_is_kept(
     bench.set(**{FIRST: action})
     prepared, (failure,) = run(hurried(cpu_s=1), "knot.obj")
     assert (prepared, failure.reason) == ([], reason)
-    assert not is_passing(failure.reason)
+    assert not is_transient(failure.reason)
     assert len(bench.calls) == tries
     bench.set()
     assert run(bench, "knot.obj") == ([], [failure])

@@ -33,7 +33,7 @@ from tests.pipeline.documents.dataset_by_hand import (
     sample,
     write_dataset,
 )
-from tests.pipeline.making.test_derive_dataset import finished
+from tests.pipeline.generation.test_derive_dataset import finished
 from tests.scenes_by_hand import tiny_scene
 from tests.textured_by_hand import sky, textured_scene
 
@@ -135,7 +135,7 @@ def test_textures_and_skies(tmp_path: Path) -> None:
 def test_a_view_has_reached_its_targets_when_it_has_reached_all(found: Distributions) -> None:
     def reached(**targets: float) -> list[bool]:
         asked = dataclasses.replace(found, targets={**found.targets, **targets})
-        each = asked.reached("train")
+        each = asked.reaches_targets("train")
         assert each is not None
         return [bool(view) for view in each]
 
@@ -144,7 +144,7 @@ def test_a_view_has_reached_its_targets_when_it_has_reached_all(found: Distribut
     assert reached(noise_floor_linear_db=33.5) == [False] * 8
     assert reached(noise_floor_objects_db=41.0) == [False] * 8
     nothing = dataclasses.replace(found, targets=dict.fromkeys(found.targets))
-    assert nothing.reached("train") is None
+    assert nothing.reaches_targets("train") is None
 
 
 def test_json_holds_all_of_it(found: Distributions) -> None:

@@ -13,7 +13,7 @@ from PIL import Image
 
 from pipeline.documents.figures import (
     drawing,
-    encoded,
+    encode_figure,
     histogram,
     panels,
     rose,
@@ -31,7 +31,7 @@ from pipeline.documents.html import (
     element,
     escape,
     image,
-    joined,
+    join_markup,
     outside_link,
     page,
     png_uri,
@@ -201,7 +201,7 @@ def test_what_a_card_knows() -> None:
 def test_text_is_escaped_once_and_attributes_cells_and_titles_cannot_be_left() -> None:
     assert escape("<&'\">") == "&lt;&amp;&#x27;&quot;&gt;"
     assert escape(escape("<")) == "&lt;"
-    assert joined(["<", Markup("<br>")]) == "&lt;\n<br>"
+    assert join_markup(["<", Markup("<br>")]) == "&lt;\n<br>"
     tags = read(element("p", HARM, id=HARM, class_="a").encode())
     assert (tags.tags, tags.names, tags.ids) == (["p"], {"id", "class"}, {HARM})
     assert read(image("data:,", HARM).encode()).tags == ["img"]
@@ -270,7 +270,7 @@ def test_any_values_can_be_drawn() -> None:
             rose(axis, VALUES[name], "directions")
         for axis, (name, values) in zip(axes[4:], VALUES.items(), strict=True):
             histogram(axis, values, name, ylabel="y", marks=marks)
-        drawn = picture(encoded(figure, "alt"))
+        drawn = picture(encode_figure(figure, "alt"))
     assert drawn.size[0] > 800
     assert len(drawn.getcolors(1 << 24) or []) > 20
 
@@ -290,7 +290,7 @@ def test_bars_hold_every_value_and_names_from_outside_are_labels() -> None:
     names = ["$\\frac{$", "高 \ud800", "", "x" * 99]
     with drawing():
         figure, _ = stacked_bars(names, {name: [1, 2, 3, 4] for name in names}, xlabel="n")
-        assert picture(encoded(figure, "alt")).size[0] > 800
+        assert picture(encode_figure(figure, "alt")).size[0] > 800
 
 
 def test_the_readers_settings_do_not_matter() -> None:
@@ -298,7 +298,7 @@ def test_the_readers_settings_do_not_matter() -> None:
         with drawing():
             figure, (axes,) = panels(1)
             histogram(axes, [1.5, 2.5], "x")
-            return encoded(figure, "alt")
+            return encode_figure(figure, "alt")
 
     plain = drawn()
     with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "black"}):

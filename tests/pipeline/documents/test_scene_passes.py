@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.documents.distributions import dataset_distributions
-from pipeline.documents.pass_colours import (
-    depth_greys,
+from pipeline.documents.pass_colors import (
+    depth_grays,
     finite_range,
-    id_colours,
+    id_colors,
 )
 from pipeline.documents.report import write_report
 from pipeline.documents.scene_page import Neighbours, encode_scene_page
@@ -82,7 +82,7 @@ def test_colours_and_captions_say_the_value() -> None:
         assert greys[met][np.argmin(depth_m[met])] == 255
         assert (np.diff(greys[met][np.argsort(depth_m[met])]) <= 0).all()
         assert np.abs(normals[met] / 127.5 - 1 - normal[met]).max() <= 0.5 / 127.5
-        assert np.array_equal(colours, id_colours(ids))
+        assert np.array_equal(colours, id_colors(ids))
         assert {tuple(colour) for colour in albedo[ids == 2]} <= {(203, 0, 0), (124, 170, 0)}
         assert np.array_equal(rough[met], np.round(40 + 215 * roughness[met]))
     depth_m = view_passes(scene, ["depth_axis_m"], view=1, resolution=SIZE)["depth_axis_m"]
@@ -152,15 +152,15 @@ def test_the_report_names_the_stored_passes(tmp_path: Path) -> None:
 
 def test_near_is_bright_and_every_id_has_its_own_colour() -> None:
     depth_m = np.array([[2.0, 3.0], [4.0, np.inf]])
-    assert depth_greys(depth_m).tolist() == [[255, 148], [40, 0]]
+    assert depth_grays(depth_m).tolist() == [[255, 148], [40, 0]]
     # metres do not matter, only the range
-    assert np.array_equal(depth_greys(depth_m * 1000), depth_greys(depth_m))
-    assert depth_greys(np.array([[3.0, np.inf]])).tolist() == [[255, 0]]
-    assert depth_greys(np.full((2, 2), np.inf)).tolist() == [[0, 0], [0, 0]]
+    assert np.array_equal(depth_grays(depth_m * 1000), depth_grays(depth_m))
+    assert depth_grays(np.array([[3.0, np.inf]])).tolist() == [[255, 0]]
+    assert depth_grays(np.full((2, 2), np.inf)).tolist() == [[0, 0], [0, 0]]
     ids = np.append(np.arange(-1, 2**16), 2**24 - 2)
-    assert len(np.unique(id_colours(ids), axis=0)) == len(ids)
-    assert not id_colours(-1).any()
+    assert len(np.unique(id_colors(ids), axis=0)) == len(ids)
+    assert not id_colors(-1).any()
     first = [[128, 0, 0], [0, 128, 0], [128, 128, 0], [0, 0, 128]]
-    assert id_colours(range(4)).tolist() == first
+    assert id_colors(range(4)).tolist() == first
     assert finite_range(np.array([np.nan, 3, 1, np.inf])) == (1, 3)
     assert finite_range(np.array([np.nan])) is None

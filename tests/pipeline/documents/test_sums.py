@@ -13,8 +13,8 @@ from typing import cast
 import pytest
 
 from pipeline.documents.attribution import encode_attribution
-from pipeline.documents.chosen import Chosen, choose_scenes
 from pipeline.documents.dataset_documents import write_documents
+from pipeline.documents.scene_choice import ChosenScene, choose_scenes
 from pipeline.documents.sums import SUMS, published_files, renew_sums, stale_sums, write_sums
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import ShardEntry, read_manifest
@@ -141,7 +141,7 @@ class Listed:
         return keys
 
 
-def chosen_of(max_scenes: int, **counts: int) -> list[Chosen]:
+def chosen_of(max_scenes: int, **counts: int) -> list[ChosenScene]:
     return choose_scenes(cast(Dataset, Listed(counts)), max_scenes)
 
 

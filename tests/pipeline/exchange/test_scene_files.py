@@ -15,14 +15,14 @@ from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles, build_scene
 from pipeline.exchange.scene_folder import find_scene_files
-from pipeline.making import render_children
-from pipeline.making.accept_scene_files import (
+from pipeline.generation import render_children
+from pipeline.generation.accept_scene_files import (
     accept_scene_files,
     build_once,
     settings_for_files,
 )
-from pipeline.making.begin_publication import begin
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.begin_dataset import begin
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.dataset.splits import scenes_of_shard, shard_name
@@ -37,7 +37,7 @@ CAMERA = {"position": [0, -2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 
 def no_child(monkeypatch: pytest.MonkeyPatch) -> None:
     """Accept files without a child, of which each costs seconds."""
     here = SimpleNamespace(call=lambda function, *args: function(*args), close=lambda: None)
-    child = "pipeline.making.accept_scene_files.asset_child"
+    child = "pipeline.generation.accept_scene_files.asset_child"
     monkeypatch.setattr(child, lambda confined_to: here)
 
 

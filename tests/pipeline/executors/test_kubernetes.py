@@ -11,10 +11,10 @@ from pipeline.executors.array_job import ArrayJob
 from pipeline.executors.kubernetes import PLACE, shards_of_place
 from pipeline.executors.kubernetes_array import KubernetesOptions, job_manifest
 from pipeline.executors.registry import find_executor
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.pipeline.making.tiny_scenes_kit import tiny_order
+from tests.pipeline.generation.tiny_scenes_kit import tiny_order
 
 GIVEN = {"TASKS": "0-1,7", "SHARDS_PER_TASK": "4"}
 

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.executors.array_job import MOST_TASKS, ArrayJob, array_job
+from pipeline.executors.array_job import MAX_TASKS, ArrayJob, array_job
 from pipeline.executors.registry import EXECUTORS, find_executor
 from pipeline.executors.slurm import shards_of_task
-from pipeline.executors.slurm_array import sbatch_environment, sbatch_words
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.executors.slurm_array import sbatch_command, sbatch_environment
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.dataset import open_dataset
 from storage.dataset.progress import missing_shards
 from storage.dataset.verify import verify_dataset
@@ -26,7 +26,7 @@ from storage.number_ranges import number_ranges, numbers_of
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.for_each import for_each
-from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
+from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
 def _array(task: int, first: int, last: int, count: int, **more: str) -> dict[str, str]:
@@ -129,7 +129,7 @@ def test_an_array_fits_the_cluster_and_covers_every_shard(cluster: Path) -> None
     order = DatasetOrder(build="pretrain-256", scenes=2_000_000)
     job = array_job(order, per_task=None, at_once=None)
     shards = -(-2_000_000 // 256)
-    assert len(job.tasks) <= MOST_TASKS
+    assert len(job.tasks) <= MAX_TASKS
     assert job.per_task * len(job.tasks) >= shards > job.per_task * (len(job.tasks) - 1)
     with pytest.raises(TrilightError, match="shards-per-task is 1: .* task 7812; .* 8 shards"):
         array_job(order, per_task=1, at_once=None)
@@ -140,7 +140,7 @@ def test_settings_that_divide_the_dataset_count(cluster: Path) -> None:
     order = DatasetOrder(build="smoke", scenes=64, changes=changes, objects="my objects")
     job = array_job(order, per_task=2, at_once=3)
     assert job.tasks == [0, 1, 2, 3]
-    words = sbatch_words(job)
+    words = sbatch_command(job)
     assert words[:3] == ["sbatch", "--parsable", "--array=0-3%3"]
     assert words[4:] == ["--changes", "splits.scenes_per_shard=8"]
     given = sbatch_environment(job)
@@ -259,7 +259,7 @@ def test_names_of_executors_load_neither_prefect_nor_the_stages() -> None:
     """They are asked for at every press of the tab key."""
     code = (
         "import sys, pipeline.executors.registry;"
-        "print([name for name in ('prefect', 'distributed', 'pipeline.making.pipeline') "
+        "print([name for name in ('prefect', 'distributed', 'pipeline.generation.pipeline') "
         "if name in sys.modules])"
     )
     done = subprocess.run(

@@ -12,8 +12,8 @@ from pipeline.flows.array_flow import make_by_array
 from pipeline.flows.dataset_flows import build_dataset, generate_scenes, prepare_assets
 from pipeline.flows.forms import BuildChanges, changed_values
 from pipeline.flows.orders import dataset_order
-from pipeline.flows.prefect_runner import may_pass
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.flows.prefect_runner import is_retryable
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.for_each import for_each
 
@@ -139,7 +139,7 @@ def test_only_what_can_pass_is_tried_again() -> None:
             raise self._error
 
     outcomes = {
-        error: may_pass(None, None, Failed(error))  # type: ignore[arg-type]
+        error: is_retryable(None, None, Failed(error))  # type: ignore[arg-type]
         for error in (
             EnvironmentFailure("disk"),
             OSError("gone"),

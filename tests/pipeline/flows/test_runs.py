@@ -16,8 +16,8 @@ from pipeline.flows import prefect_runner as runner
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.orders import DatasetInRuns, dataset_in_runs
 from pipeline.flows.process import run_to_end
-from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.tasks import shard_ranges
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.tasks import shard_ranges
 from storage.errors import TrilightError
 from tests.for_each import for_each
 
@@ -93,7 +93,7 @@ def test_rendering_on_a_card_takes_its_limit(
 def test_documents_are_tried_again_where_that_can_help() -> None:
     task = cast(Any, runner.write_documents_task)
     assert task.retries == cast(Any, runner.make_scenes).retries > 0
-    assert task.retry_condition_fn is runner.may_pass
+    assert task.retry_condition_fn is runner.is_retryable
 
 
 def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_path: Path) -> None:

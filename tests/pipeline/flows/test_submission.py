@@ -23,14 +23,14 @@ from prefect.states import Completed, Failed, Running, Scheduled, State
 
 from pipeline.flows import guarded_server
 from pipeline.flows.dataset_flows import generate_scenes
-from pipeline.flows.guarded_server import Door
+from pipeline.flows.guarded_server import RequestGuard
 from pipeline.flows.prefect_server import (
     name_prefect_failures,
     prefect_server,
     wait_until_healthy,
 )
-from pipeline.flows.submission import looks, parameters, server, submit, workers_online
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.flows.submission import parameters, poll_run, server, submit, workers_online
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.cache import open_private, private_folder
 from storage.errors import TrilightError
 from tests.for_each import case, for_each
@@ -123,7 +123,7 @@ def test_a_run_is_looked_at_until_it_has_ended_and_one_that_failed_is_no_success
         SimpleNamespace(type="table", data=json.dumps(table), key="progress", updated=2),
     ]
     slept: list[float] = []
-    seen = list(looks(served, uuid4(), slept.append))  # type: ignore[arg-type]
+    seen = list(poll_run(served, uuid4(), slept.append))  # type: ignore[arg-type]
     assert [look.state for look in seen] == ["Scheduled", "Running", "Completed"]
     assert [look.is_final for look in seen] == [False, False, True]
     assert seen[-1].is_completed and seen[-1].message == "all there"
@@ -131,7 +131,7 @@ def test_a_run_is_looked_at_until_it_has_ended_and_one_that_failed_is_no_success
     assert seen[-1].tables == {"progress": [("scenes in shards", "3 of 4")]}
     assert len(slept) == 2
     served = Server(["local"], (Failed(message="no space"),))
-    (last,) = looks(served, uuid4())  # type: ignore[arg-type]
+    (last,) = poll_run(served, uuid4())  # type: ignore[arg-type]
     assert (last.is_final, last.is_completed, last.message) == (True, False, "no space")
 
 
@@ -140,7 +140,7 @@ def test_no_server_a_closed_port_and_a_password() -> None:
         with pytest.raises(TrilightError, match="no Prefect server is set.*make serve"), server():
             pass
     request = httpx.Request("POST", "http://127.0.0.1:9/api")
-    with pytest.raises(TrilightError, match="it wants a password.*PREFECT_API_AUTH_STRING"):
+    with pytest.raises(TrilightError, match="it requires a password.*PREFECT_API_AUTH_STRING"):
         with name_prefect_failures():
             httpx.Response(401, request=request).raise_for_status()
 
@@ -153,7 +153,7 @@ def test_what_is_no_prefect_is_said_in_one_sentence_by_every_runner(
     with serve() as site:
         site.put("api/admin/version", "<html>")
         cases = {
-            "http://127.0.0.1:9/api": "^Prefect at .*: Connection refused. Run make serve, or mend",
+            "http://127.0.0.1:9/api": "^Prefect at .*: Connection refused. Run make serve, or fix",
             "garbage": "^Prefect at garbage: .* missing an 'http://'",
             f"{site.url}/api": "is no API of Prefect; expected one, such as",
             f"{site.url}/x": "it answers 404",
@@ -189,7 +189,7 @@ def _answer(kind: str = "http", **headers: str) -> list[MutableMapping[str, Any]
 
     raw = [(name.encode(), value.encode()) for name, value in headers.items()]
     scope = {"type": kind, "headers": raw, "path": "/api/deployments/filter"}
-    asyncio.run(Door(_application, ["server", "My-Host"])(scope, receive, send))
+    asyncio.run(RequestGuard(_application, ["server", "My-Host"])(scope, receive, send))
     return sent
 
 
@@ -246,7 +246,7 @@ def test_half_requests_are_closed_and_slow_answers_are_not(monkeypatch: pytest.M
         await asyncio.sleep(1.2)
         await _application(scope, receive, send)
 
-    http = guarded_server.impatient_protocol()
+    http = guarded_server.request_timeout_protocol()
     config = uvicorn.Config(answer_slowly, port=0, http=http, lifespan="off", log_level="error")
     served = uvicorn.Server(config)
     thread = threading.Thread(target=served.run, daemon=True)

@@ -30,7 +30,7 @@ from pipeline.isolation.answers import (
     encode_error,
     encode_result,
 )
-from pipeline.isolation.declared import DTYPES, result_reader
+from pipeline.isolation.result_schema import DTYPES, result_reader
 from storage.array_hints import array_scalar
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from tests.for_each import for_each

@@ -13,22 +13,22 @@ from types import SimpleNamespace
 
 import pytest
 
+from pipeline.generation.prepare_isolated import asset_child
 from pipeline.isolation import (
     ChildFailed,
     ChildLimits,
     IsolatedChild,
     Reach,
+    call_failures,
     call_with_retries,
     confinement,
-    deaths,
-    is_passing,
+    is_transient,
     reach,
     seccomp,
 )
-from pipeline.isolation.deaths import ENDS, with_retries
+from pipeline.isolation.call_failures import ENDS, with_retries
 from pipeline.isolation.landlock import landlock_version
 from pipeline.isolation.seccomp import seccomp_works
-from pipeline.making.prepare_isolated import asset_child
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.conftest import ROOT
 from tests.for_each import for_each
@@ -175,9 +175,9 @@ def _until(happened: Callable[[], bool], most_s: float) -> None:
 def test_another_folder_costs_a_fresh_child_and_the_same_one_none(place: Path) -> None:
     with closing(confined(reach(files=[place / "in"]))) as child:
         first = child.call(called.process_id)
-        child.may(reach(files=[place / "in" / "file"]))
+        child.allow_files(reach(files=[place / "in" / "file"]))
         assert child.call(called.process_id) == first
-        child.may(reach(files=[place / "outside" / "file"]))
+        child.allow_files(reach(files=[place / "outside" / "file"]))
         assert child.call(called.read, place / "outside" / "file") == "outside"
         assert child.call(called.read, place / "in" / "file") == "in"
         assert child.call(called.process_id) != first
@@ -220,7 +220,7 @@ def test_what_cannot_be_had_is_said(
         asset_child()
     monkeypatch.setenv(confinement.VARIABLE, "auto")
     confinement._warn.cache_clear()
-    assert confinement.confinement_wanted() and confinement.confinement_wanted()
+    assert confinement.should_confine() and confinement.should_confine()
     assert [record.getMessage().count("lacks Landlock") for record in caplog.records] == [1]
     caplog.clear()
 
@@ -279,7 +279,7 @@ def child_with(setup, *args: object) -> IsolatedChild:  # type: ignore[no-untype
 
 @pytest.fixture(autouse=True)
 def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(deaths, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(call_failures, "_PAUSE_S", 0.0)
 
 
 @pytest.fixture
@@ -328,7 +328,7 @@ def test_the_same_call_is_made_again(plain_child: IsolatedChild, tmp_path: Path)
 
 
 @for_each(("reason", "end"), ENDS.items())
-def test_tries_end(reason: str, end: deaths.End) -> None:
+def test_tries_end(reason: str, end: call_failures.End) -> None:
     calls: list[str] = []
 
     def fail() -> None:
@@ -349,7 +349,7 @@ def test_every_end_has_tries_and_only_two_are_verdicts() -> None:
     assert all(1 <= end.tries <= 3 for end in ENDS.values())
     tries = {name: ENDS[name].tries for name in ("killed", "exception", "crashed_signal")}
     assert tries == {"killed": 3, "exception": 3, "crashed_signal": 2}
-    assert not is_passing("degenerate")
+    assert not is_transient("degenerate")
 
 
 def test_kills_while_a_child_is_set_up_are_tried_again_and_end_the_run_at_last(

@@ -19,8 +19,8 @@ from pipeline.isolation import (
     ChildFailed,
     ChildLimits,
     IsolatedChild,
+    call_failures,
     call_with_retries,
-    deaths,
     waiting,
 )
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
@@ -156,7 +156,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[IsolatedChild]:
     """Looked at twenty times a second, and given up after three quarters of one."""
     monkeypatch.setattr(waiting, "LOOK_S", 0.05)
     monkeypatch.setattr(waiting, "LOOKS_BEFORE_KILL", 15)
-    monkeypatch.setattr(deaths, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(call_failures, "_PAUSE_S", 0.0)
     watched = IsolatedChild(limits=PATIENT, setup=called.nothing)
     yield watched
     watched.close()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.builds.named import named_build
-from pipeline.making.render_sample import BegunScene, render_sample
-from pipeline.making.view_progress import ViewProgress
+from pipeline.generation.render_sample import RenderInput, render_sample
+from pipeline.generation.view_progress import ViewProgress
 from pipeline.renders import vector_tracer
 from pipeline.renders.camera import Camera
 from pipeline.renders.renderer import SceneRenderer
@@ -125,7 +125,7 @@ def test_all_views_and_lights_share_one_load(llvm: None, monkeypatch: pytest.Mon
     changes["scenes.num_views"] = 2
     settings = named_build("smoke", resolution=16, changes=changes)
     sample = render_sample(
-        "000000000", BegunScene(scene=scene), settings, [], ViewProgress(None, 0)
+        "000000000", RenderInput(scene=scene), settings, [], ViewProgress(None, 0)
     )
     assert len(sample.views) == 2
     assert len(loads) == 2  # what camera rays meet, and what all other rays meet

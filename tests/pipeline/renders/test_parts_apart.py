@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
-from pipeline.making.render_sample import BegunScene, render_sample
-from pipeline.making.view_progress import ViewProgress
+from pipeline.generation.render_sample import RenderInput, render_sample
+from pipeline.generation.view_progress import ViewProgress
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
@@ -175,7 +175,7 @@ def test_a_build_with_the_setting_stores_what_verify_accepts(
     settings = named_build("smoke", resolution=16, changes={**changes, "scenes.num_views": 2})
     scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
     sample = render_sample(
-        "000000007", BegunScene(scene=scene), settings, [], ViewProgress(None, 7)
+        "000000007", RenderInput(scene=scene), settings, [], ViewProgress(None, 7)
     )
     manifest = Manifest(
         build="smoke",

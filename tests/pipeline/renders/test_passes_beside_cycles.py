@@ -189,15 +189,14 @@ def test_both_put_the_same_light_in_the_same_place() -> None:
 
 
 @pytest.mark.usefixtures("blender")
-@pytest.mark.parametrize(("name", "least_db"), [("cbox", 67.0), ("cbox-bunny", 65.0)])
-def test_stored_direct_light_comes_again(shared: Path, name: str, least_db: float) -> None:
-    scene = example_scene(shared, name)
+def test_stored_direct_light_comes_again(shared: Path) -> None:
+    scene = example_scene(shared, "cbox")
     picture = _cycles(scene, 256, 64, bounces=0)
-    stored = decode_exr((shared / "cycles_reference" / f"{name}.direct_raw.exr").read_bytes())
+    stored = decode_exr((shared / "cycles_reference" / "cbox.direct_raw.exr").read_bytes())
     error = np.clip(block_means(picture, BLOCK), 0, 1) - np.clip(block_means(stored, BLOCK), 0, 1)
-    # Measured: 71.5 and 68.5 dB, and 80 and 77 with 512 samples: noise. Blender's usual pixel
-    # filter in place of the box gives 63 and 58.
-    assert -10 * np.log10(np.square(error).mean()) > least_db
+    # Measured: 71.5 dB, and 80 with 512 samples: noise. Blender's usual pixel filter in place of
+    # the box gives 63.
+    assert -10 * np.log10(np.square(error).mean()) > 67.0
 
 
 DIRECT = RenderSettings(

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.making import progressive_tracer as module
-from pipeline.making.progressive_tracer import ProgressiveTracer
+from pipeline.generation import progressive_tracer as module
+from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders import preview
 from pipeline.renders.camera import Camera
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings, usual_filter
@@ -211,21 +211,21 @@ def test_the_child_keeps_the_scene_and_ends_where_it_is_told_to() -> None:
 
     try:
         with pytest.raises(Enough):
-            tracer.paint(scene, "a", camera, GROWING, stop)
-        tracer.paint(scene, "a", camera, GROWING, told.append)
+            tracer.render(scene, "a", camera, GROWING, stop)
+        tracer.render(scene, "a", camera, GROWING, told.append)
         last = told[-1]
         assert isinstance(last, GrowingPicture)
         expected = looks(scene)[-1].radiance_rgb
         assert psnr_log_db(last.radiance_rgb, expected) > 30
-        tracer.paint(scene, "a", camera, GROWING, told.append, preview_spp=4)
+        tracer.render(scene, "a", camera, GROWING, told.append, preview_spp=4)
         assert isinstance(told[-1], GrowingPicture) and told[-1].spp == 4
         assert tracer._child.call(_num_loaded) == 1, "a preview loads no scene anew"
         dark = tiny_scene(faces=tiny_scene().faces[2:], material_index=np.array([1], np.uint16),
                           object_index=np.array([1], np.uint16))  # fmt: skip
         with pytest.raises(TrilightError, match="no_surfaces"):
-            tracer.paint(dark, "dark", camera, GROWING, told.append)
+            tracer.render(dark, "dark", camera, GROWING, told.append)
         for key in ("b", "c", "d"):
-            tracer.paint(scene, key, camera, GROWING, told.append)
+            tracer.render(scene, key, camera, GROWING, told.append)
         kept = tracer._child.call(_num_loaded)
         assert kept == module.MOST_SCENES
     finally:

@@ -14,9 +14,9 @@ from pipeline.renders.kernel_textures import KernelTextures
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
-from pipeline.scenes.own_materials import own_skins
-from pipeline.scenes.pieces import dressed, emitter_piece, joined, object_piece
+from pipeline.scenes.pieces import apply_skin, concatenate_pieces, emitter_piece, object_piece
 from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.source_materials import source_skins
 from scene_templates.layout import Emitter
 from scene_templates.materials import MaterialSettings
 from storage.conventions import look_at_c2w
@@ -315,7 +315,7 @@ def test_a_traced_picture_has_the_colours_in_their_corners(tmp_path: Path, kind:
     )
     entry = PooledAsset(locked=small_pool()[0].locked, asset=prepare(path, KEEP))
     level = entry.asset.levels[0]
-    (skin,) = own_skins(
+    (skin,) = source_skins(
         [entry], [level], MaterialSettings(source="object"), seed=0, scene_index=0, attempt=0
     )
     assert skin is not None
@@ -328,7 +328,7 @@ def test_a_traced_picture_has_the_colours_in_their_corners(tmp_path: Path, kind:
         np.random.default_rng(0),
         30.0,
     )
-    square = dressed(square, positions, level.faces, skin)
+    square = apply_skin(square, positions, level.faces, skin)
     lamp = emitter_piece(
         Emitter(
             triangle=np.array([[-1, -3, 2], [1, -3, 2], [0, -3, 3.0]]),
@@ -339,7 +339,7 @@ def test_a_traced_picture_has_the_colours_in_their_corners(tmp_path: Path, kind:
     )
     scene = without_constant_textures(
         Scene(
-            **joined([square, lamp]),
+            **concatenate_pieces([square, lamp]),
             c2w=look_at_c2w(eye=[0, -2, 0], target=[0, 0, 0], up=[0, 0, 1])[None].astype(
                 np.float32
             ),

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pipeline.making.environment import environment
+from pipeline.generation.environment import environment
 from pipeline.renders import denoiser, variant_probe, vector_tracer
 from pipeline.renders import variant as variant_module
 from pipeline.renders.facts import render_facts

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.scenes import fitting
 from pipeline.scenes.budget import least_triangles, levels_within
-from pipeline.scenes.fitting import FitTable, drawn_rows
+from pipeline.scenes.fitting import FitTable, draw_rows
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
@@ -132,10 +132,10 @@ def test_too_little_room_is_rejected_with_the_numbers() -> None:
     with pytest.raises(Rejected, match="1 objects need 300 triangles at least.*has 200"):
         levels_within([_asset([(300, 0.1), (600, 0.0)])], 200, 0.0)
     with pytest.raises(Rejected, match="3 objects of at least 50 .* into the 149") as caught:
-        drawn_rows(np.random.default_rng(0), FitTable.of([50, 80]), 3, 149)
+        draw_rows(np.random.default_rng(0), FitTable.of([50, 80]), 3, 149)
     assert caught.value.reason == "over_budget"
     with pytest.raises(Rejected, match="do not fit"):
-        drawn_rows(np.random.default_rng(0), FitTable.of([5, 5], ["a", "b"]), 3, 14)
+        draw_rows(np.random.default_rng(0), FitTable.of([5, 5], ["a", "b"]), 3, 14)
 
 
 LICENCES = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC0-1.0", "cc-by-sa-4.0", "GPL-3.0-only")
@@ -194,7 +194,7 @@ def _slow_twin(
 
 
 def test_parts_change_no_draw(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "_PART", 7)
+    monkeypatch.setattr(fitting, "_CHUNK", 7)
     rejected = several = 0
     for trial in range(300):
         rng = np.random.default_rng(trial)
@@ -205,7 +205,7 @@ def test_parts_change_no_draw(monkeypatch: pytest.MonkeyPatch) -> None:
         expected = _slow_twin(np.random.default_rng(trial), least, camps, count, total)
         table = FitTable.of(least, camps)
         try:
-            assert drawn_rows(np.random.default_rng(trial), table, count, total) == expected
+            assert draw_rows(np.random.default_rng(trial), table, count, total) == expected
         except Rejected:
             assert expected is None
         rejected += expected is None
@@ -231,7 +231,7 @@ def test_no_row_is_looked_at_where_all_fit() -> None:
 
     least, camp = Counting(range(1, 1001)), Counting([0] * 1000)
     table = FitTable(least, camp, [""], FitTable.of(range(1, 1001)).sizes)
-    drawn_rows(np.random.default_rng(0), table, 3, 3000)
+    draw_rows(np.random.default_rng(0), table, 3, 3000)
     assert (least.read, camp.read) == (3, 3)
-    drawn_rows(np.random.default_rng(0), table, 3, 2000)
+    draw_rows(np.random.default_rng(0), table, 3, 2000)
     assert least.read > 1000

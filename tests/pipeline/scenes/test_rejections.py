@@ -13,8 +13,8 @@ import pytest
 
 from pipeline.builds.named import named_build
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.laws import require_laws
 from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.scene_checks import require_valid
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.records.scene import Scene
@@ -118,16 +118,16 @@ def test_what_a_scene_must_be_is_looked_at_last(scenes: list[Scene]) -> None:
     """Of a scene that is fine, each law by itself."""
     settings = named_build("smoke").scenes
     scene = next(scene for scene in scenes if scene.num_triangles > 1000)
-    require_laws(scene, settings)
-    require_laws(scene, dataclasses.replace(settings, max_triangles=scene.num_triangles))
+    require_valid(scene, settings)
+    require_valid(scene, dataclasses.replace(settings, max_triangles=scene.num_triangles))
     tight = dataclasses.replace(settings, max_triangles=scene.num_triangles - 1)
     with pytest.raises(Rejected) as caught:
-        require_laws(scene, tight)
+        require_valid(scene, tight)
     assert caught.value.reason == "over_budget"
     normals = scene.vertex_normals.copy()
     normals[0] = 0
     with pytest.raises(Rejected) as caught:
-        require_laws(dataclasses.replace(scene, vertex_normals=normals), settings)
+        require_valid(dataclasses.replace(scene, vertex_normals=normals), settings)
     assert caught.value.reason == "law_broken"
     assert "vertex_normals" in caught.value.message
 
@@ -152,10 +152,10 @@ def test_an_emitter_in_the_box_of_an_object_is_found_and_one_beside_it_is_not(
         lit = dataclasses.replace(scene, vertex_positions=moved)
         if inside:
             with pytest.raises(Rejected) as caught:
-                require_laws(lit, settings)
+                require_valid(lit, settings)
             assert caught.value.reason == "emitter_inside"
         else:
-            require_laws(lit, settings)
+            require_valid(lit, settings)
 
 
 SCENES = {

@@ -8,7 +8,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.scenes.pool import PooledAsset
-from pipeline.scenes.posing import in_unit_sphere, posed, without_slivers
+from pipeline.scenes.posing import in_unit_sphere, pose_points, without_slivers
 from pipeline.scenes.shapes import MeshShape
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Pose
@@ -112,7 +112,7 @@ def _pose(rng: np.random.Generator, radius: float) -> Pose:
 
 
 def _soup(shape: MeshShape, pose: Pose) -> NDArray[np.float64]:
-    return posed(shape.points, pose).astype(np.float64)[shape.faces]
+    return pose_points(shape.points, pose).astype(np.float64)[shape.faces]
 
 
 def test_meets_agrees_with_the_slow_twin_and_is_symmetric(pool: list[PooledAsset]) -> None:
@@ -199,7 +199,7 @@ def test_a_posed_mesh_fills_its_sphere(centring: str) -> None:
     for entry in small_pool():
         pose = _pose(rng, rng.uniform(0.2, 0.5))
         source = in_unit_sphere(entry.asset.levels[0].positions, centring)  # type: ignore[arg-type]
-        points = posed(source, pose)
+        points = pose_points(source, pose)
         assert points.dtype == np.float32
         reach = np.linalg.norm(points - pose.centre, axis=1).max()
         assert abs(reach - pose.radius) < TOUCH
@@ -210,7 +210,7 @@ def test_posing_is_a_similarity() -> None:
     for entry in small_pool():
         source = in_unit_sphere(entry.asset.levels[-1].positions, "box")
         pose = _pose(rng, rng.uniform(0.2, 0.5))
-        points = posed(source, pose).astype(np.float64)
+        points = pose_points(source, pose).astype(np.float64)
         before = np.linalg.norm(source[:, None] - source[None], axis=-1)
         after = np.linalg.norm(points[:, None] - points[None], axis=-1)
         assert np.abs(after - pose.radius * before).max() < 5 * TOUCH  # differences of differences

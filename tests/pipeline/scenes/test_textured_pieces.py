@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.scenes.pieces import ScenePiece, emitter_piece, object_piece, shell_piece
 from pipeline.scenes.shading import flat_shaded
-from pipeline.scenes.subdivision import filled, subdivided
-from pipeline.scenes.textured_pieces import cube_places, with_drawn_textures
+from pipeline.scenes.subdivision import fill_triangles, subdivide
+from pipeline.scenes.textured_pieces import cube_coordinates, with_drawn_textures
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose, ShellPart
 from scene_templates.rooms import PATCH_FACES, SIDES, patch
-from scene_templates.rotations import rotated
+from scene_templates.rotations import rotate_points
 from scene_templates.settings import SceneSettings
 from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
@@ -68,7 +68,7 @@ def test_the_sides_of_a_cube_show_a_texture_upright_and_unmirrored(side: int) ->
     up = np.array([0.0, 1, 0]) if axis == 2 else np.array([0.0, 0, 1])
     right = np.cross(up, normal)
     corners = np.array([[normal, normal + right, normal + up]])
-    found = cube_places(corners)[0]
+    found = cube_coordinates(corners)[0]
     assert np.allclose(found[1] - found[0], [1, 0]) and np.allclose(found[2] - found[0], [0, 1])
 
 
@@ -96,7 +96,7 @@ def test_an_objects_texture_turns_with_it() -> None:
     found = []
     for rotation in (np.eye(3), Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix()):
         centre = np.array([0.3, -0.2, 0.5])
-        placed = rotated(corners.reshape(-1, 3), rotation) + centre
+        placed = rotate_points(corners.reshape(-1, 3), rotation) + centre
         faces = np.arange(6, dtype=np.uint32).reshape(-1, 3)
         piece = ScenePiece(
             entry=SceneObject(name="box", kind="object"),
@@ -190,7 +190,7 @@ def test_the_number_is_met_to_within_one_edge_and_what_was_closed_stays_closed()
         had, edges = len(piece.mesh.faces), set(_edges(piece).values())
         assert edges == {2} or name not in CLOSED
         for count in COUNTS:
-            after = subdivided(piece, count)
+            after = subdivide(piece, count)
             where = (name, smooth, count)
             if count <= had:
                 assert len(after.mesh.faces) == had, where
@@ -203,7 +203,7 @@ def test_the_number_is_met_to_within_one_edge_and_what_was_closed_stays_closed()
 def test_the_surface_stays_where_it_is_with_its_materials(name: str) -> None:
     """Each part lies in one old triangle: in its plane, inside it, of its material and side."""
     piece = _piece(ALL[name], smooth=True)
-    after = subdivided(piece, 200)
+    after = subdivide(piece, 200)
     old, new = _corners(piece), _corners(after)
     assert abs(_areas(new).sum() / _areas(old).sum() - 1) < ROUNDING
     owner = np.array([_owner(old, corners) for corners in new])
@@ -245,7 +245,7 @@ def _owner(old: NDArray[np.float64], corners: NDArray[np.float64]) -> int:
 
 def test_an_edge_of_three_faces_is_halved_in_all_three() -> None:
     piece = _piece(_open_and_odd(), smooth=False)
-    after = _edges(subdivided(piece, 900))
+    after = _edges(subdivide(piece, 900))
     before = list(_edges(piece).values())
     assert before.count(3) == 1
     assert list(after.values()).count(3) >= 8
@@ -256,13 +256,13 @@ def test_an_edge_of_three_faces_is_halved_in_all_three() -> None:
 def test_shading_stays_as_it_was(name: str) -> None:
     """Normals are unit, and in the middle of an edge the mean of its ends: as interpolated."""
     piece = _piece(CLOSED[name], smooth=True)
-    after = subdivided(piece, 600)
+    after = subdivide(piece, 600)
     assert np.abs(np.linalg.norm(after.mesh.normals, axis=1) - 1).max() < ROUNDING
     # The vertices of before come first; of a sharp edge there are several in one place.
     before = len(piece.mesh.positions)
     assert np.array_equal(after.mesh.positions[:before], piece.mesh.positions)
     assert np.abs(after.mesh.normals[:before] - piece.mesh.normals).max() < ROUNDING
-    flat = subdivided(_piece(CLOSED[name], smooth=False), 600)
+    flat = subdivide(_piece(CLOSED[name], smooth=False), 600)
     geometric = _unit_normals(_corners(flat))
     assert np.abs(flat.mesh.normals[flat.mesh.faces] - geometric[:, None]).max() < 1e-4
 
@@ -272,7 +272,7 @@ def test_the_longest_edges_are_halved_first() -> None:
     piece = _piece(trimesh.creation.box(extents=(4, 0.2, 0.2)), smooth=False)
     before = np.inf
     for count in (50, 200, 1000):
-        corners = _corners(subdivided(piece, count))
+        corners = _corners(subdivide(piece, count))
         edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
         assert edges.max() < before / 1.5
         before = edges.max()
@@ -300,7 +300,7 @@ def _light() -> ScenePiece:
 def test_a_scene_is_filled_by_its_objects_alone(fill_to: int) -> None:
     pieces = [_shell(), _piece(CLOSED["box"], smooth=False), _piece(CLOSED["ball"], smooth=True)]
     pieces.append(_light())
-    after = filled(pieces, fill_to)
+    after = fill_triangles(pieces, fill_to)
     assert [after[0], after[3]] == [pieces[0], pieces[3]]
     total = sum(len(piece.mesh.faces) for piece in after)
     # Short by less than the two faces of an edge for each object, and by what its share rounds off.
@@ -312,9 +312,9 @@ def test_a_scene_is_filled_by_its_objects_alone(fill_to: int) -> None:
 
 def test_nothing_to_fill_stays_as_it_is() -> None:
     bare = [_shell(), _light()]
-    assert filled(bare, 5000) == bare
+    assert fill_triangles(bare, 5000) == bare
     full = [_shell(), _piece(CLOSED["ball"], smooth=False)]
-    same = filled(full, 208)
+    same = fill_triangles(full, 208)
     assert [len(piece.mesh.faces) for piece in same] == [128, 80]
     assert np.array_equal(_corners(same[1]), _corners(full[1]))
     assert dataclasses.replace(same[1].entry) == full[1].entry

@@ -9,16 +9,16 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
-from pipeline.scenes.laws import require_laws
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
-from pipeline.scenes.sight import Sight
+from pipeline.scenes.scene_checks import require_valid
 from pipeline.scenes.views import (
     CAMERA_ATTEMPTS,
     ViewCamera,
     cameras_of_view,
-    complaint,
+    view_problem,
     with_cameras,
 )
+from pipeline.scenes.visibility import Visibility
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.templates import TEMPLATES
@@ -85,7 +85,7 @@ def _slow_view(scene: Scene, view: int, grid: int) -> tuple[float, float, float]
 
 def test_facts_agree_with_the_slow_twin(scenes: list[Scene]) -> None:
     for scene in scenes[::25]:
-        facts = Sight(scene).facts(scene.c2w[0], float(scene.fov_deg[0]), 32)
+        facts = Visibility(scene).facts(scene.c2w[0], float(scene.fov_deg[0]), 32)
         coverage, shell_back, depth = _slow_view(scene, 0, 32)
         # A ray through an edge may fall to either side in single precision: two of 1024.
         assert abs(facts.coverage - coverage) <= 2 / 1024
@@ -121,15 +121,15 @@ def _camera(eye: list[float]) -> NDArray[np.float32]:
 
 def test_light_is_seen_from_its_side_past_emitters_and_not_through_roofs() -> None:
     """The hand-made floor is lit from above: fully so from above, not at all from below."""
-    sight = Sight(tiny_scene())
-    above, below = (sight.facts(_camera([0, 0, z]), 30.0, 16) for z in (1.0, -1.0))
+    visibility = Visibility(tiny_scene())
+    above, below = (visibility.facts(_camera([0, 0, z]), 30.0, 16) for z in (1.0, -1.0))
     assert (above.lit, above.shell_back, above.coverage) == (1.0, 0.0, 0.0)
     assert (below.lit, below.shell_back, below.coverage) == (0.0, 1.0, 0.0)
     # A scene without objects need not show any, and one with objects must.
-    assert complaint(above, ViewLaws(), has_objects=False) is None
-    assert complaint(above, ViewLaws(), has_objects=True) == "sees too little of the objects"
-    assert complaint(below, ViewLaws(), has_objects=False) == "sees the back of the shell"
-    assert complaint(below, ViewLaws(max_shell_back=1.0), has_objects=False) is not None
+    assert view_problem(above, ViewLaws(), has_objects=False) is None
+    assert view_problem(above, ViewLaws(), has_objects=True) == "sees too little of the objects"
+    assert view_problem(below, ViewLaws(), has_objects=False) == "sees the back of the shell"
+    assert view_problem(below, ViewLaws(max_shell_back=1.0), has_objects=False) is not None
     scene = tiny_scene()
     roof = scene.vertex_positions[:4] + np.array([0, 0, 1.5], np.float32)
     covered = dataclasses.replace(
@@ -140,13 +140,13 @@ def test_light_is_seen_from_its_side_past_emitters_and_not_through_roofs() -> No
         material_index=np.concatenate([scene.material_index, scene.material_index[:2]]),
         object_index=np.concatenate([scene.object_index, scene.object_index[:2]]),
     )
-    assert Sight(covered).facts(_camera([0, 0, 1.0]), 30.0, 16).lit == 0.0
+    assert Visibility(covered).facts(_camera([0, 0, 1.0]), 30.0, 16).lit == 0.0
     # Below the roof the light of an even sky still comes from the sides, and of black none does.
     for around, lit in ((constant(1.0), 1.0), (constant(0.0), 0.0)):
-        under = Sight(dataclasses.replace(covered, environment=around))
+        under = Visibility(dataclasses.replace(covered, environment=around))
         assert under.facts(_camera([0, 0, 1.0]), 30.0, 16).lit == lit
     # From right above the emitter the view goes through it to the floor.
-    facts = Sight(tiny_scene()).facts(_camera([0, 0, 2.01]), 5.0, 16)
+    facts = Visibility(tiny_scene()).facts(_camera([0, 0, 2.01]), 5.0, 16)
     assert facts.lit == 1.0
     # The rays nearest to the axis are half a pixel off it, which lengthens them by 7e-6.
     assert 2.01 < facts.depth < 2.01 * 1.00001
@@ -161,7 +161,7 @@ def test_a_sun_lights_the_side_that_it_shines_on(turned: bool) -> None:
     unlit = scene.vertex_positions.copy()
     unlit[scene.faces[scene.triangle_emits].ravel()] *= np.array([1, 1, -1], np.float32)
     alone = dataclasses.replace(scene, vertex_positions=unlit, environment=sun)
-    lit = Sight(alone).facts(_camera([0, 0, 1.0]), 30.0, 16).lit
+    lit = Visibility(alone).facts(_camera([0, 0, 1.0]), 30.0, 16).lit
     assert lit == (0.0 if turned else 1.0)
 
 
@@ -170,7 +170,7 @@ def test_cameras_stay_with_their_view_until_they_are_used_up_and_with_the_stored
 ) -> None:
     scene, found = scenes[0], list[ViewCamera]()
     with pytest.raises(Rejected, match="view 1: none of attempts") as caught:
-        for camera in cameras_of_view(scene, Sight(scene), SETTINGS, 1):
+        for camera in cameras_of_view(scene, Visibility(scene), SETTINGS, 1):
             found.append(camera)
     assert caught.value.reason == "no_camera"
     np.testing.assert_array_equal(found[0].c2w, scene.c2w[1])
@@ -179,7 +179,7 @@ def test_cameras_stay_with_their_view_until_they_are_used_up_and_with_the_stored
     assert attempts == sorted(set(attempts)) and attempts[-1] < CAMERA_ATTEMPTS
     assert len({camera.c2w.tobytes() for camera in found}) == len(found) > 5
     scene = scenes[0]
-    cameras = cameras_of_view(scene, Sight(scene), SETTINGS, 1)
+    cameras = cameras_of_view(scene, Visibility(scene), SETTINGS, 1)
     own, other = next(cameras), next(cameras)
     seen = with_cameras(scene, [other, own])
     seen.check()
@@ -198,7 +198,7 @@ def test_the_cameras_of_a_view_need_nothing_but_the_stored_scene(scenes: list[Sc
     scene = scenes[1]
     stored = dataclasses.replace(scene, provenance=json.loads(json.dumps(dict(scene.provenance))))
     one, other = (
-        list(itertools.islice(cameras_of_view(each, Sight(each), SETTINGS, 0), 2))
+        list(itertools.islice(cameras_of_view(each, Visibility(each), SETTINGS, 0), 2))
         for each in (scene, stored)
     )
     np.testing.assert_array_equal([row.c2w for row in one], [row.c2w for row in other])
@@ -292,7 +292,7 @@ def test_redrawn_scenes_are_equal_for_equal_arguments_and_keep_the_laws(scene: S
     near = dataclasses.replace(SMOKE.lights, distance=(0.01, 0.02), target_jitter=0.0)
     inside = with_new_lights(scene, near, 8, **SEEDED, attempt=0)
     with pytest.raises(Rejected, match="emitter_inside"):
-        require_laws(inside, SMOKE)
+        require_valid(inside, SMOKE)
 
 
 def test_a_scene_of_a_file_draws_no_lights() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from scene_templates.surfaces.draw import SurfaceMapSettings, draw_surface
 from scene_templates.surfaces.families import OUR_SURFACES, SURFACES
-from scene_templates.surfaces.laid import HEXAGONS, _hexagon_of, laid
+from scene_templates.surfaces.laid import HEXAGONS, _hexagon_of, lay_rows
 from scene_templates.surfaces.made import exceeded_by
 from scene_templates.surfaces.maps import MOST_ALBEDO, finish, surface_maps
 from scene_templates.surfaces.texels import Texels, stones
@@ -143,7 +143,7 @@ def test_checkers_are_half_and_half_and_bands_have_their_share() -> None:
 
 def test_pieces_tile_the_map() -> None:
     rows, columns, size = 4, 3, 96
-    pieces = laid(Texels(size), rows, columns, np.array([0.0, 0.5, 0.25, 0.9]))
+    pieces = lay_rows(Texels(size), rows, columns, np.array([0.0, 0.5, 0.25, 0.9]))
     counts = np.zeros((rows, columns), int)
     np.add.at(counts, (pieces.row, pieces.column), 1)
     # 24 rows and 32 columns of texels a piece, shifted by a share of a texel at most

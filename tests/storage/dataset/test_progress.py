@@ -23,11 +23,11 @@ from storage.dataset.progress import (
     read_status,
     tell_views,
 )
-from storage.dataset.scene_logs import SceneLog, log_scene, look_at_logs
+from storage.dataset.scene_logs import SceneLog, log_scene, sample_logs
 from storage.dataset.shard_notes import note_of
 from storage.errors import TrilightError
 from tests.http_server import serve
-from tests.pipeline.making.test_publication import begin_tiny, make_tiny_shard
+from tests.pipeline.generation.test_dataset_writer import begin_tiny, make_tiny_shard
 
 
 def test_downloads_and_objects_are_counted_from_the_start_of_each_run(tmp_path: Path) -> None:
@@ -176,12 +176,12 @@ def test_of_many_logs_few_are_read_and_the_last_scenes_are_all_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = DatasetFolder(tmp_path)
-    assert look_at_logs(folder).core_s is None
+    assert sample_logs(folder).core_s is None
     ends_s = [1000.0 + 7.0 * ((5 * number) % 24) for number in range(24)]  # in no order
     for number, end_s in enumerate(ends_s):
         _write_log(folder, number, end_s=end_s)
     (folder.logs / "asked.json").write_text("[]")
-    every = look_at_logs(folder)
+    every = sample_logs(folder)
     assert every.core_s == 24 * 2 * 10 * 2 and len(every.last) == 48
     read, decode = Counter[str](), scene_logs.decode_scene_log
 
@@ -192,6 +192,6 @@ def test_of_many_logs_few_are_read_and_the_last_scenes_are_all_there(
     monkeypatch.setattr(scene_logs, "decode_scene_log", counted)
     monkeypatch.setattr(scene_logs, "LAST_SCENES", 5)
     monkeypatch.setattr(scene_logs, "MOST_LOGS", 6)
-    some = look_at_logs(folder)
+    some = sample_logs(folder)
     assert read["logs"] == 5 + 6 and some.core_s == every.core_s
     assert some.last == every.last[-5:]

@@ -16,7 +16,7 @@ from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import dataset_folder
 from storage.dataset.mixed_data import open_mixture
 from storage.dataset.shard import write_shard
-from storage.dataset.shard_places import expanded, listed_shards
+from storage.dataset.shard_places import expand_pattern, listed_shards
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
@@ -37,7 +37,7 @@ from tests.scenes_by_hand import tiny_sample
     ],
 )
 def test_patterns(pattern: str, names: list[str]) -> None:
-    assert expanded(pattern) == names
+    assert expand_pattern(pattern) == names
 
 
 @for_each(
@@ -106,7 +106,7 @@ def test_a_folder_is_a_dataset_whatever_its_name(
         "~no such user",
     ]
     Path("{1,2}.json").touch()
-    assert expanded("{1,2}.json") == ["{1,2}.json"]
+    assert expand_pattern("{1,2}.json") == ["{1,2}.json"]
 
 
 def test_roots_and_shards_are_not_mixed(tmp_path: Path) -> None:

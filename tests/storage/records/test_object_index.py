@@ -79,7 +79,12 @@ def test_columns_say_what_the_rows_say(tmp_path: Path) -> None:
         offset += len(line)
     path, lock = tmp_path / "index", LockRows(tmp_path / "lock")
     facts = write_object_index(
-        path, reversed(objects), lock_sha256="s", lock_bytes=offset, asked="a", num_found=120
+        path,
+        reversed(objects),
+        lock_sha256="s",
+        lock_bytes=offset,
+        request_digest="a",
+        num_found=120,
     )
     index = ObjectIndex(path)
     assert index.facts == facts
@@ -109,7 +114,7 @@ def test_an_index_that_is_cut_off_says_so(tmp_path: Path) -> None:
     (row,) = _rows(1)
     one = IndexedObject(locked=row, offset=0, asset_name="0" * 32, least_triangles=1)
     path = tmp_path / "index"
-    write_object_index(path, [one], lock_sha256="", lock_bytes=1, asked="", num_found=1)
+    write_object_index(path, [one], lock_sha256="", lock_bytes=1, request_digest="", num_found=1)
     path.write_bytes(path.read_bytes()[:-24])
     index = ObjectIndex(path)
     with pytest.raises(TrilightError, match="ends before row 1"):

@@ -288,13 +288,13 @@ def test_equal_members_give_equal_samples_with_and_without_what_is_held() -> Non
 
 def test_a_map_is_unpacked_once(monkeypatch: pytest.MonkeyPatch) -> None:
     members, unpacked = encode_sample(textured_sample(KEY)), list[str]()
-    values = packed_maps._Packed.values
+    values = packed_maps._PackedMap.values
 
-    def counted(packed: packed_maps._Packed) -> np.ndarray:
+    def counted(packed: packed_maps._PackedMap) -> np.ndarray:
         unpacked.append(packed.name)
         return values(packed)
 
-    monkeypatch.setattr(packed_maps._Packed, "values", counted)
+    monkeypatch.setattr(packed_maps._PackedMap, "values", counted)
     held = HeldMaps()
     scenes = [decode_sample(KEY, members, held).scene for _ in range(3)]
     assert len(unpacked) == len(set(unpacked)) == 3
@@ -312,7 +312,7 @@ def test_memory_is_bounded_and_the_oldest_goes() -> None:
             made.append(number)
             return Texture(texels=np.full((side, side, 3), number, np.uint8))
 
-        return held.found(Texture, f"{number:064x}", b"%d" % number, unpack)
+        return held.get_or_unpack(Texture, f"{number:064x}", b"%d" % number, unpack)
 
     for number in (1, 2, 3, 1, 4, 1, 2):  # 300 bytes each: 4 takes the place of 2
         assert asked(number).texels[0, 0, 0] == number

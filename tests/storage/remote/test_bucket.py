@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.making.bucket_publication import begin_dataset, joined
-from pipeline.making.dataset_order import DatasetOrder
+from pipeline.generation.bucket_dataset_writer import begin_dataset, hold_membership
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import dataset_folder
 from storage.dataset.training_data import open_training_data
@@ -24,8 +24,8 @@ from storage.remote.bucket import Bucket
 from storage.remote.tries import with_tries
 from storage.remote.url import RemoteUrl
 from tests.for_each import for_each
-from tests.pipeline.making.bucket_kit import empty_bucket
-from tests.pipeline.making.test_publication import ENVIRONMENT, _build
+from tests.pipeline.generation.bucket_kit import empty_bucket
+from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build
 from tests.s3_server import Line, control
 from tests.storage.remote.conftest import SHARD, expected, read, with_changed_byte
 
@@ -181,7 +181,7 @@ def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun
     folder = dataset_folder("gs://shards/made")
     with (
         pytest.raises(TrilightError, match="^out 'gs://shards/made': .*conditional writes"),
-        joined(folder),
+        hold_membership(folder),
     ):
         begin_dataset(folder, _build(), ENVIRONMENT, 8, accept_environment=False)
     assert Bucket(place("gs://shards/made")).names() == {".staging/once"}

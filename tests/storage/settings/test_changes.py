@@ -18,7 +18,7 @@ from storage import array_hints
 from storage.array_hints import array_scalar
 from storage.errors import TrilightError
 from storage.settings.changes import changed
-from storage.settings.described import checked, described
+from storage.settings.described import checked, describe_fields
 from storage.settings.execution import EXECUTION
 from storage.settings.ranges import Within
 from tests.for_each import for_each
@@ -278,7 +278,7 @@ class Group:
 
 
 def test_what_is_marked_is_described_so_and_keeps_its_range() -> None:
-    by_name = {field.name: field for field in described(Group)}
+    by_name = {field.name: field for field in describe_fields(Group)}
     marked = {name for name, field in by_name.items() if field.is_execution}
     assert marked == {"marked", "alias", "switch"}
     assert by_name["marked"].expected == by_name["ranged"].expected

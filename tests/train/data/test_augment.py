@@ -29,17 +29,17 @@ from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.sky_maps import smooth
 from tests.train.toy import toy_picture, toy_sample
 from train.data.augment import (
-    augmented,
-    mirrored,
-    moved,
-    rotation_rand,
-    with_channels,
-    with_light_scaled,
-    with_vertices_turned,
+    augment_scene,
+    mirror_scene,
+    move_scene,
+    permute_channels,
+    random_rotation,
+    rotate_vertex_order,
+    scale_light,
 )
+from train.data.bad_samples import BadSampleCounter
 from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, _SceneMaker
-from train.data.unusable import Unusable
 from train.settings import AugmentationSettings
 
 RESOLUTION = 32
@@ -57,19 +57,19 @@ EVERYTHING = AugmentationSettings(
 Symmetry = Callable[[TrainingScene], TrainingScene]
 
 SYMMETRIES: dict[str, Symmetry] = {
-    "mirror": mirrored,
-    "channels": lambda scene: with_channels(scene, np.array([2, 0, 1])),
-    "vertices": lambda scene: with_vertices_turned(
+    "mirror": mirror_scene,
+    "channels": lambda scene: permute_channels(scene, np.array([2, 0, 1])),
+    "vertices": lambda scene: rotate_vertex_order(
         scene, np.arange(scene.tensors.num_triangles) % 3
     ),
-    "motion": lambda scene: moved(
-        scene, rotation_rand("uniform", rng_for(0, "turn")), torch.tensor([3.0, -1.0, 0.5])
+    "motion": lambda scene: move_scene(
+        scene, random_rotation("uniform", rng_for(0, "turn")), torch.tensor([3.0, -1.0, 0.5])
     ),
-    "light": lambda scene: with_light_scaled(scene, 2.5),
-    "rotation of the recipe": lambda scene: augmented(
+    "light": lambda scene: scale_light(scene, 2.5),
+    "rotation of the recipe": lambda scene: augment_scene(
         scene, AugmentationSettings(rotation="recipe", translation=0.25), rng_for(0, "augment")
     ),
-    "all at random": lambda scene: augmented(scene, EVERYTHING, rng_for(0, "augment")),
+    "all at random": lambda scene: augment_scene(scene, EVERYTHING, rng_for(0, "augment")),
 }
 
 
@@ -122,7 +122,7 @@ def test_a_turned_vertex_takes_its_normal_along() -> None:
     numbered = torch.arange(9.0 * count).reshape(count, 3, 3)
     tensors = dataclasses.replace(scene.tensors, triangles_T33=numbered, normals_T33=-numbered)
     scene = dataclasses.replace(scene, tensors=tensors)
-    turned = with_vertices_turned(scene, np.arange(count) % 3).tensors
+    turned = rotate_vertex_order(scene, np.arange(count) % 3).tensors
     assert torch.equal(turned.triangles_T33, -turned.normals_T33)
     for row in range(count):
         assert torch.equal(turned.triangles_T33[row], numbered[row].roll(-(row % 3), dims=0))
@@ -136,7 +136,7 @@ def test_mixed_lights_and_their_pictures_are_as_much_stronger() -> None:
     whole = {"scene": lit, "radiance_rgb": alone.sum(axis=1), "lights_rgb": alone}
     sample = dataclasses.replace(toy_sample(0, views=1), **whole)
     scene = training_scene(sample, 16, lights_apart=True)
-    mixed = augmented(scene, AugmentationSettings(light_mix=8.0), rng_for(0, "mix"))
+    mixed = augment_scene(scene, AugmentationSettings(light_mix=8.0), rng_for(0, "mix"))
     before, after = (10 ** each.tensors.material_TM[:, 7:] - 1 for each in (scene, mixed))
     assert not before[:2].any() and not after[:2].any(), "the floor stays dark"
     factors = (after / before)[2:, 0].numpy()
@@ -149,16 +149,16 @@ def test_mixed_lights_and_their_pictures_are_as_much_stronger() -> None:
 
 def test_mirroring_twice_is_nothing_and_the_original_is_left_alone() -> None:
     scene = training_scene(toy_sample(2), 16)
-    again = mirrored(mirrored(scene))
+    again = mirror_scene(mirror_scene(scene))
     assert torch.equal(again.target_VRR3, scene.target_VRR3)
     for name, value in tensors_of(scene.tensors).items():
         assert torch.equal(getattr(again.tensors, name), value), name
     copies = {name: value.clone() for name, value in tensors_of(scene.tensors).items()}
     target = scene.target_VRR3.clone()
-    augmented(scene, EVERYTHING, rng_for(1, "augment"))
+    augment_scene(scene, EVERYTHING, rng_for(1, "augment"))
     assert torch.equal(scene.target_VRR3, target)
     assert all(torch.equal(getattr(scene.tensors, name), copies[name]) for name in copies)
-    same = augmented(scene, AugmentationSettings(), rng_for(1, "augment"))
+    same = augment_scene(scene, AugmentationSettings(), rng_for(1, "augment"))
     assert same is scene
 
 
@@ -166,7 +166,7 @@ def test_uniform_rotations_favour_no_direction_and_the_recipe_favours_none_at_al
     """Of a rotation uniform on SO(3) the trace has mean 0 and variance 1; small turns raise it."""
     rng = rng_for(0, "rotations")
     traces = {
-        kind: np.array([float(rotation_rand(kind, rng).trace()) for _ in range(1500)])
+        kind: np.array([float(random_rotation(kind, rng).trace()) for _ in range(1500)])
         for kind in ("uniform", "recipe")
     }
     # five standard errors of 1500 draws: 5 / sqrt(1500) = 0.13
@@ -174,10 +174,10 @@ def test_uniform_rotations_favour_no_direction_and_the_recipe_favours_none_at_al
     assert abs(traces["uniform"].var() - 1) < 0.2  # fourth moment 3: 5 sqrt(2 / 1500) = 0.18
     assert traces["recipe"].mean() > 0.3
     for kind in ("uniform", "recipe"):
-        turned = rotation_rand(kind, rng)
+        turned = random_rotation(kind, rng)
         torch.testing.assert_close(turned @ turned.T, torch.eye(3).double())
         assert turned.det().item() == pytest.approx(1)
-    assert torch.equal(rotation_rand("none", rng), torch.eye(3).double())
+    assert torch.equal(random_rotation("none", rng), torch.eye(3).double())
 
 
 ORDER = np.array([2, 0, 1])
@@ -209,15 +209,15 @@ def test_a_sky_goes_through_the_symmetries_of_training(symmetry: str) -> None:
     )
     before = _direct(tensors)
     if symmetry == "moved":
-        rotation = rotation_rand("uniform", np.random.default_rng(0))
-        after = _direct(moved(training, rotation, torch.tensor([0.4, -0.1, 0.2])).tensors)
+        rotation = random_rotation("uniform", np.random.default_rng(0))
+        after = _direct(move_scene(training, rotation, torch.tensor([0.4, -0.1, 0.2])).tensors)
     elif symmetry == "mirrored":
-        after = _direct(mirrored(training).tensors)[:, ::-1]
+        after = _direct(mirror_scene(training).tensors)[:, ::-1]
     elif symmetry == "channels":
-        after = _direct(with_channels(training, ORDER).tensors)
+        after = _direct(permute_channels(training, ORDER).tensors)
         before = before[..., ORDER]
     else:
-        after = _direct(with_light_scaled(training, 3.0).tensors) / np.float32(3)
+        after = _direct(scale_light(training, 3.0).tensors) / np.float32(3)
     # The noise goes along, but behind a mirror: there 48 rays and more of 16 pixels differ by 3 %.
     most = 0.06 if symmetry == "mirrored" else 0.005
     assert before.std() > 0.05
@@ -244,9 +244,9 @@ def test_training_takes_skies_that_its_network_knows(config: object, is_known: b
         seed=0, window=1, batch_size=1, resolution=16, views_per_scene=1, network=config  # type: ignore[arg-type]
     )  # fmt: skip
     rng = np.random.default_rng(0)
-    maker = _SceneMaker(None, None, settings, Unusable(0))  # type: ignore[arg-type]
+    maker = _SceneMaker(None, None, settings, BadSampleCounter(0))  # type: ignore[arg-type]
     if is_known:
-        assert maker._drawn(_below_a_sky(), rng).tensors.sky is not None
+        assert maker._draw_views(_below_a_sky(), rng).tensors.sky is not None
         return
     with pytest.raises(TrilightError, match="this network does not know its light"):
-        maker._drawn(_below_a_sky(), rng)
+        maker._draw_views(_below_a_sky(), rng)

@@ -25,7 +25,7 @@ from tests.pipeline.renders.sampling import Estimate, assert_agree, camera_of, r
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.train.data.test_augment import scene_behind
 from tests.train.toy import toy_sample
-from train.data.augment import augmented
+from train.data.augment import augment_scene
 from train.data.scenes import TrainingScene, training_scene
 from train.settings import AugmentationSettings
 
@@ -111,7 +111,7 @@ def test_the_path_traced_picture_is_the_transformed_one(
     seed = next(s for s in range(9) if rng_for(s, "draw").random() < 0.5)  # a visit that mirrors
 
     def symmetry(training: TrainingScene) -> TrainingScene:
-        return augmented(training, SYMMETRIES[name], rng_for(seed, "draw"))
+        return augment_scene(training, SYMMETRIES[name], rng_for(seed, "draw"))
 
     visits = [transformed(scene, lights, symmetry) for lights in passes]
     pictures = np.array([radiance_from_log10(v.target_VRR3[0].double()) for v in visits])

@@ -15,13 +15,13 @@ from tests.for_each import for_each
 from tests.train.data.test_stream import by_key, identity, same_batches
 from tests.train.kit import keys_of, take, tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.data.mixture import RECORD, Mixture, mixture_of
+from train.data.bad_samples import BadSampleCounter, first_samples
+from train.data.mixture import RECORD, Mixture, plan_mixture
 from train.data.scenes import TrainingScene
 from train.data.stream import StreamSettings
-from train.data.unusable import Unusable, first_samples
 from train.loop.checkpoints import path_of_step, read_checkpoint
 from train.run import train_run
-from train.start import Start
+from train.start_options import StartOptions
 
 BATCH = 4
 SETTINGS = StreamSettings(seed=1, window=2, batch_size=BATCH, resolution=16, views_per_scene=1)
@@ -60,12 +60,12 @@ def test_every_stretch_has_its_shares_and_may_be_entered_anywhere(
     turns = list(itertools.islice(mixed.sources_from(0), 3000))
     for at in (0, 1, 17, 999, 2990):
         counts = tuple(turns[:at].count(source) for source in range(len(weights)))
-        assert mixed.taken(at) == counts
+        assert mixed.counts_before(at) == counts
         assert list(itertools.islice(mixed.sources_from(at), 10)) == turns[at : at + 10]
         for source, weight in enumerate(weights):
             assert abs(counts[source] - at * weight / sum(weights)) < len(weights)
     far = 10**15
-    assert sum(mixed.taken(far)) == far, "in the time of the first"
+    assert sum(mixed.counts_before(far)) == far, "in the time of the first"
 
 
 WEIGHTS = (2.0, 1.0)
@@ -109,9 +109,11 @@ def test_it_goes_on_anywhere_with_any_ranks_and_threads(
 
 def test_first_samples_come_from_every_dataset(data: TrainingData) -> None:
     shards = data.split("train")
-    shown = [sample.radiance_rgb.shape[1] for sample in first_samples(shards, 5, Unusable(0))]
+    shown = [
+        sample.radiance_rgb.shape[1] for sample in first_samples(shards, 5, BadSampleCounter(0))
+    ]
     assert shown == [16, 16, 16, 32, 32]
-    assert len(list(first_samples(data.split("validation"), 99, Unusable(0)))) == 3
+    assert len(list(first_samples(data.split("validation"), 99, BadSampleCounter(0)))) == 3
 
 
 def test_a_dataset_that_is_known_goes_on_where_it_was(roots: list[str], data: TrainingData) -> None:
@@ -119,20 +121,20 @@ def test_a_dataset_that_is_known_goes_on_where_it_was(roots: list[str], data: Tr
     run = tiny_run(scenes_per_step=BATCH)
     alone = [open_mixture([root]) for root in roots]
     header = {"step": 0, "settings": {"scenes_per_step": BATCH}, "data_digest": alone[0].digest}
-    assert mixture_of(alone[0], run, None) is None
-    assert mixture_of(alone[0], run, header | {"step": 5}) is None
-    two = mixture_of(data, run, header | {"step": 5})
+    assert plan_mixture(alone[0], run, None) is None
+    assert plan_mixture(alone[0], run, header | {"step": 5}) is None
+    two = plan_mixture(data, run, header | {"step": 5})
     assert two is not None and two.weights == (7.0, 3.0), "shares as their numbers of scenes"
     assert (two.first, two.before) == (20, (20, 0))
     later = header | {"step": 10, RECORD: two.record(), "data_digest": data.digest}
-    assert mixture_of(data, run, later) == two
+    assert plan_mixture(data, run, later) == two
     weighed = dataclasses.replace(run, data_weights=(1, 1))
-    other = mixture_of(data, weighed, later)
+    other = plan_mixture(data, weighed, later)
     assert other is not None and (other.first, other.before) == (40, (34, 6))
-    wider = mixture_of(data, tiny_run(scenes_per_step=2 * BATCH), later)
+    wider = plan_mixture(data, tiny_run(scenes_per_step=2 * BATCH), later)
     assert wider is not None and (wider.first, wider.before) == (80, (34, 6))
-    second = mixture_of(alone[1], run, later)
-    assert second is not None and second.before == (6,) and second.taken(44) == (10,)
+    second = plan_mixture(alone[1], run, later)
+    assert second is not None and second.before == (6,) and second.counts_before(44) == (10,)
 
 
 def test_mistakes_about_several_datasets(roots: list[str], data: TrainingData) -> None:
@@ -141,7 +143,7 @@ def test_mistakes_about_several_datasets(roots: list[str], data: TrainingData) -
     with pytest.raises(TrilightError, match="2 places of which 1 are shards"):
         open_mixture([roots[0], f"{roots[1]}/train-000000.tar"])
     with pytest.raises(TrilightError, match="3 numbers, but --data names 2 datasets"):
-        mixture_of(data, tiny_run(data_weights=(1.0, 1.0, 1.0)), None)
+        plan_mixture(data, tiny_run(data_weights=(1.0, 1.0, 1.0)), None)
     with pytest.raises(TrilightError, match="data_weights"):
         tiny_run(data_weights=(1.0, 0.0))
 
@@ -153,7 +155,7 @@ def test_a_damaged_shard_is_replaced_by_its_own_datasets(tmp_path: Path) -> None
             tmp_path / name, train=4, validation=1, per_shard=2, resolution=resolution
         )
     (tmp_path / "a" / "train-000001.tar").write_bytes(b"no shard")
-    mixed, unusable = open_mixture([str(tmp_path / "a"), str(tmp_path / "b")]), Unusable(2)
+    mixed, unusable = open_mixture([str(tmp_path / "a"), str(tmp_path / "b")]), BadSampleCounter(2)
     turns = list(itertools.islice(mixture(1.0, 1.0).sources_from(0), 16))
     found = take(mixed, SETTINGS, 4, workers=2, unusable=unusable, mixture=mixture(1.0, 1.0))
     keys = itertools.chain(*keys_of(found))
@@ -180,8 +182,8 @@ def test_a_run_of_two_datasets_resumes_to_the_bit_and_takes_up_a_third(
     three = [*roots, str(tmp_path / "third")]
     digest = open_mixture(three).digest
     with pytest.raises(TrilightError, match=r"--change data=mix:[0-9a-f]{12}"):
-        train_run(settings, data=three, out=out, start=Start(resume=True))
+        train_run(settings, data=three, out=out, start=StartOptions(resume=True))
     decided = {"data": digest[:16], "data_weights": (1.0, 2.0, 1.0), "num_steps": 10}
-    train_run(settings, data=three, out=out, start=Start(resume=True, decisions=decided))
+    train_run(settings, data=three, out=out, start=StartOptions(resume=True, decisions=decided))
     header = read_checkpoint(path_of_step(out / "checkpoints", 10)).header
     assert header[RECORD]["first"] == 24 and header[RECORD]["before"] == [8, 16, 0]

@@ -26,11 +26,11 @@ from tests.train.toy import toy_sample
 from train.data.open_shards import OpenShards
 from train.data.order import (
     OrderSettings,
-    Place,
-    RankShare,
+    RankSlice,
     ShardWindow,
-    batched,
-    places_from,
+    Visit,
+    batch_visits,
+    visits_from,
     windows_from,
 )
 
@@ -46,11 +46,11 @@ def windows(
     chosen = OrderSettings(seed=seed, window=window)
     stream = windows_from(len(sizes), lambda shard: sizes[shard], chosen, first)
     end = 2 * sum(sizes)
-    return list(itertools.takewhile(lambda one: one.places[0].position < end, stream))
+    return list(itertools.takewhile(lambda one: one.visits[0].position < end, stream))
 
 
-def places(found: list[ShardWindow]) -> list[Place]:
-    return [place for window in found for place in window.places]
+def places(found: list[ShardWindow]) -> list[Visit]:
+    return [place for window in found for place in window.visits]
 
 
 @settings(deadline=None)  # a busy machine is no failure
@@ -72,7 +72,7 @@ def test_samples_stay_within_their_window_of_shards(sizes: list[int], window: in
     for one in windows(sizes, window=window):
         assert len(one.shards) <= window
         held = {(shard, row) for shard in one.shards for row in range(sizes[shard])}
-        assert {(place.shard, place.row) for place in one.places} == held
+        assert {(place.shard, place.row) for place in one.visits} == held
 
 
 @settings(deadline=None)  # a busy machine is no failure
@@ -80,7 +80,7 @@ def test_samples_stay_within_their_window_of_shards(sizes: list[int], window: in
 def test_entering_later_gives_the_rest(sizes: list[int], data: st.DataObject) -> None:
     first = data.draw(st.integers(0, 2 * sum(sizes) - 1))
     whole = places(windows(sizes))
-    assert first in [place.position for place in windows(sizes, first)[0].places]
+    assert first in [place.position for place in windows(sizes, first)[0].visits]
     assert [p for p in places(windows(sizes, first)) if p.position >= first] == whole[first:]
 
 
@@ -99,11 +99,11 @@ def test_the_ranks_share_out_every_batch(sizes: list[int], first: int, window: i
     """Whatever their number: each place with one rank, equally many each, nobody left out."""
     chosen = OrderSettings(seed=1, window=window)
     stream = windows_from(len(sizes), lambda shard: sizes[shard], chosen, first)
-    for batch in itertools.islice(batched(places_from(stream, first), BATCH), 3):
+    for batch in itertools.islice(batch_visits(visits_from(stream, first), BATCH), 3):
         assert [place.position for place in batch] == list(range(first, first + BATCH))
         first += BATCH
         for world in WORLDS:
-            shares = [RankShare(rank=r, world_size=world).of_batch(batch) for r in range(world)]
+            shares = [RankSlice(rank=r, world_size=world).of_batch(batch) for r in range(world)]
             assert {len(share) for share in shares} == {BATCH // world}
             assert sorted(itertools.chain(*shares), key=lambda p: p.position) == list(batch)
 
@@ -115,9 +115,9 @@ def test_each_rank_reads_few_shards_of_a_window() -> None:
     stream = windows_from(8, lambda shard: sizes[shard], chosen, 0)
     read: list[set[int]] = [set(), set()]
     samples: list[list[int]] = [[], []]
-    for batch in itertools.islice(batched(places_from(stream, 0), 64), 8):
+    for batch in itertools.islice(batch_visits(visits_from(stream, 0), 64), 8):
         for rank in range(2):
-            mine = RankShare(rank=rank, world_size=2).of_batch(batch)
+            mine = RankSlice(rank=rank, world_size=2).of_batch(batch)
             read[rank] |= {place.shard for place in mine}
             samples[rank] += [place.arrival for place in mine]
     # measured: 5 and 5 of 8; a share drawn without regard to shards needs all 8
@@ -128,12 +128,12 @@ def test_each_rank_reads_few_shards_of_a_window() -> None:
 @for_each(("rank", "world_size"), [(1, 1), (-1, 2), (0, 0)])
 def test_ranks_that_do_not_exist_are_refused(rank: int, world_size: int) -> None:
     with pytest.raises(TrilightError, match="expected a rank from 0"):
-        RankShare(rank=rank, world_size=world_size)
+        RankSlice(rank=rank, world_size=world_size)
 
 
 def test_unequal_shares_and_empty_shards_are_refused() -> None:
     with pytest.raises(TrilightError, match="batch of 10 scenes is not divisible by 4 ranks"):
-        RankShare(rank=0, world_size=4).require_equal(10)
+        RankSlice(rank=0, world_size=4).require_equal(10)
     chosen = OrderSettings(seed=0, window=1)
     with pytest.raises(TrilightError, match="all 3 shards are empty"):
         next(windows_from(3, lambda shard: 0, chosen, 0))
@@ -173,10 +173,10 @@ def test_shards_are_open_from_their_first_sample_to_their_last_and_errors_come_t
         opened.plan([0, 0, 1])
         opened.plan([1, 2])
         assert [opened.read(number).name for number in (0, 1, 2)] == ["a", "b", "c"]
-        opened.done([0, 0, 1])
+        opened.mark_read([0, 0, 1])
         assert shards.closed == ["a"]
         assert opened.read(1).name == "b"
-        opened.done([1])
+        opened.mark_read([1])
         assert shards.closed == ["a", "b"]
         opened.plan([0])
         assert opened.read(0).name == "a"
@@ -187,7 +187,7 @@ def test_shards_are_open_from_their_first_sample_to_their_last_and_errors_come_t
         assert opened.read(0).name == "a"
         with pytest.raises(TrilightError, match="is broken"):
             opened.read(3)
-        opened.done([3])
+        opened.mark_read([3])
 
 
 SHARDS, PER_SHARD, RESOLUTION = 30, 8, 128
@@ -198,7 +198,7 @@ from contextlib import closing
 from storage.dataset.training_data import open_training_data
 from train.data.order import RankShare
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import Unusable
+from train.data.bad_samples import Unusable
 settings = StreamSettings(seed=0, window=2, batch_size=8, resolution=16, views_per_scene=2)
 data = open_training_data([sys.argv[1]]).split("train")
 batches = stream_batches(

@@ -25,11 +25,11 @@ from tests.for_each import for_each
 from tests.model.kit import tiny_config
 from tests.train.kit import take
 from tests.train.toy import toy_sample, write_toy_dataset
-from train.data.augment import augmented
+from train.data.augment import augment_scene
 from train.data.buckets import MOST_WASTE, bucket_scenes
 from train.data.resolution import block_mean
-from train.data.scenes import TrainingScene, drawn_scene, training_scene, with_target
-from train.data.stream import StreamSettings, prefetched
+from train.data.scenes import TrainingScene, scene_of_views, training_scene, with_target
+from train.data.stream import StreamSettings, prefetch
 from train.settings import AugmentationSettings
 
 SETTINGS = StreamSettings(
@@ -164,7 +164,7 @@ def test_a_bug_in_the_thread_is_not_swallowed() -> None:
         yield 1
         raise RuntimeError("a bug")
 
-    items = prefetched(broken(), 2)
+    items = prefetch(broken(), 2)
     assert next(items) == 1
     with pytest.raises(RuntimeError, match="a bug"):
         next(items)
@@ -278,10 +278,10 @@ def test_drawn_views_are_those_of_the_whole_sample_to_the_bit(
     rows_seen = 0
     for seed, resolution in enumerate((16, 16, 8, 16)):
         full = training_scene(whole, resolution, lights_apart=lights_apart)
-        drawn = drawn_scene(stored, [0, 2], resolution, lights_apart=lights_apart)
+        drawn = scene_of_views(stored, [0, 2], resolution, per_light=lights_apart)
         rows_seen += drawn.levels_L is not None
-        wanted = augmented(full, settings, np.random.default_rng(seed))
-        got = with_target(augmented(drawn, settings, np.random.default_rng(seed)))
+        wanted = augment_scene(full, settings, np.random.default_rng(seed))
+        got = with_target(augment_scene(drawn, settings, np.random.default_rng(seed)))
         assert torch.equal(got.target_VRR3, wanted.target_VRR3[[0, 2]]) and got.levels_L is None
         assert torch.equal(got.noise_V, wanted.noise_V[[0, 2]])
         for name, tensor in tensors_of(wanted.tensors).items():
@@ -296,10 +296,10 @@ def test_what_is_no_half_float_is_no_row() -> None:
     radiance = sample.radiance_rgb.copy()
     radiance[0, 0, 0] = -0.0
     members = encode_sample(dataclasses.replace(sample, radiance_rgb=radiance))
-    drawn = with_target(drawn_scene(stored_sample("1", members), [0], 8))
+    drawn = with_target(scene_of_views(stored_sample("1", members), [0], 8))
     assert drawn.target_VRR3[0, 0, 0].tolist() == [0.0, 0.0, 0.0]
     members["1.exr"] = encode_channels({"RGB": sample.radiance_rgb[1]})
-    mixed = drawn_scene(stored_sample("1", members), [0, 1], 8)
+    mixed = scene_of_views(stored_sample("1", members), [0, 1], 8)
     assert mixed.levels_L is None
     wanted = torch.from_numpy(np.log10(1 + sample.radiance_rgb[1]).astype(np.float32))
     assert torch.equal(mixed.target_VRR3[1], wanted)

@@ -24,12 +24,12 @@ from tests.for_each import for_each
 from tests.train.fake_card import CARD, fake_card
 from tests.train.kit import CPU, tiny_run
 from tests.train.toy import write_toy_dataset
-from train.data.arrival import CopyStream, StepScenes, looks_up_itself, step_scenes
-from train.data.order import RankShare
+from train.data.bad_samples import BadSampleCounter
+from train.data.device_prefetch import CopyStream, StepScenes, decodes_on_device, step_scenes
+from train.data.order import RankSlice
 from train.data.scenes import stored_levels
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import Unusable
-from train.data.workers import MOST_THREADS, Machine, fitting_workers, this_machine
+from train.data.workers import MAX_THREADS, Machine, choose_workers, detect_machine
 from train.settings import AugmentationSettings
 
 GIB = 1 << 30
@@ -84,7 +84,7 @@ def test_a_machine_is_what_its_files_say(
 ) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(16)), raising=False)
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    found = this_machine(system(tmp_path, files))
+    found = detect_machine(system(tmp_path, files))
     assert found == Machine(cores=cores, free_bytes=free, processes=2)
 
 
@@ -93,7 +93,7 @@ def test_a_machine_is_what_its_files_say(
     [
         (Machine(cores=2), False, 1, "1 thread decodes samples, by 2 cores"),
         (Machine(cores=8), True, 7, "7 threads decode samples, by 8 cores"),
-        (Machine(cores=208, processes=8), True, MOST_THREADS, "by 208 cores for 8 processes"),
+        (Machine(cores=208, processes=8), True, MAX_THREADS, "by 208 cores for 8 processes"),
         (Machine(cores=64, free_bytes=GIB // 16), True, 5, "64 cores and 0.1 GiB of free memory"),
     ],
 )
@@ -101,8 +101,8 @@ def test_threads_are_what_is_spare(
     machine: Machine, on_card: bool, threads: int, said: str
 ) -> None:
     run = dataclasses.replace(tiny_run(resolution=256), views_per_scene=2)
-    found = fitting_workers(machine, run, on_card=on_card, busy_threads=1)
-    assert found.threads == threads and said in found.because
+    found = choose_workers(machine, run, on_gpu=on_card, busy_threads=1)
+    assert found.threads == threads and said in found.reason
 
 
 LIT = AugmentationSettings(mirror=True, channels=True, light_scale=3.0)
@@ -126,9 +126,9 @@ def steps(
         open_training_data([str(dataset.folder.root)]).split("train"),
         settings,
         0,
-        share=RankShare(),
+        rank_slice=RankSlice(),
         workers=2,
-        unusable=Unusable(0),
+        unusable=BadSampleCounter(0),
     )
     with closing(batches), closing(step_scenes(batches, float, 3, device)) as found:
         yield found
@@ -141,7 +141,7 @@ def test_targets_that_are_looked_up_on_arrival_are_the_same_bits(
     """One table of all scenes, or one of each whose light was scaled."""
     pairs = []
     for looked_up in (True, False):
-        with steps(dataset, looked_up=looked_up, augmentation=augmentation) as found:
+        with steps(dataset, lookup_in_threads=looked_up, augmentation=augmentation) as found:
             taken = list(itertools.islice(found, 2))
             pairs.append([batch for step in taken for batch in step.batches])
     for ready, rows in zip(*pairs, strict=True):
@@ -210,9 +210,9 @@ def test_a_card_gets_copies_beside_its_kernels(
     dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From pinned memory, all queued at once, each waited for alone, kept until it is used."""
-    assert looks_up_itself(CARD)
+    assert decodes_on_device(CARD)
     log = _Log(monkeypatch)
-    with steps(dataset, CARD, looked_up=False) as found:
+    with steps(dataset, CARD, lookup_in_threads=False) as found:
         step = next(found)
     with fake_card():
         sent = CopyStream(CARD).send(step.batches)
@@ -233,5 +233,5 @@ def test_rows_of_targets_cover_all_pictures_but_those_of_another_resolution(tmp_
     halves = np.arange(0x7C00, dtype=np.uint16).view(np.float16).astype(np.float32)
     assert np.array_equal(stored_levels().numpy(), log10_radiance(halves).astype(np.float32))
     data = write_toy_dataset(tmp_path, train=6, validation=1, per_shard=3, resolution=32)
-    with steps(data, looked_up=False) as found:
+    with steps(data, lookup_in_threads=False) as found:
         assert all(batch.levels_BL is None for batch in next(found).batches)

@@ -28,22 +28,22 @@ from tests.train.kit import tiny_run
 from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
+from train.evaluation.baselines import MEDIAN, NEAREST, Baselines, median_picture
 from train.evaluation.evaluate import (
     GROUPED,
-    Contest,
+    EvalConfig,
     grouped_pictures,
-    judged_views,
-    make_rivals,
+    judge_views,
+    make_baselines,
     worst_and_median,
     worst_of_each_excursion,
 )
-from train.evaluation.judge import judged_scene, predict
-from train.evaluation.judged_view import NETWORK, JudgedView, by_group, facts_of, summary
+from train.evaluation.judge import predict, validation_scene
+from train.evaluation.judged_view import NETWORK, JudgedView, by_group, scene_facts, summarize_views
 from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
-from train.evaluation.order import EvaluationOrder
+from train.evaluation.options import EvaluationOptions
 from train.evaluation.published import BENCHMARK
 from train.evaluation.report import markdown, record
-from train.evaluation.rivals import MEDIAN, NEAREST, Rivals, median_picture
 from train.evaluation.same_time import TRACER
 from train.loop.state import new_state
 from train.loss.lpips import Lpips
@@ -61,13 +61,13 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=5, validation=3, per_shard=3)
 
 
-def contest(dataset: Dataset, lpips: Lpips | None = None) -> Contest:
+def contest(dataset: Dataset, lpips: Lpips | None = None) -> EvalConfig:
     data = open_training_data([str(dataset.folder.root)])
-    return Contest(
+    return EvalConfig(
         network=new_state(tiny_run()).model,
         shards=data.split("validation"),
         resolution=16,
-        rivals=make_rivals(data.split("train"), 16),
+        baselines=make_baselines(data.split("train"), 16),
         lpips=lpips,
         most_scenes=99,
     )
@@ -94,7 +94,7 @@ def test_hdr_flip_is_the_packages_and_what_cannot_be_measured_is_no_number() -> 
 
 def test_rivals_are_the_median_and_the_closest_training_picture() -> None:
     scenes = [training_scene(toy_sample(index), 16) for index in range(5)]
-    rivals = Rivals(scenes)
+    rivals = Baselines(scenes)
     target = 10 ** scenes[3].target_VRR3[1].double().numpy() - 1
     shown = rivals.pictures(target)
     # half floats of log10(1 + radiance) below 1: 2^-11 of it
@@ -105,7 +105,7 @@ def test_rivals_are_the_median_and_the_closest_training_picture() -> None:
 
 def test_every_view_is_judged_beside_its_rivals(dataset: Dataset) -> None:
     done: list[None] = []
-    rows = judged_views(contest(dataset), lambda: done.append(None))
+    rows = judge_views(contest(dataset), lambda: done.append(None))
     assert len(done) == 3 and [(row.key, row.view) for row in rows] == [
         (f"{scene:09d}", view) for scene in (5, 6, 7) for view in (0, 1)
     ]
@@ -118,9 +118,9 @@ def test_every_view_is_judged_beside_its_rivals(dataset: Dataset) -> None:
         assert similarity is not None and row.gap("ssim") == pytest.approx(1 - similarity, abs=1e-6)
         assert row.gap("lpips") is None
     few = dataclasses.replace(contest(dataset), most_scenes=1)
-    assert len(judged_views(few, lambda: None)) == 2
+    assert len(judge_views(few, lambda: None)) == 2
     with pytest.raises(TrilightError, match="resolution 24: expected a divisor of 32"):
-        judged_views(dataclasses.replace(contest(dataset), resolution=24), lambda: None)
+        judge_views(dataclasses.replace(contest(dataset), resolution=24), lambda: None)
 
 
 SCORES = dict.fromkeys(METRICS, 31.0) | {"lpips": None, "log_l1": 0.1}
@@ -166,7 +166,7 @@ def test_parts_are_ordered_and_hold_every_view() -> None:
 
 def test_a_summary_shows_the_bad_ones_and_the_noise() -> None:
     rows = [row(number) for number in range(11)]
-    found = summary(rows)
+    found = summarize_views(rows)
     assert found["psnr_log_db"]["median"] == 35.0
     assert found["psnr_log_db"]["worse_5_percent"] == pytest.approx(30.5)
     assert found["psnr_log_db"]["median_worse_than_noise"] == 5.0
@@ -174,14 +174,14 @@ def test_a_summary_shows_the_bad_ones_and_the_noise() -> None:
     assert found["lpips"] == dict.fromkeys(found["lpips"], None)
     assert found["near_floor"] == pytest.approx(4 / 11)  # 37 to 40 dB of 40
     partly = [*rows, row(11, scores={NETWORK: rows[0].scores[NETWORK] | {"lpips": 0.5}})]
-    assert summary(partly)["lpips"]["median"] is None, "never a median of another set"
+    assert summarize_views(partly)["lpips"]["median"] is None, "never a median of another set"
 
 
 def test_another_scenes_triangles_and_what_swapping_costs_are_told(dataset: Dataset) -> None:
     judging = contest(dataset)
-    rows, samples = judged_views(judging, lambda: None), list(judging.samples())
+    rows, samples = judge_views(judging, lambda: None), list(judging.samples())
     assert [view.swapped_psnr_log_db is None for view in rows] == [True] * 2 + [False] * 4
-    before, judged = samples[1], judged_scene(samples[2], judging.resolution)
+    before, judged = samples[1], validation_scene(samples[2], judging.resolution)
     seen = before.scene.with_cameras(samples[2].scene.c2w, samples[2].scene.fov_deg)
     mixed = training_scene(dataclasses.replace(samples[2], scene=seen), judging.resolution)
     shown = predict(judging.network, mixed)
@@ -234,7 +234,7 @@ def test_many_lights_are_judged_in_one_pass_and_in_groups(dataset: Dataset) -> N
     assert grouped is not None and grouped.shape == (2, 16, 16, 3)
     # by hand: every group's picture times its share, the same sums in another order
     expected = sum(
-        group.share
+        group.fraction
         * predict(
             network, training_scene(dataclasses.replace(toy_sample(0), scene=group.scene), 16)
         )
@@ -278,18 +278,18 @@ def test_no_report_takes_the_place_of_another_networks(
     (run / "checkpoints").mkdir(parents=True)
     (run / "settings.json").touch()
     places = [
-        EvaluationOrder(checkpoint=str(checkpoint), data=("d",)).place
+        EvaluationOptions(checkpoint=str(checkpoint), data=("d",)).report_folder
         for checkpoint in (run, run / "model.safetensors", run / "checkpoints/9.safetensors")
     ]
     assert places == [run / "evaluation"] * 3
-    assert EvaluationOrder(checkpoint="builtin:", data=("d",)).place == Path("evaluation")
+    assert EvaluationOptions(checkpoint="builtin:", data=("d",)).report_folder == Path("evaluation")
 
 
 def test_facts_come_from_the_scene() -> None:
     sample = toy_sample(0)
     provenance = {"template": "toy", "excursion": {"axis": "lights", "value": 16}}
     scene = sample.scene.with_provenance(provenance)
-    facts = facts_of(dataclasses.replace(sample, scene=scene))
+    facts = scene_facts(dataclasses.replace(sample, scene=scene))
     assert facts["excursion"] == ("lights", 16.0) and facts["template"] == "toy"
     *surfaces, _lamp = scene.materials[:, ROUGHNESS].tolist()
     assert (facts["num_lights"], facts["roughness"]) == (1, min(surfaces))

@@ -22,19 +22,26 @@ from tests.train.kit import tiny_run
 from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
-from train.evaluation.error_colours import ERROR_WHITE, error_picture
-from train.evaluation.evaluate import Contest, judged_views, sheet_views
+from train.evaluation.baselines import median_picture
+from train.evaluation.error_colors import ERROR_WHITE, error_picture
+from train.evaluation.evaluate import EvalConfig, judge_views, sheet_views
 from train.evaluation.judge import hit_masks
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.metrics import METRICS, noise_floors, picture_scores
 from train.evaluation.report import markdown, record
-from train.evaluation.rivals import median_picture
-from train.evaluation.same_time import CAPTION, TRACER, Times, TracerTimes, same_time, sentences
-from train.evaluation.scores import ViewScore, lead, score_view, share_better, summarise
+from train.evaluation.same_time import (
+    CAPTION,
+    TRACER,
+    SameTimeResult,
+    TracerTimes,
+    same_time,
+    sentences,
+)
+from train.evaluation.scores import ViewScore, fraction_better, lead, score_view, summarize_scores
 from train.evaluation.sheet import (
     NOISE_WHITE,
     SheetView,
-    drawn_sheet,
+    draw_sheet,
     noise_picture,
     write_picture,
 )
@@ -113,12 +120,12 @@ def test_scores_are_those_of_storage_and_a_summary_shows_the_bad_ones() -> None:
     assert score.object_psnr_log_db == object_psnr_log_db(a, b, hits)
     assert score.log_l1 == pytest.approx(np.abs(log10_radiance(a) - log10_radiance(b)).mean())
     views = [view_score(float(value), float(value)) for value in range(101)]
-    summary = summarise(views)
+    summary = summarize_scores(views)
     assert summary["log_l1"] == 50.0
     assert summary["psnr_log_db_median"] == 50.0
     assert summary["object_psnr_log_db_p5"] == pytest.approx(5.0)
-    assert share_better(views, views) == 0
-    assert share_better(views, [view_score(25.5, 25.5)] * 101) == pytest.approx(26 / 101)
+    assert fraction_better(views, views) == 0
+    assert fraction_better(views, [view_score(25.5, 25.5)] * 101) == pytest.approx(26 / 101)
 
 
 def test_no_fixed_picture_has_less_l1_error_than_the_median() -> None:
@@ -160,7 +167,7 @@ def test_the_sheet_shows_every_view(tmp_path: Path) -> None:
     target = np.full((8, 8, 3), 0.2)
     views = [sheet_view(target, target * row) for row in range(3)]
     for name in ("a.png", "b.png"):
-        write_picture(tmp_path / name, drawn_sheet(views, ("one line", "and another")))
+        write_picture(tmp_path / name, draw_sheet(views, ("one line", "and another")))
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     with Image.open(tmp_path / "a.png") as sheet:
         pixels = np.asarray(sheet.convert("RGB"))
@@ -191,7 +198,7 @@ def test_floors_of_metrics_without_a_measurement_are_of_drawn_noise() -> None:
     assert set(METRICS) - set(without) == {"lpips"}
 
 
-TIMES = Times(
+TIMES = SameTimeResult(
     network_first_s=0.12,
     network_further_s=0.06,
     scenes=4,
@@ -213,21 +220,21 @@ class Target:
 
 
 @pytest.fixture(scope="module")
-def judging(tmp_path_factory: pytest.TempPathFactory) -> tuple[Contest, list[JudgedView]]:
+def judging(tmp_path_factory: pytest.TempPathFactory) -> tuple[EvalConfig, list[JudgedView]]:
     dataset = write_toy_dataset(tmp_path_factory.mktemp("toy"), train=1, validation=3)
-    contest = Contest(
+    contest = EvalConfig(
         network=new_state(tiny_run()).model,
         shards=open_training_data([str(dataset.folder.root)]).split("validation"),
         resolution=32,
-        rivals=None,
+        baselines=None,
         lpips=None,
         most_scenes=99,
         traced=Target(),
     )
-    return contest, judged_views(contest, lambda: None)
+    return contest, judge_views(contest, lambda: None)
 
 
-def test_both_are_judged_on_the_same_views(judging: tuple[Contest, list[JudgedView]]) -> None:
+def test_both_are_judged_on_the_same_views(judging: tuple[EvalConfig, list[JudgedView]]) -> None:
     _, views = judging
     assert [TRACER in view.scores for view in views] == [True, False] * 3
     found = same_time(views, TIMES, "the first view of each scene")
@@ -245,7 +252,7 @@ def test_both_are_judged_on_the_same_views(judging: tuple[Contest, list[JudgedVi
 
 
 def test_what_takes_longer_and_what_is_missing_is_said(
-    judging: tuple[Contest, list[JudgedView]],
+    judging: tuple[EvalConfig, list[JudgedView]],
 ) -> None:
     _, views = judging
     dearest = TracerTimes(samples=1, denoiser="fast", first_s=0.1, further_s=0.07, note="slow")
@@ -262,13 +269,13 @@ def test_what_takes_longer_and_what_is_missing_is_said(
 
 
 def test_sheets_show_it_beside_the_prediction(
-    judging: tuple[Contest, list[JudgedView]], tmp_path: Path
+    judging: tuple[EvalConfig, list[JudgedView]], tmp_path: Path
 ) -> None:
     contest, views = judging
-    alone = drawn_sheet(sheet_views(dataclasses.replace(contest, traced=None), views), ("title",))
+    alone = draw_sheet(sheet_views(dataclasses.replace(contest, traced=None), views), ("title",))
     shown = sheet_views(contest, views)
     # the target went through float32 logarithms
     np.testing.assert_allclose(
-        shown[1].beside_rgb[CAPTION], shown[1].target_rgb, rtol=1e-5, atol=1e-6
+        shown[1].extra_rgb[CAPTION], shown[1].target_rgb, rtol=1e-5, atol=1e-6
     )
-    assert drawn_sheet(shown, ("title",)).width > alone.width
+    assert draw_sheet(shown, ("title",)).width > alone.width

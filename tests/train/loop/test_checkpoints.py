@@ -28,24 +28,24 @@ from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
 from train.folder import RunFolder
-from train.going_on import going_on
 from train.loop.checkpoints import (
     HEADER_KEY,
     UNSEALED,
-    keep_checkpoint,
     network_of_run,
+    newest_checkpoint,
     path_of_step,
     read_checkpoint,
-    resumed_checkpoint,
-    resumed_state,
+    restore_state,
+    save_checkpoint,
     saved_steps,
 )
-from train.loop.crew import Crew
+from train.loop.distributed import DistributedContext
 from train.loop.recorder import MetricsLog
 from train.loop.state import TrainState, new_state
+from train.monitoring.rows import read_rows
+from train.resume import plan_resume
 from train.settings import TrainSettings
 from train.stored_settings import known_settings
-from train.watching.rows import read_rows
 
 CASES = [("fsync", "before"), ("replace", "before"), ("replace", "after"), ("unlink", "before")]
 
@@ -54,7 +54,7 @@ import json, os, signal, sys
 from pathlib import Path
 from typing import Any
 from storage.settings.described import from_record
-from train.loop.checkpoints import keep_checkpoint
+from train.loop.checkpoints import save_checkpoint
 from train.loop.state import new_state
 from train.settings import TrainSettings
 from train.stored_settings import known_settings
@@ -64,7 +64,7 @@ state = new_state(settings)
 
 def keep(folder, step):
     state.step = state.skipped_steps = step
-    keep_checkpoint(folder, state, settings, data_digest="d", world_size=1)
+    save_checkpoint(folder, state, settings, data_digest="d", world_size=1)
 
 def killed(folder, name, when):
     keep(folder, 1)
@@ -101,7 +101,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
     keep(tmp_path, 4, 8, 10, 12, 16, 20, 24, checkpoints_kept=2, keep_every=10)
     assert saved_steps(tmp_path) == [10, 20, 24]
-    assert resumed_checkpoint(tmp_path, ALONE, pytest.fail).header["step"] == 24
+    assert newest_checkpoint(tmp_path, ALONE, pytest.fail).header["step"] == 24
     (tmp_path / "step-notes.safetensors").write_bytes(b"")
     assert saved_steps(tmp_path) == [10, 20, 24]
     # where the decay begins a longer run can go on as if it had been longer all along
@@ -112,8 +112,8 @@ def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
 @for_each(("call", "when"), CASES)
 def test_killed_while_saving_leaves_a_whole_one(killed: Path, call: str, when: str) -> None:
     folder = killed / f"{call} {when}"
-    newest = resumed_checkpoint(folder, ALONE, pytest.fail)
-    step = resumed_state(newest, going_on(newest.header, tiny_run(), "d", {})).step
+    newest = newest_checkpoint(folder, ALONE, pytest.fail)
+    step = restore_state(newest, plan_resume(newest.header, tiny_run(), "d", {})).step
     assert step == (1 if (call, when) in (("fsync", "before"), ("replace", "before")) else 2)
     keep(folder, 3)
     assert not list(folder.glob("*.part")), "what the killed one left is cleared away"
@@ -125,7 +125,7 @@ def keep(folder: Path, *steps: int, **changes: Any) -> None:
     state = new_state(settings)
     for step in steps:
         state.step = state.skipped_steps = step
-        keep_checkpoint(folder, state, settings, data_digest="d", world_size=1)
+        save_checkpoint(folder, state, settings, data_digest="d", world_size=1)
 
 
 def cut(path: Path) -> None:
@@ -144,7 +144,7 @@ def test_a_damaged_newest_one_is_named_and_the_one_before_it_is_used(
     keep(tmp_path, 4, 8, 12)
     damage(path_of_step(tmp_path, 12))
     notes: list[str] = []
-    assert resumed_checkpoint(tmp_path, ALONE, notes.append).header["step"] == 8
+    assert newest_checkpoint(tmp_path, ALONE, notes.append).header["step"] == 8
     (note,) = notes
     assert f"checkpoint {path_of_step(tmp_path, 12)} is not readable: " in note
     assert note.endswith("The run goes on from that of step 8")
@@ -153,7 +153,7 @@ def test_a_damaged_newest_one_is_named_and_the_one_before_it_is_used(
     with pytest.raises(
         TrilightError, match="none of its checkpoints can be resumed from"
     ) as caught:
-        resumed_checkpoint(tmp_path, ALONE, pytest.fail)
+        newest_checkpoint(tmp_path, ALONE, pytest.fail)
     for step in (4, 8, 12):
         assert f"{path_of_step(tmp_path, step)} is not readable" in str(caught.value)
 
@@ -179,10 +179,10 @@ def reseal(path: Path, **changes: object) -> None:
 def test_a_sealed_lie_is_passed_over(tmp_path: Path, lie: dict[str, object]) -> None:
     keep(tmp_path, 4, 8)
     reseal(path_of_step(tmp_path, 8))
-    assert resumed_checkpoint(tmp_path, ALONE, pytest.fail).header["step"] == 8
+    assert newest_checkpoint(tmp_path, ALONE, pytest.fail).header["step"] == 8
     reseal(path_of_step(tmp_path, 8), **lie)
     notes: list[str] = []
-    assert resumed_checkpoint(tmp_path, ALONE, notes.append).header["step"] == 4
+    assert newest_checkpoint(tmp_path, ALONE, notes.append).header["step"] == 4
     assert len(notes) == 1 and f"{path_of_step(tmp_path, 8)} is not readable: " in notes[0]
 
 
@@ -190,11 +190,11 @@ def test_a_damaged_later_one_takes_nobodys_place(tmp_path: Path) -> None:
     keep(tmp_path, 4, 12)
     flip_a_bit(path_of_step(tmp_path, 12))
     keep(tmp_path, 8, checkpoints_kept=1)
-    assert resumed_checkpoint(tmp_path, ALONE, lambda _: None).header["step"] == 8
+    assert newest_checkpoint(tmp_path, ALONE, lambda _: None).header["step"] == 8
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Two(Crew):
+class Two(DistributedContext):
     """Two processes, of which the other reads another step."""
 
     other: int
@@ -208,9 +208,9 @@ class Two(Crew):
 def test_processes_that_read_different_checkpoints_do_not_go_on(tmp_path: Path) -> None:
     keep(tmp_path, 4, 8)
     same = Two(device=ALONE.device, other=8)
-    assert resumed_checkpoint(tmp_path, same, pytest.fail).header["step"] == 8
+    assert newest_checkpoint(tmp_path, same, pytest.fail).header["step"] == 8
     with pytest.raises(TrilightError, match="do not read the same checkpoint; this one .* step 8"):
-        resumed_checkpoint(tmp_path, Two(device=ALONE.device, other=4), pytest.fail)
+        newest_checkpoint(tmp_path, Two(device=ALONE.device, other=4), pytest.fail)
 
 
 def test_a_full_disk_leaves_the_older_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,12 +228,12 @@ def test_a_full_disk_leaves_the_older_ones(tmp_path: Path, monkeypatch: pytest.M
 def test_a_network_is_found_in_folder_checkpoint_and_file(tmp_path: Path) -> None:
     settings = dataclasses.replace(tiny_run(), ema_decay=0.9)
     state, folder = new_state(settings), RunFolder(tmp_path)
-    assert state.mean_model is not None
+    assert state.ema_model is not None
     with torch.no_grad():
-        state.mean_model.decoder.token_W.fill_(0.25)
+        state.ema_model.decoder.token_W.fill_(0.25)
     with pytest.raises(TrilightError, match="no checkpoint here"):
         open_network(tmp_path, network_of_run)
-    keep_checkpoint(folder.checkpoints, state, settings, data_digest="d", world_size=1)
+    save_checkpoint(folder.checkpoints, state, settings, data_digest="d", world_size=1)
     for place in (tmp_path, path_of_step(folder.checkpoints, 0)):
         found = find_network(place, network_of_run)
         assert found.trained.resolution == settings.resolution
@@ -269,14 +269,14 @@ def equal_weights(one: TrainState, other: TrainState) -> bool:
 
 
 def save(folder: Path, state: TrainState) -> Path:
-    keep_checkpoint(folder, state, tiny_run(), data_digest=DIGEST, world_size=1)
+    save_checkpoint(folder, state, tiny_run(), data_digest=DIGEST, world_size=1)
     return path_of_step(folder, state.step)
 
 
 def load(path: Path) -> TrainState:
     checkpoint = read_checkpoint(path)
     typed = from_record(TrainSettings, known_settings(checkpoint.header["settings"], "resume"))
-    return resumed_state(checkpoint, going_on(checkpoint.header, typed, DIGEST, {}))
+    return restore_state(checkpoint, plan_resume(checkpoint.header, typed, DIGEST, {}))
 
 
 @for_each("steps", [0, 3])
@@ -306,7 +306,7 @@ def test_equal_states_give_equal_bytes_and_skipped_steps_are_no_updates(tmp_path
 def test_nothing_may_be_missing_and_no_bit_may_flip(tmp_path: Path) -> None:
     """In the header, its sha256, the weights, the last byte: each would still be a weight."""
     with pytest.raises(TrilightError, match="no checkpoint here to resume from"):
-        resumed_checkpoint(tmp_path / "checkpoints", ALONE, print)
+        newest_checkpoint(tmp_path / "checkpoints", ALONE, print)
     path = save(tmp_path, stepped(1))
     data = path.read_bytes()
     end = 8 + int.from_bytes(data[:8], "little")

@@ -149,7 +149,7 @@ def _fails_to_compile(graph: object, inputs: object) -> object:
 
 def _uncompilable(monkeypatch: pytest.MonkeyPatch, compile: Compile) -> Stepper:
     """Return a stepper on the processor whose compiler, as on some card, fails."""
-    monkeypatch.setattr(compiled, "_worth_it", lambda _: True)
+    monkeypatch.setattr(compiled, "_is_worthwhile", lambda _: True)
     _compile_by(monkeypatch, _fails_to_compile)
     run = tiny_run(compile=compile)
     return stepper(new_state(run), run)

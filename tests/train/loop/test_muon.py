@@ -12,8 +12,8 @@ from torch import Tensor
 
 from tests.for_each import for_each
 from train.loop import muon as muon_file
-from train.loop.crew import Crew
-from train.loop.muon import fitting_precision, muon, orthogonal, shared_out
+from train.loop.distributed import DistributedContext
+from train.loop.muon import choose_muon_precision, muon, orthogonal, split_over_ranks
 
 JORDAN = (3.4445, -4.7750, 2.0315)
 SHAPES = [(24, 8), (24, 8), (8, 24), (12, 12), (12, 12), (12, 12), (1, 9), (9, 1), (1, 1)]
@@ -132,7 +132,7 @@ def test_matrices_of_a_stack_do_not_meet() -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MixedCrew(Crew):
+class MixedCrew(DistributedContext):
     """Two processes, of which the other is on a processor without bfloat16."""
 
     def any(self, flag: bool) -> bool:
@@ -140,13 +140,13 @@ class MixedCrew(Crew):
 
 
 def test_the_precision_is_what_all_processors_are_quick_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    def chosen(crew: Crew, *, quick: bool) -> str:
+    def chosen(crew: DistributedContext, *, quick: bool) -> str:
         monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: quick)
-        return fitting_precision(crew)
+        return choose_muon_precision(crew)
 
-    assert chosen(Crew(device=CPU), quick=True) == "bfloat16"
-    assert chosen(Crew(device=CPU), quick=False) == "float32"
-    assert chosen(Crew(device=torch.device("cuda", 0)), quick=False) == "bfloat16"
+    assert chosen(DistributedContext(device=CPU), quick=True) == "bfloat16"
+    assert chosen(DistributedContext(device=CPU), quick=False) == "float32"
+    assert chosen(DistributedContext(device=torch.device("cuda", 0)), quick=False) == "bfloat16"
     assert chosen(MixedCrew(device=CPU), quick=True) == "float32"
 
 
@@ -157,7 +157,7 @@ def test_the_processor_answers() -> None:
             flags = stream.read().split()
     except OSError:
         pytest.skip("no /proc/cpuinfo here")
-    assert fitting_precision(Crew(device=CPU)) == (
+    assert choose_muon_precision(DistributedContext(device=CPU)) == (
         "bfloat16" if "avx512_bf16" in flags else "float32"
     )
 
@@ -186,7 +186,7 @@ def test_processes_that_share_the_work_move_alike(
             monkeypatch.setattr(
                 muon_file.dist, "all_gather", lambda p, d, rank=rank: gather(p, d, rank)
             )
-            found = shared_out(list(several), work, torch.float32)
+            found = split_over_ranks(list(several), work, torch.float32)
         assert torch.equal(found, work(list(several))), "the last to be asked was told everything"
         told.clear()
 

@@ -27,7 +27,7 @@ from train.data.buckets import MOST_WASTE, TrainingBatch, bucket_scenes, make_ba
 from train.data.scenes import TrainingScene, training_scene
 from train.loop.muon import orthogonal
 from train.loop.optim import Updater
-from train.loop.schedule import decay_begins, learning_rate
+from train.loop.schedule import decay_start_step, learning_rate
 from train.loop.state import new_state
 from train.settings import Precision, TrainSettings
 
@@ -107,12 +107,12 @@ def test_what_is_remembered_can_be_taken_over(muon_rate: float, precision: Preci
     settings = tiny_run(muon_rate=muon_rate)
     model = with_gradients()
     updater = Updater(model, settings, precision)
-    assert updater.memories() == {}
+    assert updater.optimizer_state() == {}
     updater.step(RATE)
     twin = copy.deepcopy(model)
     other = Updater(twin, settings, precision)
-    other.remember(updater.memories(), 1)
-    kinds = {name.split("/")[0] for name in updater.memories()}
+    other.load_optimizer_state(updater.optimizer_state(), 1)
+    kinds = {name.split("/")[0] for name in updater.optimizer_state()}
     assert kinds == {"exp_avg", "exp_avg_sq"} | ({"momentum_buffer"} if muon_rate else set())
     for network, own in ((model, updater), (twin, other)):
         for weight, like in zip(network.parameters(), with_gradients(1).parameters(), strict=True):
@@ -194,10 +194,10 @@ def test_a_cosine_and_a_wsd_rate_rise_once_and_fall_at_the_end() -> None:
     assert found[:11] == sorted(set(found[:11]))
     assert found[10:] == sorted(set(found[10:]), reverse=True)
     assert learning_rate(500, settings) == found[99], "no restart after the end"
-    assert decay_begins(settings) is None
+    assert decay_start_step(settings) is None
     settings = tiny_run(schedule="wsd", num_steps=100, warmup_steps=10, final_rate_share=0.1)
     found, peak = rates(settings), settings.learning_rate
-    assert decay_begins(settings) == 80
+    assert decay_start_step(settings) == 80
     assert found[:10] == [peak * (step + 1) / 11 for step in range(10)]
     assert found[10:81] == [peak] * 71
     for step in range(80, 100):
@@ -210,7 +210,7 @@ def test_a_cosine_and_a_wsd_rate_rise_once_and_fall_at_the_end() -> None:
 @for_each("share", [0.0, 0.1, 0.2, 0.5])
 def test_a_longer_wsd_run_has_the_same_rates_until_the_decay(share: float) -> None:
     short = tiny_run(schedule="wsd", num_steps=60, warmup_steps=7, decay_share=share)
-    begins = decay_begins(short)
+    begins = decay_start_step(short)
     for steps in (61, 100, 1000):
         longer = tiny_run(schedule="wsd", num_steps=steps, warmup_steps=7, decay_share=share)
         assert rates(longer)[: begins or 60] == rates(short)[: begins or 60]
@@ -219,10 +219,10 @@ def test_a_longer_wsd_run_has_the_same_rates_until_the_decay(share: float) -> No
 
 def test_the_decay_waits_for_the_warm_up() -> None:
     whole = tiny_run(schedule="wsd", num_steps=60, warmup_steps=50, decay_share=1.0)
-    assert decay_begins(whole) == 50
+    assert decay_start_step(whole) == 50
     assert rates(whole)[50] == whole.learning_rate > rates(whole)[51]
     last = tiny_run(schedule="wsd", num_steps=3, warmup_steps=2, decay_share=0.01)
-    assert decay_begins(last) == 3 and rates(last)[2] == last.learning_rate
+    assert decay_start_step(last) == 3 and rates(last)[2] == last.learning_rate
 
 
 RESOLUTION = 16

@@ -21,7 +21,7 @@ from tests.conftest import ROOT
 from tests.infra.slurm.fake_slurm import commands_in
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
-from train.watching.rows import read_rows
+from train.monitoring.rows import read_rows
 
 SMALL = {
     "model.rope_num_freqs": 1,

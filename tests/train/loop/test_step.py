@@ -29,10 +29,10 @@ from train.loop import step as step_module
 from train.loop.checkpoints import path_of_step, read_checkpoint, saved_steps
 from train.loop.decision import Decision, move_along, move_towards
 from train.loop.optim import Updater
-from train.loop.state import TrainState, mean_share, new_state
-from train.loop.step import Stepper, StepReport, predicted
+from train.loop.state import TrainState, ema_step, new_state
+from train.loop.step import Stepper, StepReport, predict_log10
+from train.monitoring.rows import read_rows
 from train.settings import Precision
-from train.watching.rows import read_rows
 
 RESOLUTION = 16
 
@@ -93,24 +93,24 @@ def test_a_step_that_is_not_finite_changes_nothing(
     batch = make_batch(scenes(2))
     assert step(state, [batch]).applied
     ruin(state, batch)
-    assert state.mean_model is not None
-    mean = copy.deepcopy(state.mean_model.state_dict())
+    assert state.ema_model is not None
+    mean = copy.deepcopy(state.ema_model.state_dict())
     weights = copy.deepcopy(state.model.state_dict())
-    memories = copy.deepcopy(state.updater.memories())
+    memories = copy.deepcopy(state.updater.optimizer_state())
     report = step(state, [batch])
     assert not report.applied
     for name, weight in state.model.state_dict().items():
         assert torch.equal(weight.nan_to_num(), weights[name].nan_to_num()), name
-    for name, memory in state.updater.memories().items():
+    for name, memory in state.updater.optimizer_state().items():
         assert torch.equal(memory, memories[name]), name
-    for name, weight in state.mean_model.state_dict().items():
+    for name, weight in state.ema_model.state_dict().items():
         assert torch.equal(weight, mean[name]), name
 
 
 def test_the_mean_follows_the_weights_faster_at_first() -> None:
     settings = tiny_run(ema_decay=0.5)
     state = new_state(settings)
-    assert state.mean_model is not None and state.shown is state.mean_model
+    assert state.ema_model is not None and state.eval_model is state.ema_model
     batch = make_batch(scenes(2))
     by_hand = state.model.decoder.rays.weight.detach().clone()
     for updates in range(12):
@@ -119,9 +119,9 @@ def test_the_mean_follows_the_weights_faster_at_first() -> None:
         decay = min(0.5, (1 + updates) / (10 + updates))
         by_hand = decay * by_hand + (1 - decay) * state.model.decoder.rays.weight.detach()
     # float32, 12 updates
-    torch.testing.assert_close(state.mean_model.decoder.rays.weight, by_hand, rtol=0, atol=1e-6)
+    torch.testing.assert_close(state.ema_model.decoder.rays.weight, by_hand, rtol=0, atol=1e-6)
     assert (by_hand - state.model.decoder.rays.weight).abs().max() > 1e-4
-    assert new_state(tiny_run()).shown is not None and new_state(tiny_run()).mean_model is None
+    assert new_state(tiny_run()).eval_model is not None and new_state(tiny_run()).ema_model is None
 
 
 @for_each("family", ["linear", "dpt"])
@@ -133,7 +133,7 @@ def test_bfloat16_rounds_no_position_ray_or_material_nor_the_last_layers(family:
     network, found = awake(tiny_config(family), torch.float32), dict[str, str]()
     positions, batch = list[Tensor](), make_batch(scenes(2))
     network.encoder.rotary.register_forward_pre_hook(lambda _, given: positions.append(given[0]))
-    exact_picture = predicted(network, batch, RESOLUTION, "float32")
+    exact_picture = predict_log10(network, batch, RESOLUTION, "float32")
 
     def note(name: str, module: nn.Module, given: tuple[Tensor, ...], output: Tensor) -> None:
         kept = isinstance(module, Norm) and output.dtype == given[0].dtype
@@ -142,7 +142,7 @@ def test_bfloat16_rounds_no_position_ray_or_material_nor_the_last_layers(family:
     for name, module in network.named_modules():
         if isinstance(module, Norm | nn.Linear | nn.Conv2d):
             module.register_forward_hook(functools.partial(note, name))
-    rounded = predicted(network, batch, RESOLUTION, "bfloat16")
+    rounded = predict_log10(network, batch, RESOLUTION, "bfloat16")
     assert rounded.dtype == torch.float32 and not torch.equal(rounded, exact_picture)
     exact_ones, ours = positions[: len(positions) // 2], positions[len(positions) // 2 :]
     for one, other in zip(exact_ones, ours, strict=True):
@@ -212,7 +212,7 @@ LATE = tiny_run(ema_decay=0.9, muon_rate=3.0, muon_takes="hidden", weight_decay=
 def late(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have a processor decide as a card does."""
     for module in (step_module, optim, muon):
-        monkeypatch.setattr(module, "decides_late", lambda _: True)
+        monkeypatch.setattr(module, "defers_sync", lambda _: True)
 
 
 def batch_of(index: int, *, bad: bool = False) -> TrainingBatch:
@@ -227,17 +227,17 @@ def taken(batches: list[TrainingBatch]) -> tuple[TrainState, list[bool]]:
     state = new_state(LATE, muon_precision="float32")
     late, unread = stepper(state, LATE), []
     for each in batches:
-        unread.append(late.take([each], 3e-3))
+        unread.append(late.launch([each], 3e-3))
         state.step += 1
-    return state, [report.applied for report in late.read(unread).reports]
+    return state, [report.applied for report in late.sync(unread).reports]
 
 
 def tensors(state: TrainState) -> dict[str, Tensor]:
-    assert state.mean_model is not None
+    assert state.ema_model is not None
     return {
         **state.model.state_dict(),
-        **{f"mean/{name}": each for name, each in state.mean_model.state_dict().items()},
-        **state.updater.memories(),
+        **{f"mean/{name}": each for name, each in state.ema_model.state_dict().items()},
+        **state.updater.optimizer_state(),
     }
 
 
@@ -260,7 +260,7 @@ def test_kernels_update_as_the_host_does_but_for_rounding(
     host, late = with_gradients(), with_gradients()
     Updater(host, LATE, "float32").step(3e-3)
     request.getfixturevalue("late")
-    decision = Decision(applied=torch.tensor(True), updates=0, is_late=True)
+    decision = Decision(applied=torch.tensor(True), updates=0, defer_sync=True)
     Updater(late, LATE, "float32").step(3e-3, decision)
     for found, wanted in zip(late.parameters(), host.parameters(), strict=True):
         # units of the last place: the fused kernels add up in another order
@@ -273,9 +273,9 @@ def test_kernels_move_as_the_host_does_or_touch_nothing(applied: bool) -> None:
     x, goal = (torch.randn(5, 7, generator=generator) for _ in range(2))
     if not applied:
         goal[0, 0] = math.nan
-    decision = Decision(applied=torch.tensor(applied), updates=torch.tensor(30.0), is_late=True)
-    share = mean_share(0.99, torch.tensor(30.0, dtype=torch.float64))
-    assert float(share) == pytest.approx(mean_share(0.99, 30), rel=1e-7)
+    decision = Decision(applied=torch.tensor(applied), updates=torch.tensor(30.0), defer_sync=True)
+    share = ema_step(0.99, torch.tensor(30.0, dtype=torch.float64))
+    assert float(share) == pytest.approx(ema_step(0.99, 30), rel=1e-7)
     assert isinstance(share, torch.Tensor) and share.dtype == torch.float32
     for move, by_hand in (
         (lambda y, late: move_towards([y], [goal], 0.05, late), x + 0.05 * (goal - x)),
@@ -292,14 +292,14 @@ def test_a_run_that_learns_late_is_the_same_run(
 ) -> None:
     """Whatever the window; skipped steps are named with their scenes; resumed to the bit."""
     write_toy_dataset(tmp_path / "data", train=6, validation=1)
-    original = Stepper.take
+    original = Stepper.launch
 
     def spoilt(self: Stepper, batches: list[TrainingBatch], *given: Any, **rest: Any) -> Tensor:
         for each in batches if self._state.step in (1, 6) else ():
             each.target_BVRR3[:] = math.inf
         return original(self, batches, *given, **rest)
 
-    monkeypatch.setattr(Stepper, "take", spoilt)
+    monkeypatch.setattr(Stepper, "launch", spoilt)
 
     def run(log_every: int, *, resume: bool = False) -> RunFolder:
         settings = tiny_run(num_steps=8, schedule="wsd", decay_share=0.4, log_every=log_every)

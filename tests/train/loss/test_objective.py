@@ -31,7 +31,7 @@ from train.loss.lpips import (
     load_lpips,
 )
 from train.loss.ms_ssim import SCALE_WEIGHTS, ms_ssim, ssim
-from train.loss.objective import Objective, tone_mapped
+from train.loss.objective import Objective, tone_map
 from train.settings import LossSettings
 
 WIDTHS = (4, 5, 6, 7, 8)
@@ -182,9 +182,9 @@ def noisy_pair(resolution: int) -> tuple[Tensor, Tensor]:
 
 def test_the_tone_map_is_the_one_that_people_see() -> None:
     radiance = np.array([0.0, 0.01, 0.3, 0.9, 1.0, 40.0])
-    mapped = tone_mapped(torch.from_numpy(np.log10(1 + radiance)))
+    mapped = tone_map(torch.from_numpy(np.log10(1 + radiance)))
     assert np.array_equal(srgb8(mapped.numpy()), preview_srgb8(radiance))
-    assert tone_mapped(torch.tensor([-0.5])).item() == 0
+    assert tone_map(torch.tensor([-0.5])).item() == 0
 
 
 @for_each("resolution", [12, 40])
@@ -239,9 +239,7 @@ def test_the_loss_adds_up_its_terms(term: str) -> None:
     assert torch.equal(losses.l1_BV, (prediction - target).abs().mean(dim=(2, 3, 4)))
     for scene in range(2):
         for view in range(3):
-            x, y = (
-                tone_mapped(p[scene, view]).permute(2, 0, 1)[None] for p in (prediction, target)
-            )
+            x, y = (tone_map(p[scene, view]).permute(2, 0, 1)[None] for p in (prediction, target))
             unlike = {"lpips": lpips(x, y), "ms_ssim": 1 - ms_ssim(x, y), "none": torch.zeros(1)}
             expected = losses.l1_BV[scene, view] + 0.05 * unlike[term].item()
             # float32: one view alone and six together are convolved in another order

@@ -50,7 +50,7 @@ def test_folders_of_servers(source: str, scheme: str, root: str) -> None:
     url = parse_url(source, what="objects")
     assert isinstance(url, RemoteUrl)
     assert (url.scheme, url.root) == (scheme, root)
-    assert "cret" not in repr(url) and "cret" not in url.shown
+    assert "cret" not in repr(url) and "cret" not in url.display_url
 
 
 def test_credentials_are_kept_apart() -> None:

@@ -1,0 +1,242 @@
+"""Request handlers of a scene's page: the scene in 3D, pictures by every engine, and exports."""
+
+import json
+import shlex
+import tempfile
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.rendering.look import Look, ToneMap, tone_mapped
+from infra.viewer.painters import Painter, render_words
+from infra.viewer.picture_options import parse_edits, parse_picture_options
+from infra.viewer.render_queue import RenderJob, RenderQueue, agreement_db
+from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
+from infra.viewer.server import NotFound, Request, Response, Route, json_response
+from pipeline.documents.png import encode_png
+from pipeline.exchange.convert import write_scene
+from pipeline.exchange.formats import FORMATS
+from pipeline.exchange.renderformer_json import camera_entry
+from pipeline.generation.progressive_tracer import ProgressiveTracer
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
+from storage.records.lights import num_lights
+from storage.records.scene import Scene
+from train.evaluation.error_colors import ERROR_WHITE, error_picture
+
+EXPORTS = {
+    ".usdz": "USD with textures",
+    ".usda": "USD as text",
+    ".glb": "glTF",
+    ".h5": "RenderFormer",
+    ".safetensors": "exact",
+}
+"""Title of each export format by suffix; a page offers those that can be written."""
+
+CAMERA = "camera.json"
+EDITED = "scene.safetensors"
+"""Names of saved files in the commands that the page shows."""
+
+_OCTETS = "application/octet-stream"
+
+
+@dataclass(kw_only=True, eq=False)
+class SceneHandlers:
+    """Handlers of one scene and its pictures."""
+
+    name: str
+    """Title of the scene on the page."""
+    scene: Scene
+    notes: Sequence[str]
+    """Losses of the conversion from the scene's file."""
+    painters: Mapping[str, Painter]
+    """Renderers by name, in the order of the page."""
+    target_px: int | None
+    """Width in pixels of the pictures in the file; None without such pictures."""
+    source: str = ""
+    """Scene as `trilight render` takes it; empty where it cannot."""
+    tracer: ProgressiveTracer | None = None
+    """Path tracer that `close` closes; None where other pages share it."""
+    queue: RenderQueue = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.queue = RenderQueue(self.scene, self.painters)
+        self._writing = threading.Lock()
+
+    def gets(self) -> dict[str, Route]:
+        """Return the routes of GET requests."""
+        return {
+            "api/scene": self._facts,
+            "api/scene.bin": lambda _: Response(body=scene_bytes(self.scene), kind=_OCTETS),
+            "api/texture/": self._texture,
+            "api/sky.bin": self._sky,
+            "api/picture/": self._progress,
+            "api/shown/": self._image_png,
+        }
+
+    def posts(self) -> dict[str, Route]:
+        """Return the routes of POST requests."""
+        return {
+            "api/picture": self._submit,
+            "api/rest": self._cancel_all,
+            "api/export": self._export,
+        }
+
+    def close(self) -> None:
+        """Stop rendering, and wait for its end."""
+        self.queue.close()
+        self.queue.join()
+        if self.tracer is not None:
+            self.tracer.close()
+
+    def _facts(self, _: Request) -> Response:
+        scene = self.scene
+        engines = [
+            {"name": name, "title": each.title, "means": each.means}
+            for name, each in self.painters.items()
+        ]
+        return json_response(
+            {
+                "name": self.name,
+                "triangles": scene.num_triangles,
+                "lights": num_lights(scene),
+                "materials": len(scene.materials),
+                "textures": len(scene.textures),
+                "views": scene.num_views,
+                "target_px": self.target_px,
+                "template": str(scene.provenance.get("template", "")),
+                "notes": list(self.notes),
+                "engines": engines,
+                "exports": [pair for pair in EXPORTS.items() if self._is_offered(pair[0])],
+            }
+        )
+
+    def _is_offered(self, suffix: str) -> bool:
+        """Return whether the scene can be exported as one file; .usda keeps pictures outside."""
+        form = FORMATS.get(suffix)
+        scene = self.scene
+        pictures = suffix == ".usda" and (scene.textures or scene.environment is not None)
+        return form is not None and form.write is not None and not pictures
+
+    def _texture(self, request: Request) -> Response:
+        name = request.path.removeprefix("api/texture/")
+        if not (name.isascii() and name.isdecimal()) or int(name) >= len(self.scene.textures):
+            raise NotFound("the scene has no such texture.")
+        return Response(body=texture_png(self.scene.textures[int(name)]), kind="image/png")
+
+    def _sky(self, _: Request) -> Response:
+        if self.scene.environment is None:
+            raise NotFound("the scene has no environment.")
+        return Response(body=sky_bytes(self.scene), kind=_OCTETS)
+
+    def _submit(self, request: Request) -> Response:
+        options = parse_picture_options(request.body, self.painters, self.scene.num_views)
+        return json_response({"id": self.queue.submit(options).id})
+
+    def _cancel_all(self, _: Request) -> Response:
+        self.queue.cancel_all()
+        return json_response({})
+
+    def _progress(self, request: Request) -> Response:
+        after = request.query.get("after", "0")
+        number = request.path.removeprefix("api/picture/")
+        job = self.queue.wait_for_update(number, int(after) if after.isdecimal() else 0)
+        return json_response(
+            {**_job_record(job, self.queue.reference(job)), **self._reproduction(job)}
+        )
+
+    def _reproduction(self, job: RenderJob) -> Mapping[str, Any]:
+        """Return the command that renders a picture, and its camera as a file for that command."""
+        options = job.options
+        camera = job.options.camera
+        place = ["--view", str(options.view), "--out", "view.exr"]
+        if options.view is None:  # a camera file means many pictures, which need a folder
+            place = ["--cameras", CAMERA, "--out", "view"]
+        words = ["trilight", "render", EDITED if options.edits else self.source, *place]
+        words += ["--resolution", str(options.resolution)]
+        command = shlex.join([*words, *render_words(self.painters[options.engine], options)])
+        camera_file = json.dumps({"cameras": [camera_entry(camera.c2w, camera.fov_deg)]})
+        return {"command": command if self.source else "", "camera": camera_file}
+
+    def _image_png(self, request: Request) -> Response:
+        job = self.queue.job(request.path.removeprefix("api/shown/"))
+        if job.image is None:
+            raise NotFound("the picture has not begun yet.")
+        if request.query.get("as") == "error":
+            pixels = self._error_of(job)
+        elif job.image.radiance_rgb is None:
+            assert job.image.pixels is not None
+            pixels = job.image.pixels
+        else:
+            pixels = _tone_map(job.image.radiance_rgb, request.query)
+        return Response(body=encode_png(pixels), kind="image/png")
+
+    def _error_of(self, job: RenderJob) -> NDArray[np.uint8]:
+        reference = self.queue.reference(job)
+        if agreement_db(job, reference) is None:
+            raise TrilightError("There is nothing to judge this picture by yet.")
+        assert job.image is not None and reference is not None and reference.image is not None
+        picture = job.image.radiance_rgb
+        other = reference.image.radiance_rgb
+        assert picture is not None and other is not None
+        return error_picture(picture, other)
+
+    def _export(self, request: Request) -> Response:
+        body = request.body if isinstance(request.body, dict) else {}
+        suffix = str(body.get("form"))
+        edits = parse_edits(body)
+        if suffix not in EXPORTS or not self._is_offered(suffix):
+            raise TrilightError(f"form {suffix:.20}: expected one of {' '.join(EXPORTS)}.")
+        key = sha256_hex(canonical_json(edits))[:24]
+        with self._writing, tempfile.TemporaryDirectory(prefix="trilight-view-") as folder:
+            path = Path(folder) / f"scene{suffix}"
+            lost = write_scene(path, self.queue.scene(key, edits))
+            data = path.read_bytes()
+        said = "; ".join(lost).encode("ascii", "replace").decode()[:800]
+        return Response(body=data, kind=_OCTETS, headers={"X-Lost": said} if said else {})
+
+
+def _job_record(job: RenderJob, reference: RenderJob | None) -> Mapping[str, Any]:
+    image = job.image
+    sampling = job.sampling
+    record: dict[str, Any] = {
+        "id": job.id,
+        "engine": job.options.engine,
+        "state": job.state,
+        "version": job.version,
+        "error": job.error,
+        "prices": job.costs,
+        "shown": image is not None,
+    }
+    if sampling is not None:
+        record["sampling"] = {"spp": sampling.spp, "expected_spp": sampling.expected_spp}
+    if image is not None:
+        record |= {
+            "spp": image.spp,
+            "core_s": image.core_s,
+            "scene_core_s": image.scene_core_s,
+            "floor_db": image.floor_db,
+            "says": image.says,
+            "notes": list(image.notes),
+            "agreement_db": agreement_db(job, reference),
+            "truth": None if reference is None else reference.options.engine,
+            "error_white": ERROR_WHITE,
+        }
+    return record
+
+
+def _tone_map(radiance_rgb: NDArray[np.float32], query: Mapping[str, str]) -> NDArray[np.uint8]:
+    tone_map: ToneMap = "filmic" if query.get("tone") == "filmic" else "plain"
+    try:
+        exposure_ev = float(query.get("ev", "0"))
+    except ValueError as error:
+        raise TrilightError("ev: expected a number of stops.") from error
+    if not -32 <= exposure_ev <= 32:
+        raise TrilightError(f"ev is {exposure_ev}; expected -32 to 32.")
+    look = Look(tone_map=tone_map, exposure_ev=exposure_ev)
+    return tone_mapped(radiance_rgb * np.float32(2.0**look.exposure_ev), look.tone_map)

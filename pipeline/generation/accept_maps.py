@@ -1,0 +1,221 @@
+"""Prepares the user's textures and environment maps, and freezes them with the objects.
+
+Each file is decoded once, in a child with limits; the result is in the user's cache. The digest of
+its content decides the split of a texture or map, by the rule of objects.
+"""
+
+import logging
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.builds.settings import BuildSettings
+from pipeline.generation.child_pool import ChildPool
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, call_with_retries, reach
+from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
+from pipeline.objects.maps.prepared import MapFiles, decode_prepared, outcome_name, prepare_map
+from storage.atomic import write_atomically
+from storage.cache import cache_folder
+from storage.conventions import SPLITS
+from storage.dataset.splits import split_of_object
+from storage.digests import sha256_hex
+from storage.errors import Rejected, TrilightError
+from storage.records.objects import SKY, TEXTURE, Failure, LockedObject
+from storage.remote.safe_url import printable
+
+log = logging.getLogger("trilight.maps")
+
+_LIMITS = ChildLimits(memory_bytes=8 << 30, wall_s=600, cpu_s=300, calls_per_child=200)
+"""The largest map, 8192 x 4096 in float32, takes 403 MB, and its mip levels six times as much."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AcceptedMaps:
+    """The user's textures and environment maps that scenes may use."""
+
+    rows: tuple[tuple[LockedObject, Path], ...] = ()
+    """Every usable texture and map with its prepared file."""
+    failures: tuple[Failure, ...] = ()
+    """Reasons why other files cannot be used, or not fully."""
+
+
+NO_MAPS = AcceptedMaps()
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapFolders:
+    """Folders of the user's textures and environment maps."""
+
+    folders: tuple[tuple[str, str], ...] = ()
+    """Pairs of a kind (TEXTURE or SKY) and a folder."""
+    licence: str | None = None
+    """Licence that the user states for folders without a catalogue."""
+
+
+NO_FOLDERS = MapFolders()
+
+
+def map_folders(order: DatasetOrder, settings: BuildSettings) -> MapFolders:
+    """Return the folders of textures and maps that the options name.
+
+    Raises:
+        TrilightError: a folder is given that no scene would use, or scenes need a folder that is
+            not given.
+    """
+    scenes = settings.scenes
+    shares = {
+        TEXTURE: (order.textures, "textures", scenes.textures.share, scenes.textures.own_share),
+        SKY: (order.skies, "skies", scenes.skies.share, scenes.skies.own_share),
+    }
+    for folder, name, share, own_share in shares.values():
+        used = bool(share and own_share)
+        if folder is None and used:
+            raise TrilightError(
+                f"scenes.{name}.own_share is {own_share:g}, but --{name} is not given; expected a "
+                f"folder. Add --{name} FOLDER, or --set scenes.{name}.own_share=0."
+            )
+        if folder is not None and not used:
+            raise TrilightError(
+                f"--{name} is given, but scenes.{name}.share is {share:g} and own_share "
+                f"{own_share:g}; expected both above 0. Add --set scenes.{name}.share=0.5 "
+                f"--set scenes.{name}.own_share=1, or leave --{name} out."
+            )
+    return MapFolders(
+        folders=tuple((kind, entry[0]) for kind, entry in shares.items() if entry[0] is not None),
+        licence=order.map_licence,
+    )
+
+
+def accept_maps(user_folders: MapFolders, settings: BuildSettings, *, workers: int) -> AcceptedMaps:
+    """Prepare the textures and maps of folders.
+
+    Args:
+        user_folders: the folders.
+        settings: the build: sizes, licences and splits.
+        workers: number of files that are decoded at the same time.
+
+    Raises:
+        TrilightError: a folder is missing or empty, none of its files can be used, or the cache
+            cannot be written.
+    """
+    rows: list[tuple[LockedObject, Path]] = []
+    failures: list[Failure] = []
+    for kind, folder in user_folders.folders:
+        listing = find_maps(
+            kind, folder, licence=user_folders.licence, allowed_licences=settings.allowed_licences
+        )
+        outcomes = _prepare_maps(kind, listing.maps, settings, workers)
+        usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
+        failures += [
+            _unread_failure(locked, path) for locked, path in usable if _notes(path).exists()
+        ]
+        lost = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
+        failures += [*listing.failures, *lost]
+        if not usable:
+            first = (*lost, *listing.failures)[0]
+            raise TrilightError(
+                f"{PLURALS[kind]}: none of {len(lost) + len(listing.failures)} files can be used; "
+                f"the first is {first.item}: {first.reason} ({first.message}). Fix or replace it."
+            )
+        _warn_of_maps(kind, [locked for locked, _ in usable], lost)
+        rows += usable
+    return AcceptedMaps(rows=tuple(rows), failures=tuple(failures))
+
+
+def _prepare_maps(
+    kind: str, maps: Sequence[FoundMap], settings: BuildSettings, workers: int
+) -> list[tuple[LockedObject, Path] | Failure]:
+    scenes = settings.scenes
+    size = scenes.textures.surfaces.size if kind == TEXTURE else scenes.skies.maps.height
+    all_files = reach(files=(path for user_map in maps for path in user_map.files.values()))
+    pool = ChildPool(
+        lambda _: IsolatedChild(limits=_LIMITS, setup=_no_setup, confined_to=all_files), workers
+    )
+
+    def prepare(user_map: FoundMap) -> tuple[LockedObject, Path] | Failure:
+        try:
+            with pool.borrow() as child:
+                path = _prepare_file(MapFiles(kind=kind, files=user_map.files, size=size), child)
+            return _lock_entry(kind, user_map, path, settings), path
+        except Rejected as rejection:
+            uid = user_map.record.uid
+            reason = rejection.reason
+            return Failure(stage="objects", item=uid, reason=reason, message=rejection.message)
+
+    try:
+        with ThreadPoolExecutor(workers) as threads:
+            return list(threads.map(prepare, maps))
+    finally:
+        pool.close()
+
+
+def _notes(prepared: Path) -> Path:
+    """Return the path of the note on unread parts of a prepared file; absent if there are none."""
+    return prepared.with_suffix(".txt")
+
+
+def _unread_failure(locked: LockedObject, path: Path) -> Failure:
+    message = _notes(path).read_text("utf-8")
+    return Failure(stage="objects", item=locked.uid, reason="not_read", message=message)
+
+
+def _no_setup() -> None:
+    """Do nothing: the child needs no setup."""
+
+
+def _prepare_file(map_files: MapFiles, child: IsolatedChild) -> Path:
+    """Prepare a file in a child unless the cache has it; return its path. Raises Rejected."""
+    name = outcome_name(map_files)
+    path = cache_folder("maps") / name[:2] / f"{name}.safetensors"
+    if not path.exists():
+        try:
+            data, unread = call_with_retries(child, prepare_map, map_files)
+        except ChildFailed as failure:
+            raise Rejected(failure.reason, failure.sentence) from failure
+        if outcome_name(map_files) != name:
+            raise Rejected("unreadable_file", "it changed while it was being prepared")
+        if unread:
+            message = printable(f"it is used without {'; '.join(unread)}")
+            write_atomically(_notes(path), message.encode())
+        write_atomically(path, data)
+    return path
+
+
+def _lock_entry(kind: str, user_map: FoundMap, path: Path, settings: BuildSettings) -> LockedObject:
+    data = path.read_bytes()
+    record = user_map.record
+    return LockedObject(
+        uid=record.uid,
+        asset_sha256=sha256_hex(data),
+        split=split_of_object(decode_prepared(data, path.name).content_sha256, settings.splits),
+        licence=record.licence,
+        licence_source=record.licence_source,
+        title=record.title,
+        attribution=record.attribution,
+        source_url=record.source_url,
+        kind=kind,
+    )
+
+
+def _warn_of_maps(kind: str, locked: Sequence[LockedObject], lost: Sequence[Failure]) -> None:
+    if lost:
+        first = lost[0]
+        log.warning(
+            "%s: %d cannot be used, such as %s (%s: %s); failures.jsonl names all",
+            PLURALS[kind],
+            len(lost),
+            first.item,
+            first.reason,
+            first.message,
+        )
+    without = [split for split in SPLITS if split not in {entry.split for entry in locked}]
+    if without and {entry.split for entry in locked} != {"test"}:
+        log.warning(
+            "%s: of %d, none belongs to %s, whose scenes get procedural ones; about 30 different "
+            "ones are enough for every split",
+            PLURALS[kind],
+            len(locked),
+            " and ".join(without),
+        )

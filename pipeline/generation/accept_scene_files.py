@@ -1,0 +1,196 @@
+"""Checks a folder of scene files and freezes the list of files that the dataset is made of."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.assets.settings import AssetSettings
+from pipeline.builds.settings import BuildSettings
+from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
+from pipeline.exchange.scene_files import SceneFiles, build_scene
+from pipeline.exchange.scene_folder import SceneFolder, require_usable
+from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.freeze_objects import AcceptedObjects, read_frozen_objects
+from pipeline.generation.prepare_isolated import asset_child
+from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
+from pipeline.objects.licences import StatedLicence, stated_licence
+from storage.dataset.progress import announce_objects, count_object
+from storage.dataset.splits import JUDGED_SPLIT
+from storage.errors import EnvironmentFailure, TrilightError
+from storage.records.objects import LockedObject
+
+
+def settings_for_files(
+    settings: BuildSettings, folder: SceneFolder | None, views: int | None
+) -> BuildSettings:
+    """Return the build's settings with the number of scenes and views of a folder.
+
+    Without a folder, the settings stay as they are.
+
+    Raises:
+        TrilightError: a file has fewer cameras than `views`, or there are no files.
+    """
+    if folder is None:
+        return settings
+    return dataclasses.replace(
+        settings,
+        scenes=dataclasses.replace(settings.scenes, num_views=folder.views(views)),
+        splits=dataclasses.replace(
+            settings.splits, one_split=True, listed_scenes=len(folder.names)
+        ),
+    )
+
+
+def accept_scene_files(
+    folder: SceneFolder,
+    licence: str | None,
+    settings: BuildSettings,
+    writer: DatasetWriter,
+) -> AcceptedObjects:
+    """Build every scene once, without rendering; the first run freezes their files.
+
+    A file that cannot become a scene is noted, and the files that it names are not frozen for it.
+
+    Raises:
+        TrilightError: no scene at all can be built, the licence is not allowed, or the files are
+            not those that the dataset was begun with.
+    """
+    stated = _require_allowed(stated_licence(licence), settings)
+    files = _build_all(folder, stated, settings, writer)
+    locked = [_lock_entry(uid, digest, stated) for uid, digest in sorted(files.sha256.items())]
+    frozen = read_frozen_objects(writer)
+    if frozen is None:
+        writer.lock_objects(locked)
+    else:
+        _require_same_files(frozen, locked)
+    return AcceptedObjects(
+        num_objects=len(locked),
+        num_found=len(locked),
+        files=files,
+    )
+
+
+def _build_all(
+    folder: SceneFolder, stated: StatedLicence, settings: BuildSettings, writer: DatasetWriter
+) -> SceneFiles:
+    """Build every scene; return digests of the usable files, and errors of the others."""
+    announce_objects(writer.folder, len(folder.names))
+    sha256: dict[str, str] = {}
+    notes: list[str] = []
+    unusable = dict(folder.unusable)
+    child = asset_child(reach(files=[folder.root]))
+    try:
+        for name in folder.names:
+            if name not in unusable:
+                try:
+                    built = _build_in_child(child, folder, name, settings)
+                    sha256 |= built.sha256
+                    notes += built.notes
+                except EnvironmentFailure:
+                    raise
+                except TrilightError as mistake:
+                    unusable[name] = str(mistake)
+            count_object(writer.folder)
+    finally:
+        child.close()
+    require_usable(folder.names, unusable)
+    return SceneFiles(
+        root=folder.root,
+        names=folder.names,
+        sha256=sha256,
+        unusable=unusable,
+        licence=stated.licence,
+        albedo_over_one=folder.albedo_over_one,
+        notes=(*notes, *(f"{name} is left out: {unusable[name].rstrip('.')}" for name in unusable)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuiltScene:
+    """Digests and notes of a scene that was built once as a check."""
+
+    sha256: Mapping[str, str]
+    """Digest of every file of the scene, by path below the folder."""
+    notes: tuple[str, ...]
+    """Notes for the user, such as unread fields and scaled albedos."""
+
+
+def build_once(
+    root: Path, name: str, settings: AssetSettings, num_views: int, over_one: AlbedoOverOne
+) -> BuiltScene:
+    """Build a scene; runs only in child processes. Raises TrilightError as `build_scene`."""
+    unread: list[str] = []
+    scene, sha256 = build_scene(
+        root,
+        name,
+        settings,
+        licence="",
+        num_views=num_views,
+        scene_index=0,
+        seed=0,
+        albedo_over_one=over_one,
+        notes=unread,
+    )
+    notes = tuple(f"{name}: {text}" for text in (*unread, *scaled_albedo_notes(scene)))
+    return BuiltScene(sha256=sha256, notes=notes)
+
+
+def _build_in_child(
+    child: IsolatedChild, folder: SceneFolder, name: str, settings: BuildSettings
+) -> BuiltScene:
+    """Build a scene in a child; raises TrilightError, or EnvironmentFailure for the machine."""
+    num_views = settings.scenes.num_views
+    try:
+        return call_with_retries(
+            child,
+            build_once,
+            folder.root,
+            name,
+            settings.assets,
+            num_views,
+            folder.albedo_over_one,
+        )
+    except ChildFailed as failure:
+        if failure.is_verdict:
+            raise TrilightError(
+                f"{name}: its meshes cannot be read ({failure}); fix or remove the file."
+            ) from failure
+        raise EnvironmentFailure(
+            f"{name}: its meshes could not be read this time ({failure}). Run the same command "
+            "again; if that does not help, see `trilight doctor`."
+        ) from failure
+
+
+def _require_allowed(stated: StatedLicence, settings: BuildSettings) -> StatedLicence:
+    if stated.licence.casefold() not in {name.casefold() for name in settings.allowed_licences}:
+        raise TrilightError(
+            f"--licence is {stated.licence}, which is not on the allow-list; if you may use the "
+            f"scenes, add --allow-licence '{stated.licence}'."
+        )
+    return stated
+
+
+def _lock_entry(uid: str, sha256: str, stated: StatedLicence) -> LockedObject:
+    return LockedObject(
+        uid=uid,
+        asset_sha256=sha256,
+        split=JUDGED_SPLIT,
+        licence=stated.licence,
+        licence_source=stated.licence_source,
+        title=uid,
+        attribution="",
+        source_url="",
+    )
+
+
+def _require_same_files(frozen: Mapping[str, LockedObject], now: list[LockedObject]) -> None:
+    by_uid = {entry.uid: entry for entry in now}
+    for uid in sorted({*frozen, *by_uid}):
+        if frozen.get(uid) != by_uid.get(uid):
+            state = "has changed" if uid in frozen and uid in by_uid else "is new"
+            raise TrilightError(
+                f"scene file {uid}: {'is missing' if uid not in by_uid else state}; expected the "
+                "files that the dataset was begun with (objects.lock.jsonl). Restore them, or "
+                "choose another --out."
+            )

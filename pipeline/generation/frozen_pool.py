@@ -1,0 +1,115 @@
+"""`FrozenPool`: the frozen objects of a dataset, read by index and opened when a scene draws them.
+
+A worker trusts the lock and the asset store: it starts without opening any object. A render child
+opens the one to three objects of its scene, checks their digests against the lock, and keeps a few
+open. If an object's file is missing on this machine, the worker prepares it again
+(`pipeline.generation.restore_object`).
+"""
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.assets.store import AssetStore
+from pipeline.scenes.budget import least_triangles
+from pipeline.scenes.fitting import FitTable
+from pipeline.scenes.pool import IndexedPool, PooledAsset
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.records.asset import decode_asset
+from storage.records.lock_rows import LockRows
+from storage.records.object_index import ObjectIndex
+
+_MOST_OPEN = 8
+"""Objects that a child keeps open for each split; most scenes have three at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrozenPool:
+    """Paths of a dataset's frozen objects; can be sent to another machine."""
+
+    lock: Path
+    """Path of objects.lock.jsonl in the dataset's folder."""
+    index: Path
+    """Path of the lock's index (storage.records.object_index)."""
+    source: str
+    """Source of the objects, for those that have to be prepared again."""
+    licence: str | None
+    """Licence that the user states for files without one."""
+
+    def open_split(self, split: str, store: AssetStore) -> "SplitPool":
+        """Return the objects of a split, sorted by uid; raises TrilightError without any."""
+        return SplitPool(self, split, store)
+
+
+class AssetMissing(Exception):
+    """The store lacks the prepared file of an object, or has another than the lock's.
+
+    Attributes:
+        uid: uid of the object.
+        asset_name: name of the missing file.
+    """
+
+    def __init__(self, uid: str, asset_name: str) -> None:
+        super().__init__(f"object {uid!r}: its prepared file is not in the asset store")
+        self.uid = uid
+        self.asset_name = asset_name
+
+
+class SplitPool(IndexedPool):
+    """The objects of one split, each opened on access."""
+
+    def __init__(self, frozen: FrozenPool, split: str, store: AssetStore) -> None:
+        index = ObjectIndex(frozen.index)
+        if split not in index.facts.splits:
+            raise TrilightError(f"split {split!r}: no frozen object belongs to it; expected one.")
+        rows = index.facts.splits[split]
+        self.fits = FitTable(
+            index.column("least", rows), index.column("camp", rows), index.facts.camps, rows.camps
+        )
+        self._offsets = index.column("offset", rows)
+        self._index = index
+        self._first = rows.start
+        self._split = split
+        self._lock = LockRows(frozen.lock)
+        self._store = store
+        self._open: OrderedDict[int, PooledAsset] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._offsets)
+
+    def __getitem__(self, row: int) -> PooledAsset:  # type: ignore[override]
+        """Return an object; read its file unless it is still open.
+
+        Raises:
+            AssetMissing: it has to be prepared again.
+            TrilightError: the index is not that of the lock.
+        """
+        if not 0 <= row < len(self):
+            raise IndexError(row)
+        if row not in self._open:
+            self._open[row] = self._read(row)
+            if len(self._open) > _MOST_OPEN:
+                self._open.popitem(last=False)
+        self._open.move_to_end(row)
+        return self._open[row]
+
+    def _read(self, row: int) -> PooledAsset:
+        locked = self._lock.at(int(self._offsets[row : row + 1][0]))
+        name = self._index.asset_name(self._first + row)
+        try:
+            data = self._store.asset_path(name).read_bytes()
+        except FileNotFoundError as error:
+            raise AssetMissing(locked.uid, name) from error
+        if sha256_hex(data) != locked.asset_sha256:
+            raise AssetMissing(locked.uid, name)
+        asset = decode_asset(data)
+        pooled = PooledAsset(locked=locked, asset=asset)
+        stored = locked.split, least_triangles(asset), pooled.camp
+        if stored != (self._split, self.fits.size(row), self.fits.camp(row)):
+            raise TrilightError(
+                f"objects.index: says otherwise of {locked.uid!r} than objects.lock.jsonl and its "
+                "file; expected the index of this lock. Delete .staging/objects.index, and it is "
+                "made again."
+            )
+        return pooled

@@ -1,0 +1,195 @@
+"""Reports the contents of one scene and renders a turntable of it, in children with limits."""
+
+import dataclasses
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.open_scene import SceneSource, load_source
+from pipeline.exchange.reader import file_child, reach_of, unconfined_child
+from pipeline.isolation import ChildFailed, call_with_retries
+from pipeline.renders.settings import RenderSettings
+from pipeline.renders.variant import Variant, activate, choose_variant
+from storage.atomic import write_atomically
+from storage.conventions import look_at_c2w, preview_srgb8
+from storage.errors import Rejected, TrilightError
+from storage.records.lights import num_lights
+from storage.records.material import EMISSION, PUBLISHED_COLUMNS, unread_columns
+from storage.records.scene import Scene
+from storage.records.scene_file import scene_digest
+
+VIEWS = 8
+ROWS = 2
+"""Rows of pictures in a turntable."""
+
+_RESOLUTION = 192
+_SPP = 64
+_FOV_DEG = 40.0
+_ELEVATION_DEG = 25.0
+_ROOM_AROUND = 1.03
+"""Factor on the least camera distance from which the whole scene is within the picture."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InspectedScene:
+    """Facts about one scene, and notes of its reader."""
+
+    facts: Mapping[str, Any]
+    """Facts for the user as JSON values, by name, such as triangles and extent_m."""
+    notes: tuple[str, ...]
+    """Parts of the file that the reader could not convert."""
+
+
+def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene:
+    """Return facts about a scene, and write its turntable if a path is given.
+
+    Raises:
+        TrilightError: the source is unusable, or the sheet cannot be rendered or written.
+    """
+    if turntable is not None and turntable.suffix.lower() != ".png":
+        raise TrilightError(f"--turntable is {turntable}; expected the name of a file X.png.")
+    child = file_child(reach_of(source))
+    renderer = unconfined_child()
+    try:
+        inspected = call_with_retries(child, _facts, source)
+        if turntable is not None:
+            from pipeline.documents.png import encode_png
+
+            scene = call_with_retries(child, load_source, source).scene
+            sheet = call_with_retries(renderer, _turntable, scene, choose_variant())
+            write_atomically(turntable, encode_png(sheet))
+    except ChildFailed as failure:
+        raise TrilightError(f"{source.name}: cannot be inspected ({failure}).") from failure
+    except Rejected as rejection:
+        raise TrilightError(f"{source.name}: cannot be rendered ({rejection}).") from rejection
+    finally:
+        child.close()
+        renderer.close()
+    return inspected
+
+
+def _facts(source: SceneSource) -> InspectedScene:
+    loaded = load_source(source)
+    scene = loaded.scene
+    low = scene.vertex_positions.min(axis=0)
+    high = scene.vertex_positions.max(axis=0)
+    kinds = Counter(entry.kind for entry in scene.objects)
+    licences = Counter(scene.licences)
+    added = unread_columns(scene.materials, PUBLISHED_COLUMNS)
+    facts = {
+        "triangles": scene.num_triangles,
+        "vertices": len(scene.vertex_positions),
+        "objects": ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())),
+        "materials": len(scene.materials),
+        **({"added_columns": ", ".join(added)} if added else {}),
+        **_maps(scene),
+        "lights": num_lights(scene),
+        "cameras": ", ".join(f"{angle:.1f} deg" for angle in scene.fov_deg[:8]),
+        "views": scene.num_views,
+        "extent_m": " x ".join(f"{size:.3g}" for size in (high - low)),
+        "greatest_radiance": float(scene.materials[:, EMISSION].max()),
+        "licences": ", ".join(f"{count} {name}" for name, count in sorted(licences.items())),
+        "made_by": str(scene.provenance.get("template", "unknown")),
+        "scene_digest": scene_digest(scene),
+    }
+    return InspectedScene(facts=facts, notes=loaded.notes)
+
+
+def _maps(scene: Scene) -> dict[str, Any]:
+    """Return facts about textures and environment, if there are any."""
+    facts: dict[str, Any] = {}
+    if scene.textures:
+        sizes = (
+            f"{each.source.name or each.sha256[:8]} {each.texels.shape[1]} x {each.texels.shape[0]}"
+            for each in scene.textures[:8]
+        )
+        facts["textures"] = f"{len(scene.textures)}: {', '.join(sizes)}"
+    if (sky := scene.environment) is not None:
+        height, width, _ = sky.radiance_rgb.shape
+        facts["environment"] = (
+            f"{sky.source.name or sky.sha256[:8]} {width} x {height}, greatest radiance "
+            f"{float(sky.radiance_rgb.max()):.4g}, {'seen' if sky.is_seen else 'hidden'}"
+        )
+    return facts
+
+
+def _turntable(scene: Scene, variant: Variant) -> NDArray[np.uint8]:
+    """Return a sheet [H, W, 3] of the scene from all sides, lit by its own lights.
+
+    Walls between the camera and the objects are left out of a picture, and with them their light.
+    """
+    from pipeline.renders.renderer import SceneRenderer
+
+    activate(variant)
+    settings = RenderSettings(
+        resolution=_RESOLUTION,
+        noise_floor_db=99.0,
+        min_spp=_SPP,
+        max_spp=_SPP,
+        min_mean_radiance=0.0,
+    )
+    pictures = []
+    for pose in turntable_poses(scene):
+        renderer = SceneRenderer(seen_into(scene, pose), settings)
+        pictures.append(preview_srgb8(renderer.render_view(pose, _FOV_DEG, 0).radiance_rgb))
+    rows = [
+        np.concatenate(pictures[at * VIEWS // ROWS : (at + 1) * VIEWS // ROWS], axis=1)
+        for at in range(ROWS)
+    ]
+    return np.concatenate(rows, axis=0)
+
+
+def seen_into(scene: Scene, pose: NDArray[np.float32]) -> Scene:
+    """Return a scene without the triangles of its shell that hide its objects.
+
+    The planes of these triangles lie between the camera of the pose [4, 4] and the middle of the
+    objects.
+    """
+    shells = np.array([entry.kind == "shell" for entry in scene.objects])[scene.object_index]
+    inside = scene.vertex_positions[scene.faces[~shells & ~scene.triangle_emits]].reshape(-1, 3)
+    if not shells.any() or not len(inside):
+        return scene
+    middle = (inside.min(axis=0) + inside.max(axis=0)).astype(np.float64) / 2
+    corners = scene.vertex_positions[scene.faces].astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    before, within = (
+        np.einsum("ti,ti->t", normals, point - corners[:, 0])
+        for point in (pose[:3, 3].astype(np.float64), middle)
+    )
+    keep = ~(shells & (before * within < 0))
+    uv = None if scene.uv is None else scene.uv.reshape(-1, 3, 2)[keep].reshape(-1, 2)
+    return dataclasses.replace(
+        scene,
+        faces=scene.faces[keep],
+        material_index=scene.material_index[keep],
+        object_index=scene.object_index[keep],
+        uv=uv,
+    )
+
+
+def turntable_poses(scene: Scene) -> list[NDArray[np.float32]]:
+    """Return camera poses [4, 4] around all reflecting surfaces; each sees all of them."""
+    points = scene.vertex_positions[np.unique(scene.faces[~scene.triangle_emits])]
+    if not len(points):
+        points = scene.vertex_positions
+    middle = (points.min(axis=0) + points.max(axis=0)).astype(np.float64) / 2
+    tangent = math.tan(math.radians(_FOV_DEG) / 2)
+    poses = []
+    for azimuth in 2 * np.pi * np.arange(VIEWS) / VIEWS:
+        up = math.sin(math.radians(_ELEVATION_DEG))
+        flat = math.cos(math.radians(_ELEVATION_DEG))
+        direction = np.array([flat * math.sin(azimuth), -flat * math.cos(azimuth), up])
+        facing = look_at_c2w(eye=middle + direction, target=middle, up=[0, 0, 1])
+        # in the camera's axes about the middle: a nearer point has to lie nearer to the axis
+        local = np.einsum("pi,ij->pj", points - middle, facing[:3, :3])
+        distances = np.abs(local[:, :2]).max(axis=1) / tangent + local[:, 2]
+        distance = max(_ROOM_AROUND * float(distances.max()), 1e-3)
+        pose = look_at_c2w(eye=middle + distance * direction, target=middle, up=[0, 0, 1])
+        poses.append(pose.astype(np.float32))
+    return poses

@@ -1,0 +1,299 @@
+"""Runs the mesh stage alone: from a source of objects to clean meshes and a quality report."""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalise
+from pipeline.assets.preview import preview_both
+from pipeline.assets.recipe import RECIPE, library_versions
+from pipeline.assets.settings import AssetSettings
+from pipeline.assets.stage import PreparedAsset
+from pipeline.documents.attribution import encode_attribution
+from pipeline.documents.quality_page import Pair, encode_quality_page
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.generation.prepare_isolated import asset_child, prepare_isolated
+from pipeline.generation.unread_notes import UnreadNotes, write_unread
+from pipeline.isolation import ChildFailed, call_with_retries, reach
+from pipeline.objects.glb import encode_glb
+from pipeline.objects.ply import encode_ply
+from pipeline.objects.sources import find_objects
+from storage.atomic import write_atomically
+from storage.cache import cache_folder
+from storage.digests import canonical_json
+from storage.errors import TrilightError
+from storage.records.asset import AssetRow, Level, decode_asset
+from storage.records.objects import Failure, write_failures
+from storage.settings.described import settings_record
+
+_PICTURES = 4
+"""Objects in each of the groups worst, median and best."""
+_WIDTH_PX = 256
+
+
+@dataclass(frozen=True)
+class AssetFolder:
+    """The paths that `trilight assets` writes."""
+
+    root: Path
+    """The folder that `--out` names."""
+
+    @property
+    def summary(self) -> Path:
+        return self.root / "assets.json"
+
+    @property
+    def catalogue(self) -> Path:
+        return self.root / "objects.jsonl"
+
+    @property
+    def failures(self) -> Path:
+        return self.root / "failures.jsonl"
+
+    @property
+    def attribution(self) -> Path:
+        return self.root / "attribution.csv"
+
+    @property
+    def page(self) -> Path:
+        return self.root / "quality.html"
+
+    @property
+    def logs(self) -> Path:
+        return self.root / "logs"
+
+    @property
+    def meshes(self) -> Path:
+        return self.root / "meshes"
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssetReport:
+    """The result of the mesh stage for all objects of a source."""
+
+    rows: tuple[AssetRow, ...]
+    """The accepted objects, in the order of their uids."""
+    failures: tuple[Failure, ...]
+    """The rejected objects with their reasons."""
+    geometry_sha256: tuple[str, ...]
+    """Digest of the geometry of each written mesh, by which `generate` assigns it to a split."""
+    unread: UnreadNotes
+    """Unread parts of the accepted objects' files."""
+
+    @property
+    def num_repaired(self) -> int:
+        """Number of accepted objects with dropped or flipped triangles."""
+        return sum(row.source.repaired for row in self.rows)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return counts and one row per object."""
+        return {
+            "accepted": len(self.rows),
+            "repaired": self.num_repaired,
+            "rejected": len(self.failures),
+            "objects": [row.as_json() for row in self.rows],
+            "failures": [dataclasses.asdict(failure) for failure in self.failures],
+            "unread": dict(self.unread),
+        }
+
+
+def make_assets(
+    source: str,
+    folder: AssetFolder,
+    settings: AssetSettings,
+    *,
+    allowed_licences: Sequence[str],
+    licence: str | None,
+    workers: int,
+    on_download: Callable[[int, int], None],
+    on_plan: Callable[[int], None],
+    on_object: Callable[[], None],
+) -> AssetReport:
+    """Prepare the objects of a source and write the folder; a repeated call uses the asset store.
+
+    Args:
+        source: source of objects, as `find_objects` takes it.
+        folder: an empty folder, or one of an earlier call, which is replaced.
+        settings: settings of the mesh stage with one budget: the folder has one mesh per object.
+        allowed_licences: objects under other licences are rejected.
+        licence: licence of files that state none.
+        workers: number of objects that are prepared at the same time.
+        downloaded: called with the number of finished downloads and their total.
+        planned: called with the number of objects, once it is known.
+        done: called after each object, from any thread.
+
+    Raises:
+        TrilightError: the source is unusable, or the folder holds other files or cannot be
+            written.
+    """
+    if workers < 1:
+        raise TrilightError(f"workers is {workers}; expected at least 1.")
+    _require_ours(folder)
+    listed = find_objects(
+        source,
+        work_dir=cache_folder("objects"),
+        allowed_licences=allowed_licences,
+        licence=licence,
+        downloaded=on_download,
+    )
+    write_atomically(folder.summary, b"{}")  # from here on the folder is ours
+    on_plan(len(listed.records))
+    prepared, rejected = prepare_isolated(
+        list(listed.records), settings, workers=workers, done=on_object
+    )
+    levels = [_only_level(asset) for asset in prepared]
+    rows = [_row(asset, level) for asset, level in zip(prepared, levels, strict=True)]
+    report = AssetReport(
+        rows=tuple(rows),
+        failures=tuple(sorted([*listed.failures, *rejected], key=lambda row: row.item)),
+        geometry_sha256=tuple(map(_geometry_sha256, levels)),
+        unread={asset.record.uid: asset.unread for asset in prepared if asset.unread},
+    )
+    _write(folder, settings, report, levels)
+    pairs = _pairs(prepared, rows, levels, settings)
+    _write_page(folder, settings, report, pairs)
+    return report
+
+
+def _write_page(
+    folder: AssetFolder,
+    settings: AssetSettings,
+    report: AssetReport,
+    pairs: dict[str, list[Pair]],
+) -> None:
+    page = encode_quality_page(
+        report.rows,
+        report.failures,
+        pairs,
+        report.unread,
+        budget=settings.budgets[0],
+        target=_target(settings),
+    )
+    write_atomically(folder.page, page)
+
+
+def _require_ours(folder: AssetFolder) -> None:
+    if folder.root.exists() and not folder.root.is_dir():
+        raise TrilightError(f"{folder.root}: is a file; expected a folder. Choose another --out.")
+    if folder.root.is_dir() and any(folder.root.iterdir()) and not folder.summary.exists():
+        raise TrilightError(
+            f"{folder.root}: holds files that `trilight assets` did not write; expected a new or "
+            "empty folder. Choose another --out."
+        )
+
+
+def _target(settings: AssetSettings) -> str:
+    within = "" if settings.epsilon is None else f"fewest within {settings.epsilon:.2%}, "
+    return f"{settings.profile}, {within}at most {settings.budgets[0]} triangles"
+
+
+def _only_level(asset: PreparedAsset) -> Level:
+    (level,) = decode_asset(asset.path.read_bytes()).levels
+    return level
+
+
+def _geometry_sha256(level: Level) -> str:
+    """Return the digest that the mesh stage would compute for the written file of a level."""
+    positions = level.positions.astype(np.float64)
+    faces = level.faces.astype(np.int64)
+    return geometry_sha256(clean(normalise(TriangleMesh(positions=positions, faces=faces))))
+
+
+def _row(prepared: PreparedAsset, level: Level) -> AssetRow:
+    record = prepared.record
+    asset = decode_asset(prepared.path.read_bytes())
+    return AssetRow(
+        uid=record.uid,
+        path=f"meshes/{_file_name(record.uid, '.ply' if level.skin is None else '.glb')}",
+        title=record.title,
+        licence=record.licence,
+        licence_source=record.licence_source,
+        attribution=record.attribution,
+        source_url=record.source_url,
+        num_faces=len(level.faces),
+        method=level.record.method,
+        quality=level.record.quality,
+        source=asset.source,
+        materials=asset.materials,
+        colours=None if level.skin is None else level.skin.quality,
+    )
+
+
+def _file_name(uid: str, suffix: str) -> str:
+    """Return a file name that is safe on every system: a uid is untrusted text."""
+    readable = re.sub(r"[^A-Za-z0-9]+", "-", uid).strip("-")[-60:]
+    return f"{readable}-{hashlib.sha256(uid.encode()).hexdigest()[:8]}{suffix}"
+
+
+def _encode_mesh(level: Level) -> bytes:
+    """Return a mesh as a PLY file, or as GLB if it has its own materials."""
+    if level.skin is None:
+        return encode_ply(level.positions, level.faces)
+    return encode_glb(level.positions, level.faces, level.skin.uv, level.skin.textures)
+
+
+def _write(
+    folder: AssetFolder, settings: AssetSettings, report: AssetReport, levels: list[Level]
+) -> None:
+    for row, level in zip(report.rows, levels, strict=True):
+        write_atomically(folder.root / row.path, _encode_mesh(level))
+    written = {folder.root / row.path for row in report.rows}
+    for path in (*folder.meshes.glob("*.ply"), *folder.meshes.glob("*.glb")):
+        if path not in written:
+            path.unlink()
+    lines = [canonical_json(row.as_json()) + b"\n" for row in report.rows]
+    write_atomically(folder.catalogue, b"".join(lines))
+    write_failures(folder.failures, report.failures)
+    write_unread(folder.logs, report.unread)
+    write_atomically(folder.attribution, encode_attribution(report.rows))
+    summary = {
+        "accepted": len(report.rows),
+        "repaired": report.num_repaired,
+        "rejected": len(report.failures),
+        "recipe": RECIPE,
+        "libraries": library_versions(),
+        "settings": settings_record(settings),
+    }
+    write_atomically(folder.summary, json.dumps(summary, indent=1, sort_keys=True).encode())
+
+
+def _pairs(
+    prepared: list[PreparedAsset],
+    rows: list[AssetRow],
+    levels: list[Level],
+    settings: AssetSettings,
+) -> dict[str, list[Pair]]:
+    """Return pictures of source and result for the worst, the median and the best objects."""
+    changed = sorted(
+        (i for i, row in enumerate(rows) if row.method != "source" or row.colours is not None),
+        key=lambda index: (-rows[index].quality.error_p99, rows[index].uid),
+    )
+    middle = max(0, len(changed) // 2 - _PICTURES // 2)
+    groups = {
+        "Worst": changed[:_PICTURES],
+        "Median": changed[middle : middle + _PICTURES],
+        "Best": changed[-_PICTURES:],
+    }
+    pairs: dict[str, list[Pair]] = {name: [] for name in groups}
+    child = asset_child()
+    try:
+        for name, indices in groups.items():
+            for i in indices:
+                path = prepared[i].record.path
+                child.allow_files(reach(files=[Path(path)]))
+                with contextlib.suppress(ChildFailed):  # a missing picture must not stop the run
+                    source, result = call_with_retries(
+                        child, preview_both, path, settings, levels[i], _WIDTH_PX
+                    )
+                    pairs[name].append(Pair(row=rows[i], source=source, result=result))
+    finally:
+        child.close()
+    return pairs

@@ -1,0 +1,343 @@
+"""Batches of objects: divides the mesh stage among all workers, without preparing any twice.
+
+A batch is some dozens of objects that follow each other in the order of their uids, which alone
+decide where it ends: one more object changes one batch. Workers claim batches as they claim scenes,
+through the bucket if there is one; a kill loses the batches in hand. The result of a batch is a
+small file whose name is a digest of all its inputs. It lies beside the dataset for the other
+workers, and in the user's cache for later datasets. A worker that finds it prepares no object.
+"""
+
+import contextlib
+import json
+import time
+import uuid
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.assets.recipe import READERS, RECIPE
+from pipeline.assets.settings import AssetSettings
+from pipeline.assets.stage import PreparedAsset
+from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.prepare_isolated import MeshWork
+from pipeline.isolation import is_transient
+from pipeline.objects.listing import SUFFIXES, Fetched
+from storage.atomic import write_atomically
+from storage.cache import cache_folder
+from storage.claims import WaitNotice
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
+from storage.records.asset import least_triangles_in
+from storage.records.objects import Failure, ObjectRecord
+
+_CACHE = "object-batches"
+"""Folder of the user's cache with results for later datasets."""
+_NUM_OBJECTS = 32
+"""Mean number of objects of a batch: about one core-minute if nothing is cached."""
+_SELF_CONTAINED = (".off", ".stl", ".usdz")
+"""Suffixes of files that refer to no others; for other files the neighbors count too, for a PLY
+only if its pictures are read."""
+_LAYERS = (".usd", ".usda", ".usdc")
+"""Suffixes of files that may refer to other object files."""
+_PAUSES_S = (0.2, 10.0)
+"""Shortest and longest seconds between two looks at other workers' batches; the pause doubles."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparedObject:
+    """An object that the mesh stage has accepted, here or on another machine."""
+
+    record: ObjectRecord
+    """Identity and rights of the object."""
+    asset_name: str
+    """Name of the prepared file in the asset store."""
+    asset_sha256: str
+    """Digest of the prepared file."""
+    geometry_sha256: str
+    """Digest of the object's cleaned geometry."""
+    least_triangles: int
+    """Number of triangles of the coarsest level."""
+    without_own: str = ""
+    """Reason code for missing materials of its own, if they were requested."""
+    unread: tuple[str, ...] = ()
+    """Unread parts of the object's file, in short sentences."""
+
+
+PrepareResult = tuple[list[PreparedObject], list[Failure]]
+Fetch = Callable[[list[ObjectRecord]], Fetched]
+
+
+def prepared_object(asset: PreparedAsset) -> PreparedObject:
+    """Return the record of an asset whose prepared file is on this machine."""
+    return PreparedObject(
+        record=asset.record,
+        asset_name=asset.path.stem,
+        asset_sha256=asset.asset_sha256,
+        geometry_sha256=asset.geometry_sha256,
+        least_triangles=least_triangles_in(asset.path),
+        without_own=asset.without_own,
+        unread=asset.unread,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectWork:
+    """The input that all batches of a dataset share."""
+
+    settings: AssetSettings
+    """Settings of the mesh stage."""
+    writer: DatasetWriter
+    """Writer of the dataset that the objects are prepared for."""
+    fetch: Fetch | None = None
+    """Downloads objects to this machine; None if their files are local."""
+    _folders: dict[tuple[Path, bool], str] = field(default_factory=dict)
+    """Digests of the folders that were hashed."""
+
+    def name(self, records: Sequence[ObjectRecord], *, are_here: bool) -> str:
+        """Return the file name of a batch's result; `are_here` says that its files are local."""
+        named = self.settings.own_materials.keep
+        of_objects = [_facts(record, are_here, self._folders, named) for record in records]
+        facts = [of_objects, asdict(self.settings), RECIPE, READERS]
+        digest = sha256_hex(canonical_json(facts))[:32]
+        return f"{digest[:2]}/{digest}.jsonl"
+
+
+class ObjectBatch:
+    """A batch of objects and the file with its result."""
+
+    def __init__(self, records: list[ObjectRecord], work: ObjectWork) -> None:
+        self.records = records
+        self._work = work
+        name = work.name(records, are_here=work.fetch is None)
+        self._file = work.writer.folder.staged_batches / name
+        """Result in the dataset's folder, for its other workers."""
+        self.claim_file = self._file.with_suffix(".claim")  # as Publication.claim has it
+        self._cached = cache_folder(_CACHE) / name if work.fetch is None else None
+        """Result in the user's cache; None for remote objects until they have been downloaded."""
+        self._by_uid = {record.uid: record for record in records}
+
+    def result(self) -> PrepareResult | None:
+        """Return the result of the batch, in the order of its objects; None if unknown yet."""
+        try:
+            if result := self._read(self._file):
+                return result
+        except PermissionError as error:
+            raise TrilightError(
+                f"{self._file}: {error.strerror}; expected a file that every worker of the "
+                "dataset may read. Make them members of one group that may read its folder, or "
+                "run as one user."
+            ) from error
+        with contextlib.suppress(PermissionError):  # another user's cache
+            return self._read(self._cached) if self._cached else None
+        return None
+
+    def make(self, meshes: MeshWork, done: Callable[[int], None]) -> bool:
+        """Prepare the objects unless another worker does or has done so; return True if done here.
+
+        Args:
+            meshes: children for the mesh stage.
+            done: called with the number of objects that were just prepared or rejected.
+        """
+        writer = self._work.writer
+        with writer.claim(self._file) as ours:
+            if not ours or self.result() is not None:
+                return False
+            records, lost = self._fetch()
+            done(len(lost))
+            if result := self.result():
+                done(len(records))
+            else:
+                assets, failures = meshes.prepare(records, lambda: done(1))
+                result = [*map(prepared_object, assets)], [*failures, *lost]
+            is_final = not _may_change(result[1])
+            data = _encode(result)
+            if is_final and self._cached:
+                write_atomically(self._cached, data)
+            write_atomically(self._file, data)
+            if is_final:
+                writer.upload(self._file)
+        return True
+
+    def forget_transient(self) -> None:
+        """Delete a result with transient failures, so that these objects are tried again."""
+        result = self.result()
+        if result is not None and _may_change(result[1]):
+            self._file.unlink(missing_ok=True)
+
+    def _fetch(self) -> Fetched:
+        if self._work.fetch is None:
+            return self.records, []
+        records, lost = self._work.fetch(self.records)
+        records = sorted(records, key=lambda record: record.uid)
+        if not lost:
+            self._cached = cache_folder(_CACHE) / self._work.name(records, are_here=True)
+        return records, lost
+
+    def _read(self, path: Path) -> PrepareResult | None:
+        try:
+            return self._decode([json.loads(line) for line in path.read_bytes().splitlines()])
+        except FileNotFoundError:
+            return None
+        except (KeyError, TypeError, ValueError):
+            path.unlink(missing_ok=True)  # damaged: it is made again
+            return None
+
+    def _decode(self, rows: Iterable[dict[str, Any]]) -> PrepareResult:
+        prepared = list[PreparedObject]()
+        failures = list[Failure]()
+        for row in rows:
+            if "reason" in row:
+                failures.append(Failure(**row))
+            else:
+                record = self._by_uid[row.pop("uid")]
+                unread = tuple(row.pop("unread", ()))
+                prepared.append(PreparedObject(record=record, unread=unread, **row))
+        if len(prepared) + len(failures) != len(self.records):
+            raise ValueError("rows are missing")
+        return prepared, failures
+
+
+def cut_objects(records: Sequence[ObjectRecord]) -> list[list[ObjectRecord]]:
+    """Cut records, sorted by uid, into batches; the uids alone decide where."""
+    batches: list[list[ObjectRecord]] = []
+    for record in records:
+        is_first = int(sha256_hex(record.uid.encode())[:8], 16) % _NUM_OBJECTS == 0
+        if not batches or is_first or len(batches[-1]) == 2 * _NUM_OBJECTS:
+            batches.append([])
+        batches[-1].append(record)
+    return batches
+
+
+def prepare_in_batches(
+    records: Sequence[ObjectRecord],
+    work: ObjectWork,
+    *,
+    workers: int,
+    done: Callable[[int], None],
+    should_stop: Callable[[], bool] = lambda: False,
+    retry_transient: bool = True,
+) -> PrepareResult:
+    """Prepare objects together with all other workers; return when all are done.
+
+    Args:
+        records: objects, sorted by uid.
+        work: input that the batches share.
+        workers: number of objects that are prepared here at the same time.
+        done: called with a number of objects that are done, here or elsewhere; from any thread.
+        should_stop: returns True if the remaining objects are no longer needed.
+        retry_transient: try objects again that failed for a transient reason before.
+
+    Returns:
+        The accepted objects and the rejected ones, both in the order of `records`.
+
+    Raises:
+        TrilightError: as `prepare_assets`, or the dataset cannot be written.
+    """
+    batches = [ObjectBatch(batch, work) for batch in cut_objects(records)]
+    if retry_transient:
+        for batch in batches:
+            batch.forget_transient()
+    results: dict[int, PrepareResult] = {}
+    ours: set[int] = set()
+
+    def make(number: int) -> bool:
+        return not should_stop() and batches[number].make(meshes, done)
+
+    order = _random_order(len(batches))
+    at_once = 1 + -(-workers // _NUM_OBJECTS)  # no child waits for the last object of a batch
+    # children end first: after Ctrl-C no thread waits for the objects that it has in hand
+    with ThreadPoolExecutor(at_once) as threads, MeshWork(work.settings, workers) as meshes:
+        pause_s = _PAUSES_S[0]
+        notice = WaitNotice()
+        while True:
+            for number in _collect_results(batches, results) - ours:
+                done(len(batches[number].records))
+            missing = [number for number in order if number not in results]
+            if not missing or should_stop():
+                break
+            tried = zip(missing, threads.map(make, missing), strict=True)
+            made = [number for number, is_ours in tried if is_ours]
+            ours.update(made)
+            if made:
+                pause_s = _PAUSES_S[0]
+                notice = WaitNotice()
+            else:  # others are at them
+                notice.update(batches[missing[0]].claim_file)
+                time.sleep(pause_s)
+                pause_s = min(2 * pause_s, _PAUSES_S[1])
+    ordered = [result for _, result in sorted(results.items())]
+    return [one for some, _ in ordered for one in some], [f for _, some in ordered for f in some]
+
+
+def _random_order(count: int) -> list[int]:
+    """Return batch numbers from a random first one: to find a claimed batch costs a look."""
+    first = uuid.uuid4().int % count if count else 0
+    return [*range(first, count), *range(first)]
+
+
+def _collect_results(batches: Sequence[ObjectBatch], results: dict[int, PrepareResult]) -> set[int]:
+    """Add the results that are new to `results`; return the numbers of their batches."""
+    new = set()
+    for number, batch in enumerate(batches):
+        if number not in results and (result := batch.result()) is not None:
+            results[number] = result
+            new.add(number)
+    return new
+
+
+def _may_change(failures: Iterable[Failure]) -> bool:
+    """Return True if a later run may succeed: after failed downloads and transient failures."""
+    return any(failure.stage == "objects" or is_transient(failure.reason) for failure in failures)
+
+
+def _encode(result: PrepareResult) -> bytes:
+    """Return a result as a file; the digest in its name covers the rights of objects."""
+    prepared, failures = result
+    rows = [*map(_row, prepared), *map(asdict, failures)]
+    return b"".join(canonical_json(row) + b"\n" for row in rows)
+
+
+def _row(one: PreparedObject) -> dict[str, Any]:
+    left_out = {"record"} if one.unread else {"record", "unread"}
+    row = {name: value for name, value in vars(one).items() if name not in left_out}
+    return {"uid": one.record.uid, **row}
+
+
+def _facts(
+    record: ObjectRecord, is_here: bool, folders: dict[tuple[Path, bool], str], with_pictures: bool
+) -> list[Any]:
+    """Return the inputs of a result as JSON values: the record, and the state of a local file.
+
+    `folders` caches digests of folders.
+    """
+    facts = asdict(record)
+    path = Path(facts.pop("path"))
+    root = facts.pop("root")
+    if not is_here:
+        return [facts]
+    fetched = path.is_relative_to(cache_folder(""))  # its time is that of the download
+    suffix = path.suffix.lower()
+    alone = fetched or suffix in _SELF_CONTAINED or (suffix == ".ply" and not with_pictures)
+    folder = Path(root) if root and with_pictures else path.parent
+    neighbors = "" if alone else _digest_neighbors(folder, suffix in _LAYERS, folders)
+    return [facts, path.suffix, *_state(path, fetched), neighbors]
+
+
+def _state(path: Path, fetched: bool) -> list[int]:
+    try:
+        status = path.stat()
+    except OSError:
+        return []
+    return [status.st_size, 0 if fetched else status.st_mtime_ns]
+
+
+def _digest_neighbors(folder: Path, layers: bool, folders: dict[tuple[Path, bool], str]) -> str:
+    """Return a digest of the files of a folder that an object in it may refer to."""
+    if (folder, layers) not in folders:
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        named = [path for path in files if layers or path.suffix.lower() not in SUFFIXES]
+        states = [[str(path.relative_to(folder)), *_state(path, False)] for path in named]
+        folders[folder, layers] = sha256_hex(canonical_json(states))
+    return folders[folder, layers]

@@ -1,0 +1,284 @@
+"""The whole pipeline on one page: from a source of objects to a dataset for training.
+
+    step       what comes out                                        who does it
+    ---------  ----------------------------------------------------  ------------------------------
+    objects    files whose licence allows their use                  pipeline.objects.sources
+    meshes     the same objects, cleaned, with fewer triangles       pipeline.assets.stage
+    scenes     meshes with a room, materials, lights and cameras     pipeline.scenes.compose
+    renders    a picture of each camera, down to the noise floor     pipeline.renders.renderer
+    shards     tars of finished scenes, the same bytes everywhere    pipeline.shards.pack
+    documents  card, report and contact sheet for readers            pipeline.documents
+
+The objects are frozen after the mesh stage (scene files instead, if scenes come from files; the
+objects of a finished dataset, if its scenes are revisited). From then on scene k is a function of
+the settings, the frozen objects and k alone, whichever worker makes it. A `Runner` makes many
+scenes at the same time (`make_shards`): on threads, in a Slurm array, with Prefect, on a Dask
+cluster (pipeline.executors.registry lists them). Native code runs in child processes, so that a
+crash costs one attempt.
+
+The files on disk are the only state, and every step may be killed at any moment. A mesh is kept in
+the asset store, a scene in the staging folder, a shard in the dataset; the next run looks for these
+and makes the rest. Several runs on one folder share the work (storage.claims), and those on one
+bucket share batches of objects (storage.remote.claims) and shards (pipeline.shards.bucket_mirror).
+"""
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from pipeline.builds.named import object_source
+from pipeline.builds.settings import BuildSettings
+from pipeline.documents.dataset_documents import write_documents
+from pipeline.documents.sheets import write_first_pictures
+from pipeline.generation.accept_maps import MapFolders, map_folders
+from pipeline.generation.accept_objects import (
+    accept_objects,
+    load_trusted_objects,
+    prepare_unfrozen_objects,
+)
+from pipeline.generation.accept_revisited import accept_revisited
+from pipeline.generation.accept_scene_files import accept_scene_files
+from pipeline.generation.attempt_scene import MAX_ATTEMPTS, attempt_scene
+from pipeline.generation.bucket_dataset_writer import hold_membership
+from pipeline.generation.dataset_order import DatasetOrder, generate_words
+from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.freeze_objects import AcceptedObjects
+from pipeline.generation.machine import available_cores
+from pipeline.generation.object_options import ObjectOptions
+from pipeline.generation.render_children import (
+    close_children,
+    cores_of_child,
+    render_child,
+    scene_reader,
+)
+from pipeline.generation.restore_object import restore_object
+from pipeline.generation.run import (
+    Outcome,
+    Run,
+    ShardJob,
+    TaskResult,
+    Watcher,
+    begin_or_resume_dataset,
+    resolve_settings,
+)
+from pipeline.generation.runner import Runner
+from pipeline.generation.tasks import Piece, iter_rounds_until_done
+from pipeline.generation.unfinished_shard import UnfinishedShard
+from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
+from storage.dataset.asked import write_asked
+from storage.dataset.layout import dataset_folder
+from storage.dataset.manifest import ShardEntry
+from storage.dataset.statistics import Statistics
+from storage.errors import Rejected, TrilightError
+from storage.records.objects import Failure
+from storage.records.sample import Sample, sample_key
+from storage.records.scene import Scene
+
+
+def make_dataset(
+    order: DatasetOrder, runner: Runner, watch: Watcher = lambda run, outcome: None
+) -> Outcome:
+    """Make a dataset: all its missing shards, or those of a range.
+
+    Args:
+        order: the dataset, and the range of shards to make.
+        runner: runs the tasks.
+        watch: called after each task.
+
+    Raises:
+        TrilightError: an error that the user can fix; finished scenes stay on disk.
+    """
+    with _begin_run(order) as run:  # objects, meshes
+        make_shards(run, runner, watch)  # scenes, renders, shards
+        finished = run.publication.finish()
+        run.require_within_budget()
+        statistics = None
+        if finished and not run.publication.left_to_others:
+            statistics = runner.finish(lambda: make_documents(run.publication))
+    return run.outcome(finished, statistics)
+
+
+def prepare_dataset(order: DatasetOrder) -> Run:
+    """Begin a dataset and freeze its objects, without rendering; raises as `make_dataset`."""
+    with _begin_run(order) as run:
+        return run
+
+
+@contextlib.contextmanager
+def _begin_run(order: DatasetOrder) -> Iterator[Run]:
+    """Join a dataset's workers and yield the run; the first worker freezes the objects."""
+    folder = dataset_folder(order.place)
+    folder = replace(folder, root=Path(os.path.realpath(folder.root)))
+    settings, listed = resolve_settings(
+        order, folder
+    )  # refuses an order before anything is written
+    with hold_membership(folder):
+        user_folders = map_folders(order, settings)
+        writer = begin_or_resume_dataset(order, settings, folder)
+        if listed or order.revisits:
+            with folder.mutex("objects"):
+                writer.refresh()
+                accepted = (
+                    accept_scene_files(listed, order.licence, settings, writer)
+                    if listed
+                    else accept_revisited(order.revisits or "", settings, writer)
+                )
+        else:
+            accepted = _accept_together(order, settings, writer, user_folders)
+        write_asked(folder, generate_words(order))
+        yield Run(
+            order=order,
+            settings=settings,
+            scene_folder=listed,
+            publication=writer,
+            accepted=accepted,
+        )
+
+
+def _accept_together(
+    order: DatasetOrder, settings: BuildSettings, writer: DatasetWriter, user_folders: MapFolders
+) -> AcceptedObjects:
+    """Return the frozen objects; prepare them with the other workers if they are not frozen."""
+    options = ObjectOptions(
+        source=object_source(settings, order.objects),
+        licence=order.licence,
+        settings=settings,
+        writer=writer,
+        workers=available_cores(),
+        user_folders=user_folders,
+    )
+    if trusted := load_trusted_objects(options):
+        return trusted
+    listed = prepare_unfrozen_objects(options)
+    with writer.folder.mutex("objects"):  # one worker freezes, and the others load the result
+        writer.refresh()
+        return accept_objects(options, listed)
+
+
+def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:
+    """Turn frozen meshes into shards: the runner calls `make_task` for many tasks in parallel."""
+    writer = run.publication
+    job = run.job(runner.num_at_once or run.num_workers())
+    try:
+        for this_round in iter_rounds_until_done(run, at_once=runner.window or job.num_at_once):
+            for outcome in runner.run(this_round.tasks, job):  # parallel from here
+                this_round.record(outcome)
+                for shard in outcome.shards:
+                    writer.add_shard(shard)
+                watch(run, outcome)
+                run.require_within_budget()
+    finally:
+        close_children()
+
+
+def make_task(job: ShardJob, pieces: tuple[Piece, ...]) -> TaskResult:
+    """Make the scenes of some pieces, and pack the shards that are complete then.
+
+    A runner calls this for each task, on a thread, in another process or on another machine.
+    Finished scenes are not made again.
+
+    Raises:
+        TrilightError: the output cannot be written, or this machine would make other bytes.
+    """
+    started = time.monotonic()
+    with render_child(job) as child, scene_reader(job) as read:
+        made = [make_piece(job, piece, child, read) for piece in pieces]
+    seconds = time.monotonic() - started
+    return TaskResult(
+        shards=tuple(shard for _, shard in made if shard),
+        scenes=sum(scenes for scenes, _ in made),
+        seconds=seconds,
+        core_s=seconds * cores_of_child(job),
+    )
+
+
+def make_piece(
+    job: ShardJob,
+    piece: Piece,
+    child: IsolatedChild,
+    read: Callable[[int], Scene] | None = None,
+) -> tuple[int, ShardEntry | None]:
+    """Make the missing scenes of a piece, and pack its shard if that is complete then.
+
+    Scenes claimed by other workers are skipped; the worker that stages the last scene packs. A
+    scene that cannot be made is no error: the shard omits it, and failures.jsonl has the reason.
+
+    Returns:
+        Number of scenes made or given up here, and the shard if this call packed it.
+    """
+    splits = job.settings.splits
+    profile = job.settings.storage.profile
+    shard = UnfinishedShard(job.folder, splits, piece.shard_index)
+    scenes = 0
+    attempts = 1 if read else MAX_ATTEMPTS  # a file is always the same
+    for scene_index in range(piece.first, piece.last):
+        with shard.claim(scene_index) as ours:
+            if not ours:
+                continue
+            began = time.monotonic()
+            restore = partial(restore_object, job)
+            sample, failures = make_scene(shard.split, scene_index, attempts, child, restore, read)
+            shard.stage(
+                scene_index, sample, failures, profile, began=began, cores=cores_of_child(job)
+            )
+            scenes += 1
+            if sample and not job.folder.contact_sheet.exists():
+                build = job.settings.build
+                with contextlib.suppress(TrilightError):  # a courtesy must not end the run
+                    write_first_pictures(job.folder, sample, build=build, split=shard.split)
+    return scenes, shard.pack()
+
+
+def make_scene(
+    split: str,
+    scene_index: int,
+    attempts: int,
+    child: IsolatedChild,
+    restore: Callable[[str, str], None],
+    read: Callable[[int], Scene] | None = None,
+) -> tuple[Sample | None, list[Failure]]:
+    """Compose and render a scene: return the sample of the first accepted attempt, and failures.
+
+    In the child, `attempt_scene` composes the scene and renders its views; a scene of a file is
+    read in another child, by `read`. If a child is killed, crashes or takes too long, the same
+    attempt is repeated in a new one. If the prepared file of an object is missing, `restore` makes
+    it again for the same attempt.
+    """
+    failures: list[Failure] = []
+    for attempt in range(attempts):
+        key = sample_key(scene_index)
+        try:
+            from_file = (read(scene_index),) if read else ()
+            tried = call_with_retries(child, attempt_scene, split, scene_index, attempt, *from_file)
+            while tried.missing_asset:
+                restore(*tried.missing_asset)
+                tried = call_with_retries(child, attempt_scene, split, scene_index, attempt)
+        except (ChildFailed, Rejected) as error:
+            if isinstance(error, Rejected):
+                stage = "scenes"
+                reason = error.reason
+                why = error.message
+            else:
+                why = f"{error.reason}: {error.sentence}"
+                stage = "renders"
+                reason = "environmental_skip"
+            failures.append(
+                Failure(stage=stage, item=key, reason=reason, message=why, attempt=attempt)
+            )
+            continue
+        failures += tried.failures
+        if tried.sample:
+            return tried.sample, failures
+    return None, failures
+
+
+def make_documents(writer: DatasetWriter) -> Statistics:
+    """Write the documents of all shards; one worker at a time."""
+    with writer.folder.mutex("documents"):
+        statistics = write_documents(writer.dataset(), writer.folder)
+        writer.upload_documents()
+        return statistics

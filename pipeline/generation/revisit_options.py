@@ -1,0 +1,141 @@
+"""`trilight revisit`: converts its options to options of the new dataset."""
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pipeline.builds.revisit import MOST_CAMERAS, GivenCamera, RevisitSettings
+from pipeline.exchange.open_scene import load_cameras, scene_source
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.renders.settings import NoiseFloor, Resolution
+from pipeline.shards.finished_dataset import open_finished
+from scene_templates.templates import TEMPLATES
+from storage.errors import TrilightError
+from storage.settings.described import checked, settings_record
+from storage.settings.ranges import Seed, Share, Within
+
+_DRAWN = re.compile(r"(?P<layout>\w+):(?P<count>\d{1,6})")
+_CAMERAS = (
+    "expected keep; a number, such as 4, for so many views of each scene, those that it has first; "
+    "new:4 for new cameras only; a layout and a number, such as plane:4; or a file with cameras"
+)
+_LIGHTS = "expected keep, new, or a number of new lights, such as 3"
+
+
+@checked()
+class RevisitOptions:
+    """The finished dataset, and the changes to its scenes."""
+
+    dataset: str
+    """Folder of a finished dataset."""
+    out: str
+    """Folder of the new dataset, or a bucket such as s3://bucket/folder. Run the same command again
+    to resume."""
+    cameras: str = "keep"
+    """Cameras of each scene: keep; a number, such as 4, for so many, those that it has first; new:4
+    for new ones only; plane:4 for new ones as another layout has them; or a file with cameras
+    (RenderFormer JSON, USD, or any scene), the same for every scene."""
+    lights: str = "keep"
+    """Lights of each scene: keep; new for as many drawn anew; or a number of new ones, such as 3.
+    `--set scenes.lights.NAME=VALUE` changes what they are drawn from."""
+    materials: Literal["keep", "new"] = "keep"
+    """Materials of each scene: keep, or new for ones drawn anew. `--set
+    scenes.materials.NAME=VALUE` changes what they are drawn from."""
+    seed: Seed | None = None
+    """Seed of all that is drawn anew, and of the samples: with another one, every picture is
+    rendered again; by default the dataset's."""
+    resolution: Resolution | None = None
+    """Width of a picture in pixels; by default the dataset's."""
+    noise_floor_db: NoiseFloor | None = None
+    """Sampling stops at this measured noise floor in dB (psnr_log_db); by default as the dataset
+    was made."""
+    noise_floor_linear_db: NoiseFloor | None = None
+    """The same as psnr_linear_db; by default as the dataset was made. Of several floors, all are
+    reached."""
+    noise_floor_objects_db: NoiseFloor | None = None
+    """The same as object_psnr_log_db; by default as the dataset was made."""
+    build: str | None = None
+    """Build that fills in settings which the dataset does not state, since it was merged; by
+    default the dataset's own."""
+    workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
+    """Number of render processes, which share the cores; by default one, or one for each graphics
+    card."""
+    failure_budget: Share = 0.1
+    """Share of scenes that may fail for good before the run stops."""
+    accept_environment: bool = False
+    """Continue a dataset that was started with other library versions."""
+    shards: str | None = None
+    """Range A:B of the shards to make, from A up to but not including B; by default all."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Changes to the dataset's settings, by dotted name, such as storage.passes=[depth,normal]
+    (values are JSON); by default there are none."""
+
+
+def revisit_order(options: RevisitOptions) -> DatasetOrder:
+    """Return the options of the new dataset, without the settings of the finished one.
+
+    Raises:
+        TrilightError: the dataset is unfinished, or an option is malformed.
+    """
+    manifest = open_finished(options.dataset).manifest
+    revisit = RevisitSettings(
+        source_digest=manifest.dataset_digest,
+        **_cameras(options.cameras, manifest.num_views),
+        **_lights(options.lights),
+        materials=options.materials,
+    )
+    return DatasetOrder(
+        build=options.build or manifest.build,
+        revisits=os.path.realpath(options.dataset),
+        out=options.out,
+        seed=options.seed,
+        resolution=options.resolution,
+        noise_floor_db=options.noise_floor_db,
+        noise_floor_linear_db=options.noise_floor_linear_db,
+        noise_floor_objects_db=options.noise_floor_objects_db,
+        workers=options.workers,
+        failure_budget=options.failure_budget,
+        accept_environment=options.accept_environment,
+        shards=options.shards,
+        changes={**options.changes, "revisit": settings_record(revisit)},
+    )
+
+
+def _cameras(words: str, num_views: int) -> dict[str, Any]:
+    if words == "keep":
+        return {"kept_cameras": num_views}
+    if words.isascii() and words.isdecimal():
+        count = int(words)
+        return {
+            "kept_cameras": min(count, num_views),
+            "new_cameras": max(0, count - num_views),
+        }
+    drawn = _DRAWN.fullmatch(words)
+    if drawn and drawn["layout"] == "new":
+        return {"kept_cameras": 0, "new_cameras": int(drawn["count"])}
+    if drawn and drawn["layout"] in TEMPLATES:
+        layout = drawn["layout"]
+        count = int(drawn["count"])
+        return {"kept_cameras": 0, "new_cameras": count, "camera_layout": layout}
+    if Path(words).is_file():
+        c2w, fov_deg = load_cameras(scene_source(words))
+        if len(c2w) > MOST_CAMERAS:
+            raise TrilightError(f"--cameras {words}: {len(c2w)}; expected up to {MOST_CAMERAS}.")
+        cameras = tuple(
+            GivenCamera(c2w=tuple(pose.ravel().tolist()), fov_deg=float(angle))
+            for pose, angle in zip(c2w, fov_deg, strict=True)
+        )
+        return {"kept_cameras": 0, "given_cameras": cameras}
+    layouts = ", ".join(TEMPLATES)
+    raise TrilightError(f"--cameras is {words!r}; {_CAMERAS} (layouts: {layouts}).")
+
+
+def _lights(words: str) -> dict[str, Any]:
+    if words in ("keep", "new"):
+        return {"lights": words}
+    if words.isascii() and words.isdecimal():
+        return {"lights": "new", "num_lights": int(words)}
+    raise TrilightError(f"--lights is {words!r}; {_LIGHTS}.")

@@ -1,0 +1,229 @@
+"""Records that the steps of `pipeline.generation.pipeline` pass to each other."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.builds.named import BUILDS, frozen_note, named_build, object_source
+from pipeline.builds.settings import BuildSettings
+from pipeline.exchange.scene_folder import SceneFolder, find_scene_files
+from pipeline.generation.accept_revisited import settings_for_revisit
+from pipeline.generation.accept_scene_files import settings_for_files
+from pipeline.generation.bucket_dataset_writer import begin_dataset
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.environment import environment
+from pipeline.generation.freeze_objects import AcceptedObjects
+from pipeline.generation.machine import children_of_gpu, gpu_memory_bytes, visible_gpus
+from pipeline.objects.sources import look_at_source
+from pipeline.renders.variant import choose_variant
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, ShardEntry
+from storage.dataset.splits import lacks_validation
+from storage.dataset.statistics import Statistics
+from storage.errors import TrilightError
+from storage.records.objects import Failure
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Run:
+    """A dataset that has begun, with its objects frozen: the input of every later step."""
+
+    order: DatasetOrder
+    """The command's options."""
+    settings: BuildSettings
+    """The build with the options' changes."""
+    scene_folder: SceneFolder | None
+    """The scene files, where scenes come from files."""
+    publication: DatasetWriter
+    """Writes the manifest and publishes finished shards."""
+    accepted: AcceptedObjects
+    """The frozen objects, textures, skies or scene files that scenes are made of."""
+
+    def missing_shards(self) -> list[int]:
+        """Return the numbers of the requested shards that are not finished."""
+        return self.publication.missing_shards(self.order.shard_range())
+
+    def num_workers(self) -> int:
+        """Return the number of parallel tasks of one process; an executor may set another."""
+        if self.order.workers is not None:
+            return self.order.workers
+        if choose_variant().name != "cuda_ad_rgb":
+            return 1
+        num_gpus = max(1, len(visible_gpus()))
+        return num_gpus * children_of_gpu(self.settings.renders.resolution, gpu_memory_bytes())
+
+    def job(self, num_at_once: int) -> "ShardJob":
+        """Return the job that all tasks of this run share; one process runs `num_at_once` tasks."""
+        manifest = self.publication.manifest
+        return ShardJob(
+            folder=self.publication.folder,
+            settings=self.settings,
+            environment={} if self.order.accept_environment else manifest.environment,
+            accepted=self.accepted,
+            lock_sha256=manifest.objects_lock_sha256,
+            num_at_once=num_at_once,
+            extensions=manifest.extensions,
+        )
+
+    def outcome(self, finished: Manifest | None, statistics: Statistics | None) -> "Outcome":
+        """Return the result of the run; a finished dataset adds its digest and statistics."""
+        writer = self.publication
+        listed = self.scene_folder
+        notes: tuple[str, ...] = ()
+        if listed and self.accepted.files:
+            notes = (*self.accepted.files.notes, *listed.notes(self.settings.scenes.num_views))
+        elif statistics and self.order.revisits is None:
+            notes = frozen_note(self.order.build, statistics)
+            splits = self.settings.splits
+            num_scenes = writer.manifest.num_scenes
+            if lacking := lacks_validation(num_scenes, splits):
+                notes += (lacking,)
+        return Outcome(
+            digest=finished.dataset_digest if finished else "",
+            num_objects_found=self.accepted.num_found,
+            num_objects_used=self.accepted.num_objects,
+            num_scenes_given_up=writer.progress.given_up,
+            failures=tuple(writer.failures),
+            num_shards=len(finished.shards) if finished else writer.num_finished_shards(),
+            num_shards_planned=writer.num_shards,
+            statistics=statistics,
+            notes=notes,
+        )
+
+    def require_within_budget(self) -> None:
+        """Raise TrilightError if too many scenes failed: in this run, at the end in all runs.
+
+        Scene files that cannot become a scene do not count.
+        """
+        writer = self.publication
+        files = self.accepted.files
+        num_scenes = writer.manifest.num_scenes
+        budget = self.order.failure_budget
+        given_up = writer.progress.given_up
+        if given_up > budget * num_scenes + (len(files.unusable) if files else 0):
+            writer.add_failures(writer.failures)
+            raise TrilightError(
+                f"{writer.folder.display_name}: {given_up} of {num_scenes} scenes could not be "
+                "made, "
+                f"more than the failure budget of {budget:.0%}. The reasons are in "
+                f"{writer.folder.failures.name}; fix them, or raise --failure-budget."
+            )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShardJob:
+    """The input that all tasks of a run share; it can be sent to another machine."""
+
+    folder: DatasetFolder
+    """The dataset, at the same path on every machine."""
+    settings: BuildSettings
+    """Settings of the dataset, with all changes applied."""
+    environment: Mapping[str, Any]
+    """Environment of the dataset's first run, required of every worker; empty to accept any."""
+    accepted: AcceptedObjects
+    """The frozen objects; a prepared file that is missing in the user's cache is made again."""
+    lock_sha256: str
+    """Digest of the frozen objects."""
+    num_at_once: int
+    """Tasks at a time in one process; they share its cores."""
+    extensions: Mapping[str, str]
+    """Extensions of the dataset's first run, required of every worker (storage.extensions)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskResult:
+    """The result of one task."""
+
+    shards: tuple[ShardEntry, ...]
+    """The shards that the task packed."""
+    scenes: int
+    """Scenes that the task made or gave up, without those that were finished before."""
+    seconds: float
+    """Wall time of the task."""
+    core_s: float
+    """Wall time multiplied by the cores of the render child."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """The result of a run."""
+
+    digest: str
+    """The dataset digest; empty where the dataset is not finished."""
+    num_objects_found: int
+    """Objects in the source, or the files that scenes are made of."""
+    num_objects_used: int
+    """Objects that scenes may draw from."""
+    num_scenes_given_up: int
+    """Scenes whose every attempt failed; only those of this run while the dataset is unfinished."""
+    failures: tuple[Failure, ...]
+    """Rejections of this run that are not in `failures.jsonl` yet."""
+    num_shards: int
+    """Finished shards, as far as this machine knows."""
+    num_shards_planned: int
+    """Shards of the finished dataset."""
+    statistics: Statistics | None
+    """Statistics of the dataset; None if it is unfinished, or another machine writes the
+    documents."""
+    notes: tuple[str, ...] = ()
+    """Notes for the user: unknown fields of scene files, unused cameras, and whether a frozen set
+    is the published one."""
+
+
+Watcher = Callable[[Run, TaskResult], None]
+"""Called after each task."""
+
+
+def resolve_settings(
+    order: DatasetOrder, folder: DatasetFolder
+) -> tuple[BuildSettings, SceneFolder | None]:
+    """Return the dataset's settings, and the scene files if scenes come from files.
+
+    Raises:
+        TrilightError: the settings contradict each other, or the source or files are unusable.
+    """
+    settings = named_build(
+        order.build,
+        seed=order.seed,
+        resolution=order.resolution,
+        noise_floor_db=order.noise_floor_db,
+        noise_floor_linear_db=order.noise_floor_linear_db,
+        noise_floor_objects_db=order.noise_floor_objects_db,
+        allow_licences=order.allow_licences,
+        changes=order.changes,
+    )
+    if order.revisits is not None or settings.revisit is not None:
+        return settings_for_revisit(settings, order.revisits), None
+    source = object_source(settings, order.objects)
+    files = order.scenes_from
+    listed = None if files is None else find_scene_files(files, order.albedo_over_one)
+    if listed is None and not folder.manifest.exists():
+        look_at_source(source, allowed_licences=settings.allowed_licences, licence=order.licence)
+    return settings_for_files(settings, listed, order.views), listed
+
+
+def begin_or_resume_dataset(
+    order: DatasetOrder, settings: BuildSettings, folder: DatasetFolder
+) -> DatasetWriter:
+    """Begin a dataset, or resume the one in its folder.
+
+    Raises:
+        TrilightError: the dataset was begun with other options, lacks the requested shards, or
+            cannot be rendered here.
+    """
+    variant = choose_variant()
+    writer = begin_dataset(
+        folder,
+        settings,
+        environment(variant),
+        BUILDS[order.build].num_scenes if order.scenes is None else order.scenes,
+        accept_environment=order.accept_environment,
+    )
+    requested = order.shard_range()
+    if requested is not None and requested.start >= writer.num_shards:
+        raise TrilightError(
+            f"shards is {order.shards!r}; expected one that begins below {writer.num_shards}, "
+            f"the shards of {writer.manifest.num_scenes} scenes."
+        )
+    return writer

@@ -1,0 +1,40 @@
+"""`ViewProgress`: a render child writes the progress of a scene's views to the dataset's folder."""
+
+import time
+from collections.abc import Generator
+
+from pipeline.renders.results import RenderedView, Sampling
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.progress import forget_views, tell_views
+
+_EVERY_S = 0.5
+"""Seconds between two writes."""
+
+
+class ViewProgress:
+    """Reports the progress of one scene; never affects the output."""
+
+    def __init__(self, folder: DatasetFolder | None, scene_index: int) -> None:
+        self._folder = folder
+        self._scene_index = scene_index
+        self._written_s = 0.0
+
+    def render_view(
+        self, view: int, steps: Generator[Sampling, None, RenderedView]
+    ) -> RenderedView:
+        """Render view number `view`, from 0, and report progress; raises as the renderer does."""
+        while True:
+            try:
+                now = next(steps)
+            except StopIteration as end:
+                rendered: RenderedView = end.value
+                return rendered
+            if self._folder is not None and time.monotonic() - self._written_s >= _EVERY_S:
+                self._written_s = time.monotonic()
+                fraction = min(1.0, now.spp / now.expected_spp)
+                tell_views(self._folder, self._scene_index, view + fraction)
+
+    def end(self) -> None:
+        """Delete the progress of the scene."""
+        if self._folder is not None:
+            forget_views(self._folder, self._scene_index)

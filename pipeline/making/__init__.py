@@ -1,1 +1,0 @@
-"""The engine that makes datasets, without Prefect: files are the truth."""

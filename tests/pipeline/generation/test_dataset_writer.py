@@ -1,0 +1,294 @@
+"""A dataset is begun once, refuses to become another, and grows without changing what is there."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from pipeline.builds.named import named_build
+from pipeline.builds.settings import BuildSettings
+from pipeline.generation import dataset_writer
+from pipeline.generation.begin_dataset import begin
+from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.objects.generated import generate_objects
+from pipeline.shards.pack import pack_shard
+from storage.dataset import layout
+from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import index_shard, read_manifest
+from storage.dataset.progress import read_progress
+from storage.dataset.settings import SplitSettings
+from storage.dataset.shard import scan_members
+from storage.dataset.shard_notes import note_of
+from storage.dataset.splits import scenes_of_shard, shard_name
+from storage.dataset.staging import is_staged, stage_scene
+from storage.dataset.verify import verify_dataset
+from storage.errors import TrilightError
+from storage.records.objects import Failure, LockedObject
+from storage.records.sample import Sample, sample_key
+from tests.for_each import for_each
+from tests.pipeline.documents.dataset_by_hand import locked
+from tests.scenes_by_hand import tiny_sample, tiny_scene
+
+ENVIRONMENT = {"mitsuba_variant": "llvm_ad_rgb", "libraries": {"mitsuba": "3.9.1"}}
+
+
+def _build() -> BuildSettings:
+    build = named_build("smoke", resolution=16)
+    return dataclasses.replace(build, scenes=dataclasses.replace(build.scenes, num_views=2))
+
+
+def _begin(root: Path, build: BuildSettings, scenes: int = 4, **environment: str) -> DatasetWriter:
+    return begin(
+        DatasetFolder(root), build, {**ENVIRONMENT, **environment}, scenes, accept_environment=False
+    )
+
+
+def _locked() -> LockedObject:
+    return locked("a")
+
+
+def _sample(index: int) -> Sample:
+    return dataclasses.replace(tiny_sample(seed=index), key=sample_key(index))
+
+
+def make_tiny_shard(writer: DatasetWriter, index: int) -> None:
+    """Make a shard of four tiny scenes, each with one rejection."""
+    build = _build()
+    folder, name = writer.folder, shard_name(index, build.splits)
+    for scene in scenes_of_shard(index, build.splits):
+        failure = Failure(stage="scenes", item=sample_key(scene), reason="no_camera", message="x")
+        profile = build.storage.profile
+        stage_scene(folder.staged_shard(name), scene, _sample(scene), [failure], profile)
+    writer.add_shard(pack_shard(folder, name, scenes_of_shard(index, build.splits)))
+
+
+def begin_tiny(root: Path, scenes: int) -> DatasetWriter:
+    """Begin a dataset of tiny scenes, four to a shard, two views each."""
+    return _begin(root, _build(), scenes)
+
+
+def _dataset(root: Path, scenes: int = 8) -> DatasetWriter:
+    build = _build()
+    writer = _begin(root, build, scenes)
+    writer.lock_objects([_locked()])
+    for index in writer.missing_shards():
+        make_tiny_shard(writer, index)
+    writer.finish()
+    return writer
+
+
+def test_the_digest_knows_nothing_of_place_or_order(tmp_path: Path) -> None:
+    forwards = _dataset(tmp_path / "a").manifest
+    build = _build()
+    backwards = _begin(tmp_path / "b", build, 8)
+    backwards.lock_objects([_locked()])
+    for index in (1, 0):
+        make_tiny_shard(backwards, index)
+    assert backwards.finish() == backwards.manifest
+    assert backwards.manifest.dataset_digest == forwards.dataset_digest
+    assert backwards.manifest == forwards
+
+
+def test_as_many_scenes_are_planned_as_are_asked_for(tmp_path: Path) -> None:
+    writer = _begin(tmp_path, _build(), 5)
+    assert writer.manifest.num_scenes == 5
+    assert writer.missing_shards() == [0, 1]
+    done = writer.progress
+    assert (done.shards, done.shards_requested, done.scenes_requested) == (0, 2, 5)
+
+
+def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Path) -> None:
+    _dataset(tmp_path)
+    other = named_build("smoke", resolution=32, seed=3)
+    other = dataclasses.replace(other, scenes=_build().scenes)
+    with pytest.raises(TrilightError, match=r"renders.resolution was 16, now 32 \(and 1 more\)"):
+        _begin(tmp_path, other)
+    with pytest.raises(TrilightError, match="mitsuba_variant was 'llvm_ad_rgb', now 'scalar_rgb'"):
+        _begin(tmp_path, _build(), mitsuba_variant="scalar_rgb")
+    elsewhere = {**ENVIRONMENT, "mitsuba_variant": "scalar_rgb"}
+    begin(DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True)
+
+
+def test_a_shard_that_missed_the_manifest_is_found(tmp_path: Path) -> None:
+    """A kill between the shard's rename and its note's, or the manifest's, leaves it so."""
+    whole = _dataset(tmp_path / "a").manifest
+    writer = _begin(tmp_path / "b", _build(), 8)
+    writer.lock_objects([_locked()])
+    for index in range(2):
+        make_tiny_shard(writer, index)
+    note_of(writer.folder, whole.shards[0].name).unlink()
+    assert open_dataset(str(tmp_path / "b")).manifest.shards == whole.shards[1:]
+    later = _begin(tmp_path / "b", _build(), 8)
+    assert later.missing_shards() == []
+    assert later.finish() == whole == open_dataset(str(tmp_path / "b")).manifest
+
+
+def test_a_deleted_shard_is_made_again(tmp_path: Path) -> None:
+    whole = _dataset(tmp_path).manifest
+    (tmp_path / whole.shards[1].name).unlink()
+    assert any("missing" in problem for problem in verify_dataset(tmp_path).problems)
+    assert _dataset(tmp_path).manifest == whole
+    assert verify_dataset(tmp_path).problems == []
+
+
+@for_each("fast", [False, True])
+def test_damage_is_named(tmp_path: Path, fast: bool) -> None:
+    shard = _dataset(tmp_path).manifest.shards[0]
+    name = shard.name
+    with (tmp_path / name).open("rb") as stream:
+        *_, last = scan_members(stream, name)
+    data = bytearray((tmp_path / name).read_bytes())
+    data[last.offset + last.num_bytes // 2] ^= 1
+    (tmp_path / name).write_bytes(data)
+    problems = verify_dataset(tmp_path, fast=fast).problems
+    assert fast == (not problems)  # a changed byte is seen only by its hash
+    assert all(problem.startswith(name) for problem in problems)
+    (tmp_path / name).write_bytes(data[:-512])
+    assert verify_dataset(tmp_path, fast=fast).problems
+
+
+def _make_again(writer: DatasetWriter, samples: list[Sample]) -> None:
+    """Replace the first shard by one of these samples."""
+    name = shard_name(0, _build().splits)
+    for index, sample in enumerate(samples):
+        again = dataclasses.replace(sample, key=sample_key(index))
+        stage_scene(writer.folder.staged_shard(name), index, again, [], "lossless")
+    writer.folder.shard(name).unlink()  # the first writer of a shard wins
+    writer.add_shard(pack_shard(writer.folder, name, range(len(samples))))
+    writer.finish()
+
+
+def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
+    writer = _dataset(tmp_path, 4)
+    writer.lock_objects([dataclasses.replace(_locked(), split="test")])
+    assert verify_dataset(tmp_path).problems == []  # the tiny scenes use no object
+    scene = tiny_scene()
+    used = dataclasses.replace(scene.objects[0], kind="object", uid="a")
+    sample = dataclasses.replace(_sample(0), scene=tiny_scene(objects=(used, *scene.objects[1:])))
+    _make_again(writer, [sample] * 4)
+    assert "belongs to split test" in verify_dataset(tmp_path).problems[0]
+
+
+@for_each("name", ["README.md", "LICENSE.md"])
+def test_documents_of_others_are_not_replaced(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("theirs")
+    with pytest.raises(TrilightError, match=rf"{name} is there.*another --out"):
+        _begin(tmp_path, _build())
+    assert not (tmp_path / "manifest.json").exists()
+    (tmp_path / "train-000000.tar").write_bytes(b"")
+    with pytest.raises(TrilightError, match=r"shards but no manifest\.json"):
+        _begin(tmp_path, _build())
+
+
+def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None:
+    writer = _dataset(tmp_path, 4)
+    licences = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC-BY-SA-3.0")
+    rows = [dataclasses.replace(_locked(), uid=uid) for uid in "abc"]
+    writer.lock_objects(rows)
+    scene = tiny_scene()
+    floor = scene.objects[0]
+    samples = []
+    for index in range(4):
+        used = [
+            dataclasses.replace(floor, name=uid, kind="object", uid=uid, licence=licence)
+            for uid, licence in zip("abc", licences, strict=True)
+        ][index % 2 :]
+        objects = (*scene.objects, *used)
+        samples.append(dataclasses.replace(_sample(index), scene=tiny_scene(objects=objects)))
+    _make_again(writer, samples)
+    problems = [text for text in verify_dataset(tmp_path).problems if "share-alike" in text]
+    assert [problem.split(":")[1] for problem in problems] == [
+        " sample 000000000", " sample 000000002",
+    ]  # fmt: skip
+    assert "CC-BY-SA-3.0 and CC-BY-SA-4.0 meet" in problems[0]
+
+
+def test_a_shard_in_the_folder_of_a_worker_alone_is_no_shard(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such a run would go on for ever: what is packed would be missing again and again."""
+    pauses: list[float] = []
+    elsewhere = _dataset(tmp_path / "worker", 4).manifest.shards[0]
+    writer = _begin(tmp_path / "here", _build(), 4)
+    monkeypatch.setattr(dataset_writer.time, "sleep", pauses.append)
+    with pytest.raises(TrilightError, match="a worker has packed .* folder is not this one"):
+        writer.add_shard(elsewhere)
+    assert sum(pauses) > 60  # a network file system may keep a listing for a minute
+    assert writer.missing_shards() == [0]
+
+    def appear(seconds: float) -> None:
+        name = elsewhere.name
+        (tmp_path / "here" / name).write_bytes((tmp_path / "worker" / name).read_bytes())
+
+    monkeypatch.setattr(dataset_writer.time, "sleep", appear)
+    writer.add_shard(elsewhere)
+    assert open_dataset(str(tmp_path / "here")).manifest.shards == (elsewhere,)
+
+
+@pytest.fixture()
+def two_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two files in a folder stand for 4,096: the rule is the same."""
+    monkeypatch.setattr(layout, "FILES_PER_FOLDER", 2)
+
+
+def _most_entries(root: Path) -> int:
+    folders = [root, *(path for path in root.rglob("*") if path.is_dir())]
+    return max(sum(1 for _ in folder.glob("[a-z0-9]*[0-9].*")) for folder in folders)
+
+
+def test_the_first_shards_stay_where_the_design_has_them() -> None:
+    splits = SplitSettings(scenes_per_shard=4)
+    assert shard_name(0, splits) == "train-000000.tar"
+    assert shard_name(4093, splits) == "test-004093.tar"
+    assert shard_name(4096, splits) == "part-0001/train-004096.tar"
+    assert shard_name(999_999, splits) == "part-0244/train-999999.tar"
+
+
+@pytest.mark.usefixtures("two_each")
+def test_a_dataset_in_parts_is_whole(tmp_path: Path) -> None:
+    """Shards, rejections and logs move together; reading and verifying find them."""
+    writer = _dataset(tmp_path, scenes=20)
+    shards = writer.manifest.shards
+    names = [shard.name for shard in shards]
+    assert names == [
+        "train-000000.tar", "train-000001.tar", "part-0001/validation-000002.tar",
+        "part-0001/train-000003.tar", "part-0002/train-000004.tar",
+    ]  # fmt: skip
+    assert read_manifest(tmp_path / "manifest.json") == writer.manifest
+    found = verify_dataset(tmp_path)
+    assert (found.problems, found.num_samples) == ([], 20)
+    dataset = open_dataset(str(tmp_path))
+    keys = [s.key for shard in dataset.manifest.shards for s in dataset.read_shard(shard)]
+    assert keys == [sample_key(index) for index in range(20)]
+    assert _most_entries(tmp_path) == 2
+    assert writer.missing_shards() == []
+    assert read_progress(writer.folder).scenes_done == 20
+    path = tmp_path / names[3]
+    moved = path.rename(tmp_path / "away")
+    assert verify_dataset(tmp_path).problems == ["part-0001/train-000003.tar: missing"]
+    assert writer.missing_shards() == [3]
+    moved.rename(path)
+    assert index_shard(path) == shards[3]
+    path.with_name("train-000009.tar").write_bytes(b"")
+    assert verify_dataset(tmp_path).problems == ["part-0001/train-000009.tar: not in the manifest"]
+
+
+@pytest.mark.usefixtures("two_each")
+def test_staged_scenes_and_built_in_objects_stand_in_parts(tmp_path: Path) -> None:
+    for index in range(5):
+        stage_scene(tmp_path / "shard", index, _sample(index), [], "lossless")
+    assert all(is_staged(tmp_path / "shard", index) for index in range(5))
+    objects = generate_objects("builtin:30", tmp_path / "objects")
+    assert len({entry.uid for entry in objects}) == 30
+    assert all("part" not in entry.uid for entry in objects)
+    assert _most_entries(tmp_path) == 2
+
+
+def test_two_workers_are_kept_apart(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path)
+    with folder.hold_exclusively():
+        with pytest.raises(TrilightError, match="another process"), folder.hold_exclusively():
+            pass
+    with folder.hold_exclusively():
+        pass

@@ -1,0 +1,378 @@
+"""merge, select and reshard of finished datasets: what goes in comes out, once, with its maps."""
+
+import dataclasses
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pytest
+
+from pipeline.generation.derive_dataset import derive_dataset
+from pipeline.shards.derive import DeriveOptions, derive_shards
+from pipeline.shards.finished_dataset import open_finished
+from pipeline.shards.pack import pack_shard
+from pipeline.shards.plans import Selection
+from storage.dataset import layout
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.derived import derivation_of
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, index_shard, write_manifest
+from storage.dataset.shard import contents_of, write_shard
+from storage.dataset.staging import read_staged_scene, stage_scene
+from storage.dataset.verify import verify_dataset
+from storage.digests import sha256_hex
+from storage.records.objects import (
+    Failure,
+    LockedObject,
+    encode_objects_lock,
+    read_failures,
+    read_objects_lock,
+    write_failures,
+    write_objects_lock,
+)
+from storage.records.profiles import Profile
+from storage.records.sample import Sample, encode_sample, sample_key
+from storage.records.scene import Scene
+from tests.for_each import for_each
+from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample
+from tests.textured_by_hand import (
+    colour_texture,
+    number_texture,
+    sky,
+    textured_sample,
+    textured_scene,
+)
+
+SETTINGS = {
+    "build": "smoke",
+    "renders": {"noise_floor_db": 40.0, "max_spp": 256, "resolution": 16},
+    "scenes": {"max_triangles": 9},
+    "splits": {"scenes_per_shard": 2},
+}
+TRAIN_OBJECT = dataclasses.replace(locked("a"), asset_sha256="a" * 64)
+TEST_OBJECT = dataclasses.replace(locked("c", "CC-BY-4.0", split="test"), asset_sha256="c" * 64)
+
+
+def lit(index: int, salt: int, uids: Sequence[str], template: str = "plane") -> Sample:
+    """Return a sample whose scene no other (index, salt) has; floors rise with the index."""
+    scene: Scene = furnished(uids, template)
+    scene.materials[0, 0] = 0.3 + 0.001 * index + 0.1 * salt
+    return sample(index, scene, noise_floor_db=36.0 + index)
+
+
+def scenes(salt: int, *, train: str = "a", test: str = "c") -> dict[str, list[Sample]]:
+    """Return four scenes for training in two shards, and two for testing."""
+    return {
+        "train-000000.tar": [lit(0, salt, [train]), lit(1, salt, [], "wall")],
+        "train-000001.tar": [lit(2, salt, [train], "wall"), lit(3, salt, [train])],
+        "test-000002.tar": [lit(4, salt, [test], "wall"), lit(5, salt, [test])],
+    }
+
+
+def finished(
+    root: Path,
+    shards: Mapping[str, Sequence[Sample]],
+    *,
+    objects: Sequence[LockedObject] = (TRAIN_OBJECT, TEST_OBJECT, locked("unused", "MIT")),
+    failures: Sequence[Failure] = (),
+    seed: int = 0,
+    profiles: Sequence[Profile] = (),
+    **changes: object,
+) -> Path:
+    """Write a finished dataset; `changes` replace fields of its manifest.
+
+    Shards are packed by `profiles`, one for each, or all without loss.
+    """
+    folder = DatasetFolder(root)
+    for row, (name, of_shard) in enumerate(shards.items()):
+        profile = profiles[row] if profiles else "lossless"
+        members = [(entry.key, encode_sample(entry, profile)) for entry in of_shard]
+        write_shard(folder.shard(name), members)
+    write_objects_lock(folder.objects_lock, objects)
+    write_failures(folder.failures, failures)
+    manifest = Manifest(
+        build="smoke",
+        settings={**SETTINGS, "seed": seed},
+        environment={"mitsuba_variant": "none"},
+        num_scenes=2 * len(shards),
+        num_views=2,
+        objects_lock_sha256=sha256_hex(encode_objects_lock(objects)),
+        shards=tuple(index_shard(folder.shard(name)) for name in shards),
+    )
+    write_manifest(folder.manifest, dataclasses.replace(manifest, **changes))  # type: ignore[arg-type]
+    return root
+
+
+MERGE = DeriveOptions(operation="merge")
+
+
+def made(out: Path, derive: DeriveOptions, *places: Path) -> Dataset:
+    """Make a whole dataset, documents and all."""
+    derive_dataset([str(place) for place in places], derive, out)
+    assert verify_dataset(out).problems == []
+    return open_dataset(str(out))
+
+
+def shards_made(out: Path, derive: DeriveOptions, *places: Path) -> Dataset:
+    """Make all that a digest covers, without the documents, which take seconds."""
+    derive_shards([open_finished(str(place)) for place in places], derive, DatasetFolder(out))
+    assert verify_dataset(out).problems == []
+    return open_dataset(str(out))
+
+
+def bytes_of(root: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for path in root.rglob("*")
+        if path.is_file()
+    }
+
+
+def samples_of(dataset: Dataset) -> dict[str, tuple[str, dict[str, bytes]]]:
+    """Return split and members of every sample, by key."""
+    return {
+        sample.key: (shard.split, encode_sample(sample))
+        for shard in dataset.manifest.shards
+        for sample in dataset.read_shard(shard)
+    }
+
+
+def given(shards: dict[str, list[Sample]], offset: int = 0) -> dict[str, tuple[str, dict]]:
+    return {
+        sample_key(int(sample.key) + offset): (name.partition("-")[0], encode_sample(sample))
+        for name, of_shard in shards.items()
+        for sample in of_shard
+    }
+
+
+def test_a_merge_holds_every_scene_under_its_raised_key(tmp_path: Path) -> None:
+    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
+    merged = shards_made(tmp_path / "c", MERGE, a, b)
+    assert samples_of(merged) == given(scenes(0)) | given(scenes(1), 6)
+    assert [shard.name for shard in merged.manifest.shards] == [
+        "train-000000.tar", "train-000001.tar", "test-000002.tar",
+        "train-000003.tar", "train-000004.tar", "test-000005.tar",
+    ]  # fmt: skip
+    for shard in open_dataset(str(a)).manifest.shards:  # the first source's shards stay as they are
+        assert merged.folder.shard(shard.name).read_bytes() == (a / shard.name).read_bytes()
+
+
+def test_the_manifest_says_where_scenes_are_from(tmp_path: Path) -> None:
+    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
+    manifest = made(tmp_path / "c", MERGE, a, b).manifest
+    derivation = derivation_of(manifest.settings)
+    assert derivation is not None and derivation.operation == "merge"
+    for source, root, offset in zip(derivation.sources, (a, b), (0, 6), strict=True):
+        of_source = open_dataset(str(root)).manifest
+        assert source["digest"] == of_source.dataset_digest
+        assert source["settings"] == of_source.settings
+        assert (source["key_offset"], source["num_scenes"]) == (offset, 6)
+    assert "seed" not in manifest.settings  # they differ in it
+    assert manifest.settings["renders"]["resolution"] == 16
+    assert (manifest.num_scenes, manifest.num_samples) == (12, 12)
+    body = (tmp_path / "c" / "README.md").read_text()
+    assert all(str(source["digest"]) in body for source in derivation.sources)
+
+
+def test_a_merge_of_a_merge_nests(tmp_path: Path) -> None:
+    roots = [finished(tmp_path / str(salt), scenes(salt), seed=salt) for salt in range(3)]
+    shards_made(tmp_path / "ab", MERGE, *roots[:2])
+    merged = shards_made(tmp_path / "abc", MERGE, tmp_path / "ab", roots[2])
+    assert samples_of(merged) == given(scenes(0)) | given(scenes(1), 6) | given(scenes(2), 12)
+    derivation = derivation_of(merged.manifest.settings)
+    assert derivation is not None
+    assert "derived" in derivation.sources[0]["settings"]
+    assert derivation.sources[1]["key_offset"] == 12
+
+
+def test_equal_inputs_give_equal_bytes_wherever_they_lie(tmp_path: Path) -> None:
+    """All files, documents too; neither clock nor place is in them."""
+    results = []
+    for place in ("one", "two/deeper"):
+        a = finished(tmp_path / place / "a", scenes(0))
+        b = finished(tmp_path / place / "b", scenes(1), seed=1)
+        made(tmp_path / place / "merge", MERGE, a, b)
+        select = DeriveOptions(operation="select", selection=Selection(split="train"))
+        reshard = DeriveOptions(operation="reshard", scenes_per_shard=3)
+        for derive in (select, reshard):
+            shards_made(tmp_path / place / derive.operation, derive, a)
+        results.append(bytes_of(tmp_path / place))
+        assert not [path.name for path in (tmp_path / place).iterdir() if path.name[0] == "."]
+    assert results[0] == results[1]
+    documents = ("README.md", "LICENSE.md", "croissant.json", "attribution.csv")
+    assert {f"merge/{name}" for name in documents} <= set(results[0])
+
+
+@for_each(
+    ("selection", "keys"),
+    [
+        (Selection(split="train"), [0, 1, 2, 3]),
+        (Selection(split="test"), [4, 5]),
+        (Selection(template="wall"), [1, 2, 4]),
+        (Selection(min_noise_floor_db=39.0), [3, 4, 5]),
+        (Selection(split="train", template="plane", min_noise_floor_db=37.0), [3]),
+    ],
+)
+def test_a_selection_keeps_keys_and_bytes(
+    tmp_path: Path, selection: Selection, keys: list[int]
+) -> None:
+    a = finished(tmp_path / "a", scenes(0))
+    chosen = shards_made(tmp_path / "c", DeriveOptions(operation="select", selection=selection), a)
+    whole = given(scenes(0))
+    assert samples_of(chosen) == {sample_key(key): whole[sample_key(key)] for key in keys}
+
+
+def test_a_merge_after_a_selection_gives_no_key_twice(tmp_path: Path) -> None:
+    """A selection keeps its keys, which then go beyond its number of scenes."""
+    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
+    derive = DeriveOptions(operation="select", selection=Selection(split="test"))
+    chosen = shards_made(tmp_path / "c", derive, a)
+    merged = shards_made(tmp_path / "d", MERGE, chosen.folder.root, b)
+    test_part = {"test-000002.tar": scenes(0)["test-000002.tar"]}
+    assert samples_of(merged) == given(test_part) | given(scenes(1), 6)
+
+
+def test_a_selection_keeps_only_the_rights_of_what_it_holds(tmp_path: Path) -> None:
+    a = finished(tmp_path / "a", scenes(0))
+    derive = DeriveOptions(operation="select", selection=Selection(split="train"))
+    chosen = made(tmp_path / "c", derive, a)
+    assert [entry.uid for entry in read_objects_lock(chosen.folder.objects_lock)] == ["a"]
+    assert 'license: "cc0-1.0"' in chosen.folder.card.read_text()
+    assert "CC-BY-4.0" not in chosen.folder.attribution.read_text()
+
+
+def test_resharding_divides_each_split_evenly(tmp_path: Path) -> None:
+    a = finished(tmp_path / "a", scenes(0))
+    resharded = shards_made(
+        tmp_path / "c", DeriveOptions(operation="reshard", scenes_per_shard=3), a
+    )
+    assert [(s.name, s.num_samples) for s in resharded.manifest.shards] == [
+        ("train-000000.tar", 3), ("train-000001.tar", 1), ("test-000002.tar", 2),
+    ]  # fmt: skip
+    assert samples_of(resharded) == given(scenes(0))
+    assert resharded.manifest.settings["splits"]["scenes_per_shard"] == 3
+    back = shards_made(
+        tmp_path / "d", DeriveOptions(operation="reshard", scenes_per_shard=2), tmp_path / "c"
+    )
+    assert [shard.sha256 for shard in back.manifest.shards] == [
+        shard.sha256 for shard in open_dataset(str(a)).manifest.shards
+    ]
+
+
+def test_many_shards_stand_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two files in a folder stand for 4,096."""
+    monkeypatch.setattr(layout, "FILES_PER_FOLDER", 2)
+    of_training = {name: of for name, of in scenes(0).items() if "train" in name}
+    a = finished(tmp_path / "a", of_training)
+    resharded = shards_made(
+        tmp_path / "c", DeriveOptions(operation="reshard", scenes_per_shard=1), a
+    )
+    assert [shard.name for shard in resharded.manifest.shards[1:4]] == [
+        "train-000001.tar", "part-0001/train-000002.tar", "part-0001/train-000003.tar",
+    ]  # fmt: skip
+    assert samples_of(resharded) == given(of_training)
+    again = DeriveOptions(operation="reshard", scenes_per_shard=2)
+    back = shards_made(tmp_path / "d", again, tmp_path / "c")
+    assert [s.sha256 for s in back.manifest.shards] == [
+        s.sha256 for s in open_dataset(str(a)).manifest.shards
+    ]
+
+
+def test_rejections_follow_their_scenes(tmp_path: Path) -> None:
+    def failure(item: str, stage: str = "scenes") -> Failure:
+        return Failure(stage=stage, item=item, reason="no_room", message="m")
+
+    failures = [failure("000000001"), failure("000000005.1", "renders"), failure("e", "objects")]
+    given_up = {name: of[:1] if "test" in name else of for name, of in scenes(0).items()}
+    a = finished(tmp_path / "a", given_up, failures=failures)
+    b = finished(tmp_path / "b", scenes(1), failures=failures[:1])
+    merged = shards_made(tmp_path / "c", MERGE, a, b)
+    items = [row.item for row in read_failures(merged.folder.failures)]
+    assert items == ["e", "000000005.1", "000000001", "000000007"]  # 5 was given up in a
+    assert "000000006" in samples_of(merged)
+    derive = DeriveOptions(operation="select", selection=Selection(template="wall"))
+    chosen = shards_made(tmp_path / "d", derive, a)
+    assert [row.item for row in read_failures(chosen.folder.failures)] == ["e", "000000001"]
+
+
+def test_objects_that_two_sources_prepared_otherwise_are_both_named(tmp_path: Path) -> None:
+    """Two builds cut the same object to other budgets: one uid, two assets, one split."""
+    a = finished(tmp_path / "a", scenes(0))
+    rows = [
+        dataclasses.replace(entry, asset_sha256=f"{number}" * 64)
+        for number, entry in enumerate(read_objects_lock(a / "objects.lock.jsonl"))
+    ]
+    b = finished(tmp_path / "b", scenes(1), objects=rows)
+    merged = shards_made(tmp_path / "c", MERGE, a, b)
+    locked = read_objects_lock(merged.folder.objects_lock)
+    assert [entry.uid for entry in locked] == ["a", "a", "c", "c"]
+    shutil.rmtree(tmp_path / "c")
+    assert shards_made(tmp_path / "c", MERGE, a, b).digest == merged.digest
+
+
+def _textured(index: int, look: int) -> Sample:
+    """Return a textured scene that no other index has."""
+    scene = textured_scene(look, environment=sky())
+    scene.vertex_positions[4:, 2] += 0.01 * index
+    provenance = {**scene.provenance, "template": "textured"}
+    plain = lit(index, 0, [])
+    return dataclasses.replace(plain, scene=dataclasses.replace(scene, provenance=provenance))
+
+
+def textured_scenes() -> dict[str, list[Sample]]:
+    """Return a plain and a textured scene in one shard, and two of two looks in another."""
+    return {
+        "train-000000.tar": [lit(0, 3, []), _textured(1, 0)],
+        "train-000001.tar": [_textured(2, 0), _textured(3, 1)],
+    }
+
+
+def maps_in(dataset: Dataset) -> list[list[str]]:
+    """Return the names of the maps in each shard."""
+    names = []
+    for shard in dataset.manifest.shards:
+        with dataset.files.open(shard, checked=True) as stream:
+            names.append(list(contents_of(stream, shard.name).maps))
+    return names
+
+
+def test_a_selection_takes_the_maps_that_it_needs_and_no_other(tmp_path: Path) -> None:
+    a = finished(tmp_path / "a", textured_scenes())
+    chosen = DeriveOptions(
+        operation="select", selection=Selection(where=f'key == "{sample_key(3)}"')
+    )
+    made = shards_made(tmp_path / "b", chosen, a)
+    held = [colour_texture(1).sha256, number_texture().sha256, sky().sha256]
+    assert sorted(maps_in(made)[0]) == sorted(f"__map-{sha256}__" for sha256 in held)
+    plain = DeriveOptions(operation="select", selection=Selection(where='template == "plane"'))
+    left = shards_made(tmp_path / "c", plain, a)
+    assert left.manifest.num_samples == 1 and maps_in(left) == [[]]
+
+
+def test_resharding_stores_each_map_once_in_each_new_shard(tmp_path: Path) -> None:
+    a = finished(tmp_path / "a", textured_scenes())
+    whole = shards_made(tmp_path / "b", DeriveOptions(operation="reshard", scenes_per_shard=4), a)
+    (shard,) = whole.manifest.shards
+    assert [len(names) for names in maps_in(whole)] == [4]
+    apart = shards_made(tmp_path / "c", DeriveOptions(operation="reshard", scenes_per_shard=1), a)
+    assert [len(names) for names in maps_in(apart)] == [0, 3, 3, 3]
+    assert samples_of(apart) == samples_of(whole) == given(textured_scenes())
+    again = shards_made(
+        tmp_path / "d", DeriveOptions(operation="reshard", scenes_per_shard=4), tmp_path / "c"
+    )
+    assert [each.sha256 for each in again.manifest.shards] == [shard.sha256]
+
+
+def test_staged_scenes_bring_their_maps_into_the_shard(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path)
+    samples = [textured_sample(sample_key(index), index // 2) for index in range(3)]
+    staged = folder.staged_shard("train-000000.tar")
+    for index, each in enumerate(samples):
+        stage_scene(staged, index, each, [], "compact")
+        assert read_staged_scene(staged, index).members == encode_sample(each, "compact")
+    packed = pack_shard(folder, "train-000000.tar", range(3))
+    with folder.shard(packed.name).open("rb") as stream:
+        assert len(contents_of(stream, packed.name).maps) == 4
+    other = tmp_path / "train-000009.tar"
+    write_shard(other, [(sample.key, encode_sample(sample, "compact")) for sample in samples])
+    assert index_shard(other).sha256 == packed.sha256

@@ -1,0 +1,301 @@
+"""Whom a begun dataset binds; a user's own files are recorded, refused, never imported."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import pytest
+from prefect.exceptions import ParameterTypeError
+
+from infra.repair import repair
+from pipeline.builds.named import BUILDS, named_build, typed_build
+from pipeline.exchange.reader import file_child
+from pipeline.executors.threads import ThreadRunner
+from pipeline.generation.begin_dataset import begin
+from pipeline.generation.bucket_dataset_writer import hold_membership
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import make_dataset, make_task, prepare_dataset
+from pipeline.isolation import call_with_retries
+from pipeline.shards.derive import _extensions
+from scene_templates.families import FAMILIES
+from storage.dataset.asked import read_asked, write_asked
+from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import read_manifest, write_manifest
+from storage.dataset.verify import verify_dataset
+from storage.errors import TrilightError
+from storage.extensions import load_extension, mistake_in_extension
+from storage.removed import removal_message
+from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions, written
+from tests.for_each import for_each
+from tests.pipeline.documents.dataset_by_hand import edit_manifest
+from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, begin_tiny, make_tiny_shard
+from tests.pipeline.generation.tiny_scenes_kit import (
+    Undocumented,
+    shard_job,
+    tiny_order,
+    without_rendering,
+)
+
+TEMPLATE = EXAMPLES / "template.py"
+TRAP = "from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n"
+"""Leaves a mark when it is imported."""
+
+
+def _begin(root: Path) -> None:
+    build = named_build("smoke")
+    begin(DatasetFolder(root), build, ENVIRONMENT, 4, accept_environment=False)
+
+
+def test_the_manifest_records_what_had_part_in_a_dataset(tmp_path: Path) -> None:
+    with loaded(TEMPLATE) as extension:
+        _begin(tmp_path)
+    manifest = read_manifest(tmp_path / "manifest.json")
+    assert manifest.extensions == {"template.py": extension.sha256}
+    assert str(EXAMPLES) not in (tmp_path / "manifest.json").read_text()
+    with pytest.raises(TrilightError, match=r"begun with the extension template\.py, which is not"):
+        _begin(tmp_path)
+    other = written(tmp_path, TEMPLATE.read_text() + "\n# changed\n", "template.py")
+    with (
+        loaded(other),
+        pytest.raises(TrilightError, match=r"another extension template\.py: its sha256 was"),
+    ):
+        _begin(tmp_path)
+    with loaded(TEMPLATE):
+        _begin(tmp_path)
+
+
+def test_a_manifest_without_extensions_is_what_it_was(tmp_path: Path) -> None:
+    with loaded(EXAMPLES / "executor.py"):  # changes how a dataset is made, and nothing of it
+        _begin(tmp_path)
+    assert "extensions" not in json.loads((tmp_path / "manifest.json").read_text())
+    with (
+        loaded(TEMPLATE),
+        pytest.raises(TrilightError, match=r"begun without the extension template\.py; leave"),
+    ):
+        _begin(tmp_path)
+
+
+def test_a_worker_without_the_extension_is_refused(tmp_path: Path) -> None:
+    job = shard_job(tmp_path, extensions={"template.py": "1" * 64})
+    with pytest.raises(TrilightError, match=r"this worker: .* add --extend template\.py"):
+        make_task(job, ())
+
+
+def test_children_know_what_is_registered() -> None:
+    """Also those of a fork server that was started before."""
+    child = file_child()
+    try:
+        with pytest.raises(TrilightError, match="template 'corridor' is unknown"):
+            child.call(parts_of, "corridor")
+        child.retire()
+        with loaded(TEMPLATE):
+            assert child.call(parts_of, "corridor") == ("floor", "wall1", "wall2")
+            child.retire()
+    finally:
+        child.close()
+
+
+BUG = """
+from trilight.extend import Sector, Template
+
+def sector(high=60):
+    return Sector(azimuth_deg=0, half_width_deg=9, elevation_deg=(3, high))
+
+def parts_of(name):
+    return {}[name]
+"""
+"""An extension with a bug in what is called later."""
+
+
+def test_a_bug_in_an_extension_is_its_authors_and_stops_at_once(tmp_path: Path) -> None:
+    """In a child too: it is neither tried again nor taken for a failure of the environment."""
+    child = file_child()
+    with room_for_extensions():
+        bug = load_extension(written(tmp_path, BUG)).module.parts_of
+        said = r"^extension own\.py, line 8: KeyError: 'floor'\.$"
+        with pytest.raises(TrilightError, match=said):
+            call_with_retries(child, bug, "floor")
+        child.close()
+        with pytest.raises(KeyError) as caught:
+            bug("floor")
+        assert re.match(said, str(mistake_in_extension(caught.value)))
+    with pytest.raises(ZeroDivisionError) as other:
+        divmod(1, 0)
+    assert mistake_in_extension(other.value) is None
+
+
+@for_each(
+    ("changed", "said"),
+    [
+        ('parts=("floor", "wall9")', "('floor', 'wall9'); expected floor first, then any of floor"),
+        ('parts=("wall0", "floor")', "('wall0', 'floor'); expected floor first"),
+        ('parts=("floor", "wall0", "wall0")', "'wall0'); expected floor first"),
+        ('parts=("floor",), lights=sector(99)', "elevation_deg is (3, 99); expected two from -90"),
+    ],
+)
+def test_a_template_is_checked_when_it_is_made(tmp_path: Path, changed: str, said: str) -> None:
+    text = f"Template(**dict(name='t', cameras=sector(), lights=sector()) | dict({changed}))"
+    with (
+        room_for_extensions(),
+        pytest.raises(TrilightError, match=rf"^extension own\.py, line \d+: .*{re.escape(said)}"),
+    ):
+        load_extension(written(tmp_path, f"{BUG}\n{text}\n"))
+
+
+@for_each("extended", [{}, {"trap.py": "0" * 64}])
+def test_a_dataset_never_causes_an_import(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extended: dict[str, str]
+) -> None:
+    """Its build may say FILE.py:FUNCTION, and its extensions may lie beside it."""
+    folder = tmp_path / "set"
+    monkeypatch.chdir(tmp_path)
+    writer = begin_tiny(folder, 4)
+    make_tiny_shard(writer, 0)
+    for place in (tmp_path, folder):
+        written(place, TRAP, "trap.py")
+    manifest = dataclasses.replace(writer.manifest, build="trap.py:f", extensions=extended)
+    write_manifest(folder / "manifest.json", manifest)
+    verify_dataset(str(folder))
+    expected = "begun with the extension trap.py" if extended else "'trap.py:f' is unknown"
+    with pytest.raises(TrilightError, match=expected):
+        repair(str(folder), ["train-000000.tar"], objects="builtin:", scenes_from=None)
+    for words in (["generate", "trap.py:f"], ["generate", "smoke", "--extend", "trap.py"]):
+        write_asked(DatasetFolder(folder), words)
+        assert read_asked(open_dataset(str(folder))) is None
+    assert not list(tmp_path.rglob("*.ran"))
+
+
+def test_a_form_cannot_name_a_file(tmp_path: Path) -> None:
+    from pipeline.flows.dataset_flows import generate_scenes
+
+    trap = written(tmp_path, TRAP)
+    with pytest.raises(ParameterTypeError, match="build"):
+        generate_scenes.validate_parameters({"build": f"{trap}:f"})
+    assert not list(tmp_path.rglob("*.ran"))
+
+
+def test_families_are_chosen_by_name() -> None:
+    with loaded(EXAMPLES / "family.py"):
+        for names in ("crowd", ["crowd", "plane-single"]):
+            families = named_build("smoke", changes={"scenes.families": names}).scenes.families
+            assert families[0] == FAMILIES["crowd"]()
+            assert len(families) == (2 if isinstance(names, list) else 1)
+        heavy = {"scenes.families": ["crowd"], "scenes.families.weight": 5.0}
+        assert named_build("smoke", changes=heavy).scenes.families[0].weight == 5.0
+    for wrong in ("crowd", ["plane-single", "crowd"], 3):
+        with pytest.raises(
+            TrilightError, match=r"setting 'scenes\.families' is .* of plane-single"
+        ):
+            named_build("smoke", changes={"scenes.families": wrong})
+    with pytest.raises(TrilightError, match=r"families.* expected at least one"):
+        named_build("smoke", changes={"scenes.families": []})
+
+
+def test_a_build_of_ones_own_has_a_name_of_its_own(tmp_path: Path) -> None:
+    text = """
+from pipeline.builds.training import smoke
+import dataclasses
+
+def mine():
+    return dataclasses.replace(smoke(), build="mine")
+
+def posing():
+    return smoke()
+
+def nothing():
+    pass
+"""
+    path = written(tmp_path, text)
+    with room_for_extensions():
+        name = typed_build(f"{path}:mine")
+        assert (name, named_build(name).build, BUILDS[name].num_scenes) == (
+            "own.py:mine",
+            "mine",
+            32,
+        )
+        with pytest.raises(TrilightError, match="build='smoke', which is one of Trilight's own"):
+            named_build(typed_build(f"{path}:posing"))
+        with pytest.raises(TrilightError, match=r"own\.py: it returned a NoneType; expected Build"):
+            typed_build(f"{path}:nothing")
+    assert name not in BUILDS
+
+
+def test_derived_sets_name_the_extensions_of_their_sources(tmp_path: Path) -> None:
+    manifest = begin_tiny(tmp_path, 4).manifest
+    one, other = ({"a.py": "1"}, {"a.py": "2", "b.py": "3"})
+    manifests = [dataclasses.replace(manifest, extensions=each) for each in (one, other)]
+    assert _extensions([manifest, *manifests]) == {"a.py": "1 2", "b.py": "3"}
+    assert _extensions([manifest]) == {}
+
+
+@for_each("source", ["OBJECTZ", "empty", "builtin:many", "env:TRILIGHT_NOWHERE"])
+def test_a_mistyped_source_leaves_nothing_behind(
+    source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(TrilightError, match="objects"):
+        make_dataset(DatasetOrder(objects=source, out="set"), ThreadRunner())
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+
+
+def test_what_was_only_begun_is_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a run leaves it that ended over its objects: other settings and fewer scenes are free."""
+    without_rendering(monkeypatch)
+    folder = DatasetFolder(tmp_path / "set")
+    with folder.hold_membership():
+        begin(folder, named_build("smoke", seed=5), {}, 24, accept_environment=False)
+    run = prepare_dataset(tiny_order(out=str(folder.root), scenes=4, seed=7))
+    assert run.publication.manifest.settings["seed"] == 7
+    assert run.publication.manifest.num_scenes == 4
+
+
+def test_what_has_objects_or_scenes_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    without_rendering(monkeypatch)
+    order = tiny_order(out=str(tmp_path / "set"), scenes=4, seed=5)
+    prepare_dataset(order)  # its objects are frozen, no more
+    other = dataclasses.replace(order, seed=7)
+    with pytest.raises(TrilightError, match="begun with another setting: seed was 5, now 7"):
+        prepare_dataset(other)
+    make_dataset(order, Undocumented())
+    with pytest.raises(TrilightError, match="seed was 5, now 7"):
+        prepare_dataset(other)
+
+
+def test_nobody_forgets_while_another_is_at_work(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path / "set")
+    with hold_membership(folder):
+        begin(folder, named_build("smoke", seed=5), {}, 4, accept_environment=False)
+        with hold_membership(folder):
+            assert read_manifest(folder.manifest).settings["seed"] == 5
+
+
+def test_who_was_replaced_all_the_same_stops(tmp_path: Path) -> None:
+    """Locks do not reach every machine: a maker whose manifest has become another's says so."""
+    folder = DatasetFolder(tmp_path / "set")
+    with folder.hold_membership():
+        mine = begin(folder, named_build("smoke", seed=5), {}, 4, accept_environment=False)
+        folder.manifest.unlink()
+        begin(folder, named_build("smoke", seed=7), {}, 4, accept_environment=False)
+        with pytest.raises(TrilightError, match="another dataset has been begun here"):
+            mine.lock_objects([])
+
+
+def test_a_dataset_of_removed_settings_is_read_and_not_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_rendering(monkeypatch)
+    order = tiny_order(out=str(tmp_path / "set"), scenes=4)
+    make_dataset(order, Undocumented())
+    dataset = open_dataset(str(tmp_path / "set"))
+    settings = dict(dataset.manifest.settings)
+    settings["splits"] = {**settings["splits"], "object_parts": 2}
+    edit_manifest(dataset, settings=settings)
+    assert verify_dataset(str(tmp_path / "set")).problems == []
+    refusal = re.escape(removal_message("setting 'splits.object_parts'"))
+    with pytest.raises(TrilightError, match=refusal):
+        make_dataset(order, Undocumented())
+    with pytest.raises(TrilightError, match=refusal):
+        named_build("smoke", changes={"splits.object_parts": 2})

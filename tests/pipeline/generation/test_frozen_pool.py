@@ -1,0 +1,394 @@
+"""Frozen objects, textures and maps: opened where scenes draw them, trusted as the lock says."""
+
+import csv
+import dataclasses
+import io
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.builds.named import named_build
+from pipeline.builds.settings import BuildSettings
+from pipeline.documents.attribution import encode_attribution
+from pipeline.generation import accept_maps as accepting
+from pipeline.generation import frozen_pool, pipeline, restore_object
+from pipeline.generation import object_options as asked_objects
+from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
+from pipeline.generation.accept_objects import accept_objects, load_trusted_objects
+from pipeline.generation.attempt_scene import SceneAttempt
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.freeze_objects import AcceptedObjects, require_same
+from pipeline.generation.frozen_pool import AssetMissing, SplitPool
+from pipeline.generation.prepare_isolated import asset_store
+from pipeline.generation.user_maps import user_maps
+from pipeline.objects.maps.prepared import MapFiles, prepare_map
+from pipeline.scenes.compose import compose_scene
+from pipeline.scenes.fitting import draw_rows
+from pipeline.scenes.pool import PooledAsset, fits_of
+from scene_templates.user_maps import UserMap, draw_user_map
+from storage.conventions import SPLITS
+from storage.dataset.manifest import Manifest
+from storage.dataset.verify import check_sample
+from storage.errors import Rejected, TrilightError
+from storage.records.asset import Asset, decode_asset
+from storage.records.object_index import ObjectIndex
+from storage.records.objects import (
+    SKY,
+    TEXTURE,
+    decode_objects_lock,
+    encode_objects_lock,
+    read_objects_lock,
+)
+from storage.records.texture import MapSource
+from storage.seeds import rng_for
+from tests.infra.child_here import ChildHere
+from tests.pipeline.documents.dataset_by_hand import locked
+from tests.pipeline.generation.frozen_kit import SOURCE, asked, begun, build, frozen, prepared
+from tests.pipeline.objects.maps.test_maps import exr, noise, png, sun_map
+from tests.pipeline.scenes.small_pool import first_scene, small_pool
+from tests.scenes_by_hand import tiny_sample
+
+NUM_OBJECTS = 30
+
+
+@pytest.fixture(scope="module")
+def made(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[DatasetWriter, AcceptedObjects]]:
+    folder = tmp_path_factory.mktemp("frozen")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TRILIGHT_CACHE", str(folder / "cache"))
+        writer = begun(folder / "set")
+        yield writer, frozen(writer, [prepared(n) for n in range(NUM_OBJECTS)])
+
+
+def _opened(accepted: AcceptedObjects, split: str = "train") -> SplitPool:
+    assert accepted.pool is not None
+    return accepted.pool.open_split(split, asset_store())
+
+
+def _whole(writer: DatasetWriter, accepted: AcceptedObjects) -> list[PooledAsset]:
+    """The pool as it would be with every object of the split in memory."""
+    by_digest = {p.asset_sha256: p.path for p in map(prepared, range(NUM_OBJECTS))}
+    return [
+        PooledAsset(locked=row, asset=decode_asset(Path(by_digest[row.asset_sha256]).read_bytes()))
+        for row in read_objects_lock(writer.folder.objects_lock)
+        if row.split == "train"
+    ]
+
+
+def test_scenes_of_opened_objects_are_those_of_objects_in_memory(
+    made: tuple[DatasetWriter, AcceptedObjects],
+) -> None:
+    whole, opened = _whole(*made), _opened(made[1])
+    assert [entry.locked for entry in opened] == [entry.locked for entry in whole]
+    for room in (30, 60, 200, 5000):  # some objects do not fit, or all do
+        draws = [
+            [draw_rows(np.random.default_rng(n), fits_of(pool), 2, room) for n in range(20)]
+            for pool in (opened, whole)
+        ]
+        assert draws[0] == draws[1]
+    for index in range(2):
+        one, other = (
+            first_scene(build().scenes, pool, seed=1, scene_index=index) for pool in (opened, whole)
+        )
+        assert one.objects == other.objects
+        assert np.array_equal(one.vertex_positions, other.vertex_positions)
+
+
+def test_only_a_few_objects_are_open(
+    made: tuple[DatasetWriter, AcceptedObjects], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frozen_pool, "_MOST_OPEN", 3)
+    read: list[bytes] = []
+
+    def counted(data: bytes) -> Asset:
+        read.append(data)
+        return decode_asset(data)
+
+    monkeypatch.setattr(frozen_pool, "decode_asset", counted)
+    pool = _opened(made[1])
+    assert not read
+    for row in (0, 1, 2, 0, 3, 0, 1):
+        assert pool[row].locked.uid == read_objects_lock_uids(made[0])[row]
+    assert len(read) == 5  # 0, 1, 2, 3, and 1 again
+    assert len(pool._open) == 3
+    for row in (-1, len(pool)):
+        with pytest.raises(IndexError):
+            pool[row]
+
+
+def read_objects_lock_uids(writer: DatasetWriter) -> list[str]:
+    rows = read_objects_lock(writer.folder.objects_lock)
+    return [row.uid for row in rows if row.split == "train"]
+
+
+def test_a_second_start_looks_at_no_object(
+    made: tuple[DatasetWriter, AcceptedObjects], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And at all of them where it is asked for another source, or there is no index of the lock."""
+    writer, accepted = made
+
+    def look(source: str, **more: object) -> None:
+        raise LookupError(source)
+
+    monkeypatch.setattr(asked_objects, "list_objects", look)
+    assert accept_objects(asked(writer)) == accepted
+    for source, licence in (("another", None), (SOURCE, "MIT")):
+        with pytest.raises(LookupError):
+            accept_objects(asked(writer, source, licence))
+    index, lock = writer.folder.staged_index, writer.folder.objects_lock
+    for path in (index, lock):
+        was = path.read_bytes()
+        for damaged in (b"", was[:40], was + b" "):
+            path.write_bytes(damaged)
+            if (path, damaged) != (index, was + b" "):  # which tells nothing about the lock
+                assert load_trusted_objects(asked(writer)) is None
+        path.write_bytes(was)
+    assert load_trusted_objects(asked(writer)) == accepted
+
+
+def test_a_file_that_is_not_the_locked_one_is_away(
+    made: tuple[DatasetWriter, AcceptedObjects],
+) -> None:
+    pool = _opened(made[1])
+    name = pool._index.asset_name(pool._first)
+    path = asset_store().asset_path(name)
+    was = path.read_bytes()
+    try:
+        for damage in (path.unlink, lambda: path.write_bytes(was[:-1]), lambda: _swap(path, pool)):
+            damage()
+            with pytest.raises(AssetMissing) as caught:
+                pool[0]
+            assert (caught.value.uid, caught.value.asset_name) == (
+                read_objects_lock_uids(made[0])[0],
+                name,
+            )
+    finally:
+        path.write_bytes(was)
+    assert pool[0].locked.uid == read_objects_lock_uids(made[0])[0]
+
+
+def _swap(path: Path, pool: SplitPool) -> None:
+    """Put another object of the same store in the place of one."""
+    other = asset_store().asset_path(pool._index.asset_name(pool._first + 1))
+    path.write_bytes(other.read_bytes())
+
+
+def test_an_index_that_contradicts_the_objects_is_refused(
+    made: tuple[DatasetWriter, AcceptedObjects],
+) -> None:
+    """A wrong number of triangles would quietly change what is drawn."""
+    path = made[0].folder.staged_index
+    was = path.read_bytes()
+    index = ObjectIndex(path)
+    _, begin = index._arrays["least"]
+    row = index._data + begin + 4 * index.facts.splits["train"].start
+    path.write_bytes(was[:row] + bytes([was[row] ^ 1]) + was[row + 1 :])
+    try:
+        with pytest.raises(TrilightError, match=r"objects\.index: says otherwise of 'object .*Del"):
+            _opened(made[1])[0]
+    finally:
+        path.write_bytes(was)
+
+
+def test_an_object_that_is_away_is_brought_back_for_the_same_attempt(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls: list[tuple[object, ...]] = []
+    away = [("a", "1"), ("b", "2")]
+
+    def call(child: object, function: object, *args: object) -> SceneAttempt:
+        calls.append(args)
+        return SceneAttempt(sample=None, failures=[], missing_asset=away[0] if away else None)
+
+    def restore(uid: str, name: str) -> None:
+        calls.append((uid, name))
+        away.pop(0)
+
+    monkeypatch.setattr(pipeline, "call_with_retries", call)
+    child: object = None
+    pipeline.make_scene("train", 7, 1, child, restore)  # type: ignore[arg-type]
+    assert calls == [("train", 7, 0), ("a", "1"), ("train", 7, 0), ("b", "2"), ("train", 7, 0)]
+
+
+def test_an_object_that_is_there_again_is_found(tmp_path: Path) -> None:
+    """A worker that lives long has listed the source before."""
+    source = ("builtin:4", None, tmp_path / "objects", ("MIT", "CC0-1.0"))
+    uid = restore_object._list_source(*source).allowed[0].uid
+    shutil.rmtree(tmp_path / "objects")
+    record = restore_object.find_object(*source, uid)
+    assert record is not None and Path(record.path).exists()
+
+
+def test_a_frozen_row_that_is_gone_or_has_changed_is_named() -> None:
+    row = locked("texture:cloth", kind=TEXTURE)
+    require_same("textures", {row.uid: row}, [row, locked("a")])
+    with pytest.raises(TrilightError, match="'texture:cloth' is missing or no longer usable"):
+        require_same("textures", {row.uid: row}, [])
+    with pytest.raises(TrilightError, match="'texture:cloth' has changed"):
+        require_same("textures", {row.uid: row}, [dataclasses.replace(row, licence="MIT")])
+
+
+SHARES = {
+    "scenes.textures.share": 0.9,
+    "scenes.textures.own_share": 1.0,
+    "scenes.textures.surfaces.size": 4,
+    "scenes.skies.share": 1.0,
+    "scenes.skies.own_share": 1.0,
+    "scenes.skies.maps.height": 4,
+    "splits.held_out_objects": 0.3,
+}
+
+
+@pytest.fixture(scope="module")
+def settings() -> BuildSettings:
+    return named_build("smoke", changes=SHARES)
+
+
+@pytest.fixture(scope="module")
+def accepted(settings: BuildSettings, tmp_path_factory: pytest.TempPathFactory) -> AcceptedMaps:
+    """Twelve of each, one in a second copy, and a map that is no map."""
+    root = tmp_path_factory.mktemp("own")
+    for number in range(12, 24):
+        png(root / "textures" / f"cloth{number}.png", noise(number))
+        (root / "skies").mkdir(exist_ok=True)
+        exr(root / "skies" / f"sky{number}.exr", sun_map(number))
+    png(root / "textures" / "copy.bmp", noise(12))
+    exr(root / "skies" / "copy.exr", sun_map(12))
+    exr(root / "skies" / "bad.exr", np.full((2, 4, 3), np.nan, np.float32))
+    folders = ((TEXTURE, str(root / "textures")), (SKY, str(root / "skies")))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TRILIGHT_CACHE", str(root / "cache"))
+        patch.setattr(accepting, "IsolatedChild", ChildHere)
+        return accept_maps(MapFolders(folders=folders), settings, workers=1)
+
+
+def test_rows_have_splits_by_content_and_copies_stay_together(accepted: AcceptedMaps) -> None:
+    rows = {locked.uid: locked for locked, _ in accepted.rows}
+    assert len(rows) == 26
+    assert [failure.reason for failure in accepted.failures] == ["not_a_number"]
+    for copy, first in (("texture:copy", "texture:cloth12"), ("sky:copy", "sky:sky12")):
+        assert rows[copy].split == rows[first].split
+    for kind in (TEXTURE, SKY):
+        assert {row.split for row in rows.values() if row.kind == kind} == set(SPLITS)
+    assert decode_objects_lock(encode_objects_lock(rows.values()), "lock") == sorted(
+        rows.values(), key=lambda row: row.uid
+    )
+
+
+def test_no_texture_or_map_of_test_is_in_train(
+    accepted: AcceptedMaps, settings: BuildSettings
+) -> None:
+    """By their bytes: not only the uids differ, but what scenes show."""
+    uids: dict[str, set[str]] = {}
+    shown: dict[str, set[str]] = {}
+    for split in SPLITS:
+        own = user_maps(accepted.rows, split)
+        uids[split], shown[split] = set(), set()
+        for index in range(5):
+            try:
+                scene = compose_scene(
+                    settings.scenes,
+                    small_pool(),
+                    seed=0,
+                    scene_index=index,
+                    attempt=0,
+                    user_maps=own,
+                )
+            except Rejected:
+                continue
+            scene.check()
+            uids[split].update(scene.provenance["maps"])
+            shown[split].update(t.sha256 for t in scene.textures if t.channels == 3)
+            assert scene.environment is not None
+            assert scene.provenance["sky"]["family"] == "own"
+            sky = scene.environment.radiance_rgb / scene.environment.radiance_rgb.max()
+            shown[split].add(str(np.round(np.sort(sky.ravel()), 4).tolist()))
+        assert uids[split]
+    specular = set.intersection(*shown.values())  # F0 of no metal, the same constant everywhere
+    assert len(specular) <= 1
+    for one, other in (("train", "test"), ("train", "validation"), ("validation", "test")):
+        assert not uids[one] & uids[other]
+        assert not (shown[one] & shown[other]) - specular
+    split_of = {locked.uid: locked.split for locked, _ in accepted.rows}
+    assert all(split_of[uid] == split for split in SPLITS for uid in uids[split])
+
+
+def test_without_own_ones_a_scene_is_what_it_was(
+    accepted: AcceptedMaps, settings: BuildSettings
+) -> None:
+    """Folders change no draw while their shares are 0, and procedural ones stay where none is."""
+    changes = {name: 0.0 for name in SHARES if name.endswith("own_share")}
+    plain = named_build("smoke", changes=SHARES | changes).scenes
+    own = user_maps(accepted.rows, "train")
+    first, second = (
+        compose_scene(plain, small_pool(), seed=0, scene_index=3, attempt=0, **given)
+        for given in ({}, {"user_maps": own})
+    )
+    assert [t.sha256 for t in first.textures] == [t.sha256 for t in second.textures]
+    assert "maps" not in second.provenance
+
+
+def test_documents_name_them_and_a_stranger_in_a_scene_is_a_fault(accepted: AcceptedMaps) -> None:
+    rows = [locked for locked, _ in accepted.rows]
+    table = list(csv.DictReader(io.StringIO(encode_attribution(rows).decode())))
+    done = {row["uid"]: row["changes"] for row in table}
+    assert "laid on other surfaces" in done["texture:copy"] and "turned" in done["sky:copy"]
+    sample, locked = tiny_sample(), {row.uid: row for row in rows}
+    manifest = Manifest(
+        build="smoke",
+        settings={},
+        environment={},
+        num_scenes=1,
+        num_views=sample.scene.num_views,
+        objects_lock_sha256="",
+        shards=(),
+    )
+    trains = next(row.uid for row in rows if row.split == "train")
+    held = next(row.uid for row in rows if row.split == "test")
+    named = {**sample.scene.provenance, "maps": [trains, held, "sky:unknown"]}
+    shown = dataclasses.replace(sample, scene=sample.scene.with_provenance(named))
+    faults = "; ".join(check_sample(shown, "train", manifest, locked))
+    assert f"object {held!r} belongs to split test" in faults
+    assert "object 'sky:unknown' is not in objects.lock.jsonl" in faults and trains not in faults
+
+
+def test_share_alike_licences_never_meet() -> None:
+    def map_under(licence: str) -> UserMap[int]:
+        return UserMap(uid=licence, source=MapSource(licence=licence), load=lambda: 0)
+
+    own = [map_under("CC-BY-SA-4.0"), map_under("CC-BY-SA-3.0"), map_under("CC0-1.0")]
+    drawn = {
+        found.uid
+        for number in range(50)
+        if (found := draw_user_map(rng_for(number, "own"), own, 1.0, ["CC-BY-SA-3.0", "MIT"]))
+    }
+    assert drawn == {"CC-BY-SA-3.0", "CC0-1.0"}
+    assert draw_user_map(rng_for(0, "own"), own[:1], 1.0, ["CC-BY-SA-3.0"]) is None
+
+
+def test_folders_and_shares_belong_together() -> None:
+    with pytest.raises(TrilightError, match="--skies is not given"):
+        map_folders(DatasetOrder(textures="t"), named_build("smoke", changes=SHARES))
+    with pytest.raises(TrilightError, match=r"--textures is given, but .*own_share 0"):
+        map_folders(DatasetOrder(textures="t"), named_build("smoke"))
+    with pytest.raises(TrilightError, match="only where scenes are composed"):
+        DatasetOrder(textures="t", scenes_from="scenes")
+    with pytest.raises(TrilightError, match="only with --textures or --skies"):
+        DatasetOrder(map_licence="MIT")
+
+
+def test_files_that_lie_are_refused_with_their_part(tmp_path: Path) -> None:
+    broken = tmp_path / "a_roughness.png"
+    broken.write_bytes(b"\x89PNG\r\n\x1a\n")
+    files = {"base": png(tmp_path / "a.png", noise(1)), "roughness": broken}
+    with pytest.raises(Rejected, match="roughness: it is cut off, or no PNG"):
+        prepare_map(MapFiles(kind=TEXTURE, files=files, size=4))
+    wide = exr(tmp_path / "wide.exr", np.ones((1, 8193, 3), np.float32))
+    with pytest.raises(Rejected, match="twice as wide as high"):
+        prepare_map(MapFiles(kind=SKY, files={"map": wide}, size=4))

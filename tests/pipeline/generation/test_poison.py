@@ -1,0 +1,237 @@
+"""What kills a child, or takes the disk or the bucket away, is a counted failure or a clear line.
+
+All through the real `make_dataset`: meshes, children, renders, shards, documents.
+"""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pipeline.executors.threads import ThreadRunner
+from pipeline.generation import pipeline
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import make_dataset, prepare_dataset
+from pipeline.generation.run import Outcome
+from storage.dataset.dataset import open_dataset
+from storage.dataset.verify import verify_dataset
+from storage.errors import EnvironmentFailure, TrilightError
+from tests.pipeline.assets.meshes_by_hand import knot, write_obj
+from tests.pipeline.generation import poison
+from tests.pipeline.generation.bucket_kit import OUT, empty_bucket
+from tests.s3_server import control, s3_server
+
+pytestmark = pytest.mark.slow("kills")
+"""Children that die and are started again take a minute together."""
+
+SHARD_BYTES = 174_000
+SHEET_BYTES = 150_000
+"""The contact sheet of the first scene, about."""
+"""Four scenes of four views at 32 pixels; measured."""
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Objects, a cache that all runs of this file share, and one dataset that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("workshop")
+    (folder / "objects").mkdir()
+    for number in range(8):
+        write_obj(folder / "objects" / f"knot{number}.obj", knot(segments=20 + number, sides=6))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TRILIGHT_CACHE", str(folder / "cache"))
+        patch.setattr("pipeline.documents.report._SECTIONS", {})
+        make(folder, folder / "plain")
+        yield folder
+
+
+def order(folder: Path, out: Path | str, **changes: object) -> DatasetOrder:
+    return DatasetOrder(
+        objects=str(folder / "objects"),
+        out=str(out),
+        **{"scenes": 8, "resolution": 32, "noise_floor_db": 20.0, **changes},  # type: ignore[arg-type]
+    )
+
+
+def make(folder: Path, out: Path | str, **changes: object) -> Outcome:
+    return make_dataset(order(folder, out, **changes), ThreadRunner())
+
+
+def expected(workshop: Path) -> str:
+    return open_dataset(str(workshop / "plain")).digest
+
+
+def test_a_mesh_that_crashes_its_child_is_one_failure(
+    workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other objects are used, and the dataset is the one without it."""
+    monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", poison.prepare_or_crash)
+    poisoned = write_obj(workshop / "objects" / poison.OBJECT, knot(segments=64))
+    try:
+        outcome = make(workshop, tmp_path / "set")
+    finally:
+        poisoned.unlink()
+    assert (outcome.num_objects_found, outcome.num_objects_used) == (9, 8)
+    assert outcome.digest == expected(workshop)
+    rejected = [
+        row for row in open_dataset(str(tmp_path / "set")).failures() if row.stage == "assets"
+    ]
+    assert [(row.item, row.reason) for row in rejected] == [("poison", "crashed_signal_11")]
+
+
+@pytest.fixture
+def cold(workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with a cache in which no mesh is; the children of one object are killed."""
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", poison.prepare_or_die)
+    monkeypatch.setenv("TRILIGHT_CONFINE", "off")  # they count their deaths in a file
+    (workshop / poison.DEATHS).write_text("0")
+    yield tmp_path
+    (workshop / poison.DEATHS).unlink()
+
+
+def test_a_mesh_child_that_is_killed_twice_changes_no_object(workshop: Path, cold: Path) -> None:
+    """The lock holds the digest of every mesh, and all pictures follow from it."""
+    (workshop / poison.DEATHS).write_text("2")
+    begun = prepare_dataset(order(workshop, cold / "set"))
+    assert (workshop / poison.DEATHS).read_text() == "0"
+    undisturbed = open_dataset(str(workshop / "plain")).manifest
+    assert begun.publication.manifest.objects_lock_sha256 == undisturbed.objects_lock_sha256
+
+
+def test_an_object_whose_children_are_all_killed_is_tried_again_by_the_next_run(
+    workshop: Path, cold: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A dataset begun without it says so; one that was begun with it waits for it."""
+    deaths, small = workshop / poison.DEATHS, {"scenes": 4}
+    deaths.write_text("3")
+    begun = prepare_dataset(order(workshop, cold / "without", **small))
+    assert begun.accepted.num_objects == 7
+    (failure,) = open_dataset(str(cold / "without")).failures()
+    assert (failure.item, failure.reason) == ("knot0", "killed")
+    (record,) = caplog.records
+    assert "1 could not be prepared this time (1 x killed)" in record.getMessage()
+    begun = prepare_dataset(order(workshop, cold / "with", **small))
+    assert begun.accepted.num_objects == 8
+    shutil.rmtree(cold / "cache")
+    begun.publication.folder.staged_index.unlink()
+    deaths.write_text("3")
+    with pytest.raises(
+        EnvironmentFailure, match="'knot0', which .* begun with.*killed.*run the same"
+    ):
+        prepare_dataset(order(workshop, cold / "with", **small))
+    assert open_dataset(str(cold / "with")).failures() == []
+    assert prepare_dataset(order(workshop, cold / "with", **small)).accepted == begun.accepted
+
+
+def test_meshes_that_are_away_are_made_again_where_a_scene_draws_them(
+    workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of no scene are not, and one that has changed is refused."""
+    begun = prepare_dataset(order(workshop, tmp_path / "set"))
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", poison.prepare_or_die)
+    monkeypatch.setenv("TRILIGHT_CONFINE", "off")  # they count their deaths in a file
+    (workshop / poison.DEATHS).write_text("1000")
+    drawn = {
+        row.uid
+        for sample in open_dataset(str(workshop / "plain")).samples()
+        for row in sample.scene.objects
+    }
+    assert "knot0" in drawn
+    assert prepare_dataset(order(workshop, tmp_path / "set")).accepted == begun.accepted
+    with pytest.raises(EnvironmentFailure, match="'knot0', which .*killed.*run the same"):
+        make(workshop, tmp_path / "set")
+    mesh = workshop / "objects" / "knot0.obj"
+    was = mesh.read_bytes()
+    write_obj(mesh, knot(segments=40))
+    (workshop / poison.DEATHS).write_text("0")
+    with pytest.raises(TrilightError, match="'knot0' has changed; expected the objects that"):
+        make(workshop, tmp_path / "set")
+    mesh.write_bytes(was)
+    outcome = make(workshop, tmp_path / "set")
+    (workshop / poison.DEATHS).unlink()
+    assert outcome.digest == expected(workshop)
+    assert len(list((tmp_path / "cache").glob("assets/??/*.safetensors"))) <= len(drawn) + 1
+
+
+def test_scenes_that_abort_their_child_are_counted(
+    workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One is saved by its next attempt; one is given up, within the budget and beyond it."""
+    monkeypatch.setattr(pipeline, "attempt_scene", poison.render_or_abort)
+    monkeypatch.setattr(pipeline, "MAX_ATTEMPTS", 2)  # 16 would start a child 48 times
+    with pytest.raises(TrilightError, match="1 of 8 scenes could not be made.*budget of 0%"):
+        make(workshop, tmp_path / "set", failure_budget=0.0)
+    outcome = make(workshop, tmp_path / "set", failure_budget=0.2)
+    assert outcome.num_scenes_given_up == 1
+    dataset = open_dataset(str(tmp_path / "set"))
+    assert verify_dataset(tmp_path / "set").problems == []
+    keys = [key for shard in dataset.manifest.shards for key in dataset.keys(shard)]
+    assert keys == [f"{index:09d}" for index in range(8) if index != poison.LOST_SCENE]
+    skips = [row for row in dataset.failures() if row.reason == "environmental_skip"]
+    assert [(int(row.item), row.attempt) for row in skips] == [(1, 0), (2, 0), (2, 1)]
+    assert all("SIGABRT" in row.message for row in skips)
+
+
+def test_a_bucket_that_is_lost_in_the_middle(
+    workshop: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
+    pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
+    with s3_server() as port, empty_bucket(port, monkeypatch) as driver:
+        with pytest.raises(TrilightError) as caught:
+            make_dataset(
+                order(workshop, OUT),
+                ThreadRunner(),
+                lambda run, outcome: control(port, "reset-auth", b"0"),
+            )
+        control(port, "reset-auth", b"inf")
+        text = str(caught.value)
+        assert text.startswith(f"out '{OUT}': cannot be") and "run the same command again" in text
+        assert "s3cret" not in text and "\n" not in text
+        assert "shards/set/train-000000.tar" in driver.find("shards/set")
+        made = _log_rows(workshop)
+        assert make(workshop, OUT).digest == expected(workshop)
+        assert _log_rows(workshop) == 8 >= made >= 4  # nothing was made twice
+        assert verify_dataset(OUT).problems == []
+
+
+def _log_rows(workshop: Path) -> int:
+    logs = (workshop / "cache" / "outputs").glob("*/logs/*.jsonl")
+    return sum(len(path.read_text().splitlines()) for path in logs)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 8 MB, which only root can make."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(folder)]
+    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("a small disk must be mounted, which takes root and the right to mount")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def test_a_full_disk_is_one_line_and_loses_nothing(workshop: Path, small_disk: Path) -> None:
+    """Room for nothing; for the first scenes; for all scenes of a shard, and not for the shard."""
+    out, ballast = small_disk / "set", small_disk / "ballast"
+    for room in (20_000, SHARD_BYTES // 2, SHARD_BYTES + SHARD_BYTES // 2 + SHEET_BYTES):
+        ballast.unlink(missing_ok=True)
+        used = sum(path.stat().st_size for path in small_disk.rglob("*") if path.is_file())
+        free = os.statvfs(small_disk).f_bavail * os.statvfs(small_disk).f_frsize
+        ballast.write_bytes(bytes(free - max(4096, room - used)))
+        with pytest.raises(EnvironmentFailure, match="the disk is full.*free some space") as caught:
+            make(workshop, out)
+        assert "\n" not in str(caught.value)
+        assert not list(out.glob("*.tar"))
+        assert not list(out.rglob("*.part"))
+        if (out / "manifest.json").exists():
+            assert verify_dataset(out).problems == []
+    assert len(list(out.glob(".staging/samples/*/*.tar"))) == 4
+    ballast.unlink()
+    assert make(workshop, out).digest == expected(workshop)
+    assert verify_dataset(out).problems == []

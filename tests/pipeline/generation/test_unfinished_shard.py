@@ -1,0 +1,356 @@
+"""Pieces of shards by several makers: every scene once, one packer; rounds wait for others."""
+
+import contextlib
+import dataclasses
+import os
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from PIL import Image
+
+from pipeline.generation import pipeline, render_children, tasks, unfinished_shard
+from pipeline.generation.attempt_scene import SceneAttempt
+from pipeline.generation.child_pool import ChildPool
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.freeze_objects import AcceptedObjects
+from pipeline.generation.pipeline import make_dataset, make_piece
+from pipeline.generation.run import Run, ShardJob, TaskResult
+from pipeline.generation.tasks import Piece
+from pipeline.generation.unfinished_shard import UnfinishedShard
+from pipeline.isolation import ChildFailed, IsolatedChild
+from pipeline.shards.pack import pack_shard
+from storage import claims
+from storage.claims import hold_claim
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import ShardEntry, index_shard
+from storage.dataset.progress import read_progress, read_status
+from storage.dataset.shard import write_shard
+from storage.dataset.shard_notes import ShardNote, note_shard, noted_shard
+from storage.dataset.staging import is_staged, read_staged_scene, stage_scene
+from storage.dataset.statistics import Statistics
+from storage.errors import TrilightError
+from storage.records.objects import Failure, read_failures
+from storage.records.sample import sample_key
+from tests.pipeline.generation.test_dataset_writer import (
+    _build,
+    _sample,
+    begin_tiny,
+    make_tiny_shard,
+)
+from tests.pipeline.generation.tiny_scenes_kit import shard_job
+
+NAME = "train-000000.tar"
+
+
+class FakeChild:
+    """Makes tiny samples at once, and counts."""
+
+    def __init__(self, made: "Counter[int]", broken: int = -1) -> None:
+        self._made = made
+        self._broken = broken
+
+    def call(self, function: Any, split: str, scene_index: int, attempt: int) -> SceneAttempt:
+        if scene_index == self._broken and attempt == 0:
+            raise ChildFailed("crashed_signal_11", "native code ended by SIGSEGV")
+        self._made[scene_index] += 1
+        return SceneAttempt(sample=_sample(scene_index), failures=[])
+
+
+@pytest.fixture(autouse=True)
+def _begun(tmp_path: Path) -> None:
+    """Begin the dataset whose shard this is."""
+    begin_tiny(tmp_path, 4)
+
+
+def _make(root: Path, first: int, last: int, made: "Counter[int]", broken: int = -1) -> Any:
+    child = cast(IsolatedChild, FakeChild(made, broken))
+    piece = Piece(shard_index=0, first=first, last=last)
+    _, shard = make_piece(shard_job(root), piece, child)
+    return shard
+
+
+def test_many_makers_of_one_shard_make_every_scene_once(tmp_path: Path) -> None:
+    made: Counter[int] = Counter()
+    packed: list[ShardEntry | None] = []
+    threads = [
+        threading.Thread(target=lambda: packed.append(_make(tmp_path, 0, 4, made)))
+        for _ in range(6)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert made == {0: 1, 1: 1, 2: 1, 3: 1}
+    (shard,) = [entry for entry in packed if entry]
+    assert shard == index_shard(tmp_path / NAME)
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_whoever_makes_the_last_piece_packs(tmp_path: Path) -> None:
+    made: Counter[int] = Counter()
+    assert _make(tmp_path, 2, 4, made) is None
+    shard = _make(tmp_path, 0, 2, made)
+    assert shard is not None
+    assert shard.num_samples == 4
+    assert _make(tmp_path, 0, 4, made) is None  # there is nothing left to do
+    assert made.total() == 4
+
+
+def test_the_first_scene_can_be_looked_at_at_once(tmp_path: Path) -> None:
+    sheet, made = DatasetFolder(tmp_path).contact_sheet, Counter[int]()
+    _make(tmp_path, 2, 3, made)
+    first = sheet.read_bytes()
+    assert Image.open(sheet).size[0] > 2 * 192, "both views side by side"
+    _make(tmp_path, 3, 4, made)
+    assert sheet.read_bytes() == first, "later scenes leave it"
+
+
+def test_what_somebody_else_is_making_is_left_to_them(tmp_path: Path) -> None:
+    made: Counter[int] = Counter()
+    claim = DatasetFolder(tmp_path).staged_shard(NAME) / f"{sample_key(1)}.claim"
+    with hold_claim(claim):
+        assert _make(tmp_path, 0, 4, made) is None
+    assert made == {0: 1, 2: 1, 3: 1}
+    assert _make(tmp_path, 0, 4, made) is not None  # they died; now it is free
+
+
+def test_who_waits_for_others_says_for_whom(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(claims, "_SILENT_S", 0.0)
+    folder, missing = DatasetFolder(tmp_path), [[0], [0], []]
+    writer = SimpleNamespace(folder=folder)
+    settings = SimpleNamespace(splits=_build().splits)
+    run: Any = SimpleNamespace(
+        publication=writer, settings=settings, missing_shards=lambda: missing.pop(0)
+    )
+    _make(tmp_path, 1, 4, Counter())
+    with hold_claim(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
+        tasks._wait_for_others(run, 0.0)
+    assert f"{sample_key(0)}.claim: waiting for 0 s for process {os.getpid()} of" in caplog.text
+
+
+def test_a_shard_that_is_packed_while_one_looks_is_not_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its scenes leave the staging then: they are neither staged nor claimed, and yet not free."""
+    looked_at = UnfinishedShard(DatasetFolder(tmp_path), _build().splits, 0)
+    assert looked_at.is_free()
+
+    def packed_meanwhile(staged: Path, scene_index: int) -> bool:
+        seen = is_staged(staged, scene_index)
+        monkeypatch.setattr(unfinished_shard, "is_staged", is_staged)
+        assert _make(tmp_path, 0, 4, Counter()) is not None
+        return seen
+
+    monkeypatch.setattr(unfinished_shard, "is_staged", packed_meanwhile)
+    assert not looked_at.is_free()
+
+
+def _somebody_quicker(
+    monkeypatch: pytest.MonkeyPatch, claim_name: str, work: Callable[[], object]
+) -> None:
+    """Let somebody else do `work` just before this process asks for a claim."""
+
+    @contextlib.contextmanager
+    def claimed_late(claim: Path) -> Iterator[bool]:
+        if claim.name == claim_name:
+            monkeypatch.setattr(unfinished_shard, "hold_claim", hold_claim)
+            work()
+        with hold_claim(claim) as ours:
+            yield ours
+
+    monkeypatch.setattr(unfinished_shard, "hold_claim", claimed_late)
+
+
+def test_a_scene_that_somebody_made_before_the_claim_is_not_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: Counter[int] = Counter()
+    _somebody_quicker(monkeypatch, f"{sample_key(0)}.claim", lambda: _make(tmp_path, 0, 1, made))
+    _make(tmp_path, 0, 1, made)
+    assert made == {0: 1}
+
+
+def test_a_shard_that_somebody_packed_before_the_claim_has_one_packer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: Counter[int] = Counter()
+    packed: list[ShardEntry | None] = []
+    _somebody_quicker(monkeypatch, "pack.claim", lambda: packed.append(_make(tmp_path, 0, 4, made)))
+    packed.append(_make(tmp_path, 0, 4, made))
+    assert [entry is not None for entry in packed] == [True, False]
+    assert made.total() == 4
+
+
+def test_a_scene_that_crashes_its_child_costs_an_attempt(tmp_path: Path) -> None:
+    made: Counter[int] = Counter()
+    assert _make(tmp_path, 0, 2, made, broken=1) is None
+    staged = DatasetFolder(tmp_path).staged_shard(NAME)
+    (failure,) = read_staged_scene(staged, 1).failures
+    assert (failure.reason, failure.attempt) == ("environmental_skip", 0)
+    assert "SIGSEGV" in failure.message
+
+
+def test_a_note_of_an_earlier_shard_is_not_believed(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path)
+    write_shard(tmp_path / NAME, [(sample_key(0), {"json": b"{}"})])
+    before = ShardNote(shard=index_shard(tmp_path / NAME), failures=())
+    note_shard(folder, before)
+    assert noted_shard(folder, NAME) == before
+    (tmp_path / NAME).unlink()
+    write_shard(tmp_path / NAME, [(sample_key(0), {"json": b"[]"})])  # of the same size
+    assert noted_shard(folder, NAME).shard == index_shard(tmp_path / NAME) != before.shard
+
+
+class Idle:
+    """A runner that finds everything taken, and counts."""
+
+    num_at_once = 1
+    window = None
+
+    def __init__(self) -> None:
+        self.rounds: list[int] = []
+
+    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
+        self.rounds.append(0)
+        for _ in tasks:
+            self.rounds[-1] += 1
+            yield TaskResult(shards=(), scenes=0, seconds=0.0, core_s=0.0)
+
+    def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
+        raise AssertionError("not finished")
+
+
+def _run(root: Path, scenes: int) -> Run:
+    return Run(
+        order=DatasetOrder(out=str(root), scenes=scenes),
+        settings=_build(),
+        scene_folder=None,
+        publication=begin_tiny(root, scenes),
+        accepted=AcceptedObjects(num_objects=0, num_found=0),
+    )
+
+
+def _claim(folder: DatasetFolder, scene: int) -> Any:
+    return hold_claim(folder.staged_shard(NAME) / f"{sample_key(scene)}.claim")
+
+
+def test_waiting_for_others_takes_few_looks_and_no_tasks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, runner, pauses = _run(tmp_path, 4), Idle(), list[float]()
+    held = contextlib.ExitStack()
+
+    def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) == 8:  # one of them dies: there is something to do
+            held.close()
+        if len(pauses) == 10:  # and somebody else was quicker
+            make_tiny_shard(begin_tiny(tmp_path, 4), 0)
+
+    monkeypatch.setattr(tasks.time, "sleep", sleep)
+    for scene in range(4):
+        held.enter_context(_claim(run.publication.folder, scene))
+    pipeline.make_shards(run, runner, lambda run, outcome: None)
+    assert pauses == [1, 2, 4, 8, 16, 32, 60, 60, 60, 60]
+    assert runner.rounds == [1, 1, 1]  # at first, after the eighth pause, after the ninth
+
+
+def test_a_range_leaves_to_others_what_they_are_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def sleep(seconds: float) -> None:
+        raise AssertionError("nobody waits")
+
+    monkeypatch.setattr(tasks.time, "sleep", sleep)
+    run, runner = _run(tmp_path, 8), Idle()
+    ranged = dataclasses.replace(run, order=dataclasses.replace(run.order, shards="0:1"))
+    pipeline.make_shards(ranged, runner, lambda run, outcome: None)
+    assert runner.rounds == [1]
+    assert ranged.missing_shards() == [0]
+    assert run.missing_shards() == [0, 1]
+
+
+def test_what_is_free_is_what_nobody_is_at(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path)
+    shard = UnfinishedShard(folder, _build().splits, 0)
+    assert shard.is_free()
+    for scene in range(3):
+        stage_scene(folder.staged_shard(NAME), scene, _sample(scene), [], "lossless")
+    with _claim(folder, 3):
+        assert not shard.is_free()
+    assert shard.is_free()
+    stage_scene(folder.staged_shard(NAME), 3, _sample(3), [], "lossless")
+    assert shard.is_free()  # to be packed
+    with hold_claim(folder.staged_shard(NAME) / "pack.claim"):
+        assert not shard.is_free()
+    pack_shard(folder, NAME, range(4))
+    assert not shard.is_free()
+
+
+def test_a_rerun_does_not_escape_the_failure_budget(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All shards are there, but an earlier run stopped since too many scenes were given up."""
+    run = _run(tmp_path, 4)
+    folder = run.publication.folder
+    for scene in range(4):
+        failure = Failure(stage="scenes", item=sample_key(scene), reason="no", message="x")
+        stage_scene(folder.staged_shard(NAME), scene, None, [failure], "lossless")
+    run.publication.add_shard(pack_shard(folder, NAME, range(4)))
+    with pytest.raises(TrilightError, match=r"4 of 4 .*The reasons are in failures\.jsonl"):
+        run.require_within_budget()  # while it is made
+    assert [row.item for row in read_failures(folder.failures)] == [*map(sample_key, range(4))]
+    monkeypatch.setattr(pipeline, "_begin_run", lambda order: contextlib.nullcontext(run))
+    with pytest.raises(TrilightError, match="4 of 4 scenes could not be made"):
+        make_dataset(run.order, Idle())
+
+
+def test_scenes_that_are_given_up_are_not_counted_as_made(tmp_path: Path) -> None:
+    """While they wait, in a shard that is not listed, and in a finished dataset."""
+    run = _run(tmp_path, 4)
+    folder = run.publication.folder
+    shard = UnfinishedShard(folder, run.settings.splits, 0)
+    for scene in range(4):
+        made = _sample(scene) if scene else None
+        shard.stage(scene, made, [], "lossless", began=0.0, cores=1)
+    shard.stage(0, None, [], "lossless", began=0.0, cores=1)  # again, after a kill
+
+    def counts() -> set[tuple[int, int, int]]:
+        shown = read_progress(folder), read_status(str(folder.root))
+        return {(now.scenes_done, now.scenes_given_up, now.scenes_planned) for now in shown}
+
+    assert counts() == {(3, 1, 4)}
+    packed = shard.pack()
+    assert packed is not None
+    run.publication.add_shard(packed)
+    assert counts() == {(3, 1, 4)}
+    run.publication.finish()
+    assert counts() == {(3, 1, 4)}
+
+
+def test_only_children_that_nobody_uses_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another run may be at work on the same Dask worker."""
+    closed: list[str] = []
+
+    def pool(name: str) -> ChildPool:
+        child = SimpleNamespace(close=lambda: closed.append(name))
+        return ChildPool(lambda number: cast(IsolatedChild, child), 1)
+
+    job = cast(Any, SimpleNamespace(
+        folder=DatasetFolder(Path("a")), settings=SimpleNamespace(digest="d"), lock_sha256="l"
+    ))  # fmt: skip
+    monkeypatch.setattr(render_children, "_pools", {("b", "d", "l"): pool("other")})
+    monkeypatch.setattr(render_children, "_render_pool", lambda job: pool("ours"))
+    with render_children.render_child(job):
+        assert closed == ["other"]
+        render_children.close_idle_children()
+        assert closed == ["other"]
+    render_children.close_idle_children()
+    assert closed == ["other", "ours"]

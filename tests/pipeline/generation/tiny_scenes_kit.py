@@ -1,0 +1,86 @@
+"""Runs that are real in all but objects and pictures: scenes by hand, which cost nothing."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.executors.threads import ThreadRunner
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.freeze_objects import AcceptedObjects
+from pipeline.generation.object_options import ObjectOptions
+from pipeline.generation.run import ShardJob
+from pipeline.renders.variant import Variant
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.statistics import Statistics
+from storage.records.objects import Failure
+from storage.records.sample import Sample, sample_key
+from tests.pipeline.generation.test_dataset_writer import _build, _locked
+from tests.scenes_by_hand import tiny_sample
+
+
+def tiny_order(**changes: Any) -> DatasetOrder:
+    """Return an order that fits the scenes by hand: two views of 16 pixels, four to a shard."""
+    return DatasetOrder(**{"resolution": 16, "changes": {"scenes.num_views": 2}, **changes})
+
+
+def shard_job(root: Path, **changes: Any) -> ShardJob:
+    """Return what workers are told of a dataset of tiny scenes without objects."""
+    job = ShardJob(
+        folder=DatasetFolder(root),
+        settings=_build(),
+        environment={},
+        accepted=AcceptedObjects(num_objects=0, num_found=0),
+        lock_sha256="",
+        num_at_once=1,
+        extensions={},
+    )
+    return dataclasses.replace(job, **changes)
+
+
+def without_rendering(
+    monkeypatch: pytest.MonkeyPatch, made: Callable[[int], None] = lambda scene: None
+) -> list[tuple[str, int]]:
+    """Replace objects and pictures; returns a list that fills with split and scene of each made.
+
+    Args:
+        monkeypatch: takes it back.
+        made: called with each scene as it is made.
+    """
+    scenes: list[tuple[str, int]] = []
+
+    def accept(order: ObjectOptions, *more: Any) -> AcceptedObjects:
+        if not order.writer.manifest.objects_lock_sha256:
+            order.writer.lock_objects([_locked()])
+        return AcceptedObjects(num_objects=0, num_found=1)
+
+    def make(split: str, scene: int, *more: Any) -> tuple[Sample, list[Failure]]:
+        scenes.append((split, scene))
+        made(scene)
+        return dataclasses.replace(tiny_sample(seed=scene), key=sample_key(scene)), []
+
+    monkeypatch.setattr(
+        "pipeline.generation.pipeline.prepare_unfrozen_objects", lambda *given: None
+    )
+    monkeypatch.setattr("pipeline.generation.pipeline.accept_objects", accept)
+    monkeypatch.setattr("pipeline.generation.pipeline.make_scene", make)
+    without_probe(monkeypatch)
+    return scenes
+
+
+def without_probe(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Try no library: nothing is rendered."""
+    unprobed = Variant(name="llvm_ad_rgb", libllvm="", note="")
+    monkeypatch.setattr("pipeline.renders.variant._on_processor", lambda: unprobed)
+
+
+class Undocumented(ThreadRunner):
+    """Threads, as `trilight generate` uses them; no report is drawn of a finished dataset."""
+
+    def __init__(self) -> None:
+        self.finished = 0
+
+    def finish(self, write_documents: Callable[[], Statistics]) -> Any:
+        self.finished += 1

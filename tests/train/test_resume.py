@@ -1,0 +1,332 @@
+"""What a run is, and what a command that resumes it may say.
+
+Named runs exist, and contradictions are refused by field. Execution is as one likes, meaning as it
+was, or a decision.
+"""
+
+import dataclasses
+import json
+from typing import Any
+
+import pytest
+
+from model.base_widths import BaseWidths
+from model.config import SIZES, large
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
+from storage.removed import LAST_COMMIT
+from storage.settings.described import settings_record
+from tests.for_each import for_each
+from tests.train.kit import TINY_MODEL, tiny_run
+from train.resume import ResumePlan, event_records, plan_resume
+from train.runs import RUNS, changed_run, named_run, scale_intervals
+from train.settings import AugmentationSettings, TrainSettings
+from train.stored_settings import known_settings, stored_settings
+
+DIGEST = "d" * 64
+OTHER = "0123456789" * 6 + "abcd"
+
+
+def header(settings: TrainSettings | None = None, *, step: int = 8, **more: Any) -> dict[str, Any]:
+    record = {
+        "step": step,
+        "settings": settings_record(settings or tiny_run()),
+        "data_digest": DIGEST,
+        "history": [],
+    }
+    return json.loads(json.dumps(record | more))
+
+
+def following(before: dict[str, Any], going: ResumePlan, step: int) -> dict[str, Any]:
+    """Return the header of a later checkpoint of a run that went on."""
+    return header(going.settings, step=step, history=event_records(going.history)) | {
+        "data_digest": before["data_digest"]
+    }
+
+
+def test_the_same_command_goes_on_and_nothing_happens() -> None:
+    going = plan_resume(header(), tiny_run(), DIGEST, {})
+    assert going == ResumePlan(settings=tiny_run(), history=(), notes=(), changes_meaning=False)
+
+
+def test_removed_settings_stand_in_checkpoints_where_they_stood() -> None:
+    """At the values that meant none, so that checkpoints keep their bytes."""
+    stored = stored_settings(tiny_run())
+    assert list(stored["loss"]) == [
+        "perceptual", "perceptual_weight", "lpips_precision", "noise_half"
+    ]  # fmt: skip
+    fields = list(stored["model"])
+    assert fields[fields.index("rope_max_freq") + 1] == "projected_freqs"
+    assert fields[-3:] == ["texture_cells", "sky_cells", "sky_rays"]
+    assert known_settings(stored, "resume") == settings_record(tiny_run())
+    going = plan_resume(header() | {"settings": stored}, tiny_run(), DIGEST, {})
+    assert going.settings == tiny_run() and not going.history
+
+
+@for_each(
+    ("group", "name", "value"), [("model", "sky_cells", 48), ("loss", "lpips_precision", "float16")]
+)
+def test_runs_that_use_what_was_removed_are_refused(group: str, name: str, value: Any) -> None:
+    begun = header()
+    begun["settings"][group][name] = value
+    message = (
+        f"^checkpoint: {group}.{name} is {value!r}: removed since, and commit {LAST_COMMIT} is"
+    )
+    with pytest.raises(TrilightError, match=message):
+        plan_resume(begun, tiny_run(), DIGEST, {})
+
+
+EXECUTED: dict[str, Any] = {
+    "scenes_per_pass": 1,
+    "precision": "bfloat16",
+    "recompute_activations": True,
+    "most_unusable": 3,
+    "log_every": 1,
+    "validate_every": 3,
+    "checkpoint_every": 5,
+    "checkpoints_kept": 7,
+    "keep_every": 10,
+    "validation_scenes": 1,
+}
+
+
+def test_execution_is_free_and_noted() -> None:
+    """All of it at once, since intervals have to fit each other, and back again."""
+    typed = tiny_run(**EXECUTED)
+    going = plan_resume(header(), typed, DIGEST, {})
+    assert going.settings == typed and not going.changes_meaning
+    assert {event.name for event in going.history} == set(EXECUTED)
+    assert {event.kind for event in going.history} == {"execution"}
+    assert "from step 8 on, scenes_per_pass is 1 instead of 16" in going.notes
+    back = plan_resume(following(header(), going, 9), tiny_run(), DIGEST, {})
+    assert back.settings == tiny_run() and len(back.history) == 2 * len(EXECUTED)
+
+
+@for_each(
+    ("changes", "message"),
+    [
+        (
+            {"seed": 1},
+            r"seed is 1, but the checkpoint was made with 0\. Go on as it was with --set seed=0, "
+            "or decide on --change seed=1, which the run records",
+        ),
+        ({"num_steps": 20}, "num_steps is 20, but .* 12.* --set num_steps=12.*change num_steps=20"),
+        ({"betas": (0.9, 0.95)}, r"--set betas=\[0.9,0.99\].* --change betas=\[0.9,0.95\]"),
+        (
+            {"augmentation": AugmentationSettings(mirror=True)},
+            "augmentation.channels is false, .* with true, and augmentation.vertex_order is "
+            "false.*--change augmentation.channels=false --change augmentation.vertex_order=false",
+        ),
+        (
+            {"model": dataclasses.replace(TINY_MODEL, hidden_width=64)},
+            "model.hidden_width is 64, but the checkpoint was made with 48.* another run in",
+        ),
+    ],
+)
+def test_other_meaning_is_refused_with_both_values_and_both_ways(
+    changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(TrilightError, match=message):
+        plan_resume(header(), tiny_run(**changes), DIGEST, {})
+
+
+def test_a_decision_holds_from_its_step_and_is_not_typed_again() -> None:
+    first = plan_resume(
+        header(), tiny_run(), DIGEST, {"learning_rate": 1e-3, "loss.noise_half": 0.5}
+    )
+    assert first.changes_meaning
+    assert (first.settings.learning_rate, first.settings.loss.noise_half) == (1e-3, 0.5)
+    (event, _) = sorted(first.history, key=lambda event: event.name)
+    assert dataclasses.asdict(event) == {
+        "step": 8, "kind": "meaning", "name": "learning_rate", "before": 2e-3, "after": 1e-3,
+    }  # fmt: skip
+    assert "from step 8 on, learning_rate is 0.001 instead of 0.002" in first.notes
+    later = following(header(), first, 10)
+    for typed in (tiny_run(), first.settings):  # as it was begun, or as it is
+        again = plan_resume(later, typed, DIGEST, {})
+        assert again.settings == first.settings and again.history == first.history
+        assert not again.changes_meaning
+        assert "as decided at step 8, learning_rate is 0.001" in again.notes
+    same = plan_resume(later, tiny_run(), DIGEST, {"learning_rate": 1e-3})
+    assert not same.changes_meaning and same.history == first.history
+    with pytest.raises(TrilightError, match=r"is 0\.003, but the checkpoint was made with 0\.001"):
+        plan_resume(later, tiny_run(learning_rate=3e-3), DIGEST, {})
+    second = plan_resume(later, tiny_run(), DIGEST, {"learning_rate": 5e-4})
+    last = plan_resume(following(later, second, 11), tiny_run(), DIGEST, {})
+    assert last.settings.learning_rate == 5e-4
+    assert [event.step for event in last.history] == [8, 8, 10]
+
+
+@for_each(
+    ("decisions", "message"),
+    [
+        (
+            {"scenes_per_pass": 2},
+            "--change scenes_per_pass: it is execution.* --set scenes_per_pass",
+        ),
+        ({"model.hidden_width": 64}, "model.hidden_width: it is the run's for good.*--from"),
+        ({"base_widths.width": 64}, "base_widths.width: it is the run's for good"),
+        ({"muon_rate": 3.0}, "muon_rate=3: the checkpoint lacks the memories"),
+        ({"num_steps": 7}, "num_steps=7: 8 steps are done.*--branch"),
+        ({"learning_rate": 2}, "'learning_rate' is 2; expected a number above 0, up to 1"),
+    ],
+)
+def test_what_cannot_be_decided_is_refused(decisions: dict[str, Any], message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        plan_resume(header(), tiny_run(), DIGEST, decisions)
+
+
+def test_other_data_is_a_decision_by_digest() -> None:
+    with pytest.raises(TrilightError, match="the data are sha256:012345678901, .* sha256:dddddd"):
+        plan_resume(header(), tiny_run(), OTHER, {})
+    with pytest.raises(TrilightError, match="--change data=sha256:012345678901, which"):
+        plan_resume(header(), tiny_run(), OTHER, {})
+    for wrong in ("sha256:99999999999", "sha256:01", "new", 12):
+        with pytest.raises(TrilightError, match="--change data is .* the data are sha256:0123456"):
+            plan_resume(header(), tiny_run(), OTHER, {"data": wrong})
+    going = plan_resume(header(), tiny_run(), OTHER, {"data": "sha256:012345678901"})
+    (event,) = going.history
+    assert (event.name, event.before, event.after) == ("data", DIGEST, OTHER)
+    assert going.changes_meaning
+    assert "data is sha256:012345678901 instead of sha256:dddddddddddd" in going.notes[0]
+    listed = plan_resume(header(), tiny_run(), f"list:{OTHER}", {"data": "list:01234567"})
+    assert listed.history[0].after == f"list:{OTHER}"
+    later = following(header(), going, 9) | {"data_digest": OTHER}
+    assert not plan_resume(
+        later, tiny_run(), OTHER, {"data": "sha256:012345678901"}
+    ).changes_meaning
+
+
+def test_a_run_from_before_a_setting_stays_as_it_was() -> None:
+    """Even where the named run has another value by now; until that is decided on."""
+    old = header()
+    for later in ("schedule", "decay_share", "recompute_activations"):
+        del old["settings"][later]
+    del old["settings"]["model"]["window_bundles"], old["history"]
+    typed = tiny_run(schedule="wsd")
+    going = plan_resume(old, typed, DIGEST, {})
+    assert going.settings == tiny_run() and not going.changes_meaning
+    assert going.notes == (
+        "schedule is cosine and not wsd, since the run is older than that setting; --change "
+        "schedule=wsd changes it",
+    )
+    again = plan_resume(following(old, going, 9), typed, DIGEST, {})
+    assert again.settings == tiny_run() and again.history == going.history
+    decided = plan_resume(following(old, going, 9), typed, DIGEST, {"schedule": "wsd"})
+    assert decided.settings == typed and decided.changes_meaning
+    for either in ("wsd", "cosine"):
+        last = plan_resume(following(old, decided, 10), tiny_run(schedule=either), DIGEST, {})
+        assert last.settings == typed
+
+
+def test_a_rate_that_rises_again_is_said() -> None:
+    begun = tiny_run(schedule="wsd", num_steps=20)
+    late = plan_resume(header(begun, step=18), begun, DIGEST, {"num_steps": 40})
+    assert any("the rate had been falling since step 16" in note for note in late.notes)
+    early = plan_resume(header(begun, step=16), begun, DIGEST, {"num_steps": 40})
+    assert not any("falling" in note for note in early.notes)
+
+
+def test_unknown_runs_are_refused() -> None:
+    message = "'smoek': no such run; did you mean smoke.* builtin, fine"
+    with pytest.raises(TrilightError, match=message):
+        named_run("smoek")
+
+
+@for_each("name", sorted(RUNS))
+def test_named_runs_survive_json_and_fewer_steps_bring_warm_up_and_intervals_along(
+    name: str,
+) -> None:
+    """So that any number of steps is a run that is logged, judged and saved as the whole one is."""
+    run = named_run(name)
+    record = settings_record(run)
+    assert run.run == name and json.loads(json.dumps(record)) == record
+    for steps in (1, 2, 7, 24, 331, run.num_steps // 2):
+        shorter = changed_run(name, {}, steps=steps)
+        assert shorter.num_steps == steps
+        share = steps / run.num_steps
+        # rounded to a whole number of rows, and never to none
+        assert abs(shorter.warmup_steps - run.warmup_steps * share) <= 0.5
+        assert abs(shorter.log_every - run.log_every * share) < 1
+        for field in ("validate_every", "checkpoint_every"):
+            assert abs(getattr(shorter, field) - getattr(run, field) * share) <= shorter.log_every
+        assert shorter.keep_every % shorter.checkpoint_every == 0
+        assert (shorter.keep_every > 0) == (run.keep_every > 0)
+    assert changed_run(name, {}, steps=run.num_steps) == run
+    longer = changed_run(name, {}, steps=3 * run.num_steps)
+    assert dataclasses.replace(longer, num_steps=run.num_steps) == run
+
+
+def test_what_is_stated_is_not_brought_along() -> None:
+    stated = {"warmup_steps": 5, "validate_every": 12, "checkpoint_every": 24}
+    found = changed_run("smoke", stated, steps=24)
+    assert {name: getattr(found, name) for name in stated} == stated
+    assert changed_run("smoke", {"checkpoint_every": 9}, steps=80).log_every in (1, 3)
+    assert not scale_intervals(named_run("smoke"), 24, stated).keys() & stated.keys()
+    with pytest.raises(TrilightError, match="warmup_steps is 50; expected 0 to 23"):
+        changed_run("smoke", {"warmup_steps": 50}, steps=24)
+    with pytest.raises(TrilightError, match="num_steps'? is 0; expected a whole number from 1"):
+        changed_run("smoke", {}, steps=0)
+    for value, message in ((0, "is 0; expected a whole number from 1"), ("often", "is 'often'")):
+        with pytest.raises(TrilightError, match=f"log_every'? {message}"):
+            changed_run("pretrain", {"log_every": value}, steps=24)
+
+
+@for_each(
+    ("changes", "message"),
+    [
+        ({"resolution": 20}, "resolution is 20; expected a multiple of 8"),
+        ({"warmup_steps": 12}, "warmup_steps is 12; expected 0 to 11"),
+        ({"validate_every": 5}, "validate_every is 5; expected a multiple of log_every, 2"),
+        ({"checkpoint_every": 3}, "checkpoint_every is 3"),
+        ({"precision": "float16"}, "precision is 'float16'; expected float32 or bfloat16"),
+    ],
+)
+def test_contradictory_settings_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        tiny_run(**changes)
+
+
+def test_the_paper_runs_are_the_papers() -> None:
+    """Zeng et al. 2025, section 4, and the published configuration."""
+    first, second = named_run("paper-pretrain"), named_run("paper-finetune")
+    assert (first.resolution, first.most_triangles, first.num_steps) == (256, 1536, 500_000)
+    assert (first.scenes_per_step, first.views_per_scene) == (128, 2)
+    assert (first.warmup_steps, first.learning_rate) == (8_000, 1e-4)
+    assert (second.resolution, second.most_triangles, second.num_steps) == (512, 4096, 100_000)
+    for run in (first, second):
+        assert (run.loss.perceptual, run.loss.perceptual_weight) == ("lpips", 0.05)
+        assert (run.betas, run.weight_decay, run.grad_clip) == ((0.9, 0.999), 0.01, 1.0)
+        assert (run.augmentation.rotation, run.augmentation.translation) == ("recipe", 0.25)
+        assert run.ema_decay == run.muon_rate == 0 and not run.augmentation.mirror
+        assert run.base_widths == BaseWidths() and run.base_widths.width == 0
+    assert second.from_weights and not first.from_weights
+
+
+def test_every_size_can_be_asked_for_by_name() -> None:
+    for name, make in SIZES.items():
+        assert changed_run("smoke", {"model": name}).model == make()
+    without = changed_run("pretrain", {"model.window_bundles": 0, "model": "large"})
+    assert without.model == dataclasses.replace(large(), window_bundles=0)
+    with pytest.raises(TrilightError, match="'model' is 'larg'; did you mean large"):
+        changed_run("smoke", {"model": "larg"})
+    with pytest.raises(TrilightError, match="resolution is 72; expected a multiple of 64"):
+        changed_run("smoke", {"model": "large", "resolution": 72})
+
+
+SHIPPED = {
+    "builtin": "f414db1e0417fdce",
+    "hits": "62ab9f9520cd9d79",
+    "hits-tokens": "ca39119c1c965aa5",
+    "paper-pretrain-large": "54b5eefedba2fa94",  # of the published training code
+    "paper-finetune-large": "c54e4a456bc09c9d",
+}
+"""Of what a run states beside its name and the defaults. Another digest is another run, which takes
+another name."""
+
+
+def test_the_runs_of_the_shipped_networks_stay_what_they_are() -> None:
+    for name, digest in SHIPPED.items():
+        record = settings_record(named_run(name), stated=True)
+        del record["run"]
+        assert sha256_hex(canonical_json(record))[:16] == digest, name

@@ -1,0 +1,272 @@
+"""Initial or resumed state of a run, and the settings.json that records it."""
+
+import dataclasses
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from model.open import open_network
+from model.renderformer import RenderFormer
+from model.weights import decode_config, encode_weights, read_metadata
+from storage.atomic import write_atomically
+from storage.dataset.training_data import TrainingData
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.extensions import extension_digests
+from storage.records.safe_read import read_plain
+from storage.typed_json import read_json
+from train.data.mixture import RECORD, plan_mixture
+from train.folder import RunFolder
+from train.loop.checkpoints import (
+    HEADER_KEY,
+    Checkpoint,
+    is_checkpoint,
+    network_of_run,
+    newest_checkpoint,
+    path_of_step,
+    read_checkpoint,
+    restore_state,
+    save_checkpoint,
+    saved_steps,
+)
+from train.loop.distributed import DistributedContext
+from train.loop.muon import choose_muon_precision
+from train.loop.recorder import MetricsLog
+from train.loop.state import TrainState, new_state
+from train.monitoring.rows import read_rows
+from train.progress import TrainProgress
+from train.result import pretty_json
+from train.resume import Event, ResumePlan, event_records, plan_resume
+from train.settings import TrainSettings
+from train.start_options import StartOptions
+from train.stored_settings import stored_settings
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StartPlan:
+    """Everything that a run starts or resumes with; nothing is written yet."""
+
+    settings: TrainSettings
+    """Settings of the next step."""
+    network: RenderFormer | None = None
+    """Network whose weights are copied; None for random weights or a checkpoint."""
+    network_source: str = ""
+    """Path or name from which that network was opened."""
+    checkpoint: Checkpoint | None = None
+    """Checkpoint that is restored; None for a new run."""
+    resume_plan: ResumePlan | None = None
+    """Changed settings and history of a resumed run; None for a new run."""
+    branch: Path | None = None
+    """Checkpoint or run folder that a new folder continues; None otherwise."""
+
+
+def plan_start(
+    settings: TrainSettings,
+    folder: RunFolder,
+    data_digest: str,
+    start: StartOptions,
+    dist_context: DistributedContext,
+    progress: TrainProgress,
+) -> StartPlan:
+    """Read what the run starts or resumes with, without writing anything.
+
+    Raises:
+        TrilightError: the folder holds a run already, or has none to resume; the checkpoint is
+            damaged; or settings or data differ from the run's without a recorded decision.
+    """
+    if not start.resume and saved_steps(folder.checkpoints):
+        raise TrilightError(
+            f"{folder.root}: holds a run already; add --resume to go on with it, or choose "
+            "another --out."
+        )
+    start.check(settings)
+    if not start.continues_run:
+        source = start.begin_with
+        if source is None:
+            return StartPlan(settings=settings)
+        network = open_network(source, network_of_run)
+        settings = dataclasses.replace(settings, model=network.config)
+        return StartPlan(settings=settings, network=network, network_source=source)
+    branch = None if start.resume or start.branch is None else Path(start.branch)
+    if branch is None or branch.is_dir():
+        checkpoints = (folder if branch is None else RunFolder(branch)).checkpoints
+        checkpoint = newest_checkpoint(checkpoints, dist_context, progress.note)
+    else:
+        checkpoint = read_checkpoint(branch)
+        # the first process soon writes into the folder that all have looked at
+        dist_context.barrier()
+    if settings.from_weights:
+        config = decode_config(checkpoint.header["model"], str(branch or folder.root))
+        settings = dataclasses.replace(settings, model=config)
+    resume_plan = plan_resume(checkpoint.header, settings, data_digest, start.decisions)
+    return StartPlan(
+        settings=resume_plan.settings, checkpoint=checkpoint, resume_plan=resume_plan, branch=branch
+    )
+
+
+def init_or_resume_state(
+    plan: StartPlan,
+    folder: RunFolder,
+    data: TrainingData,
+    dist_context: DistributedContext,
+    progress: TrainProgress,
+) -> TrainState:
+    """Create or restore the state before the run's next step, and record it on disk.
+
+    A run that has just started, branched or changed its meaning is on disk when this returns.
+
+    Raises:
+        TrilightError: `data_weights` has another length than the list of datasets.
+    """
+    precision = choose_muon_precision(dist_context)
+    data_digest = data.digest
+    header = None if plan.checkpoint is None else plan.checkpoint.header
+    mixture = plan_mixture(data, plan.settings, header)
+    if mixture is not None:
+        progress.note(f"the stream mixes {mixture}")
+    if plan.checkpoint is None or plan.resume_plan is None:
+        state = new_state(plan.settings, dist_context.device, plan.network, precision)
+        state.mixture = mixture
+        digest = None
+        if plan.network is not None:
+            digest = sha256_hex(encode_weights(plan.network))
+            header = _header_of(Path(plan.network_source)) | {"sha256": digest}
+            state.history = (_origin(0, "weights", header),)
+        if dist_context.is_first:
+            more = {"begun_with_sha256": digest}
+            _write_settings(folder, plan.settings, state, data_digest, dist_context, more)
+        return state
+    state = restore_state(plan.checkpoint, plan.resume_plan, dist_context.device, precision)
+    state.mixture = mixture
+    if plan.branch is not None:
+        state.history += (_origin(state.step, "checkpoint", plan.checkpoint.header),)
+    for note in plan.resume_plan.notes:
+        progress.note(note)
+    _record_execution_changes(plan.checkpoint, dist_context, state, progress)
+    if dist_context.is_first:
+        _write_resumed_run(plan, folder, state, data_digest, dist_context)
+    return state
+
+
+def _write_resumed_run(
+    plan: StartPlan,
+    folder: RunFolder,
+    state: TrainState,
+    data_digest: str,
+    dist_context: DistributedContext,
+) -> None:
+    """Write how a run resumes, so that a kill before its next checkpoint loses nothing."""
+    if plan.branch is not None:
+        _copy_log_of_parent(plan.branch, folder, state.step)
+    _write_settings(folder, plan.settings, state, data_digest, dist_context)
+    if plan.branch is not None or (
+        plan.resume_plan is not None and plan.resume_plan.changes_meaning
+    ):
+        save_checkpoint(
+            folder.checkpoints,
+            state,
+            plan.settings,
+            data_digest=data_digest,
+            world_size=dist_context.world_size,
+        )
+
+
+def _origin(step: int, name: str, header: Mapping[str, Any]) -> Event:
+    """Return the event of what a run started with; it holds no path of the user's machine."""
+    settings = header.get("settings", {})
+    after = {
+        "run": settings.get("run"),
+        "step": header.get("step"),
+        "sha256": header.get("sha256"),
+    }
+    return Event(step=step, kind="origin", name=name, after=after)
+
+
+def _header_of(path: Path) -> dict[str, Any]:
+    """Return the header of a checkpoint, or an empty one for other weights files."""
+    if path.is_dir() and (steps := saved_steps(RunFolder(path).checkpoints)):
+        path = path_of_step(RunFolder(path).checkpoints, steps[-1])
+    if path.suffix != ".safetensors" or not path.is_file():
+        return {}
+    metadata = read_metadata(path)
+    return dict(json.loads(metadata[HEADER_KEY])) if is_checkpoint(metadata) else {}
+
+
+def _copy_log_of_parent(path: Path, folder: RunFolder, step: int) -> None:
+    """Copy the parent's metrics up to the step of the branch."""
+    parent = RunFolder(path if path.is_dir() else path.parent.parent)
+    log = MetricsLog(folder.metrics, first_step=0)
+    for row in read_rows(parent.metrics):
+        if row["step"] <= step:
+            log.append(row)
+
+
+def _write_settings(
+    folder: RunFolder,
+    settings: TrainSettings,
+    state: TrainState,
+    data_digest: str,
+    dist_context: DistributedContext,
+    more: Mapping[str, Any] | None = None,
+) -> None:
+    """Write settings.json: current settings, their history, and how the run started."""
+    origin = {
+        "begun_with_sha256": None,
+        **({"extensions": extensions} if (extensions := extension_digests("weights")) else {}),
+        "versions": {"torch": torch.__version__, "python": platform.python_version()},
+        "threads": torch.get_num_threads(),
+        "processes": dist_context.world_size,
+        "muon_precision": state.updater.muon_precision,
+        **(more or {}),
+    }
+    now = {
+        "settings": stored_settings(settings),
+        "data_digest": data_digest,
+        **({RECORD: state.mixture.record()} if state.mixture else {}),
+        "history": event_records(state.history),
+    }
+    write_atomically(folder.settings, pretty_json(origin | _read_settings(folder) | now))
+
+
+def _read_settings(folder: RunFolder) -> dict[str, Any]:
+    """Return the stored settings.json, or an empty record if it is missing or damaged."""
+    try:
+        return read_json(read_plain(folder.settings), dict[str, Any], str(folder.settings))
+    except (OSError, TrilightError):
+        return {}
+
+
+def _record_execution_changes(
+    checkpoint: Checkpoint,
+    dist_context: DistributedContext,
+    state: TrainState,
+    progress: TrainProgress,
+) -> None:
+    """Report and record changed processes, threads and Muon precision."""
+    header = checkpoint.header
+    muon = state.updater.muon_precision
+    now = {
+        "processes": (header["world_size"], dist_context.world_size),
+        "threads": (header.get("threads"), torch.get_num_threads()),
+        # the only one that there was
+        "muon_precision": (header.get("muon_precision", "bfloat16"), muon),
+    }
+    descriptions = {
+        "processes": f"{dist_context.world_size} processes instead of {header['world_size']}: "
+        "the same to rounding, not to the bit",
+        "threads": f"{torch.get_num_threads()} threads instead of {header.get('threads')}: the "
+        "same to rounding, not to the bit",
+        "muon_precision": f"Muon's products in {muon} instead of {now['muon_precision'][0]}, which "
+        "suits the processors here: the same to the rounding of bfloat16, not to the bit",
+    }
+    for name, (before, after) in now.items():
+        if before is None or after is None or before == after:
+            continue
+        progress.note(f"the run goes on with {descriptions[name]}")
+        event = Event(step=state.step, kind="execution", name=name, before=before, after=after)
+        state.history += (event,)

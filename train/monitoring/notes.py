@@ -1,0 +1,27 @@
+"""Writer of notes.jsonl, the dated notes of a run; unlike the log it is never truncated."""
+
+import json
+import time
+from pathlib import Path
+
+from storage.atomic import write_error
+
+
+def add_note(path: Path, step: int, text: str) -> None:
+    """Append a sentence without its full stop.
+
+    Args:
+        path: path of notes.jsonl.
+        step: number of steps that were done by then.
+        text: the sentence.
+
+    Raises:
+        TrilightError: the folder is full or cannot be written.
+    """
+    line = json.dumps({"step": step, "at_unix_s": round(time.time()), "text": text})
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as stream:
+            stream.write(line + "\n")
+    except OSError as error:
+        raise write_error(path, error) from error

@@ -1,0 +1,284 @@
+"""Resume plan of a run: its stored settings, recorded changes, and today's execution settings.
+
+A command that resumes states the run as it was started. Its execution settings are used as given.
+All other settings have to equal those of the checkpoint, except for named changes (`--change`),
+each of which the run records.
+"""
+
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from storage.errors import TrilightError
+from storage.settings.changes import changed, differences
+from storage.settings.described import describe_fields, from_record, settings_record
+from train.loop.schedule import decay_start_step
+from train.settings import TrainSettings
+from train.stored_settings import known_settings
+
+DATA = "data"
+"""Name of the change to other data. Its value is the start of their digest, after `sha256:` for a
+dataset and `list:` for listed shards, so that digits are never parsed as a number."""
+
+_FIXED = ("run", "from_weights", "model", "base_widths")
+"""Settings that cannot change within a run."""
+
+_LEAST_DIGITS = 8
+"""Minimum number of digits that identify a digest; fewer could match other data."""
+
+_EXECUTION = frozenset(field.name for field in describe_fields(TrainSettings) if field.is_execution)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """Recorded change of a run between two steps."""
+
+    step: int
+    """Number of steps that were done by then."""
+    kind: Literal["origin", "meaning", "execution", "earlier"]
+    """`origin`: the weights or checkpoint of the start; `meaning`: a decision; `execution`: another
+    execution setting; `earlier`: the run is older than a setting and keeps its value (`after`),
+    whatever the command states (`before`)."""
+    name: str
+    """Name of the setting, or `data`, `processes`, `threads`; `weights` or `checkpoint` of an
+    origin."""
+    before: Any = None
+    """Value until that step; None of an origin."""
+    after: Any = None
+    """Value from that step on; of an origin the run, its step and the sha256 of its weights."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResumePlan:
+    """Settings, history and messages of a run that resumes."""
+
+    settings: TrainSettings
+    """Settings of the next step."""
+    history: tuple[Event, ...]
+    """All events so far, oldest first, including those of this resume."""
+    notes: tuple[str, ...]
+    """Messages for the user, one per change."""
+    changes_meaning: bool
+    """True if this resume changes a setting or the data that decide the weights."""
+
+
+def plan_resume(
+    header: Mapping[str, Any],
+    typed: TrainSettings,
+    data_digest: str,
+    decisions: Mapping[str, Any],
+) -> ResumePlan:
+    """Return the plan to resume a run from a checkpoint.
+
+    Args:
+        header: header of the checkpoint (train.loop.checkpoints).
+        typed: the run as the command states it, as it was started or as it is now.
+        data_digest: digest of the data of this call.
+        decisions: settings by dotted name, and `data`, that change from here on.
+
+    Raises:
+        TrilightError: settings or data differ and were not decided on; the message names all of
+            them, both values and both remedies. A change that no run allows, or one of execution.
+    """
+    step = header["step"]
+    before = from_record(TrainSettings, known_settings(header["settings"], "checkpoint"))
+    old_record = settings_record(before)
+    past_events = events_of(header.get("history", ()))
+    named_decisions = {name: value for name, value in decisions.items() if name != DATA}
+    _require_meaning(named_decisions)
+    typed_otherwise = differences(old_record, settings_record(typed))
+    execution_changes = {
+        name: typed_otherwise[name] for name in typed_otherwise if name in _EXECUTION
+    }
+    settings = changed(before, execution_changes | named_decisions)
+    new_values = differences(old_record, settings_record(settings))
+    stated = _original_values(past_events)
+    events = list[Event]()
+    undecided = dict[str, Any]()
+    for name, value in typed_otherwise.items():
+        if name in new_values or value in stated.get(name, ()):
+            continue
+        if _lacks(header["settings"], name):
+            stored = _value_at(old_record, name)
+            events.append(Event(step=step, kind="earlier", name=name, before=value, after=stored))
+        else:
+            undecided[name] = value
+    if undecided:
+        raise _undecided_error(old_record, undecided)
+    events += _change_events(old_record, new_values, step)
+    events += _data_event(header, data_digest, decisions.get(DATA))
+    _require_possible(before, settings, step, events)
+    return ResumePlan(
+        settings=settings,
+        history=(*past_events, *events),
+        notes=tuple(_notes(before, settings, step, past_events, events)),
+        changes_meaning=any(event.kind == "meaning" for event in events),
+    )
+
+
+def _change_events(
+    old_record: Mapping[str, Any], new_values: Mapping[str, Any], step: int
+) -> list[Event]:
+    """Return the events of settings that change at a step."""
+    return [
+        Event(
+            step=step,
+            kind="execution" if name in _EXECUTION else "meaning",
+            name=name,
+            before=_value_at(old_record, name),
+            after=value,
+        )
+        for name, value in new_values.items()
+    ]
+
+
+def events_of(records: Sequence[Mapping[str, Any]]) -> tuple[Event, ...]:
+    """Return events from their JSON records."""
+    return tuple(Event(**record) for record in records)
+
+
+def event_records(events: Sequence[Event]) -> list[dict[str, Any]]:
+    """Return events as the JSON records of checkpoints, settings.json and summary.json."""
+    return [dataclasses.asdict(event) for event in events]
+
+
+def _original_values(past: Sequence[Event]) -> dict[str, list[Any]]:
+    """Return, by setting, the earlier values that a command may still state."""
+    stated: dict[str, list[Any]] = {}
+    for event in past:
+        values = [event.before, event.after] if event.kind == "earlier" else [event.before]
+        stated.setdefault(event.name, values)
+    return stated
+
+
+def _require_meaning(named: Mapping[str, Any]) -> None:
+    for name, value in named.items():
+        if name in _EXECUTION:
+            raise TrilightError(
+                f"--change {name}: it is execution, which is free when a run goes on; expected "
+                f"--set {name}={_to_text(value)}."
+            )
+
+
+def _data_event(header: Mapping[str, Any], digest: str, decided: Any) -> Iterator[Event]:
+    before = header["data_digest"]
+    if digest == before:
+        return
+    data_name = _short_digest(digest)
+    if decided is None:
+        raise TrilightError(
+            f"resume: the data are {data_name}, but the checkpoint was made with "
+            f"{_short_digest(before)}. Go on with those by --data, or decide to go on with these "
+            f"by --change {DATA}={data_name}, which the run records."
+        )
+    digits = str(decided).rpartition(":")[2]
+    if not _with_prefix(digest).startswith(str(decided)) or len(digits) < _LEAST_DIGITS:
+        raise TrilightError(
+            f"--change {DATA} is {decided}, but the data are {data_name}; expected that, or the "
+            "other data by --data."
+        )
+    yield Event(step=header["step"], kind="meaning", name=DATA, before=before, after=digest)
+
+
+def _undecided_error(old: Mapping[str, Any], wrong: Mapping[str, Any]) -> TrilightError:
+    """Return the error that lists settings that differ without a decision."""
+    said = ", and ".join(
+        f"{name} is {_to_text(value)}, but the checkpoint was made with "
+        f"{_to_text(_value_at(old, name))}"
+        for name, value in wrong.items()
+    )
+    back = " ".join(f"--set {name}={_to_text(_value_at(old, name))}" for name in wrong)
+    if "num_steps" in wrong:
+        back += " (and no --steps)"
+    if fixed := [name for name in wrong if name.split(".")[0] in _FIXED]:
+        other = f"begin another run in another folder, since {fixed[0]} is the run's for good"
+    else:
+        change = " ".join(f"--change {name}={_to_text(value)}" for name, value in wrong.items())
+        other = f"decide on {change}, which the run records"
+    return TrilightError(f"resume: {said}. Go on as it was with {back}, or {other}.")
+
+
+def _require_possible(
+    before: TrainSettings, now: TrainSettings, step: int, events: Sequence[Event]
+) -> None:
+    for event in events:
+        if event.kind == "meaning" and event.name.split(".")[0] in _FIXED:
+            raise TrilightError(
+                f"--change {event.name}: it is the run's for good; expected another run in another "
+                "folder, which may begin with this one's weights (--from)."
+            )
+    if (before.muon_rate == 0) != (now.muon_rate == 0):
+        raise TrilightError(
+            f"--change muon_rate={now.muon_rate:g}: the checkpoint lacks the memories of the other "
+            "optimiser; expected another run in another folder, which begins with this one's "
+            "weights (--from)."
+        )
+    if now.num_steps < step and now.num_steps != before.num_steps:
+        raise TrilightError(
+            f"--change num_steps={now.num_steps}: {step} steps are done; expected at least that, "
+            "or an earlier checkpoint in another folder (--branch)."
+        )
+
+
+def _notes(
+    before: TrainSettings,
+    now: TrainSettings,
+    step: int,
+    past: Sequence[Event],
+    events: Sequence[Event],
+) -> Iterator[str]:
+    def value(event: Event, which: Any) -> str:
+        return _short_digest(which) if event.name == DATA else _to_text(which)
+
+    standing = {event.name: event for event in past if event.kind == "meaning"}
+    for event in standing.values():
+        if event.name not in {other.name for other in events}:
+            yield f"as decided at step {event.step}, {event.name} is {value(event, event.after)}"
+    for event in events:
+        said = f"{event.name} is {value(event, event.after)}"
+        if event.kind == "earlier":
+            yield (
+                f"{said} and not {_to_text(event.before)}, since the run is older than that "
+                f"setting; --change {event.name}={_to_text(event.before)} changes it"
+            )
+        else:
+            yield f"from step {step} on, {said} instead of {value(event, event.before)}"
+    begins = decay_start_step(before)
+    if now.num_steps > before.num_steps and begins is not None and begins < step:
+        yield (
+            f"the rate had been falling since step {begins} and rises again; from the checkpoint "
+            f"of that step (--branch), it would be as if the run had been longer all along"
+        )
+
+
+def _to_text(value: Any) -> str:
+    """Return a value as it is typed after `=`."""
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+
+
+def _with_prefix(digest: str) -> str:
+    return digest if ":" in digest else f"sha256:{digest}"
+
+
+def _short_digest(digest: str) -> str:
+    """Return the first 12 digits of a digest of data, after its kind."""
+    kind, _, digits = _with_prefix(digest).partition(":")
+    return f"{kind}:{digits[:12]}"
+
+
+def _value_at(record: Mapping[str, Any], name: str) -> Any:
+    """Return the value at a dotted name."""
+    value: Any = record
+    for part in name.split("."):
+        value = value[part]
+    return value
+
+
+def _lacks(record: Mapping[str, Any], name: str) -> bool:
+    try:
+        _value_at(record, name)
+    except (KeyError, TypeError):
+        return True
+    return False
