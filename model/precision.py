@@ -7,8 +7,8 @@ banding. These are a hundredth of the work; rounding them too cost 7 dB on a tra
 S68).
 
 Weights are rounded once before inference, and not at every use (autocast): equally fast, half the
-memory. Training in reduced precision needs float32 weights and therefore uses autocast; `as_given`
-disables autocast for operations that are always float32.
+memory. Training in reduced precision needs float32 weights and therefore uses autocast;
+`without_autocast` disables it for operations that are always float32.
 """
 
 from collections.abc import Iterator

@@ -73,7 +73,7 @@ def width_scales(model: RenderFormer, base: BaseWidths) -> dict[str, WidthScale]
 
 @torch.no_grad()
 def scale_start(model: RenderFormer, scales: Mapping[str, WidthScale]) -> None:
-    """Scale the weights from `RenderFormer.initialise` to their size at this width."""
+    """Scale the weights from `RenderFormer.initialize` to their size at this width."""
     for name, weight in model.named_parameters():
         if scales[name].start != 1:
             weight.mul_(scales[name].start)

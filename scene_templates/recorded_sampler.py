@@ -1,4 +1,4 @@
-"""`StatedDraws`: random numbers that are drawn by name from a stated range, and remembered.
+"""`RecordedSampler`: random numbers that are drawn by name from a stated range, and remembered.
 
 What a surface or a sky is drawn from is written once, where it is drawn. The tests compare what was
 drawn with what was stated, and the reference page of surfaces and skies is made of it.

@@ -187,7 +187,7 @@ def require_same_extensions(what: str, before: Mapping[str, str], now: Mapping[s
 
     Args:
         what: was begun, as messages name it.
-        before, now: as `recorded` returns them.
+        before, now: as `extension_digests` returns them.
 
     Raises:
         TrilightError: one is missing, new, or another file; the message names it.

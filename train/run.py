@@ -70,7 +70,7 @@ def train_run(
             split nothing is evaluated.
         out: folder of the run (train.folder), new unless it resumes.
         start: how the run starts; by default new, with random weights.
-        crew: the processes that train together (loop.crew.join_crew); by default this one alone.
+        dist_context: processes of a distributed run (`join_processes`); by default this one alone.
         workers: threads that read and decode samples; by default as many as fit. The weights do
             not depend on them.
         watched: settings of the monitoring, on which the weights do not depend either.

@@ -269,7 +269,7 @@ def typed_run(typed: str) -> str:
     other sources must not be passed, since the file is executed.
 
     Raises:
-        TrilightError: as `Registry.typed`, or the function returns something else.
+        TrilightError: as `Registry.resolve`, or the function returns something else.
     """
     return RUNS.resolve(typed, _as_run)
 

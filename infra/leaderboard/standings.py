@@ -28,7 +28,7 @@ class Standing:
     timed_scenes: int
     """Number of scenes behind these medians."""
     scores: Mapping[str, Any]
-    """Summary of each metric by name (train.evaluation.judged_view.summary)."""
+    """Summary of each metric by name (train.evaluation.judged_view.summarize_views)."""
     lead: PairedLead | None
     """Paired difference from the rival; None for the rival and for NOISE."""
     on_front: bool | None

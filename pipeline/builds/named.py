@@ -34,7 +34,7 @@ def typed_build(typed: str) -> str:
     file is executed.
 
     Raises:
-        TrilightError: as `Registry.typed`, or the function returns something else.
+        TrilightError: as `Registry.resolve`, or the function returns something else.
     """
     return BUILDS.resolve(typed, _as_build)
 

@@ -77,8 +77,10 @@ def scene_sky(
     is_seen = bool(rng.random() < settings.seen_share)
     mean = _mean_radiance(radiance)
     target_radiance = over_lamps * lamp_irradiance(emitters, radiance_rgb) / math.pi
+    with np.errstate(over="ignore"):  # a scene's laws refuse infinite radiance by name
+        scaled = (radiance * np.float32(target_radiance / mean)).astype(np.float32)
     environment = Environment(
-        radiance_rgb=(radiance * np.float32(target_radiance / mean)).astype(np.float32),
+        radiance_rgb=scaled,
         rotation=_about_z(azimuth_rad),
         is_seen=is_seen,
         source=source,

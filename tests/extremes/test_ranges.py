@@ -264,9 +264,10 @@ INTERNAL = {
     "StreamSettings": "made of TrainSettings",
     "OrderSettings": "made of StreamSettings",
     "PublishedConfig": "a ModelConfig, and one number that the published code fixes",
-    "PreviewSettings": "made of Asked",
+    "PreviewSettings": "made of RenderOptions",
     "StorageSettings": "has no number",
-    "StatusOrder": "has no number",
+    "BaseSettings": "has no number",
+    "EvalConfig": "made of EvaluationOptions",
 }
 """Settings that nobody writes, or without numbers."""
 

@@ -26,7 +26,7 @@ class ChildHere:
     ) -> None:
         self._setup: tuple[Callable[..., None], tuple[Any, ...]] | None = (setup, setup_args)
 
-    def may(self, more: Reach) -> None:
+    def allow_files(self, more: Reach) -> None:
         """Allow more files: nothing is confined here."""
 
     def call(self, function: Callable[..., Result], *args: Any) -> Result:

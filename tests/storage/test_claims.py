@@ -33,8 +33,8 @@ from train.loop.distributed import DistributedContext
 HOLD = """
 import sys, time
 from pathlib import Path
-from storage.claims import claimed
-with claimed(Path(sys.argv[1])) as ours:
+from storage.claims import hold_claim
+with hold_claim(Path(sys.argv[1])) as ours:
     print(ours, flush=True)
     time.sleep(60)
 """

@@ -98,7 +98,7 @@ def stream_batches(
         shards: shards of the train split.
         settings: settings that determine order and scenes.
         first: number of a global batch.
-        share: slice of each batch for this process; all slices have equal size.
+        rank_slice: slice of each batch for this process; all slices have equal size.
         workers: threads that read and decode; with 0 the caller's thread. The result does not
             depend on them.
         mixture: mixture of the datasets, if there are several.

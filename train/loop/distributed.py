@@ -125,7 +125,7 @@ def join_processes(device: str | None = None) -> Iterator[DistributedContext]:
 
 
 def choose_device(requested: str | None, local_rank: int = 0) -> torch.device:
-    """Return the device of a process; see `join_crew`."""
+    """Return the device of a process; see `join_processes`."""
     kind = requested or ("cuda" if torch.cuda.is_available() else "cpu")
     if kind not in ("cpu", "cuda"):
         raise TrilightError(f"device {kind!r}; expected cpu or cuda.")

@@ -146,7 +146,7 @@ KILLED = """
 import sys
 from pathlib import Path
 from pipeline.generation import derive_dataset as flow
-from pipeline.shards.derive import Derive
+from pipeline.shards.derive import DeriveOptions
 
 def stop(done, total):
     if done > 4:  # three are read, one is written
@@ -154,7 +154,7 @@ def stop(done, total):
         import time
         time.sleep(60)
 
-derive = Derive(operation="reshard", scenes_per_shard=3)
+derive = DeriveOptions(operation="reshard", scenes_per_shard=3)
 flow.derive_dataset([sys.argv[1]], derive, Path(sys.argv[2]), progress=stop)
 """
 

@@ -196,13 +196,13 @@ CHILD = """
 import itertools, json, resource, sys
 from contextlib import closing
 from storage.dataset.training_data import open_training_data
-from train.data.order import RankShare
+from train.data.order import RankSlice
 from train.data.stream import StreamSettings, stream_batches
-from train.data.bad_samples import Unusable
+from train.data.bad_samples import BadSampleCounter
 settings = StreamSettings(seed=0, window=2, batch_size=8, resolution=16, views_per_scene=2)
 data = open_training_data([sys.argv[1]]).split("train")
 batches = stream_batches(
-    data, settings, 0, share=RankShare(), workers=2, unusable=Unusable(0)
+    data, settings, 0, rank_slice=RankSlice(), workers=2, unusable=BadSampleCounter(0)
 )
 count = peak = 0
 with closing(batches):
