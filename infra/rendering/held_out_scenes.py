@@ -17,7 +17,7 @@ from pipeline.generation.begin_dataset import begin
 from pipeline.generation.environment import environment
 from pipeline.generation.object_options import ObjectOptions
 from pipeline.isolation import ChildLimits, IsolatedChild
-from pipeline.renders.variant import choose_variant
+from pipeline.renders.variant import Variant, choose_variant
 from pipeline.scenes.compose import compose_scene
 from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
@@ -37,7 +37,11 @@ _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=4 * 3600, calls_per_child=10
 
 
 def composing_child(
-    build: BuildSettings, objects: str, folder: Path, threads: int | None = None
+    build: BuildSettings,
+    objects: str,
+    folder: Path,
+    threads: int | None = None,
+    variant: Variant | None = None,
 ) -> IsolatedChild:
     """Return a child that composes and renders the scenes of a preset; the caller closes it.
 
@@ -46,8 +50,9 @@ def composing_child(
         objects: source of the objects.
         folder: empty folder for the record of the objects.
         threads: CPU threads of Mitsuba and the denoiser; None for all cores.
+        variant: Mitsuba variant; None for that of the CPU, or of TRILIGHT_VARIANT.
     """
-    variant = choose_variant()
+    variant = variant or choose_variant()
     workers = threads or os.cpu_count() or 1
     publication = begin(
         DatasetFolder(folder), build, environment(variant), 1, accept_environment=False
@@ -57,7 +62,8 @@ def composing_child(
     )
     accepted = accept_objects(objects_order)
     recipe = SceneRecipe(settings=build, variant=variant, threads=workers, pool=accepted.pool)
-    return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(recipe,))
+    limits = dataclasses.replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
+    return IsolatedChild(limits=limits, setup=set_up_child, setup_args=(recipe,))
 
 
 def held_out_build() -> BuildSettings:

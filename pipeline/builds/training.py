@@ -90,7 +90,7 @@ def sky_256() -> BuildSettings:
 
 
 TRAINING_BUILDS = {
-    "smoke": NamedBuild(settings=smoke, num_scenes=24),
+    "smoke": NamedBuild(settings=smoke, num_scenes=24, device="cpu"),
     "pretrain-256": NamedBuild(settings=pretrain_256, num_scenes=65_536),
     "finetune-512": NamedBuild(settings=finetune_512, num_scenes=16_384),
     "textured-256": NamedBuild(settings=textured_256, num_scenes=16_384),

@@ -4,6 +4,7 @@ This process requests one pass of samples after another, so that it can report p
 """
 
 from collections.abc import Callable, Generator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,9 @@ class PathTracer:
         """Everything beside scene and camera that decides a picture, as JSON values."""
         self._is_open = False
         self._child = IsolatedChild(
-            limits=_LIMITS, setup=set_up_renderer, setup_args=(variant, threads)
+            limits=replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes)),
+            setup=set_up_renderer,
+            setup_args=(variant, threads),
         )
 
     def wake(self, name: str) -> None:

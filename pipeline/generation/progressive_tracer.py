@@ -6,6 +6,7 @@ changes scene, camera, width and depth between two pictures.
 
 import threading
 from collections.abc import Callable, Generator, Hashable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,9 @@ class ProgressiveTracer:
     def __init__(self, *, variant: Variant, threads: int) -> None:
         """Configure the child: Mitsuba's variant, and the number of CPU threads."""
         self._child = IsolatedChild(
-            limits=_LIMITS, setup=set_up_renderer, setup_args=(variant, threads)
+            limits=replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes)),
+            setup=set_up_renderer,
+            setup_args=(variant, threads),
         )
         self._one_at_a_time = threading.Lock()
 
